@@ -1,0 +1,1 @@
+"""From tracking data to supervision: rays, skeletons, von Mises-Fisher densities, probes, splits."""

@@ -1,0 +1,1 @@
+"""What was recorded: posed image sets, cameras."""

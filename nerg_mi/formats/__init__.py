@@ -1,0 +1,1 @@
+"""Files in and out. torch is imported in one file only."""

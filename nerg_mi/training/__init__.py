@@ -1,0 +1,1 @@
+"""Optimisation of radiance and gaze fields."""

@@ -1,0 +1,1 @@
+"""What a ray sees of any density: quadrature, marching, depth, visibility. Pure maths."""

@@ -1,0 +1,1 @@
+"""The Mitsuba face: one plugin a file; the class docstring is its manual page."""
