@@ -1,0 +1,41 @@
+"""The Dr.Jit array types of one backend.
+
+A field belongs to one backend (LLVM or CUDA): its weights are arrays of that
+backend. Nothing here depends on the Mitsuba variant in use, so that the code
+survives a change of variant; the types derive from arguments.
+"""
+from __future__ import annotations
+
+from types import ModuleType
+
+import drjit as dr
+
+
+def namespace(source: object) -> ModuleType:
+    """Module holding the differentiable array types of a backend.
+
+    ``source``: a Mitsuba variant name (``"llvm_ad_rgb"``), ``"llvm"``,
+    ``"cuda"``, or any JIT array or array type. Returns ``drjit.llvm.ad`` or
+    ``drjit.cuda.ad``. Raises ``ValueError`` for scalar variants, which have no
+    JIT arrays.
+    """
+    if isinstance(source, str):
+        name = source
+    else:
+        backend = dr.backend_v(source)
+        name = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}.get(backend, str(backend))
+    if name.startswith("llvm"):
+        import drjit.llvm.ad as ns
+    elif name.startswith("cuda"):
+        import drjit.cuda.ad as ns
+    else:
+        raise ValueError(
+            f'fields need a JIT variant such as "llvm_ad_rgb" or "cuda_ad_rgb", not "{name}"; '
+            "select one with mi.set_variant()"
+        )
+    return ns
+
+
+def is_cuda(ns: ModuleType) -> bool:
+    """True when ``ns`` is the CUDA backend, where networks run in fp16."""
+    return ns.__name__.startswith("drjit.cuda")

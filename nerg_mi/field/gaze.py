@@ -1,0 +1,160 @@
+"""The gaze field: how much a surface attracts, and how much an observer gives.
+
+Equation 1 of "Neural Radiance and Gaze Fields for Visual Attention Modeling in
+3D Environments": G(p_od, p_o) = F_e(p_od, -r_o) * sigmoid(F_c(p_o, r_o)), with
+r_o the unit direction from the observer p_o to the surface p_od that the
+observer sees. F_e and F_c share a trunk of the NeRF's shape (hash grid, two
+small networks) and differ in their last layer. G is a density over directions
+around the observer, in 1/sr.
+"""
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from .box import Box
+from .harmonics import encode_direction
+from .hashgrid import HashGrid, HashGridConfig
+from .mlp import MLP
+from .radiance import sigmoid
+
+VARIANTS = ("emit", "capture", "emit_capture")
+ACTIVATIONS = ("softplus", "exp", "linear")
+
+
+def softplus(x):
+    """log(1 + exp(x)) without overflow; the gradient is the sigmoid."""
+    # max(x, 0) + log(1 + exp(-|x|)), written so that both branches differentiate.
+    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
+
+
+def activate(x, activation: str):
+    """The emit head's output, a density in 1/sr: non-negative unless ``activation`` is linear."""
+    if activation == "softplus":
+        return softplus(x)
+    if activation == "exp":
+        return dr.exp(dr.minimum(x, 30.0))
+    return x
+
+
+@dataclass(frozen=True)
+class GazeConfig:
+    """Variant, output activation and sizes. The defaults are the paper's (its NeRF's configuration).
+
+    ``variant``: ``emit`` (a property of the surface alone), ``capture`` (the observer alone,
+    sigmoid output) or ``emit_capture`` (their product). ``activation`` of the emit head:
+    ``softplus`` and ``exp`` give densities, ``linear`` is the paper's and may be negative.
+    """
+
+    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(finest=512))
+    variant: str = "emit_capture"
+    activation: str = "softplus"
+    width: int = 64
+    geometry: int = 15
+    sh_degree: int = 4
+
+    def __post_init__(self):
+        if self.variant not in VARIANTS:
+            raise ValueError(f'the gaze variant must be one of {", ".join(VARIANTS)}, got "{self.variant}"')
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f'the activation must be one of {", ".join(ACTIVATIONS)}, got "{self.activation}"')
+        if min(self.width, self.geometry, self.sh_degree) < 1:
+            raise ValueError(f"every size of a gaze field must be at least 1, got {self}")
+
+    @property
+    def position_sizes(self) -> list[int]:
+        return [self.grid.size, self.width, self.geometry]
+
+    @property
+    def direction_sizes(self) -> list[int]:
+        return [self.sh_degree**2 + self.geometry, self.width, self.width]
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(d: dict) -> GazeConfig:
+        return GazeConfig(**{**d, "grid": HashGridConfig(**d["grid"])})
+
+
+class GazeField:
+    """Gaze density (1/sr) of an observer attending a surface.
+
+    Positions are in the field's units inside ``box`` (outside of it the grid's features are 0).
+    """
+
+    DRJIT_STRUCT = {
+        "grid": None, "position_net": None, "direction_net": None, "emit_head": None, "capture_head": None,
+    }
+    _NETS = ("position_net", "direction_net", "emit_head", "capture_head")
+
+    def __init__(self, config: GazeConfig, box: Box, grid: HashGrid, position_net: MLP, direction_net: MLP,
+                 emit_head: MLP, capture_head: MLP):
+        self.config, self.box, self.grid = config, box, grid
+        self.position_net, self.direction_net = position_net, direction_net
+        self.emit_head, self.capture_head = emit_head, capture_head
+        self.pack()
+
+    @staticmethod
+    def random(config: GazeConfig, box: Box, ns: ModuleType, seed: int = 0) -> GazeField:
+        """An untrained field of backend ``ns``; equal seeds give equal weights."""
+        rng = np.random.default_rng(seed)
+        return GazeField(
+            config, box,
+            HashGrid.random(config.grid, ns, rng),
+            MLP.random(config.position_sizes, ns, rng),
+            MLP.random(config.direction_sizes, ns, rng),
+            MLP.random([config.width, 1], ns, rng),
+            MLP.random([config.width, 1], ns, rng),
+        )
+
+    def parameters(self) -> dict:
+        """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
+        out = {"grid.table": self.grid.table}
+        for name in self._NETS:
+            out |= {f"{name}.{i}": w for i, w in enumerate(getattr(self, name).weights)}
+        return out
+
+    def set_parameters(self, values: dict) -> None:
+        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
+        known = self.parameters()
+        for name, value in values.items():
+            if name not in known:
+                raise ValueError(f'a gaze field has no parameter "{name}"; it has {", ".join(known)}')
+            if name == "grid.table":
+                self.grid.table = value
+            else:
+                net, index = name.split(".")
+                getattr(self, net).weights[int(index)] = value
+        self.pack()
+
+    def pack(self) -> None:
+        """Refresh what the kernels read; call after any change of the weights."""
+        for name in self._NETS:
+            getattr(self, name).pack()
+
+    def _trunk(self, p, d, active):
+        geometry = self.position_net(self.grid(self.box.to_unit(p), active))
+        hidden = self.direction_net(encode_direction(d, self.config.sh_degree) + geometry)
+        return [dr.maximum(h, 0) for h in hidden]
+
+    def emit(self, p_od, r_o, active=True):
+        """F_e(p_od, -r_o) after its activation, in 1/sr. ``r_o``: unit, from observer to surface."""
+        return activate(self.emit_head(self._trunk(p_od, -r_o, active))[0], self.config.activation)
+
+    def capture(self, p_o, r_o, active=True):
+        """sigmoid(F_c(p_o, r_o)), the probability that what is emitted is perceived."""
+        return sigmoid(self.capture_head(self._trunk(p_o, r_o, active))[0])
+
+    def evaluate(self, p_od, p_o, r_o, active=True):
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``.
+
+        A variant that lacks a part has 1 in its place and does not evaluate it.
+        """
+        one = type(p_od.x)(1)
+        emit = one if self.config.variant == "capture" else self.emit(p_od, r_o, active)
+        capture = one if self.config.variant == "emit" else self.capture(p_o, r_o, active)
+        return emit * capture, emit, capture

@@ -1,0 +1,155 @@
+"""Multiresolution hash grid (Müller et al. 2022, "Instant Neural Graphics Primitives").
+
+The memory layout is torch-ngp's, so that its checkpoints load without loss: a
+vertex stride of resolution + 1 on dense levels (no aliasing at the far faces),
+rows rounded up to a multiple of 8, scales in float32, and zero outside of the
+unit cube. A level whose (resolution + 1)^3 vertices do not fit in the table is
+hashed with the primes of the paper.
+"""
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from .backend import namespace
+
+_PRIMES = (1, 2654435761, 805459861)
+
+
+@dataclass(frozen=True)
+class HashGridConfig:
+    """Shape of a grid: ``levels`` x ``features``, ``2**log2_rows`` rows a level at
+    most, resolutions growing geometrically from ``base`` to ``finest``."""
+
+    levels: int = 16
+    features: int = 2
+    log2_rows: int = 19
+    base: int = 16
+    finest: int = 2048
+
+    def __post_init__(self):
+        if self.levels < 1 or self.base < 1 or self.finest < self.base:
+            raise ValueError(
+                f"a hash grid needs levels >= 1 and finest >= base >= 1, got levels={self.levels}, "
+                f"base={self.base}, finest={self.finest}"
+            )
+        if self.features not in (2, 4):
+            raise ValueError(f"features must be 2 or 4 (one packet load a vertex), got {self.features}")
+        if not 3 <= self.log2_rows <= 26:
+            raise ValueError(f"log2_rows must lie in 3..26, got {self.log2_rows}")
+
+    @property
+    def size(self) -> int:
+        """Number of features that the grid returns a point."""
+        return self.levels * self.features
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+    def level_scales(self) -> np.ndarray:
+        """Scale of each level as float32, (levels,): ``exp2(l log2 s) base - 1``."""
+        growth = np.log2(self.finest / self.base) / max(self.levels - 1, 1)
+        level = np.arange(self.levels, dtype=np.float32)
+        return (np.exp2(level * np.float32(growth)) * np.float32(self.base) - np.float32(1)).astype(np.float32)
+
+    def level_rows(self) -> list[int]:
+        """Rows of each level; the allocation uses the float64 resolution, as torch-ngp does."""
+        growth = np.exp2(np.log2(self.finest / self.base) / max(self.levels - 1, 1))
+        rows = []
+        for level in range(self.levels):
+            resolution = int(np.ceil(self.base * growth**level))
+            vertices = min(2**self.log2_rows, (resolution + 1) ** 3)
+            rows.append(int(np.ceil(vertices / 8) * 8))
+        return rows
+
+    def offsets(self) -> list[int]:
+        """First row of each level, and the total at the end, (levels + 1,)."""
+        return [0, *np.cumsum(self.level_rows()).tolist()]
+
+
+class HashGrid:
+    """Trainable features at points of the unit cube.
+
+    ``table`` is the flat parameter array, (rows * features,), the features of
+    one row adjacent and the levels one after another.
+    """
+
+    DRJIT_STRUCT = {"table": None}
+
+    def __init__(self, config: HashGridConfig, table):
+        self.config = config
+        self.table = table
+        expected = config.offsets()[-1] * config.features
+        if len(table) != expected:
+            raise ValueError(
+                f"the table of this hash grid has {len(table)} entries but its configuration {config} "
+                f"needs {expected}"
+            )
+        self._scales = config.level_scales()
+        self._rows = config.level_rows()
+        self._offsets = config.offsets()
+
+    @staticmethod
+    def random(config: HashGridConfig, ns: ModuleType, rng: np.random.Generator, scale: float = 1e-4) -> HashGrid:
+        """A grid with entries uniform in ``[-scale, scale]``."""
+        size = config.offsets()[-1] * config.features
+        return HashGrid(config, ns.Float(rng.uniform(-scale, scale, size).astype(np.float32)))
+
+    def is_hashed(self, level: int) -> bool:
+        stride = int(np.ceil(self._scales[level])) + 2
+        return stride**3 > self._rows[level]
+
+    def __call__(self, p, active=True, mode: dr.ReduceMode = dr.ReduceMode.Auto) -> list:
+        """Features at ``p`` (Array3f in the unit cube): ``levels * features`` Floats.
+
+        Points outside of the cube give zeros. ``mode`` chooses how gradients are
+        added to the table.
+        """
+        inside = active & dr.all((p >= 0) & (p <= 1))
+        # A negative coordinate cast to an unsigned cell would extrapolate by 4e9.
+        p = dr.select(inside, p, 0)
+        out = []
+        for level in range(self.config.levels):
+            out += self._level(level, p, inside, mode)
+        return out
+
+    def _level(self, level: int, p, active, mode) -> list:
+        ns = namespace(p)
+        packet = {2: ns.Array2f, 4: ns.Array4f}[self.config.features]
+        scale = float(self._scales[level])
+        pos = [dr.fma(c, scale, 0.5) for c in (p.x, p.y, p.z)]
+        cell = [ns.UInt32(c) for c in pos]
+        w = [c - ns.Float(i) for c, i in zip(pos, cell)]
+        lo, hi = self._corner_indices(level, cell)
+        offset = self._offsets[level]
+
+        def corner(ix, iy, iz):
+            row = self._combine(level, ix, iy, iz) + offset
+            return dr.gather(packet, self.table, row, active, mode=mode)
+
+        # Seven lerps a feature instead of eight weights and eight products.
+        planes = []
+        for iz in (lo[2], hi[2]):
+            rows = [dr.lerp(corner(lo[0], iy, iz), corner(hi[0], iy, iz), w[0]) for iy in (lo[1], hi[1])]
+            planes.append(dr.lerp(rows[0], rows[1], w[1]))
+        return list(dr.select(active, dr.lerp(planes[0], planes[1], w[2]), 0))
+
+    def _corner_indices(self, level: int, cell):
+        """Per-axis parts of the vertex index, for the lower and the upper corner."""
+        if self.is_hashed(level):
+            steps = _PRIMES
+        else:
+            stride = int(np.ceil(self._scales[level])) + 2
+            steps = (1, stride, stride * stride)
+        lo = [c * s for c, s in zip(cell, steps)]
+        return lo, [a + s for a, s in zip(lo, steps)]
+
+    def _combine(self, level: int, ix, iy, iz):
+        if not self.is_hashed(level):
+            return ix + iy + iz
+        h = ix ^ iy ^ iz
+        rows = self._rows[level]
+        return h & (rows - 1) if rows & (rows - 1) == 0 else h % rows

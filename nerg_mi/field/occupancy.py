@@ -1,0 +1,71 @@
+"""Where a field may hold density: a bit a cell, and how far away the next one is.
+
+Marching skips a step only when its midpoint lies in an empty cell. The distance
+to the nearest occupied cell (chessboard metric) lets a ray leap over many empty
+cells with one look-up.
+"""
+from __future__ import annotations
+
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+_FAR = 255
+
+
+class OccupancyGrid:
+    """Cubic grid over a field's unit cube, x varying fastest.
+
+    ``bits``: bool array (R, R, R), indexed [z, y, x]. ``threshold``: the density
+    (1/unit) below which a cell counts as empty; it is the bound that skipping
+    rests on and is recorded in checkpoints.
+    """
+
+    DRJIT_STRUCT = {"distance": None}
+
+    def __init__(self, bits: np.ndarray, ns: ModuleType, threshold: float):
+        bits = np.asarray(bits, bool)
+        if bits.ndim != 3 or len(set(bits.shape)) != 1:
+            raise ValueError(f"an occupancy grid is a cube of cells, got shape {bits.shape}")
+        self.bits, self.threshold = bits, float(threshold)
+        self.resolution = bits.shape[0]
+        self.distance = ns.UInt8(self._chessboard(bits).ravel())
+
+    @staticmethod
+    def _chessboard(bits: np.ndarray) -> np.ndarray:
+        """Chessboard distance in cells to the nearest occupied cell, 0..255 (0: occupied)."""
+        if not bits.any():
+            return np.full(bits.shape, _FAR, np.uint8)
+        from scipy.ndimage import distance_transform_cdt
+
+        return np.minimum(distance_transform_cdt(~bits, metric="chessboard"), _FAR).astype(np.uint8)
+
+    @property
+    def fraction(self) -> float:
+        """Share of the cells that are occupied."""
+        return float(self.bits.mean())
+
+    def empty_cells(self, u, active=True):
+        """Distance in cells (UInt32) from the cell of ``u`` (unit cube) to an occupied one; 0: occupied.
+
+        Points outside of the cube are clamped to its nearest cell.
+        """
+        uint = dr.uint32_array_t(type(u.x))
+        res = self.resolution
+        c = [uint(dr.clip(x * res, 0, res - 1)) for x in (u.x, u.y, u.z)]
+        index = c[0] + res * (c[1] + res * c[2])
+        return uint(dr.gather(type(self.distance), self.distance, index, active))
+
+    def packed(self) -> np.ndarray:
+        """The bits as bytes, (R^3 / 8,), x fastest, lowest bit first."""
+        return np.packbits(self.bits.ravel(), bitorder="little")
+
+    @staticmethod
+    def from_packed(data: np.ndarray, resolution: int, ns: ModuleType, threshold: float) -> OccupancyGrid:
+        if data.size * 8 < resolution**3:
+            raise ValueError(
+                f"an occupancy grid of resolution {resolution} needs {resolution**3 // 8} bytes, got {data.size}"
+            )
+        bits = np.unpackbits(data, bitorder="little")[: resolution**3].reshape((resolution,) * 3)
+        return OccupancyGrid(bits.astype(bool), ns, threshold)

@@ -1,0 +1,158 @@
+"""The radiance field: density and view-dependent colour at a point.
+
+Architecture of instant-ngp (Müller et al. 2022) as torch-ngp and the paper use
+it: hash grid -> density net -> (log density, geometry features); spherical
+harmonics of the direction and the geometry features -> colour net -> sigmoid.
+"""
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from .box import Box
+from .harmonics import encode_direction
+from .hashgrid import HashGrid, HashGridConfig
+from .mlp import MLP
+from .occupancy import OccupancyGrid
+
+# exp(30) is 1e13 per unit: opaque at any scale, and far from the overflow of fp32 (exp(88)).
+_MAX_LOG_DENSITY = 30.0
+
+
+@dataclass(frozen=True)
+class RadianceConfig:
+    """Sizes of the networks. The defaults are the paper's.
+
+    ``density_hidden`` / ``color_hidden``: hidden layers of ``width`` neurons;
+    ``geometry``: features handed from the density net to the colour net;
+    ``sh_degree``: degree of the direction encoding (``sh_degree**2`` numbers);
+    ``density_scale``: density, in 1/unit, where the density net returns 0.
+    """
+
+    grid: HashGridConfig = field(default_factory=HashGridConfig)
+    width: int = 64
+    density_hidden: int = 1
+    color_hidden: int = 2
+    geometry: int = 15
+    sh_degree: int = 4
+    density_scale: float = 1.0
+
+    def __post_init__(self):
+        if min(self.width, self.density_hidden, self.color_hidden, self.geometry, self.sh_degree) < 1:
+            raise ValueError(f"every size of a radiance field must be at least 1, got {self}")
+        if not (np.isfinite(self.density_scale) and self.density_scale > 0):
+            raise ValueError(f"density_scale must be positive and finite, got {self.density_scale}")
+
+    @property
+    def density_sizes(self) -> list[int]:
+        return [self.grid.size] + [self.width] * self.density_hidden + [1 + self.geometry]
+
+    @property
+    def color_sizes(self) -> list[int]:
+        return [self.sh_degree**2 + self.geometry] + [self.width] * self.color_hidden + [3]
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(d: dict) -> RadianceConfig:
+        return RadianceConfig(**{**d, "grid": HashGridConfig(**d["grid"])})
+
+
+def density_from_log(h, scale: float):
+    """Density from the density net's first output, clamped well before fp32 overflows."""
+    return scale * dr.exp(dr.minimum(h, _MAX_LOG_DENSITY))
+
+
+def sigmoid(x):
+    """1 / (1 + exp(-x)), finite with its gradient for every finite x."""
+    return dr.fma(0.5, dr.tanh(0.5 * x), 0.5)
+
+
+class RadianceField:
+    """Density (1/unit) and colour at points of ``box``.
+
+    ``color_space``: ``"srgb"`` or ``"linear"``, the space in which samples are
+    composited because the field was trained in it. ``occupancy``: where density
+    may exceed its threshold; None marches the whole box.
+    ``march_step``: step length, in units, that the field was trained with.
+    """
+
+    DRJIT_STRUCT = {"grid": None, "density_net": None, "color_net": None, "_head": None, "occupancy": None}
+
+    def __init__(
+        self,
+        config: RadianceConfig,
+        box: Box,
+        grid: HashGrid,
+        density_net: MLP,
+        color_net: MLP,
+        occupancy: OccupancyGrid | None = None,
+        color_space: str = "srgb",
+        march_step: float | None = None,
+    ):
+        if color_space not in ("srgb", "linear"):
+            raise ValueError(f'color_space must be "srgb" or "linear", got "{color_space}"')
+        self.config, self.box, self.color_space = config, box, color_space
+        self.grid, self.density_net, self.color_net = grid, density_net, color_net
+        self.occupancy, self.march_step = occupancy, march_step
+        self.pack()
+
+    @staticmethod
+    def random(config: RadianceConfig, box: Box, ns: ModuleType, seed: int = 0, **kwargs) -> RadianceField:
+        """An untrained field of backend ``ns``; equal seeds give equal weights."""
+        rng = np.random.default_rng(seed)
+        return RadianceField(
+            config,
+            box,
+            HashGrid.random(config.grid, ns, rng),
+            MLP.random(config.density_sizes, ns, rng),
+            MLP.random(config.color_sizes, ns, rng),
+            **kwargs,
+        )
+
+    def parameters(self) -> dict:
+        """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
+        out = {"grid.table": self.grid.table}
+        for name, net in (("density_net", self.density_net), ("color_net", self.color_net)):
+            out |= {f"{name}.{i}": w for i, w in enumerate(net.weights)}
+        return out
+
+    def set_parameters(self, values: dict) -> None:
+        """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
+        known = self.parameters()
+        for name, value in values.items():
+            if name not in known:
+                raise ValueError(f'a radiance field has no parameter "{name}"; it has {", ".join(known)}')
+            if name == "grid.table":
+                self.grid.table = value
+            else:
+                net, index = name.split(".")
+                getattr(self, net).weights[int(index)] = value
+        self.pack()
+
+    def pack(self) -> None:
+        """Refresh what the kernels read; call after any change of the weights."""
+        self.density_net.pack()
+        self.color_net.pack()
+        # Depth passes need one output of the last layer, not 1 + geometry of them.
+        last = self.density_net.weights[-1]
+        self._head = MLP(self.density_net.weights[:-1] + [last[0:1, :]])
+        self._head.pack()
+
+    def density(self, p, active=True):
+        """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside of the box."""
+        inside = active & self.box.contains(p)
+        h = self._head(self.grid(self.box.to_unit(p), inside))
+        return dr.select(inside, density_from_log(h[0], self.config.density_scale), 0)
+
+    def density_color(self, p, d, active=True):
+        """Density (1/unit) and colour (Array3f in ``color_space``, 0..1) of ``p`` seen along unit ``d``."""
+        inside = active & self.box.contains(p)
+        h = self.density_net(self.grid(self.box.to_unit(p), inside))
+        sigma = dr.select(inside, density_from_log(h[0], self.config.density_scale), 0)
+        rgb = self.color_net(encode_direction(d, self.config.sh_degree) + h[1:])
+        return sigma, type(p)(*[sigmoid(c) for c in rgb])
