@@ -1,0 +1,191 @@
+"""Shelves, coolers, counter and the goods on them: what stands in the demo store.
+
+A shelf unit is built in its own frame: u along the shelf, w out of its back towards the shopper, z up. Backs, ends and
+boards are solid and closed, so that nobody sees through a shelf and a field has something to learn behind every good.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nerg_mi.scenes.store.layout import EAST, NORTH, SOUTH, WEST, Place, Region, srgb
+
+# What a category's goods look like (sRGB), and the colour of its special offer.
+GOODS = {
+    "snacks": (("d94f30", "f2a33a", "f6d55c", "8c4a2f", "c92f45", "e8e0c9"), "ffd400"),
+    "sweets": (("b5338a", "e86fa6", "6a3d9a", "f5b8d0", "4b2e83", "f4ede4"), "ff3d7f"),
+    "noodles": (("b3261e", "f08a24", "f7e3af", "7a9e3f", "2f5d50", "d9c7a0"), "ff6a00"),
+    "household": (("2b6cb0", "63b3d1", "a9d6e5", "e6eef2", "3c7a5a", "6b7f92"), "00a6ff"),
+    "cosmetics": (("e8c7d0", "b284be", "7fb7be", "f3efe6", "5c6b8a", "d8899b"), "c800d8"),
+    "stationery": (("38618c", "35a7a0", "f0c808", "d7d2cb", "6c757d", "d1495b"), "ff9f1c"),
+    "bread": (("c68b59", "e0b074", "9c6644", "f0dcb8", "7f5539", "d9a15b"), "ffe08a"),
+    "drinks": (("1d70a2", "2fae66", "d7263d", "f46036", "f3e9d2", "3b3561"), "e10600"),
+    "dairy": (("e7f0f7", "7fb3d5", "f9e79f", "aed6a1", "d6c0dd", "4d88b8"), "2ec4ff"),
+    "meals": (("3f7d4e", "c7b446", "b9562f", "2c3e50", "ead7b0", "8fae5d"), "66e000"),
+    "magazines": (("d1495b", "edae49", "00798c", "30638e", "e5e5e5", "5f0f40"), "ffee00"),
+    "offers": (("e63946", "ffb703", "fb8500", "f1faee", "2a9d8f", "8338ec"), "ff0033"),
+    "counter_goods": (("9a9a9a", "c0392b", "2c3e50", "d4ac0d", "ecf0f1", "7d3c98"), "ff5500"),
+}
+
+
+class Frame:
+    """Local (u, w, z) to the world: the back of a unit starts at ``origin`` (x, y) and faces ``facing``."""
+
+    def __init__(self, origin, facing):
+        self.origin, self.facing = np.array(origin, float), np.array(facing[:2], float)
+        self.along = np.abs(self.facing[::-1])  # u ascends with x or y, whatever the facing
+        axis = int(np.argmax(np.abs(self.facing)))
+        sign = int(self.facing[axis])
+        self.front, self.back = (axis, sign), (axis, -sign)
+        self.ends = ((1 - axis, -1), (1 - axis, 1))
+        self.triple = (*map(int, facing),)
+
+    def box(self, u, w, z):
+        """World (lo, hi) of the local ranges u, w, z."""
+        a, b = (self.origin + uu * self.along + ww * self.facing for uu, ww in zip(u, w))
+        lo, hi = np.minimum(a, b), np.maximum(a, b)
+        return np.array([*lo, z[0]]), np.array([*hi, z[1]])
+
+
+def _good(place: Place, frame: Frame, u, w, z, ground, label, style: int) -> None:
+    """One good: a box whose front carries a label band, an upper cap or a checked label."""
+    patterns = {
+        0: ((1, 3), lambda i, j: label if j == 1 else ground),
+        1: ((1, 2), lambda i, j: label if j == 1 else ground),
+        2: ((2, 2), lambda i, j: label if (i + j) % 2 else ground),
+        3: ((1, 1), lambda i, j: ground),
+    }
+    lo, hi = frame.box(u, w, z)
+    skip = {frame.back, (2, -1)}  # they stand on a board, their backs are never seen
+    place.box(lo, hi, ground, skip=skip, fronts={frame.front: patterns[style]}, solid=False)
+
+
+def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: float, category: str, focus_u=None) -> None:
+    """Fill one board from u[0] to u[1] with groups of equal goods; ``focus_u`` is kept for the special offer."""
+    colors, offer = GOODS[category]
+    pos, last = u[0], -1
+    while pos < u[1] - 0.05:
+        if focus_u and pos < focus_u[1] - 1e-6 and pos >= focus_u[0] - 1e-6:
+            n = 3
+            width = (focus_u[1] - focus_u[0]) / n
+            for k in range(n):
+                a = focus_u[0] + k * width
+                _good(place, frame, (a, a + width), (0.02, depth - 0.01), (z0, z0 + room * 0.9), srgb(offer), srgb("ffffff"), 0)
+            pos = focus_u[1]
+            continue
+        stop = focus_u[0] if focus_u and pos < focus_u[0] - 1e-6 else u[1]
+        width = rng.uniform(0.11, 0.24)
+        count = int(rng.integers(1, 4))
+        if pos + count * width > stop - 0.08:  # the last group takes what is left
+            count = max(1, round((stop - pos) / width))
+            width = (stop - pos) / count
+        pick = int(rng.choice([k for k in range(len(colors)) if k != last]))
+        last = pick
+        other = colors[(pick + int(rng.integers(1, len(colors)))) % len(colors)]
+        height = room * rng.uniform(0.62, 0.92)
+        front = depth - rng.uniform(0.01, 0.05)
+        style = int(rng.integers(0, 4))
+        for k in range(count):
+            ground = np.clip(srgb(colors[pick]) * rng.uniform(0.88, 1.12), 0.02, 0.9)
+            a = pos + k * width
+            _good(place, frame, (a, a + width), (0.02, front), (z0, z0 + height), ground, srgb(other), style)
+        pos += count * width
+
+
+def shelf_unit(place, rng, frame, width, depth, boards, top, bays, trim, prefix, ends=True, kick=0.12, focus_level=2) -> None:
+    """A one-sided shelf: a solid back, a plinth, boards with price strips, goods, and one region for each bay.
+
+    ``boards``: heights of the boards' upper faces in metres, ascending; the last room ends at ``top``.
+    ``bays``: category of each bay; bays share the width equally.
+    """
+    edge = 0.04 if ends else 0.0
+    trim = srgb(trim)
+    body = srgb("c9c6bf")
+    lo, hi = frame.box((0, width), (0, depth), (0, top))
+    place.solids.append(np.stack([lo, hi]))
+    back = frame.box((edge, width - edge), (0.0, 0.02), (kick, top))
+    place.box(*back, body * 0.8, skip={frame.back, (2, -1), *frame.ends}, solid=False)
+    for k in range(2 if ends else 0):
+        a = 0.0 if k == 0 else width - edge
+        panel = frame.box((a, a + edge), (0, depth), (0, top))
+        place.box(*panel, trim, skip={frame.back, (2, -1)}, solid=False)
+    place.box(*frame.box((edge, width - edge), (0, depth), (0, kick)), trim * 0.5, skip={frame.back, (2, -1), *frame.ends}, solid=False)
+    bay_width = (width - 2 * edge) / len(bays)
+    for level, z in enumerate(boards):
+        thick = 0.035
+        strips = max(2, round(width / 0.45))
+        fronts = {frame.front: ((strips, 1), lambda i, j, s=level: (srgb("f2f0e6"), trim)[(i + s) % 2])}
+        if z > kick + 1e-6:
+            board = frame.box((edge, width - edge), (0.02, depth), (z - thick, z))
+            place.box(*board, body, skip={frame.back, *frame.ends}, fronts=fronts, solid=False)
+        room = (boards[level + 1] - thick if level + 1 < len(boards) else top) - z
+        for b, category in enumerate(bays):
+            u = (edge + b * bay_width, edge + (b + 1) * bay_width)
+            focus = None
+            if level == min(focus_level, len(boards) - 1):
+                half = min(0.24, 0.4 * bay_width)
+                middle = np.mean(u) + rng.uniform(-1, 1) * max(0.0, 0.5 * bay_width - half - 0.12)
+                focus = (middle - half, middle + half)
+                name = f"{prefix}_{category}" if len(bays) == 1 or bays.count(category) == 1 else f"{prefix}_{category}_{b + 1}"
+                region = frame.box(u, (0, depth), (0, top))
+                box = frame.box(focus, (0.02, depth - 0.01), (z, z + room * 0.9))
+                place.regions.append(Region(name, category, tuple(region[0]), tuple(region[1]), frame.triple, tuple(map(tuple, box))))
+            _stock(place, rng, frame, u, depth, z, room, category, focus)
+
+
+def _gondola(place, rng, number: int, x: float, west, east, cap: str, trim: str) -> None:
+    """A double shelf of 0.7 m with its spine at x, an end cap in the south, a picture in the north, a sign on top."""
+    y0, y1, top = 1.6, 4.2, 1.7
+    boards = (0.12, 0.50, 0.82, 1.14, 1.44)
+    for facing, bays, side in ((WEST, west, "west"), (EAST, east, "east")):
+        shelf_unit(place, rng, Frame((x, y0), facing), y1 - y0, 0.35, boards, top, bays, trim, f"gondola_{number}_{side}", focus_level=3 if side == "west" else 2)
+    shelf_unit(place, rng, Frame((x - 0.35, y0), SOUTH), 0.7, 0.3, (0.12, 0.55, 0.95, 1.30), 1.7, (cap,), trim, f"endcap_{number}", focus_level=2)
+    ground, light = srgb(trim), srgb("f4efe2")
+    place.box((x - 0.35, y1, 0), (x + 0.35, y1 + 0.03, top), ground, skip={(1, -1), (2, -1)},
+              fronts={(1, 1): ((4, 8), lambda i, j: light if (i * 3 + j * 2) % 7 < 2 else ground * (0.6 + 0.08 * j))})  # fmt: skip
+    place.box((x - 0.04, 2.0, top), (x + 0.04, 3.8, top + 0.32), ground, skip={(2, -1)},
+              fronts={(0, s): ((9, 2), lambda i, j: light if j == 1 and i % 3 else ground) for s in (-1, 1)})  # fmt: skip
+
+
+def _counter(place: Place, rng) -> None:
+    """The counter with till and impulse goods, the cabinet behind it, the coffee corner."""
+    wood, top, steel = srgb("8a5a3c"), srgb("ded5c4"), srgb("5b6670")
+    red = srgb("c8402f")
+    place.box((6.85, 1.0, 0), (7.35, 3.4, 0.9), wood, skip={(2, -1)},
+              fronts={(0, -1): ((8, 3), lambda i, j: red if j == 1 else wood * (0.8 + 0.4 * (i % 2)))})  # fmt: skip
+    place.box((6.8, 0.95, 0.9), (7.4, 3.45, 0.95), top, fronts={(2, 1): ((2, 8), lambda i, j: top * (0.8 + 0.25 * ((i + j) % 2)))})
+    place.box((6.95, 2.75, 0.95), (7.3, 3.15, 1.3), steel, skip={(2, -1)}, fronts={(0, -1): ((2, 2), lambda i, j: srgb("9fd3c7") if j else steel)})
+    place.regions.append(Region("counter_till", "till", (6.8, 2.6, 0.0), (7.4, 3.45, 1.35), WEST, ((6.95, 2.75, 0.95), (7.3, 3.15, 1.3))))
+    lo = (6.83, 1.1)
+    for level, z in enumerate((0.95, 1.17)):
+        _stock(place, rng, Frame((lo[0] + 0.32, lo[1]), WEST), (0.0, 1.0), 0.3 - 0.1 * level, z, 0.2, "sweets")
+    place.solids.append(np.array([(6.83, 1.1, 0.95), (7.15, 2.1, 1.4)]))
+    place.box((7.15, 1.1, 0.95), (7.19, 2.1, 1.45), srgb("6a3d9a"), skip={(2, -1)})
+    place.regions.append(Region("counter_sweets", "sweets", (6.8, 1.0, 0.9), (7.2, 2.1, 1.45), WEST, ((6.85, 1.3, 0.97), (7.15, 1.9, 1.37))))
+    shelf_unit(place, rng, Frame((8.0, 0.8), WEST), 2.8, 0.25, (0.12, 0.6, 1.0, 1.3, 1.6), 1.95, ("counter_goods",), "7a2b2b", "counter_wall", focus_level=3)
+    # coffee corner in the north-east
+    place.box((7.05, 5.35, 0), (8.0, 6.0, 0.92), srgb("4a3428"), skip={(2, -1), (1, 1), (0, 1)},
+              fronts={(1, -1): ((4, 4), lambda i, j: srgb("d9a066") if (i + j) % 3 == 0 else srgb("6b4a36"))})  # fmt: skip
+    place.box((7.15, 5.55, 0.92), (7.55, 5.95, 1.5), srgb("26292b"), skip={(2, -1)},
+              fronts={(1, -1): ((3, 4), lambda i, j: (srgb("ff7a1a"), srgb("26292b"), srgb("a9b4b8"))[(i + j) % 3])})  # fmt: skip
+    place.box((7.62, 5.6, 0.92), (7.92, 5.9, 1.25), srgb("e8dcc8"), skip={(2, -1)},
+              fronts={(1, -1): ((2, 3), lambda i, j: srgb("b5493b") if j == 1 else srgb("e8dcc8"))})  # fmt: skip
+    place.regions.append(Region("coffee", "coffee", (7.05, 5.35, 0.0), (8.0, 6.0, 1.5), SOUTH, ((7.15, 5.55, 0.95), (7.55, 5.95, 1.5))))
+
+
+def furnish(place: Place, rng) -> None:
+    """Put everything into the empty room; the areas of interest are added in this order."""
+    _gondola(place, rng, 1, 1.85, ("snacks", "sweets"), ("noodles", "snacks"), "offers", "c2572b")
+    _gondola(place, rng, 2, 3.65, ("household", "cosmetics"), ("stationery", "household"), "offers", "2d6a8f")
+    _gondola(place, rng, 3, 5.45, ("noodles", "bread"), ("bread", "sweets"), "offers", "4d7c3a")
+    shelf_unit(place, rng, Frame((0.0, 0.7), EAST), 4.2, 0.35, (0.12, 0.55, 0.92, 1.26, 1.6), 2.0, ("cosmetics", "stationery", "household"), "a8792c", "wall")
+    # coolers: deeper, taller, dark inside frames, with a bright header
+    for k, category in enumerate(("dairy", "meals", "drinks", "drinks")):
+        x = 0.55 + 1.6 * k
+        frame = Frame((x, 6.0), SOUTH)
+        shelf_unit(place, rng, frame, 1.6, 0.6, (0.25, 0.70, 1.10, 1.48), 1.9, (category,), "dfe7ea", f"cooler_{k + 1}", kick=0.25, focus_level=2)
+        sign = (srgb("2fa4d9"), srgb("ffffff"))
+        place.box(*frame.box((0, 1.6), (0, 0.6), (1.9, 2.2)), sign[0], skip={frame.back},
+                  fronts={frame.front: ((8, 2), lambda i, j, k=k: sign[(i // 2 + j + k) % 2])})  # fmt: skip
+    shelf_unit(place, rng, Frame((1.1, 0.0), NORTH), 2.2, 0.28, (0.12, 0.55, 0.95), 1.35, ("magazines", "magazines"), "5a5f66", "rack", focus_level=2)
+    _counter(place, rng)

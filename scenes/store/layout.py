@@ -1,0 +1,242 @@
+"""The layout of the demo store: one deterministic place made of axis-aligned boxes.
+
+The store is a convenience store of 8 x 6 x 3 m. Frame: x east, y north, z up, metres, the origin in the south-west corner
+of the floor. Three gondolas run north-south and make four aisles; coolers fill the north wall, a wall shelf the west wall,
+the counter stands in the east, the door is in the south wall.
+
+Everything is opaque, diffuse and textured with colour patches of 10 to 50 cm: what a radiance field can learn from small
+pictures, and what exact ray casts answer without ambiguity.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+ROOM = (8.0, 6.0, 3.0)  # metres
+SOUTH, NORTH, WEST, EAST = (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)
+
+
+def srgb(code: str) -> np.ndarray:
+    """Linear reflectance (3,) of an sRGB colour written as six hex digits."""
+    c = np.array([int(code[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+
+
+@dataclass(frozen=True)
+class Region:
+    """A named area of interest: an axis-aligned box in metres, and the direction in which its goods face.
+
+    ``focus`` is the box of its eye-catcher (the special offer of a shelf bay, the till of a counter), lo and hi.
+    """
+
+    name: str
+    category: str
+    lo: tuple
+    hi: tuple
+    facing: tuple
+    focus: tuple
+
+    def as_json(self) -> dict:
+        r = lambda v: [round(float(x), 4) for x in v]  # noqa: E731
+        return {
+            "name": self.name,
+            "category": self.category,
+            "min": r(self.lo),
+            "max": r(self.hi),
+            "facing": list(self.facing),
+            "focus": {"min": r(self.focus[0]), "max": r(self.focus[1])},
+        }
+
+
+@dataclass
+class Place:
+    """Coloured quads and solid boxes under construction.
+
+    ``quads`` (N, 4, 3) corners in metres, counter-clockwise seen from outside; ``colors`` (N, 3) linear reflectances;
+    ``lights`` (M, 4, 3) emitting quads; ``solids`` (K, 2, 3) boxes that nobody can stand in.
+    """
+
+    quads: list = field(default_factory=list)
+    colors: list = field(default_factory=list)
+    lights: list = field(default_factory=list)
+    solids: list = field(default_factory=list)
+    regions: list = field(default_factory=list)
+
+    def patch(self, axis: int, sign: int, at: float, lo2, hi2, color) -> None:
+        """One rectangle in the plane ``axis = at``, facing ``sign``; lo2, hi2 in the two other axes in ascending order."""
+        a, b = [k for k in range(3) if k != axis]
+        corners = np.empty((4, 3))
+        corners[:, axis] = at
+        corners[:, a] = (lo2[0], hi2[0], hi2[0], lo2[0])
+        corners[:, b] = (lo2[1], lo2[1], hi2[1], hi2[1])
+        # e_a x e_b is +e_axis for x and z, and -e_y for y
+        if sign * (-1 if axis == 1 else 1) < 0:
+            corners = corners[::-1]
+        self.quads.append(corners)
+        self.colors.append(np.asarray(color, float))
+
+    def grid(self, axis: int, sign: int, at: float, lo2, hi2, cells, color_of) -> None:
+        """A rectangle cut into ``cells`` (n, m) patches; ``color_of(i, j)`` gives a colour, or None for a light panel."""
+        us, vs = np.linspace(lo2[0], hi2[0], cells[0] + 1), np.linspace(lo2[1], hi2[1], cells[1] + 1)
+        for i in range(cells[0]):
+            for j in range(cells[1]):
+                color = color_of(i, j)
+                self.patch(axis, sign, at, (us[i], vs[j]), (us[i + 1], vs[j + 1]), 0 if color is None else color)
+                if color is None:
+                    self.lights.append(self.quads.pop())
+                    self.colors.pop()
+
+    def box(self, lo, hi, color, skip=(), fronts=None, solid=True) -> None:
+        """A box. ``skip``: faces (axis, sign) that are left out, because something else covers them.
+
+        ``fronts``: {(axis, sign): (cells, color_of)} for faces that carry a pattern.
+        """
+        lo, hi = np.minimum(lo, hi), np.maximum(lo, hi)
+        for axis in range(3):
+            rest = [k for k in range(3) if k != axis]
+            for sign in (-1, 1):
+                if (axis, sign) in skip:
+                    continue
+                at = (hi if sign > 0 else lo)[axis]
+                cells, color_of = (fronts or {}).get((axis, sign), ((1, 1), lambda i, j: color))
+                self.grid(axis, sign, at, lo[rest], hi[rest], cells, color_of)
+        if solid:
+            self.solids.append(np.stack([lo, hi]))
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The finished place as arrays, in metres; see `Place` for the fields. ``seed`` is what it was made from."""
+
+    seed: int
+    quads: np.ndarray
+    colors: np.ndarray
+    lights: np.ndarray
+    solids: np.ndarray
+    regions: tuple
+
+    @property
+    def aabb(self) -> np.ndarray:
+        """(2, 3) bounds of the room."""
+        return np.array([(0.0, 0.0, 0.0), ROOM])
+
+    def clearance(self, positions) -> np.ndarray:
+        """Distance (P,) in metres from positions (P, 3) to the nearest solid or room surface; 0 inside of a solid."""
+        p = np.atleast_2d(positions)
+        gap = np.maximum(self.solids[None, :, 0] - p[:, None], p[:, None] - self.solids[None, :, 1])
+        solid = np.linalg.norm(np.maximum(gap, 0.0), axis=-1).min(axis=1)
+        wall = np.minimum(p, np.array(ROOM) - p).min(axis=1)
+        return np.maximum(np.minimum(solid, wall), 0.0)
+
+
+def _shades(rng, base, cells, spread=0.12):
+    """A colour function over cells: the base with a random brightness for each cell."""
+    gains = 1.0 + spread * rng.uniform(-1, 1, cells)
+    return lambda i, j: np.clip(np.asarray(base) * gains[i, j], 0.02, 0.9)
+
+
+def _shell(place: Place, rng) -> None:
+    """Floor, walls and ceiling with the light panels."""
+    X, Y, Z = ROOM
+    warm, grey, mat = srgb("d8cfc0"), srgb("b3aca2"), srgb("7f95a8")
+    gain = 1.0 + 0.10 * rng.uniform(-1, 1, (16, 12))
+    place.grid(
+        2, 1, 0.0, (0, 0), (X, Y), (16, 12),
+        lambda i, j: gain[i, j] * (mat if j < 2 and 11 <= i <= 14 else (warm, grey)[(i + j) % 2]),
+    )  # fmt: skip
+    tile = 1.0 + 0.08 * rng.uniform(-1, 1, (16, 12))
+    place.grid(
+        2, -1, Z, (0, 0), (X, Y), (16, 12),
+        lambda i, j: None if i % 4 in (1, 2) and j % 3 == 1 else tile[i, j] * srgb("dedede" if (i + j) % 2 else "cfd3d8"),
+    )  # fmt: skip
+
+    # Walls in cells of 25 cm: a dado, a stripe in the colour of the wall, a light field with vertical bands above.
+    walls = {
+        (0, 1, 0.0, Y): ("e9dcc3", "c4622d", "f0c48a"),
+        (0, -1, X, Y): ("d5e2d0", "2f7d4f", "9cc9a3"),
+        (1, 1, 0.0, X): ("dfe3ee", "2b5fa8", "9db8e0"),
+        (1, -1, Y, X): ("e8d9e2", "8c2f5f", "d9a0bd"),
+    }
+    for (axis, sign, at, length), (field_, stripe, band) in walls.items():
+        n = round(length / 0.25)
+        gain = 1.0 + 0.10 * rng.uniform(-1, 1, (n, 12))
+        wide = rng.random(n) < 0.35
+
+        def color_of(i, j, n=n, gain=gain, wide=wide, base=field_, stripe=stripe, band=band, south=(axis, sign) == (1, 1)):
+            x = (i + 0.5) * 0.25
+            if south and 6.0 < x < 7.25 and j < 8:  # the door
+                return srgb("3c4a57" if j in (0, 7) or i in (24, 28) else "7fa6b8") * gain[i, j]
+            if j in (9,):
+                return srgb(stripe) * gain[i, j]
+            if j < 4:
+                return srgb(stripe) * 0.45 * gain[i, j] + 0.12
+            return srgb(band if wide[i] and j < 9 else base) * gain[i, j]
+
+        place.grid(axis, sign, at, (0, 0), (length, Z), (n, 12), color_of)
+
+
+def _poster(place: Place, rng, axis: int, sign: int, at: float, lo2, hi2, colors) -> tuple:
+    """A picture board of 3 cm on a wall: a ground with bars and a bright square. Returns its box (lo, hi)."""
+    rest = [k for k in range(3) if k != axis]
+    lo, hi = np.empty(3), np.empty(3)
+    lo[rest], hi[rest] = lo2, hi2
+    lo[axis], hi[axis] = sorted((at, at + 0.03 * sign))
+    n, m = (max(3, round((hi2[k] - lo2[k]) / 0.14)) for k in range(2))
+    ground, bar, mark = (srgb(c) for c in colors)
+    hole = rng.integers(1, n - 1), rng.integers(1, m - 1)
+
+    def color_of(i, j):
+        if abs(i - hole[0]) <= n // 6 and abs(j - hole[1]) <= m // 6:
+            return mark
+        return bar if (i + 2 * j) % 5 == 0 or j == 0 else ground * (0.8 + 0.4 * j / m)
+
+    place.box(lo, hi, ground, skip={(axis, -sign)}, fronts={(axis, sign): ((n, m), color_of)})
+    return lo, hi
+
+
+def build(seed: int = 0) -> Layout:
+    """The store of a seed. The furniture always stands at the same places; goods, shades and pictures vary."""
+    from nerg_mi.scenes.store import furniture
+
+    rng = np.random.default_rng([seed, 0x570E])
+    place = Place()
+    _shell(place, rng)
+    furniture.furnish(place, rng)
+    for args, name in (
+        ((0, 1, 0.0, (1.2, 2.30), (3.0, 2.90), ("c4622d", "f4e3c1", "fff3b0")), None),
+        ((0, -1, 8.0, (4.10, 1.20), (5.00, 2.30), ("2f7d4f", "f2f2e6", "ffd23f")), "poster_east"),
+        ((0, -1, 8.0, (1.0, 2.35), (3.4, 2.85), ("b8342f", "ffffff", "ffd23f")), None),
+        ((1, 1, 0.0, (3.55, 1.10), (4.55, 2.10), ("2b5fa8", "ffd23f", "e4572e")), "poster_south"),
+        ((1, 1, 0.0, (4.75, 1.30), (5.65, 2.10), ("e4572e", "fff7e6", "2b5fa8")), None),
+        ((1, -1, 6.0, (1.0, 2.35), (3.4, 2.85), ("2f6f8f", "e8f4f8", "ffffff")), None),
+        ((1, -1, 6.0, (4.2, 2.35), (6.6, 2.85), ("8c2f5f", "f7dbe8", "ffd23f")), None),
+    ):
+        lo, hi = _poster(place, rng, *args)
+        if name:
+            facing = [0, 0, 0]
+            facing[args[0]] = args[1]
+            place.regions.append(Region(name, "poster", tuple(lo), tuple(hi), tuple(facing), (tuple(lo), tuple(hi))))
+    return Layout(
+        seed=seed,
+        quads=np.array(place.quads),
+        colors=np.array(place.colors),
+        lights=np.array(place.lights),
+        solids=np.array(place.solids),
+        regions=tuple(place.regions),
+    )
+
+
+def write_regions(layout: Layout, path) -> Path:
+    """Write ``regions.json``: the room's bounds and the areas of interest, boxes in metres."""
+    path = Path(path)
+    content = {
+        "units": "metres, x east, y north, z up",
+        "aabb": layout.aabb.tolist(),
+        "regions": [r.as_json() for r in layout.regions],
+    }
+    path.write_text(json.dumps(content, indent=1) + "\n")
+    return path

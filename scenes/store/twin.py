@@ -1,0 +1,170 @@
+"""The digital twin of the demo store: ``twin.xml`` with two small meshes, and exact ray casts against them.
+
+``twin.ply`` carries one linear reflectance for each face (mesh attribute ``face_color``), ``twin_lights.ply`` the ceiling
+panels. Any stock Mitsuba renders ``twin.xml`` with its ``path`` integrator; units are metres, z up.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+TWIN_XML = HERE / "twin.xml"
+
+# Reflectances stay away from black and white: interreflection keeps the light soft, and no texel is without a gradient.
+ALBEDO_RANGE = (0.03, 0.82)
+PANEL_RADIANCE = 4.4
+
+XML = """<!-- The demo store as shapes. Metres, z up. Made by nerg_mi.scenes.store.make. -->
+<scene version="3.0.0">
+    <default name="spp" value="64"/>
+    <default name="width" value="480"/>
+    <default name="height" value="360"/>
+
+    <integrator type="path" id="integrator">
+        <integer name="max_depth" value="6"/>
+    </integrator>
+
+    <sensor type="perspective" id="camera">
+        <float name="fov" value="78"/>
+        <string name="fov_axis" value="x"/>
+        <float name="near_clip" value="0.01"/>
+        <float name="far_clip" value="100"/>
+        <transform name="to_world">
+            <lookat origin="7.4, 0.5, 2.2" target="3.2, 3.6, 0.9" up="0, 0, 1"/>
+        </transform>
+        <sampler type="independent">
+            <integer name="sample_count" value="$spp"/>
+        </sampler>
+        <film type="hdrfilm">
+            <integer name="width" value="$width"/>
+            <integer name="height" value="$height"/>
+            <rfilter type="box"/>
+            <string name="component_format" value="float32"/>
+            <string name="pixel_format" value="rgb"/>
+        </film>
+    </sensor>
+
+    <shape type="ply" id="store">
+        <string name="filename" value="twin.ply"/>
+        <boolean name="face_normals" value="true"/>
+        <bsdf type="twosided">
+            <bsdf type="diffuse">
+                <texture type="mesh_attribute" name="reflectance">
+                    <string name="name" value="face_color"/>
+                </texture>
+            </bsdf>
+        </bsdf>
+    </shape>
+
+    <shape type="ply" id="lights">
+        <string name="filename" value="twin_lights.ply"/>
+        <boolean name="face_normals" value="true"/>
+        <bsdf type="diffuse">
+            <rgb name="reflectance" value="0.8"/>
+        </bsdf>
+        <emitter type="area">
+            <rgb name="radiance" value="{r:.2f}, {g:.2f}, {b:.2f}"/>
+        </emitter>
+    </shape>
+</scene>
+"""
+
+
+def _write_ply(path: Path, quads: np.ndarray, colors: np.ndarray | None) -> None:
+    """Binary PLY of quads (N, 4, 3), each as two triangles; colors (N, 3) become the attribute ``face_color``."""
+    corners = np.round(quads.reshape(-1, 3), 5)
+    vertices, index = np.unique(corners, axis=0, return_inverse=True)
+    index = index.reshape(-1, 4)
+    triangles = index[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3).astype("<i4")
+    fields = [("n", "u1"), ("v", "<i4", 3)] + ([("c", "<f4", 3)] if colors is not None else [])
+    faces = np.zeros(len(triangles), fields)
+    faces["n"], faces["v"] = 3, triangles
+    if colors is not None:
+        faces["c"] = np.repeat(colors, 2, axis=0)
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    header += [f"property float {k}" for k in "xyz"]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    # Mitsuba groups the face properties color_0..2 into the attribute face_color
+    header += [f"property float color_{k}" for k in range(3)] if colors is not None else []
+    path.write_bytes(("\n".join([*header, "end_header", ""])).encode() + vertices.astype("<f4").tobytes() + faces.tobytes())
+
+
+def write_twin(layout, folder=HERE) -> list[Path]:
+    """Write twin.xml, twin.ply and twin_lights.ply of a `Layout` into a folder; returns their paths."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_ply(folder / "twin.ply", layout.quads, np.clip(layout.colors, *ALBEDO_RANGE))
+    _write_ply(folder / "twin_lights.ply", layout.lights, None)
+    tint = PANEL_RADIANCE * np.array([1.0, 0.97, 0.92])
+    (folder / "twin.xml").write_text(XML.format(r=tint[0], g=tint[1], b=tint[2]))
+    return [folder / n for n in ("twin.xml", "twin.ply", "twin_lights.ply")]
+
+
+@lru_cache(maxsize=8)
+def _load(path: str, variant: str, stamp: float):
+    import mitsuba as mi
+
+    return mi.load_file(path)
+
+
+def load_twin(path=TWIN_XML):
+    """The twin as an `mi.Scene` of the active variant, loaded once for each file and variant."""
+    import mitsuba as mi
+
+    path = Path(path)
+    if mi.variant() is None:
+        raise RuntimeError('No Mitsuba variant is set; call mi.set_variant("llvm_ad_rgb") before loading the twin.')
+    if not path.exists():
+        raise FileNotFoundError(f'"{path}" is missing; make it with: python -m nerg_mi.scenes.store.make --stage twin')
+    return _load(str(path), mi.variant(), path.stat().st_mtime)
+
+
+def _rays(origins, directions, maxt=None):
+    import mitsuba as mi
+
+    o = np.ascontiguousarray(np.asarray(origins, np.float32).reshape(-1, 3).T)
+    d = np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3).T)
+    n = max(o.shape[1], d.shape[1])
+    o, d = (np.ascontiguousarray(np.broadcast_to(v, (3, n))) for v in (o, d))
+    ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+    if maxt is not None:
+        ray.maxt = mi.Float(np.ascontiguousarray(np.broadcast_to(np.asarray(maxt, np.float32).ravel(), (n,))))
+    return ray, n
+
+
+CHUNK = 1 << 21  # rays a launch: bounds the memory of large queries
+
+
+def cast(origins, directions, scene=None) -> np.ndarray:
+    """Distance in metres from origins (N, 3) along unit directions (N, 3) to the twin; float64 (N,), inf on a miss.
+
+    One origin or one direction is broadcast. ``scene``: another scene than the store's own twin.
+    """
+    scene = load_twin() if scene is None else scene
+    o, d = np.broadcast_arrays(np.atleast_2d(origins), np.atleast_2d(directions))
+    out = np.empty(len(o))
+    for a in range(0, len(o), CHUNK):
+        ray, n = _rays(o[a : a + CHUNK], d[a : a + CHUNK])
+        t = scene.ray_intersect_preliminary(ray, coherent=False).t
+        out[a : a + n] = np.asarray(t, np.float64)
+    return out
+
+
+def visible(origins, points, scene=None, tolerance: float = 1e-3) -> np.ndarray:
+    """Whether each of points (N, 3) is seen from origins (N, 3): nothing of the twin lies between them. Bool (N,).
+
+    The last ``tolerance`` metres before the point are not tested, so that a point on a surface is not hidden by it.
+    """
+    scene = load_twin() if scene is None else scene
+    o, p = np.broadcast_arrays(np.atleast_2d(origins), np.atleast_2d(points))
+    out = np.empty(len(o), bool)
+    for a in range(0, len(o), CHUNK):
+        offset = (p[a : a + CHUNK] - o[a : a + CHUNK]).astype(np.float64)
+        length = np.linalg.norm(offset, axis=1)
+        ray, n = _rays(o[a : a + CHUNK], offset / np.maximum(length, 1e-12)[:, None], np.maximum(length - tolerance, 0.0))
+        out[a : a + n] = ~np.asarray(scene.ray_test(ray), bool)
+    return out
