@@ -12,7 +12,8 @@ from typing import Sequence
 import numpy as np
 
 from ..formats.skeleton_file import KEYPOINTS, iterate_skeleton
-from .rays import Rays, RaysBuilder
+from .collecting import RaysBuilder
+from .rays import Rays
 
 # The keypoints whose meaning is known: columns 6:9, 39:42 and 33:36 of the file.
 LEFT_EAR, RIGHT_EAR, NOSE = 2, 13, 11

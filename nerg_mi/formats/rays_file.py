@@ -31,7 +31,7 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
         with open(path, "wb") as out:  # a file object: savez may not append a suffix
             np.savez_compressed(out, metadata=np.array(document), **columns)
         return
-    pa, pq = _pyarrow()
+    pa, pq = pyarrow_modules()
     table = {}
     for name, value in columns.items():
         if name in _VECTORS:
@@ -54,7 +54,7 @@ def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict
             raise ValueError(f"{path} is not a rays file ({error}); make one with 'nerg rays import'") from error
         document = str(columns.pop("metadata", ""))
     else:
-        _, pq = _pyarrow()
+        _, pq = pyarrow_modules()
         table = pq.read_table(path)
         document = ((table.schema.metadata or {}).get(b"nerg_mi") or b"").decode()
         flat = {name: table.column(name).to_numpy() for name in table.column_names}
@@ -82,7 +82,7 @@ def _suffix(path: str | os.PathLike) -> str:
     return suffix
 
 
-def _pyarrow() -> tuple[Any, Any]:
+def pyarrow_modules() -> tuple[Any, Any]:
     try:
         import pyarrow
         import pyarrow.parquet

@@ -1,0 +1,169 @@
+"""Tables of rays: CSV (also ``.gz``) and Parquet, read by named columns.
+
+A column map says which columns of a table mean what, in the order of the axes:
+``origin=x,y,z direction=dx,dy,dz t=time person=id confidence=valid hit=hx,hy,hz``.
+"""
+from __future__ import annotations
+
+import csv
+import gzip
+import itertools
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Iterator, NamedTuple, Sequence
+
+import numpy as np
+
+BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
+
+_MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
+_FIELDS = {"origin": 3, "direction": 3, "hit": 3, "t": 1, "person": 1, "confidence": 1}
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """Names of a table's columns. ``origin`` and ``direction`` are required;
+    without ``t`` rows are numbered, without ``person`` the file is the person,
+    without ``confidence`` it is one."""
+
+    origin: tuple[str, str, str]
+    direction: tuple[str, str, str]
+    t: str | None = None
+    person: str | None = None
+    confidence: str | None = None
+    hit: tuple[str, str, str] | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> ColumnMap:
+        """From ``"origin=x,y,z direction=dx,dy,dz t=time ..."``.
+
+        Raises ``ValueError`` for an unknown or repeated field, a wrong number
+        of columns, or when origin or direction is missing.
+        """
+        found: dict[str, tuple[str, ...] | str] = {}
+        for word in text.split():
+            key, _, value = word.partition("=")
+            columns = tuple(c for c in value.split(",") if c)
+            if key not in _FIELDS or key in found:
+                raise ValueError(f"column map: {key!r} is unknown or given twice; use {', '.join(_FIELDS)}, each once")
+            if len(columns) != _FIELDS[key]:
+                raise ValueError(f"column map: {key} needs {_FIELDS[key]} column name(s), got {len(columns)} in {word!r}")
+            found[key] = columns if _FIELDS[key] == 3 else columns[0]
+        for key in ("origin", "direction"):
+            if key not in found:
+                raise ValueError(f"column map: {key} is missing; add {key}=x,y,z with the names of its columns")
+        return cls(**found)  # type: ignore[arg-type]
+
+    def __str__(self) -> str:
+        words = []
+        for key in _FIELDS:
+            value = getattr(self, key)
+            if value is not None:
+                words.append(f"{key}={value if isinstance(value, str) else ','.join(value)}")
+        return " ".join(words)
+
+
+class TableBlock(NamedTuple):
+    """``numbers`` (n, C) float64 in the order asked, NaN where a cell is empty;
+    ``texts`` (n, T) str; ``lines`` (n,) 1-based lines of the file (rows for
+    Parquet)."""
+
+    numbers: np.ndarray
+    texts: np.ndarray
+    lines: np.ndarray
+
+
+def iterate_table(path: str | os.PathLike, numbers: Sequence[str], texts: Sequence[str] = ()) -> Iterator[TableBlock]:
+    """Yield named columns of a table in blocks of at most ``BLOCK`` rows.
+
+    The separator (comma, semicolon or tab) is taken from the header. Cells
+    that are empty or say nan, na, null or none are NaN. Raises ``ValueError``
+    for a missing column (naming those there are), a row with too few cells, or
+    a cell that is no number (naming its line).
+    """
+    name = str(path).lower()
+    if name.endswith(".parquet"):
+        yield from _iterate_parquet(path, numbers, texts)
+        return
+    with _open(path) as source:
+        header = source.readline().rstrip("\r\n").lstrip("\ufeff")
+        separator = max(",;\t", key=header.count)
+        columns = [c.strip() for c in next(csv.reader([header], delimiter=separator))] if header else []
+        where = {c: i for i, c in enumerate(columns)}
+        _require(path, [*numbers, *texts], columns)
+        number_at, text_at = [where[c] for c in numbers], [where[c] for c in texts]
+        count = 1
+        while raw := list(itertools.islice(source, BLOCK)):
+            lines = count + 1 + np.flatnonzero([bool(line.strip()) for line in raw])
+            kept = [line for line in raw if line.strip()]
+            count += len(raw)
+            if kept:
+                yield _convert(path, kept, lines, separator, columns, number_at, text_at)
+
+
+def _convert(
+    path: object, rows: list[str], lines: np.ndarray, separator: str, columns: list[str], number_at: list[int], text_at: list[int]
+) -> TableBlock:
+    # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast
+    # reader refuses them, so they are spelt out first.
+    gap = separator * 2
+    filled = [r.replace(gap, f"{separator}nan{separator}").replace(gap, f"{separator}nan{separator}") if gap in r else r for r in rows]
+    options = dict(delimiter=separator, comments=None, quotechar='"', ndmin=2)
+    try:
+        values = np.loadtxt(filled, usecols=number_at, dtype=np.float64, **options)
+    except ValueError:
+        values = _convert_slowly(path, rows, lines, separator, columns, number_at)
+    words = np.loadtxt(rows, usecols=text_at, dtype=str, **options) if text_at else np.empty((len(rows), 0), dtype=str)
+    return TableBlock(values, words, lines)
+
+
+def _convert_slowly(
+    path: object, rows: list[str], lines: np.ndarray, separator: str, columns: list[str], number_at: list[int]
+) -> np.ndarray:
+    """Cell by cell: knows more spellings of "missing", and names the bad cell."""
+    out = np.empty((len(rows), len(number_at)))
+    for i, cells in enumerate(csv.reader(rows, delimiter=separator)):
+        if len(cells) <= max(number_at):
+            raise ValueError(f"{path}, line {lines[i]}: {len(cells)} cells, the header has {len(columns)}; mend or remove the line")
+        for j, k in enumerate(number_at):
+            word = cells[k].strip()
+            try:
+                out[i, j] = np.nan if word.lower() in _MISSING else float(word)
+            except ValueError:
+                raise ValueError(
+                    f"{path}, line {lines[i]}, column {columns[k]!r}: {word!r} is not a number; mend the cell or the column map"
+                ) from None
+    return out
+
+
+def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[TableBlock]:
+    from .rays_file import pyarrow_modules
+
+    _, pq = pyarrow_modules()
+    table = pq.ParquetFile(path)
+    _require(path, [*numbers, *texts], table.schema_arrow.names)
+    first = 1
+    for batch in table.iter_batches(batch_size=BLOCK, columns=list(dict.fromkeys([*numbers, *texts]))):
+        n = batch.num_rows
+        column = lambda c: batch.column(batch.schema.get_field_index(c))
+        values = [column(c).to_numpy(zero_copy_only=False).astype(np.float64) for c in numbers]
+        words = [np.array([str(v) for v in column(c).to_pylist()], dtype=str) for c in texts]
+        yield TableBlock(
+            np.stack(values, axis=1) if values else np.empty((n, 0)),
+            np.stack(words, axis=1) if words else np.empty((n, 0), dtype=str),
+            np.arange(first, first + n),
+        )
+        first += n
+
+
+def _require(path: object, wanted: Sequence[str], there: Sequence[str]) -> None:
+    missing = [c for c in wanted if c not in there]
+    if missing:
+        raise ValueError(f"{path} has no column {', '.join(map(repr, missing))}; its columns are {', '.join(there) or 'none'}")
+
+
+def _open(path: str | os.PathLike) -> IO[str]:
+    if Path(path).suffix.lower() == ".gz":
+        return gzip.open(path, "rt", encoding="utf-8", newline="")
+    return open(path, "rt", encoding="utf-8", newline="")
