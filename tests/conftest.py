@@ -1,0 +1,112 @@
+"""What all tests share: variants, free memory between files, optional torch, and recorded data that may not be there."""
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import os
+from pathlib import Path
+
+import pytest
+
+import nerg_mi  # chooses the libLLVM, so it comes before drjit and mitsuba
+
+ROOT = Path(__file__).resolve().parents[1]
+TORCH_REQUIRED = os.environ.get("NERG_REQUIRE_TORCH", "0") not in ("", "0")
+
+
+# ------------------------------------------------------------------------
+#  Variants
+# ------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def rgb():
+    """Every test starts in llvm_ad_rgb, whatever the one before it left behind; gives the module `mitsuba`."""
+    import mitsuba as mi
+
+    if mi.variant() != "llvm_ad_rgb":
+        mi.set_variant("llvm_ad_rgb")
+    return mi
+
+
+@pytest.fixture
+def mono(rgb):
+    """Runs the test in llvm_ad_mono; gives the module `mitsuba`."""
+    rgb.set_variant("llvm_ad_mono")
+    yield rgb
+    rgb.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(params=["llvm_ad_rgb", "llvm_ad_mono"])
+def rgb_and_mono(request, rgb):
+    """Runs the test in llvm_ad_rgb and in llvm_ad_mono; gives the module `mitsuba`."""
+    rgb.set_variant(request.param)
+    yield rgb
+    rgb.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _free_memory():
+    """Kernels and arrays of one file are of no use to the next, and the suite must fit on a small machine."""
+    yield
+    import drjit as dr
+
+    gc.collect()
+    dr.kernel_history_clear()
+    dr.flush_malloc_cache()
+    dr.flush_kernel_cache()
+
+
+# ------------------------------------------------------------------------
+#  torch: an extra. With NERG_REQUIRE_TORCH=1 a test skipped for want of it is a failure
+# ------------------------------------------------------------------------
+
+
+def pytest_configure(config):
+    if TORCH_REQUIRED and importlib.util.find_spec("torch") is None:
+        pytest.exit("NERG_REQUIRE_TORCH is set and torch is not installed: pip install torch, or unset it.", returncode=1)
+
+
+def _fail_if_skipped_for_torch(report):
+    if TORCH_REQUIRED and report.skipped and isinstance(report.longrepr, tuple) and "torch" in report.longrepr[2].lower():
+        report.outcome = "failed"
+        report.longrepr = f"NERG_REQUIRE_TORCH is set, and this was skipped: {report.longrepr[2]}"
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    return _fail_if_skipped_for_torch((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    return _fail_if_skipped_for_torch((yield))
+
+
+@pytest.fixture
+def torch():
+    """The module `torch`; without it the test is skipped, or fails where NERG_REQUIRE_TORCH is set."""
+    return pytest.importorskip("torch", reason="torch is not installed (pip install torch)")
+
+
+# ------------------------------------------------------------------------
+#  Recorded data
+# ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def recorded():
+    """`recorded("fox")` is the folder of a recorded data set: in $NERG_DATA, else in ../shared/data of the checkout.
+
+    The data are not part of the repository; a test that needs what is not there is skipped.
+    """
+    base = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
+
+    def find(name: str) -> Path:
+        if not (base / name).exists():
+            pytest.skip(f'the recorded data "{name}" are not here: set NERG_DATA to the folder that holds them')
+        return base / name
+
+    return find
