@@ -149,10 +149,13 @@ class RadianceField:
         h = self._head(self.grid(self.box.to_unit(p), inside))
         return dr.select(inside, density_from_log(h[0], self.config.density_scale), 0)
 
-    def density_color(self, p, d, active=True):
-        """Density (1/unit) and colour (Array3f in ``color_space``, 0..1) of ``p`` seen along unit ``d``."""
+    def density_features(self, p, active=True):
+        """Density (1/unit) at ``p`` and the ``geometry`` features (list of Floats) that ``color`` needs."""
         inside = active & self.box.contains(p)
         h = self.density_net(self.grid(self.box.to_unit(p), inside))
-        sigma = dr.select(inside, density_from_log(h[0], self.config.density_scale), 0)
-        rgb = self.color_net(encode_direction(d, self.config.sh_degree) + h[1:])
-        return sigma, type(p)(*[sigmoid(c) for c in rgb])
+        return dr.select(inside, density_from_log(h[0], self.config.density_scale), 0), h[1:]
+
+    def color(self, features: list, d):
+        """Colour (Array3f in ``color_space``, 0..1) of a point with ``features``, seen along unit ``d``."""
+        rgb = self.color_net(encode_direction(d, self.config.sh_degree) + features)
+        return type(d)(*[sigmoid(c) for c in rgb])

@@ -1,0 +1,16 @@
+"""1 - exp(-x) and log(1 + x) without cancellation, which Dr.Jit lacks."""
+from __future__ import annotations
+
+import drjit as dr
+
+
+def one_minus_exp(x):
+    """1 - exp(-x) for x >= 0, to full relative precision also for tiny x; 1 at infinity."""
+    # tanh is accurate near 0 and saturates at 1: 1 - exp(-x) = 2 th / (1 + th), th = tanh(x / 2).
+    th = dr.tanh(0.5 * x)
+    return 2 * th / (1 + th)
+
+
+def log1p(x):
+    """log(1 + x) for -1 < x, to full relative precision also for tiny x."""
+    return 2 * dr.atanh(x / (2 + x))

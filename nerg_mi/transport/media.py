@@ -1,0 +1,193 @@
+"""What the marcher asks of a place: its extent, its density and its colour.
+
+A trained field and any pair of Mitsuba volumes answer the same questions, so that
+analytic cases, grids from other tools and neural fields run through one code path.
+Rays are handed over once (``local``), then every sample is ``o + t d`` in the
+medium's own coordinates while ``t`` stays the distance in the scene.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from ..field.gaze import GazeField
+from ..field.radiance import RadianceField
+from .ray_box import intersect_box
+
+
+class Similarity:
+    """A rotation, uniform scale and translation: a field's ``to_world``.
+
+    ``matrix``: (4, 4), field to scene. Raises ``ValueError`` when it shears, mirrors or scales
+    unevenly: densities and directions would then have no single scale.
+    """
+
+    def __init__(self, matrix=None):
+        m = np.eye(4) if matrix is None else np.asarray(matrix, float)
+        linear = m[:3, :3]
+        scale = abs(np.linalg.det(linear)) ** (1 / 3)
+        if not np.isfinite(scale) or scale == 0 or not np.allclose(
+            linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2
+        ) or np.linalg.det(linear) < 0:
+            raise ValueError(
+                '"to_world" of a field must be a rotation, a uniform scale and a translation; bake any other '
+                "transform into the field's training data"
+            )
+        self.matrix, self.scale = m, float(scale)
+        self.inverse = np.linalg.inv(m)
+        self.identity = bool(np.array_equal(m, np.eye(4)))
+
+    def point_to_local(self, p):
+        return p if self.identity else self._apply(self.inverse, p, 1)
+
+    def vector_to_local(self, v):
+        """A scene vector in field coordinates; a unit vector becomes 1 / scale long."""
+        return v if self.identity else self._apply(self.inverse, v, 0)
+
+    def direction_to_local(self, v):
+        """A unit scene direction as a unit field direction."""
+        return v if self.identity else self._apply(self.inverse * self.scale, v, 0)
+
+    def bounds(self, lower, upper):
+        """Scene-space axis-aligned bounds of a field-space box."""
+        corners = np.array([[x, y, z, 1] for x in (lower[0], upper[0]) for y in (lower[1], upper[1])
+                            for z in (lower[2], upper[2])])
+        p = (corners @ self.matrix.T)[:, :3]
+        return p.min(0), p.max(0)
+
+    @staticmethod
+    def _apply(m, v, w):
+        rows = [dr.fma(a, v.x, dr.fma(b, v.y, dr.fma(c, v.z, w * e))) for a, b, c, e in m[:3].tolist()]
+        return type(v)(*rows)
+
+
+@dataclass
+class LocalRay:
+    """A ray in a medium's coordinates: point ``o + t d`` at scene distance ``t``; ``w`` is the unit direction."""
+
+    o: object
+    d: object
+    w: object
+    t_near: object
+    t_far: object
+
+
+class FieldMedium:
+    """A radiance field placed in the scene."""
+
+    def __init__(self, field: RadianceField, to_world: Similarity | None = None):
+        self.field, self.to_world = field, to_world or Similarity()
+        # A field scaled by s is s times longer, so its density per scene unit is s times lower.
+        self._per_unit = 1 / self.to_world.scale
+        self.occupancy = field.occupancy
+        self.color_space = field.color_space
+        self.has_color = True
+
+    @property
+    def length_scale(self) -> float:
+        """Diagonal of the medium in scene units."""
+        return self.field.box.diagonal * self.to_world.scale
+
+    @property
+    def step(self) -> float | None:
+        """Step length in scene units that suits the medium, if it knows one."""
+        return None if self.field.march_step is None else self.field.march_step * self.to_world.scale
+
+    def bounds(self):
+        return self.to_world.bounds(self.field.box.lower, self.field.box.upper)
+
+    def local(self, o, d) -> LocalRay:
+        o_l, d_l = self.to_world.point_to_local(o), self.to_world.vector_to_local(d)
+        near, far = intersect_box(o_l, d_l, self.field.box.lower, self.field.box.upper)
+        return LocalRay(o_l, d_l, self.to_world.direction_to_local(d), near, far)
+
+    def to_unit(self, p):
+        """Occupancy-grid coordinates (unit cube) of local points."""
+        return self.field.box.to_unit(p)
+
+    def unit_length(self) -> float:
+        """Local length of the unit cube's edge."""
+        return self.field.box.side
+
+    def density(self, p, active):
+        return self.field.density(p, active) * self._per_unit
+
+    def density_features(self, p, active):
+        """Density, and what ``color`` needs of the same point."""
+        sigma, features = self.field.density_features(p, active)
+        return sigma * self._per_unit, features
+
+    def color(self, features, p, w, active):
+        """Colour in ``color_space`` (Array3f)."""
+        return self.field.color(features, w)
+
+
+class VolumeMedium:
+    """Any Mitsuba volume as density (1/scene unit), optionally with a second one as colour.
+
+    Outside of the density volume's ``bbox()`` there is vacuum. It is marched without skipping:
+    a foreign volume states no bound that would allow it. Colours are spectra of the variant in use.
+    """
+
+    occupancy = None
+    color_space = "spectrum"
+    step = None
+
+    def __init__(self, density, color=None):
+        import mitsuba as mi
+
+        self._interaction = mi.Interaction3f
+        self._density, self._color = density, color
+        self.has_color = color is not None
+        box = density.bbox()
+        self._lower, self._upper = np.array(box.min, float), np.array(box.max, float)
+        if not np.all(np.isfinite(self._lower) & np.isfinite(self._upper)) or np.any(self._upper <= self._lower):
+            raise ValueError(
+                f'the volume "density" has no finite extent (its bounding box is {self._lower} to {self._upper}); '
+                "give it a to_world that places it in the scene"
+            )
+
+    @property
+    def length_scale(self) -> float:
+        return float(np.linalg.norm(self._upper - self._lower))
+
+    def bounds(self):
+        return self._lower, self._upper
+
+    def local(self, o, d) -> LocalRay:
+        near, far = intersect_box(o, d, self._lower, self._upper)
+        return LocalRay(o, d, d, near, far)
+
+    def _at(self, p, w=None):
+        it = dr.zeros(self._interaction)
+        it.p = p
+        it.t = 0
+        if w is not None:
+            it.wi = -w
+        return it
+
+    def density(self, p, active):
+        # A negative value of an interpolated or fitted grid would create light.
+        return dr.maximum(self._density.eval_1(self._at(p), active), 0)
+
+    def density_features(self, p, active):
+        return self.density(p, active), []
+
+    def color(self, features, p, w, active):
+        return self._color.eval(self._at(p, w), active)
+
+
+class GazeMedium:
+    """A gaze field placed in the scene. Densities over directions do not change with scale."""
+
+    def __init__(self, field: GazeField, to_world: Similarity | None = None):
+        self.field, self.to_world = field, to_world or Similarity()
+
+    def evaluate(self, p_od, p_o, r_o, active):
+        """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``."""
+        local = self.to_world
+        return self.field.evaluate(
+            local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active
+        )
