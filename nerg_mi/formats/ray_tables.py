@@ -157,10 +157,11 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
         first += n
 
 
-def _require(path: object, wanted: Sequence[str], there: Sequence[str]) -> None:
+def _require(path: object, wanted: list[str], there: list[str]) -> None:
     missing = [c for c in wanted if c not in there]
     if missing:
-        raise ValueError(f"{path} has no column {', '.join(map(repr, missing))}; its columns are {', '.join(there) or 'none'}")
+        brief = lambda names: ", ".join(c[:40] for c in names[:12]) + (", ..." if len(names) > 12 else "")
+        raise ValueError(f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}")
 
 
 def _open(path: str | os.PathLike) -> IO[str]:

@@ -1,0 +1,86 @@
+"""Sets of directions on the unit sphere, with the solid angle of each.
+
+Directions are (N, 3) float64, unit. Solid angles are in steradian and sum to
+4π, so that ``sum(density * solid_angle)`` is the integral of a density.
+"""
+from __future__ import annotations
+
+import numpy as np
+
+FULL_SPHERE = 4.0 * np.pi  # sr
+_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+
+def fibonacci_directions(count: int) -> np.ndarray:
+    """``count`` directions of equal area on a golden-angle spiral, (count, 3).
+
+    Each stands for 4π/count sr. The spiral runs from +z to -z: direction i has
+    z = 1 - (2i + 1)/count. Neighbours are about sqrt(4π/count) rad apart, 4.5
+    degrees at 2,048; narrower densities than that are not resolved.
+    (Swinbank & Purser 2006.) Raises ``ValueError`` for a count below 1.
+    """
+    if count < 1:
+        raise ValueError(f"count is {count}; a set of directions needs at least one")
+    i = np.arange(count)
+    z = 1.0 - (2.0 * i + 1.0) / count
+    return _from_height(z, i * _GOLDEN_ANGLE)
+
+
+def uniform_directions(count: int, rng: np.random.Generator) -> np.ndarray:
+    """``count`` independent uniform directions, (count, 3) (Archimedes)."""
+    return _from_height(1.0 - 2.0 * rng.random(count), 2.0 * np.pi * rng.random(count))
+
+
+def latlong_to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Direction (..., 3) that Mitsuba's ``envmap`` shows at texture position
+    ``u``, ``v`` in [0, 1], in the map's own frame (y up).
+
+    Inverse of its u = atan2(x, -z) / 2π, v = acos(y) / π: the centre of the picture
+    is +z, its left and right edges are -z, its top row is +y.
+    """
+    phi, theta = 2.0 * np.pi * np.asarray(u), np.pi * np.asarray(v)
+    sin = np.sin(theta)
+    return np.stack([np.sin(phi) * sin, np.cos(theta) * np.ones_like(phi), -np.cos(phi) * sin], axis=-1)
+
+
+def direction_to_latlong(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Texture position (u, v) in [0, 1) x [0, 1] of unit directions (..., 3);
+    the inverse of :func:`latlong_to_direction` (u is arbitrary at the poles)."""
+    x, y, z = np.moveaxis(np.asarray(direction), -1, 0)
+    # The angle from +y by atan2: acos loses half the digits at the poles.
+    return np.arctan2(x, -z) / (2.0 * np.pi) % 1.0, np.arctan2(np.hypot(x, z), y) / np.pi
+
+
+def latlong_grid(
+    width: int, height: int, to_world: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel-centre directions and exact pixel solid angles of a panorama.
+
+    Pixel (row j, column i) is at u = (i + 1/2)/width, v = (j + 1/2)/height of
+    the mapping of Mitsuba's ``envmap`` (whose bitmap has its columns there too, but
+    its rows at v = j/(height - 1)). ``to_world``: (3, 3) or (4, 4), whose
+    rotation is applied as ``to_world`` of the envmap is; see :data:`Z_UP`.
+    Returns directions (height * width, 3), row by row, and solid angles
+    (height * width,) sr: (2π/width)(cos θ_j - cos θ_{j+1}), summing to 4π.
+    """
+    if width < 1 or height < 1:
+        raise ValueError(f"a panorama of {width} x {height} pixels has no directions; give at least 1 x 1")
+    u = (np.arange(width) + 0.5) / width
+    v = (np.arange(height) + 0.5) / height
+    V, U = np.meshgrid(v, u, indexing="ij")
+    direction = latlong_to_direction(U.ravel(), V.ravel())
+    if to_world is not None:
+        direction = direction @ np.asarray(to_world, dtype=np.float64)[:3, :3].T
+    # cos a - cos b as a product: exact near the poles, where both are close to 1.
+    band = 2.0 * np.sin(np.pi * v) * np.sin(0.5 * np.pi / height)
+    return direction, np.repeat(2.0 * np.pi / width * band, width)
+
+
+# Turns the envmap's y up into z up: (x, y, z) becomes (x, -z, y), so that the
+# edges of the panorama show +y and its centre column -y.
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def _from_height(z: np.ndarray, phi: np.ndarray) -> np.ndarray:
+    r = np.sqrt((1.0 - z) * (1.0 + z))
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
