@@ -60,7 +60,10 @@ class Library:
 
 
 def remedy() -> str:
-    """How to get a usable library on this kind of machine: the end of a sentence."""
+    """How to get a usable library on this machine: the end of a sentence."""
+    best = next(iter(installed()), None)
+    if VARIABLE in os.environ and best is not None and best.usable:
+        return f"unset {VARIABLE}, since {best} is installed"
     if sys.platform == "darwin":
         return f'"brew install llvm", or set {VARIABLE} to a libLLVM.dylib of version {MINIMUM} or newer'
     if sys.platform == "win32":

@@ -1,0 +1,87 @@
+"""The command `nerg`: finds the sub-command, runs it, and tells an expected error in one sentence.
+
+Each sub-command is a file of this folder that defines either a function `command` (its parameters are the options, its
+docstring the help) or `app`, a `typer.Typer` with sub-commands of its own, and a line in `COMMANDS`. Only the module of
+the command that was asked for is imported, so that `nerg --help` answers at once; for the same reason these modules
+import Mitsuba, NumPy and the like inside their functions.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from typing import Annotated
+
+import typer
+
+from .. import __version__
+from ..errors import sentence
+
+COMMANDS = {
+    "doctor": "Say what works on this machine, and how to mend what does not.",
+    "render": "Render a scene file to an EXR or PNG file.",
+}
+"""Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line `arguments` (default: that of the process) and end the process.
+
+    Exit codes: 0 done; 1 an expected error, told in one sentence (with --traceback or NERG_TRACEBACK=1 in full);
+    2 a wrong command line; 130 interrupted.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    full = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0") or "--traceback" in arguments
+    # Allowed anywhere on the line: it is added after something went wrong, at the end.
+    arguments = [a for a in arguments if a != "--traceback"]
+    try:
+        _app(next((a for a in arguments if not a.startswith("-")), None))(arguments, prog_name="nerg")
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        sys.exit(130)
+    except (ValueError, OSError, ImportError) as error:  # NergError is a ValueError
+        if full:
+            raise
+        print(f"nerg: {sentence(error)}", file=sys.stderr)
+        sys.exit(1)
+
+
+def _app(asked: str | None) -> typer.Typer:
+    """All commands, of which only the one `asked` for is more than its name and its line of help."""
+    app = typer.Typer(
+        name="nerg",
+        help="Neural radiance and gaze fields for Mitsuba 3.",
+        add_completion=False,
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
+    app.callback()(_global_options)
+    for name, line in COMMANDS.items():
+        if name != asked:
+            app.command(name, help=line)(_unasked)
+            continue
+        module = importlib.import_module(f"{__name__}.{name}")
+        if hasattr(module, "app"):
+            app.add_typer(module.app, name=name, help=line)
+        else:
+            app.command(name)(module.command)
+    return app
+
+
+def _unasked() -> None:
+    """Stands for a command in the list of commands; one that is run has been asked for."""
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"nerg {__version__}")
+        raise typer.Exit()
+
+
+def _global_options(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+    traceback: Annotated[bool, typer.Option("--traceback", help="Show where an error arose (also: NERG_TRACEBACK=1).")] = False,
+) -> None:
+    pass

@@ -1,0 +1,107 @@
+"""From a scene file to a picture file, with the integrator that the scene names."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from .errors import NergError, UnusableLLVM, sentence
+
+_FORMATS = (".exr", ".png")
+_PREFERRED = ("cuda_ad_rgb", "llvm_ad_rgb")
+
+
+def parse_defines(pairs: Iterable[str]) -> dict[str, str]:
+    """`["spp=4", "name=a=b"]` as `{"spp": "4", "name": "a=b"}`. Raises NergError for a pair without a key or a "="."""
+    values = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not (key and equals):
+            raise NergError(f'"-D {pair}" is no definition: write -D key=value.')
+        values[key] = value
+    return values
+
+
+def activate(variant: str | None = None) -> str:
+    """Make a Mitsuba variant the active one, with the plugins of this package, and give its name.
+
+    `variant` None: `cuda_ad_rgb` where there is an NVIDIA driver, otherwise `llvm_ad_rgb`. Raises NergError for a name
+    that Mitsuba does not know and for a variant that does not work here.
+    """
+    import mitsuba as mi
+
+    from . import llvm
+
+    if variant is not None and variant not in mi.variants():
+        raise NergError(f'there is no variant "{variant}"; this Mitsuba has {", ".join(mi.variants())}.')
+    wanted = [variant] if variant else [v for v in _PREFERRED if not v.startswith("cuda") or llvm.has_cuda()]
+    for choice in wanted:
+        try:
+            mi.set_variant(choice)
+            return choice
+        except UnusableLLVM:
+            raise
+        except ImportError as error:  # Mitsuba says so where the backend of a variant cannot start
+            failed = error
+    raise NergError(f'the variant "{wanted[-1]}" does not work here ({sentence(failed)}); "nerg doctor" says how to mend it.')
+
+
+def render_file(
+    scene: str | Path,
+    output: str | Path,
+    *,
+    defaults: Mapping[str, str] | None = None,
+    sensor: int = 0,
+    variant: str | None = None,
+    spp: int = 0,
+    seed: int = 0,
+    threads: int = 0,
+) -> str:
+    """Render the scene file `scene`, write the picture `output`, and give a sentence that says what was done.
+
+    `output` ends in .exr (all channels of the film, AOVs among them, as float32) or in .png (its colour, tonemapped to
+    sRGB); its folder is made. `defaults`: values for the `<default>` and `$key` of the scene. `sensor`: index. `spp`: samples
+    a pixel, 0 for those of the scene's sampler. `threads`: 0 for one a core. Raises NergError for what the user can mend.
+    """
+    scene, output = Path(scene), Path(output)
+    if output.suffix.lower() not in _FORMATS:
+        raise NergError(f'"{output}" has no known picture format: let its name end in .exr or .png.')
+    if not scene.is_file():
+        raise NergError(f'there is no scene file "{scene}".')
+    active = activate(variant)
+
+    import drjit as dr
+    import mitsuba as mi
+
+    if threads:
+        dr.set_thread_count(threads)
+    start = time.perf_counter()
+    try:
+        loaded = mi.load_file(str(scene), **(defaults or {}))
+    except RuntimeError as error:
+        raise NergError(sentence(error)) from error
+    count = len(loaded.sensors())
+    if not 0 <= sensor < count:
+        raise NergError(f'"{scene}" has {count} sensor(s) and number {sensor} was asked for: choose -s from 0 on.')
+    try:
+        mi.render(loaded, sensor=sensor, spp=spp, seed=seed)
+        bitmap = loaded.sensors()[sensor].film().bitmap()
+    except RuntimeError as error:
+        raise NergError(sentence(error)) from error
+
+    output.parent.mkdir(parents=True, exist_ok=True)
+    _write(mi, bitmap, output)
+    width, height = bitmap.size()
+    seconds = time.perf_counter() - start
+    return f"Wrote {output} ({width} x {height}, {bitmap.channel_count()} channels, {active}, {seconds:.1f} s)."
+
+
+def _write(mi, bitmap, output: Path) -> None:
+    if output.suffix.lower() == ".exr":
+        floats = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
+        floats.write(str(output))
+        return
+    # With AOVs the bitmap has many channels, of which the colour is the layer without a name.
+    colour = dict(bitmap.split()).get("<root>", bitmap) if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel else bitmap
+    mi.util.write_bitmap(str(output), colour, write_async=False)
