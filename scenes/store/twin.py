@@ -16,7 +16,7 @@ TWIN_XML = HERE / "twin.xml"
 
 # Reflectances stay away from black and white: interreflection keeps the light soft, and no texel is without a gradient.
 ALBEDO_RANGE = (0.03, 0.82)
-PANEL_RADIANCE = 4.4
+PANEL_RADIANCE = 7.0
 
 XML = """<!-- The demo store as shapes. Metres, z up. Made by nerg_mi.scenes.store.make. -->
 <scene version="3.0.0">

@@ -1,0 +1,83 @@
+"""Make the demo store from a seed: ``python -m nerg_mi.scenes.store.make --seed 0 [--stage NAME ...]``.
+
+Stages run in the order of `STAGES`. What the package carries is written beside this file, what can be made again into
+``build/``. Each stage reads only what earlier stages wrote.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a stage is told: the seed, the folder of the committed results and the folder of everything else."""
+
+    seed: int
+    store: Path = HERE
+    build: Path = HERE / "build"
+
+
+def make_twin(job: Job) -> list[Path]:
+    """The place as Mitsuba shapes, and its areas of interest: twin.xml, two meshes, regions.json."""
+    from nerg_mi.scenes.store import layout, twin
+
+    place = layout.build(job.seed)
+    return [*twin.write_twin(place, job.store), layout.write_regions(place, job.store / "regions.json")]
+
+
+def make_views(job: Job) -> list[Path]:
+    """Posed pictures with exact depth, from the twin."""
+    from nerg_mi.scenes.store import layout, twin, views
+
+    views.write_views(layout.build(job.seed), job.build, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml"))
+    return [job.build / "transforms.json", job.build / "transforms_test.json"]
+
+
+def make_shoppers(job: Job) -> list[Path]:
+    """Tracking data: shoppers whose heads follow the attention law."""
+    from nerg_mi.scenes.store import layout, shoppers, twin
+
+    path = job.build / "shoppers.csv"
+    shoppers.write_shoppers(layout.build(job.seed), path, seed=job.seed, scene=twin.load_twin(job.store / "twin.xml"))
+    return [path]
+
+
+# Name and function, in order. A stage returns the files that it wrote.
+STAGES = {
+    "twin": make_twin,
+    "views": make_views,
+    "shoppers": make_shoppers,
+}
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m nerg_mi.scenes.store.make", description=__doc__.splitlines()[0])
+    parser.add_argument("--seed", type=int, default=0, help="everything is made from it (default: 0)")
+    parser.add_argument("--stage", action="append", choices=list(STAGES), help="only this one; may be given several times")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
+    args = parser.parse_args(argv)
+
+    import mitsuba as mi
+
+    mi.set_variant(args.variant)
+    job = Job(args.seed)
+    job.build.mkdir(parents=True, exist_ok=True)
+    for name, stage in STAGES.items():
+        if args.stage and name not in args.stage:
+            continue
+        print(f"[{name}] {stage.__doc__.splitlines()[0]}")
+        start = time.perf_counter()
+        for path in stage(job):
+            shown = path.relative_to(job.store) if path.is_relative_to(job.store) else path
+            print(f"[{name}] wrote {shown} ({path.stat().st_size / 1e6:.2f} MB)")
+        print(f"[{name}] {time.perf_counter() - start:.1f} s")
+
+
+if __name__ == "__main__":
+    main()

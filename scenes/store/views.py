@@ -1,0 +1,144 @@
+"""The posed pictures of the demo store: what a photographer with a depth camera would bring home.
+
+Writes into a folder: ``images/*.png`` (8-bit sRGB), ``depth/*.npy`` (float32 (h, w), metres along the ray from the camera's
+centre through each pixel's centre, exact; 0 where nothing is hit), ``transforms.json`` and ``transforms_test.json``
+(held-out views) with the conventions of instant-ngp and nerfstudio: OpenGL camera-to-world (x right, y up, z back), in the
+store's own metric frame with z up. ``aabb`` are the bounds of the store.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.scenes.store import cameras, twin
+from nerg_mi.scenes.store.layout import Layout
+
+BUILD = Path(__file__).resolve().parent / "build"
+
+# Mitsuba's cameras look along +z with x to the left; OpenGL's along -z with x to the right.
+_GL_TO_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
+
+
+def mitsuba_pose(pose: np.ndarray) -> np.ndarray:
+    """The ``to_world`` (4, 4) of a Mitsuba sensor for an OpenGL camera-to-world pose."""
+    return np.asarray(pose) @ _GL_TO_MITSUBA
+
+
+class Photographer:
+    """Renders pictures and depths of a scene for poses; one sensor is moved about, so that nothing recompiles."""
+
+    def __init__(self, camera: cameras.Pinhole, scene=None, spp: int = 64):
+        import mitsuba as mi
+
+        self.camera, self.spp = camera, spp
+        self.scene = twin.load_twin() if scene is None else scene
+        self.sensor = mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": camera.fov_x,
+                "fov_axis": "x",
+                "near_clip": 0.01,
+                "far_clip": 100.0,
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.width,
+                    "height": camera.height,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+                # half the noise of independent samples at the same cost
+                "sampler": {"type": "multijitter", "sample_count": spp},
+            }
+        )
+        self.params = mi.traverse(self.sensor)
+
+    def picture(self, pose: np.ndarray, seed: int, spp: int | None = None) -> np.ndarray:
+        """Linear radiance (h, w, 3), float32."""
+        import drjit as dr
+        import mitsuba as mi
+
+        to_world = mi.Transform4f(mi.Matrix4f(mitsuba_pose(pose).tolist()))
+        # as literals the pose would be baked into the kernel, and every view compiled anew
+        dr.make_opaque(to_world)
+        self.params["to_world"] = to_world
+        self.params.update()
+        return np.array(mi.render(self.scene, sensor=self.sensor, spp=spp or self.spp, seed=mi.UInt32(seed)))
+
+    def depth(self, pose: np.ndarray) -> np.ndarray:
+        """Distance (h, w) float32 in metres along the rays through the pixels' centres; 0 where nothing is hit."""
+        directions = self.camera.directions().reshape(-1, 3) @ pose[:3, :3].T
+        t = twin.cast(pose[:3, 3], directions, self.scene)
+        return np.where(np.isfinite(t), t, 0.0).astype(np.float32).reshape(self.camera.height, self.camera.width)
+
+
+def write_png(path: Path, picture: np.ndarray) -> None:
+    """Write linear radiance (h, w, 3) as 8-bit sRGB; what is brighter than white is clipped."""
+    import mitsuba as mi
+
+    bitmap = mi.Bitmap(np.ascontiguousarray(picture, np.float32))
+    bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+
+
+def transforms(camera: cameras.Pinhole, layout: Layout, frames: list) -> dict:
+    """The content of a ``transforms.json``: intrinsics in pixels, frames, bounds."""
+    return {
+        "camera_model": "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.focal,
+        "fl_y": camera.focal,
+        "cx": 0.5 * camera.width,
+        "cy": 0.5 * camera.height,
+        "k1": 0.0,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+        "aabb": layout.aabb.tolist(),
+        "frames": frames,
+    }
+
+
+def write_views(
+    layout: Layout, folder=BUILD, *, camera=None, train: int = 168, test: int = 12, spp: int = 64, seed: int = 0, scene=None, say=print
+) -> dict:
+    """Choose, render and write the picture set into ``folder``; returns the coverage figures, also in ``coverage.json``.
+
+    ``train``, ``test``: numbers of views; ``spp``: samples a pixel of a training view; a held-out view gets four times as
+    many, so that its noise does not limit what it can measure; ``say``: where progress goes.
+    """
+    camera = camera or cameras.Pinhole()
+    folder = Path(folder)
+    for name in ("images", "depth"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        # an earlier, larger set would leave pictures behind that no file lists
+        for old in (folder / name).glob("t*_???.*"):
+            old.unlink()
+    start = time.perf_counter()
+    sets = dict(zip(("train", "test"), cameras.choose_views(layout, camera, train, test, seed, scene)))
+    figures = cameras.coverage(layout, camera, sets["train"], seed + 1, scene)
+    say(f"chose {train} + {test} views in {time.perf_counter() - start:.1f} s")
+    for name, value in figures.items():
+        say(f"  {name}: {value:.1%}" if value <= 1 else f"  {name}: {value:g}")
+
+    photographer = Photographer(camera, scene, spp)
+    start, done = time.perf_counter(), 0
+    for kind, poses in sets.items():
+        frames = []
+        for k, pose in enumerate(poses):
+            stem = f"{kind}_{k:03d}"
+            write_png(folder / "images" / f"{stem}.png", photographer.picture(pose, seed * 10_000 + done, spp if kind == "train" else 4 * spp))
+            np.save(folder / "depth" / f"{stem}.npy", photographer.depth(pose))
+            frames.append({"file_path": f"images/{stem}.png", "depth_file_path": f"depth/{stem}.npy", "transform_matrix": pose.tolist()})
+            done += 1
+            if done % 30 == 0:
+                say(f"  {done} of {train + test} views, {time.perf_counter() - start:.0f} s")
+        name = "transforms.json" if kind == "train" else "transforms_test.json"
+        (folder / name).write_text(json.dumps(transforms(camera, layout, frames), indent=1) + "\n")
+    (folder / "coverage.json").write_text(json.dumps(figures, indent=1) + "\n")
+    say(f"rendered {done} views in {time.perf_counter() - start:.0f} s")
+    return figures
