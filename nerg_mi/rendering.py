@@ -99,8 +99,8 @@ def render_file(
 
 def _write(mi, bitmap, output: Path) -> None:
     if output.suffix.lower() == ".exr":
-        floats = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
-        floats.write(str(output))
+        # float32 whatever the component_format of the film, which counts only where the film writes itself
+        bitmap.write(str(output))
         return
     # With AOVs the bitmap has many channels, of which the colour is the layer without a name.
     colour = dict(bitmap.split()).get("<root>", bitmap) if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel else bitmap

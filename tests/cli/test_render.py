@@ -1,0 +1,98 @@
+"""`nerg render` on a small scene of stock plugins."""
+
+import numpy as np
+import pytest
+
+import nerg_mi.cli
+
+SCENE = """
+<scene version="3.0.0">
+    <default name="integrator" value="path"/>
+    <default name="level" value="0.25"/>
+    <integrator type="aov"><string name="aovs" value="dd:depth"/><integrator type="$integrator"/></integrator>
+    <emitter type="constant"><float name="radiance" value="$level"/></emitter>
+    <shape type="sphere"><float name="radius" value="0.3"/></shape>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, -4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="8"/><rfilter type="box"/></film>
+        <sampler type="independent"><integer name="sample_count" value="2"/></sampler>
+    </sensor>
+    <sensor type="panorama">
+        <film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="6"/><rfilter type="box"/></film>
+    </sensor>
+</scene>
+"""
+
+
+@pytest.fixture
+def scene(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE)
+    return str(path)
+
+
+def nerg(*arguments):
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(list(map(str, arguments)))
+    return end.value.code or 0
+
+
+def test01_exr_has_all_channels_in_float32(rgb, scene, tmp_path, capsys):
+    out = tmp_path / "new" / "out.exr"
+    assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb") == 0
+    assert str(out) in capsys.readouterr().out
+    bitmap = rgb.Bitmap(str(out))
+    assert tuple(bitmap.size()) == (16, 8)
+    fields = [field.name for field in bitmap.struct_()]
+    assert set("RGB") <= set(fields) and "dd.T" in fields
+    assert bitmap.component_format() == rgb.Struct.Type.Float32
+    assert np.allclose(np.array(bitmap)[0, 0, :3], 0.25)
+
+
+def test02_png_is_tonemapped_colour(rgb, scene, tmp_path):
+    out = tmp_path / "out.png"
+    assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb", "-D", "level=0.5") == 0
+    picture = np.array(rgb.Bitmap(str(out)))
+    assert picture.shape == (8, 16, 3) and picture.dtype == np.uint8
+    assert abs(int(picture[0, 0, 0]) - 188) <= 1  # 0.5 in sRGB
+
+
+def test03_define_sensor_spp_and_seed(rgb, scene, tmp_path):
+    def render(name, *options):
+        assert nerg("render", scene, "-o", tmp_path / name, "-m", "llvm_ad_rgb", *options) == 0
+        return np.array(rgb.Bitmap(str(tmp_path / name)))
+
+    assert render("panorama.exr", "-s", 1).shape[:2] == (6, 12)
+    assert np.allclose(render("level.exr", "-D", "level=0.75", "-D", "integrator=direct")[0, 0, :3], 0.75)
+    a, b, c = (render(f"{i}.exr", "--spp", 1, "--seed", seed) for i, seed in enumerate((3, 3, 4)))
+    assert np.array_equal(a, b) and not np.array_equal(a, c)
+
+
+def test04_mono(rgb, scene, tmp_path):
+    out = tmp_path / "mono.exr"
+    assert nerg("render", scene, "-o", out, "-m", "llvm_ad_mono") == 0
+    assert {"Y", "dd.T"} <= {field.name for field in rgb.Bitmap(str(out)).struct_()}
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        (["-o", "out.bmp"], "let its name end in .exr or .png"),
+        (["-o", "out.exr", "-s", "7"], "has 2 sensor(s) and number 7 was asked for"),
+        (["-o", "out.exr", "-m", "llvm_rgb"], 'there is no variant "llvm_rgb"'),
+        (["-o", "out.exr", "-D", "level"], "write -D key=value"),
+        (["-o", "out.exr", "-D", "integrator=nope"], '"nope" not found'),
+        (["-o", "out.exr", "-m", "scalar_rgb", "-s", "1"], '"panorama" needs a variant that compiles its kernels'),
+    ],
+)
+def test05_one_sentence(scene, tmp_path, monkeypatch, capsys, options, said):
+    monkeypatch.chdir(tmp_path)
+    assert nerg("render", scene, *options) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("nerg: ") and said in lines[0]
+    assert not (tmp_path / "out.exr").exists()
+
+
+def test06_missing_scene(tmp_path, capsys):
+    assert nerg("render", tmp_path / "nowhere.xml", "-o", tmp_path / "out.exr") == 1
+    assert "there is no scene file" in capsys.readouterr().err
