@@ -1,0 +1,195 @@
+r"""The attention law of the demo store's shoppers: what is true about their gaze, in closed form.
+
+At an observer's position :math:`p` the density of the direction of attention :math:`\omega`, in 1/sr, is
+
+.. math::
+
+    g(\omega \mid p) = \frac{A_0\, b(\omega) + \sum_k A_k(p)\, \mathrm{vMF}(\omega;\, \mu_k(p), \kappa_k(p))}
+                            {A_0 + \sum_k A_k(p)},
+    \qquad A_k(p) = a_k\, v_k(p)\, c_k(p)\, \frac{1}{1 + (d_k / d_0)^2}
+
+with one target k for each area of interest, namely the front of its eye-catcher (``focus`` in regions.json):
+
+- :math:`a_k` its attractiveness: that of its category, times a factor in [0.5, 1.5) of its own;
+- :math:`v_k` the fraction of 4 x 4 points on its front that are visible from p, by exact ray casts to the twin;
+- :math:`d_k, \mu_k` distance and direction to the mean of its visible points; :math:`d_0` = 1.2 m;
+- :math:`c_k` the cosine between :math:`-\mu_k` and the front's normal, 0 from behind;
+- :math:`1/\kappa_k = \sigma_h^2 + (w_k^2 + h_k^2) / (24\, d_k^2)`: head jitter of 8 degrees, and the mean variance a
+  direction of a w x h rectangle seen from d (the small-angle variance of a vMF lobe is 1/kappa);
+- :math:`b(\omega) \propto \exp(-(\omega_z - z_0)^2 / 2 s^2)`, uniform in azimuth: glances at nothing in particular, a
+  little below the horizon. Equal steps in :math:`\omega_z` are equal solid angles, so its integral over the sphere is
+  :math:`2\pi` times that of a truncated normal on [-1, 1].
+
+Each term integrates to one, hence g does, exactly. Where no target is visible g = b.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.special import ndtr, ndtri
+
+from nerg_mi.scenes.store import twin
+
+HERE = Path(__file__).resolve().parent
+REGIONS = HERE / "regions.json"
+
+# a_k: what draws eyes in a convenience store
+ATTRACTIVENESS = {
+    "offers": 2.2, "drinks": 1.6, "sweets": 1.4, "snacks": 1.3, "meals": 1.3, "magazines": 1.1, "coffee": 1.2, "till": 1.0,
+    "bread": 0.9, "dairy": 0.8, "noodles": 0.8, "counter_goods": 0.6, "cosmetics": 0.6, "stationery": 0.4, "household": 0.35,
+    "poster": 0.7,
+}  # fmt: skip
+
+BACKGROUND = 0.2  # A_0
+FALLOFF = 1.2  # d_0, metres
+JITTER = np.radians(8.0)  # sigma_h
+BAND = (-0.12, 0.28)  # z_0, s
+SAMPLES = 4  # points a side on a target's front
+STAND_OFF = 0.01  # metres in front of the surface: the goods of a front are not all flush
+_CHUNK = 4096  # positions a batch of ray casts
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """The law at P positions as a mixture: ``weights`` (P, K + 1), the background last; ``mu`` (P, K, 3) unit;
+    ``kappa`` (P, K); ``visible`` (P, K) fractions in [0, 1]."""
+
+    weights: np.ndarray
+    mu: np.ndarray
+    kappa: np.ndarray
+    visible: np.ndarray
+
+
+def read_regions(path=REGIONS) -> list[dict]:
+    """The areas of interest of a regions.json."""
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f'"{path}" is missing; make it with: python -m nerg_mi.scenes.store.make --stage twin')
+    return json.loads(path.read_text())["regions"]
+
+
+class AttentionLaw:
+    """The law of the module's docstring for a place. Positions in metres in the store's frame, densities in 1/sr.
+
+    ``regions``: dicts as in regions.json (default: the store's own). ``scene``: the twin to cast rays at (default: the
+    store's own, in the active Mitsuba variant).
+    """
+
+    def __init__(self, regions=None, scene=None):
+        regions = read_regions() if regions is None else list(regions)
+        self.scene = scene
+        self.names = [r["name"] for r in regions]
+        unknown = sorted({r["category"] for r in regions} - set(ATTRACTIVENESS))
+        if unknown:
+            raise ValueError(f'The categories {unknown} have no attractiveness; add them to ATTRACTIVENESS.')
+        # a factor of its own for each target: the golden ratio's multiples are spread evenly over [0, 1)
+        spread = 0.5 + np.arange(1, len(regions) + 1) * 0.6180339887498949 % 1.0
+        self.attractiveness = np.array([ATTRACTIVENESS[r["category"]] for r in regions]) * spread
+        self.normals = np.array([r["facing"] for r in regions], float)
+        fronts, sizes = zip(*(_front(r) for r in regions))
+        self.points = np.stack(fronts)  # (K, S, 3)
+        self.spread2 = (np.square(sizes).sum(axis=1)) / 24.0  # square metres
+
+    def lobes(self, positions) -> Lobes:
+        """The mixture at positions (P, 3)."""
+        positions = np.atleast_2d(np.asarray(positions, np.float64))
+        parts = [self._lobes(positions[a : a + _CHUNK]) for a in range(0, len(positions), _CHUNK)]
+        return Lobes(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("weights", "mu", "kappa", "visible")))
+
+    def _lobes(self, p) -> Lobes:
+        K, S = self.points.shape[:2]
+        P = len(p)
+        # only fronts that face the observer are worth a ray
+        facing = np.einsum("pksc,kc->pks", p[:, None, None] - self.points[None], self.normals) > 0
+        i, k, s = np.nonzero(facing)
+        seen = np.zeros((P, K, S))
+        if len(i):
+            seen[i, k, s] = twin.visible(p[i], self.points[k, s], self.scene)
+        fraction = seen.mean(axis=2)
+        # where nothing is visible the weight is zero; the centre stands in, so that nothing is 0/0
+        share = np.where(fraction[..., None] > 0, seen, 1.0)
+        centre = np.einsum("pks,ksc->pkc", share, self.points) / share.sum(axis=2)[..., None]
+        offset = centre - p[:, None]
+        distance = np.maximum(np.linalg.norm(offset, axis=2), 1e-6)
+        mu = offset / distance[..., None]
+        cosine = np.maximum(-np.einsum("pkc,kc->pk", mu, self.normals), 0.0)
+        strength = self.attractiveness * fraction * cosine / (1.0 + (distance / FALLOFF) ** 2)
+        weights = np.concatenate([strength, np.full((P, 1), BACKGROUND)], axis=1)
+        weights /= weights.sum(axis=1, keepdims=True)
+        return Lobes(weights, mu, 1.0 / (JITTER**2 + self.spread2 / distance**2), fraction)
+
+    def density(self, positions, directions) -> np.ndarray:
+        """Density (P, D) in 1/sr at positions (P, 3) for unit directions (D, 3), the same for all, or (P, D, 3)."""
+        lobes = self.lobes(positions)
+        directions = np.asarray(directions, np.float64)
+        P = len(lobes.weights)
+        directions = np.broadcast_to(directions, (P, *directions.shape[-2:]))
+        out = np.empty(directions.shape[:2])
+        for n in range(P):
+            w, kappa = lobes.weights[n], lobes.kappa[n]
+            use = np.flatnonzero(w[:-1] > 0)
+            cos = directions[n] @ lobes.mu[n, use].T
+            norm = kappa[use] / (2 * np.pi * -np.expm1(-2 * kappa[use]))
+            out[n] = (np.exp(kappa[use] * (cos - 1.0)) * (norm * w[use])).sum(axis=1)
+            out[n] += w[-1] * band_density(directions[n, :, 2])
+        return out
+
+    def sample(self, positions, rng) -> np.ndarray:
+        """One exact draw (P, 3) from the law at each of positions (P, 3). ``rng``: a NumPy Generator."""
+        lobes = self.lobes(positions)
+        P = len(lobes.weights)
+        u = rng.random((P, 3))
+        k = (np.cumsum(lobes.weights, axis=1) < u[:, :1] * lobes.weights.sum(axis=1, keepdims=True)).sum(axis=1)
+        background = k == lobes.weights.shape[1] - 1
+        row = np.flatnonzero(~background)
+        mu = np.tile((0.0, 0.0, 1.0), (P, 1))
+        z = band_sample(u[:, 1])
+        mu[row], kappa = lobes.mu[row, k[row]], lobes.kappa[row, k[row]]
+        # inversion of the vMF distribution of the cosine (Ulrich 1984; Jakob 2012)
+        v = u[row, 1]
+        z[row] = 1.0 + np.log(v + (1.0 - v) * np.exp(-2.0 * kappa)) / kappa
+        a, b = _tangents(mu)
+        r, phi = np.sqrt(np.maximum(1.0 - z**2, 0.0)), 2 * np.pi * u[:, 2]
+        out = (r * np.cos(phi))[:, None] * a + (r * np.sin(phi))[:, None] * b + z[:, None] * mu
+        return out / np.linalg.norm(out, axis=1, keepdims=True)
+
+
+def band_density(z) -> np.ndarray:
+    """The background b in 1/sr at directions of height z = omega_z."""
+    z0, s = BAND
+    total = ndtr((1 - z0) / s) - ndtr((-1 - z0) / s)
+    return np.exp(-0.5 * ((z - z0) / s) ** 2) / (np.sqrt(2 * np.pi) * s * total * 2 * np.pi)
+
+
+def band_sample(u) -> np.ndarray:
+    """Heights z of draws from the background for uniform numbers u."""
+    z0, s = BAND
+    low, high = ndtr((-1 - z0) / s), ndtr((1 - z0) / s)
+    return np.clip(z0 + s * ndtri(low + u * (high - low)), -1.0, 1.0)
+
+
+def _front(region: dict):
+    """Points (S, 3) on the front of a region's eye-catcher, and the front's two sizes in metres."""
+    lo, hi = (np.array(region["focus"][k], float) for k in ("min", "max"))
+    facing = np.array(region["facing"], float)
+    axis = int(np.argmax(np.abs(facing)))
+    rest = [k for k in range(3) if k != axis]
+    t = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    grid = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = np.empty((len(grid), 3))
+    points[:, rest] = lo[rest] + grid * (hi - lo)[rest]
+    points[:, axis] = (hi if facing[axis] > 0 else lo)[axis] + STAND_OFF * facing[axis]
+    return points, (hi - lo)[rest]
+
+
+def _tangents(n):
+    """Two unit vectors orthogonal to each of n (N, 3) (Duff et al. 2017)."""
+    sign = np.where(n[:, 2] >= 0, 1.0, -1.0)
+    a = -1.0 / (sign + n[:, 2])
+    b = n[:, 0] * n[:, 1] * a
+    first = np.stack([1 + sign * n[:, 0] ** 2 * a, sign * b, -sign * n[:, 0]], axis=1)
+    return first, np.stack([b, sign + n[:, 1] ** 2 * a, -n[:, 1]], axis=1)
