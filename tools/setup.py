@@ -1,0 +1,142 @@
+"""Makes the checkout ready to run: a usable libLLVM, `.venv`, and the package in it, editable.
+
+    python3 tools/setup.py [EXTRA ...]
+
+EXTRA: optional dependencies of pyproject.toml, such as `test`. Run again, it does only what is missing. Works on Debian
+and Ubuntu with Python 3.10 or newer; elsewhere on Linux and on macOS everything but the installation of libLLVM does.
+Nothing but the standard library is used, since nothing else may be there yet.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+VENV = ROOT / ".venv"
+STAMP = VENV / "nerg-setup.json"
+
+
+class Stop(Exception):
+    """Set-up cannot go on; the message is one sentence with what to do."""
+
+
+# ------------------------------------------------------------------------
+#  libLLVM
+# ------------------------------------------------------------------------
+
+
+def newest_package(names: list[str], minimum: int) -> str | None:
+    """Of apt's package names, the libLLVM with the highest version from `minimum` up; None if there is none."""
+    # Ubuntu 24.04 added "t64" to some of them.
+    found = [(int(match[1]), name) for name in names if (match := re.fullmatch(r"libllvm(\d+)(t64)?", name))]
+    return max((entry for entry in found if entry[0] >= minimum), default=(0, None))[1]
+
+
+def offered(minimum: int) -> str | None:
+    """The newest libLLVM package from `minimum` up that apt offers; None if it offers none."""
+    answer = subprocess.run(["apt-cache", "pkgnames", "libllvm"], capture_output=True, text=True, check=True)
+    return newest_package(answer.stdout.split(), minimum)
+
+
+def administrator() -> list[str] | None:
+    """What to put before a command to run it as root without a question; None if that is not allowed."""
+    if os.geteuid() == 0:
+        return []
+    if shutil.which("sudo") and subprocess.run(["sudo", "-n", "true"], capture_output=True).returncode == 0:
+        return ["sudo", "-n"]
+    return None
+
+
+def provide_llvm() -> None:
+    """Have a libLLVM on which Dr.Jit's kernels run, installing one with apt if need be and allowed."""
+    # With the command's module loaded, an unusable libLLVM is ours to mend and no reason for nerg_mi to refuse its import.
+    sys.path.insert(0, str(ROOT))
+    import nerg_command  # noqa: F401
+    from nerg_mi import llvm
+
+    trouble = llvm.problem()
+    if trouble is None or (llvm.VARIABLE not in os.environ and llvm.has_cuda()):
+        return
+    if llvm.VARIABLE in os.environ or not shutil.which("apt-get"):
+        raise Stop(trouble)
+
+    root = administrator()
+    package = offered(llvm.MINIMUM)
+    if package is None and root is not None:
+        # A fresh machine may not have fetched the lists of packages.
+        subprocess.run([*root, "apt-get", "update", "-qq"], check=True)
+        package = offered(llvm.MINIMUM)
+    if root is None:
+        command = f"sudo apt-get install {package}" if package else "sudo apt-get update"
+        raise Stop(f"LLVM {llvm.MINIMUM} or newer is missing and installing it needs your password: type\n\n    {command}\n\nand run this again.")
+    if package is None:
+        raise Stop(f"apt offers no libLLVM from version {llvm.MINIMUM} up: use a newer release of the system, or {llvm.remedy()}.")
+    print(f"Installing {package} ...", flush=True)
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    install = [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", package]
+    if subprocess.run(install, env=environment).returncode != 0:
+        # Lists of packages that are there, but older than the packages.
+        subprocess.run([*root, "apt-get", "update", "-qq"], check=True)
+        subprocess.run(install, env=environment, check=True)
+    llvm.prepare()
+    if llvm.problem() is not None:
+        raise Stop(llvm.problem())
+
+
+# ------------------------------------------------------------------------
+#  Python
+# ------------------------------------------------------------------------
+
+
+def provide_venv() -> Path:
+    """Have a virtual environment with pip, and give its Python."""
+    python = VENV / "bin" / "python"
+    if python.exists() and subprocess.run([python, "-m", "pip", "--version"], capture_output=True).returncode == 0:
+        return python
+    if importlib.util.find_spec("ensurepip") is None or importlib.util.find_spec("venv") is None:
+        raise Stop("Python's venv module is missing: type\n\n    sudo apt-get install python3-venv\n\nand run this again.")
+    print(f"Making {VENV.name} ...", flush=True)
+    subprocess.run([sys.executable, "-m", "venv", "--clear", VENV], check=True)
+    return python
+
+
+def provide_package(python: Path, extras: set[str]) -> None:
+    """Have the package installed as pyproject.toml says, with at least these extras."""
+    key = hashlib.sha256((ROOT / "pyproject.toml").read_bytes()).hexdigest()
+    done = json.loads(STAMP.read_text()) if STAMP.exists() else {}
+    if done.get("pyproject") == key and extras <= set(done["extras"]):
+        return
+    extras |= set(done.get("extras", ()))
+    what = str(ROOT) + (f"[{','.join(sorted(extras))}]" if extras else "")
+    print("Installing nerg_mi and what it needs ...", flush=True)
+    subprocess.run([python, "-m", "pip", "install", "-q", "--disable-pip-version-check", "-e", what], check=True)
+    # Written last: an installation that was interrupted is done again.
+    STAMP.write_text(json.dumps({"pyproject": key, "extras": sorted(extras)}))
+
+
+def main(extras: list[str]) -> int:
+    try:
+        if sys.version_info < (3, 10):
+            raise Stop(f"Python 3.10 or newer is needed and this is {sys.version.split()[0]}: name another with make PYTHON=python3.12.")
+        provide_llvm()
+        provide_package(provide_venv(), set(extras))
+    except Stop as stop:
+        print(f"set-up: {stop}", file=sys.stderr)
+        return 1
+    except subprocess.CalledProcessError as error:
+        # The command has said itself what went wrong.
+        print(f"set-up: this failed, mend what it says and run again: {' '.join(map(str, error.cmd))}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
