@@ -1,0 +1,45 @@
+"""The radiance field's forward pass in the form that trains fastest: networks as tensor products."""
+from __future__ import annotations
+
+import drjit as dr
+
+from ..field.box import Box
+from ..field.harmonics import encode_direction
+from ..field.hashgrid import HashGrid
+from ..field.mlp import MLP
+from ..field.radiance import RadianceConfig, density_from_log, sigmoid
+
+
+def stack(rows: list, ns):
+    """Rows (Floats of one length) as a TensorXf (rows, N)."""
+    return ns.TensorXf(dr.ravel(ns.ArrayXf(rows), order="C"), (len(rows), dr.width(rows[0])))
+
+
+def unstack(x, ns) -> list:
+    """Rows of a TensorXf (rows, N) as Floats.
+
+    A plain slice would send its gradient back through atomic additions; no two rows share an
+    entry, so that ``Permute`` (plain stores) is right.
+    """
+    rows, width = x.shape
+    index = dr.arange(ns.UInt32, width)
+    return [dr.gather(ns.Float, x.array, index + dr.opaque(ns.UInt32, k * width), mode=dr.ReduceMode.Permute)
+            for k in range(rows)]
+
+
+def density_color(config: RadianceConfig, box: Box, parameters: dict, p, d, ns):
+    """Density (1/unit) and colour (list of 3 Floats in 0..1) at world points ``p`` seen along ``d``.
+
+    The same maths as ``RadianceField.density_color`` on ``parameters`` spelt as the field spells them; points
+    must lie in ``box``. Gradients reach every entry of ``parameters``.
+    """
+    def net(name):
+        count = sum(k.startswith(name + ".") for k in parameters)
+        return MLP([parameters[f"{name}.{i}"] for i in range(count)])
+
+    # Expand: every thread adds to a copy of the table of its own; a fraction of the cost of atomics.
+    features = HashGrid(config.grid, parameters["grid.table"])(box.to_unit(p), True, dr.ReduceMode.Expand)
+    h = unstack(net("density_net").tensor(stack(features, ns)), ns)
+    sigma = density_from_log(h[0], config.density_scale)
+    c = net("color_net").tensor(stack(encode_direction(d, config.sh_degree) + h[1:], ns))
+    return sigma, [sigmoid(x) for x in unstack(c, ns)]

@@ -1,0 +1,146 @@
+"""Samples of training rays: steps in cells that may hold density, in front of what is opaque.
+
+Plain marching with true steps. Every ray shares one table of step edges, shifted by its own jitter;
+steps are kept where the density grid has a bit, then where a density-only pass still sees light.
+What is kept lies packed, ray after ray (see ``compositing``).
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from ..field.box import Box
+from .compositing import Segments
+
+
+class StepTable:
+    """Edges t_0 < t_1 < ... from ``near`` to ``far``, in scene units.
+
+    A step is ``step`` long, or ``growth`` times its distance where that is longer: pixels widen with
+    distance, and so may steps. The rule is scale-free, as ``transport.march`` has it.
+    """
+
+    def __init__(self, ns, near: float, far: float, step: float, growth: float):
+        edges = [near]
+        while edges[-1] < far:
+            edges.append(edges[-1] + max(step, growth * edges[-1]))
+        # One more, because jitter shifts every edge by up to one step.
+        edges.append(edges[-1] + max(step, growth * edges[-1]))
+        self.steps = len(edges) - 1
+        self.edges = ns.Float(np.array(edges, np.float32))
+
+    def interval(self, k, offset):
+        """Start and length of step ``k``, shifted by ``offset`` in [0, 1) of a step."""
+        Float = type(offset)
+        a, b = dr.gather(Float, self.edges, k), dr.gather(Float, self.edges, k + 1)
+        c = dr.gather(Float, self.edges, dr.minimum(k + 2, self.steps))
+        # The edge after the last repeats it: a step of no length beyond the far end.
+        start, stop = dr.lerp(a, b, offset), dr.lerp(b, dr.maximum(c, b), offset)
+        return start, stop - start
+
+
+@dataclass
+class Rays:
+    """``o``, ``d``: Array3f origins and unit directions, world frame; ``t0``, ``t1``: where each crosses
+    the box (empty where t1 <= t0); ``count``: how many."""
+
+    o: object
+    d: object
+    t0: object
+    t1: object
+    count: int
+
+
+def rays_in_box(o, d, box: Box, near: float) -> Rays:
+    """Rays clipped to ``box``, from ``near`` on."""
+    Float = type(d.x)
+    t0, t1 = Float(near), Float(dr.inf)
+    for axis in range(3):
+        inverse = dr.rcp(d[axis])
+        a, b = (box.lower[axis] - o[axis]) * inverse, (box.upper[axis] - o[axis]) * inverse
+        # fmin/fmax pass over the NaN of a ray that runs within a face.
+        t0, t1 = dr.fmax(t0, dr.fmin(a, b)), dr.fmin(t1, dr.fmax(a, b))
+    dr.eval(o, d, t0, t1)
+    return Rays(o, d, t0, t1, dr.width(o))
+
+
+@dataclass
+class Samples:
+    """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint
+    (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding."""
+
+    ray: object
+    t: object
+    length: object
+    p: object
+    segments: Segments
+    count: int
+
+
+def occupied_steps(rays: Rays, table: StepTable, offset, occupied) -> tuple | None:
+    """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated.
+
+    ``offset``: each ray's jitter, [0, 1); ``occupied``: function of points (Array3f) and a mask,
+    giving a mask. None when there is not one step.
+    """
+    UInt32 = dr.uint32_array_t(type(offset))
+    total = rays.count * table.steps
+    if total >= 2**32:
+        raise ValueError(f"{rays.count} rays of {table.steps} steps are too many for one batch")
+    # The number of steps is a literal: division by it becomes a multiplication.
+    index = dr.arange(UInt32, total)
+    ray = index // table.steps
+    _, _, p, inside = _step(rays, table, offset, ray, index - ray * table.steps)
+    kept = dr.compress(occupied(p, inside))
+    if dr.width(kept) == 0:
+        return None
+    ray = kept // table.steps
+    t, length, p, _ = _step(rays, table, offset, ray, kept - ray * table.steps)
+    dr.eval(ray, t, length, p)
+    return ray, t, length, p
+
+
+def _step(rays: Rays, table: StepTable, offset, ray, k):
+    Float = type(offset)
+    t, length = table.interval(k, dr.gather(Float, offset, ray))
+    middle = t + 0.5 * length
+    o, d = (dr.gather(type(rays.o), v, ray) for v in (rays.o, rays.d))
+    inside = (middle > dr.gather(Float, rays.t0, ray)) & (middle < dr.gather(Float, rays.t1, ray)) & (length > 0)
+    return t, length, o + d * middle, inside
+
+
+def visible_samples(
+    rays: Rays, table: StepTable, offset, occupied, density, stop: float, pad: int | None = None
+) -> tuple[Samples | None, int]:
+    """Samples that may matter, and the number of leading rays that they cover completely.
+
+    ``density``: function of points and a mask giving σ without a gradient; samples that less than
+    ``stop`` of the light reaches are dropped. ``pad``: make exactly so many samples, dropping the last rays
+    that do not fit. Returns (None, rays) when no ray meets anything.
+    """
+    steps = occupied_steps(rays, table, offset, occupied)
+    if steps is None:
+        return None, rays.count
+    ray, t, length, p = steps
+    Bool = dr.mask_t(t)
+    everywhere = dr.full(Bool, True, dr.width(t))
+    segments = Segments(ray, everywhere, rays.count)
+    tau = dr.minimum(density(p, everywhere) * length, 60.0)
+    light = dr.exp(-type(t)(segments.before(tau)))
+    kept = dr.compress(light > stop)
+    count, covered = dr.width(kept), rays.count
+    if pad is not None and count > pad:
+        # The ray in which the limit falls is incomplete: it and all later ones wait for another batch.
+        covered = int(dr.gather(type(ray), ray, dr.gather(type(kept), kept, type(kept)(pad))).numpy()[0])
+        if covered == 0:
+            raise ValueError(f"a single ray has more than {pad} samples; enlarge the batch or the step")
+    UInt32 = type(ray)
+    j = dr.arange(UInt32, pad if pad is not None else count)
+    source = dr.gather(UInt32, kept, dr.minimum(j, dr.opaque(UInt32, count - 1)))
+    ray = dr.gather(UInt32, ray, source)
+    active = (j < dr.opaque(UInt32, count)) & (ray < dr.opaque(UInt32, covered))
+    t, length, p = (dr.gather(type(v), v, source) for v in (t, length, p))
+    dr.eval(ray, active, t, length, p)
+    return Samples(ray, t, length, p, Segments(ray, active, rays.count), min(count, pad or count)), covered
