@@ -28,24 +28,22 @@ def import_rays(
     """Convert tracking files to rays: right-handed, z up, metres, seconds."""
     from ..attention import presets
 
-    def read():
-        if (preset is None) == (columns is None):
-            raise ValueError("say what the files are: either --preset NAME or --map COLUMNS")
-        if columns is not None:
-            return presets.rays_from_table(
-                files, columns, up=up, handedness=hand, units=units,
-                person_from=person_from, min_confidence=min_confidence, tick=tick,
-            )  # fmt: skip
+    if (preset is None) == (columns is None):
+        raise ValueError("say what the files are: either --preset NAME or --map COLUMNS")
+    if columns is not None:
+        rays = presets.rays_from_table(
+            files, columns, up=up, handedness=hand, units=units,
+            person_from=person_from, min_confidence=min_confidence, tick=tick,
+        )  # fmt: skip
+    else:
         known = presets.preset(preset)
         declared = {"units": units != "m", "up": up != "z", "hand": hand != "right", "person-from": person_from != "column",
                     "min-confidence": min_confidence != 0.0, "tick": tick != 1.0 and "tick" not in known.options}  # fmt: skip
         unused = [f"--{option}" for option, given in declared.items() if given]
         if unused:
             raise ValueError(f"preset {preset} knows its own conventions; leave out {', '.join(unused)}")
-        return known.read(files, **({"tick": tick} if "tick" in known.options else {}))
-
-    rays = _or_exit(read)
-    _or_exit(lambda: rays.save(output))
+        rays = known.read(files, **({"tick": tick} if "tick" in known.options else {}))
+    rays.save(output)
     _card(rays, output)
     typer.echo(f"wrote {output}")
 
@@ -55,16 +53,7 @@ def show_rays(rays: Annotated[Path, typer.Argument(help="Rays file (.npz or .par
     """The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height."""
     from ..attention.rays import Rays
 
-    _card(_or_exit(lambda: Rays.load(rays)), rays)
-
-
-def _or_exit(action):
-    """Run; a user's mistake ends the command with its sentence, not a traceback."""
-    try:
-        return action()
-    except (ValueError, OSError, ImportError) as error:
-        typer.echo(f"nerg rays: {error}", err=True)
-        raise typer.Exit(1) from error
+    _card(Rays.load(rays), rays)
 
 
 def _card(rays, path: Path) -> None:

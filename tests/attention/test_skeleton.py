@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+
+from nerg_mi.attention import skeleton
+from nerg_mi.formats.skeleton_file import write_skeleton
+
+
+def heads(n=200, seed=0):
+    rng = np.random.default_rng(seed)
+    d = rng.normal(size=(n, 3))
+    d[0], d[1] = (0, 0, -1), (0, 0, 1)  # straight down and up
+    return rng.uniform([0, 0, 1.2], [8, 6, 1.9], (n, 3)), d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def test_body_gives_exactly_its_head_pose():
+    origin, direction = heads()
+    body = skeleton.keypoints_from_head(origin, direction)
+    o, d = skeleton.head_poses(body)
+    assert np.abs(o - origin).max() < 1e-6 and np.abs(d - direction).max() < 1e-6
+    assert np.isfinite(body).all() and body[..., 2].min() > -0.05
+    # The left ear is on the left of where the head looks.
+    side = body[2:, skeleton.LEFT_EAR] - body[2:, skeleton.RIGHT_EAR]
+    left = np.cross([0, 0, 1.0], direction[2:])
+    assert np.all(np.sum(side * left, axis=1) > 0)
+    assert np.allclose(np.linalg.norm(side, axis=1), skeleton.EAR_DISTANCE)
+
+
+def test_unseen_keypoints_and_bad_heads():
+    origin, direction = heads(3)
+    body = skeleton.keypoints_from_head(origin, direction)
+    body[0, skeleton.NOSE] = np.nan
+    body[1, skeleton.NOSE] = 0.5 * (body[1, skeleton.LEFT_EAR] + body[1, skeleton.RIGHT_EAR])
+    _, d = skeleton.head_poses(body)
+    assert np.isnan(d[:2]).all() and np.isfinite(d[2]).all()
+    with pytest.raises(ValueError, match="head pose 1"):
+        skeleton.keypoints_from_head(origin, direction * [[1], [0], [1]])
+    with pytest.raises(ValueError, match="expected"):
+        skeleton.head_poses(np.zeros((4, 21, 3)))
+
+
+def test_rays_of_a_file(tmp_path):
+    origin, direction = heads(50)
+    body = skeleton.keypoints_from_head(origin, direction)
+    body[7, skeleton.RIGHT_EAR] = np.nan
+    path = tmp_path / "day.csv.gz"
+    write_skeleton(path, [f"p{i % 3}" for i in range(50)], np.arange(50), body)
+    rays = skeleton.rays_from_skeleton(path, tick=0.1)
+    keep = np.arange(50) != 7
+    assert len(rays) == 49 and rays.persons == ("p0", "p1", "p2") and rays.hit is None
+    assert np.allclose(rays.t, np.arange(50)[keep] * 0.1)
+    assert np.abs(rays.direction - direction[keep]).max() < 2e-5  # micrometres in the file
+    assert rays.metadata["dropped"] == [{"reason": "origin is missing", "file": "day.csv.gz", "count": 1, "rows": [[8, 8]]}]

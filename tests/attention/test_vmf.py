@@ -1,0 +1,63 @@
+import numpy as np
+import pytest
+
+from nerg_mi.attention import vmf
+from nerg_mi.attention.sphere import fibonacci_directions
+
+
+@pytest.mark.parametrize("kappa", [1e-8, 1e-3, 1.0, 50.0, 1e4, 1e8])
+def test_normaliser_over_sixteen_orders(kappa):
+    got = float(vmf.log_normaliser(kappa))
+    # scipy's form, log of κ/(4π sinh κ) e^κ, in its stable regimes.
+    want = -np.log(4 * np.pi) + kappa if kappa < 1e-6 else np.log(kappa) - np.log(2 * np.pi) - np.log1p(-np.exp(-2 * kappa))
+    assert np.isclose(got, want, rtol=1e-12)
+
+
+def test_normaliser_at_zero_is_uniform_and_matches_a_known_value():
+    assert np.isclose(vmf.log_normaliser(0.0), -np.log(4 * np.pi), rtol=1e-15)
+    assert np.isclose(vmf.log_normaliser(1e4), 7.372463305566, rtol=1e-12)
+    with pytest.raises(ValueError, match="negative or NaN"):
+        vmf.log_normaliser(-1.0)
+
+
+@pytest.mark.parametrize("kappa", [1e-8, 1.0, 20.0, 100.0])
+def test_density_integrates_to_one(kappa):
+    x = fibonacci_directions(8192)
+    f = np.exp(vmf.log_density(x, np.array([0.48, 0.6, 0.64]), kappa))
+    assert np.isclose(f.mean() * 4 * np.pi, 1, atol=1e-3)
+
+
+def test_density_keeps_its_digits_near_the_mean():
+    mu = np.array([0.0, 0.0, 1.0])
+    angle = 1e-5
+    x = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    assert np.isclose(vmf.log_density(x, mu, 1e8) - vmf.log_normaliser(1e8), -1e8 * 2 * np.sin(angle / 2) ** 2, rtol=1e-9)
+
+
+def test_kappa_inverts_the_resultant_length():
+    kappa = np.geomspace(1e-6, 1e7, 200)
+    back = vmf.kappa_from_resultant(vmf.mean_resultant_length(kappa))
+    assert np.allclose(back, kappa, rtol=1e-7)
+    assert vmf.kappa_from_resultant(0.0) == vmf.KAPPA_MIN
+    assert vmf.kappa_from_resultant(1.0) == vmf.KAPPA_MAX
+    with pytest.raises(ValueError, match="average unit vectors"):
+        vmf.kappa_from_resultant(1.5)
+
+
+def test_bandwidth_rule_of_the_published_code():
+    # Values of nerg-neural-gaze at 1,024 rays.
+    R = [0.1, 0.3, 0.5, 0.8, 0.9, 0.95]
+    assert np.allclose(vmf.silverman_kappa(R, 1024), [4.3, 13.6, 25.6, 71, 142, 285], rtol=5e-3)
+    assert np.isclose(vmf.silverman_kappa(1.0, 1), 1 / 1.06**2)
+    assert np.isfinite(vmf.silverman_kappa(1.0, 50))
+
+
+@pytest.mark.parametrize("kappa", [1e-8, 2.0, 50.0, 1e6])
+def test_samples_have_the_moments(kappa):
+    rng = np.random.default_rng(3)
+    mu = np.tile([0.48, -0.6, -0.64], (50_000, 1))
+    x = vmf.sample(mu, kappa, rng)
+    assert np.allclose(np.linalg.norm(x, axis=1), 1, atol=1e-12)
+    assert np.allclose(x.mean(axis=0), vmf.mean_resultant_length(kappa) * mu[0], atol=0.012)
+    if kappa > 1:
+        assert np.isclose(vmf.one_minus_cosine(x, mu).mean(), 1 - vmf.mean_resultant_length(kappa), rtol=0.02)
