@@ -92,7 +92,8 @@ def examine() -> Diagnosis:
     """Try everything and report it; takes a few seconds."""
     diagnosis = Diagnosis()
     add = diagnosis.findings.append
-    add(Finding("versions", f"nerg {__version__}, Python {platform.python_version()}, {_version('mitsuba')}, {_version('drjit')}"))
+    python = f"Python {platform.python_version()}"
+    add(Finding("versions", ", ".join((f"nerg {__version__}", python, _version("mitsuba"), _version("drjit")))))
 
     library, trouble = llvm.current(), llvm.problem()
     add(Finding("libLLVM", str(library) if library else "none", trouble or ""))
@@ -110,7 +111,8 @@ def examine() -> Diagnosis:
         add(Finding("CUDA", "does not work", f"install an NVIDIA driver R570 or newer; Dr.Jit said: {_one_line(said)}"))
     else:
         old = tuple(cuda["version"]) < CUDA_MINIMUM
-        add(Finding("CUDA", ".".join(map(str, cuda["version"])), "neural fields need an NVIDIA driver R570 or newer: update it." if old else ""))
+        said = "neural fields need an NVIDIA driver R570 or newer: update it." if old else ""
+        add(Finding("CUDA", ".".join(map(str, cuda["version"])), said))
 
     for backend, result in results.items():
         text, said = " ".join(result["variants"]) or "none", ""
@@ -128,7 +130,8 @@ def examine() -> Diagnosis:
 
     diagnosis.usable = any(not v.startswith("scalar") for result in results.values() for v in result["variants"])
     if not diagnosis.usable:
-        add(Finding("verdict", "nothing can be rendered: no llvm and no cuda variant works", "mend libLLVM or CUDA as said above."))
+        said = "mend libLLVM or CUDA as said above."
+        add(Finding("verdict", "nothing can be rendered: no llvm and no cuda variant works", said))
     else:
         add(Finding("verdict", "ready to render"))
     return diagnosis

@@ -44,7 +44,8 @@ def activate(variant: str | None = None) -> str:
             raise
         except ImportError as error:  # Mitsuba says so where the backend of a variant cannot start
             failed = error
-    raise NergError(f'the variant "{wanted[-1]}" does not work here ({sentence(failed)}); "nerg doctor" says how to mend it.')
+    said = sentence(failed)
+    raise NergError(f'the variant "{wanted[-1]}" does not work here ({said}); "nerg doctor" says how to mend it.')
 
 
 def render_file(
@@ -61,8 +62,8 @@ def render_file(
     """Render the scene file `scene`, write the picture `output`, and give a sentence that says what was done.
 
     `output` ends in .exr (all channels of the film, AOVs among them, as float32) or in .png (its colour, tonemapped to
-    sRGB); its folder is made. `defaults`: values for the `<default>` and `$key` of the scene. `sensor`: index. `spp`: samples
-    a pixel, 0 for those of the scene's sampler. `threads`: 0 for one a core. Raises NergError for what the user can mend.
+    sRGB); its folder is made. `defaults`: values for the `<default>` and `$key` of the scene. `sensor`: index. `spp`:
+    samples a pixel, 0 for those of the scene's sampler. `threads`: 0 for one a core. Raises NergError for what the user can mend.
     """
     scene, output = Path(scene), Path(output)
     if output.suffix.lower() not in _FORMATS:
@@ -103,5 +104,6 @@ def _write(mi, bitmap, output: Path) -> None:
         bitmap.write(str(output))
         return
     # With AOVs the bitmap has many channels, of which the colour is the layer without a name.
-    colour = dict(bitmap.split()).get("<root>", bitmap) if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel else bitmap
-    mi.util.write_bitmap(str(output), colour, write_async=False)
+    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+        bitmap = dict(bitmap.split())["<root>"]
+    mi.util.write_bitmap(str(output), bitmap, write_async=False)

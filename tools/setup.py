@@ -76,9 +76,15 @@ def provide_llvm() -> None:
         package = offered(llvm.MINIMUM)
     if root is None:
         command = f"sudo apt-get install {package}" if package else "sudo apt-get update"
-        raise Stop(f"LLVM {llvm.MINIMUM} or newer is missing and installing it needs your password: type\n\n    {command}\n\nand run this again.")
+        raise Stop(
+            f"LLVM {llvm.MINIMUM} or newer is missing and installing it needs your password: type\n\n"
+            f"    {command}\n\nand run this again."
+        )
     if package is None:
-        raise Stop(f"apt offers no libLLVM from version {llvm.MINIMUM} up: use a newer release of the system, or {llvm.remedy()}.")
+        raise Stop(
+            f"apt offers no libLLVM from version {llvm.MINIMUM} up: use a newer release of the system, "
+            f"or set {llvm.VARIABLE} to such a libLLVM."
+        )
     print(f"Installing {package} ...", flush=True)
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
     install = [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", package]
@@ -125,7 +131,8 @@ def provide_package(python: Path, extras: set[str]) -> None:
 def main(extras: list[str]) -> int:
     try:
         if sys.version_info < (3, 10):
-            raise Stop(f"Python 3.10 or newer is needed and this is {sys.version.split()[0]}: name another with make PYTHON=python3.12.")
+            version = sys.version.split()[0]
+            raise Stop(f"Python 3.10 or newer is needed and this is {version}: name another with make PYTHON=python3.12.")
         provide_llvm()
         provide_package(provide_venv(), set(extras))
     except Stop as stop:

@@ -81,7 +81,11 @@ def _version(wanted: bool) -> None:
 
 
 def _global_options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
-    traceback: Annotated[bool, typer.Option("--traceback", help="Show where an error arose (also: NERG_TRACEBACK=1).")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+    traceback: Annotated[
+        bool, typer.Option("--traceback", help="Show where an error arose (also: NERG_TRACEBACK=1).")
+    ] = False,
 ) -> None:
     pass

@@ -17,7 +17,8 @@ def command(
     ] = None,
     sensor: Annotated[int, typer.Option("-s", "--sensor", help="Index of the sensor, counted from 0.")] = 0,
     variant: Annotated[
-        Optional[str], typer.Option("-m", "--mode", help="Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]")
+        Optional[str],
+        typer.Option("-m", "--mode", help="Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]"),
     ] = None,
     spp: Annotated[int, typer.Option("--spp", min=0, help="Samples a pixel; 0: as the scene says.")] = 0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random numbers.")] = 0,

@@ -47,7 +47,7 @@ def pixel_solid_angles(width: int, height: int) -> np.ndarray:
     """Solid angle in steradian that each pixel stands for: shape (height, width), float64; the sum is 4π.
 
     ω = 2π/W (cos θ₀ - cos θ₁) between the borders of the pixel's row, which end at the poles. A density per steradian
-    that was rendered with the `panorama` sensor integrates over the sphere as `(density * pixel_solid_angles(W, H)).sum()`.
+    that was rendered with the `panorama` sensor has the integral `(density * pixel_solid_angles(W, H)).sum()`.
     """
     _check(width, height)
     border = np.clip(np.pi * (np.arange(height + 1) - 0.5) / (height - 1), 0, np.pi)
