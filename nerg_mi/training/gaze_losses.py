@@ -14,6 +14,9 @@ import drjit as dr
 
 # Of the uniform density: what a density of zero counts as inside a logarithm.
 KLD_EPS = 1e-6
+# 1/sr (uniform is 0.08): a density whose mean is lower is a map of zeros. Its gradient
+# grows as one over the mean, and would leave float32 before the mean does.
+VANISHED = 1e-12
 # A probe whose spread is below this fraction of its mean is constant: no correlation.
 FLAT = 1e-5
 
@@ -97,7 +100,7 @@ def probe_cc(prediction: Any, truth: Any, directions: int, w: Any) -> Any:
 def _relative(density: Any, directions: int, w: Any) -> Any:
     """Density in units of the uniform one of equal integral."""
     mean = dr.block_sum(w * density, directions)
-    live = mean > 0
+    live = mean > VANISHED
     inverse = dr.select(live, dr.rcp(dr.select(live, mean, 1)), 0)
     # A map of zeros has no shape: it counts as uniform, without a gradient.
     return density * dr.repeat(inverse, directions) + dr.repeat(dr.select(live, type(density)(0), 1), directions)

@@ -1,0 +1,76 @@
+import numpy as np
+import pytest
+
+from nerg_mi.attention import vmf
+from nerg_mi.attention.probes import place_probes
+from nerg_mi.attention.rays import Rays
+from nerg_mi.attention.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.evaluation import gaze_baselines as baselines
+from nerg_mi.evaluation import metrics
+from tests.reference.kde import kde as reference
+
+X = fibonacci_directions(1024)
+
+
+@pytest.fixture(scope="module")
+def rays():
+    """People who look at one thing in the middle of the room."""
+    rng = np.random.default_rng(1)
+    origin = rng.uniform([0, 0, 1.5], [4, 4, 1.6], (9000, 3))
+    to = np.array([2.0, 2.0, 1.0]) - origin
+    mu = to / np.linalg.norm(to, axis=1, keepdims=True)
+    n = len(mu)
+    return Rays(np.arange(n) * 1.0, np.zeros(n), ("a",), origin, vmf.sample(mu, 40.0, rng), np.ones(n))
+
+
+def test_position_blind_is_the_kde_of_all(rays):
+    density = baselines.position_blind(rays, kappa=30.0, backend="llvm")(np.zeros((3, 3)), X)
+    want = reference(X, rays.direction, [0, len(rays)], [30.0])
+    assert density.shape == (3, 1024) and np.allclose(density, want, rtol=2e-4)
+    own = baselines.position_blind(rays, kappa=30.0, backend="llvm")(np.zeros((2, 3)), np.stack([X, X[::-1]]))
+    assert np.allclose(own[0], own[1, ::-1], rtol=1e-5)
+
+
+def test_nearest_probes(rays):
+    probes = place_probes(rays, 0.4, count=50, kappa_rule="fixed", kappa=20.0)
+    density = probes.density(X, "llvm")
+    one = baselines.nearest_probes(probes, 1, backend="llvm")(probes.positions[:5], X)
+    assert np.allclose(one, density[:5], rtol=1e-5)
+    at = np.array([[1.0, 1.0, 1.55]])
+    near = np.argsort(np.linalg.norm(probes.positions - at, axis=1))[:4]
+    four = baselines.nearest_probes(probes, 4, backend="llvm")
+    assert np.allclose(four(at, X)[0], density[near].mean(axis=0), rtol=1e-5)
+    assert np.allclose(four(at, X[None])[0], four(at, X)[0], rtol=1e-5)
+
+
+def test_nearest_rays(rays):
+    at = np.array([[1.0, 1.0, 1.55], [3.0, 2.0, 1.55]])
+    density = baselines.nearest_rays(rays, 300, kappa=20.0, backend="llvm")(at, X)
+    near = np.argsort(np.linalg.norm(rays.origin - at[1], axis=1))[:300]
+    assert np.allclose(density[1], reference(X, rays.direction[near], [0, 300], [20.0])[0], rtol=2e-4)
+
+
+def test_all_integrate_to_one_and_position_helps(rays):
+    rng = np.random.default_rng(0)
+    at = rng.uniform([0.5, 0.5, 1.5], [3.5, 3.5, 1.6], (12, 3))
+    to = np.array([2.0, 2.0, 1.0]) - at
+    truth = np.exp(vmf.log_density(X, (to / np.linalg.norm(to, axis=1, keepdims=True))[:, None], 40.0))
+    probes = place_probes(rays, 0.4, count=200, kappa_rule="fixed", kappa=20.0)
+    scores = {}
+    for name, baseline in {
+        "uniform": baselines.uniform(),
+        "blind": baselines.position_blind(rays, backend="llvm"),
+        "probes": baselines.nearest_probes(probes, 4, backend="llvm"),
+        "rays": baselines.nearest_rays(rays, 256, backend="llvm"),
+    }.items():
+        density = baseline(at, X)
+        assert np.allclose(density.mean(axis=1) * 4 * np.pi, 1, atol=1e-3)
+        scores[name] = metrics.cc(truth, density).mean()
+    assert scores["uniform"] == 0 and scores["blind"] < 0.5 < 0.7 < min(scores["probes"], scores["rays"])
+
+
+def test_own_directions_of_nearest_rays(rays):
+    rng = np.random.default_rng(0)
+    at, own = rays.origin[:70], uniform_directions(70 * 8, rng).reshape(70, 8, 3)
+    f = baselines.nearest_rays(rays, 100, backend="llvm")
+    assert np.allclose(f(at, own)[66], f(at[66:67], own[66])[0], rtol=1e-5)
