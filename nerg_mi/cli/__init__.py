@@ -21,6 +21,7 @@ from ..errors import sentence
 COMMANDS = {
     "doctor": "Say what works on this machine, and how to mend what does not.",
     "render": "Render a scene file to an EXR or PNG file.",
+    "rays": "Import tracking files as rays of attention, and look at what they hold.",
 }
 """Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""
 
