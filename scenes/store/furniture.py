@@ -60,7 +60,7 @@ def _good(place: Place, frame: Frame, u, w, z, ground, label, style: int) -> Non
     place.box(lo, hi, ground, skip=skip, fronts={frame.front: patterns[style]}, solid=False)
 
 
-def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: float, category: str, focus_u=None) -> None:
+def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: float, category: str, focus_u=None):
     """Fill one board from u[0] to u[1] with groups of equal goods; ``focus_u`` is kept for the special offer."""
     colors, offer = GOODS[category]
     pos, last = u[0], -1
@@ -70,7 +70,8 @@ def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: fl
             width = (focus_u[1] - focus_u[0]) / n
             for k in range(n):
                 a = focus_u[0] + k * width
-                _good(place, frame, (a, a + width), (0.02, depth - 0.01), (z0, z0 + room * 0.9), srgb(offer), srgb("ffffff"), 0)
+                box = (a, a + width), (0.02, depth - 0.01), (z0, z0 + room * 0.9)
+                _good(place, frame, *box, srgb(offer), srgb("ffffff"), 0)
             pos = focus_u[1]
             continue
         stop = focus_u[0] if focus_u and pos < focus_u[0] - 1e-6 else u[1]
@@ -92,24 +93,27 @@ def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: fl
         pos += count * width
 
 
-def shelf_unit(place, rng, frame, width, depth, boards, top, bays, trim, prefix, ends=True, kick=0.12, focus_level=2) -> None:
-    """A one-sided shelf: a solid back, a plinth, boards with price strips, goods, and one region for each bay.
+def shelf_unit(
+    place: Place, rng, frame: Frame, width: float, depth: float, boards, top: float, bays, trim: str, prefix: str,
+    kick: float = 0.12, focus_level: int = 2,
+) -> None:
+    """A one-sided shelf: a solid back, ends, a plinth, boards with price strips, goods, and one region for each bay.
 
     ``boards``: heights of the boards' upper faces in metres, ascending; the last room ends at ``top``.
-    ``bays``: category of each bay; bays share the width equally.
+    ``bays``: category of each bay; bays share the width equally. ``focus_level``: the board of the special offers.
     """
-    edge = 0.04 if ends else 0.0
+    edge = 0.04
     trim = srgb(trim)
     body = srgb("c9c6bf")
     lo, hi = frame.box((0, width), (0, depth), (0, top))
     place.solids.append(np.stack([lo, hi]))
     back = frame.box((edge, width - edge), (0.0, 0.02), (kick, top))
     place.box(*back, body * 0.8, skip={frame.back, (2, -1), *frame.ends}, solid=False)
-    for k in range(2 if ends else 0):
-        a = 0.0 if k == 0 else width - edge
+    for a in (0.0, width - edge):
         panel = frame.box((a, a + edge), (0, depth), (0, top))
         place.box(*panel, trim, skip={frame.back, (2, -1)}, solid=False)
-    place.box(*frame.box((edge, width - edge), (0, depth), (0, kick)), trim * 0.5, skip={frame.back, (2, -1), *frame.ends}, solid=False)
+    plinth = frame.box((edge, width - edge), (0, depth), (0, kick))
+    place.box(*plinth, trim * 0.5, skip={frame.back, (2, -1), *frame.ends}, solid=False)
     bay_width = (width - 2 * edge) / len(bays)
     for level, z in enumerate(boards):
         thick = 0.035
@@ -126,10 +130,11 @@ def shelf_unit(place, rng, frame, width, depth, boards, top, bays, trim, prefix,
                 half = min(0.24, 0.4 * bay_width)
                 middle = np.mean(u) + rng.uniform(-1, 1) * max(0.0, 0.5 * bay_width - half - 0.12)
                 focus = (middle - half, middle + half)
-                name = f"{prefix}_{category}" if len(bays) == 1 or bays.count(category) == 1 else f"{prefix}_{category}_{b + 1}"
+                name = f"{prefix}_{category}" + (f"_{b + 1}" if bays.count(category) > 1 else "")
                 region = frame.box(u, (0, depth), (0, top))
                 box = frame.box(focus, (0.02, depth - 0.01), (z, z + room * 0.9))
-                place.regions.append(Region(name, category, tuple(region[0]), tuple(region[1]), frame.triple, tuple(map(tuple, box))))
+                bounds = tuple(map(tuple, region))
+                place.regions.append(Region(name, category, *bounds, frame.triple, tuple(map(tuple, box))))
             _stock(place, rng, frame, u, depth, z, room, category, focus)
 
 
@@ -138,8 +143,12 @@ def _gondola(place, rng, number: int, x: float, west, east, cap: str, trim: str)
     y0, y1, top = 1.6, 4.2, 1.7
     boards = (0.12, 0.50, 0.82, 1.14, 1.44)
     for facing, bays, side in ((WEST, west, "west"), (EAST, east, "east")):
-        shelf_unit(place, rng, Frame((x, y0), facing), y1 - y0, 0.35, boards, top, bays, trim, f"gondola_{number}_{side}", focus_level=3 if side == "west" else 2)
-    shelf_unit(place, rng, Frame((x - 0.35, y0), SOUTH), 0.7, 0.3, (0.12, 0.55, 0.95, 1.30), 1.7, (cap,), trim, f"endcap_{number}", focus_level=2)
+        shelf_unit(
+            place, rng, Frame((x, y0), facing), y1 - y0, 0.35, boards, top, bays, trim, f"gondola_{number}_{side}",
+            focus_level=3 if side == "west" else 2,
+        )
+    end = Frame((x - 0.35, y0), SOUTH)
+    shelf_unit(place, rng, end, 0.7, 0.3, (0.12, 0.55, 0.95, 1.30), top, (cap,), trim, f"endcap_{number}")
     ground, light = srgb(trim), srgb("f4efe2")
     place.box((x - 0.35, y1, 0), (x + 0.35, y1 + 0.03, top), ground, skip={(1, -1), (2, -1)},
               fronts={(1, 1): ((4, 8), lambda i, j: light if (i * 3 + j * 2) % 7 < 2 else ground * (0.6 + 0.08 * j))})  # fmt: skip
@@ -153,16 +162,21 @@ def _counter(place: Place, rng) -> None:
     red = srgb("c8402f")
     place.box((6.85, 1.0, 0), (7.35, 3.4, 0.9), wood, skip={(2, -1)},
               fronts={(0, -1): ((8, 3), lambda i, j: red if j == 1 else wood * (0.8 + 0.4 * (i % 2)))})  # fmt: skip
-    place.box((6.8, 0.95, 0.9), (7.4, 3.45, 0.95), top, fronts={(2, 1): ((2, 8), lambda i, j: top * (0.8 + 0.25 * ((i + j) % 2)))})
-    place.box((6.95, 2.75, 0.95), (7.3, 3.15, 1.3), steel, skip={(2, -1)}, fronts={(0, -1): ((2, 2), lambda i, j: srgb("9fd3c7") if j else steel)})
-    place.regions.append(Region("counter_till", "till", (6.8, 2.6, 0.0), (7.4, 3.45, 1.35), WEST, ((6.95, 2.75, 0.95), (7.3, 3.15, 1.3))))
+    place.box((6.8, 0.95, 0.9), (7.4, 3.45, 0.95), top,
+              fronts={(2, 1): ((2, 8), lambda i, j: top * (0.8 + 0.25 * ((i + j) % 2)))})  # fmt: skip
+    till = (6.95, 2.75, 0.95), (7.3, 3.15, 1.3)
+    place.box(*till, steel, skip={(2, -1)}, fronts={(0, -1): ((2, 2), lambda i, j: srgb("9fd3c7") if j else steel)})
+    place.regions.append(Region("counter_till", "till", (6.8, 2.6, 0.0), (7.4, 3.45, 1.35), WEST, till))
     lo = (6.83, 1.1)
     for level, z in enumerate((0.95, 1.17)):
         _stock(place, rng, Frame((lo[0] + 0.32, lo[1]), WEST), (0.0, 1.0), 0.3 - 0.1 * level, z, 0.2, "sweets")
     place.solids.append(np.array([(6.83, 1.1, 0.95), (7.15, 2.1, 1.4)]))
     place.box((7.15, 1.1, 0.95), (7.19, 2.1, 1.45), srgb("6a3d9a"), skip={(2, -1)})
-    place.regions.append(Region("counter_sweets", "sweets", (6.8, 1.0, 0.9), (7.2, 2.1, 1.45), WEST, ((6.85, 1.3, 0.97), (7.15, 1.9, 1.37))))
-    shelf_unit(place, rng, Frame((8.0, 0.8), WEST), 2.8, 0.25, (0.12, 0.6, 1.0, 1.3, 1.6), 1.95, ("counter_goods",), "7a2b2b", "counter_wall", focus_level=3)
+    rack = (6.85, 1.3, 0.97), (7.15, 1.9, 1.37)
+    place.regions.append(Region("counter_sweets", "sweets", (6.8, 1.0, 0.9), (7.2, 2.1, 1.45), WEST, rack))
+    cabinet = Frame((8.0, 0.8), WEST)
+    boards = (0.12, 0.6, 1.0, 1.3, 1.6)
+    shelf_unit(place, rng, cabinet, 2.8, 0.25, boards, 1.95, ("counter_goods",), "7a2b2b", "counter_wall", focus_level=3)
     # coffee corner in the north-east
     place.box((7.05, 5.35, 0), (8.0, 6.0, 0.92), srgb("4a3428"), skip={(2, -1), (1, 1), (0, 1)},
               fronts={(1, -1): ((4, 4), lambda i, j: srgb("d9a066") if (i + j) % 3 == 0 else srgb("6b4a36"))})  # fmt: skip
@@ -170,7 +184,8 @@ def _counter(place: Place, rng) -> None:
               fronts={(1, -1): ((3, 4), lambda i, j: (srgb("ff7a1a"), srgb("26292b"), srgb("a9b4b8"))[(i + j) % 3])})  # fmt: skip
     place.box((7.62, 5.6, 0.92), (7.92, 5.9, 1.25), srgb("e8dcc8"), skip={(2, -1)},
               fronts={(1, -1): ((2, 3), lambda i, j: srgb("b5493b") if j == 1 else srgb("e8dcc8"))})  # fmt: skip
-    place.regions.append(Region("coffee", "coffee", (7.05, 5.35, 0.0), (8.0, 6.0, 1.5), SOUTH, ((7.15, 5.55, 0.95), (7.55, 5.95, 1.5))))
+    machine = (7.15, 5.55, 0.95), (7.55, 5.95, 1.5)
+    place.regions.append(Region("coffee", "coffee", (7.05, 5.35, 0.0), (8.0, 6.0, 1.5), SOUTH, machine))
 
 
 def furnish(place: Place, rng) -> None:
@@ -178,14 +193,17 @@ def furnish(place: Place, rng) -> None:
     _gondola(place, rng, 1, 1.85, ("snacks", "sweets"), ("noodles", "snacks"), "offers", "c2572b")
     _gondola(place, rng, 2, 3.65, ("household", "cosmetics"), ("stationery", "household"), "offers", "2d6a8f")
     _gondola(place, rng, 3, 5.45, ("noodles", "bread"), ("bread", "sweets"), "offers", "4d7c3a")
-    shelf_unit(place, rng, Frame((0.0, 0.7), EAST), 4.2, 0.35, (0.12, 0.55, 0.92, 1.26, 1.6), 2.0, ("cosmetics", "stationery", "household"), "a8792c", "wall")
+    bays = ("cosmetics", "stationery", "household")
+    shelf_unit(place, rng, Frame((0.0, 0.7), EAST), 4.2, 0.35, (0.12, 0.55, 0.92, 1.26, 1.6), 2.0, bays, "a8792c", "wall")
     # coolers: deeper, taller, dark inside frames, with a bright header
     for k, category in enumerate(("dairy", "meals", "drinks", "drinks")):
         x = 0.55 + 1.6 * k
         frame = Frame((x, 6.0), SOUTH)
-        shelf_unit(place, rng, frame, 1.6, 0.6, (0.25, 0.70, 1.10, 1.48), 1.9, (category,), "dfe7ea", f"cooler_{k + 1}", kick=0.25, focus_level=2)
+        boards = (0.25, 0.70, 1.10, 1.48)
+        shelf_unit(place, rng, frame, 1.6, 0.6, boards, 1.9, (category,), "dfe7ea", f"cooler_{k + 1}", kick=0.25)
         sign = (srgb("2fa4d9"), srgb("ffffff"))
         place.box(*frame.box((0, 1.6), (0, 0.6), (1.9, 2.2)), sign[0], skip={frame.back},
                   fronts={frame.front: ((8, 2), lambda i, j, k=k: sign[(i // 2 + j + k) % 2])})  # fmt: skip
-    shelf_unit(place, rng, Frame((1.1, 0.0), NORTH), 2.2, 0.28, (0.12, 0.55, 0.95), 1.35, ("magazines", "magazines"), "5a5f66", "rack", focus_level=2)
+    rack = Frame((1.1, 0.0), NORTH)
+    shelf_unit(place, rng, rack, 2.2, 0.28, (0.12, 0.55, 0.95), 1.35, ("magazines", "magazines"), "5a5f66", "rack")
     _counter(place, rng)

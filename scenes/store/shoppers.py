@@ -19,7 +19,7 @@ from nerg_mi.scenes.store.layout import ROOM, Layout
 
 RATE = 5.0  # samples a second
 EYE_HEIGHT = (1.5, 1.75)  # metres: height of the midpoint of the ears, which is taken as the eye's
-BODY = 0.22  # metres that a walk keeps from furniture, to the midpoint of the head
+BODY = 0.22  # metres that a walk keeps from furniture; sway takes back a few centimetres
 DOOR = (6.6, 0.45)
 AISLES = (0.93, 2.75, 4.55, 6.3)  # x of the four aisles
 ROWS = (0.8, 1.9, 2.9, 3.9, 4.8)  # y of the waypoints along them; the first and last are the cross aisles
@@ -167,9 +167,10 @@ def walk(store: Store, rng, stops: int, weights: np.ndarray) -> Walk:
     return Walk(np.arange(len(xy)) / RATE, head, standing)
 
 
-def simulate(layout: Layout, *, shoppers: int = 100, stops=(8, 20), seed: int = 0, scene=None, law: AttentionLaw | None = None):
+def simulate(layout: Layout, *, shoppers: int = 100, stops=(8, 20), seed: int = 0, scene=None, law=None):
     """Everybody's visit. Returns ids (N,) str, times (N,) int64 in milliseconds, origins (N, 3), directions (N, 3),
-    sorted by time. ``stops``: least and largest number of areas of interest that a shopper visits."""
+    sorted by time. ``stops``: least and largest number of areas of interest that a shopper visits; ``law``: the
+    `AttentionLaw` (default: that of the layout, with rays cast at ``scene``)."""
     law = law or AttentionLaw([r.as_json() for r in layout.regions], scene)
     store = Store(layout)
     rng = np.random.default_rng([seed, 0x5407])
@@ -198,5 +199,6 @@ def write_shoppers(layout: Layout, path, *, say=print, **options) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     # 0.1 mm turns a head by less than 1 mrad, far below the law's jitter
     write_skeleton(path, ids, times, keypoints_from_head(origins, directions), decimals=4)
-    say(f"{len(ids)} head poses of {len(np.unique(ids))} shoppers, {floor_clearance(layout, origins[:, :2]).min():.2f} m from furniture at least")
+    nearest = floor_clearance(layout, origins[:, :2]).min()
+    say(f"{len(ids)} head poses of {len(np.unique(ids))} shoppers, at least {nearest:.2f} m from furniture")
     return path

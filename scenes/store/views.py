@@ -104,7 +104,8 @@ def transforms(camera: cameras.Pinhole, layout: Layout, frames: list) -> dict:
 
 
 def write_views(
-    layout: Layout, folder=BUILD, *, camera=None, train: int = 168, test: int = 12, spp: int = 64, seed: int = 0, scene=None, say=print
+    layout: Layout, folder=BUILD, *, camera=None, train: int = 168, test: int = 12, spp: int = 64, seed: int = 0,
+    scene=None, say=print,
 ) -> dict:
     """Choose, render and write the picture set into ``folder``; returns the coverage figures, also in ``coverage.json``.
 
@@ -131,9 +132,11 @@ def write_views(
         frames = []
         for k, pose in enumerate(poses):
             stem = f"{kind}_{k:03d}"
-            write_png(folder / "images" / f"{stem}.png", photographer.picture(pose, seed * 10_000 + done, spp if kind == "train" else 4 * spp))
+            picture = photographer.picture(pose, seed * 10_000 + done, spp if kind == "train" else 4 * spp)
+            write_png(folder / "images" / f"{stem}.png", picture)
             np.save(folder / "depth" / f"{stem}.npy", photographer.depth(pose))
-            frames.append({"file_path": f"images/{stem}.png", "depth_file_path": f"depth/{stem}.npy", "transform_matrix": pose.tolist()})
+            files = {"file_path": f"images/{stem}.png", "depth_file_path": f"depth/{stem}.npy"}
+            frames.append(files | {"transform_matrix": pose.tolist()})
             done += 1
             if done % 30 == 0:
                 say(f"  {done} of {train + test} views, {time.perf_counter() - start:.0f} s")
