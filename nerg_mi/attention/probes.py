@@ -105,17 +105,19 @@ def place_probes(
     from scipy.spatial import cKDTree
 
     tree = cKDTree(rays.origin)
+    within = tree.query_ball_point(queries, radius, return_length=True)
     # A block of queries at a time: the neighbours of thousands are millions.
-    kept, runs = [], []
-    for start in range(0, len(queries), 256):
-        block = queries[start : start + 256]
-        for i, found in enumerate(tree.query_ball_point(block, radius), start):
-            if len(found) >= min_rays:
-                found = np.array(found)
-                far = np.sum((rays.origin[found] - queries[i]) ** 2, axis=1)
-                runs.append(found[np.argsort(far, kind="stable")[:cap]])
-                kept.append(i)
-    if not kept:
+    kept, runs = np.flatnonzero(within >= min_rays), []
+    most = int(min(cap, within.max(initial=1)))
+    block = max(1, (1 << 20) // most)
+    for start in range(0, len(kept), block):
+        which = kept[start : start + block]
+        # A hair more than R, so that rounding loses none of those counted; the
+        # nearest so many are they.
+        bound = radius * (1.0 + 1e-9)
+        _, found = tree.query(queries[which], k=np.arange(1, most + 1), distance_upper_bound=bound)
+        runs += [near[: min(count, most)] for near, count in zip(found, within[which])]
+    if not len(kept):
         raise ValueError(
             f"none of {len(queries)} probes holds {min_rays} rays within {radius} m; enlarge the radius or lower min_rays"
         )
