@@ -8,6 +8,7 @@ mean is the business of :mod:`nerg_mi.attention.skeleton`.
 from __future__ import annotations
 
 import gzip
+import io
 import os
 from pathlib import Path
 from typing import IO, Iterator, NamedTuple, Sequence
@@ -122,7 +123,7 @@ def read_skeleton(path: str | os.PathLike) -> SkeletonRows:
 def _rows(path: object, ids: list[str], times: list[int], texts: list[str], lines: list[int]) -> SkeletonRows:
     # One conversion for the whole run; only when it fails is the line searched for.
     try:
-        values = np.array(",".join(texts).split(","), dtype=np.float64)
+        values = np.loadtxt(texts, delimiter=",", comments=None, dtype=np.float64, ndmin=2)
     except ValueError:
         for number, text in zip(lines, texts):
             for word in text.split(","):
@@ -145,6 +146,4 @@ def _open(path: str | os.PathLike, mode: str) -> IO[str]:
     if mode == "r":
         return gzip.open(path, "rt", encoding="utf-8")
     # mtime=0: equal poses give equal bytes, whenever they are written.
-    import io
-
     return io.TextIOWrapper(gzip.GzipFile(Path(path), "wb", mtime=0), encoding="utf-8", newline="\n")
