@@ -16,6 +16,9 @@ from . import llvm
 
 PLUGINS = (
     ("panorama", "sensor"),
+    ("nerf", "volume"),
+    ("gazefield", "volume"),
+    ("nerg", "integrator"),
 )
 """Name and kind of each plugin; the module `nerg_mi.plugins.<name>` registers it. Order: a plugin follows those it uses."""
 

@@ -21,13 +21,13 @@ LOG2 = 0.6931471805599453
 class MarchSettings:
     """Controls of a march; lengths in scene units.
 
-    ``step``: step length; ``step_growth``: steps are at least this share of the distance
+    ``step``: step length; ``dt_gamma``: steps are at least this share of the distance
     travelled (instant-ngp's cone stepping; 0: uniform); ``stop``: transmittance below which
     what lies behind is left out; ``color_cutoff``: samples of less weight get no colour.
     """
 
     step: float
-    step_growth: float = 0.0
+    dt_gamma: float = 0.0
     stop: float = 1e-6
     color_cutoff: float = 1e-4
 
@@ -68,9 +68,9 @@ class MarchResult:
 
 def step_length(t, settings: MarchSettings):
     """Length of the step that starts at ``t``."""
-    if settings.step_growth == 0:
+    if settings.dt_gamma == 0:
         return type(t)(settings.step)
-    return dr.maximum(t * settings.step_growth, settings.step)
+    return dr.maximum(t * settings.dt_gamma, settings.step)
 
 
 def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, color=None,
@@ -111,7 +111,7 @@ def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, 
             lit = active & (weight > settings.color_cutoff)
             total = total + weight * dr.if_stmt(
                 (features, p), lit,
-                lambda features, p: medium.color(features, p, ray.w, lit),
+                lambda features, p: color(medium.color(features, p, ray.w, lit)),
                 lambda features, p: dr.zeros(color),
                 label="colour",
             )

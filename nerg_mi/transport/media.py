@@ -160,12 +160,9 @@ class VolumeMedium:
         near, far = intersect_box(o, d, self._lower, self._upper)
         return LocalRay(o, d, d, near, far)
 
-    def _at(self, p, w=None):
+    def _at(self, p):
         it = dr.zeros(self._interaction)
         it.p = p
-        it.t = 0
-        if w is not None:
-            it.wi = -w
         return it
 
     def density(self, p, active):
@@ -176,7 +173,7 @@ class VolumeMedium:
         return self.density(p, active), []
 
     def color(self, features, p, w, active):
-        return self._color.eval(self._at(p, w), active)
+        return self._color.eval(self._at(p), active)
 
 
 class GazeMedium:

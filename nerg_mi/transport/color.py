@@ -1,0 +1,26 @@
+"""From composited samples to linear radiance."""
+from __future__ import annotations
+
+import drjit as dr
+
+
+def srgb_to_linear(c):
+    """Inverse of the sRGB transfer function (IEC 61966-2-1), per component."""
+    low = c <= 0.04045
+    return dr.select(low, c / 12.92, dr.power((dr.select(low, 1, c) + 0.055) / 1.055, 2.4))
+
+
+def composite_to_linear(total, alpha, color_space: str):
+    """α lin(C / α) as a spectrum of the variant in use; 0, with finite gradients, where α = 0.
+
+    ``total``: weighted sum C of the samples' colours in ``color_space``: ``srgb``, ``linear``
+    (rgb, Color3f), or ``spectrum`` (already in the variant's own).
+    """
+    import mitsuba as mi
+
+    if color_space == "spectrum":
+        return total
+    if color_space == "srgb":
+        some = alpha > 0
+        total = dr.select(some, alpha * srgb_to_linear(total / dr.select(some, alpha, 1)), 0)
+    return mi.Spectrum(mi.luminance(total)) if mi.is_monochromatic else mi.Spectrum(total)

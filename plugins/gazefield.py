@@ -1,0 +1,95 @@
+r"""
+.. _volume-gazefield:
+
+Trained gaze field (:monosp:`gazefield`)
+----------------------------------------
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - Checkpoint (safetensors) written by ``nerg train gaze`` or ``nerg_mi.formats.fields.save_gaze``.
+     Relative names are looked up beside the scene file.
+
+ * - to_world
+   - |transform|
+   - A rotation, a uniform scale and a translation that place the field in the scene; it should be that of the radiance
+     field. Densities over directions do not change with scale. (Default: none)
+
+ * - grid.table, position_net.0, ..., direction_net.0, ..., emit_head.0, capture_head.0
+   - |tensor|
+   - Hash grid features and the weight matrices of the trunk and of the two heads.
+   - |exposed|, |differentiable|
+
+How much surfaces attract an observer: equation 1 of the paper,
+:math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o) \cdot \mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions
+around the observer. It is the ``gaze`` of the integrator :ref:`nerg <integrator-nerg>`; having two positions for an
+argument, it cannot be evaluated as a plain volume.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: gazefield-volume
+
+        <volume type="gazefield" name="gaze">
+            <string name="filename" value="shoppers.safetensors"/>
+        </volume>
+
+    .. code-tab:: python
+
+        'gaze': {
+            'type': 'gazefield',
+            'filename': 'shoppers.safetensors'
+        }
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from nerg_mi.field.backend import namespace
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.registration import register
+from nerg_mi.transport.media import GazeMedium, Similarity
+
+
+class GazeFieldVolume(mi.Volume):
+    __doc__ = __doc__
+
+    def __init__(self, props):
+        super().__init__(props)
+        if "filename" not in props:
+            raise ValueError('the volume "gazefield" needs "filename", the checkpoint of a gaze field')
+        self.filename = str(mi.file_resolver().resolve(props["filename"]))
+        to_world = props.get("to_world", mi.ScalarTransform4f())
+        self.field, self.metadata = load_gaze(self.filename, namespace(mi.variant()))
+        self._similarity = Similarity(to_world.matrix)
+
+    def gaze_medium(self) -> GazeMedium:
+        """The gaze field as the integrator sees it."""
+        return GazeMedium(self.field, self._similarity)
+
+    def bbox(self):
+        lower, upper = self._similarity.bounds(self.field.box.lower, self.field.box.upper)
+        return mi.ScalarBoundingBox3f(lower.tolist(), upper.tolist())
+
+    def channel_count(self):
+        return 1
+
+    def traverse(self, cb):
+        for name, value in self.field.parameters().items():
+            cb.put(name, value, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys=()):
+        self.field.pack()
+
+    def to_string(self):
+        c = self.field.config
+        return (
+            f"GazeFieldVolume[\n  filename = {self.filename},\n  variant = {c.variant},\n"
+            f"  activation = {c.activation},\n"
+            f"  grid = {c.grid.levels} x {c.grid.features}, 2^{c.grid.log2_rows} rows, "
+            f"{c.grid.base} to {c.grid.finest}\n]"
+        )
+
+
+register("volume", "gazefield", GazeFieldVolume)

@@ -1,0 +1,416 @@
+r"""
+.. _integrator-nerg:
+
+Neural radiance and gaze fields (:monosp:`nerg`)
+------------------------------------------------
+
+.. pluginparameters::
+
+ * - field
+   - :paramtype:`volume`
+   - A trained radiance field (:ref:`nerf <volume-nerf>`): density and colour. Either this or ``density``.
+
+ * - density, color
+   - :paramtype:`volume`
+   - Any Mitsuba volumes: density in 1 / scene unit (first channel), and colour (optional; black without it). Outside of
+     the bounding box of ``density`` there is vacuum.
+
+ * - gaze
+   - :paramtype:`volume`
+   - A trained gaze field (:ref:`gazefield <volume-gazefield>`). Without it no gaze is computed.
+
+ * - observer
+   - :paramtype:`sensor`
+   - Whose gaze it is; only its position counts. Without it the observer is the centre of the rendering camera, and an
+     observer placed exactly there gives the same picture. Cameras without a centre (orthographic, say) need one.
+   - |exposed|
+
+ * - occlusion
+   - |bool|
+   - Hide gaze on surfaces that the observer cannot see. Not needed, and not computed, while the observer is the camera.
+     (Default: true)
+
+ * - falloff
+   - |float|
+   - :math:`d_f`, in scene units: how far behind what the observer sees gaze fades to zero; 0 is a hard edge.
+     (Default: 0.1)
+   - |exposed|, |differentiable|
+
+ * - tolerance
+   - |float|
+   - How far behind what the observer sees a surface may lie and still be the same one, in scene units; 0 stands for two
+     march steps. (Default: 0)
+
+ * - depth
+   - |string|
+   - ``expected`` (mean distance of absorption) or ``median`` (where half of the ray's own opacity is reached). The
+     surface that gaze is evaluated on lies at this depth. (Default: ``expected``)
+
+ * - surface_opacity
+   - |float|
+   - Opacity from which on a ray is said to meet a surface; position, gaze and visibility are 0 below it. (Default: 0.5)
+
+ * - radiance
+   - |bool|
+   - false computes no colour: the image is black, the AOVs are unchanged. (Default: true)
+
+ * - background
+   - |float| or |rgb|
+   - Linear radiance behind everything; an environment emitter of the scene takes its place. (Default: 0)
+
+ * - aovs
+   - |string|
+   - Comma-separated list, in the order wanted; see below. What is not asked for is not computed.
+     (Default: ``depth,opacity``)
+
+ * - step
+   - |float|
+   - March step in scene units; 0 stands for the one that the field was trained with, or for a 1024th of the medium's
+     diagonal. (Default: 0)
+
+ * - dt_gamma
+   - |float|
+   - Steps are at least this share of the distance travelled. (Default: 0, i.e. uniform steps)
+
+ * - stop
+   - |float|
+   - Transmittance below which what lies behind is left out. (Default: 1e-6)
+
+ * - color_cutoff
+   - |float|
+   - Samples that contribute less than this weight get no colour. (Default: 1e-4)
+
+ * - jitter
+   - |bool|
+   - Shift the steps of each sample by a random share of a step. (Default: false)
+
+This integrator marches a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that each ray
+meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper), with
+:math:`p_o` the observer, :math:`r_o` the direction to the surface and :math:`p_{od}` the surface that the *observer*
+meets along it. For an observer who is not the camera, a second, density-only march from :math:`p_o` finds
+:math:`p_{od}` and the visibility :math:`1 - \mathrm{clip}((d_{o*} - d_o - \mathrm{tolerance}) / d_f, 0, 1)` that gaze is
+multiplied with.
+
+AOVs (0 where nothing is met):
+
+- ``depth`` (``depth.T``): distance along the ray from the ray's origin, wherever opacity > 0
+- ``opacity`` (``.Y``): 1 - transmittance
+- ``position`` (``.X .Y .Z``): the surface :math:`p_d`
+- ``gaze`` (``.Y``): density in 1/sr of the observer attending this surface, after occlusion
+- ``emit``, ``capture`` (``.Y``): the two factors after their activations; 1 for one that the variant lacks
+- ``visibility`` (``.Y``): 1 visible to the observer .. 0 hidden
+- ``observer_depth`` (``.T``): :math:`d_o`; the distance to the surface where no occlusion is computed
+- ``density_evals``, ``color_evals``, ``gaze_evals`` (``.Y``): evaluations made for the pixel
+
+Colours are composited in the colour space that the field was trained in, then converted to linear:
+:math:`L = \alpha\,\mathrm{lin}(C / \alpha) + (1 - \alpha) L_{behind}`. Mono variants receive the luminance. The film's
+alpha is 1 wherever opacity > 0; use the ``opacity`` AOV for the fractional one.
+
+Use a box filter and ``component_format`` ``float32`` for AOVs: other filters blend depths across edges, and fp16 rounds
+them. With a box filter equal seeds give equal pictures to the bit.
+
+Derivatives reach field and gaze weights, volumes, ``falloff``, camera and observer positions. They do not see the edges
+of visibility, nor where marching starts and stops. Shapes in the scene are not rendered: a warning says so.
+Spectral and polarized variants are not supported.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: nerg-integrator
+
+        <integrator type="nerg" id="integrator">
+            <volume name="field" type="nerf">
+                <string name="filename" value="store.safetensors"/>
+            </volume>
+            <volume name="gaze" type="gazefield">
+                <string name="filename" value="shoppers.safetensors"/>
+            </volume>
+            <sensor name="observer" type="perspective">
+                <transform name="to_world">
+                    <lookat origin="2, 1, 1.6" target="4, 3, 1.4" up="0, 0, 1"/>
+                </transform>
+            </sensor>
+            <float name="falloff" value="0.3"/>
+            <string name="aovs" value="depth,opacity,gaze,visibility"/>
+        </integrator>
+
+    .. code-tab:: python
+
+        'type': 'nerg',
+        'density': {'type': 'constvolume', 'value': 3.0},
+        'depth': 'median',
+        'aovs': 'depth,opacity'
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from nerg_mi.registration import register
+from nerg_mi.transport import viewpoint
+from nerg_mi.transport.color import composite_to_linear
+from nerg_mi.transport.depth import KINDS, surface_depth
+from nerg_mi.transport.march import MarchSettings, march
+from nerg_mi.transport.media import VolumeMedium
+from nerg_mi.transport.visibility import visibility
+
+CHANNELS = {
+    "depth": "T", "opacity": "Y", "position": "XYZ", "gaze": "Y", "emit": "Y", "capture": "Y", "visibility": "Y",
+    "observer_depth": "T", "density_evals": "Y", "color_evals": "Y", "gaze_evals": "Y",
+}
+_GAZE_AOVS = {"gaze", "emit", "capture", "gaze_evals"}
+_OBSERVER_AOVS = {"visibility", "observer_depth"}
+
+
+class NergIntegrator(mi.SamplingIntegrator):
+    __doc__ = __doc__
+
+    def __init__(self, props):
+        super().__init__(props)
+        if mi.is_spectral or mi.is_polarized:
+            raise ValueError(
+                f'"nerg" renders rgb and mono variants, not "{mi.variant()}": radiance fields are trained on rgb photos; '
+                'call mi.set_variant("llvm_ad_rgb")'
+            )
+        field, density, color = (props.get(k, None) for k in ("field", "density", "color"))
+        gaze, observer = props.get("gaze", None), props.get("observer", None)
+        self.medium = _medium(field, density, color)
+        if gaze is not None and not hasattr(gaze, "gaze_medium"):
+            raise ValueError('"gaze" must be a volume of type "gazefield"')
+        if observer is not None and not isinstance(observer, mi.Sensor):
+            raise ValueError('"observer" must be a sensor; its to_world places the observer')
+        self._children = {"field": field, "density": density, "color": color, "gaze": gaze, "observer": observer}
+        self.gaze = None if gaze is None else gaze.gaze_medium()
+        self.observer = observer
+        if observer is not None:
+            viewpoint.require_center(observer, '"observer"')
+
+        self.occlusion = bool(props.get("occlusion", True))
+        self.falloff = mi.Float(_number(props, "falloff", 0.1, low=0))
+        self.tolerance = _number(props, "tolerance", 0, low=0)
+        self.depth_kind = _choice(props, "depth", "expected", KINDS)
+        self.surface_opacity = _number(props, "surface_opacity", 0.5, low=0, high=1)
+        self.radiance = bool(props.get("radiance", True))
+        self.background = _background(props)
+        self.aovs = _aovs(props.get("aovs", "depth,opacity"), gaze is not None)
+        self.jitter = bool(props.get("jitter", False))
+        step = _number(props, "step", 0, low=0)
+        self.settings = MarchSettings(
+            step=step or self.medium.step or self.medium.length_scale / 1024,
+            dt_gamma=_number(props, "dt_gamma", 0, low=0, high=1),
+            stop=_number(props, "stop", 1e-6, low=0, high=1),
+            color_cutoff=_number(props, "color_cutoff", 1e-4, low=0, high=1),
+        )
+        # The sensors of the render in progress; None when another integrator drives ours.
+        self._sensors = None
+        self._warned = False
+
+    # ------------------------------------------------------------------------
+    # Mitsuba's interface
+    # ------------------------------------------------------------------------
+
+    def aov_names(self):
+        return [f"{name}.{c}" for name in self.aovs for c in CHANNELS[name]]
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        if isinstance(sensor, int):
+            sensor = scene.sensors()[sensor]
+        if not self._warned and len(scene.shapes()) > 0:
+            self._warned = True
+            mi.Log(mi.LogLevel.Warn, f'"nerg" does not render the {len(scene.shapes())} shapes of this scene.')
+        self._sensors = [sensor]
+        try:
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+        finally:
+            self._sensors = None
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        active = mi.Bool(active)
+        offset = sampler.next_1d(active) if self.jitter else None
+        asked = set(self.aovs)
+        count = bool(asked & {"density_evals", "color_evals"})
+
+        # ---------------------- The camera's ray ----------------------------
+        local = self.medium.local(ray.o, ray.d)
+        t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, ray.maxt)
+        lit = self.radiance and self.medium.has_color
+        result = march(
+            self.medium, local, t0, t1, active, self.settings, offset=offset, count=count,
+            color=_color_type(self.medium) if lit else None,
+        )
+        alpha = result.opacity
+        some = active & (alpha > 0)
+        out = {"opacity": dr.select(active, alpha, 0)}
+        if asked - {"opacity", "density_evals", "color_evals"}:
+            out["depth"] = dr.select(
+                some, surface_depth(self.depth_kind, result, self.medium, local, t0, t1, some, self.settings), 0
+            )
+
+        # ---------------------- The surface and its gaze ---------------------
+        density_evals = result.density_evals
+        if asked & (_GAZE_AOVS | _OBSERVER_AOVS | {"position"}):
+            surface = some & (alpha >= self.surface_opacity)
+            p_d = ray.o + ray.d * out["depth"]
+            out["position"] = dr.select(surface, p_d, 0)
+            if asked & (_GAZE_AOVS | _OBSERVER_AOVS):
+                more = self._gaze(scene, ray, p_d, surface, asked, count, out)
+                density_evals = density_evals + more if count else None
+        out["density_evals"], out["color_evals"] = density_evals, result.color_evals
+        if count and not lit:
+            out["color_evals"] = mi.Float(0)
+
+        # ---------------------- Colour ---------------------------------------
+        L = mi.Spectrum(0)
+        if self.radiance:
+            L = (1 - alpha) * self._behind(scene, ray, active)
+            if lit:
+                L += composite_to_linear(result.color, alpha, self.medium.color_space)
+        aovs = [c for name in self.aovs for c in (out[name] if name == "position" else [out[name]])]
+        return dr.select(active, L, 0), some, aovs
+
+    def traverse(self, cb):
+        for name, child in self._children.items():
+            if child is not None:
+                cb.put(name, child, mi.ParamFlags.Differentiable)
+        cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
+
+    def parameters_changed(self, keys=()):
+        if not dr.all(self.falloff >= 0):
+            raise ValueError(f'"falloff" must not be negative, got {self.falloff}')
+
+    def to_string(self):
+        s = self.settings
+        body = {k: str(v).replace("\n", "\n  ") for k, v in self._children.items() if v is not None and k != "observer"}
+        if self.observer is not None:
+            body["observer"] = viewpoint.center(self.observer)
+        body |= {
+            "occlusion": self.occlusion, "falloff": self.falloff, "tolerance": self.tolerance or "2 steps",
+            "depth": self.depth_kind, "surface_opacity": self.surface_opacity, "radiance": self.radiance,
+            "aovs": ",".join(self.aovs), "step": s.step, "dt_gamma": s.dt_gamma, "stop": s.stop,
+            "color_cutoff": s.color_cutoff, "jitter": self.jitter,
+        }
+        return "NergIntegrator[\n" + "".join(f"  {k} = {v},\n" for k, v in body.items()) + "]"
+
+    # ------------------------------------------------------------------------
+    # The observer
+    # ------------------------------------------------------------------------
+
+    def _gaze(self, scene, ray, p_d, surface, asked, count, out):
+        """Add the AOVs that depend on the observer to ``out``; returns the density evaluations made."""
+        sensors = self._sensors or scene.sensors()
+        if self.observer is None:
+            p_o = viewpoint.center_of_ray(sensors, ray)
+            aligned = True
+        else:
+            p_o = viewpoint.center(self.observer)
+            aligned = viewpoint.same_center(sensors, p_o)
+
+        v = p_d - p_o
+        distance = dr.norm(v)
+        # An observer exactly on the surface has no direction to it; any one will do, and is finite.
+        apart = distance > 0
+        r_o = dr.select(apart, v / dr.select(apart, distance, 1), mi.Vector3f(0, 0, 1))
+
+        p_od, d_o, seen, evals = p_d, distance, mi.Float(1), mi.Float(0)
+        if self.occlusion and not aligned:
+            p_od, d_o, seen, evals = self._observe(p_d, p_o, r_o, distance, surface, count)
+        out["visibility"] = dr.select(surface, seen, 0)
+        out["observer_depth"] = dr.select(surface, d_o, 0)
+
+        if asked & _GAZE_AOVS:
+            # Where the observer cannot see, the product is 0 and is not computed.
+            attended = surface & (seen > 0)
+            gaze, emit, capture = self.gaze.evaluate(p_od, p_o, r_o, attended if asked <= {"gaze"} else surface)
+            out["gaze"] = dr.select(attended, gaze * seen, 0)
+            out["emit"], out["capture"] = dr.select(surface, emit, 0), dr.select(surface, capture, 0)
+            out["gaze_evals"] = dr.select(surface, 2.0 if self.gaze.field.config.variant == "emit_capture" else 1.0, 0.0)
+        return evals
+
+    def _observe(self, p_d, p_o, r_o, distance, surface, count):
+        """What the observer meets towards ``p_d``: ``(p_od, d_o, visibility, density evaluations)``."""
+        local = self.medium.local(p_o, r_o)
+        t0, t1 = dr.maximum(local.t_near, 0), local.t_far
+        result = march(self.medium, local, t0, t1, surface, self.settings, count=count)
+        met = surface & (result.opacity >= self.surface_opacity)
+        depth = surface_depth(self.depth_kind, result, self.medium, local, t0, t1, surface, self.settings)
+        # An observer who meets nothing sees the point itself.
+        d_o = dr.select(met, depth, distance)
+        tolerance = self.tolerance or 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * distance)
+        seen = visibility(distance, d_o, self.falloff, tolerance)
+        return p_o + r_o * d_o, d_o, seen, result.density_evals
+
+    def _behind(self, scene, ray, active):
+        """Radiance behind everything: the scene's environment, else the background."""
+        environment = scene.environment()
+        if environment is None or self.hide_emitters:
+            return self.background
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi, si.wavelengths = -ray.d, ray.wavelengths
+        return environment.eval(si, active)
+
+
+# ----------------------------------------------------------------------------
+# Reading the properties
+# ----------------------------------------------------------------------------
+
+
+def _medium(field, density, color):
+    if (field is None) == (density is None):
+        raise ValueError('"nerg" needs either "field" (a volume of type "nerf") or "density" (any volume), and not both')
+    if field is not None:
+        if color is not None:
+            raise ValueError('"color" goes with "density"; a "field" brings its own colour')
+        if not hasattr(field, "medium"):
+            raise ValueError('"field" must be a volume of type "nerf"; give other volumes as "density" and "color"')
+        return field.medium()
+    for name, volume in (("density", density), ("color", color)):
+        if volume is not None and not isinstance(volume, mi.Volume):
+            raise ValueError(f'"{name}" must be a volume')
+    return VolumeMedium(density, color)
+
+
+def _number(props, name, default, low=-math.inf, high=math.inf):
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f'"{name}" must be a number, got {value!r}')
+    if not (math.isfinite(value) and low <= value <= high):
+        raise ValueError(f'"{name}" must lie in {low:g} .. {high:g}, got {value}')
+    return float(value)
+
+
+def _choice(props, name, default, choices):
+    value = props.get(name, default)
+    if value not in choices:
+        raise ValueError(f'"{name}" must be one of {", ".join(choices)}, got "{value}"')
+    return value
+
+
+def _aovs(text, has_gaze):
+    names = [n.strip() for n in text.split(",") if n.strip()]
+    for name in names:
+        if name not in CHANNELS:
+            raise ValueError(f'"aovs" does not know "{name}"; it knows {", ".join(CHANNELS)}')
+        if name in _GAZE_AOVS and not has_gaze:
+            raise ValueError(f'"aovs" asks for "{name}", which needs a "gaze" volume')
+    if len(set(names)) < len(names):
+        raise ValueError(f'"aovs" names something twice: "{text}"')
+    return names
+
+
+def _background(props):
+    value = props.get("background", 0.0)
+    if hasattr(value, "eval_3"):  # a texture: what dict scenes make of {'type': 'rgb'}
+        value = value.eval_3(dr.zeros(mi.SurfaceInteraction3f))
+    rgb = mi.Color3f(value)
+    if not dr.all(dr.isfinite(rgb) & (rgb >= 0), axis=None):
+        raise ValueError(f'"background" must be finite and not negative, got {value}')
+    return mi.Spectrum(mi.luminance(rgb)) if mi.is_monochromatic else mi.Spectrum(rgb)
+
+
+def _color_type(medium):
+    return mi.Spectrum if medium.color_space == "spectrum" else mi.Color3f
+
+
+register("integrator", "nerg", NergIntegrator)
