@@ -91,8 +91,14 @@ def read_image(path: str | Path) -> np.ndarray:
     except RuntimeError as e:
         raise ValueError(f'the image "{path}" cannot be read: {str(e).strip().splitlines()[-1]}') from e
     alpha = bitmap.has_alpha()
-    pixels = mi.Bitmap.PixelFormat.RGBA if alpha else mi.Bitmap.PixelFormat.RGB
-    out = np.array(bitmap.convert(pixels, mi.Struct.Type.Float32, srgb_gamma=True), np.float32)
+    formats = (mi.Bitmap.PixelFormat.RGB, mi.Bitmap.PixelFormat.RGBA)
+    most = {mi.Struct.Type.UInt8: 255, mi.Struct.Type.UInt16: 65535}.get(bitmap.component_format())
+    if most is not None and bitmap.srgb_gamma() and bitmap.pixel_format() in formats:
+        # The usual case needs no conversion, which Mitsuba would make by way of linear values.
+        out = np.array(bitmap).astype(np.float32) / most
+    else:
+        pixels = formats[alpha]
+        out = np.array(bitmap.convert(pixels, mi.Struct.Type.Float32, srgb_gamma=True), np.float32)
     if not np.all(np.isfinite(out)):
         raise ValueError(f'the image "{path}" holds values that are not finite')
     return np.clip(out, 0, 1)

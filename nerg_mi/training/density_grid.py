@@ -29,16 +29,12 @@ class DensityGrid:
         self.ns, self.box, self.resolution, self.step, self.threshold = ns, box, resolution, step, threshold
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
-        self.seen = self._seen(cameras, min_views)
-        if not dr.any(self.seen):
+        self._allow(self._seen(cameras, min_views))
+        if self.seen_count == 0:
             raise ValueError(
                 f"not one cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
                 "give a box that holds what the pictures show with --aabb"
             )
-        self.seen_count = int(dr.count(self.seen)[0])
-        self.value = dr.select(self.seen, ns.Float(1), 0)
-        self.bits = dr.select(self.seen, ns.UInt8(1), 0)
-        dr.eval(self.value, self.bits)
         self._turn = 0
 
     def _corner(self, index):
@@ -48,6 +44,11 @@ class DensityGrid:
         y = index // r - z * r
         x = index - (z * r + y) * r
         return self.ns.Array3f(x, y, z) / r
+
+    def _point(self, index, rng: np.random.Generator, stratum=0, parts: int = 1):
+        """A random world point in each cell, in part ``stratum`` of ``parts`` an axis."""
+        jitter = self.ns.Array3f(*[self.ns.Float(rng.random(dr.width(index), np.float32)) for _ in range(3)])
+        return self._to_world(self._corner(index) + (stratum + jitter) / (parts * self.resolution))
 
     def _to_world(self, u):
         return (u - 0.5) * self.box.side + self.ns.Array3f(*self.box.center)
@@ -60,13 +61,13 @@ class DensityGrid:
         Float, UInt32 = self.ns.Float, self.ns.UInt32
         p = self._to_world(self._corner(self.index) + 0.5 / self.resolution)
         cell = self.box.side / self.resolution
-        center, half = np.asarray(self.box.center), (np.subtract(self.box.upper, self.box.lower) + cell) / 2
-        inside = dr.all(dr.abs(p - self.ns.Array3f(*center)) < self.ns.Array3f(*half))
+        half = ((np.subtract(self.box.upper, self.box.lower) + cell) / 2).tolist()
+        inside = dr.all(dr.abs(p - self.ns.Array3f(*self.box.center)) < self.ns.Array3f(*half))
         count = dr.zeros(UInt32, self.resolution**3)
         dr.eval(p, inside)
         for camera in cameras:
             i = camera.intrinsics
-            rows = [Float(v) for v in np.vstack([camera.to_world[:3, :3].T.ravel(), ]).ravel()]
+            rows = [Float(v) for v in camera.to_world[:3, :3].T.ravel()]
             origin = [Float(v) for v in camera.center]
             edge = [Float(v) for v in (i.cx / i.fx, (i.width - i.cx) / i.fx, i.cy / i.fy, (i.height - i.cy) / i.fy)]
             # As literals the pose would compile one kernel a camera.
@@ -79,6 +80,31 @@ class DensityGrid:
             dr.eval(count)
         return inside & (count >= min(min_views, len(cameras)))
 
+    def carve(self, points) -> None:
+        """Keep only the cells that hold or touch one of the surface points: ``points`` yields Array3f (world).
+
+        For depth that is exact and known at every pixel: all that a camera can see lies on those points.
+        """
+        from scipy.ndimage import binary_dilation
+
+        r = self.resolution
+        found = dr.zeros(self.ns.UInt8, r**3)
+        for p in points:
+            u = (p - self.ns.Array3f(*self.box.center)) / self.box.side + 0.5
+            c = [self.ns.UInt32(dr.clip(x * r, 0, r - 1)) for x in (u.x, u.y, u.z)]
+            dr.scatter(found, self.ns.UInt8(1), c[0] + r * (c[1] + r * c[2]))
+            dr.eval(found)
+        near = binary_dilation(found.numpy().reshape(r, r, r) > 0, np.ones((3, 3, 3)))
+        self._allow(self.seen & self.ns.Bool(near.ravel()))
+
+    def _allow(self, cells) -> None:
+        """Restrict samples to ``cells`` (mask), all of which count as occupied until they are looked at."""
+        self.seen = cells
+        self.seen_count = int(dr.count(cells)[0])
+        self.value = dr.zeros(self.ns.Float, self.resolution**3)
+        self.bits = dr.select(cells, self.ns.UInt8(1), 0)
+        dr.eval(self.seen, self.value, self.bits)
+
     def occupied(self, p, active):
         """Mask of the points ``p`` (Array3f, world) in cells that may hold density."""
         r = self.resolution
@@ -86,18 +112,21 @@ class DensityGrid:
         c = [self.ns.UInt32(dr.clip(x * r, 0, r - 1)) for x in (u.x, u.y, u.z)]
         return active & (dr.gather(self.ns.UInt8, self.bits, c[0] + r * (c[1] + r * c[2]), active) > 0)
 
-    def update(self, density, rng: np.random.Generator) -> None:
-        """Look at one random point in an eighth of the cells; ``density``: σ at world points, without gradient."""
-        total = self.resolution**3
-        index = dr.arange(self.ns.UInt32, total // _PARTS) * _PARTS + dr.opaque(self.ns.UInt32, self._turn % _PARTS)
-        self._turn += 1
+    def update(self, density, rng: np.random.Generator, everywhere: bool = False) -> None:
+        """Look at one random point in an eighth of the cells, or in all of them.
+
+        ``density``: σ at world points (Array3f, mask), without gradient.
+        """
+        parts = 1 if everywhere else _PARTS
+        index = dr.arange(self.ns.UInt32, self.resolution**3 // parts) * parts
+        index += dr.opaque(self.ns.UInt32, self._turn % parts)
+        self._turn += not everywhere
         index = dr.gather(self.ns.UInt32, index, dr.compress(dr.gather(self.ns.Bool, self.seen, index)))
         if dr.width(index) > 0:
-            jitter = self.ns.Array3f(*[self.ns.Float(rng.random(dr.width(index), np.float32)) for _ in range(3)])
-            p = self._to_world(self._corner(index) + jitter / self.resolution)
-            found = density(p, True) * self.step
             # Beyond some optical depth more says nothing, and would drown the mean.
-            value = dr.maximum(dr.gather(self.ns.Float, self.value, index) * _DECAY, dr.minimum(found, 10))
+            value = dr.minimum(density(self._point(index, rng), True) * self.step, 10)
+            if not everywhere:
+                value = dr.maximum(dr.gather(self.ns.Float, self.value, index) * _DECAY, value)
             dr.scatter(self.value, value, index, mode=dr.ReduceMode.Permute)
             dr.eval(self.value)
         mean = dr.sum(self.value) / self.seen_count
@@ -126,9 +155,7 @@ class DensityGrid:
                 break
             stratum = self.ns.Array3f(k % probes, k // probes % probes, k // probes**2)
             dr.make_opaque(stratum)
-            jitter = self.ns.Array3f(*[self.ns.Float(rng.random(dr.width(index), np.float32)) for _ in range(3)])
-            p = self._to_world(self._corner(index) + (stratum + jitter) / (probes * self.resolution))
-            hit = dr.compress(density(p, True) > limit)
+            hit = dr.compress(density(self._point(index, rng, stratum, probes), True) > limit)
             if dr.width(hit) > 0:
                 dr.scatter(found, self.ns.UInt8(1), dr.gather(self.ns.UInt32, index, hit))
                 dr.eval(found)

@@ -11,8 +11,9 @@ from ..field.radiance import RadianceConfig, density_from_log, sigmoid
 
 
 def stack(rows: list, ns):
-    """Rows (Floats of one length) as a TensorXf (rows, N)."""
-    return ns.TensorXf(dr.ravel(ns.ArrayXf(rows), order="C"), (len(rows), dr.width(rows[0])))
+    """Rows (Floats of one length, or constants) as a TensorXf (rows, N)."""
+    flat = dr.ravel(ns.ArrayXf(rows), order="C")
+    return ns.TensorXf(flat, (len(rows), dr.width(flat) // len(rows)))
 
 
 def unstack(x, ns) -> list:
@@ -30,7 +31,7 @@ def unstack(x, ns) -> list:
 def density_color(config: RadianceConfig, box: Box, parameters: dict, p, d, ns):
     """Density (1/unit) and colour (list of 3 Floats in 0..1) at world points ``p`` seen along ``d``.
 
-    The same maths as ``RadianceField.density_color`` on ``parameters`` spelt as the field spells them; points
+    The same maths as ``RadianceField.density_features`` and ``color`` on ``parameters`` spelt as the field spells them; points
     must lie in ``box``. Gradients reach every entry of ``parameters``.
     """
     def net(name):

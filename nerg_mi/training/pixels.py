@@ -39,6 +39,7 @@ class PixelBank:
                 d = pixel_directions(i).reshape(-1, 3)
                 tables[i] = (d[:, :2] / -d[:, 2:]).astype(np.float32)
             directions.append(tables[i])
+        self.centers = np.array([v.camera.center for v in views])
         self._frame = ns.UInt32(frame)
         self._xy = ns.Float(np.concatenate(directions).ravel())
         self._pose = ns.Float(np.concatenate([v.camera.to_world[:3].ravel() for v in views]).astype(np.float32))
@@ -51,6 +52,7 @@ class PixelBank:
             depth = [(v.depth if v.depth is not None else np.zeros(v.color.shape[:2])).ravel() for v in views]
             self._depth = ns.Float(np.concatenate(depth).astype(np.float32))
         self.has_depth = self._depth is not None
+        self.depth_everywhere = self.has_depth and bool(dr.all(self._depth > 0))
 
     def batch(self, index) -> PixelBatch:
         """Rays and colours of the pixels at ``index`` (UInt32)."""
@@ -66,3 +68,11 @@ class PixelBank:
         depth = None if self._depth is None else dr.gather(ns.Float, self._depth, index)
         dr.eval(o, d, rgb, alpha, depth)
         return PixelBatch(o, d, rgb, alpha, depth)
+
+    def surface_points(self, chunk: int = 2**20):
+        """The points (Array3f, world) that the pixels with depth see, ``chunk`` pixels at a time."""
+        for first in range(0, self.size, chunk):
+            index = dr.arange(self.ns.UInt32, min(chunk, self.size - first)) + dr.opaque(self.ns.UInt32, first)
+            pixels = self.batch(index)
+            known = dr.compress(pixels.depth > 0)
+            yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)

@@ -1,0 +1,158 @@
+"""Training a radiance field on posed pictures.
+
+instant-ngp's training (Müller et al. 2022) in Dr.Jit, arranged for the CPU backend: rays march a grid
+of occupied cells with true steps; a density-only pass drops what lies behind opaque surfaces; what remains
+is packed into batches of constant size, the number of rays adapting; networks run as tensor products.
+"""
+from __future__ import annotations
+
+import time
+
+import drjit as dr
+import numpy as np
+from drjit.opt import Adam
+
+from ..capture.images import View
+from ..field.box import Box
+from ..field.radiance import RadianceConfig, RadianceField
+from .density_grid import DensityGrid
+from .losses import color_loss, composite, depth_loss
+from .model import density_color
+from .pixels import PixelBank
+from .preview import psnr, render_view
+from .sampling import StepTable, rays_in_box, visible_samples
+from .settings import RadianceSettings
+
+# The density pass may run on weights a few steps old: it only decides which samples are worth a look.
+_REFRESH = 4
+_MAX_RAYS = 2**14
+
+
+class RadianceTrainer:
+    """One run: state, ``step()``, and ``field()`` for what it has come to.
+
+    ``views``: the training pictures; ``box``: where density may be, in their coordinates; ``depth``: supervise with
+    the views' depth. Equal seeds draw equal rays; sums over threads are not ordered, so that weights agree
+    between runs to rounding (and bit for bit only with one thread).
+    """
+
+    def __init__(self, views: list[View], box: Box, config: RadianceConfig, settings: RadianceSettings, ns,
+                 depth: bool = True):
+        if not views:
+            raise ValueError("there are no pictures to train on")
+        self.config, self.settings, self.box, self.ns = config, settings, box, ns
+        self.rng = np.random.default_rng(settings.seed)
+        self.pixels = PixelBank(ns, views)
+        self.use_depth = depth and self.pixels.has_depth
+        self.live = RadianceField.random(config, box, ns, settings.seed)
+        self.optimiser = Adam(settings.learning_rate, self.live.parameters(), beta_2=0.99, epsilon=1e-15)
+        self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.live.parameters().items()}
+        self.march_step = settings.march_step * box.side
+        self.grid = DensityGrid(ns, box, settings.resolution, self.march_step, [v.camera for v in views],
+                                settings.min_views)
+        if self.use_depth and self.pixels.depth_everywhere:
+            self.grid.carve(self.pixels.surface_points())
+        self.grid.update(self.density, self.rng, everywhere=True)
+        self._tables: dict[int, StepTable] = {}
+        self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
+        self._started = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since the run began."""
+        return time.perf_counter() - self._started
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0..1."""
+        s = self.settings
+        return min(1.0, self.steps / s.steps if s.steps is not None else self.seconds / (60 * s.minutes))
+
+    def table(self, stride: int = 1) -> StepTable:
+        """Step edges ``stride`` times as coarse as the finest."""
+        if stride not in self._tables:
+            s, side = self.settings, self.box.side
+            self._tables[stride] = StepTable(self.ns, s.near * side, self._far(), stride * self.march_step,
+                                             stride * s.growth)
+        return self._tables[stride]
+
+    def _far(self) -> float:
+        """The farthest that a training camera can be from a point of the box."""
+        corners = np.array([[b[i] for i, b in zip(k, zip(self.box.lower, self.box.upper))]
+                            for k in np.ndindex(2, 2, 2)])
+        return float(max(np.linalg.norm(corners - c, axis=1).max() for c in self.pixels.centers))
+
+    def density(self, p, active):
+        """Current density at world points, without gradient."""
+        with dr.suspend_grad():
+            return self.live.density(p, active)
+
+    def step(self) -> None:
+        """Draw rays, march, composite, and move the weights once."""
+        s, ns = self.settings, self.ns
+        if self.steps % _REFRESH == 0:
+            self.live.set_parameters({k: dr.detach(self.optimiser[k]) for k in self.averaged})
+        if self.steps % s.grid_every == 0 and self.steps > 0:
+            self.grid.update(self.density, self.rng)
+        pixels = self.pixels.batch(ns.UInt32(self.rng.integers(0, self.pixels.size, self.rays, np.uint32)))
+        rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
+        offset = ns.Float(self.rng.random(self.rays, np.float32))
+        stride = s.stride(self.steps)
+        samples, covered = visible_samples(rays, self.table(stride), offset, self.grid.occupied, self.density,
+                                           s.stop, pad=s.batch)
+        self.steps += 1
+        if samples is None:
+            self._adapt(0)
+            return
+        background = ns.Array3f(*[ns.Float(self.rng.random(self.rays, np.float32)) for _ in range(3)])
+        self._descend(samples, pixels, background, covered, stride)
+        self._adapt(samples.count / covered)
+
+    def _descend(self, samples, pixels, background, covered: int, stride: int) -> None:
+        s, ns = self.settings, self.ns
+        d = dr.gather(ns.Array3f, pixels.d, samples.ray)
+        parameters = {k: self.optimiser[k] for k in self.averaged}
+        sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns)
+        weight, tau, color, opacity = composite(sigma, rgb, samples)
+        loss = color_loss(color, opacity, pixels, background, s.huber)
+        if self.use_depth:
+            # In units of the step at hand: while marching is coarse, no more can be asked for.
+            loss += s.depth_weight * depth_loss(weight, tau, samples, pixels, s.depth_margin * self.march_step,
+                                                stride * self.march_step)
+        complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
+        loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
+        dr.backward(loss)
+        self.optimiser.set_learning_rate(s.rate(self.progress))
+        self.optimiser.step()
+        self.loss, self.samples = loss, samples.count
+        if self.steps % _REFRESH == 0:
+            # A short memory at first: the start of a run is not worth remembering.
+            decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** _REFRESH
+            for k, old in self.averaged.items():
+                self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * (1 - decay)
+            dr.eval(self.averaged)
+
+    def _adapt(self, samples_a_ray: float) -> None:
+        """Choose the number of rays that will fill a batch."""
+        wanted = 0.95 * self.settings.batch / max(samples_a_ray, 1e-3)
+        # Damped, because a batch of few rays is a noisy estimate.
+        rays = min(max(0.5 * (self.rays + wanted), self.rays / 2), 2 * self.rays)
+        self.rays = int(np.clip(rays, 64, _MAX_RAYS))
+
+    def measure(self, views: list[View], every: int = 1, background: float = 0.0) -> list[float]:
+        """PSNR in dB of the averaged field on each of ``views``, on every ``every``-th pixel."""
+        field, near = self.field(bound=False), self.settings.near * self.box.side
+        out = []
+        for view in views:
+            seen = render_view(field, self.grid.occupied, self.table(), view, near, background, every)
+            out.append(psnr(seen.color, view.over(background)[every // 2::every, every // 2::every]))
+        return out
+
+    def field(self, bound: bool = True) -> RadianceField:
+        """The field with averaged weights. ``bound``: with the occupancy that rendering may rest on."""
+        out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step)
+        out.set_parameters({k: type(v)(v) for k, v in self.averaged.items()})
+        if bound:
+            with dr.suspend_grad():
+                out.occupancy = self.grid.bound(out.density, np.random.default_rng(self.settings.seed))
+        return out

@@ -1,0 +1,85 @@
+"""What a radiance field is trained with."""
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+
+from ..field.box import Box
+from ..field.hashgrid import HashGridConfig
+from ..field.radiance import RadianceConfig
+
+# (levels, log2 rows, finest resolution, width, hidden layers of the colour net). "paper" has the paper's sizes;
+# "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16.
+_SIZES = {
+    "small": (8, 16, 1024, 32, 1),
+    "medium": (12, 18, 2048, 32, 2),
+    "paper": (16, 19, 2048, 64, 2),
+}
+
+
+def sized_config(size: str, box: Box) -> RadianceConfig:
+    """Architecture of a ``size`` for a scene box: an untrained field absorbs about 1 - 1/e across it."""
+    if size not in _SIZES:
+        raise ValueError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
+    levels, rows, finest, width, color_hidden = _SIZES[size]
+    return RadianceConfig(
+        grid=HashGridConfig(levels=levels, log2_rows=rows, finest=finest), width=width, color_hidden=color_hidden,
+        density_scale=1 / box.side,
+    )
+
+
+@dataclass(frozen=True)
+class RadianceSettings:
+    """Controls of a training run; lengths are shares of the scene box's side.
+
+    ``steps`` or ``minutes``: how long, exactly one of them. ``batch``: samples a step; ``learning_rate``: held for
+    the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself; ``average``: decay a step
+    of the averaged weights, which are the result. ``march_step``: shortest step (instant-ngp's √3/1024);
+    ``growth``: steps are at least this share of their distance; ``near``: where rays start; ``stop``: samples
+    that less light reaches are left out. ``resolution``: of the density grid; ``min_views``: cells that fewer
+    cameras see stay empty; ``strides``: the first steps of the run march this many times coarser, ``stride_steps`` each,
+    which clears early fog cheaply. ``huber``: error at which the colour loss turns linear. ``depth_weight``:
+    weight of the depth terms where depth is known; ``depth_margin``: distance from the true surface, in march
+    steps, within which a ray's weight should lie.
+    """
+
+    steps: int | None = None
+    minutes: float | None = None
+    seed: int = 0
+    batch: int = 2**15
+    learning_rate: float = 2.5e-2
+    final_rate: float = 0.01
+    hold: float = 0.2
+    average: float = 0.99
+    march_step: float = 3**0.5 / 1024
+    growth: float = 1 / 256
+    near: float = 0.005
+    stop: float = 2e-3
+    resolution: int = 128
+    grid_every: int = 16
+    min_views: int = 2
+    strides: tuple[int, ...] = field(default=(8, 4, 2))
+    stride_steps: int = 96
+    huber: float = 0.1
+    depth_weight: float = 0.05
+    depth_margin: float = 1.5
+
+    def __post_init__(self):
+        if (self.steps is None) == (self.minutes is None):
+            raise ValueError("give the length of the training either in steps or in minutes")
+        if (self.steps if self.steps is not None else self.minutes) <= 0:
+            raise ValueError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
+        if self.resolution % 8:
+            raise ValueError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
+
+    def rate(self, progress: float) -> float:
+        """Learning rate at ``progress`` in 0..1 of the run."""
+        late = max(0.0, progress - self.hold) / (1 - self.hold)
+        return self.learning_rate * self.final_rate ** min(late, 1.0)
+
+    def stride(self, step: int) -> int:
+        """How many times coarser than ``march_step`` step number ``step`` marches."""
+        stage = step // self.stride_steps
+        return self.strides[stage] if stage < len(self.strides) else 1
+
+    def to_dict(self) -> dict:
+        return asdict(self)
