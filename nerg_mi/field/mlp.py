@@ -24,12 +24,13 @@ class MLP:
     matrix units require; on LLVM fp16 is slower than fp32 and is not used.
     """
 
-    DRJIT_STRUCT = {"weights": list, "_packed": list}
+    DRJIT_STRUCT = {"weights": list}
 
     def __init__(self, weights: list):
         self.weights = list(weights)
-        self._packed = []
         self._views = None
+        # What the kernels read: the packed weights of all layers, attached to ``weights``.
+        self.buffer = None
         for first, second in zip(self.weights, self.weights[1:]):
             if first.shape[0] != second.shape[1]:
                 raise ValueError(
@@ -58,7 +59,8 @@ class MLP:
         ns = namespace(self.weights[0])
         weights = [ns.TensorXf16(w) if is_cuda(ns) else w for w in self.weights]
         packed = nn.pack(*weights, layout="training")
-        self._views = [packed] if len(weights) == 1 else list(packed[-len(weights):])
+        self._views = [packed] if len(weights) == 1 else list(packed)
+        self.buffer = self._views[0].buffer
 
     def __call__(self, x: list) -> list:
         """Outputs (list of Floats) at inputs ``x`` (list of Floats), as cooperative vectors."""

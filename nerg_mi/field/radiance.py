@@ -143,6 +143,10 @@ class RadianceField:
         self._head = MLP(self.density_net.weights[:-1] + [last[0:1, :]])
         self._head.pack()
 
+    def kernel_parameters(self) -> list:
+        """The arrays that evaluations read: the table and the packed networks, attached to ``parameters()``."""
+        return [self.grid.table, self.density_net.buffer, self.color_net.buffer, self._head.buffer]
+
     def density(self, p, active=True):
         """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside of the box."""
         inside = active & self.box.contains(p)

@@ -98,6 +98,10 @@ class FieldMedium:
     def bounds(self):
         return self.to_world.bounds(self.field.box.lower, self.field.box.upper)
 
+    def parameters(self) -> list:
+        """Arrays that densities and colours depend on, for derivatives."""
+        return self.field.kernel_parameters()
+
     def local(self, o, d) -> LocalRay:
         o_l, d_l = self.to_world.point_to_local(o), self.to_world.vector_to_local(d)
         near, far = intersect_box(o_l, d_l, self.field.box.lower, self.field.box.upper)
@@ -155,6 +159,16 @@ class VolumeMedium:
 
     def bounds(self):
         return self._lower, self._upper
+
+    def parameters(self) -> list:
+        """Arrays that densities and colours depend on, for derivatives."""
+        import mitsuba as mi
+
+        values = []
+        for volume in (self._density, self._color):
+            if volume is not None:
+                values += [v for v in dict(mi.traverse(volume)).values() if dr.is_array_v(v) and dr.is_float_v(v)]
+        return values
 
     def local(self, o, d) -> LocalRay:
         near, far = intersect_box(o, d, self._lower, self._upper)
