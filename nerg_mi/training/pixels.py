@@ -52,7 +52,7 @@ class PixelBank:
             depth = [(v.depth if v.depth is not None else np.zeros(v.color.shape[:2])).ravel() for v in views]
             self._depth = ns.Float(np.concatenate(depth).astype(np.float32))
         self.has_depth = self._depth is not None
-        self.depth_everywhere = self.has_depth and bool(dr.all(self._depth > 0))
+        self.depth_everywhere = self.has_depth and dr.count(self._depth > 0)[0] >= 0.999 * self.size
 
     def batch(self, index) -> PixelBatch:
         """Rays and colours of the pixels at ``index`` (UInt32)."""

@@ -139,13 +139,19 @@ class RadianceTrainer:
         rays = min(max(0.5 * (self.rays + wanted), self.rays / 2), 2 * self.rays)
         self.rays = int(np.clip(rays, 64, _MAX_RAYS))
 
-    def measure(self, views: list[View], every: int = 1, background: float = 0.0) -> list[float]:
-        """PSNR in dB of the averaged field on each of ``views``, on every ``every``-th pixel."""
-        field, near = self.field(bound=False), self.settings.near * self.box.side
+    def measure(self, views: list[View], every: int = 1, field: RadianceField | None = None) -> list[float]:
+        """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel.
+
+        Of ``field``, by its own occupancy; without one, of the averaged weights so far.
+        """
+        occupied = self.grid.occupied
+        if field is not None:
+            occupied = lambda p, active: active & (field.occupancy.empty_cells(self.box.to_unit(p), active) == 0)
+        shown, near = field or self.field(bound=False), self.settings.near * self.box.side
         out = []
         for view in views:
-            seen = render_view(field, self.grid.occupied, self.table(), view, near, background, every)
-            out.append(psnr(seen.color, view.over(background)[every // 2::every, every // 2::every]))
+            seen = render_view(shown, occupied, self.table(), view, near, every=every)
+            out.append(psnr(seen.color, view.over(0)[every // 2::every, every // 2::every]))
         return out
 
     def field(self, bound: bool = True) -> RadianceField:

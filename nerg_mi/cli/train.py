@@ -1,0 +1,92 @@
+"""``nerg train``: fields from recordings."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Train fields from recordings.")
+
+
+@app.command("radiance")
+def train_radiance(
+    dataset: Annotated[Path, typer.Argument(help="Folder of a posed image set, or its transforms.json.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Checkpoint to write (.safetensors).")],
+    holdout: Annotated[
+        Optional[int], typer.Option(help="Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.")
+    ] = None,
+    size: Annotated[str, typer.Option(help="Size of the field: small, medium or paper.")] = "small",
+    width: Annotated[Optional[int], typer.Option(help="Width of the pictures in pixels.")] = None,
+    downscale: Annotated[Optional[float], typer.Option(help="Or: divide their size by this.")] = None,
+    minutes: Annotated[Optional[float], typer.Option(help="Train for this long. Default: 5.")] = None,
+    steps: Annotated[Optional[int], typer.Option(help="Or: train for so many steps.")] = None,
+    aabb: Annotated[Optional[str], typer.Option(help="Bounds of what is seen: x0,y0,z0,x1,y1,z1.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the weights, rays and jitter.")] = 0,
+    threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
+    half: Annotated[bool, typer.Option("--half", help="Store the weights in fp16.")] = False,
+    depth: Annotated[bool, typer.Option(help="Supervise with the data set's depth, where it has any.")] = True,
+    variant: Annotated[str, typer.Option(help="Mitsuba variant.")] = "llvm_ad_rgb",
+) -> None:
+    """Train a radiance field on posed pictures, and report the error on those held out."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from ..capture.dataset import open_dataset
+    from ..field.backend import namespace
+    from ..training.radiance_run import save_trained, train_radiance
+    from ..training.settings import RadianceSettings, sized_config
+
+    mi.set_variant(variant)
+    if threads is not None:
+        dr.set_thread_count(threads)
+    if minutes is None and steps is None:
+        minutes = 5.0
+    settings = RadianceSettings(steps=steps, minutes=minutes, seed=seed)
+    data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth)
+    config = sized_config(size, data.box)
+    if data.missing:
+        typer.echo(data.missing)
+    show = lambda corner: ", ".join(f"{x:.3g}" for x in corner)
+    typer.echo(f"box: ({show(data.box.lower)}) to ({show(data.box.upper)}), {data.box_from}")
+    typer.echo(f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
+               f"{data.source['width']} x {data.source['height']} pixels")
+    with _Bar() as bar:
+        field, provenance = train_radiance(data, config, settings, namespace(variant), depth, bar.update)
+    save_trained(field, provenance, output, half)
+    typer.echo(f"{provenance['steps']} steps in {provenance['seconds']:.0f} s")
+    if data.held_out:
+        typer.echo(f"held-out PSNR: {provenance['psnr_held_out']['mean']:.2f} dB")
+    typer.echo(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
+
+
+def _numbers(text: str | None) -> tuple | None:
+    if text is None:
+        return None
+    try:
+        return tuple(float(x) for x in text.split(","))
+    except ValueError as e:
+        raise ValueError(f'--aabb needs numbers x0,y0,z0,x1,y1,z1, got "{text}"') from e
+
+
+class _Bar:
+    """Progress of a training, with the time left and the last held-out error."""
+
+    def __enter__(self):
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._progress = Progress(BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(),
+                                  TextColumn("{task.description}"))
+        self._task = self._progress.add_task("compiling", total=1.0)
+        self._progress.start()
+        return self
+
+    def update(self, state) -> None:
+        # Rich's own estimate follows the speed of the last moments, which pauses for looks upset.
+        left = state.seconds * (1 - state.done) / max(state.done, 1e-6)
+        error = f", held out {state.psnr:.2f} dB" if state.psnr is not None else ""
+        self._progress.update(self._task, completed=state.done,
+                              description=f"{left:.0f} s left, step {state.steps}{error}")
+
+    def __exit__(self, *error):
+        self._progress.stop()

@@ -1,0 +1,84 @@
+"""A whole radiance training: from a data set to a checkpoint, with its held-out error on the way."""
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Callable
+
+import numpy as np
+
+from ..capture.dataset import Dataset
+from ..field.radiance import RadianceConfig, RadianceField
+from ..formats.fields import save_radiance
+from .radiance import RadianceTrainer
+from .settings import RadianceSettings
+
+# Shares of the run at which the held-out error is looked at.
+_LOOKS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
+_LOOK_VIEWS, _LOOK_EVERY = 4, 3
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State of a run. ``done``: share 0..1; ``seconds``: so far; ``psnr``: the last held-out error in dB, or None;
+    ``rays``, ``samples``: of the last step."""
+
+    done: float
+    steps: int
+    seconds: float
+    rays: int
+    samples: int
+    psnr: float | None
+
+
+def train_radiance(
+    dataset: Dataset, config: RadianceConfig, settings: RadianceSettings, ns: ModuleType, depth: bool = True,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> tuple[RadianceField, dict]:
+    """Train a field on ``dataset``; returns it, with its occupancy, and its provenance (JSON).
+
+    The held-out views are looked at and never learnt from: a few of them, coarsely, at some shares of the run, and
+    all of them, fully, at the end. Ctrl-C ends the run early with what it has come to.
+    """
+    trainer = RadianceTrainer(dataset.train, dataset.box, config, settings, ns, depth)
+    spread = np.linspace(0, len(dataset.held_out) - 1, min(_LOOK_VIEWS, len(dataset.held_out))).round().astype(int)
+    watched = [dataset.held_out[i] for i in spread]
+    looks = list(_LOOKS) if watched else []
+    history, last, interrupted = [], None, False
+    try:
+        while trainer.progress < 1:
+            trainer.step()
+            if looks and trainer.progress >= looks[0]:
+                looks = [x for x in looks if x > trainer.progress]
+                last = float(np.mean(trainer.measure(watched, _LOOK_EVERY)))
+                history.append({"steps": trainer.steps, "seconds": round(trainer.seconds, 1), "psnr": round(last, 2)})
+            if on_progress is not None:
+                on_progress(Progress(trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last))
+    except KeyboardInterrupt:
+        interrupted = True
+    seconds = trainer.seconds
+    field = trainer.field()
+    provenance = {
+        **dataset.source,
+        "settings": settings.to_dict(),
+        "depth_supervision": trainer.use_depth,
+        "steps": trainer.steps,
+        "seconds": round(seconds, 1),
+        "interrupted": interrupted,
+        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "psnr_watched": {"views": [v.name for v in watched], "every_pixel": _LOOK_EVERY, "history": history},
+    }
+    if dataset.held_out:
+        psnr = trainer.measure(dataset.held_out, field=field)
+        provenance["psnr_held_out"] = {
+            "mean": round(float(np.mean(psnr)), 3),
+            "views": {v.name: round(p, 3) for v, p in zip(dataset.held_out, psnr)},
+        }
+    return field, provenance
+
+
+def save_trained(field: RadianceField, provenance: dict, output: str | Path, half: bool = False) -> None:
+    """Write the checkpoint of a training, with ``provenance`` in its metadata."""
+    save_radiance(field, output, provenance, half)
