@@ -119,8 +119,9 @@ def sensor_dict(camera: Camera) -> dict:
         "to_world": mi.ScalarTransform4f((camera.to_world @ _OPENGL_FROM_MITSUBA).tolist()),
         "fov": float(np.degrees(2 * np.arctan(i.width / (2 * i.fx)))),
         "fov_axis": "x",
-        "principal_point_offset_x": float(i.cx / i.width - 0.5),
-        "principal_point_offset_y": float(i.cy / i.height - 0.5),
+        # Mitsuba counts the offset from the principal point to the film's centre.
+        "principal_point_offset_x": float(0.5 - i.cx / i.width),
+        "principal_point_offset_y": float(0.5 - i.cy / i.height),
         "near_clip": 1e-3,
         "far_clip": 1e5,
         "film": {

@@ -35,6 +35,7 @@ class DensityGrid:
                 f"not one cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
                 "give a box that holds what the pictures show with --aabb"
             )
+        self.surface = dr.full(ns.Bool, False, cells)
         self._turn = 0
 
     def _corner(self, index):
@@ -83,7 +84,8 @@ class DensityGrid:
     def carve(self, points) -> None:
         """Keep only the cells that hold or touch one of the surface points: ``points`` yields Array3f (world).
 
-        For depth that is exact and known at every pixel: all that a camera can see lies on those points.
+        For depth that is exact and known at every pixel: all that a camera can see lies on those points. The
+        cells that hold one stay on whatever is found in them: once off, nothing would be learnt there again.
         """
         from scipy.ndimage import binary_dilation
 
@@ -94,6 +96,7 @@ class DensityGrid:
             c = [self.ns.UInt32(dr.clip(x * r, 0, r - 1)) for x in (u.x, u.y, u.z)]
             dr.scatter(found, self.ns.UInt8(1), c[0] + r * (c[1] + r * c[2]))
             dr.eval(found)
+        self.surface = self.seen & (found > 0)
         near = binary_dilation(found.numpy().reshape(r, r, r) > 0, np.ones((3, 3, 3)))
         self._allow(self.seen & self.ns.Bool(near.ravel()))
 
@@ -131,7 +134,7 @@ class DensityGrid:
             dr.eval(self.value)
         mean = dr.sum(self.value) / self.seen_count
         bound = dr.minimum(self.threshold, 0.5 * mean)
-        self.bits = dr.select(self.seen & (self.value > bound), self.ns.UInt8(1), 0)
+        self.bits = dr.select((self.seen & (self.value > bound)) | self.surface, self.ns.UInt8(1), 0)
         dr.eval(self.bits)
 
     @property

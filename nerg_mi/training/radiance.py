@@ -50,7 +50,9 @@ class RadianceTrainer:
         self.march_step = settings.march_step * box.side
         self.grid = DensityGrid(ns, box, settings.resolution, self.march_step, [v.camera for v in views],
                                 settings.min_views)
-        if self.use_depth and self.pixels.depth_everywhere:
+        # With exact depth everywhere the free space is known from the start, and there is no fog to clear.
+        self.carved = self.use_depth and self.pixels.depth_everywhere
+        if self.carved:
             self.grid.carve(self.pixels.surface_points())
         self.grid.update(self.density, self.rng, everywhere=True)
         self._tables: dict[int, StepTable] = {}
@@ -97,7 +99,7 @@ class RadianceTrainer:
         pixels = self.pixels.batch(ns.UInt32(self.rng.integers(0, self.pixels.size, self.rays, np.uint32)))
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
         offset = ns.Float(self.rng.random(self.rays, np.float32))
-        stride = s.stride(self.steps)
+        stride = 1 if self.carved else s.stride(self.steps)
         samples, covered = visible_samples(rays, self.table(stride), offset, self.grid.occupied, self.density,
                                            s.stop, pad=s.batch)
         self.steps += 1

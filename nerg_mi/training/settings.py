@@ -7,12 +7,12 @@ from ..field.box import Box
 from ..field.hashgrid import HashGridConfig
 from ..field.radiance import RadianceConfig
 
-# (levels, log2 rows, finest resolution, width, hidden layers of the colour net). "paper" has the paper's sizes;
+# (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's sizes;
 # "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16.
 _SIZES = {
-    "small": (8, 16, 1024, 32, 1),
-    "medium": (12, 18, 2048, 32, 2),
-    "paper": (16, 19, 2048, 64, 2),
+    "small": (8, 16, 32, 512, 32, 1),
+    "medium": (12, 18, 16, 2048, 32, 2),
+    "paper": (16, 19, 16, 2048, 64, 2),
 }
 
 
@@ -20,9 +20,9 @@ def sized_config(size: str, box: Box) -> RadianceConfig:
     """Architecture of a ``size`` for a scene box: an untrained field absorbs about 1 - 1/e across it."""
     if size not in _SIZES:
         raise ValueError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
-    levels, rows, finest, width, color_hidden = _SIZES[size]
+    levels, rows, base, finest, width, color_hidden = _SIZES[size]
     return RadianceConfig(
-        grid=HashGridConfig(levels=levels, log2_rows=rows, finest=finest), width=width, color_hidden=color_hidden,
+        grid=HashGridConfig(levels=levels, log2_rows=rows, base=base, finest=finest), width=width, color_hidden=color_hidden,
         density_scale=1 / box.side,
     )
 
@@ -46,9 +46,9 @@ class RadianceSettings:
     minutes: float | None = None
     seed: int = 0
     batch: int = 2**15
-    learning_rate: float = 2.5e-2
-    final_rate: float = 0.01
-    hold: float = 0.2
+    learning_rate: float = 1e-2
+    final_rate: float = 0.03
+    hold: float = 0.4
     average: float = 0.99
     march_step: float = 3**0.5 / 1024
     growth: float = 1 / 256
@@ -60,7 +60,7 @@ class RadianceSettings:
     strides: tuple[int, ...] = field(default=(8, 4, 2))
     stride_steps: int = 96
     huber: float = 0.1
-    depth_weight: float = 0.05
+    depth_weight: float = 0.02
     depth_margin: float = 1.5
 
     def __post_init__(self):

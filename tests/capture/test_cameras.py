@@ -1,0 +1,63 @@
+"""Rays of cameras: distortion, projection, and agreement with Mitsuba's own camera."""
+import numpy as np
+import pytest
+
+from nerg_mi.capture.cameras import Camera, distort, pixel_directions, project, sensor_dict, undistort
+from nerg_mi.formats.transforms import Intrinsics
+
+FOX = Intrinsics(135, 240, 171.94, 171.81, 69.3, 120.7, 0.0578421, -0.0805099, -0.000980296, 0.00015575)
+
+
+def pose(rng):
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    if np.linalg.det(q) < 0:
+        q[:, 0] *= -1
+    m = np.eye(4)
+    m[:3, :3], m[:3, 3] = q, rng.normal(size=3)
+    return m
+
+
+@pytest.mark.parametrize("distortion", [FOX.distortion, (0.1, 0.02, 0.001, -0.002), (-0.2, 0.05, 0, 0), (0, 0, 0, 0)])
+def test_undistort_inverts_distort(distortion):
+    xy = np.random.default_rng(0).uniform(-0.8, 0.8, (500, 2))
+    assert np.allclose(undistort(distort(xy, distortion), distortion), xy, atol=1e-9)
+
+
+def test_folding_distortion_is_refused():
+    with pytest.raises(ValueError, match="cannot be inverted"):
+        undistort(np.array([[1.5, 1.5]]), (-0.5, 0.0, 0.0, 0.0))
+
+
+def test_pixel_rays_project_back_to_their_pixels():
+    camera = Camera(FOX, pose(np.random.default_rng(1)))
+    d = pixel_directions(FOX) @ camera.to_world[:3, :3].T
+    points = camera.center + d.reshape(-1, 3) * np.random.default_rng(2).uniform(0.5, 5, (d.size // 3, 1))
+    pixel, front = project(points, camera)
+    x, y = np.meshgrid(np.arange(135) + 0.5, np.arange(240) + 0.5)
+    assert front.all()
+    assert np.allclose(pixel, np.stack([x.ravel(), y.ravel()], axis=1), atol=1e-6)
+
+
+def test_points_behind_a_camera_are_not_in_front():
+    camera = Camera(FOX, np.eye(4))
+    assert not project(np.array([[0.0, 0.0, 1.0]]), camera)[1][0]
+    assert project(np.array([[0.0, 0.0, -1.0]]), camera)[1][0]
+
+
+def test_mitsuba_sensor_sends_the_same_rays(rgb):
+    """Principal point off the centre, no square picture."""
+    i = Intrinsics(32, 20, 25.0, 25.0, 14.0, 11.5)
+    camera = Camera(i, pose(np.random.default_rng(3)))
+    sensor = rgb.load_dict(sensor_dict(camera))
+    x, y = np.meshgrid((np.arange(32) + 0.5) / 32, (np.arange(20) + 0.5) / 20)
+    ray, _ = sensor.sample_ray(0.0, 0.5, rgb.Point2f(x.ravel(), y.ravel()), rgb.Point2f(0.5, 0.5))
+    expected = (pixel_directions(i) @ camera.to_world[:3, :3].T).reshape(-1, 3)
+    assert np.allclose(ray.d.numpy().T, expected, atol=2e-5)
+
+
+def test_sensor_refuses_what_it_cannot_express():
+    with pytest.raises(ValueError, match="distortion"):
+        sensor_dict(Camera(FOX, np.eye(4)))
+    with pytest.raises(ValueError, match="square pixels"):
+        sensor_dict(Camera(Intrinsics(8, 8, 10.0, 11.0, 4.0, 4.0), np.eye(4)))
