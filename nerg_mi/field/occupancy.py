@@ -15,9 +15,9 @@ _FAR = 255
 
 
 class OccupancyGrid:
-    """Cubic grid over a field's unit cube, x varying fastest.
+    """Grid over the unit cube, x varying fastest.
 
-    ``bits``: bool array (R, R, R), indexed [z, y, x]. ``threshold``: the density
+    ``bits``: bool array, indexed [z, y, x] (a field's has equal edges, R). ``threshold``: the density
     (1/unit) below which a cell counts as empty; it is the bound that skipping
     rests on and is recorded in checkpoints.
     """
@@ -26,10 +26,10 @@ class OccupancyGrid:
 
     def __init__(self, bits: np.ndarray, ns: ModuleType, threshold: float):
         bits = np.asarray(bits, bool)
-        if bits.ndim != 3 or len(set(bits.shape)) != 1:
-            raise ValueError(f"an occupancy grid is a cube of cells, got shape {bits.shape}")
+        if bits.ndim != 3 or 0 in bits.shape:
+            raise ValueError(f"an occupancy grid has three axes of at least one cell, got shape {bits.shape}")
         self.bits, self.threshold = bits, float(threshold)
-        self.resolution = bits.shape[0]
+        self.cells = bits.shape[::-1]
         self.distance = ns.UInt8(self._chessboard(bits).ravel())
 
     @staticmethod
@@ -42,6 +42,13 @@ class OccupancyGrid:
         return np.minimum(distance_transform_cdt(~bits, metric="chessboard"), _FAR).astype(np.uint8)
 
     @property
+    def resolution(self) -> int:
+        """Cells along an edge of a cubic grid."""
+        if len(set(self.cells)) != 1:
+            raise ValueError(f"a grid of {self.cells} cells has no single resolution; fields need a cubic one")
+        return self.cells[0]
+
+    @property
     def fraction(self) -> float:
         """Share of the cells that are occupied."""
         return float(self.bits.mean())
@@ -52,9 +59,8 @@ class OccupancyGrid:
         Points outside of the cube are clamped to its nearest cell.
         """
         uint = dr.uint32_array_t(type(u.x))
-        res = self.resolution
-        c = [uint(dr.clip(x * res, 0, res - 1)) for x in (u.x, u.y, u.z)]
-        index = c[0] + res * (c[1] + res * c[2])
+        c = [uint(dr.clip(x * n, 0, n - 1)) for x, n in zip((u.x, u.y, u.z), self.cells)]
+        index = c[0] + self.cells[0] * (c[1] + self.cells[1] * c[2])
         return uint(dr.gather(type(self.distance), self.distance, index, active))
 
     def packed(self) -> np.ndarray:

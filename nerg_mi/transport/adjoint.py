@@ -21,7 +21,8 @@ import drjit as dr
 
 from .march import MarchResult, advance, limits, march_primal
 from .media import LocalRay
-from .quadrature import absorbed_share, mean_depth_share
+from .quadrature import absorbed_share
+from .rules import rule
 
 
 def attached(medium, ray, t0, t1) -> bool:
@@ -31,18 +32,22 @@ def attached(medium, ray, t0, t1) -> bool:
     )
 
 
-def differentiable_march(medium, ray, t0, t1, active, settings, offset, color, count, until) -> MarchResult:
+def differentiable_march(medium, ray, t0, t1, active, settings, offset, color, count, until,
+                         fine_from) -> MarchResult:
     """``march_primal`` as one differentiable operation."""
-    fixed = (medium, active, settings, offset, color, count, until)
-    tau, moment, half, slope, total, n, m = dr.custom(_March, ray.o, ray.d, ray.w, t0, t1, fixed)
-    return MarchResult(tau, moment, half, dr.detach(slope), total, n, m)
+    fixed = (medium, active, settings, offset, color, count, until, fine_from)
+    out = dr.custom(_March, ray.o, ray.d, ray.w, t0, t1, fixed)
+    result = MarchResult(*out)
+    for name in ("half_slope", "enter", "enter_tau"):
+        setattr(result, name, dr.detach(getattr(result, name)))
+    return result
 
 
 class _March(dr.CustomOp):
     def eval(self, o, d, w, t0, t1, fixed):
         self.fixed = fixed
         self.ray, self.t0, self.t1 = LocalRay(o, d, w, t0, t1), t0, t1
-        medium, active, settings, offset, color, count, until = fixed
+        medium, active, settings, offset, color, count, until, fine_from = fixed
         # The medium's weights are read, not passed: tell the graph that the result depends on them.
         for parameter in medium.parameters():
             self.add_input(parameter)
@@ -50,27 +55,36 @@ class _March(dr.CustomOp):
             # Symbolic also where an enclosing derivative has switched loops to evaluated ones: the
             # steps must not be stored.
             with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-                result = march_primal(medium, self.ray, t0, t1, active, settings, offset, color, count, until)
+                result = march_primal(
+                    medium, self.ray, t0, t1, active, settings, offset, color, count, until, fine_from
+                )
         self.result = result
-        return (result.tau, result.moment, result.half, result.half_slope, result.color,
-                result.density_evals, result.color_evals)
+        return (result.tau, result.moment, result.half, result.half_slope, result.enter, result.enter_tau,
+                result.color, result.density_evals, result.color_evals)
 
     def backward(self):
-        medium, active, settings, offset, color, _, until = self.fixed
-        d_tau, d_moment, d_half, _, d_color, _, _ = self.grad_out()
+        medium, active, settings, offset, color, _, until, fine_from = self.fixed
+        d_tau, d_moment, d_half, _, _, _, d_color, _, _ = self.grad_out()
         primal, ray = self.result, self.ray
         Float = type(self.t0)
         goal, end = limits(Float, settings, until)
+        quadrature = rule(settings.quadrature, medium)
         d_half = dr.select(dr.isfinite(primal.half), d_half, 0)
 
         def body(active, t, share, tau, moment, total, grads):
-            active, t, delta, t_next = advance(medium, ray, t, self.t1, share, settings, active)
-            weight = None
+            active, t, delta, t_next = advance(
+                medium, ray, t, self.t1, share, settings, active, quadrature.planes, fine_from
+            )
             with dr.resume_grad():
                 leaves = [dr.detach(x) for x in (ray.o, ray.d, ray.w, self.t0, self.t1)]
                 dr.enable_grad(leaves)
-                start, length, dtau, c_i, lit = self._step(leaves, t, delta, t_next, active, tau)
-                m_i = dr.fma(length, mean_depth_share(dtau), start)
+                o, d, w, t0, t1 = leaves
+                begin = t0 + (t - self.t0)
+                length = dr.select(t_next >= self.t1, t1 - begin, delta)
+                step = quadrature.step(
+                    medium, LocalRay(o, d, w, t0, t1), begin, length, t_next, None, active, color
+                )
+                dtau, m_i = step.dtau, dr.fma(length, step.share, begin)
                 transmittance = dr.exp(-tau)
                 share_i = absorbed_share(dtau)
                 weight = dr.detach(transmittance * share_i)
@@ -78,7 +92,8 @@ class _March(dr.CustomOp):
                 arriving = d_moment * m_i
                 behind = d_moment * (primal.moment - moment)
                 if color is not None:
-                    c_i = dr.select(lit, c_i, 0)
+                    lit = active & (weight > settings.color_cutoff)
+                    c_i = dr.select(lit, step.color(lit), 0)
                     total = total + weight * dr.detach(c_i)
                     arriving += dr.dot(d_color, c_i)
                     behind += dr.dot(d_color, primal.color - total)
@@ -86,7 +101,7 @@ class _March(dr.CustomOp):
                 before = tau + dr.detach(dtau) < goal
                 crosses = ~before & (tau < goal) & active
                 h = dr.select(before, -primal.half_slope * dtau, 0)
-                h += dr.select(crosses, start + length * (goal - tau) / dr.select(crosses, dtau, 1), 0)
+                h += dr.select(crosses, begin + step.crossing(dr.select(crosses, goal - tau, 0)), 0)
                 f = dr.select(active, f + d_half * h, 0)
                 dr.backward_from(f)
                 grads = [g + dr.grad(x) for g, x in zip(grads, leaves)]
@@ -106,21 +121,3 @@ class _March(dr.CustomOp):
 
     def name(self):
         return "march"
-
-    def _step(self, leaves, t, delta, t_next, active, tau):
-        """Start, length, optical depth and colour of one step, attached to ``leaves`` and the medium."""
-        medium, _, settings, _, color, _, _ = self.fixed
-        o, d, w, t0, t1 = leaves
-        start = t0 + (t - self.t0)
-        length = dr.select(t_next >= self.t1, t1 - start, delta)
-        p = o + d * (start + 0.5 * length)
-        lit, c = None, None
-        if color is None:
-            sigma = medium.density(p, active)
-        else:
-            sigma, features = medium.density_features(p, active)
-        dtau = dr.select(active, sigma * length, 0)
-        if color is not None:
-            lit = active & (dr.exp(-tau) * absorbed_share(dr.detach(dtau)) > settings.color_cutoff)
-            c = color(medium.color(features, p, w, lit))
-        return start, length, dtau, c, lit

@@ -1,12 +1,17 @@
-"""Which distance along a ray is "the surface": expected or median depth."""
+"""Which distance along a ray is "the surface": expected, median or refined depth."""
 from __future__ import annotations
+
+from dataclasses import replace
 
 import drjit as dr
 
 from .elementary import log1p
-from .march import MarchResult, MarchSettings, march
+from .march import LOG2, MarchResult, MarchSettings, march, step_length
 
-KINDS = ("expected", "median")
+KINDS = ("expected", "median", "refined")
+
+# Sub-steps in which a refined depth searches the step that crosses.
+_PARTS = 16
 
 
 def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, settings: MarchSettings):
@@ -14,6 +19,7 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
 
     The median is where half of this ray's own accumulated opacity is reached, which is the crossing
     of transmittance 1/2 for rays that became opaque. The others (few) are marched again for theirs.
+    ``refined`` searches the crossing step again with finer steps, for densities that change within one.
     """
     if kind == "expected":
         return result.expected_depth
@@ -24,4 +30,16 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
     again = march(medium, ray, t0, t1, rest, settings, until=dr.select(rest, goal, 1))
     # Rounding can leave the second march a hair short of its goal: the crossing is then the far end.
     crossing = dr.minimum(again.half, t1)
-    return dr.select(rest, crossing, dr.select(opaque & active, result.half, 0))
+    depth = dr.select(rest, crossing, dr.select(opaque & active, result.half, 0))
+    if kind == "median":
+        return depth
+    with dr.suspend_grad():
+        enter = dr.select(rest, again.enter, result.enter)
+        missing = dr.select(rest, goal - again.enter_tau, LOG2 - result.enter_tau)
+        found = active & (rest | opaque) & (missing > 0) & dr.isfinite(dr.select(rest, again.half, result.half))
+        step = step_length(enter, settings)
+        fine = march(medium, ray, enter, dr.minimum(enter + step, t1), found,
+                     replace(settings, step=settings.step / _PARTS), until=dr.select(found, missing, 1))
+        # A finer march may find a little less in the step than the coarse one did.
+        moved = dr.select(found & dr.isfinite(fine.half), fine.half - depth, 0)
+    return depth + moved

@@ -9,13 +9,16 @@ Derivatives come from ``adjoint``, which marches again instead of storing sample
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from .quadrature import absorbed_share, mean_depth_share
+from .quadrature import absorbed_share
+from .rules import rule
 
 LOG2 = 0.6931471805599453
+# Optical depth that counts as a first trace of matter.
+_TRACE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -24,13 +27,17 @@ class MarchSettings:
 
     ``step``: step length; ``dt_gamma``: steps are at least this share of the distance
     travelled (instant-ngp's cone stepping; 0: uniform); ``stop``: transmittance below which
-    what lies behind is left out; ``color_cutoff``: samples of less weight get no colour.
+    what lies behind is left out; ``color_cutoff``: samples of less weight get no colour;
+    ``quadrature``: see ``rules``; ``coarse``: steps in front of all matter are this many times longer
+    (``fine_start`` finds where it begins; 1: one step length everywhere).
     """
 
     step: float
     dt_gamma: float = 0.0
     stop: float = 1e-6
     color_cutoff: float = 1e-4
+    quadrature: str = "constant"
+    coarse: float = 1.0
 
     @property
     def opaque(self) -> float:
@@ -44,7 +51,8 @@ class MarchResult:
 
     ``tau``: optical depth; ``moment``: weighted sum of distances; ``half``: distance at which
     transmittance crosses 1/2 (infinite where it does not), or the optical depth ``until``;
-    ``half_slope``: change of ``half`` with that optical depth, detached; ``color``: weighted sum of
+    ``half_slope``: change of ``half`` with that optical depth, detached; ``enter``, ``enter_tau``: start
+    of the step that crosses, and the optical depth there; ``color``: weighted sum of
     colours (None when no colour was asked for); ``density_evals``, ``color_evals``: evaluations made
     (None unless counted).
     """
@@ -53,6 +61,8 @@ class MarchResult:
     moment: object
     half: object
     half_slope: object
+    enter: object
+    enter_tau: object
     color: object = None
     density_evals: object = None
     color_evals: object = None
@@ -70,19 +80,19 @@ class MarchResult:
 
 
 def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, color=None,
-          count: bool = False, until=None) -> MarchResult:
+          count: bool = False, until=None, fine_from=None) -> MarchResult:
     """March ``ray`` (``media.LocalRay``) from ``t0`` to ``t1``.
 
     ``offset`` in [0, 1): length of the first step as a share of a full one (jitter; None: a full
     step). ``color``: array type of the medium's colour, or None for a density-only pass. ``until``:
     optical depth at which to end, for a march that only looks for that crossing. ``count``: count
-    evaluations. Differentiable in the ray, ``t0``, ``t1``, ``until`` and the medium's parameters.
+    evaluations. ``fine_from``: distance up to which steps are coarse. Differentiable in the ray, ``t0``, ``t1``, ``until`` and the medium's parameters.
     """
     from .adjoint import attached, differentiable_march
 
     Float = type(ray.t_near)
     active = dr.mask_t(Float)(active) & (t0 < t1)
-    arguments = (Float(t0), Float(t1), active, settings, offset, color, count, until)
+    arguments = (Float(t0), Float(t1), active, settings, offset, color, count, until, fine_from)
     if attached(medium, ray, t0, t1):
         result = differentiable_march(medium, ray, *arguments)
     else:
@@ -93,51 +103,48 @@ def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, 
     return result
 
 
-def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, until) -> MarchResult:
+def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, until, fine_from) -> MarchResult:
     """The march itself, without derivatives."""
     Float = type(t0)
     goal, end = limits(Float, settings, until)
 
     # The loops are functional rather than @dr.syntax: what they close over (fields, settings) stays
     # out of the loop state, where a field's weight arrays would be carried along lane by lane.
-    def body(active, t, share, tau, moment, half, slope, total, n, m):
-        active, t, delta, t_next = advance(medium, ray, t, t1, share, settings, active)
-        p = ray.o + ray.d * (t + 0.5 * delta)
-        sigma, features = (
-            (medium.density(p, active), []) if color is None else medium.density_features(p, active)
+    quadrature = rule(settings.quadrature, medium)
+
+    def body(active, t, share, carry, tau, moment, half, slope, enter, enter_tau, total, n, m):
+        active, t, delta, t_next = advance(
+            medium, ray, t, t1, share, settings, active, quadrature.planes, fine_from
         )
-        dtau = dr.select(active, sigma * delta, 0)
-        weight = dr.exp(-tau) * absorbed_share(dtau)
-        moment = dr.fma(weight, dr.fma(delta, mean_depth_share(dtau), t), moment)
-        crosses = active & (tau < goal) & (tau + dtau >= goal)
-        inverse = delta / dr.select(crosses, dtau, 1)
-        half = dr.select(crosses, dr.fma(goal - tau, inverse, t), half)
-        slope = dr.select(crosses, inverse, slope)
+        step = quadrature.step(medium, ray, t, delta, t_next, carry, active, color)
+        weight = dr.exp(-tau) * absorbed_share(step.dtau)
+        moment = dr.fma(weight, dr.fma(delta, step.share, t), moment)
+        crosses = active & (tau < goal) & (tau + step.dtau >= goal)
+        half = dr.select(crosses, t + step.crossing(goal - tau), half)
+        slope = dr.select(crosses, delta / dr.select(crosses, step.dtau, 1), slope)
+        enter, enter_tau = dr.select(crosses, t, enter), dr.select(crosses, tau, enter_tau)
 
         if color is not None:
             lit = active & (weight > settings.color_cutoff)
             total = total + weight * dr.if_stmt(
-                (features, p), lit,
-                lambda features, p: color(medium.color(features, p, ray.w, lit)),
-                lambda features, p: dr.zeros(color),
-                label="colour",
+                (lit,), lit, step.color, lambda lit: dr.zeros(color), label="colour"
             )
             if count:
                 m = m + dr.select(lit, 1, 0)
         if count:
-            n = n + dr.select(active, 1, 0)
+            n = n + step.evals
 
-        tau = tau + dtau
+        tau = tau + step.dtau
         active = active & (t_next < t1) & (tau < end)
-        return active, t_next, Float(1), tau, moment, half, slope, total, n, m
+        return active, t_next, Float(1), step.carry, tau, moment, half, slope, enter, enter_tau, total, n, m
 
     start = (
-        active, t0, Float(1 if offset is None else offset), Float(0), Float(0), Float(dr.inf), Float(0),
-        None if color is None else dr.zeros(color), Float(0) if count else None,
-        Float(0) if count and color is not None else None,
+        active, t0, Float(1 if offset is None else offset), quadrature.start(Float), Float(0), Float(0),
+        Float(dr.inf), Float(0), Float(0), Float(0), None if color is None else dr.zeros(color),
+        Float(0) if count else None, Float(0) if count and color is not None else None,
     )
     state = dr.while_loop(start, lambda active, *_: active, body, label="march")
-    return MarchResult(*state[3:])
+    return MarchResult(*state[4:])
 
 
 def limits(Float, settings: MarchSettings, until):
@@ -148,48 +155,67 @@ def limits(Float, settings: MarchSettings, until):
     return goal, dr.minimum(goal, settings.opaque)
 
 
-def advance(medium, ray, t, t1, share, settings, active):
-    """The next step to evaluate: ``(active, t, delta, t_next)``, from ``t`` on, ``delta`` long."""
+def fine_start(medium, ray, t0, t1, active, settings: MarchSettings):
+    """Distance from which matter must be marched finely: a coarse density-only march's first trace of it.
+
+    What is thinner than a coarse step may be missed.
+    """
+    scout = replace(settings, step=settings.step * settings.coarse, coarse=1.0, quadrature="constant")
+    found = march(medium, ray, t0, t1, active, scout, until=_TRACE)
+    return dr.select(dr.isfinite(found.half), dr.detach(found.enter) - scout.step, dr.inf)
+
+
+def advance(medium, ray, t, t1, share, settings, active, planes=None, fine_from=None):
+    """The next step to evaluate: ``(active, t, delta, t_next)``, from ``t`` on, ``delta`` long.
+
+    ``planes`` (``cells.VoxelCells``): also end the step where the ray leaves a voxel.
+    """
     if medium.occupancy is not None:
-        t, share = _leap(medium, ray, t, t1, share, settings, active)
+        t, share = _leap(medium, ray, t, t1, share, settings, active, fine_from)
         active = active & (t < t1)
     # The last step ends at the exit; a step too short to move t ends the march.
-    delta = dr.minimum(step_length(t, settings) * share, t1 - t)
+    delta = dr.minimum(step_length(t, settings, fine_from) * share, t1 - t)
+    if planes is not None:
+        delta = dr.minimum(delta, planes.next_boundary(ray, t) - t)
     t_next = dr.minimum(t + delta, t1)
     return active & (t_next > t), t, delta, t_next
 
 
-def step_length(t, settings: MarchSettings):
+def step_length(t, settings: MarchSettings, fine_from=None):
     """Length of the step that starts at ``t``."""
-    if settings.dt_gamma == 0:
-        return type(t)(settings.step)
-    return dr.maximum(t * settings.dt_gamma, settings.step)
+    step = type(t)(settings.step) if settings.dt_gamma == 0 else dr.maximum(t * settings.dt_gamma, settings.step)
+    if fine_from is None:
+        return step
+    return dr.select(t + step * settings.coarse <= fine_from, step * settings.coarse, step)
 
 
-def _leap(medium, ray, t, t1, share, settings, active):
+def _leap(medium, ray, t, t1, share, settings, active, fine_from):
     """Advance ``t`` by whole steps to the first whose midpoint lies in an occupied cell."""
     grid = medium.occupancy
-    cell = 1 / grid.resolution
-    o, d = medium.to_unit(ray.o), ray.d / medium.unit_length()
+    o, d = medium.to_unit(ray.o), medium.vector_to_unit(ray.d)
 
     def body(seeking, t, share):
-        step = step_length(t, settings) * share
+        full = step_length(t, settings, fine_from)
+        step = full * share
         middle = t + 0.5 * dr.minimum(step, t1 - t)
         u = o + d * middle
         k = grid.empty_cells(u, seeking)
         # The cells at chessboard distance < k around this one are empty: a box of 2k - 1 cells.
-        reach = (type(t)(k) - 1) * cell
+        reach = type(t)(k) - 1
         gap = type(t)(dr.inf)
-        for uc, dc in zip((u.x, u.y, u.z), (d.x, d.y, d.z)):
-            low = dr.floor(uc * grid.resolution) * cell - reach
-            wall = dr.select(dc > 0, low + 2 * reach + cell, low) - uc
-            gap = dr.minimum(gap, dr.select(dc != 0, wall / dr.select(dc != 0, dc, 1), dr.inf))
+        for uc, dc, cells in zip((u.x, u.y, u.z), (d.x, d.y, d.z), grid.cells):
+            low = dr.floor(uc * cells) - reach
+            wall = dr.select(dc > 0, low + 2 * reach + 1, low) - uc * cells
+            gap = dr.minimum(gap, dr.select(dc != 0, wall / dr.select(dc != 0, dc * cells, 1), dr.inf))
         # Every step whose midpoint is certainly in that box is passed over. The next one's midpoint is
         # half a step beyond this step's end; at least this step itself is passed.
-        full = step_length(t, settings)
         whole = dr.maximum(dr.floor((middle + gap - t - step) / full + 0.5), 0)
         jump = seeking & (k > 0)
-        t = dr.select(jump, t + step + whole * full, t)
+        landing = t + step + whole * full
+        if fine_from is not None:
+            # Coarse steps end where fine ones begin.
+            landing = dr.select(t < fine_from, dr.minimum(landing, dr.maximum(fine_from, t + step)), landing)
+        t = dr.select(jump, landing, t)
         share = dr.select(jump, 1, share)
         return jump & (t < t1), t, share
 

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from ..field.backend import namespace
 from ..field.gaze import GazeField
 from ..field.radiance import RadianceField
+from .cells import bound, describe
 from .ray_box import intersect_box
 
 
@@ -84,6 +86,7 @@ class FieldMedium:
         self.occupancy = field.occupancy
         self.color_space = field.color_space
         self.has_color = True
+        self.cells = None
 
     @property
     def length_scale(self) -> float:
@@ -111,9 +114,8 @@ class FieldMedium:
         """Occupancy-grid coordinates (unit cube) of local points."""
         return self.field.box.to_unit(p)
 
-    def unit_length(self) -> float:
-        """Local length of the unit cube's edge."""
-        return self.field.box.side
+    def vector_to_unit(self, v):
+        return v / self.field.box.side
 
     def density(self, p, active):
         return self.field.density(p, active) * self._per_unit
@@ -131,18 +133,18 @@ class FieldMedium:
 class VolumeMedium:
     """Any Mitsuba volume as density (1/scene unit), optionally with a second one as colour.
 
-    Outside of the density volume's ``bbox()`` there is vacuum. It is marched without skipping:
-    a foreign volume states no bound that would allow it. Colours are spectra of the variant in use.
+    Outside of the density volume's ``bbox()`` there is vacuum. Empty voxels of an axis-aligned
+    ``gridvolume`` are skipped, under the bound that its voxels give; any other volume states no bound and
+    is marched unskipped. Colours are spectra of the variant in use.
     """
 
-    occupancy = None
     color_space = "spectrum"
     step = None
 
     def __init__(self, density, color=None):
         import mitsuba as mi
 
-        self._interaction = mi.Interaction3f
+        self._interaction, self._variant = mi.Interaction3f, mi.variant()
         self._density, self._color = density, color
         self.has_color = color is not None
         box = density.bbox()
@@ -152,6 +154,22 @@ class VolumeMedium:
                 f'the volume "density" has no finite extent (its bounding box is {self._lower} to {self._upper}); '
                 "give it a to_world that places it in the scene"
             )
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Read the grid's voxels again; call after they have changed."""
+        described = describe(self._density)
+        self.cells, self._bound = None, None
+        if described is not None:
+            self.cells, data = described
+            self._bound = bound(data, namespace(self._variant))
+
+    @property
+    def occupancy(self):
+        """Where there may be density; None while derivatives of it are tracked, which empty voxels have too."""
+        if self._bound is None or any(dr.grad_enabled(v) for v in self.parameters()):
+            return None
+        return self._bound
 
     @property
     def length_scale(self) -> float:
@@ -173,6 +191,16 @@ class VolumeMedium:
     def local(self, o, d) -> LocalRay:
         near, far = intersect_box(o, d, self._lower, self._upper)
         return LocalRay(o, d, d, near, far)
+
+    def to_unit(self, p):
+        """Occupancy-grid coordinates (the volume as the unit cube) of points."""
+        return (p - type(p)(*self._lower.tolist())) * self._inverse_size(p)
+
+    def vector_to_unit(self, v):
+        return v * self._inverse_size(v)
+
+    def _inverse_size(self, v):
+        return type(v)(*(1 / (self._upper - self._lower)).tolist())
 
     def _at(self, p):
         it = dr.zeros(self._interaction)

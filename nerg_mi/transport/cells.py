@@ -1,0 +1,84 @@
+"""The voxels of a grid volume: where its interpolant has kinks, and what bounds it."""
+from __future__ import annotations
+
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from ..field.occupancy import OccupancyGrid
+
+# Share of a voxel by which a point on a boundary counts as beyond it; far below what a sample can tell.
+_NUDGE = 1e-4
+
+
+class VoxelCells:
+    """Axis-aligned cells between which a grid's interpolant has no kink.
+
+    ``lower``, ``upper``: corners of the volume; ``resolution``: voxels along x, y, z; ``shift``: 0.5 for
+    trilinear interpolation, whose pieces meet at voxel centres, 0 for nearest neighbours.
+    """
+
+    def __init__(self, lower, upper, resolution, shift: float):
+        self._lower = [float(v) for v in lower]
+        self._scale = [r / (u - l) for r, l, u in zip(resolution, lower, upper)]
+        self._shift = shift
+
+    def next_boundary(self, ray, t):
+        """Distance at which ``ray`` leaves the cell that it is in just beyond ``t``."""
+        end = type(t)(dr.inf)
+        for o, d, lower, scale in zip((ray.o.x, ray.o.y, ray.o.z), (ray.d.x, ray.d.y, ray.d.z), self._lower,
+                                      self._scale):
+            a, b = (o - lower) * scale - self._shift, d * scale
+            c = dr.fma(b, t, a)
+            wall = dr.select(b > 0, dr.floor(c + _NUDGE) + 1, dr.ceil(c - _NUDGE) - 1)
+            end = dr.minimum(end, dr.select(b != 0, (wall - a) / dr.select(b != 0, b, 1), dr.inf))
+        return end
+
+
+def describe(volume) -> tuple[VoxelCells, np.ndarray] | None:
+    """Cells and voxel values (z, y, x) of an axis-aligned Mitsuba ``gridvolume``; None for any other volume.
+
+    Mitsuba does not tell a volume's transform or interpolation, so both are found by asking for values and
+    comparing them with the grid's: what does not match is treated as any other volume.
+    """
+    import mitsuba as mi
+
+    if not hasattr(volume, "class_name") or volume.class_name() != "GridVolume":
+        return None
+    data = np.array(mi.traverse(volume)["data"], np.float32)
+    data = data.reshape(data.shape[:3] + (-1,))[..., 0]
+    box = volume.bbox()
+    lower, upper = np.array(box.min, float), np.array(box.max, float)
+    resolution = data.shape[::-1]
+    rng = np.random.default_rng(0)
+    index = np.stack([rng.integers(0, r, 64) for r in resolution])
+    size = (upper - lower) / resolution
+
+    def ask(cell):
+        it = dr.zeros(mi.Interaction3f)
+        it.p = mi.Point3f((lower[:, None] + cell * size[:, None]).astype(np.float32))
+        return np.array(volume.eval_1(it))
+
+    values = data[index[2], index[1], index[0]]
+    scale = max(float(np.abs(data).max()), 1e-30)
+    if not np.allclose(ask(index + 0.5), values, atol=1e-3 * scale):
+        return None
+    # A quarter voxel off the centre, nearest neighbours still return the centre's value.
+    nearest = np.allclose(ask(index + 0.25), values, atol=1e-6 * scale)
+    if nearest and not np.allclose(data, data.flat[0]):
+        return VoxelCells(lower, upper, resolution, 0.0), data
+    return VoxelCells(lower, upper, resolution, 0.5), data
+
+
+def bound(data: np.ndarray, ns: ModuleType) -> OccupancyGrid | None:
+    """Cells of a cubic grid over the volume that may hold density: voxel maxima dilated by one voxel.
+
+    The bound holds for every point that either interpolation can reach. None when nothing could be skipped.
+    """
+    from scipy.ndimage import maximum_filter
+
+    reach = maximum_filter(data, 3, mode="nearest") > 0
+    if reach.all():
+        return None
+    return OccupancyGrid(reach, ns, 0.0)
