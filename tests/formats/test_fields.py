@@ -1,0 +1,88 @@
+"""Fields in and out of files: exact in fp32, rounded in fp16, and a sentence for what does not fit."""
+import json
+
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+from safetensors import safe_open
+from safetensors.numpy import save_file
+
+from nerg_mi.field.box import Box
+from nerg_mi.field.gaze import GazeConfig, GazeField
+from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
+
+GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
+BOX = Box((-1, 0, 2), (3, 2, 4))
+
+
+def radiance(resolution=5):
+    bits = np.random.default_rng(0).random((resolution,) * 3) < 0.2
+    return RadianceField.random(
+        RadianceConfig(GRID, width=16, color_hidden=1, geometry=3, sh_degree=2, density_scale=7.0), BOX, ns, 1,
+        occupancy=OccupancyGrid(bits, ns, 0.25), color_space="linear", march_step=0.01,
+    )  # fmt: skip
+
+
+def gaze():
+    return GazeField.random(GazeConfig(GRID, "capture", "exp", width=16, geometry=3, sh_degree=3), BOX, ns, 2)
+
+
+def arrays(field):
+    return {k: v.numpy() for k, v in field.parameters().items()}
+
+
+def rewrite(path, change):
+    """Write the file again after ``change(tensors, metadata)``."""
+    with safe_open(path, framework="numpy") as f:
+        tensors, meta = {k: f.get_tensor(k) for k in f.keys()}, json.loads(f.metadata()["nerg"])
+    change(tensors, meta)
+    save_file(tensors, path, metadata={"nerg": json.dumps(meta)})
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test01_radiance_round_trip(tmp_path, half):
+    field, path = radiance(), tmp_path / "f.safetensors"
+    save_radiance(field, path, {"dataset": "fox", "seconds": 12.5}, half=half)
+    again, meta = load_radiance(path, ns)
+    assert again.config == field.config and again.box == field.box
+    assert (again.color_space, again.march_step) == ("linear", 0.01)
+    assert np.array_equal(again.occupancy.bits, field.occupancy.bits) and again.occupancy.threshold == 0.25
+    assert meta["provenance"] == {"dataset": "fox", "seconds": 12.5} and meta["units"]["density"] == "1 / scene unit"
+    for k, v in arrays(field).items():
+        assert np.array_equal(arrays(again)[k], v.astype(np.float16).astype(np.float32) if half else v), k
+        assert arrays(again)[k].dtype == np.float32
+    if not half:
+        p = ns.Array3f(1, 1, 3)
+        assert field.density(p).numpy()[0] == again.density(p).numpy()[0] > 0
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test02_gaze_round_trip(tmp_path, half):
+    field, path = gaze(), tmp_path / "g.safetensors"
+    save_gaze(field, path, {}, half=half)
+    again, meta = load_gaze(path, ns)
+    assert again.config == field.config and again.box == field.box and meta["units"]["gaze"] == "1 / steradian"
+    for k, v in arrays(field).items():
+        assert np.array_equal(arrays(again)[k], v.astype(np.float16).astype(np.float32) if half else v), k
+
+
+def test03_without_occupancy_and_step(tmp_path):
+    field = RadianceField.random(RadianceConfig(GRID, width=16), BOX, ns)
+    save_radiance(field, tmp_path / "f", {})
+    again, _ = load_radiance(tmp_path / "f", ns)
+    assert again.occupancy is None and again.march_step is None and again.color_space == "srgb"
+
+
+def test04_the_other_kind(tmp_path):
+    save_gaze(gaze(), tmp_path / "g", {})
+    with pytest.raises(ValueError, match="holds a gaze field where a radiance field is needed"):
+        load_radiance(tmp_path / "g", ns)
+    save_radiance(radiance(), tmp_path / "f", {})
+    with pytest.raises(ValueError, match="holds a radiance field where a gaze field is needed"):
+        load_gaze(tmp_path / "f", ns)
+
+
+NAMES = ["grid.table", "density_net.0", "color_net.1", "occupancy.bits"]
