@@ -1,0 +1,84 @@
+"""Expected and median depth against closed forms, for opaque and for semi-transparent matter."""
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.transport.depth import surface_depth
+from nerg_mi.transport.march import MarchSettings, march
+from nerg_mi.transport.media import VolumeMedium
+
+from ..reference import march_numpy as reference
+
+
+def depth(mi, medium, kind, settings, o=(0.5, 0.5, 0), d=(0, 0, 1)):
+    o, d = np.atleast_2d(np.asarray(o, np.float32)), np.atleast_2d(np.asarray(d, np.float32))
+    ray = medium.local(mi.Point3f(o.T), mi.Vector3f(d.T))
+    t0, t1, active = dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True)
+    result = march(medium, ray, t0, t1, active, settings)
+    return surface_depth(kind, result, medium, ray, t0, t1, active, settings).numpy()
+
+
+def slab(mi, sigma, near=1.0):
+    to_world = mi.ScalarTransform4f().translate([0, 0, near])
+    return VolumeMedium(mi.load_dict({"type": "constvolume", "value": float(sigma), "to_world": to_world}))
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1e-3, 0.1, 0.69, 0.7, 1, 3, 10, 13.8, 13.9, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("kind", ["expected", "median"])
+def test01_slab(rgb, kind, sigma):
+    # The median of a thin slab is its middle: half of *this ray's own* opacity.
+    expected = reference.slab(sigma, 1, 2)[1 if kind == "expected" else 2]
+    assert np.isclose(depth(rgb, slab(rgb, sigma), kind, MarchSettings(0.01))[0], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["expected", "median"])
+def test02_nothing_met_is_zero(rgb, kind):
+    assert depth(rgb, slab(rgb, 0), kind, MarchSettings(0.01)).tolist() == [0]
+    assert depth(rgb, slab(rgb, 5), kind, MarchSettings(0.01), o=(3, 3, 0)).tolist() == [0]
+
+
+def two_slabs(mi, front, back):
+    """Matter in [0.2, 0.4] and [0.7, 0.9] of the unit cube, as steps of a nearest-neighbour grid."""
+    data = np.zeros((10, 1, 1), np.float32)
+    data[2:4], data[7:9] = front, back
+    return VolumeMedium(mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(data), "filter_type": "nearest"}))
+
+
+@pytest.mark.parametrize("front, back", [(1, 1), (2, 1e4), (0.1, 50), (5, 5), (100, 1)])
+def test03_a_window_and_a_wall(rgb, front, back):
+    medium = two_slabs(rgb, front, back)
+    settings = MarchSettings(0.1 / 64)
+    a, b = 0.2 * front, 0.2 * back
+    w1, w2 = -math.expm1(-a), math.exp(-a) * -math.expm1(-b)
+    mean = lambda s, near: reference.slab(s, near, near + 0.2)[1]  # noqa: E731
+    expected = (w1 * mean(front, 1.2) + w2 * mean(back, 1.7)) / (w1 + w2)
+    goal = -math.log1p(-(w1 + w2) / 2)
+    median = 1.2 + goal / front if goal <= a else 1.7 + (goal - a) / back
+    got = [depth(rgb, medium, kind, settings, o=(0.5, 0.5, -1))[0] for kind in ("expected", "median")]
+    assert np.allclose(got, [expected, median], rtol=2e-5)
+
+
+def test05_median_gradient_equals_central_differences(rgb):
+    # d/dσ of -log((1 + e^-σ) / 2) / σ
+    for sigma in (0.1, 1.0, 5.0, 50.0):
+        data = rgb.TensorXf(np.full((2, 2, 2, 1), sigma, np.float32))
+        volume = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.full((2, 2, 2), sigma, np.float32))})
+        params = rgb.traverse(volume)
+        key = next(k for k in params.keys() if k.endswith("data"))
+        s = rgb.Float(sigma)
+        dr.enable_grad(s)
+        params[key] = data * 0 + s
+        params.update()
+        medium = VolumeMedium(volume)
+        for kind, form in (("median", 2), ("expected", 1)):
+            ray = medium.local(rgb.Point3f(0.5, 0.5, -1), rgb.Vector3f(0, 0, 1))
+            settings = MarchSettings(1 / 32)
+            result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
+            d = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+            dr.set_grad(s, 0)
+            dr.backward(d, dr.ADFlag.ClearInterior)
+            h = 1e-5 * sigma
+            difference = (reference.slab(sigma + h, 1, 2)[form] - reference.slab(sigma - h, 1, 2)[form]) / (2 * h)
+            assert np.isclose(dr.grad(s).numpy()[0], difference, rtol=2e-3, atol=1e-5), (kind, sigma)

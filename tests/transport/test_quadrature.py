@@ -1,0 +1,89 @@
+"""The step rule against integrals in extended precision, and its invariances."""
+from fractions import Fraction
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.transport.quadrature import absorbed_share, mean_depth_share
+
+TAU = np.logspace(-8, 8, 1601).astype(np.float32)
+
+
+def exact_share(tau):
+    """1/τ - 1/expm1(τ) by rational arithmetic (the series of exp), so that nothing cancels."""
+    out = []
+    for t in np.atleast_1d(tau).astype(float):
+        if t > 50:
+            out.append(1 / t)
+            continue
+        x, term, tail, n = Fraction(t), Fraction(1), Fraction(0), 2
+        # expm1(τ) / τ = 1 + Σ τ^n / (n + 1)!;  1/τ - 1/expm1(τ) = (Σ ...) / (τ expm1(τ)/τ)
+        term = x / 2
+        while term > Fraction(1, 10**40) * (1 + tail):
+            tail += term
+            n += 1
+            term = (term * x / n).limit_denominator(10**60)
+        out.append(float(tail / (x * (1 + tail))))
+    return np.array(out)
+
+
+def test01_the_reference_agrees_with_quadrature():
+    # ∫ s τ exp(-τ s) ds / ∫ τ exp(-τ s) ds over [0, 1], by Gauss-Legendre
+    s, w = np.polynomial.legendre.leggauss(60)
+    s, w = (s + 1) / 2, w / 2
+    for tau in (1e-6, 0.1, 1, 5, 20):
+        f = tau * np.exp(-tau * s) * w
+        assert np.isclose(exact_share(tau)[0], (f * s).sum() / f.sum(), rtol=1e-12)
+
+
+def test02_mean_depth_share():
+    tau = np.concatenate([TAU[::8], np.nextafter(np.float32(0.5), [0, 1]).astype(np.float32)])
+    got = mean_depth_share(ns.Float(tau)).numpy()
+    assert np.all(np.abs(got - exact_share(tau)) <= 1e-6 * exact_share(tau))
+
+
+def test03_its_ends():
+    got = mean_depth_share(ns.Float([0, 1e-38, 3e38, np.inf])).numpy()
+    assert got[0] == 0.5 and got[1] == 0.5 and abs(got[2]) < 1e-34 and abs(got[3]) < 1e-34
+
+
+def test04_derivatives_are_finite_and_right():
+    tau = np.concatenate([[0], TAU[::8], [np.inf]]).astype(np.float32)
+    v = ns.Float(tau)
+    dr.enable_grad(v)
+    dr.backward(dr.sum(mean_depth_share(v)))
+    got = dr.grad(v).numpy()
+    assert np.all(np.isfinite(got))
+    t = tau[1:-1].astype(float)
+    with np.errstate(over="ignore"):
+        series = -1 / 12 + t**2 / 240 - t**4 / 6048
+        closed = -1 / t**2 + 1 / (4 * np.sinh(np.minimum(t, 600) / 2) ** 2)
+    expected = np.where(t < 0.1, series, closed)
+    assert np.allclose(got[1:-1], expected, rtol=2e-4, atol=2e-6)
+    assert np.isclose(got[0], -1 / 12)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test05_splitting_a_step_changes_nothing(share):
+    tau = TAU[TAU < 1e4]
+    a, b = ns.Float(tau * np.float32(share)), ns.Float(tau * np.float32(1 - share))
+    whole = ns.Float(tau)
+    behind = dr.exp(-a) * absorbed_share(b)
+    assert np.allclose((absorbed_share(a) + behind).numpy(), absorbed_share(whole).numpy(), rtol=1e-6)
+    moment = absorbed_share(a) * share * mean_depth_share(a) + behind * (share + (1 - share) * mean_depth_share(b))
+    expected = (absorbed_share(whole) * mean_depth_share(whole)).numpy()
+    assert np.allclose(moment.numpy(), expected, rtol=2e-6)
+
+
+def test06_permuting_steps_preserves_opacity():
+    tau = np.random.default_rng(0).exponential(0.1, 64).astype(np.float32)
+    opacities = []
+    for order in (np.arange(64), np.arange(64)[::-1], np.random.default_rng(1).permutation(64)):
+        light, total = 1.0, 0.0
+        for share in absorbed_share(ns.Float(tau[order])).numpy():
+            total += light * share
+            light *= 1 - share
+        opacities.append(total)
+    assert np.allclose(opacities, -np.expm1(-tau.astype(float).sum()), rtol=1e-6)
