@@ -35,7 +35,7 @@ class DensityGrid:
                 f"not one cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
                 "give a box that holds what the pictures show with --aabb"
             )
-        self.surface = dr.full(ns.Bool, False, cells)
+        self.always = dr.full(ns.Bool, False, cells)
         self._turn = 0
 
     def _corner(self, index):
@@ -96,7 +96,7 @@ class DensityGrid:
             c = [self.ns.UInt32(dr.clip(x * r, 0, r - 1)) for x in (u.x, u.y, u.z)]
             dr.scatter(found, self.ns.UInt8(1), c[0] + r * (c[1] + r * c[2]))
             dr.eval(found)
-        self.surface = self.seen & (found > 0)
+        self.always = self.seen & (found > 0)
         near = binary_dilation(found.numpy().reshape(r, r, r) > 0, np.ones((3, 3, 3)))
         self._allow(self.seen & self.ns.Bool(near.ravel()))
 
@@ -134,8 +134,17 @@ class DensityGrid:
             dr.eval(self.value)
         mean = dr.sum(self.value) / self.seen_count
         bound = dr.minimum(self.threshold, 0.5 * mean)
-        self.bits = dr.select((self.seen & (self.value > bound)) | self.surface, self.ns.UInt8(1), 0)
+        self.bits = dr.select((self.seen & (self.value > bound)) | self.always, self.ns.UInt8(1), 0)
         dr.eval(self.bits)
+
+    def settle(self, density, rng: np.random.Generator) -> None:
+        """From now on sample every cell of the `bound` of this moment.
+
+        Cells that were left out stopped learning, and what hashing made of them shows once a picture is rendered
+        under the bound: the last part of a run must clear it.
+        """
+        self.always = self.always | self.ns.Bool(self.bound(density, rng).bits.ravel())
+        dr.eval(self.always)
 
     @property
     def fraction(self) -> float:

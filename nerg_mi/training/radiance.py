@@ -56,6 +56,7 @@ class RadianceTrainer:
             self.grid.carve(self.pixels.surface_points())
         self.grid.update(self.density, self.rng, everywhere=True)
         self._tables: dict[int, StepTable] = {}
+        self._settled = False
         self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
         self._started = time.perf_counter()
 
@@ -95,6 +96,10 @@ class RadianceTrainer:
         if self.steps % _REFRESH == 0:
             self.live.set_parameters({k: dr.detach(self.optimiser[k]) for k in self.averaged})
         if self.steps % s.grid_every == 0 and self.steps > 0:
+            if not self._settled and self.progress >= s.settle:
+                with dr.suspend_grad():
+                    self.grid.settle(self.density, self.rng)
+                self._settled = True
             self.grid.update(self.density, self.rng)
         pixels = self.pixels.batch(ns.UInt32(self.rng.integers(0, self.pixels.size, self.rays, np.uint32)))
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)

@@ -37,7 +37,7 @@ class RadianceSettings:
     ``growth``: steps are at least this share of their distance; ``near``: where rays start; ``stop``: samples
     that less light reaches are left out. ``resolution``: of the density grid; ``min_views``: cells that fewer
     cameras see stay empty; ``strides``: the first steps of the run march this many times coarser, ``stride_steps`` each,
-    which clears early fog cheaply. ``huber``: error at which the colour loss turns linear. ``depth_weight``:
+    which clears early fog cheaply. ``settle``: share of the run after which all cells that rendering will visit are sampled. ``huber``: error at which the colour loss turns linear. ``depth_weight``:
     weight of the depth terms where depth is known; ``depth_margin``: distance from the true surface, in march
     steps, within which a ray's weight should lie.
     """
@@ -57,6 +57,7 @@ class RadianceSettings:
     resolution: int = 128
     grid_every: int = 16
     min_views: int = 2
+    settle: float = 0.75
     strides: tuple[int, ...] = field(default=(8, 4, 2))
     stride_steps: int = 96
     huber: float = 0.1

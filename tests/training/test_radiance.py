@@ -1,0 +1,170 @@
+"""The radiance trainer on a tiny place: it learns, repeats itself, and its gradients are right."""
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.capture.cameras import Camera, pixel_directions
+from nerg_mi.capture.dataset import Dataset
+from nerg_mi.capture.images import View
+from nerg_mi.field.box import Box
+from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.fields import load_radiance
+from nerg_mi.formats.transforms import Intrinsics
+from nerg_mi.training.losses import color_loss, composite, depth_loss
+from nerg_mi.training.model import density_color
+from nerg_mi.training.pixels import PixelBank
+from nerg_mi.training.radiance import RadianceTrainer
+from nerg_mi.training.radiance_run import save_trained, train_radiance
+from nerg_mi.training.sampling import StepTable, rays_in_box, visible_samples
+from nerg_mi.training.settings import RadianceSettings, sized_config
+
+BOX = Box((-1, -1, -1), (1, 1, 1))
+RADIUS = 0.6
+TINY = RadianceConfig(
+    grid=HashGridConfig(levels=4, log2_rows=12, base=8, finest=64), width=16, color_hidden=1, density_scale=0.5
+)
+LENS = Intrinsics(24, 24, 30.0, 30.0, 12.0, 12.0)
+
+
+def looking_at_origin(center):
+    z = center / np.linalg.norm(center)
+    x = np.cross([0, 0, 1.0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), center
+    return pose
+
+
+def ball(pose, depth=True):
+    """A ball of radius RADIUS, coloured by its normal, before nothing (alpha 0)."""
+    d = (pixel_directions(LENS) @ pose[:3, :3].T).reshape(-1, 3)
+    o = pose[:3, 3]
+    b, c = d @ o, o @ o - RADIUS**2
+    hit = b * b - c > 0
+    t = np.where(hit, -b - np.sqrt(np.where(hit, b * b - c, 0)), 0)
+    rgb = 0.5 + 0.4 * (o + d * t[:, None]) / RADIUS
+    color = np.concatenate([np.where(hit[:, None], rgb, 0), hit[:, None]], axis=1)
+    return View("ball", Camera(LENS, pose), color.reshape(24, 24, 4).astype(np.float32),
+                t.reshape(24, 24).astype(np.float32) if depth else None)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    rng = np.random.default_rng(0)
+    centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
+    views = [ball(looking_at_origin(2 * c / np.linalg.norm(c))) for c in centers]
+    return Dataset(views[4:], views[:4], BOX, "as given", None, {"dataset": "ball"})
+
+
+def settings(**changes):
+    given = {"steps": 300, "batch": 2**12, "resolution": 32, "march_step": 1 / 64, "stride_steps": 16, "seed": 1,
+             "depth_weight": 2e-3, **changes}
+    return RadianceSettings(**given)
+
+
+def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
+    """20 dB on held-out views after 300 small steps; the checkpoint says how."""
+    seen = []
+    field, provenance = train_radiance(dataset, TINY, settings(), ns, on_progress=seen.append)
+    assert provenance["psnr_held_out"]["mean"] > 20
+    assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].done == 1
+    save_trained(field, provenance, tmp_path / "ball.safetensors", half=True)
+    loaded, meta = load_radiance(tmp_path / "ball.safetensors", ns)
+    assert meta["provenance"]["settings"]["seed"] == 1
+    assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
+
+
+def test_learns_without_depth(dataset):
+    _, provenance = train_radiance(dataset, TINY, settings(), ns, depth=False)
+    assert provenance["psnr_held_out"]["mean"] > 19 and not provenance["depth_supervision"]
+
+
+def test_equal_seeds_give_equal_fields_to_rounding(dataset):
+    """The sums of several threads come in no fixed order; a few steps differ by rounding alone."""
+    def weights(seed):
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(seed=seed), ns)
+        for _ in range(4):
+            trainer.step()
+        return trainer.optimiser["density_net.0"].numpy()
+
+    assert np.allclose(weights(3), weights(3), atol=1e-4)
+    assert not np.allclose(weights(3), weights(4), atol=1e-2)
+
+
+def test_stored_occupancy_bounds_the_density(dataset):
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns)
+    while trainer.progress < 1:
+        trainer.step()
+    field = trainer.field()
+    assert 0 < field.occupancy.fraction < 0.9
+    # Only cells that enough cameras see are promised anything.
+    rng = np.random.default_rng(5)
+    p = ns.Array3f(rng.uniform(-0.7, 0.7, (3, 50_000)).astype(np.float32))
+    empty = field.occupancy.empty_cells(BOX.to_unit(p)) > 0
+    with dr.suspend_grad():
+        sigma = dr.select(empty, field.density(p), 0).numpy()
+    assert np.mean(sigma > field.occupancy.threshold) < 1e-3
+
+
+def test_tensor_products_equal_the_fields_own_evaluation():
+    rng = np.random.default_rng(2)
+    field = RadianceField.random(TINY, BOX, ns, 0)
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    p = ns.Array3f(rng.uniform(-0.99, 0.99, (3, 200)).astype(np.float32))
+    d = dr.normalize(ns.Array3f(rng.normal(size=(3, 200)).astype(np.float32)))
+    sigma, rgb = density_color(TINY, BOX, field.parameters(), p, d, ns)
+    expected, features = field.density_features(p)
+    assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4)
+    assert np.allclose(np.array([c.numpy() for c in rgb]), field.color(features, d).numpy(), atol=1e-5)
+
+
+def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
+    """Fixed samples, all loss terms, a direction through all weights: central differences to 1 %."""
+    rng = np.random.default_rng(6)
+    field = RadianceField.random(TINY, BOX, ns, 0)
+    table = rng.normal(size=len(field.grid.table)).astype(np.float32)
+    field.set_parameters({"grid.table": ns.Float(table)})
+    pixels = PixelBank(ns, dataset.train).batch(ns.UInt32(rng.integers(0, 24 * 24, 64).astype(np.uint32)))
+    rays = rays_in_box(pixels.o, pixels.d, BOX, 0.01)
+    offset = ns.Float(rng.random(64).astype(np.float32))
+    background = ns.Array3f(rng.random((3, 64)).astype(np.float32))
+    with dr.suspend_grad():
+        samples, covered = visible_samples(rays, StepTable(ns, 0.01, 4, 0.03, 0), offset, lambda p, a: a, field.density,
+                                           2e-3, pad=2**13)
+    assert covered == 64
+    start = {k: dr.detach(v) for k, v in field.parameters().items()}
+
+    def loss(parameters):
+        d = dr.gather(ns.Array3f, pixels.d, samples.ray)
+        sigma, rgb = density_color(TINY, BOX, parameters, samples.p, d, ns)
+        weight, tau, color, opacity = composite(sigma, rgb, samples)
+        terms = color_loss(color, opacity, pixels, background, 0.1)
+        terms += 0.1 * depth_loss(weight, tau, samples, pixels, 0.1, 0.1)
+        return dr.sum(ns.Float64(terms))
+
+    parameters = {k: type(v)(v) for k, v in start.items()}
+    dr.enable_grad(parameters)
+    dr.backward(loss(parameters))
+    # Along the signs of the gradient the parts of the slope do not cancel.
+    direction = {k: type(v)(dr.sign(dr.grad(v))) * type(v)(rng.random(v.shape).astype(np.float32))
+                 for k, v in parameters.items()}
+    slope = sum(float(np.sum(dr.grad(parameters[k]).numpy() * direction[k].numpy())) for k in parameters)
+    h = 3e-4
+    up, down = (loss({k: v + s * h * direction[k] for k, v in start.items()}).numpy()[0] for s in (1, -1))
+    assert slope == pytest.approx((up - down) / (2 * h), rel=0.01)
+
+
+def test_settings_and_sizes_are_checked():
+    for wrong in ({}, {"steps": 5, "minutes": 1.0}, {"steps": 0}, {"steps": 5, "resolution": 100}):
+        with pytest.raises(ValueError):
+            RadianceSettings(**wrong)
+    with pytest.raises(ValueError, match="small, medium, paper"):
+        sized_config("huge", BOX)
+    assert sized_config("paper", BOX).grid.log2_rows == 19
+
+
+def test_a_box_that_no_camera_sees_is_refused(dataset):
+    with pytest.raises(ValueError, match="--aabb"):
+        RadianceTrainer(dataset.train, Box((50, 50, 50), (51, 51, 51)), TINY, settings(), ns)
