@@ -41,10 +41,23 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - How far behind what the observer sees a surface may lie and still be the same one, in scene units; 0 stands for two
      march steps. (Default: 0)
 
+ * - visibility
+   - |string|
+   - How occlusion is decided. ``depth``: what the observer meets is compared with the distance to the surface (the
+     paper). ``transmittance``: the share of light that passes between observer and surface; ``falloff`` has no part in
+     it. ``map``: as ``depth``, with the observer's depths marched once for all directions and kept until the observer
+     or the field changes; right for many pixels or frames of one observer, and without derivatives with respect to it.
+     (Default: ``depth``)
+
+ * - map_height
+   - |int|
+   - Rows of the ``map``; it has twice as many columns. (Default: 512)
+
  * - depth
    - |string|
-   - ``expected`` (mean distance of absorption) or ``median`` (where half of the ray's own opacity is reached). The
-     surface that gaze is evaluated on lies at this depth. (Default: ``expected``)
+   - ``expected`` (mean distance of absorption), ``median`` (where half of the ray's own opacity is reached) or
+     ``refined`` (the median, searched again inside the step that reaches it). The surface that gaze is evaluated on
+     lies at this depth. (Default: ``expected``)
 
  * - surface_opacity
    - |float|
@@ -67,6 +80,17 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - |float|
    - March step in scene units; 0 stands for the one that the field was trained with, or for a 1024th of the medium's
      diagonal. (Default: 0)
+
+ * - quadrature
+   - |string|
+   - ``constant``: density is constant over a step, sampled at its middle. ``linear``: linear between samples at the
+     steps' ends. ``cells``: for an axis-aligned ``gridvolume`` as density, steps also end at voxel boundaries, where two
+     samples integrate its interpolant exactly. (Default: ``constant``)
+
+ * - coarse
+   - |float|
+   - Steps in front of all matter are this many times longer; a first, density-only march finds where matter begins. What
+     is thinner than such a step may be missed. 1 does without. (Default: 1)
 
  * - dt_gamma
    - |float|
@@ -152,8 +176,11 @@ from nerg_mi.registration import register
 from nerg_mi.transport import viewpoint
 from nerg_mi.transport.color import composite_to_linear
 from nerg_mi.transport.depth import KINDS, surface_depth
-from nerg_mi.transport.march import MarchSettings, march
+from nerg_mi.transport.march import MarchSettings, fine_start, march
 from nerg_mi.transport.media import VolumeMedium
+from nerg_mi.transport.observer_map import ObserverMap
+from nerg_mi.transport.rules import KINDS as QUADRATURES
+from nerg_mi.transport.rules import rule
 from nerg_mi.transport.visibility import visibility
 
 CHANNELS = {
@@ -190,6 +217,9 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.occlusion = bool(props.get("occlusion", True))
         self.falloff = mi.Float(_number(props, "falloff", 0.1, low=0))
         self.tolerance = _number(props, "tolerance", 0, low=0)
+        self.visibility_kind = _choice(props, "visibility", "depth", ("depth", "transmittance", "map"))
+        self.map_height = int(_number(props, "map_height", 512, low=2, high=16384))
+        self._map = None
         self.depth_kind = _choice(props, "depth", "expected", KINDS)
         self.surface_opacity = _number(props, "surface_opacity", 0.5, low=0, high=1)
         self.radiance = bool(props.get("radiance", True))
@@ -202,7 +232,10 @@ class NergIntegrator(mi.SamplingIntegrator):
             dt_gamma=_number(props, "dt_gamma", 0, low=0, high=1),
             stop=_number(props, "stop", 1e-6, low=0, high=1),
             color_cutoff=_number(props, "color_cutoff", 1e-4, low=0, high=1),
+            quadrature=_choice(props, "quadrature", "constant", QUADRATURES),
+            coarse=_number(props, "coarse", 1, low=1),
         )
+        rule(self.settings.quadrature, self.medium)
         # The sensors of the render in progress; None when another integrator drives ours.
         self._sensors = None
         self._warned = False
@@ -236,10 +269,8 @@ class NergIntegrator(mi.SamplingIntegrator):
         local = self.medium.local(ray.o, ray.d)
         t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, ray.maxt)
         lit = self.radiance and self.medium.has_color
-        result = march(
-            self.medium, local, t0, t1, active, self.settings, offset=offset, count=count,
-            color=_color_type(self.medium) if lit else None,
-        )
+        result = self._march(local, t0, t1, active, offset=offset, count=count,
+                             color=_color_type(self.medium) if lit else None)
         alpha = result.opacity
         some = active & (alpha > 0)
         out = {"opacity": dr.select(active, alpha, 0)}
@@ -270,6 +301,15 @@ class NergIntegrator(mi.SamplingIntegrator):
         aovs = [c for name in self.aovs for c in (out[name] if name == "position" else [out[name]])]
         return dr.select(active, L, 0), some, aovs
 
+    def _march(self, local, t0, t1, active, **options):
+        fine_from, scouted = None, 0
+        if self.settings.coarse > 1:
+            fine_from, scouted = fine_start(self.medium, local, t0, t1, active, self.settings)
+        result = march(self.medium, local, t0, t1, active, self.settings, fine_from=fine_from, **options)
+        if result.density_evals is not None:
+            result.density_evals += scouted
+        return result
+
     def traverse(self, cb):
         for name, child in self._children.items():
             if child is not None:
@@ -277,6 +317,9 @@ class NergIntegrator(mi.SamplingIntegrator):
         cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
+        self._map = None
+        if hasattr(self.medium, "refresh"):
+            self.medium.refresh()
         if not dr.all(self.falloff >= 0):
             raise ValueError(f'"falloff" must not be negative, got {self.falloff}')
 
@@ -286,9 +329,9 @@ class NergIntegrator(mi.SamplingIntegrator):
         if self.observer is not None:
             body["observer"] = viewpoint.center(self.observer)
         body |= {
-            "occlusion": self.occlusion, "falloff": self.falloff, "tolerance": self.tolerance or "2 steps",
+            "occlusion": self.occlusion, "visibility": self.visibility_kind, "falloff": self.falloff, "tolerance": self.tolerance or "2 steps",
             "depth": self.depth_kind, "surface_opacity": self.surface_opacity, "radiance": self.radiance,
-            "aovs": ",".join(self.aovs), "step": s.step, "dt_gamma": s.dt_gamma, "stop": s.stop,
+            "aovs": ",".join(self.aovs), "quadrature": s.quadrature, "step": s.step, "coarse": s.coarse, "dt_gamma": s.dt_gamma, "stop": s.stop,
             "color_cutoff": s.color_cutoff, "jitter": self.jitter,
         }
         return "NergIntegrator[\n" + "".join(f"  {k} = {v},\n" for k, v in body.items()) + "]"
@@ -330,16 +373,33 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def _observe(self, p_d, p_o, r_o, distance, surface, count):
         """What the observer meets towards ``p_d``: ``(p_od, d_o, visibility, density evaluations)``."""
+        tolerance = self.tolerance or 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * distance)
+        if self.visibility_kind == "map":
+            observed = self._observer_map(p_o)
+            met, seen = observed.look_up(r_o, distance, self.falloff, tolerance, surface)
+            d_o = dr.select(dr.isfinite(met), met, distance)
+            return p_o + r_o * d_o, d_o, seen, mi.Float(0)
+
         local = self.medium.local(p_o, r_o)
         t0, t1 = dr.maximum(local.t_near, 0), local.t_far
-        result = march(self.medium, local, t0, t1, surface, self.settings, count=count)
+        if self.visibility_kind == "transmittance":
+            # The surface's own matter in front of its depth is no occluder.
+            between = self._march(local, t0, dr.minimum(t1, distance - tolerance), surface, count=count)
+            return p_d, distance, dr.exp(-between.tau), between.density_evals
+        result = self._march(local, t0, t1, surface, count=count)
         met = surface & (result.opacity >= self.surface_opacity)
         depth = surface_depth(self.depth_kind, result, self.medium, local, t0, t1, surface, self.settings)
         # An observer who meets nothing sees the point itself.
         d_o = dr.select(met, depth, distance)
-        tolerance = self.tolerance or 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * distance)
-        seen = visibility(distance, d_o, self.falloff, tolerance)
-        return p_o + r_o * d_o, d_o, seen, result.density_evals
+        return p_o + r_o * d_o, d_o, visibility(distance, d_o, self.falloff, tolerance), result.density_evals
+
+    def _observer_map(self, p_o):
+        """The observer's map, marched anew only when the observer has moved or a parameter has changed."""
+        if self._map is None or not dr.all(self._map.center == dr.detach(p_o), axis=None):
+            self._map = ObserverMap(
+                self.medium, p_o, self.map_height, self.settings, self.depth_kind, self.surface_opacity, mi.Vector3f
+            )
+        return self._map
 
     def _behind(self, scene, ray, active):
         """Radiance behind everything: the scene's environment, else the background."""

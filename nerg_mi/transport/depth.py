@@ -17,6 +17,8 @@ _PARTS = 16
 def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, settings: MarchSettings):
     """Depth of ``kind`` from a march's result, 0 where nothing absorbs.
 
+    Evaluations that finding it takes are added to ``result.density_evals``, if that is counted.
+
     The median is where half of this ray's own accumulated opacity is reached, which is the crossing
     of transmittance 1/2 for rays that became opaque. The others (few) are marched again for theirs.
     ``refined`` searches the crossing step again with finer steps, for densities that change within one.
@@ -27,7 +29,10 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
     alpha = result.opacity
     rest = active & ~opaque & (alpha > 0)
     goal = -log1p(-0.5 * alpha)
-    again = march(medium, ray, t0, t1, rest, settings, until=dr.select(rest, goal, 1))
+    count = result.density_evals is not None
+    again = march(medium, ray, t0, t1, rest, settings, until=dr.select(rest, goal, 1), count=count)
+    if count:
+        result.density_evals = result.density_evals + again.density_evals
     # Rounding can leave the second march a hair short of its goal: the crossing is then the far end.
     crossing = dr.minimum(again.half, t1)
     depth = dr.select(rest, crossing, dr.select(opaque & active, result.half, 0))
@@ -39,7 +44,9 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
         found = active & (rest | opaque) & (missing > 0) & dr.isfinite(dr.select(rest, again.half, result.half))
         step = step_length(enter, settings)
         fine = march(medium, ray, enter, dr.minimum(enter + step, t1), found,
-                     replace(settings, step=settings.step / _PARTS), until=dr.select(found, missing, 1))
+                     replace(settings, step=settings.step / _PARTS), until=dr.select(found, missing, 1), count=count)
+        if count:
+            result.density_evals = result.density_evals + fine.density_evals
         # A finer march may find a little less in the step than the coarse one did.
         moved = dr.select(found & dr.isfinite(fine.half), fine.half - depth, 0)
     return depth + moved

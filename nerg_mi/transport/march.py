@@ -156,13 +156,14 @@ def limits(Float, settings: MarchSettings, until):
 
 
 def fine_start(medium, ray, t0, t1, active, settings: MarchSettings):
-    """Distance from which matter must be marched finely: a coarse density-only march's first trace of it.
+    """Distance from which matter must be marched finely, and the density evaluations that finding it took.
 
-    What is thinner than a coarse step may be missed.
+    A coarse density-only march looks for the first trace of matter. What is thinner than a coarse step may be missed.
     """
     scout = replace(settings, step=settings.step * settings.coarse, coarse=1.0, quadrature="constant")
-    found = march(medium, ray, t0, t1, active, scout, until=_TRACE)
-    return dr.select(dr.isfinite(found.half), dr.detach(found.enter) - scout.step, dr.inf)
+    with dr.suspend_grad():
+        found = march(medium, ray, t0, t1, active, scout, until=_TRACE, count=True)
+        return dr.select(dr.isfinite(found.half), found.enter - scout.step, dr.inf), found.density_evals
 
 
 def advance(medium, ray, t, t1, share, settings, active, planes=None, fine_from=None):
