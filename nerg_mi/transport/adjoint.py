@@ -17,12 +17,17 @@ Steps keep their lengths and move with the ray's entry t0; the last one ends at 
 """
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 
 from .march import MarchResult, advance, limits, march_primal
 from .media import LocalRay
 from .quadrature import absorbed_share
 from .rules import rule
+
+
+_INPUTS = ("o", "d", "w", "t0", "t1")
 
 
 def attached(medium, ray, t0, t1) -> bool:
@@ -43,10 +48,36 @@ def differentiable_march(medium, ray, t0, t1, active, settings, offset, color, c
     return result
 
 
+@dataclass
+class _State:
+    """Where a repeated march is: the primal's loop state as far as derivatives need it."""
+
+    active: object
+    t: object
+    share: object
+    tau: object
+    moment: object
+    color: object
+
+
+@dataclass
+class _Replayed:
+    """One repeated step. ``before``: the looked-for crossing lies behind it; ``crosses``: in it."""
+
+    active: object
+    dtau: object
+    mean: object
+    color: object
+    transmittance: object
+    before: object
+    crosses: object
+    crossing: object
+
+
 class _March(dr.CustomOp):
     def eval(self, o, d, w, t0, t1, fixed):
         self.fixed = fixed
-        self.ray, self.t0, self.t1 = LocalRay(o, d, w, t0, t1), t0, t1
+        self.inputs = (o, d, w, t0, t1)
         medium, active, settings, offset, color, count, until, fine_from = fixed
         # The medium's weights are read, not passed: tell the graph that the result depends on them.
         for parameter in medium.parameters():
@@ -56,68 +87,116 @@ class _March(dr.CustomOp):
             # steps must not be stored.
             with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
                 result = march_primal(
-                    medium, self.ray, t0, t1, active, settings, offset, color, count, until, fine_from
+                    medium, LocalRay(*self.inputs), t0, t1, active, settings, offset, color, count, until, fine_from
                 )
         self.result = result
         return (result.tau, result.moment, result.half, result.half_slope, result.enter, result.enter_tau,
                 result.color, result.density_evals, result.color_evals)
 
     def backward(self):
-        medium, active, settings, offset, color, _, until, fine_from = self.fixed
+        active, color = self.fixed[1], self.fixed[4]
         d_tau, d_moment, d_half, _, _, _, d_color, _, _ = self.grad_out()
-        primal, ray = self.result, self.ray
-        Float = type(self.t0)
-        goal, end = limits(Float, settings, until)
-        quadrature = rule(settings.quadrature, medium)
+        primal = self.result
         d_half = dr.select(dr.isfinite(primal.half), d_half, 0)
 
-        def body(active, t, share, tau, moment, total, grads):
-            active, t, delta, t_next = advance(
-                medium, ray, t, self.t1, share, settings, active, quadrature.planes, fine_from
-            )
+        def body(state, grads):
             with dr.resume_grad():
-                leaves = [dr.detach(x) for x in (ray.o, ray.d, ray.w, self.t0, self.t1)]
+                leaves = [dr.detach(x) for x in self.inputs]
                 dr.enable_grad(leaves)
-                o, d, w, t0, t1 = leaves
-                begin = t0 + (t - self.t0)
-                length = dr.select(t_next >= self.t1, t1 - begin, delta)
-                step = quadrature.step(
-                    medium, LocalRay(o, d, w, t0, t1), begin, length, t_next, None, active, color
-                )
-                dtau, m_i = step.dtau, dr.fma(length, step.share, begin)
-                transmittance = dr.exp(-tau)
-                share_i = absorbed_share(dtau)
-                weight = dr.detach(transmittance * share_i)
-                moment = moment + weight * dr.detach(m_i)
-                arriving = d_moment * m_i
-                behind = d_moment * (primal.moment - moment)
+                step, state = self._replay(leaves, state)
+                arriving = d_moment * step.mean
+                behind = d_moment * (primal.moment - state.moment)
                 if color is not None:
-                    lit = active & (weight > settings.color_cutoff)
-                    c_i = dr.select(lit, step.color(lit), 0)
-                    total = total + weight * dr.detach(c_i)
-                    arriving += dr.dot(d_color, c_i)
-                    behind += dr.dot(d_color, primal.color - total)
-                f = dtau * (d_tau - behind) + transmittance * share_i * arriving
-                before = tau + dr.detach(dtau) < goal
-                crosses = ~before & (tau < goal) & active
-                h = dr.select(before, -primal.half_slope * dtau, 0)
-                h += dr.select(crosses, begin + step.crossing(dr.select(crosses, goal - tau, 0)), 0)
-                f = dr.select(active, f + d_half * h, 0)
-                dr.backward_from(f)
+                    arriving += dr.dot(d_color, step.color)
+                    behind += dr.dot(d_color, primal.color - state.color)
+                f = step.dtau * (d_tau - behind) + step.transmittance * absorbed_share(step.dtau) * arriving
+                h = dr.select(step.before, -primal.half_slope * step.dtau, dr.select(step.crosses, step.crossing, 0))
+                dr.backward_from(dr.select(step.active, f + d_half * h, 0))
                 grads = [g + dr.grad(x) for g, x in zip(grads, leaves)]
-            tau = tau + dr.detach(dtau)
-            active = active & (t_next < self.t1) & (tau < end)
-            return active, t_next, Float(1), tau, moment, total, grads
+            return state, grads
 
-        start = (
-            active, self.t0, Float(1 if offset is None else offset), Float(0), Float(0),
-            None if color is None else dr.zeros(color),
-            [dr.zeros(type(x), dr.width(x)) for x in (ray.o, ray.d, ray.w, self.t0, self.t1)],
-        )
-        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-            *_, grads = dr.while_loop(start, lambda active, *_: active, body, label="march adjoint")
-        for name, g in zip(("o", "d", "w", "t0", "t1"), grads):
+        zeros = [dr.zeros(type(x), dr.width(x)) for x in self.inputs]
+        for name, g in zip(_INPUTS, self._march_again(body, active, zeros)):
             self.set_grad_in(name, g)
+
+    def forward(self):
+        active, color = self.fixed[1], self.fixed[4]
+        tangents = [self.grad_in(name) for name in _INPUTS]
+        Float = type(self.inputs[3])
+        primal = self.result
+
+        def body(state, sums):
+            tau_dot, moment_dot, half_dot, color_dot = sums
+            with dr.resume_grad():
+                leaves = [dr.detach(x) for x in self.inputs]
+                dr.enable_grad(leaves)
+                for leaf, tangent in zip(leaves, tangents):
+                    dr.set_grad(leaf, tangent)
+                step, state = self._replay(leaves, state)
+                # The step's own weight, and what it adds to the sums while T_i is held fixed.
+                weight = step.transmittance * absorbed_share(step.dtau)
+                outputs = [step.dtau, weight * step.mean, dr.select(step.crosses, step.crossing, 0)]
+                outputs += [] if color is None else [weight * step.color]
+                # Keep all derivatives: an output is an interior node of others, and the weights serve again.
+                dr.forward_to(outputs, flags=dr.ADFlag.ClearNone)
+                own = [dr.select(step.active, dr.grad(x), 0) for x in outputs]
+            # T_i falls with the optical depth in front of the step.
+            moment_dot = moment_dot + own[1] - dr.select(step.active, tau_dot * dr.detach(outputs[1]), 0)
+            half_dot = half_dot + own[2] - dr.select(step.crosses, tau_dot * primal.half_slope, 0)
+            if color is not None:
+                color_dot = color_dot + own[3] - dr.select(step.active, tau_dot * dr.detach(outputs[3]), 0)
+            return state, (tau_dot + own[0], moment_dot, half_dot, color_dot)
+
+        zero = (Float(0), Float(0), Float(0), None if color is None else dr.zeros(color))
+        tau_dot, moment_dot, half_dot, color_dot = self._march_again(body, active, zero)
+        nothing = Float(0)
+        counts = [None if x is None else nothing for x in (primal.density_evals, primal.color_evals)]
+        self.set_grad_out((tau_dot, moment_dot, half_dot, nothing, nothing, nothing, color_dot, *counts))
+
+    def _march_again(self, body, active, extra):
+        """Repeat the primal's steps, threading ``extra`` through ``body(state, extra)``."""
+        offset, color = self.fixed[3], self.fixed[4]
+        Float = type(self.inputs[3])
+        start = _State(active, self.inputs[3], Float(1 if offset is None else offset), Float(0), Float(0),
+                       None if color is None else dr.zeros(color))
+        with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
+            _, extra = dr.while_loop(
+                (start, extra), lambda state, _: state.active, lambda state, extra: body(state, extra),
+                label="march adjoint",
+            )
+        return extra
+
+    def _replay(self, leaves, state):
+        """The next step, attached to ``leaves`` and the medium, and the state after it."""
+        medium, _, settings, _, color, _, until, fine_from = self.fixed
+        primal_t0, primal_t1 = self.inputs[3:]
+        Float = type(primal_t0)
+        quadrature = rule(settings.quadrature, medium)
+        goal, end = limits(Float, settings, until)
+        ray = LocalRay(*self.inputs)
+        active, t, delta, t_next = advance(
+            medium, ray, state.t, primal_t1, state.share, settings, state.active, quadrature.planes, fine_from
+        )
+        o, d, w, t0, t1 = leaves
+        begin = t0 + (t - primal_t0)
+        length = dr.select(t_next >= primal_t1, t1 - begin, delta)
+        step = quadrature.step(medium, LocalRay(o, d, w, t0, t1), begin, length, t_next, None, active, color)
+        tau = state.tau
+        dtau = dr.detach(step.dtau)
+        transmittance = dr.exp(-tau)
+        weight = transmittance * absorbed_share(dtau)
+        mean = dr.fma(length, step.share, begin)
+        moment, total, painted = dr.fma(weight, dr.detach(mean), state.moment), state.color, None
+        if color is not None:
+            lit = active & (weight > settings.color_cutoff)
+            painted = dr.select(lit, step.color(lit), 0)
+            total = total + weight * dr.detach(painted)
+        before = active & (tau + dtau < goal)
+        crosses = active & ~before & (tau < goal)
+        crossing = begin + step.crossing(dr.select(crosses, goal - tau, 0))
+        replayed = _Replayed(active, step.dtau, mean, painted, transmittance, before, crosses, crossing)
+        after = _State(active & (t_next < primal_t1) & (tau + dtau < end), t_next, Float(1), tau + dtau, moment, total)
+        return replayed, after
 
     def name(self):
         return "march"
