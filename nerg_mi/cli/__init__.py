@@ -19,6 +19,7 @@ from .. import __version__
 from ..errors import sentence
 
 COMMANDS = {
+    "demo": "Render the demo store: pictures of what a gaze field is.",
     "doctor": "Say what works on this machine, and how to mend what does not.",
     "render": "Render a scene file to an EXR or PNG file.",
     "rays": "Import tracking files as rays of attention, and look at what they hold.",

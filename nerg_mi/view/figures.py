@@ -111,7 +111,7 @@ class _Sheet:
         from matplotlib.figure import Figure
 
         h, w = pictures[0].shape[:2]
-        left, foot = (34, 30) if axes else (_FOOT, _FOOT)
+        left, foot = (44, 32) if axes else (_FOOT, _FOOT)
         self.height = h + _HEAD + foot
         self.width = left + len(pictures) * (w + _GAP) + (_BAR + _LABELS if scale else 0)
         self.figure = Figure(figsize=(self.width / DPI, self.height / DPI), dpi=DPI)

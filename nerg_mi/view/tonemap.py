@@ -25,9 +25,9 @@ def to_bytes(display) -> np.ndarray:
 
 def write_png(path, display, text: dict[str, str] | None = None) -> None:
     """Write display values (h, w, 3) in 0..1 as an 8-bit PNG. ``text``: what its header says (tEXt chunks)."""
-    from PIL import Image, PngImagePlugin
+    import mitsuba as mi
 
-    said = PngImagePlugin.PngInfo()
+    bitmap = mi.Bitmap(to_bytes(display))
     for key, value in (text or {}).items():
-        said.add_text(key, value)
-    Image.fromarray(to_bytes(display)).save(path, pnginfo=said)
+        bitmap.metadata()[key] = value
+    bitmap.write(str(path))
