@@ -57,7 +57,18 @@ def test05_packed_round_trip(resolution):
 
 
 def test06_wrong_shapes():
-    with pytest.raises(ValueError, match="cube of cells"):
-        OccupancyGrid(np.zeros((2, 2, 3), bool), ns, 1)
+    for shape in ((2, 2), (2, 0, 3)):
+        with pytest.raises(ValueError, match="three axes of at least one cell"):
+            OccupancyGrid(np.zeros(shape, bool), ns, 1)
     with pytest.raises(ValueError, match="needs 64 bytes, got 63"):
         OccupancyGrid.from_packed(np.zeros(63, np.uint8), 8, ns, 1)
+
+
+def test07_grids_with_unequal_edges():
+    bits = np.random.default_rng(2).random((2, 5, 7)) < 0.2
+    grid = OccupancyGrid(bits, ns, 0)
+    z, y, x = np.meshgrid(*(np.arange(n) for n in bits.shape), indexing="ij")
+    centres = (np.stack([x, y, z], -1).reshape(-1, 3) + 0.5) / (7, 5, 2)
+    assert np.array_equal(grid.empty_cells(ns.Array3f(centres.T)).numpy(), brute_force(bits).ravel())
+    with pytest.raises(ValueError, match="no single resolution"):
+        grid.resolution

@@ -1,0 +1,31 @@
+"""Small fields, written to files, for the tests of the plugins."""
+import drjit.llvm.ad as ns
+import numpy as np
+
+from nerg_mi.field.box import Box
+from nerg_mi.field.gaze import GazeConfig, GazeField
+from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.fields import save_gaze, save_radiance
+
+GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
+BOX = Box((-1, -1, -1), (1, 1, 1))
+
+
+def radiance(path, density_scale=2.0, seed=0, occupancy=None, **kwargs):
+    field = RadianceField.random(
+        RadianceConfig(GRID, width=16, geometry=7, sh_degree=2, density_scale=density_scale), BOX, ns, seed,
+        occupancy=occupancy, march_step=0.1, **kwargs,
+    )  # fmt: skip
+    table = np.random.default_rng(seed).normal(size=len(field.grid.table)).astype(np.float32)
+    field.set_parameters({"grid.table": ns.Float(table)})
+    save_radiance(field, path, {"test": seed})
+    return field
+
+
+def gaze(path, variant="emit_capture", seed=1):
+    field = GazeField.random(GazeConfig(GRID, variant, width=16, geometry=7, sh_degree=2), BOX, ns, seed)
+    table = 2 * np.random.default_rng(seed).normal(size=len(field.grid.table)).astype(np.float32)
+    field.set_parameters({"grid.table": ns.Float(table)})
+    save_gaze(field, path, {"test": seed})
+    return field

@@ -1,0 +1,39 @@
+"""The volume `gazefield`: equation 1 in the scene, its place and its parameters."""
+import numpy as np
+import pytest
+
+from . import fields
+
+
+def load(mi, path, **kwargs):
+    return mi.load_dict({"type": "gazefield", "filename": str(path), **kwargs})
+
+
+def ask(mi, medium, p_od, p_o, r_o):
+    return [v.numpy()[0] for v in medium.evaluate(*(mi.Vector3f(np.asarray(x, float).tolist()) for x in (p_od, p_o, r_o)), True)]
+
+
+@pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
+def test01_placed_in_the_scene(rgb, tmp_path, variant):
+    fields.gaze(tmp_path / "g.safetensors", variant)
+    p_o, p_od = np.array([-0.5, 0.1, -0.7]), np.array([0.4, 0.3, 0.6])
+    r_o = (p_od - p_o) / np.linalg.norm(p_od - p_o)
+    plain = ask(rgb, load(rgb, tmp_path / "g.safetensors").gaze_medium(), p_od, p_o, r_o)
+    to_world = rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 1, 0], 30).scale(4)
+    m = np.array(to_world.matrix)
+    moved = load(rgb, tmp_path / "g.safetensors", to_world=to_world).gaze_medium()
+    assert np.allclose(ask(rgb, moved, (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r_o / 4), plain, rtol=1e-4)
+
+
+def test02_parameters_and_text(rgb, tmp_path):
+    field = fields.gaze(tmp_path / "g.safetensors")
+    volume = load(rgb, tmp_path / "g.safetensors")
+    assert set(rgb.traverse(volume).keys()) == set(field.parameters())
+    assert "variant = emit_capture" in str(volume) and "g.safetensors" in str(volume)
+    assert np.allclose(np.array(volume.bbox().max).ravel(), 1)
+
+
+def test03_wrong_files(rgb, tmp_path):
+    fields.radiance(tmp_path / "f.safetensors")
+    with pytest.raises(RuntimeError, match="holds a radiance field where a gaze field is needed"):
+        load(rgb, tmp_path / "f.safetensors")

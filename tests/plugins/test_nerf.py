@@ -1,0 +1,62 @@
+"""The volume `nerf`: what it returns, where it lies, and what it says about wrong files."""
+import numpy as np
+import pytest
+
+from . import fields
+
+
+@pytest.fixture
+def field(tmp_path):
+    return fields.radiance(tmp_path / "f.safetensors")
+
+
+def load(mi, path, **kwargs):
+    return mi.load_dict({"type": "nerf", "filename": str(path), **kwargs})
+
+
+def evaluate(mi, volume, p):
+    it = mi.Interaction3f()
+    it.p = mi.Point3f(np.asarray(p, np.float32).T)
+    return volume.eval_1(it).numpy()
+
+
+def test01_density_in_the_scene(rgb, tmp_path, field):
+    p = np.random.default_rng(0).uniform(-1.2, 1.2, (50, 3)).astype(np.float32)
+    expected = field.density(rgb.Point3f(p.T)).numpy()
+    assert (expected == 0).any() and (expected > 0).any()
+    assert np.allclose(evaluate(rgb, load(rgb, tmp_path / "f.safetensors"), p), expected, rtol=1e-6)
+    to_world = rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 1, 0], 30).scale(4)
+    volume = load(rgb, tmp_path / "f.safetensors", to_world=to_world)
+    q = np.array(to_world.matrix)[:3] @ np.concatenate([p.T, np.ones((1, 50))])
+    inside = np.abs(np.abs(p) - 1).min(-1) > 1e-4
+    assert np.allclose(evaluate(rgb, volume, q.T)[inside], expected[inside] / 4, rtol=1e-3)
+
+
+def test02_bounds(rgb, tmp_path, field):
+    box = load(rgb, tmp_path / "f.safetensors", to_world=rgb.ScalarTransform4f().translate([1, 2, 3]).scale(2)).bbox()
+    assert np.allclose(np.array(box.min).ravel(), [-1, 0, 1]) and np.allclose(np.array(box.max).ravel(), [3, 4, 5])
+
+
+def test03_parameters(rgb, tmp_path, field):
+    volume = load(rgb, tmp_path / "f.safetensors")
+    params = rgb.traverse(volume)
+    assert set(field.parameters()) == set(params.keys())
+    before = evaluate(rgb, volume, [[0.1, 0.2, 0.3]])
+    params["density_net.1"] = params["density_net.1"] * 2
+    params.update()
+    assert not np.isclose(evaluate(rgb, volume, [[0.1, 0.2, 0.3]]), before, rtol=1e-3)
+
+
+@pytest.mark.parametrize("change", ["mirror", "shear", "uneven"])
+def test04_placements_that_are_no_similarity(rgb, tmp_path, field, change):
+    m = np.eye(4)
+    m[{"mirror": (0, 0), "shear": (0, 1), "uneven": (2, 2)}[change]] = {"mirror": -1, "shear": 0.5, "uneven": 3}[change]
+    with pytest.raises(RuntimeError, match='"to_world" of a field must be a rotation'):
+        load(rgb, tmp_path / "f.safetensors", to_world=rgb.ScalarTransform4f(m.tolist()))
+
+
+def test06_stock_integrators_take_it_as_a_medium(rgb, tmp_path, field):
+    # A heterogeneous medium asks for the maximum, and for spectra.
+    volume = load(rgb, tmp_path / "f.safetensors")
+    assert volume.channel_count() == 1
+    assert "NerfVolume[" in str(volume) and "f.safetensors" in str(volume)
