@@ -99,8 +99,10 @@ def run_demo(
     versions = _versions(active)
     header = {"Software": f"nerg_mi {__version__}", "Comment": f"seed {seed}, {spp} samples a pixel, {active}"}
     # One scale for all pictures of gaze, so that a colour means the same in each of them.
-    shown = [(r.aovs["gaze"], r.mask) for r in (own, camera, without)]
-    heat = Heat(max(top_of(g, m) for g, m in shown if np.any(g > 0)) if any(np.any(g > 0) for g, _ in shown) else 0.0)
+    tops = [top_of(r.aovs["gaze"], r.mask) for r in (own, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)]
+    if not tops:
+        raise NergError(f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer.')
+    heat = Heat(max(tops))
     marker = _pixel_of_observer(mi, seen)
     files = _write_pictures(out, camera, own, sphere, without, heat, marker, header)
     camera.bitmap.metadata()["seed"] = seed

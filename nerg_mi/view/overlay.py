@@ -31,8 +31,8 @@ class Heat:
     colors: str = "inferno"
     opacity: float = 0.9
     ramp: float = 0.35
-    dim: float = 0.75
-    grey: float = 0.75
+    dim: float = 0.8
+    grey: float = 0.6
 
     def __post_init__(self):
         if not (np.isfinite(self.top) and self.top > 0):

@@ -1,0 +1,160 @@
+"""Visibility and depth of the store's field against exact ray casts to its twin.
+
+    python benchmarks/store_visibility.py [--field FILE] [--width 240] [--out out/benchmarks/store_visibility.csv]
+
+For several pairs of a camera and an observer, the integrator `nerg` renders depth, position and visibility (falloff 0, one
+ray a pixel). The same rays are cast at the twin. A pixel agrees when visibility is 1 where the twin lets the observer see
+the surface that this pixel's ray meets in the twin, and 0 where it does not.
+
+Away from silhouettes: pixels within `--margin` pixels of a discontinuity of the exact depth or of the exact visibility are
+left out; there a centimetre decides, and a field has no edges finer than its grid. How many that are is a column.
+
+Columns: `agree` away from silhouettes, of it the share `wrongly seen` and `wrongly hidden`; `agree all` with silhouettes;
+`agree own`: the exact test is made at the field's own surface point instead of the twin's (5 cm before it are not tested);
+`kept` share of pixels away from silhouettes; `visible` share of pixels that are exactly visible; errors of depth in cm over
+all pixels with a surface.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from pathlib import Path
+
+import numpy as np
+
+# name: (camera, target, eye). Cameras see over or around shelves; eyes are a shopper's.
+PAIRS = {
+    "demo": ("6.5, 0.7, 2.3", "4.6, 3.0, 1.1", "4.8, 2.2, 1.6"),
+    "aisle 3, from the north": ("6.5, 5.0, 2.2", "4.5, 2.8, 0.9", "4.5, 2.0, 1.6"),
+    "aisle 2, from the north": ("4.9, 5.0, 2.2", "2.8, 2.6, 0.9", "2.75, 2.0, 1.6"),
+    "aisle 1, from the south": ("2.75, 0.7, 2.2", "1.0, 3.0, 1.0", "0.9, 3.2, 1.6"),
+    "counter, from the west": ("4.55, 1.0, 2.2", "7.0, 2.6, 1.0", "6.3, 3.0, 1.6"),
+    "coolers, from the south": ("6.3, 1.0, 2.3", "3.6, 5.6, 1.2", "3.6, 4.8, 1.6"),
+    "door, level": ("6.3, 4.9, 1.6", "5.6, 1.0, 1.1", "5.6, 0.7, 1.6"),
+}
+KINDS = ("expected", "median", "refined")
+
+
+def near_edges(depth: np.ndarray, visible: np.ndarray, margin: int) -> np.ndarray:
+    """Pixels (h, w) within ``margin`` pixels of a jump of the exact depth (over 4 cm + 3 %) or of visibility."""
+    from scipy.ndimage import binary_dilation
+
+    edge = np.zeros(depth.shape, bool)
+    for axis in (0, 1):
+        lo = (slice(None),) * axis + (slice(None, -1),)
+        hi = (slice(None),) * axis + (slice(1, None),)
+        jump = np.abs(depth[hi] - depth[lo]) > 0.04 + 0.03 * np.minimum(depth[hi], depth[lo])
+        jump |= visible[hi] != visible[lo]
+        edge[lo] |= jump
+        edge[hi] |= jump
+    # The pixels at both sides of a jump are marked already.
+    return binary_dilation(edge, np.ones((3, 3)), iterations=margin - 1) if margin > 1 else edge
+
+
+def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, width: int, margin: int) -> dict:
+    """One row of the table."""
+    import mitsuba as mi
+
+    from nerg_mi.scenes.store import twin
+
+    camera, target, eye = PAIRS[pair]
+    values = {"camera": camera, "target": target, "eye": eye, "width": str(width), "height": str(2 * width // 3),
+              "depth": kind, "visibility": visibility, "falloff": "0", "radiance": "false",
+              "aovs": "opacity,position,visibility", **files}  # fmt: skip
+    loaded = mi.load_file(str(scene), **values)
+    start = time.perf_counter()
+    picture = np.array(mi.render(loaded, sensor=0, spp=1, seed=1), np.float64)[..., 3:]
+    seconds = time.perf_counter() - start
+    opacity, p, seen = picture[..., 0], picture[..., 1:4], picture[..., 4]
+
+    # Mitsuba draws each ray anywhere in its pixel; the surface point that the field reports gives it back.
+    surface = opacity >= 0.5
+    o, e = (np.array([float(x) for x in v.split(",")]) for v in (camera, eye))
+    # From the camera's centre; the AOV "depth" starts at the near plane.
+    depth = np.linalg.norm(p - o, axis=-1)
+    d = (p - o) / np.maximum(depth[..., None], 1e-9)
+    exact = np.full(depth.shape, np.nan)
+    exact[surface] = twin.cast(o, d[surface])
+    # A millimetre before the surface: the point itself must not hide itself.
+    truth, own = np.zeros(depth.shape, bool), np.zeros(depth.shape, bool)
+    truth[surface] = twin.visible(e, (o + (exact[surface, None] - 1e-3) * d[surface]))
+    own[surface] = twin.visible(e, p[surface], tolerance=0.05)
+
+    far = surface & ~near_edges(np.nan_to_num(exact, nan=1e3), truth, margin)
+    shown = seen > 0.5
+    error = 100 * np.abs(depth - exact)[surface]
+    return {
+        "pair": pair, "depth": kind, "visibility": visibility,
+        "agree": (shown == truth)[far].mean(), "wrongly seen": (shown & ~truth)[far].mean(),
+        "wrongly hidden": (~shown & truth)[far].mean(), "agree all": (shown == truth)[surface].mean(),
+        "agree own": (shown == own)[far].mean(), "kept": far.mean(), "visible": truth[surface].mean(),
+        "no surface": 1 - surface.mean(), "median cm": np.median(error), "p90 cm": np.percentile(error, 90),
+        "within 5 cm": (error < 5).mean(), "within 10 cm": (error < 10).mean(),
+        "p90 cm away": np.percentile(100 * np.abs(depth - exact)[far], 90), "seconds": seconds,
+    }  # fmt: skip
+
+
+def table(rows: list[dict]) -> None:
+    """Print ``rows``, and their means for each kind of depth and visibility."""
+    from rich.console import Console
+    from rich.table import Table
+
+    out = Table(title="Visibility and depth against exact ray casts")
+    names = [k for k in rows[0] if k != "seconds"]
+    for k in names:
+        out.add_column(k, justify="left" if isinstance(rows[0][k], str) else "right")
+
+    def cells(row):
+        return [v if isinstance(v, str) else f"{v:.2f}" if k.endswith(("cm", "away")) else f"{100 * v:.2f}"
+                for k, v in ((k, row[k]) for k in names)]  # fmt: skip
+
+    for row in rows:
+        out.add_row(*cells(row))
+    out.add_section()
+    for key in dict.fromkeys((r["depth"], r["visibility"]) for r in rows):
+        mine = [r for r in rows if (r["depth"], r["visibility"]) == key]
+        mean = {k: "mean" if k == "pair" else v if isinstance(v, str) else float(np.mean([r[k] for r in mine]))
+                for k, v in mine[0].items()}  # fmt: skip
+        out.add_row(*cells(mean), style="bold")
+    Console(width=max(170, Console().width)).print(out)
+    print("Shares in percent, depth errors in cm.")
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--field", type=Path, help="checkpoint (default: that of the store)")
+    parser.add_argument("--gaze", type=Path, help="checkpoint of the scene's gaze field (default: the store's; not evaluated)")
+    parser.add_argument("--width", type=int, default=240, help="width of a picture in pixels (3:2)")
+    parser.add_argument("--margin", type=int, default=2, help="pixels left out around silhouettes")
+    parser.add_argument("--kinds", default="expected,median", help=f"kinds of depth, of {', '.join(KINDS)}")
+    parser.add_argument("--visibility", default="depth", help="kinds of visibility: depth, transmittance, map")
+    parser.add_argument("--pair", action="append", choices=list(PAIRS), help="only this one; may be given several times")
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/store_visibility.csv"), help="CSV file to write")
+    args = parser.parse_args(argv)
+
+    import nerg_mi  # noqa: F401  chooses the libLLVM, so it comes before mitsuba
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.view.demo import store_scene
+
+    files = {k: str(v.resolve()) for k, v in (("field", args.field), ("gaze", args.gaze)) if v is not None}
+    rows = [
+        measure(store_scene(), pair, kind, visibility, files, args.width, args.margin)
+        for visibility in args.visibility.split(",")
+        for kind in args.kinds.split(",")
+        for pair in args.pair or PAIRS
+    ]
+    table(rows)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    with args.out.open("w", newline="") as f:
+        writer = csv.DictWriter(f, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"wrote {args.out}")
+
+
+if __name__ == "__main__":
+    main()
