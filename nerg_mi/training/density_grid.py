@@ -87,8 +87,12 @@ class DensityGrid:
         For depth that is exact and known at every pixel: all that a camera can see lies on those points. The
         cells that hold one stay on whatever is found in them: once off, nothing would be learnt there again.
         """
-        from scipy.ndimage import binary_dilation
+        found = self._holding(points)
+        self.always = self.seen & self.ns.Bool(found.ravel())
+        self._allow(self.seen & self.ns.Bool(_grown(found).ravel()))
 
+    def _holding(self, points) -> np.ndarray:
+        """Cells (R, R, R) that hold one of the points (Array3f, world) of an iterable."""
         r = self.resolution
         found = dr.zeros(self.ns.UInt8, r**3)
         for p in points:
@@ -96,9 +100,7 @@ class DensityGrid:
             c = [self.ns.UInt32(dr.clip(x * r, 0, r - 1)) for x in (u.x, u.y, u.z)]
             dr.scatter(found, self.ns.UInt8(1), c[0] + r * (c[1] + r * c[2]))
             dr.eval(found)
-        self.always = self.seen & (found > 0)
-        near = binary_dilation(found.numpy().reshape(r, r, r) > 0, np.ones((3, 3, 3)))
-        self._allow(self.seen & self.ns.Bool(near.ravel()))
+        return found.numpy().reshape(r, r, r) > 0
 
     def _allow(self, cells) -> None:
         """Restrict samples to ``cells`` (mask), all of which count as occupied until they are looked at."""
@@ -110,10 +112,13 @@ class DensityGrid:
 
     def occupied(self, p, active):
         """Mask of the points ``p`` (Array3f, world) in cells that may hold density."""
+        return self._within(self.bits, p, active)
+
+    def _within(self, bits, p, active):
         r = self.resolution
         u = (p - self.ns.Array3f(*self.box.center)) / self.box.side + 0.5
         c = [self.ns.UInt32(dr.clip(x * r, 0, r - 1)) for x in (u.x, u.y, u.z)]
-        return active & (dr.gather(self.ns.UInt8, self.bits, c[0] + r * (c[1] + r * c[2]), active) > 0)
+        return active & (dr.gather(self.ns.UInt8, bits, c[0] + r * (c[1] + r * c[2]), active) > 0)
 
     def update(self, density, rng: np.random.Generator, everywhere: bool = False) -> None:
         """Look at one random point in an eighth of the cells, or in all of them.
@@ -137,13 +142,13 @@ class DensityGrid:
         self.bits = dr.select((self.seen & (self.value > bound)) | self.always, self.ns.UInt8(1), 0)
         dr.eval(self.bits)
 
-    def settle(self, density, rng: np.random.Generator) -> None:
+    def settle(self, density, rng: np.random.Generator, lit) -> None:
         """From now on sample every cell of the `bound` of this moment.
 
         Cells that were left out stopped learning, and what hashing made of them shows once a picture is rendered
         under the bound: the last part of a run must clear it.
         """
-        self.always = self.always | self.ns.Bool(self.bound(density, rng).bits.ravel())
+        self.always = self.always | self.ns.Bool(self.bound(density, rng, lit).bits.ravel())
         dr.eval(self.always)
 
     @property
@@ -151,13 +156,14 @@ class DensityGrid:
         """Share of all cells that samples are taken in."""
         return float(dr.sum(self.ns.Float(self.bits))[0]) / self.resolution**3
 
-    def bound(self, density, rng: np.random.Generator, probes: int = 3) -> OccupancyGrid:
-        """A grid for rendering. A cell is empty when no probe in it finds density above the threshold.
+    def bound(self, density, rng: np.random.Generator, lit, probes: int = 3) -> OccupancyGrid:
+        """A grid for rendering, of cells that may hold density and that matter to the training rays.
 
-        ``probes``**3 jittered points a cell are looked at, and every cell that touches an occupied one
-        stays on, so that a bump between the probes of a face is not cut. The threshold, in 1/unit, is
-        the density that absorbs ``self.threshold`` in one training step. Cells that too few cameras see
-        are empty by definition: nothing was learnt there.
+        ``probes``**3 jittered points a cell are looked at; a cell with one above the threshold stays on, and so do all
+        that touch it, so that a bump between the probes of a face is not cut. The threshold, in 1/unit, is the density
+        that absorbs ``self.threshold`` in one training step. Of these cells those stay that take more than a
+        thousandth of some training ray's light, or touch one that does: ``lit(density, occupied)`` yields
+        the points of such samples. All others are empty by definition: no picture says what is in them.
         """
         limit = self.threshold / self.step
         found = dr.zeros(self.ns.UInt8, self.resolution**3)
@@ -171,8 +177,15 @@ class DensityGrid:
             if dr.width(hit) > 0:
                 dr.scatter(found, self.ns.UInt8(1), dr.gather(self.ns.UInt32, index, hit))
                 dr.eval(found)
-        from scipy.ndimage import binary_dilation
-
         shape = (self.resolution,) * 3
-        bits = binary_dilation(found.numpy().reshape(shape) > 0, np.ones((3, 3, 3)))
-        return OccupancyGrid(bits & self.seen.numpy().reshape(shape), self.ns, limit)
+        dense = _grown(found.numpy().reshape(shape) > 0) & self.seen.numpy().reshape(shape)
+        bits = self.ns.UInt8(dense.ravel())
+        shown = self._holding(lit(density, lambda p, active: self._within(bits, p, active)))
+        return OccupancyGrid(dense & _grown(shown), self.ns, limit)
+
+
+def _grown(cells: np.ndarray) -> np.ndarray:
+    """``cells`` and all that touch one of them, by a face, an edge or a corner."""
+    from scipy.ndimage import binary_dilation
+
+    return binary_dilation(cells, np.ones((3, 3, 3)))

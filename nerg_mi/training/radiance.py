@@ -15,6 +15,7 @@ from drjit.opt import Adam
 from ..capture.images import View
 from ..field.box import Box
 from ..field.radiance import RadianceConfig, RadianceField
+from .compositing import weights
 from .density_grid import DensityGrid
 from .losses import color_loss, composite, depth_loss
 from .model import density_color
@@ -26,6 +27,10 @@ from .settings import RadianceSettings
 # The density pass may run on weights a few steps old: it only decides which samples are worth a look.
 _REFRESH = 4
 _MAX_RAYS = 2**14
+# Training rays that decide, at the end, which cells matter.
+_LOOKS, _LOOK_RAYS = 64, 2**12
+# Rays whose depth loss exceeds this are drawn again; so many are kept.
+_WRONG, _HARD = 0.3, 2**14
 
 
 class RadianceTrainer:
@@ -56,7 +61,7 @@ class RadianceTrainer:
             self.grid.carve(self.pixels.surface_points())
         self.grid.update(self.density, self.rng, everywhere=True)
         self._tables: dict[int, StepTable] = {}
-        self._settled = False
+        self._settled, self._hard, self.misplaced = False, np.zeros(0, np.uint32), None
         self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
         self._started = time.perf_counter()
 
@@ -98,10 +103,11 @@ class RadianceTrainer:
         if self.steps % s.grid_every == 0 and self.steps > 0:
             if not self._settled and self.progress >= s.settle:
                 with dr.suspend_grad():
-                    self.grid.settle(self.density, self.rng)
+                    self.grid.settle(self.density, self.rng, self._lit)
                 self._settled = True
             self.grid.update(self.density, self.rng)
-        pixels = self.pixels.batch(ns.UInt32(self.rng.integers(0, self.pixels.size, self.rays, np.uint32)))
+        index = self._draw()
+        pixels = self.pixels.batch(ns.UInt32(index))
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
         offset = ns.Float(self.rng.random(self.rays, np.float32))
         stride = 1 if self.carved else s.stride(self.steps)
@@ -113,7 +119,24 @@ class RadianceTrainer:
             return
         background = ns.Array3f(*[ns.Float(self.rng.random(self.rays, np.float32)) for _ in range(3)])
         self._descend(samples, pixels, background, covered, stride)
+        if self.use_depth:
+            self._remember(index[:covered])
         self._adapt(samples.count / covered)
+
+    def _draw(self) -> np.ndarray:
+        """Indices of the pixels of a batch: at random, a share of them from those whose depth was wrong before."""
+        index = self.rng.integers(0, self.pixels.size, self.rays, np.uint32)
+        if self._hard.size and self.progress > self.settings.hold:
+            again = int(self.settings.replay * self.rays)
+            index[:again] = self._hard[self.rng.integers(0, self._hard.size, again)]
+            # In mixed order, because the last rays of a batch may not fit into it.
+            self.rng.shuffle(index)
+        return index
+
+    def _remember(self, index: np.ndarray) -> None:
+        """Keep the pixels of this batch whose depth was wrong, in place of the oldest kept."""
+        wrong = self.misplaced.numpy()[:len(index)] > _WRONG
+        self._hard = np.concatenate([self._hard, index[wrong]])[-_HARD:]
 
     def _descend(self, samples, pixels, background, covered: int, stride: int) -> None:
         s, ns = self.settings, self.ns
@@ -124,8 +147,10 @@ class RadianceTrainer:
         loss = color_loss(color, opacity, pixels, background, s.huber)
         if self.use_depth:
             # In units of the step at hand: while marching is coarse, no more can be asked for.
-            loss += s.depth_weight * depth_loss(weight, tau, samples, pixels, s.depth_margin * self.march_step,
-                                                stride * self.march_step)
+            placed = depth_loss(weight, tau, samples, pixels, s.depth_margin * self.march_step, stride * self.march_step)
+            # Places first, colours later: once surfaces stand, colour has more to say.
+            loss += s.depth_weight * s.final_depth ** self.progress * placed
+            self.misplaced = dr.detach(placed)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
         loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
         dr.backward(loss)
@@ -138,6 +163,19 @@ class RadianceTrainer:
             for k, old in self.averaged.items():
                 self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * (1 - decay)
             dr.eval(self.averaged)
+
+    def _lit(self, density, occupied):
+        """Points (Array3f) of the samples that give a training ray more than a thousandth of its light."""
+        s, ns = self.settings, self.ns
+        rng = np.random.default_rng(s.seed)
+        for _ in range(_LOOKS):
+            pixels = self.pixels.batch(ns.UInt32(rng.integers(0, self.pixels.size, _LOOK_RAYS, np.uint32)))
+            rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
+            offset = ns.Float(rng.random(_LOOK_RAYS, np.float32))
+            samples, _ = visible_samples(rays, self.table(), offset, occupied, density, s.stop)
+            if samples is not None:
+                weight = weights(density(samples.p, True) * samples.length, samples.segments)
+                yield dr.gather(ns.Array3f, samples.p, dr.compress(weight > 1e-3))
 
     def _adapt(self, samples_a_ray: float) -> None:
         """Choose the number of rays that will fill a batch."""
@@ -167,5 +205,5 @@ class RadianceTrainer:
         out.set_parameters({k: type(v)(v) for k, v in self.averaged.items()})
         if bound:
             with dr.suspend_grad():
-                out.occupancy = self.grid.bound(out.density, np.random.default_rng(self.settings.seed))
+                out.occupancy = self.grid.bound(out.density, np.random.default_rng(self.settings.seed), self._lit)
         return out

@@ -38,8 +38,8 @@ class RadianceSettings:
     that less light reaches are left out. ``resolution``: of the density grid; ``min_views``: cells that fewer
     cameras see stay empty; ``strides``: the first steps of the run march this many times coarser, ``stride_steps`` each,
     which clears early fog cheaply. ``settle``: share of the run after which all cells that rendering will visit are sampled. ``huber``: error at which the colour loss turns linear. ``depth_weight``:
-    weight of the depth terms where depth is known; ``depth_margin``: distance from the true surface, in march
-    steps, within which a ray's weight should lie.
+    weight of the depth terms where depth is known, falling to ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in march
+    steps, within which a ray's weight should lie; ``replay``: share of the rays drawn from those whose depth was wrong.
     """
 
     steps: int | None = None
@@ -57,12 +57,14 @@ class RadianceSettings:
     resolution: int = 128
     grid_every: int = 16
     min_views: int = 2
-    settle: float = 0.75
+    settle: float = 0.85
     strides: tuple[int, ...] = field(default=(8, 4, 2))
     stride_steps: int = 96
     huber: float = 0.1
     depth_weight: float = 0.02
+    final_depth: float = 0.25
     depth_margin: float = 1.5
+    replay: float = 0.25
 
     def __post_init__(self):
         if (self.steps is None) == (self.minutes is None):
