@@ -92,6 +92,17 @@ def test05_outside_of_the_box_the_features_are_zero():
     assert emit[0] == emit[1]
 
 
+def test06_softplus_and_its_gradient():
+    x = ns.Float([-1e4, -100, -50, -1, -1e-4, 0, 1e-4, 1, 50, 100, 1e4])
+    dr.enable_grad(x)
+    y = softplus(x)
+    dr.backward(dr.sum(y))
+    v = x.numpy().astype(float)
+    assert np.allclose(y.numpy(), np.logaddexp(0, v), rtol=1e-6, atol=1e-7)
+    assert np.all(y.numpy() >= 0)
+    assert np.allclose(dr.grad(x).numpy(), reference.sigmoid(v), atol=1e-6)
+
+
 def test07_activations_far_out_are_finite():
     x = ns.Float([-1e30, -90, 0, 29, 90, 1e30])
     for name in ("softplus", "exp"):
@@ -137,3 +148,20 @@ def test09_names_and_sizes():
 def test10_wrong_settings(wrong, words):
     with pytest.raises(ValueError, match=words):
         GazeConfig(**wrong)
+
+
+def test11_one_observer_and_many_directions():
+    # The way the integrator asks: a single position, a direction a pixel; forward and backward.
+    field, (p_od, p_o, r_o) = make(), queries(8)
+    x = ns.Float(0)
+    dr.enable_grad(x)
+    eye = ns.Array3f(*p_o[0].tolist()) + ns.Array3f(x, 0.5 * x, -x)
+    gaze = field.evaluate(ns.Array3f(p_od.T), eye, ns.Array3f(r_o.T))[0]
+    many = np.repeat(p_o[:1], 8, 0)
+    assert np.allclose(gaze.numpy(), evaluate(field, p_od, many, r_o)[0], rtol=1e-6)
+    dr.backward(dr.sum(gaze))
+    ends = [
+        reference.gaze(p_od, many + h * np.array([1, 0.5, -1]), r_o, arrays(field), GRID, BOX.lower, BOX.upper,
+                       "emit_capture", "softplus")[0].sum() for h in (1e-4, -1e-4)
+    ]  # fmt: skip
+    assert np.isclose(dr.grad(x).numpy()[0], (ends[0] - ends[1]) / 2e-4, rtol=0.02)

@@ -72,3 +72,16 @@ def test04_random_weights_are_bounded_and_seeded():
 def test05_layers_that_do_not_fit():
     with pytest.raises(ValueError, match="do not fit together"):
         MLP([dr.zeros(ns.TensorXf, (4, 3)), dr.zeros(ns.TensorXf, (2, 5))])
+
+
+def test06_inputs_of_one_and_of_many_lanes():
+    net, weights, x = make([3, 8, 2], n=5)
+    one = ns.Float(0.25)
+    dr.enable_grad(one)
+    out = net([one, ns.Float(x[:, 1]), ns.Float(x[:, 2])])
+    x[:, 0] = 0.25
+    assert np.allclose(np.stack([o.numpy() for o in out], -1), reference.mlp(x, weights), atol=1e-6)
+    dr.backward(dr.sum(out[0]))
+    h = np.array([1e-4, 0, 0])
+    difference = (reference.mlp(x + h, weights)[:, 0] - reference.mlp(x - h, weights)[:, 0]).sum() / 2e-4
+    assert np.isclose(dr.grad(one).numpy()[0], difference, rtol=1e-3)

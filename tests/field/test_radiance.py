@@ -156,6 +156,25 @@ def test12_wrong_color_space():
         make(color_space="aces")
 
 
+def test13_a_table_of_another_length_is_refused():
+    # Gathers beyond the end of a table would read foreign memory.
+    field = make()
+    with pytest.raises(ValueError, match="grid.table"):
+        field.set_parameters({"grid.table": dr.zeros(ns.Float, 8)})
+
+
+def test14_a_matrix_of_another_shape_is_refused():
+    field = make()
+    with pytest.raises(ValueError, match="density_net.0"):
+        field.set_parameters({"density_net.0": dr.zeros(ns.TensorXf, (3, 3))})
+
+
+def test15_networks_that_do_not_fit_the_grid_are_refused():
+    a, b = make(), make(config=RadianceConfig(grid=HashGridConfig(**{**GRID, "levels": 3}), width=16, geometry=7))
+    with pytest.raises(ValueError):
+        RadianceField(CONFIG, BOX, a.grid, b.density_net, a.color_net)
+
+
 def test16_the_grid_belongs_to_one_configuration():
     grid = HashGrid.random(HashGridConfig(**GRID), ns, np.random.default_rng(0))
     assert grid.config == CONFIG.grid and make().config.grid == CONFIG.grid

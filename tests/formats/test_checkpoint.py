@@ -86,6 +86,14 @@ def test07_somebody_elses_safetensors(tmp_path):
         read_checkpoint(path, "radiance")
 
 
+@pytest.mark.parametrize("text", ["{", "[1]", "3", '"x"', ""])
+def test08_damaged_metadata(tmp_path, text):
+    path = tmp_path / "f.safetensors"
+    save_file({"x": np.ones(2)}, path, metadata={"nerg": text})
+    with pytest.raises(ValueError, match="f.safetensors"):
+        read_checkpoint(path, "radiance")
+
+
 def test09_another_kind_and_another_format(tmp_path):
     path = tmp_path / "f.safetensors"
     write_checkpoint(path, "gaze", TENSORS, {})

@@ -86,3 +86,59 @@ def test04_the_other_kind(tmp_path):
 
 
 NAMES = ["grid.table", "density_net.0", "color_net.1", "occupancy.bits"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test05_missing_tensors_are_named(tmp_path, name):
+    path = tmp_path / "f.safetensors"
+    save_radiance(radiance(), path, {})
+    rewrite(path, lambda tensors, meta: tensors.pop(name))
+    with pytest.raises(ValueError, match=name) as e:
+        load_radiance(path, ns)
+    assert "f.safetensors" in str(e.value)
+
+
+@pytest.mark.parametrize("name", ["grid.table", "position_net.1", "direction_net.0", "emit_head.0", "capture_head.0"])
+def test06_missing_gaze_tensors_are_named(tmp_path, name):
+    path = tmp_path / "g.safetensors"
+    save_gaze(gaze(), path, {})
+    rewrite(path, lambda tensors, meta: tensors.pop(name))
+    with pytest.raises(ValueError, match=name) as e:
+        load_gaze(path, ns)
+    assert "g.safetensors" in str(e.value)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test07_tensors_of_the_wrong_shape(tmp_path, name):
+    path = tmp_path / "f.safetensors"
+    save_radiance(radiance(), path, {})
+    rewrite(path, lambda tensors, meta: tensors.update({name: tensors[name][:1].copy()}))
+    with pytest.raises(ValueError) as e:
+        load_radiance(path, ns)
+    assert "f.safetensors" in str(e.value)
+
+
+@pytest.mark.parametrize("key", ["architecture", "box", "color_space"])
+def test08_missing_metadata(tmp_path, key):
+    path = tmp_path / "f.safetensors"
+    save_radiance(radiance(), path, {})
+    rewrite(path, lambda tensors, meta: meta.pop(key))
+    with pytest.raises(ValueError, match=key) as e:
+        load_radiance(path, ns)
+    assert "f.safetensors" in str(e.value)
+
+
+def test09_an_architecture_of_a_later_version(tmp_path):
+    path = tmp_path / "f.safetensors"
+    save_radiance(radiance(), path, {})
+    rewrite(path, lambda tensors, meta: meta["architecture"].update(novelty=3))
+    with pytest.raises(ValueError, match="novelty"):
+        load_radiance(path, ns)
+
+
+def test10_weights_that_are_not_finite_are_refused(tmp_path):
+    # fp16 ends at 65504: half=True would store infinity in silence.
+    field = radiance()
+    field.set_parameters({"color_net.1": field.color_net.weights[1] * 1e6})
+    with pytest.raises(ValueError, match="color_net.1"):
+        save_radiance(field, tmp_path / "f", {}, half=True)

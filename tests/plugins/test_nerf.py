@@ -55,6 +55,20 @@ def test04_placements_that_are_no_similarity(rgb, tmp_path, field, change):
         load(rgb, tmp_path / "f.safetensors", to_world=rgb.ScalarTransform4f(m.tolist()))
 
 
+def test05_wrong_files(rgb, tmp_path):
+    fields.gaze(tmp_path / "g.safetensors")
+    with pytest.raises(RuntimeError, match="holds a gaze field where a radiance field is needed"):
+        load(rgb, tmp_path / "g.safetensors")
+    (tmp_path / "x.safetensors").write_bytes(b"no")
+    with pytest.raises(RuntimeError, match="x.safetensors.*not a readable safetensors file"):
+        load(rgb, tmp_path / "x.safetensors")
+    with pytest.raises(RuntimeError, match='"filename"'):
+        rgb.load_dict({"type": "nerf", "filename": 3.0})
+    with pytest.raises(RuntimeError, match="bogus"):
+        fields.radiance(tmp_path / "f.safetensors")
+        load(rgb, tmp_path / "f.safetensors", bogus=1.0)
+
+
 def test06_stock_integrators_take_it_as_a_medium(rgb, tmp_path, field):
     # A heterogeneous medium asks for the maximum, and for spectra.
     volume = load(rgb, tmp_path / "f.safetensors")

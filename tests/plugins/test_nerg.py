@@ -136,6 +136,18 @@ def test03_every_documented_parameter_is_read_and_documented(rgb, name):
         assert f"{name} = " in str(integrator)
 
 
+@pytest.mark.parametrize("name, value", [
+    ("falloff", -0.1), ("falloff", "far"), ("falloff", float("nan")), ("falloff", float("inf")), ("falloff", True),
+    ("tolerance", -1.0), ("depth", "mean"), ("depth", 3), ("surface_opacity", 1.5), ("surface_opacity", -0.1),
+    ("radiance", "no"), ("radiance", 2.0), ("occlusion", "false"), ("jitter", "yes"), ("background", -1.0),
+    ("background", "red"), ("aovs", "depth,colour"), ("aovs", "depth,depth"), ("aovs", 3), ("aovs", "gaze"),
+    ("step", -1.0), ("step", float("inf")), ("dt_gamma", -1.0), ("stop", 2.0), ("stop", -1.0), ("color_cutoff", -1.0),
+])  # fmt: skip
+def test04_wrong_values_are_named(rgb, name, value):
+    with pytest.raises((RuntimeError, ValueError), match=f'"{name}"'):
+        rgb.load_dict(constant(**{name: value}))
+
+
 def test05_wrong_children_are_named(rgb, files):
     with pytest.raises(RuntimeError, match='either "field".*or "density".*not both'):
         rgb.load_dict({"type": "nerg"})
@@ -153,6 +165,24 @@ def test05_wrong_children_are_named(rgb, files):
         rgb.load_dict(constant(observer={"type": "constvolume", "value": 1.0}))
     with pytest.raises(RuntimeError, match='"observer" is a .*no centre'):
         rgb.load_dict(constant(observer={"type": "orthographic"}))
+
+
+def test06_an_observer_who_is_a_batch_is_refused(rgb):
+    # It would stand at the origin of the scene.
+    batch = {"type": "batch", "film": {"type": "hdrfilm", "width": 4, "height": 2},
+             "a": {"type": "perspective", "to_world": look_at(rgb, (1, 2, 3)), "film": {"type": "hdrfilm", "width": 2, "height": 2}},
+             "b": {"type": "perspective", "to_world": look_at(rgb, (3, 2, 1)), "film": {"type": "hdrfilm", "width": 2, "height": 2}}}
+    with pytest.raises(RuntimeError, match='"observer"'):
+        rgb.load_dict(constant(observer=batch))
+
+
+def test07_missing_files_are_named(rgb, tmp_path):
+    for kind, name in (("nerf", "field"), ("gazefield", "gaze")):
+        with pytest.raises(RuntimeError, match="nowhere.safetensors.*does not exist"):
+            rgb.load_dict(constant(**{name: {"type": kind, "filename": "nowhere.safetensors"}}) if name == "gaze" else
+                          {"type": "nerg", name: {"type": kind, "filename": "nowhere.safetensors"}})
+        with pytest.raises(RuntimeError, match='"filename"'):
+            rgb.load_dict({"type": kind})
 
 
 # ------------------------------------------------------------------------
@@ -234,6 +264,36 @@ def test12_unit_cube(rgb_and_mono, kind, depth):
     inside = {"expected": 1 / 3 - 1 / math.expm1(3), "median": -math.log((1 + math.exp(-3)) / 2) / 3}[depth]
     # Distance from the ray's own origin, which lies on the near plane.
     assert abs(out["depth.T"].item() - (2 - 0.01 + inside)) < 1e-4
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1e-3, 1, 1e3, 1e6, 1e9])
+def test13_any_density(rgb, sigma):
+    out = channels(rgb, constant(sigma), straight(rgb, "perspective"))
+    assert np.isclose(out["opacity.Y"].item(), -math.expm1(-sigma), rtol=1e-5)
+    inside = 0.5 if sigma < 1e-2 else 1 / sigma - (1 / math.expm1(sigma) if sigma < 700 else 0)
+    assert np.isclose(out["depth.T"].item(), 1.99 + inside, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sigma", [0.05, 3.0])
+def test14_colour_of_a_homogeneous_volume(rgb_and_mono, sigma):
+    # α C + (1 - α) L_behind, also where every single step weighs less than color_cutoff.
+    mi = rgb_and_mono
+    color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.9, 0.5, 0.2]}}
+    background = {"type": "rgb", "value": [0.1, 0.2, 0.4]}
+    image = render(mi, constant(sigma, color=color, background=background, aovs=""), straight(mi, "perspective")).ravel()
+    α = -math.expm1(-sigma)
+    expected = α * np.array([0.9, 0.5, 0.2]) + (1 - α) * np.array([0.1, 0.2, 0.4])
+    if "mono" in mi.variant():
+        expected = expected @ [0.212671, 0.715160, 0.072169]
+    assert np.allclose(image, expected, rtol=2e-3)
+
+
+def test15_environment_takes_the_place_of_the_background(rgb):
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.4, 0.8]}}
+    image = render(rgb, constant(3.0, background=9.0, aovs=""), straight(rgb, "perspective"), sky=sky).ravel()
+    assert np.allclose(image, math.exp(-3) * np.array([0.2, 0.4, 0.8]), rtol=1e-4)
+    hidden = render(rgb, constant(3.0, hide_emitters=True, aovs=""), straight(rgb, "perspective"), sky=sky).ravel()
+    assert not hidden.any()
 
 
 def test16_an_envmap_is_seen_where_it_belongs(rgb):
@@ -476,6 +536,25 @@ def test35_spectral_and_polarized_are_refused(rgb, variant):
         rgb.set_variant("llvm_ad_rgb")
 
 
+def test36_scalar_is_refused_and_forgotten(files):
+    # In a process of its own: what scalar_rgb registers stays.
+    code = f"""
+import nerg_mi, mitsuba as mi
+mi.set_variant("scalar_rgb")
+try:
+    mi.load_dict({{"type": "nerg"}})
+except RuntimeError as e:
+    assert '"nerg" needs a variant that compiles its kernels' in str(e), e
+else:
+    raise SystemExit("not refused")
+mi.set_variant("llvm_ad_rgb")
+mi.load_dict({{"type": "nerf", "filename": r"{files / "field.safetensors"}"}})
+mi.load_dict({{"type": "nerg", "field": {{"type": "nerf", "filename": r"{files / "field.safetensors"}"}}}})
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-2000:]
+
+
 # ------------------------------------------------------------------------
 #  Seen from Python
 # ------------------------------------------------------------------------
@@ -542,15 +621,58 @@ def test40_a_voxel_grid_that_changes_is_seen(rgb):
     assert before < 0.5 and np.isclose(after, 1 - math.exp(-2), rtol=1e-4)
 
 
-def test41_a_turned_grid_is_not_skipped_by_its_own_voxels(rgb):
-    # A small dense block of a large empty grid, turned by 45 degrees: its place is elsewhere than its indices say.
+@pytest.mark.parametrize("angle", [45, 90, 180])
+def test41_a_turned_grid_is_not_skipped_by_its_own_voxels(rgb, angle):
+    # A small dense block of a large empty grid, turned: its place is elsewhere than its indices say.
     data = np.zeros((32, 32, 32), np.float32)
     data[14:18, 2:6, 2:6] = 50
-    turn = rgb.ScalarTransform4f().rotate([0, 0, 1], 45).translate([-0.5, -0.5, -0.5])
+    turn = rgb.ScalarTransform4f().rotate([0, 0, 1], angle).translate([-0.5, -0.5, -0.5])
     density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "to_world": turn}
-    # The block's centre, turned
-    c = np.array([4 / 32 - 0.5, 4 / 32 - 0.5])
-    x, y = (c[0] - c[1]) / 2**0.5, (c[0] + c[1]) / 2**0.5
+    x, y = (np.array(turn.matrix) @ [4 / 32, 4 / 32, 0.5, 1])[:2].tolist()
     sensor = camera(rgb, (x, y, -2), (x, y, 0), fov=1e-3, size=1)
     out = channels(rgb, {"type": "nerg", "density": density, "aovs": "opacity"}, sensor)
     assert out["opacity.Y"].item() > 0.9
+
+
+def test42_a_grid_that_repeats_is_bounded_as_it_repeats(rgb):
+    # The last half voxel interpolates with the first voxel of the next repetition.
+    data = np.zeros((8, 8, 8), np.float32)
+    data[0] = 40
+    opacity = {}
+    for wrap in ("clamp", "repeat"):
+        density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "wrap_mode": wrap}
+        sensor = camera(rgb, (-2, 0.5, 0.99), (0, 0.5, 0.99), fov=1e-3, size=1)
+        opacity[wrap] = channels(rgb, {"type": "nerg", "density": density, "aovs": "opacity"}, sensor)["opacity.Y"].item()
+    assert opacity["clamp"] == 0
+    assert np.isclose(opacity["repeat"], 1 - math.exp(-40 * (0.5 - 0.01 * 8)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("visibility", ["depth", "map", "transmittance"])
+def test43_kinds_of_visibility_agree_on_opaque_walls(rgb, visibility):
+    out = hidden_scene(rgb, visibility=visibility, falloff=0.0, map_height=256)
+    x = out["position.X"]
+    hidden, visible = x * 0.95 / 1.7 < 0.3 - 0.08, x * 0.85 / 1.7 > 0.3 + 0.08
+    assert hidden.sum() > 20 and visible.sum() > 5
+    assert np.allclose(out["visibility.Y"][hidden], 0, atol=1e-6) and np.allclose(out["visibility.Y"][visible], 1, atol=1e-6)
+
+
+@pytest.mark.parametrize("quadrature", ["constant", "linear", "cells"])
+def test44_quadratures_converge_to_one_picture(rgb, quadrature):
+    data = np.random.default_rng(0).exponential(2, (4, 5, 6)).astype(np.float32)
+    density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data),
+               "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)}
+    still = {**camera(rgb, size=6), "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
+    base = {"type": "nerg", "density": density, "stop": 1e-9}
+    fine = channels(rgb, {**base, "step": 1e-3}, still)
+    got = channels(rgb, {**base, "step": 2e-3 if quadrature == "constant" else 0.02, "quadrature": quadrature}, still)
+    for c in fine:
+        assert np.allclose(got[c], fine[c], rtol=1e-3, atol=1e-4), c
+
+
+def test45_coarse_steps_in_front_of_matter_change_nothing_behind(rgb):
+    a, b = (hidden_scene(rgb, coarse=c, falloff=0.0, aovs="depth,opacity,visibility,position,observer_depth") for c in (1.0, 4.0))
+    # Steps end elsewhere: a pixel at the shadow's edge may change sides.
+    assert np.mean(a["visibility.Y"] != b["visibility.Y"]) < 0.06
+    same = a["visibility.Y"] == b["visibility.Y"]
+    for c in ("depth.T", "opacity.Y", "observer_depth.T"):
+        assert np.allclose(a[c][same], b[c][same], rtol=1e-2, atol=5e-3), c

@@ -180,6 +180,25 @@ def test09_nothing_met_gives_no_nan(rgb, files):
         assert np.all(np.isfinite(dr.grad(params[k]).numpy())), k
 
 
+def test10_a_sensor_that_stands_on_its_own_near_plane(rgb, files):
+    # Rays of a panorama start at the observer: where they miss, surface and observer coincide.
+    observer = {"type": "panorama", "to_world": rgb.ScalarTransform4f().translate([0, 0, -3]),
+                "film": {"type": "hdrfilm", "width": 4, "height": 4}}
+    integrator = {**neural(rgb, files), "observer": {**observer}}
+    sensor = {**observer, "film": {**camera(rgb)["film"], "width": 8, "height": 4}, "sampler": camera(rgb)["sampler"]}
+    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+    params = rgb.traverse(scene)
+    key = "integrator.observer.to_world"
+    if key not in params:
+        pytest.skip("panorama exposes no to_world")
+    x = rgb.Float(0)
+    dr.enable_grad(x)
+    params[key] = rgb.Transform4f().translate([x, 0, 0]) @ rgb.Transform4f(params[key])
+    params.update()
+    dr.backward(dr.sum(rgb.render(scene, params=params, spp=1), axis=None))
+    assert np.isfinite(dr.grad(x).numpy().item())
+
+
 def test11_forward_mode(rgb, files):
     scene = scene_of(rgb, neural(rgb, files))
     params = rgb.traverse(scene)

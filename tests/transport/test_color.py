@@ -40,3 +40,13 @@ def test03_mono_is_the_luminance(mono, space):
     assert len(out) == 1
     linear = iec(c) if space == "srgb" else c
     assert np.isclose(np.array(out).ravel()[0], α * linear @ [0.212671, 0.715160, 0.072169], rtol=1e-5)
+
+
+@pytest.mark.parametrize("α", [0.0, 1e-38, 1e-20, 1e-6])
+def test04_no_opacity_no_nan(rgb, α):
+    total, alpha = rgb.Color3f(α * 0.5), rgb.Float(α)
+    dr.enable_grad(total, alpha)
+    out = composite_to_linear(total, alpha, "srgb")
+    assert np.allclose(np.array(out), α * iec(np.array(0.5)), rtol=1e-4)
+    dr.backward(dr.sum(out), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    assert np.all(np.isfinite(np.array(dr.grad(total)))) and np.all(np.isfinite(np.array(dr.grad(alpha))))

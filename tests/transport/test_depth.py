@@ -60,6 +60,14 @@ def test03_a_window_and_a_wall(rgb, front, back):
     assert np.allclose(got, [expected, median], rtol=2e-5)
 
 
+@pytest.mark.parametrize("stop", [0, 1e-6, 1e-2, 0.3, 0.5, 0.6, 0.9, 1.0])
+@pytest.mark.parametrize("kind", ["expected", "median"])
+def test04_depth_is_inside_for_every_stop(rgb, kind, stop):
+    # A march that stops early has seen less, but what it saw lies in the box.
+    got = depth(rgb, slab(rgb, [20.0][0]), kind, MarchSettings(0.01, stop=stop))[0]
+    assert 1 <= got <= 1.06
+
+
 def test05_median_gradient_equals_central_differences(rgb):
     # d/dσ of -log((1 + e^-σ) / 2) / σ
     for sigma in (0.1, 1.0, 5.0, 50.0):

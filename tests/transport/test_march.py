@@ -44,11 +44,44 @@ def one(x):
 # ------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("near", [0, 1, 10])
+@pytest.mark.parametrize("sigma", [1e-8, 1e-6, 1e-3, 1, 3, 1e3, 1e6, 1e9])
+def test01_slab(rgb, sigma, near):
+    r = run(rgb, slab(rgb, sigma, near), (0.5, 0.5, 0), (0, 0, 1))
+    opacity, expected, median = reference.slab(sigma, near, near + 1)
+    assert np.isclose(one(r.opacity), opacity, rtol=1e-5)
+    assert np.isclose(one(r.expected_depth), expected, rtol=1e-5)
+    if sigma > 1:
+        assert np.isclose(one(r.half), near + math.log(2) / sigma, rtol=1e-5)
+    else:
+        assert one(r.half) == (np.inf if sigma < 0.69 else pytest.approx(near + math.log(2) / sigma))
+
+
 @pytest.mark.parametrize("sigma", [10, 1e3, 1e6, 1e9])
 def test02_depth_remaining_before_a_dense_slab(rgb, sigma):
     # With the face at the ray's origin the depth is 1/σ and nothing else.
     r = run(rgb, slab(rgb, sigma), (0.5, 0.5, 0), (0, 0, 1))
     assert np.isclose(one(r.expected_depth), reference.slab(sigma, 0, 1)[1], rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1, 1e6])
+def test03_boxes_of_any_size(rgb, size):
+    r = run(rgb, slab(rgb, 2 / size, size, size), (size / 2, size / 2, 0), (0, 0, 1), MarchSettings(size * DIAGONAL / 1024))
+    opacity, expected, _ = reference.slab(2, 1, 2)
+    assert np.isclose(one(r.opacity), opacity, rtol=1e-5) and np.isclose(one(r.expected_depth) / size, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("distance", [100, 1000, 30000])
+def test04_slabs_far_away(rgb, distance):
+    # Positions are rounded to float32 there; optical depth must not be counted twice or lost for it.
+    r = run(rgb, slab(rgb, 1e-3, distance), (0.5, 0.5, 0), (0, 0, 1))
+    assert np.isclose(one(r.tau), 1e-3, rtol=2e-4)
+    assert np.isclose(one(r.expected_depth), distance + 0.5, rtol=1e-5)
+
+
+def test05_a_step_below_the_spacing_of_floats_loses_nothing(rgb):
+    r = run(rgb, slab(rgb, 3, 1e5), (0.5, 0.5, 0), (0, 0, 1))
+    assert np.isclose(one(r.opacity), 1 - math.exp(-3), rtol=0.02)
 
 
 @pytest.mark.parametrize("sigma", [0, 1e-38])
@@ -160,6 +193,16 @@ def test13_early_stop(rgb, stop):
     steps = 100 if stop == 0 else math.ceil(-math.log(stop) / 0.5)
     assert abs(one(full.density_evals) - steps) <= 1
     assert abs(one(full.expected_depth) - 1.02) < 2e-3 + 2 * stop
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e-6, 0.25, 0.999999])
+def test14_jitter_moves_borders_only(rgb, offset):
+    # In constant density the borders of the steps do not matter, wherever the first one lies.
+    for near in (0, 1, 50):
+        r = run(rgb, slab(rgb, 3, near), (0.5, 0.5, 0), (0, 0, 1), MarchSettings(0.01), offset=rgb.Float(offset))
+        opacity, expected, _ = reference.slab(3, near, near + 1)
+        assert np.isclose(one(r.opacity), opacity, rtol=2e-4), (near, offset)
+        assert np.isclose(one(r.expected_depth), expected, rtol=2e-4)
 
 
 def test15_jitter_equals_the_numpy_march(rgb):

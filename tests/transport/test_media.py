@@ -66,6 +66,12 @@ MOVED_TO_NAN = np.eye(4)
 MOVED_TO_NAN[0, 3] = np.nan
 
 
+@pytest.mark.parametrize("matrix", [SHEAR, UNEVEN, MIRROR, FLAT, NAN, PROJECTIVE, MOVED_TO_NAN])
+def test03_other_transforms_are_refused(matrix):
+    with pytest.raises(ValueError, match='"to_world"'):
+        Similarity(matrix)
+
+
 def gather(mi, medium, o, d, scale):
     ray = medium.local(mi.Point3f(o.tolist()), mi.Vector3f(d.tolist()))
     t0 = dr.maximum(ray.t_near, 0)
