@@ -30,23 +30,29 @@ def register(kind: str, name: str, cls: type) -> None:
     """Register the plugin class `cls` under `name` for the active variant; the last line of every plugin module.
 
     `kind`: "integrator", "sensor", "volume", "texture", "film", ... In a scalar variant a refusal is registered in its
-    place, so that the user reads what to do instead of that there is no such plugin.
+    place, so that the user reads what to do instead of that there is no such plugin. Volumes get none: what scalar_rgb
+    knows of a name decides what dict scenes of every later variant expect, and that would be a texture.
     """
     import mitsuba as mi
 
     put = getattr(mi, f"register_{_REGISTRY.get(kind, kind)}")
     if mi.variant().startswith("scalar"):
-        put(name, _refusal(name, mi.variant()))
+        if kind not in _REGISTRY:
+            put(name, _refusal(name, mi.variant()))
     else:
         put(name, lambda props: cls(props))
 
 
+def _excuse(variant: str, what: str) -> str:
+    return (
+        f'{what} needs a variant that compiles its kernels, and "{variant}" is active: '
+        f'call mi.set_variant("llvm_ad_rgb") (or "cuda_ad_rgb") before loading the scene.'
+    )
+
+
 def _refusal(name: str, variant: str):
     def refuse(props):
-        raise RuntimeError(
-            f'"{name}" needs a variant that compiles its kernels, and "{variant}" is active: '
-            f'call mi.set_variant("llvm_ad_rgb") (or "cuda_ad_rgb") before loading the scene.'
-        )
+        raise RuntimeError(_excuse(variant, f'"{name}"'))
 
     return refuse
 
@@ -56,6 +62,10 @@ def _on_variant(old: str | None, new: str | None) -> None:
     if new is None:
         return
     llvm.require(new)
+    if new.startswith("scalar"):
+        mi = sys.modules["mitsuba"]
+        names = ", ".join(f'"{name}"' for name, _ in PLUGINS)
+        mi.Log(mi.LogLevel.Warn, _excuse(new, f"each of nerg_mi's plugins ({names})"))
     for name, kind in PLUGINS:
         if new.startswith("scalar"):
             # The classes are not even made: arrays of scalar variants lack what their bodies use.

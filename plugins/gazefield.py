@@ -48,6 +48,7 @@ import mitsuba as mi
 
 from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.properties import text
 from nerg_mi.registration import register
 from nerg_mi.transport.media import GazeMedium, Similarity
 
@@ -57,9 +58,7 @@ class GazeFieldVolume(mi.Volume):
 
     def __init__(self, props):
         super().__init__(props)
-        if "filename" not in props:
-            raise ValueError('the volume "gazefield" needs "filename", the checkpoint of a gaze field')
-        self.filename = str(mi.file_resolver().resolve(props["filename"]))
+        self.filename = str(mi.file_resolver().resolve(text(props, "filename")))
         to_world = props.get("to_world", mi.ScalarTransform4f())
         self.field, self.metadata = load_gaze(self.filename, namespace(mi.variant()))
         self._similarity = Similarity(to_world.matrix)

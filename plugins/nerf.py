@@ -47,6 +47,7 @@ import mitsuba as mi
 
 from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_radiance
+from nerg_mi.properties import text
 from nerg_mi.registration import register
 from nerg_mi.transport.media import FieldMedium, Similarity
 
@@ -56,9 +57,7 @@ class NerfVolume(mi.Volume):
 
     def __init__(self, props):
         super().__init__(props)
-        if "filename" not in props:
-            raise ValueError('the volume "nerf" needs "filename", the checkpoint of a radiance field')
-        self.filename = str(mi.file_resolver().resolve(props["filename"]))
+        self.filename = str(mi.file_resolver().resolve(text(props, "filename")))
         to_world = props.get("to_world", mi.ScalarTransform4f())
         self.field, self.metadata = load_radiance(self.filename, namespace(mi.variant()))
         self._similarity = Similarity(to_world.matrix)

@@ -167,11 +167,10 @@ Spectral and polarized variants are not supported.
 
 from __future__ import annotations
 
-import math
-
 import drjit as dr
 import mitsuba as mi
 
+from nerg_mi.properties import boolean, choice, integer, number, text
 from nerg_mi.registration import register
 from nerg_mi.transport import viewpoint
 from nerg_mi.transport.color import composite_to_linear
@@ -214,26 +213,26 @@ class NergIntegrator(mi.SamplingIntegrator):
         if observer is not None:
             viewpoint.require_center(observer, '"observer"')
 
-        self.occlusion = bool(props.get("occlusion", True))
-        self.falloff = mi.Float(_number(props, "falloff", 0.1, low=0))
-        self.tolerance = _number(props, "tolerance", 0, low=0)
-        self.visibility_kind = _choice(props, "visibility", "depth", ("depth", "transmittance", "map"))
-        self.map_height = int(_number(props, "map_height", 512, low=2, high=16384))
+        self.occlusion = boolean(props, "occlusion", True)
+        self.falloff = mi.Float(number(props, "falloff", 0.1, low=0))
+        self.tolerance = number(props, "tolerance", 0, low=0)
+        self.visibility_kind = choice(props, "visibility", "depth", ("depth", "transmittance", "map"))
+        self.map_height = integer(props, "map_height", 512, low=2, high=16384)
         self._map = None
-        self.depth_kind = _choice(props, "depth", "expected", KINDS)
-        self.surface_opacity = _number(props, "surface_opacity", 0.5, low=0, high=1)
-        self.radiance = bool(props.get("radiance", True))
+        self.depth_kind = choice(props, "depth", "expected", KINDS)
+        self.surface_opacity = number(props, "surface_opacity", 0.5, low=0, high=1)
+        self.radiance = boolean(props, "radiance", True)
         self.background = _background(props)
-        self.aovs = _aovs(props.get("aovs", "depth,opacity"), gaze is not None)
-        self.jitter = bool(props.get("jitter", False))
-        step = _number(props, "step", 0, low=0)
+        self.aovs = _aovs(text(props, "aovs", "depth,opacity"), gaze is not None)
+        self.jitter = boolean(props, "jitter", False)
+        step = number(props, "step", 0, low=0)
         self.settings = MarchSettings(
             step=step or self.medium.step or self.medium.length_scale / 1024,
-            dt_gamma=_number(props, "dt_gamma", 0, low=0, high=1),
-            stop=_number(props, "stop", 1e-6, low=0, high=1),
-            color_cutoff=_number(props, "color_cutoff", 1e-4, low=0, high=1),
-            quadrature=_choice(props, "quadrature", "constant", QUADRATURES),
-            coarse=_number(props, "coarse", 1, low=1),
+            dt_gamma=number(props, "dt_gamma", 0, low=0, high=1),
+            stop=number(props, "stop", 1e-6, low=0, high=1),
+            color_cutoff=number(props, "color_cutoff", 1e-4, low=0, high=1),
+            quadrature=choice(props, "quadrature", "constant", QUADRATURES),
+            coarse=number(props, "coarse", 1, low=1),
         )
         rule(self.settings.quadrature, self.medium)
         # The sensors of the render in progress; None when another integrator drives ours.
@@ -431,31 +430,15 @@ def _medium(field, density, color):
     return VolumeMedium(density, color)
 
 
-def _number(props, name, default, low=-math.inf, high=math.inf):
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f'"{name}" must be a number, got {value!r}')
-    if not (math.isfinite(value) and low <= value <= high):
-        raise ValueError(f'"{name}" must lie in {low:g} .. {high:g}, got {value}')
-    return float(value)
-
-
-def _choice(props, name, default, choices):
-    value = props.get(name, default)
-    if value not in choices:
-        raise ValueError(f'"{name}" must be one of {", ".join(choices)}, got "{value}"')
-    return value
-
-
-def _aovs(text, has_gaze):
-    names = [n.strip() for n in text.split(",") if n.strip()]
+def _aovs(value, has_gaze):
+    names = [n.strip() for n in value.split(",") if n.strip()]
     for name in names:
         if name not in CHANNELS:
             raise ValueError(f'"aovs" does not know "{name}"; it knows {", ".join(CHANNELS)}')
         if name in _GAZE_AOVS and not has_gaze:
             raise ValueError(f'"aovs" asks for "{name}", which needs a "gaze" volume')
     if len(set(names)) < len(names):
-        raise ValueError(f'"aovs" names something twice: "{text}"')
+        raise ValueError(f'"aovs" names something twice: "{value}"')
     return names
 
 
@@ -463,6 +446,8 @@ def _background(props):
     value = props.get("background", 0.0)
     if hasattr(value, "eval_3"):  # a texture: what dict scenes make of {'type': 'rgb'}
         value = value.eval_3(dr.zeros(mi.SurfaceInteraction3f))
+    if isinstance(value, (str, bool)):
+        raise ValueError(f'"background" must be a number or an rgb colour, got {value!r}')
     rgb = mi.Color3f(value)
     if not dr.all(dr.isfinite(rgb) & (rgb >= 0), axis=None):
         raise ValueError(f'"background" must be finite and not negative, got {value}')

@@ -16,10 +16,11 @@ import drjit as dr
 import numpy as np
 
 from .box import Box
+from .elementary import log1p
 from .harmonics import encode_direction
 from .hashgrid import HashGrid, HashGridConfig
 from .mlp import MLP
-from .radiance import sigmoid
+from .radiance import assign, sigmoid
 
 VARIANTS = ("emit", "capture", "emit_capture")
 ACTIVATIONS = ("softplus", "exp", "linear")
@@ -27,8 +28,8 @@ ACTIVATIONS = ("softplus", "exp", "linear")
 
 def softplus(x):
     """log(1 + exp(x)) without overflow; the gradient is the sigmoid."""
-    # max(x, 0) + log(1 + exp(-|x|)), written so that both branches differentiate.
-    return dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x)))
+    # max(x, 0) + log(1 + exp(-|x|)), with a derivative of 1/2 at 0.
+    return 0.5 * (x + dr.abs(x)) + log1p(dr.exp(-dr.abs(x)))
 
 
 def activate(x, activation: str):
@@ -93,6 +94,12 @@ class GazeField:
 
     def __init__(self, config: GazeConfig, box: Box, grid: HashGrid, position_net: MLP, direction_net: MLP,
                  emit_head: MLP, capture_head: MLP):
+        grid.require(config.grid)
+        for name, net, sizes in (
+            ("position_net", position_net, config.position_sizes), ("direction_net", direction_net, config.direction_sizes),
+            ("emit_head", emit_head, [config.width, 1]), ("capture_head", capture_head, [config.width, 1]),
+        ):
+            net.require(sizes, name)
         self.config, self.box, self.grid = config, box, grid
         self.position_net, self.direction_net = position_net, direction_net
         self.emit_head, self.capture_head = emit_head, capture_head
@@ -120,15 +127,7 @@ class GazeField:
 
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
-        known = self.parameters()
-        for name, value in values.items():
-            if name not in known:
-                raise ValueError(f'a gaze field has no parameter "{name}"; it has {", ".join(known)}')
-            if name == "grid.table":
-                self.grid.table = value
-            else:
-                net, index = name.split(".")
-                getattr(self, net).weights[int(index)] = value
+        assign(self, values)
         self.pack()
 
     def pack(self) -> None:

@@ -84,10 +84,7 @@ class HashGrid:
         self.table = table
         expected = config.offsets()[-1] * config.features
         if len(table) != expected:
-            raise ValueError(
-                f"the table of this hash grid has {len(table)} entries but its configuration {config} "
-                f"needs {expected}"
-            )
+            raise ValueError(f'"grid.table" has {len(table)} entries where its configuration {config} needs {expected}')
         self._scales = config.level_scales()
         self._rows = config.level_rows()
         self._offsets = config.offsets()
@@ -97,6 +94,11 @@ class HashGrid:
         """A grid with entries uniform in ``[-scale, scale]``."""
         size = config.offsets()[-1] * config.features
         return HashGrid(config, ns.Float(rng.uniform(-scale, scale, size).astype(np.float32)))
+
+    def require(self, config: HashGridConfig) -> None:
+        """Raise ``ValueError`` unless this is a grid of ``config``."""
+        if self.config != config:
+            raise ValueError(f"this grid is {self.config} where its field needs {config}")
 
     def is_hashed(self, level: int) -> bool:
         stride = int(np.ceil(self._scales[level])) + 2

@@ -46,6 +46,12 @@ class MLP:
             weights.append(ns.TensorXf(rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32)))
         return MLP(weights)
 
+    def require(self, sizes: list[int], name: str) -> None:
+        """Raise ``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs]."""
+        shapes, expected = [tuple(w.shape) for w in self.weights], [(o, i) for i, o in zip(sizes, sizes[1:])]
+        if shapes != expected:
+            raise ValueError(f'"{name}" has layers of shapes {shapes} where its architecture needs {expected}')
+
     @property
     def inputs(self) -> int:
         return self.weights[0].shape[1]
@@ -68,6 +74,9 @@ class MLP:
             self.pack()
         ns = namespace(self.weights[0])
         half = is_cuda(ns)
+        # Cooperative vectors do not sum the derivatives of a lane that is shared by all the others.
+        width = max(dr.width(c) for c in x)
+        x = [c + dr.zeros(ns.Float, width) if dr.width(c) < width else c for c in x]
         v = nn.CoopVec(*([ns.Float16(c) for c in x] if half else x))
         for i, view in enumerate(self._views):
             v = nn.matvec(view, v)

@@ -62,6 +62,22 @@ class RadianceConfig:
         return RadianceConfig(**{**d, "grid": HashGridConfig(**d["grid"])})
 
 
+def assign(field, values: dict) -> None:
+    """Replace parameters of a field by name, each by one of the same shape."""
+    known = field.parameters()
+    for name, value in values.items():
+        if name not in known:
+            raise ValueError(f'this field has no parameter "{name}"; it has {", ".join(known)}')
+        if value.shape != known[name].shape:
+            raise ValueError(f'"{name}" has shape {known[name].shape}, and cannot become one of {value.shape}')
+    for name, value in values.items():
+        owner, index = name.split(".")
+        if name == "grid.table":
+            field.grid.table = value
+        else:
+            getattr(field, owner).weights[int(index)] = value
+
+
 def density_from_log(h, scale: float):
     """Density from the density net's first output, clamped well before fp32 overflows."""
     return scale * dr.exp(dr.minimum(h, _MAX_LOG_DENSITY))
@@ -96,6 +112,9 @@ class RadianceField:
     ):
         if color_space not in ("srgb", "linear"):
             raise ValueError(f'color_space must be "srgb" or "linear", got "{color_space}"')
+        grid.require(config.grid)
+        density_net.require(config.density_sizes, "density_net")
+        color_net.require(config.color_sizes, "color_net")
         self.config, self.box, self.color_space = config, box, color_space
         self.grid, self.density_net, self.color_net = grid, density_net, color_net
         self.occupancy, self.march_step = occupancy, march_step
@@ -123,15 +142,7 @@ class RadianceField:
 
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
-        known = self.parameters()
-        for name, value in values.items():
-            if name not in known:
-                raise ValueError(f'a radiance field has no parameter "{name}"; it has {", ".join(known)}')
-            if name == "grid.table":
-                self.grid.table = value
-            else:
-                net, index = name.split(".")
-                getattr(self, net).weights[int(index)] = value
+        assign(self, values)
         self.pack()
 
     def pack(self) -> None:

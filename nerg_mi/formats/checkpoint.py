@@ -44,6 +44,16 @@ def _umask() -> int:
     return mask
 
 
+def _parse(raw: str, path: Path) -> dict:
+    try:
+        metadata = json.loads(raw)
+    except json.JSONDecodeError as e:
+        raise ValueError(f'the metadata of "{path}" are damaged: {e}') from e
+    if not isinstance(metadata, dict):
+        raise ValueError(f'the metadata of "{path}" are damaged: a JSON object is needed')
+    return metadata
+
+
 def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
     """Tensors and metadata of a checkpoint of ``kind``.
 
@@ -60,7 +70,7 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray],
             raw = (f.metadata() or {}).get("nerg")
             if raw is None:
                 raise ValueError(f'"{path}" is a safetensors file but not a nerg_mi checkpoint (no "nerg" metadata)')
-            metadata = json.loads(raw)
+            metadata = _parse(raw, path)
             if metadata.get("kind") != kind:
                 raise ValueError(f'"{path}" holds a {metadata.get("kind")} field where a {kind} field is needed')
             if metadata.get("format") != FORMAT:

@@ -4,6 +4,7 @@ Weights may be stored in fp16 (half the size); they are fp32 once loaded.
 """
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -19,25 +20,34 @@ from .checkpoint import read_checkpoint, write_checkpoint
 
 
 def _dump(parameters: dict, half: bool) -> dict[str, np.ndarray]:
-    return {k: np.asarray(v.numpy(), np.float16 if half else np.float32) for k, v in parameters.items()}
+    out = {}
+    for name, value in parameters.items():
+        value = value.numpy()
+        stored = value.astype(np.float16 if half else np.float32)
+        if not np.all(np.isfinite(stored)):
+            why = "exceeds what fp16 can hold; store it in fp32" if np.all(np.isfinite(value)) else "is not finite"
+            raise ValueError(f'the weight array "{name}" {why}')
+        out[name] = stored
+    return out
 
 
-def _net(tensors: dict, name: str, layers: int, ns: ModuleType, path) -> MLP:
-    weights = []
-    for i in range(layers):
-        key = f"{name}.{i}"
-        if key not in tensors:
-            raise ValueError(f'the checkpoint "{path}" lacks the weights "{key}" that its architecture names')
-        weights.append(ns.TensorXf(tensors[key].astype(np.float32)))
-    return MLP(weights)
+@contextmanager
+def _reading(path):
+    """Name the file in whatever is found wrong with what it holds."""
+    try:
+        yield
+    except KeyError as e:
+        raise ValueError(f'the checkpoint "{path}" lacks {e}, which its kind of field needs') from e
+    except (TypeError, ValueError) as e:
+        raise ValueError(f'the checkpoint "{path}" holds no usable field: {e}') from e
 
 
-def _check_shapes(net: MLP, sizes: list[int], name: str, path) -> MLP:
-    shapes = [tuple(w.shape) for w in net.weights]
-    expected = [(o, i) for i, o in zip(sizes, sizes[1:])]
-    if shapes != expected:
-        raise ValueError(f'"{name}" in "{path}" has layers {shapes} where its architecture needs {expected}')
-    return net
+def _net(tensors: dict, name: str, sizes: list[int], ns: ModuleType) -> MLP:
+    return MLP([ns.TensorXf(tensors[f"{name}.{i}"].astype(np.float32)) for i in range(len(sizes) - 1)])
+
+
+def _grid(tensors: dict, config, ns: ModuleType) -> HashGrid:
+    return HashGrid(config, ns.Float(tensors["grid.table"].astype(np.float32)))
 
 
 def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half: bool = False) -> None:
@@ -60,18 +70,16 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
 def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict]:
     """The field in ``path`` on backend ``ns`` (see ``field.backend.namespace``), and its metadata."""
     tensors, meta = read_checkpoint(path, "radiance")
-    config = RadianceConfig.from_dict(meta["architecture"])
-    occupancy = None
-    if "occupancy" in meta:
-        occupancy = OccupancyGrid.from_packed(tensors["occupancy.bits"], meta["occupancy"]["resolution"], ns,
-                                              meta["occupancy"]["threshold"])
-    nets = {}
-    for name, sizes in (("density_net", config.density_sizes), ("color_net", config.color_sizes)):
-        nets[name] = _check_shapes(_net(tensors, name, len(sizes) - 1, ns, path), sizes, name, path)
-    field = RadianceField(
-        config, Box(**meta["box"]), HashGrid(config.grid, ns.Float(tensors["grid.table"].astype(np.float32))),
-        nets["density_net"], nets["color_net"], occupancy, meta["color_space"], meta["march_step"],
-    )
+    with _reading(path):
+        config, occupancy = RadianceConfig.from_dict(meta["architecture"]), None
+        if "occupancy" in meta:
+            about = meta["occupancy"]
+            occupancy = OccupancyGrid.from_packed(tensors["occupancy.bits"], about["resolution"], ns, about["threshold"])
+        field = RadianceField(
+            config, Box(**meta["box"]), _grid(tensors, config.grid, ns),
+            _net(tensors, "density_net", config.density_sizes, ns), _net(tensors, "color_net", config.color_sizes, ns),
+            occupancy, meta["color_space"], meta["march_step"],
+        )
     return field, meta
 
 
@@ -89,11 +97,12 @@ def save_gaze(field: GazeField, path: str | Path, provenance: dict, half: bool =
 def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField, dict]:
     """The gaze field in ``path`` on backend ``ns``, and its metadata."""
     tensors, meta = read_checkpoint(path, "gaze")
-    config = GazeConfig.from_dict(meta["architecture"])
-    sizes = {
-        "position_net": config.position_sizes, "direction_net": config.direction_sizes,
-        "emit_head": [config.width, 1], "capture_head": [config.width, 1],
-    }
-    nets = {k: _check_shapes(_net(tensors, k, len(s) - 1, ns, path), s, k, path) for k, s in sizes.items()}
-    grid = HashGrid(config.grid, ns.Float(tensors["grid.table"].astype(np.float32)))
-    return GazeField(config, Box(**meta["box"]), grid, **nets), meta
+    with _reading(path):
+        config = GazeConfig.from_dict(meta["architecture"])
+        sizes = {
+            "position_net": config.position_sizes, "direction_net": config.direction_sizes,
+            "emit_head": [config.width, 1], "capture_head": [config.width, 1],
+        }
+        nets = {name: _net(tensors, name, size, ns) for name, size in sizes.items()}
+        field = GazeField(config, Box(**meta["box"]), _grid(tensors, config.grid, ns), **nets)
+    return field, meta

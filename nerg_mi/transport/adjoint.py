@@ -5,7 +5,7 @@ The primal's sums are known, so a second march that repeats its steps knows, at
 step i, both what lies in front and what lies behind it. With T_i the
 transmittance before the step, and M and C the weighted sums of distances and
 colours, the derivative of the outputs with respect to the step's own optical
-depth dτ_i, mean distance m_i and colour c_i is that of
+depth dτ_i, mean distance m_i (from t0 on) and colour c_i is that of
 
     f_i = δτ dτ_i + T_i (1 - e^{-dτ_i}) (δM m_i + δC c_i) - dτ_i (δM M_{>i} + δC C_{>i}) + δh h_i
 
@@ -17,7 +17,7 @@ Steps keep their lengths and move with the ray's entry t0; the last one ends at 
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 
@@ -40,6 +40,8 @@ def attached(medium, ray, t0, t1) -> bool:
 def differentiable_march(medium, ray, t0, t1, active, settings, offset, color, count, until,
                          fine_from) -> MarchResult:
     """``march_primal`` as one differentiable operation."""
+    # Every sample gets its own colour: a shared one would hand its derivative to the wrong samples.
+    settings = replace(settings, color_cutoff=0.0)
     fixed = (medium, active, settings, offset, color, count, until, fine_from)
     out = dr.custom(_March, ray.o, ray.d, ray.w, t0, t1, fixed)
     result = MarchResult(*out)
@@ -185,10 +187,10 @@ class _March(dr.CustomOp):
         dtau = dr.detach(step.dtau)
         transmittance = dr.exp(-tau)
         weight = transmittance * absorbed_share(dtau)
-        mean = dr.fma(length, step.share, begin)
+        mean = dr.fma(length, step.share, t - primal_t0)
         moment, total, painted = dr.fma(weight, dr.detach(mean), state.moment), state.color, None
         if color is not None:
-            lit = active & (weight > settings.color_cutoff)
+            lit = active & (weight > 0)
             painted = dr.select(lit, step.color(lit), 0)
             total = total + weight * dr.detach(painted)
         before = active & (tau + dtau < goal)

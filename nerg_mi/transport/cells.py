@@ -51,8 +51,8 @@ def describe(volume) -> tuple[VoxelCells, np.ndarray] | None:
     box = volume.bbox()
     lower, upper = np.array(box.min, float), np.array(box.max, float)
     resolution = data.shape[::-1]
-    rng = np.random.default_rng(0)
-    index = np.stack([rng.integers(0, r, 64) for r in resolution])
+    # Every voxel is asked for: few of them tell a grid that is mostly empty from its mirror image.
+    index = np.indices(data.shape).reshape(3, -1)[::-1]
     size = (upper - lower) / resolution
 
     def ask(cell):
@@ -78,7 +78,8 @@ def bound(data: np.ndarray, ns: ModuleType) -> OccupancyGrid | None:
     """
     from scipy.ndimage import maximum_filter
 
-    reach = maximum_filter(data, 3, mode="nearest") > 0
+    # Beyond its border a grid goes on with its border's voxels, mirrored ones or those of the far side.
+    reach = (maximum_filter(data, 3, mode="nearest") > 0) | (maximum_filter(data, 3, mode="wrap") > 0)
     if reach.all():
         return None
     return OccupancyGrid(reach, ns, 0.0)

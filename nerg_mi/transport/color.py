@@ -10,6 +10,12 @@ def srgb_to_linear(c):
     return dr.select(low, c / 12.92, dr.power((dr.select(low, 1, c) + 0.055) / 1.055, 2.4))
 
 
+def srgb_slope(c):
+    """Derivative of ``srgb_to_linear``, per component."""
+    low = c <= 0.04045
+    return dr.select(low, 1 / 12.92, 2.4 / 1.055 * dr.power((dr.select(low, 1, c) + 0.055) / 1.055, 1.4))
+
+
 def composite_to_linear(total, alpha, color_space: str):
     """α lin(C / α) as a spectrum of the variant in use; 0, with finite gradients, where α = 0.
 
@@ -21,6 +27,10 @@ def composite_to_linear(total, alpha, color_space: str):
     if color_space == "spectrum":
         return total
     if color_space == "srgb":
+        # Written as its own tangent, which has the same value and derivative but divides by α only once:
+        # the derivative of C / α divides by its square, which is 0 in single precision for faint samples.
         some = alpha > 0
-        total = dr.select(some, alpha * srgb_to_linear(total / dr.select(some, alpha, 1)), 0)
+        c = dr.detach(dr.select(some, total / dr.select(some, alpha, 1), 0))
+        slope = srgb_slope(c)
+        total = dr.fma(slope, total, alpha * (srgb_to_linear(c) - slope * c))
     return mi.Spectrum(mi.luminance(total)) if mi.is_monochromatic else mi.Spectrum(total)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import drjit as dr
 
-from .elementary import log1p
+from ..field.elementary import log1p
 from .march import LOG2, MarchResult, MarchSettings, march, step_length
 
 KINDS = ("expected", "median", "refined")
@@ -25,7 +25,7 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
     """
     if kind == "expected":
         return result.expected_depth
-    opaque = result.tau >= settings.opaque
+    opaque = (result.tau >= settings.opaque) & dr.isfinite(result.half)
     alpha = result.opacity
     rest = active & ~opaque & (alpha > 0)
     goal = -log1p(-0.5 * alpha)

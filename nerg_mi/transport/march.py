@@ -17,6 +17,8 @@ from .quadrature import absorbed_share
 from .rules import rule
 
 LOG2 = 0.6931471805599453
+# Least step as a share of the distance: four spacings of single precision.
+_SPACING = 2.0**-21
 # Optical depth that counts as a first trace of matter.
 _TRACE = 1e-3
 
@@ -27,7 +29,8 @@ class MarchSettings:
 
     ``step``: step length; ``dt_gamma``: steps are at least this share of the distance
     travelled (instant-ngp's cone stepping; 0: uniform); ``stop``: transmittance below which
-    what lies behind is left out; ``color_cutoff``: samples of less weight get no colour;
+    what lies behind is left out; ``color_cutoff``: samples are gathered until they weigh this much,
+    and share the last one's colour;
     ``quadrature``: see ``rules``; ``coarse``: steps in front of all matter are this many times longer
     (``fine_start`` finds where it begins; 1: one step length everywhere).
     """
@@ -49,7 +52,9 @@ class MarchSettings:
 class MarchResult:
     """What a march gathered along each ray.
 
-    ``tau``: optical depth; ``moment``: weighted sum of distances; ``half``: distance at which
+    ``tau``: optical depth; ``moment``: weighted sum of distances from ``origin`` on, the distance at
+    which the march began (far from the ray's start, sums of whole distances would lose their last
+    digits); ``half``: distance at which
     transmittance crosses 1/2 (infinite where it does not), or the optical depth ``until``;
     ``half_slope``: change of ``half`` with that optical depth, detached; ``enter``, ``enter_tau``: start
     of the step that crosses, and the optical depth there; ``color``: weighted sum of
@@ -66,6 +71,7 @@ class MarchResult:
     color: object = None
     density_evals: object = None
     color_evals: object = None
+    origin: object = 0
 
     @property
     def opacity(self):
@@ -76,14 +82,14 @@ class MarchResult:
         """Mean distance of absorption, 0 where nothing absorbs."""
         alpha = self.opacity
         some = alpha > 0
-        return dr.select(some, self.moment / dr.select(some, alpha, 1), 0)
+        return dr.select(some, self.origin + self.moment / dr.select(some, alpha, 1), 0)
 
 
 def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, color=None,
           count: bool = False, until=None, fine_from=None) -> MarchResult:
     """March ``ray`` (``media.LocalRay``) from ``t0`` to ``t1``.
 
-    ``offset`` in [0, 1): length of the first step as a share of a full one (jitter; None: a full
+    ``offset`` in [0, 1]: length of the first step as a share of a full one (jitter; None: a full
     step). ``color``: array type of the medium's colour, or None for a density-only pass. ``until``:
     optical depth at which to end, for a march that only looks for that crossing. ``count``: count
     evaluations. ``fine_from``: distance up to which steps are coarse. Differentiable in the ray, ``t0``, ``t1``, ``until`` and the medium's parameters.
@@ -97,6 +103,7 @@ def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, 
         result = differentiable_march(medium, ray, *arguments)
     else:
         result = march_primal(medium, ray, *arguments)
+    result.origin = arguments[0]
     if until is not None and dr.grad_enabled(until):
         crossed = dr.isfinite(result.half)
         result.half = dr.select(crossed, dr.fma(result.half_slope, until - dr.detach(until), result.half), result.half)
@@ -112,23 +119,25 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
     # out of the loop state, where a field's weight arrays would be carried along lane by lane.
     quadrature = rule(settings.quadrature, medium)
 
-    def body(active, t, share, carry, tau, moment, half, slope, enter, enter_tau, total, n, m):
+    def body(active, t, share, carry, tau, moment, half, slope, enter, enter_tau, total, pending, n, m):
         active, t, delta, t_next = advance(
             medium, ray, t, t1, share, settings, active, quadrature.planes, fine_from
         )
         step = quadrature.step(medium, ray, t, delta, t_next, carry, active, color)
         weight = dr.exp(-tau) * absorbed_share(step.dtau)
-        moment = dr.fma(weight, dr.fma(delta, step.share, t), moment)
+        moment = dr.fma(weight, dr.fma(delta, step.share, t - t0), moment)
         crosses = active & (tau < goal) & (tau + step.dtau >= goal)
         half = dr.select(crosses, t + step.crossing(goal - tau), half)
         slope = dr.select(crosses, delta / dr.select(crosses, step.dtau, 1), slope)
         enter, enter_tau = dr.select(crosses, t, enter), dr.select(crosses, tau, enter_tau)
 
         if color is not None:
-            lit = active & (weight > settings.color_cutoff)
-            total = total + weight * dr.if_stmt(
+            pending = pending + weight
+            lit = active & (pending > settings.color_cutoff)
+            total = total + pending * dr.if_stmt(
                 (lit,), lit, step.color, lambda lit: dr.zeros(color), label="colour"
             )
+            pending = dr.select(lit, 0, pending)
             if count:
                 m = m + dr.select(lit, 1, 0)
         if count:
@@ -136,15 +145,20 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
 
         tau = tau + step.dtau
         active = active & (t_next < t1) & (tau < end)
-        return active, t_next, Float(1), step.carry, tau, moment, half, slope, enter, enter_tau, total, n, m
+        return active, t_next, Float(1), step.carry, tau, moment, half, slope, enter, enter_tau, total, pending, n, m
 
     start = (
         active, t0, Float(1 if offset is None else offset), quadrature.start(Float), Float(0), Float(0),
         Float(dr.inf), Float(0), Float(0), Float(0), None if color is None else dr.zeros(color),
-        Float(0) if count else None, Float(0) if count and color is not None else None,
+        None if color is None else Float(0), Float(0) if count else None, Float(0) if count and color is not None else None,
     )
     state = dr.while_loop(start, lambda active, *_: active, body, label="march")
-    return MarchResult(*state[4:])
+    *sums, total, pending, n, m = state[4:]
+    if color is not None:
+        # What never gathered enough weight for a colour of its own takes that of the rest.
+        painted = absorbed_share(sums[0]) - pending
+        total *= dr.select(painted > 0, 1 + pending / dr.select(painted > 0, painted, 1), 0)
+    return MarchResult(*sums, total, n, m)
 
 
 def limits(Float, settings: MarchSettings, until):
@@ -174,17 +188,20 @@ def advance(medium, ray, t, t1, share, settings, active, planes=None, fine_from=
     if medium.occupancy is not None:
         t, share = _leap(medium, ray, t, t1, share, settings, active, fine_from)
         active = active & (t < t1)
-    # The last step ends at the exit; a step too short to move t ends the march.
-    delta = dr.minimum(step_length(t, settings, fine_from) * share, t1 - t)
+    # The last step ends at the exit.
+    t_next = dr.minimum(t + step_length(t, settings, fine_from) * share, t1)
     if planes is not None:
-        delta = dr.minimum(delta, planes.next_boundary(ray, t) - t)
-    t_next = dr.minimum(t + delta, t1)
-    return active & (t_next > t), t, delta, t_next
+        # Rounding may put a boundary that has just been reached before t: a march must still go on.
+        least = t + dr.maximum(t * _SPACING, settings.step * _SPACING)
+        t_next = dr.minimum(dr.minimum(t_next, dr.maximum(planes.next_boundary(ray, t), least)), t1)
+    # What a step covers is what t moves by, rounding included, so that steps leave no gap and no overlap.
+    return active, t, t_next - t, t_next
 
 
 def step_length(t, settings: MarchSettings, fine_from=None):
     """Length of the step that starts at ``t``."""
-    step = type(t)(settings.step) if settings.dt_gamma == 0 else dr.maximum(t * settings.dt_gamma, settings.step)
+    # A step must move t: it is at least a few spacings of the floats around it.
+    step = dr.maximum(t * max(settings.dt_gamma, _SPACING), settings.step)
     if fine_from is None:
         return step
     return dr.select(t + step * settings.coarse <= fine_from, step * settings.coarse, step)

@@ -29,10 +29,12 @@ class Similarity:
     def __init__(self, matrix=None):
         m = np.eye(4) if matrix is None else np.asarray(matrix, float)
         linear = m[:3, :3]
-        scale = abs(np.linalg.det(linear)) ** (1 / 3)
-        if not np.isfinite(scale) or scale == 0 or not np.allclose(
-            linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2
-        ) or np.linalg.det(linear) < 0:
+        determinant = np.linalg.det(linear)
+        scale = abs(determinant) ** (1 / 3)
+        if not (
+            np.all(np.isfinite(m)) and determinant > 0 and np.array_equal(m[3], [0, 0, 0, 1])
+            and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
+        ):
             raise ValueError(
                 '"to_world" of a field must be a rotation, a uniform scale and a translation; bake any other '
                 "transform into the field's training data"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from .elementary import one_minus_exp
+from ..field.elementary import one_minus_exp
 
 # Below it the closed form cancels; the series is then exact to 1e-8.
 _SERIES_BELOW = 0.5

@@ -13,13 +13,14 @@ from typing import Callable
 
 import drjit as dr
 
-from .elementary import one_minus_exp
+from ..field.elementary import one_minus_exp
 from .quadrature import mean_depth_share
 
 KINDS = ("constant", "linear", "cells")
 
 # Sub-steps in which a linear density's mean depth is summed; they cost no evaluation of the field.
-_PARTS = 8
+_PARTS = 12
+_DEEP = 12.0
 _GAUSS = 0.5 / 3**0.5
 
 
@@ -47,12 +48,15 @@ def linear_share(first, last):
     ``first``, ``last``: density at the ends times the step's length. Summed over sub-steps of constant
     density with their exact first moments; equals ``mean_depth_share`` where both are equal.
     """
+    # Light is absorbed in front: parts that lie behind an optical depth of 12 would be wasted.
+    whole = 0.5 * (first + last)
+    end = dr.detach(dr.select(whole > _DEEP, linear_crossing(first, last, 1, _DEEP), 1))
+    part = end / _PARTS
     moment, absorbed, tau = 0, 0, 0
     for j in range(_PARTS):
-        middle = (j + 0.5) / _PARTS
-        d = dr.lerp(first, last, middle) / _PARTS
+        d = dr.lerp(first, last, (j + 0.5) * part) * part
         weight = dr.exp(-tau) * one_minus_exp(d)
-        moment += weight * (j + mean_depth_share(d)) / _PARTS
+        moment += weight * (j + mean_depth_share(d)) * part
         absorbed += weight
         tau += d
     some = absorbed > 0

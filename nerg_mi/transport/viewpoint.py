@@ -41,12 +41,11 @@ def _kind(sensor) -> str:
 
 def require_center(sensor, role: str) -> None:
     """Raise ``ValueError`` when ``sensor`` (called ``role`` in the message) has no single centre."""
-    for member in _members(sensor):
-        if _kind(member) not in _CENTERED:
-            raise ValueError(
-                f"{role} is a {_kind(member)}, which has no centre to look from: "
-                'give the integrator an explicit "observer" such as a perspective sensor'
-            )
+    if _kind(sensor) not in _CENTERED:
+        raise ValueError(
+            f"{role} is a {_kind(sensor)}, which has no centre to look from: "
+            'give the integrator an explicit "observer" such as a perspective sensor'
+        )
 
 
 def same_center(sensors, p_o) -> bool:
@@ -64,9 +63,9 @@ def center_of_ray(sensors, ray):
     """
     import mitsuba as mi
 
-    for s in sensors:
-        require_center(s, "the rendering sensor")
     members = [m for s in sensors for m in _members(s)]
+    for member in members:
+        require_center(member, "the rendering sensor")
     if not members:
         raise ValueError('there is no sensor to take the observer from: give the integrator an "observer"')
     best = center(members[0])

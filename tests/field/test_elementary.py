@@ -3,7 +3,7 @@ import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.transport.elementary import log1p, one_minus_exp
+from nerg_mi.field.elementary import log1p, one_minus_exp
 
 EPS = np.finfo(np.float32).eps
 

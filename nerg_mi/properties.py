@@ -1,0 +1,48 @@
+"""Reading plugin properties: a wrong value is an error that names the property and what it may be."""
+
+from __future__ import annotations
+
+import math
+
+
+def number(props, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
+    """A finite number in ``low .. high``."""
+    value = props.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f'"{name}" must be a number, got {value!r}')
+    if not (math.isfinite(value) and low <= value <= high):
+        raise ValueError(f'"{name}" must lie in {low:g} .. {high:g}, got {value}')
+    return float(value)
+
+
+def integer(props, name: str, default: int, low: int, high: int) -> int:
+    """A whole number in ``low .. high``."""
+    value = number(props, name, default, low, high)
+    if value != int(value):
+        raise ValueError(f'"{name}" must be a whole number, got {value}')
+    return int(value)
+
+
+def boolean(props, name: str, default: bool) -> bool:
+    """true or false, and nothing that merely looks like it."""
+    value = props.get(name, default)
+    if not isinstance(value, bool):
+        raise ValueError(f'"{name}" must be true or false, got {value!r}')
+    return value
+
+
+def choice(props, name: str, default: str, choices: tuple[str, ...]) -> str:
+    """One of ``choices``."""
+    value = props.get(name, default)
+    if value not in choices:
+        raise ValueError(f'"{name}" must be one of {", ".join(choices)}, got {value!r}')
+    return value
+
+
+def text(props, name: str, default: str | None = None) -> str:
+    """A string; required where there is no default."""
+    value = props.get(name, default)
+    if not isinstance(value, str):
+        found = "nothing" if value is None else repr(value)
+        raise ValueError(f'"{name}" must be a string, got {found}')
+    return value
