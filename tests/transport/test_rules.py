@@ -91,3 +91,32 @@ def test06_wrong_rules(rgb):
         rule("cells", medium)
     with pytest.raises(ValueError, match='"quadrature" must be one of constant, linear, cells, got "simpson"'):
         rule("simpson", medium)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test07_every_march_ends(kind):
+    # Far away the voxels are as small as the spacing of floats. In a process of its own, which can be ended.
+    code = f"""
+import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+from nerg_mi.transport.march import MarchSettings, march
+from nerg_mi.transport.media import VolumeMedium
+data = np.full((64, 64, 64), 1.5, np.float32)
+data[::2] = 0.5
+medium = VolumeMedium(mi.load_dict({{"type": "gridvolume", "grid": mi.VolumeGrid(data)}}))
+rng = np.random.default_rng(0)
+for distance in (3, 30, 300, 3e4):
+    o = (distance * rng.normal(size=(3, 500))).astype(np.float32)
+    d = rng.random((3, 500)) - o
+    d = (d / np.linalg.norm(d, axis=0)).astype(np.float32)
+    ray = medium.local(mi.Point3f(o), mi.Vector3f(d))
+    r = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, MarchSettings(1 / 64, quadrature="{kind}", stop=0))
+    length = np.maximum(ray.t_far.numpy() - ray.t_near.numpy(), 0)
+    mean = r.tau.numpy().sum() / length.sum()
+    assert 0.95 < mean < 1.05, (distance, mean)
+"""
+    try:
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=25)
+    except subprocess.TimeoutExpired:
+        pytest.fail("the march does not end")
+    assert run.returncode == 0, run.stderr[-1500:]
