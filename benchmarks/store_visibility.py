@@ -26,7 +26,8 @@ import numpy as np
 
 # name: (camera, target, eye). Cameras see over or around shelves; eyes are a shopper's.
 PAIRS = {
-    "demo": ("6.5, 0.7, 2.3", "4.6, 3.0, 1.1", "4.8, 2.2, 1.6"),
+    "demo": ("7.4, 3.4, 2.2", "4.8, 4.2, 1.0", "4.4, 2.8, 1.6"),
+    "aisle 3, from the south": ("6.5, 0.7, 2.3", "4.6, 3.0, 1.1", "4.8, 2.2, 1.6"),
     "aisle 3, from the north": ("6.5, 5.0, 2.2", "4.5, 2.8, 0.9", "4.5, 2.0, 1.6"),
     "aisle 2, from the north": ("4.9, 5.0, 2.2", "2.8, 2.6, 0.9", "2.75, 2.0, 1.6"),
     "aisle 1, from the south": ("2.75, 0.7, 2.2", "1.0, 3.0, 1.0", "0.9, 3.2, 1.6"),
