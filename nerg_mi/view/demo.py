@@ -10,6 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import shutil
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -256,12 +258,9 @@ class _Clock:
 
 def look(out: str | Path) -> str:
     """The command with which this machine shows the pictures in ``out``."""
-    import shutil
-    import sys
-
     first = Path(out) / "occlusion.png"
-    for opener in ("open",) if sys.platform == "darwin" else ("xdg-open",):
-        if shutil.which(opener):
-            return f"{opener} {first}"
+    opener = "open" if sys.platform == "darwin" else "xdg-open"
+    if shutil.which(opener):
+        return f"{opener} {first}"
     # A machine without a desktop: any browser that reaches it will do.
     return f"python3 -m http.server --bind 127.0.0.1 --directory {out} 8000, then http://127.0.0.1:8000/{first.name}"
