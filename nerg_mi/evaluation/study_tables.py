@@ -1,0 +1,76 @@
+"""What follows from a study's rows: the Pareto front, the comparison with the paper's marching, and the files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+from .study_measure import COLUMNS
+from .study_settings import PAPER
+
+FRONTS = ("color_rmse", "depth_mae", "visibility_mae", "gaze_mae")
+"""The errors that are set against time; a row's ``pareto`` names those for which it is on the front."""
+
+
+def pareto(points: list[tuple[float, float]]) -> list[bool]:
+    """Which of the points (time, error) no other one beats: no other is at most as large in both and smaller in one."""
+    order = sorted(range(len(points)), key=lambda i: points[i])
+    on, best = [False] * len(points), math.inf
+    for i in order:
+        time, error = points[i]
+        # Of equal points all are on the front.
+        if error < best or (error == best and any(on[j] and points[j] == points[i] for j in order)):
+            on[i], best = True, error
+    return on
+
+
+def comparable(row: dict) -> bool:
+    """Whether a row renders all that the default does, for one ray a pixel of the scene itself."""
+    return row["spp"] == 1 and not row["resolution"] and row["group"] not in ("leave out", "spp")
+
+
+def mark_fronts(rows: list[dict]) -> None:
+    """Set ``pareto`` of each row: the errors of `FRONTS` for which it is on the front, without their suffix, space-separated."""
+    for row in rows:
+        row["pareto"] = ""
+    for error in FRONTS:
+        able = [r for r in rows if comparable(r) and error in r]
+        for row, on in zip(able, pareto([(r["seconds"], r[error]) for r in able])):
+            if on:
+                row["pareto"] = f"{row['pareto']} {error.rsplit('_', 1)[0]}".strip()
+
+
+def against_paper(rows: list[dict]) -> list[dict]:
+    """For each row of the paper's marching: the default beside it, the least depth error of ours that takes no longer, and
+    the shortest time of ours whose depth error is no larger, with the ratios; None where ours has no such row."""
+    ours = [r for r in rows if r["group"] != PAPER and comparable(r) and "depth_mae" in r]
+    default = next(r for r in rows if r["group"] == "default")
+    out = []
+    for paper in (r for r in rows if r["group"] == PAPER):
+        no_longer = min((r for r in ours if r["seconds"] <= paper["seconds"]), key=lambda r: r["depth_mae"], default=None)
+        no_worse = min((r for r in ours if r["depth_mae"] <= paper["depth_mae"]), key=lambda r: r["seconds"], default=None)
+        out.append({
+            "paper": _brief(paper), "default": _brief(default),
+            "equal_time": no_longer and _brief(no_longer) | {"error_ratio": paper["depth_mae"] / max(no_longer["depth_mae"], 1e-12)},
+            "equal_error": no_worse and _brief(no_worse) | {"time_ratio": paper["seconds"] / no_worse["seconds"]},
+        })  # fmt: skip
+    return out
+
+
+def _brief(row: dict) -> dict:
+    names = ("setting", "seconds", "density_evals", "color_evals", "depth_mae", "depth_p99", "surface_mae", "visibility_wrong")
+    return {n: row[n] for n in names if n in row}
+
+
+def write_tables(out: Path, report: dict) -> list[Path]:
+    """Write ``study.csv`` (the rows), ``scaling.csv`` and ``study.json`` (all of ``report``); returns their paths."""
+    paths = [out / "study.csv", out / "scaling.csv", out / "study.json"]
+    for path, rows, columns in ((paths[0], report["rows"], COLUMNS), (paths[1], report["scaling"], None)):
+        with path.open("w", newline="") as f:
+            writer = csv.DictWriter(f, columns or list(rows[0]), restval="")
+            writer.writeheader()
+            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows)
+    paths[2].write_text(json.dumps(report, indent=1) + "\n")
+    return paths
