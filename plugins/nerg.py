@@ -38,8 +38,9 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - tolerance
    - |float|
-   - How far behind what the observer sees a surface may lie and still be the same one, in scene units; 0 stands for two
-     march steps. (Default: 0)
+   - How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands for two march
+     steps. The point that the observer looks for lies this far, and one mean free path (at most a 64th of the depth),
+     in front of the camera's surface, so that no surface hides itself. (Default: 0)
 
  * - visibility
    - |string|
@@ -133,9 +134,16 @@ alpha is 1 wherever opacity > 0; use the ``opacity`` AOV for the fractional one.
 Use a box filter and ``component_format`` ``float32`` for AOVs: other filters blend depths across edges, and fp16 rounds
 them. With a box filter equal seeds give equal pictures to the bit.
 
-Derivatives reach field and gaze weights, volumes, ``falloff``, camera and observer positions. They do not see the edges
-of visibility, nor where marching starts and stops. Shapes in the scene are not rendered: a warning says so.
-Spectral and polarized variants are not supported.
+Densities that are negative or NaN count as 0, infinite ones as 1e30.
+
+Derivatives reach field and gaze weights, volumes, ``falloff``, camera and observer positions, in forward and in reverse
+mode, with memory that does not grow with the number of steps. They do not see the edges of visibility, nor where
+marching stops. Empty voxels of a ``gridvolume`` are skipped: change its data through the scene's or the integrator's
+parameters (``mi.traverse``), whose ``update()`` refreshes what is known to be empty.
+
+Inside of another integrator (``aov``, ``moment``) the camera is looked for among the scene's sensors; give ``mi.render`` one
+of these, or the integrator an explicit ``observer``. Shapes in the scene are not rendered: a warning says so. Spectral and
+polarized variants are not supported.
 
 .. tabs::
     .. code-tab:: xml
@@ -210,8 +218,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self._children = {"field": field, "density": density, "color": color, "gaze": gaze, "observer": observer}
         self.gaze = None if gaze is None else gaze.gaze_medium()
         self.observer = observer
-        if observer is not None:
-            viewpoint.require_center(observer, '"observer"')
+        self._check_observer()
 
         self.occlusion = boolean(props, "occlusion", True)
         self.falloff = mi.Float(number(props, "falloff", 0.1, low=0))
@@ -285,7 +292,9 @@ class NergIntegrator(mi.SamplingIntegrator):
             p_d = ray.o + ray.d * out["depth"]
             out["position"] = dr.select(surface, p_d, 0)
             if asked & (_GAZE_AOVS | _OBSERVER_AOVS):
-                more = self._gaze(scene, ray, p_d, surface, asked, count, out)
+                # A mean free path at the surface's own density. In fog, which has no surface, it is kept small.
+                fuzz = dr.minimum(result.half_slope, out["depth"] / 64)
+                more = self._gaze(scene, ray, p_d, fuzz, surface, asked, count, out)
                 density_evals = density_evals + more if count else None
         out["density_evals"], out["color_evals"] = density_evals, result.color_evals
         if count and not lit:
@@ -319,8 +328,15 @@ class NergIntegrator(mi.SamplingIntegrator):
         self._map = None
         if hasattr(self.medium, "refresh"):
             self.medium.refresh()
+        self._check_observer()
         if not dr.all(self.falloff >= 0):
             raise ValueError(f'"falloff" must not be negative, got {self.falloff}')
+
+    def _check_observer(self):
+        if self.observer is not None:
+            viewpoint.require_center(self.observer, '"observer"')
+            if not dr.all(dr.isfinite(dr.detach(viewpoint.center(self.observer))), axis=None):
+                raise ValueError('"observer" stands at a position that is not finite; correct its to_world')
 
     def to_string(self):
         s = self.settings
@@ -339,7 +355,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     # The observer
     # ------------------------------------------------------------------------
 
-    def _gaze(self, scene, ray, p_d, surface, asked, count, out):
+    def _gaze(self, scene, ray, p_d, fuzz, surface, asked, count, out):
         """Add the AOVs that depend on the observer to ``out``; returns the density evaluations made."""
         sensors = self._sensors or scene.sensors()
         if self.observer is None:
@@ -349,48 +365,58 @@ class NergIntegrator(mi.SamplingIntegrator):
             p_o = viewpoint.center(self.observer)
             aligned = viewpoint.same_center(sensors, p_o)
 
-        v = p_d - p_o
-        distance = dr.norm(v)
-        # An observer exactly on the surface has no direction to it; any one will do, and is finite.
-        apart = distance > 0
-        r_o = dr.select(apart, v / dr.select(apart, distance, 1), mi.Vector3f(0, 0, 1))
-
+        distance, r_o = _towards(p_o, p_d)
         p_od, d_o, seen, evals = p_d, distance, mi.Float(1), mi.Float(0)
         if self.occlusion and not aligned:
-            p_od, d_o, seen, evals = self._observe(p_d, p_o, r_o, distance, surface, count)
+            p_od, d_o, seen, evals = self._observe(ray, p_d, p_o, fuzz, surface, count)
         out["visibility"] = dr.select(surface, seen, 0)
         out["observer_depth"] = dr.select(surface, d_o, 0)
 
         if asked & _GAZE_AOVS:
-            # Where the observer cannot see, the product is 0 and is not computed.
+            # Where the observer cannot see, gaze is 0 whatever the field says.
             attended = surface & (seen > 0)
-            gaze, emit, capture = self.gaze.evaluate(p_od, p_o, r_o, attended if asked <= {"gaze"} else surface)
+            gaze, emit, capture = self.gaze.evaluate(
+                p_od, p_o, r_o, surface if asked & {"emit", "capture"} else attended
+            )
             out["gaze"] = dr.select(attended, gaze * seen, 0)
             out["emit"], out["capture"] = dr.select(surface, emit, 0), dr.select(surface, capture, 0)
             out["gaze_evals"] = dr.select(surface, 2.0 if self.gaze.field.config.variant == "emit_capture" else 1.0, 0.0)
         return evals
 
-    def _observe(self, p_d, p_o, r_o, distance, surface, count):
-        """What the observer meets towards ``p_d``: ``(p_od, d_o, visibility, density evaluations)``."""
-        tolerance = self.tolerance or 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * distance)
-        if self.visibility_kind == "map":
-            observed = self._observer_map(p_o)
-            met, seen = observed.look_up(r_o, distance, self.falloff, tolerance, surface)
-            d_o = dr.select(dr.isfinite(met), met, distance)
-            return p_o + r_o * d_o, d_o, seen, mi.Float(0)
+    def _observe(self, ray, p_d, p_o, fuzz, surface, count):
+        """What the observer meets towards ``p_d``: ``(p_od, d_o, visibility, density evaluations)``.
 
-        local = self.medium.local(p_o, r_o)
-        t0, t1 = dr.maximum(local.t_near, 0), local.t_far
+        The point that is looked for lies a little in front of the surface, towards the camera: by the
+        tolerance, and by ``fuzz``, how far light goes into the surface. A surface then never hides itself,
+        however obliquely the observer looks along it, because the ray stays above it. A tolerance along the
+        observer's ray alone would have to grow without bound.
+        """
+        tolerance = self.tolerance or 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o))
+        in_front = tolerance + fuzz
+        if self.visibility_kind == "map":
+            # Entries of a map are this far apart where the ray ends.
+            in_front += dr.norm(p_d - p_o) * (dr.pi / self.map_height)
+        distance, r_o = _towards(p_o, p_d - ray.d * in_front)
+
         if self.visibility_kind == "transmittance":
-            # The surface's own matter in front of its depth is no occluder.
-            between = self._march(local, t0, dr.minimum(t1, distance - tolerance), surface, count=count)
+            local = self.medium.local(p_o, r_o)
+            t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, distance)
+            between = self._march(local, t0, t1, surface, count=count)
             return p_d, distance, dr.exp(-between.tau), between.density_evals
-        result = self._march(local, t0, t1, surface, count=count)
-        met = surface & (result.opacity >= self.surface_opacity)
-        depth = surface_depth(self.depth_kind, result, self.medium, local, t0, t1, surface, self.settings)
-        # An observer who meets nothing sees the point itself.
-        d_o = dr.select(met, depth, distance)
-        return p_o + r_o * d_o, d_o, visibility(distance, d_o, self.falloff, tolerance), result.density_evals
+        if self.visibility_kind == "map":
+            met, seen = self._observer_map(p_o).look_up(r_o, distance, self.falloff, tolerance, surface)
+            evals = mi.Float(0)
+        else:
+            local = self.medium.local(p_o, r_o)
+            t0, t1 = dr.maximum(local.t_near, 0), local.t_far
+            result = self._march(local, t0, t1, surface, count=count)
+            depth = surface_depth(self.depth_kind, result, self.medium, local, t0, t1, surface, self.settings)
+            met = dr.select(surface & (result.opacity >= self.surface_opacity), depth, dr.inf)
+            seen, evals = visibility(distance, met, self.falloff, tolerance), result.density_evals
+        # An observer who meets nothing before the point sees the point itself.
+        blocked = met < distance - tolerance
+        d_o = dr.select(dr.isfinite(met), met, distance)
+        return dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals
 
     def _observer_map(self, p_o):
         """The observer's map, marched anew only when the observer has moved or a parameter has changed."""
@@ -408,6 +434,15 @@ class NergIntegrator(mi.SamplingIntegrator):
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi, si.wavelengths = -ray.d, ray.wavelengths
         return environment.eval(si, active)
+
+
+def _towards(p_o, p):
+    """Distance and unit direction from ``p_o`` to ``p``, finite with their derivatives where both coincide."""
+    v = p - p_o
+    square = dr.squared_norm(v)
+    apart = square > 0
+    distance = dr.select(apart, dr.sqrt(dr.select(apart, square, 1)), 0)
+    return distance, dr.select(apart, v / dr.select(apart, distance, 1), mi.Vector3f(0, 0, 1))
 
 
 # ----------------------------------------------------------------------------

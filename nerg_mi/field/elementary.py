@@ -12,5 +12,5 @@ def one_minus_exp(x):
 
 
 def log1p(x):
-    """log(1 + x) for -1 < x, to full relative precision also for tiny x."""
+    """log(1 + x) for -1 < x <= 1, to full relative precision also for tiny x."""
     return 2 * dr.atanh(x / (2 + x))

@@ -42,12 +42,19 @@ def _reading(path):
         raise ValueError(f'the checkpoint "{path}" holds no usable field: {e}') from e
 
 
+def _finite(tensors: dict, name: str) -> np.ndarray:
+    value = tensors[name].astype(np.float32)
+    if not np.all(np.isfinite(value)):
+        raise ValueError(f'the weight array "{name}" is not finite')
+    return value
+
+
 def _net(tensors: dict, name: str, sizes: list[int], ns: ModuleType) -> MLP:
-    return MLP([ns.TensorXf(tensors[f"{name}.{i}"].astype(np.float32)) for i in range(len(sizes) - 1)])
+    return MLP([ns.TensorXf(_finite(tensors, f"{name}.{i}")) for i in range(len(sizes) - 1)])
 
 
 def _grid(tensors: dict, config, ns: ModuleType) -> HashGrid:
-    return HashGrid(config, ns.Float(tensors["grid.table"].astype(np.float32)))
+    return HashGrid(config, ns.Float(_finite(tensors, "grid.table")))
 
 
 def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half: bool = False) -> None:

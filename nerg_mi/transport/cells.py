@@ -23,6 +23,7 @@ class VoxelCells:
         self._lower = [float(v) for v in lower]
         self._scale = [r / (u - l) for r, l, u in zip(resolution, lower, upper)]
         self._shift = shift
+        self.edge = min(1 / s for s in self._scale)
 
     def next_boundary(self, ray, t):
         """Distance at which ``ray`` leaves the cell that it is in just beyond ``t``."""
@@ -48,6 +49,12 @@ def describe(volume) -> tuple[VoxelCells, np.ndarray] | None:
         return None
     data = np.array(mi.traverse(volume)["data"], np.float32)
     data = data.reshape(data.shape[:3] + (-1,))[..., 0]
+    if not np.all(np.isfinite(data)):
+        bad = np.argwhere(~np.isfinite(data))
+        raise ValueError(
+            f'the grid of "density" holds {len(bad)} values that are not finite, the first in voxel '
+            f"(z, y, x) = {tuple(bad[0].tolist())}; replace them"
+        )
     box = volume.bbox()
     lower, upper = np.array(box.min, float), np.array(box.max, float)
     resolution = data.shape[::-1]

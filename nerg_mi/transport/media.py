@@ -19,6 +19,10 @@ from .cells import bound, describe
 from .ray_box import intersect_box
 
 
+MAX_DENSITY = 1e30
+"""Infinite densities count as this one, which is opaque over any length."""
+
+
 class Similarity:
     """A rotation, uniform scale and translation: a field's ``to_world``.
 
@@ -141,7 +145,6 @@ class VolumeMedium:
     """
 
     color_space = "spectrum"
-    step = None
 
     def __init__(self, density, color=None):
         import mitsuba as mi
@@ -161,9 +164,11 @@ class VolumeMedium:
     def refresh(self) -> None:
         """Read the grid's voxels again; call after they have changed."""
         described = describe(self._density)
-        self.cells, self._bound = None, None
+        self.cells, self._bound, self.step = None, None, None
         if described is not None:
             self.cells, data = described
+            # A step that is longer than a voxel can pass over a sheet.
+            self.step = min(self.length_scale / 1024, 0.5 * self.cells.edge)
             self._bound = bound(data, namespace(self._variant))
 
     @property
@@ -210,8 +215,9 @@ class VolumeMedium:
         return it
 
     def density(self, p, active):
-        # A negative value of an interpolated or fitted grid would create light.
-        return dr.maximum(self._density.eval_1(self._at(p), active), 0)
+        # A negative value of an interpolated or fitted grid would create light; comparing also drops NaN.
+        sigma = self._density.eval_1(self._at(p), active)
+        return dr.select(sigma > 0, dr.minimum(sigma, MAX_DENSITY), 0)
 
     def density_features(self, p, active):
         return self.density(p, active), []

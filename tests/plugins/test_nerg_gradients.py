@@ -101,7 +101,7 @@ def test02_colour_net(rgb, files, name):
 
 @pytest.mark.parametrize("name", ["grid.table", "position_net.0", "direction_net.1", "emit_head.0", "capture_head.0"])
 def test03_gaze_weights(rgb, files, name):
-    check(rgb, scene_of(rgb, neural(rgb, files, observer=(-2, 0.5, -2))), f"integrator.gaze.{name}", GAZE, 1e-2)
+    check(rgb, scene_of(rgb, neural(rgb, files, observer=(-2, 0.5, -2))), f"integrator.gaze.{name}", GAZE, 1e-2, rtol=0.05)
 
 
 @pytest.mark.parametrize("depth", ["median", "refined"])
