@@ -62,7 +62,7 @@ def run_study(
     report = {
         "scene": subject.name, "variant": active, "size": [width, height], "extent": subject.extent, "step": subject.step,
         "tolerance": subject.tolerance, "reference": known.source, "reference_change_when_step_halved": known.convergence,
-        "precision": "fp32", "gaze_kld_eps": study_errors.KLD_EPS, "repeats": repeats, "threads": dr.thread_count(),
+        "precision": study_measure.precision(), "gaze_kld_eps": study_errors.KLD_EPS, "repeats": repeats, "threads": dr.thread_count(),
         "peak_mb": "peak of the arrays that Dr.Jit allocated during one render",
         "seconds_of_study": time.perf_counter() - begin,
         "versions": {"nerg_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__, "python": platform.python_version()},

@@ -54,7 +54,7 @@ def _parameters(subject, row: Setting, integrator) -> dict:
         "color_cutoff": 0.0 if paper else s.color_cutoff, "depth": "unnormalised" if paper else integrator.depth_kind,
         "visibility": integrator.visibility_kind, "map_height": integrator.map_height if integrator.visibility_kind == "map" else "",
         "jitter": integrator.jitter, "radiance": integrator.radiance, "aovs": ",".join(integrator.aovs), "spp": row.spp,
-        "resolution": row.resolution or "", "precision": "fp32",
+        "resolution": row.resolution or "", "precision": precision(),
     }  # fmt: skip
 
 
@@ -110,6 +110,11 @@ def timed(subject, integrator, spp: int = 1) -> tuple[float, float]:
     start, busy = time.perf_counter(), time.process_time()
     subject.render(integrator, spp, SEED)
     return time.perf_counter() - start, time.process_time() - busy
+
+
+def precision() -> str:
+    """Of the variant in use: networks are fp16 on CUDA, where matrix units need it; everything else is fp32 everywhere."""
+    return "fp32, networks fp16" if _on_cuda() else "fp32"
 
 
 def _on_cuda() -> bool:

@@ -15,15 +15,19 @@ import numpy as np
 from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
 
 PANELS, NODES = 32, 16
+FUZZ = 1 / 64
+"""Most that a surface is moved towards the camera for being soft, as a share of its depth."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Along rays (N,): optical depth, first moment ∫ t σ T dt, and the median's distance (0 where nothing absorbs)."""
+    """Along rays (N,): optical depth, first moment ∫ t σ T dt, the median's distance (0 where nothing absorbs), and the mean
+    free path 1/σ where T = 1/2 (0 where that is not reached)."""
 
     tau: np.ndarray
     moment: np.ndarray
     median: np.ndarray
+    free_path: np.ndarray
 
     @property
     def opacity(self) -> np.ndarray:
@@ -77,13 +81,22 @@ def _pieces(scene, o, d, near, far) -> Seen:
     moment = (np.exp(-before) * -np.expm1(-tau) * (start + length * share)).sum(-1)
     total = tau.sum(-1)
 
-    goal = -np.log1p(0.5 * np.expm1(-total))
-    reached = (before + tau >= goal[:, None]) & (tau > 0)
-    i = np.argmax(reached, -1)
     row = np.arange(len(o))
-    step = tau[row, i]
-    median = start[row, i] + length[row, i] * (goal - before[row, i]) / np.where(step > 0, step, 1)
-    return Seen(total, moment, np.where(total > 0, median, 0))
+
+    def crossing(goal):
+        """Distance, and length per optical depth there, at which the optical depths ``goal`` are reached."""
+        i = np.argmax((before + tau >= goal[:, None]) & (tau > 0), -1)
+        slope = length[row, i] / np.where(tau[row, i] > 0, tau[row, i], 1)
+        return start[row, i] + slope * (goal - before[row, i]), slope
+
+    median = crossing(_half_of_opacity(total))[0]
+    free_path = crossing(np.full(len(o), np.log(2)))[1]
+    return Seen(total, moment, np.where(total > 0, median, 0), np.where(total >= np.log(2), free_path, 0))
+
+
+def _half_of_opacity(tau: np.ndarray) -> np.ndarray:
+    """Optical depth at which half of the opacity of ``tau`` is reached."""
+    return -np.log1p(0.5 * np.expm1(-tau))
 
 
 def mean_share(x: np.ndarray) -> np.ndarray:
@@ -107,13 +120,18 @@ def _profile(scene, o, d, near, far) -> Seen:
     moment *= length / (2 * PANELS)
     total = np.where(length > 0, scene.optical_depth(o, d, near, far), 0)
 
-    goal = -np.log1p(0.5 * np.expm1(-total))
-    low, high = near.copy(), far.copy()
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        short = scene.optical_depth(o, d, near, middle) < goal
-        low, high = np.where(short, middle, low), np.where(short, high, middle)
-    return Seen(total, moment, np.where(total > 0, high, 0))
+    def crossing(goal):
+        low, high = near.copy(), far.copy()
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            short = scene.optical_depth(o, d, near, middle) < goal
+            low, high = np.where(short, middle, low), np.where(short, high, middle)
+        return high
+
+    p = o + d * crossing(np.log(2))[:, None]
+    reached = total >= np.log(2)
+    sigma = np.where(reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY), 1)
+    return Seen(total, moment, np.where(total > 0, crossing(_half_of_opacity(total)), 0), np.where(reached, 1 / sigma, 0))
 
 
 @dataclass(frozen=True)
@@ -144,21 +162,30 @@ def truth(scene: AnalyticScene, gaze, o, d, *, depth: str, visibility: str, fall
     surface = seen.opacity >= surface_opacity
     p_d = o + d * t[:, None]
     p_o = np.asarray(scene.observer, float)
-    distance = np.linalg.norm(p_d - p_o, axis=-1)
-    r_o = (p_d - p_o) / np.where(distance > 0, distance, 1)[:, None]
+    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it.
+    in_front = tolerance + np.minimum(seen.free_path, t * FUZZ)
+    distance, r_o = _towards(p_o, p_d - d * in_front[:, None])
     start = np.broadcast_to(p_o, o.shape)
+    p_od = p_d
     if visibility == "transmittance":
-        share = np.exp(-look(scene, start, r_o, distance - tolerance).tau)
-        d_o = distance
+        share = np.exp(-look(scene, start, r_o, distance).tau)
     else:
         met = look(scene, start, r_o)
-        d_o = np.where(met.opacity >= surface_opacity, met.depth(depth), distance)
+        d_o = np.where(met.opacity >= surface_opacity, met.depth(depth), np.inf)
         excess = distance - d_o - tolerance
         share = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
+        blocked = excess > 0
+        p_od = np.where(blocked[:, None], p_o + r_o * np.where(blocked, d_o, 0)[:, None], p_d)
     share = np.where(surface, share, 0)
-    p_od = p_o + r_o * d_o[:, None]
-    density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, r_o) * share
+    density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, _towards(p_o, p_d)[1]) * share
     return Truth(seen.color(o, d), seen.opacity, t, share, density, "float64 closed form", {})
+
+
+def _towards(p_o, p):
+    """Distance (N,) and unit direction (N, 3) from ``p_o`` to ``p``."""
+    v = p - p_o
+    distance = np.linalg.norm(v, axis=-1)
+    return distance, v / np.where(distance > 0, distance, 1)[:, None]
 
 
 def evaluate_gaze(gaze, p_od, p_o, r_o) -> np.ndarray:
