@@ -12,8 +12,8 @@ def command(
     scene: Annotated[str, typer.Argument(help="Scene file (.xml), or slab, sphere, sheets, fog or ramp.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write into; it is made.")],
     scene_kind: Annotated[str, typer.Option(help="What SCENE is: auto, analytic or file.")] = "auto",
-    width: Annotated[int, typer.Option(help="Width of a picture in pixels.")] = 96,
-    height: Annotated[int, typer.Option(help="Height of a picture in pixels.")] = 64,
+    width: Annotated[int, typer.Option(help="Width of a picture in pixels.")] = 192,
+    height: Annotated[int, typer.Option(help="Height of a picture in pixels.")] = 128,
     repeats: Annotated[int, typer.Option(help="Timed renders of each setting; their median counts.")] = 5,
     quick: Annotated[bool, typer.Option("--quick", help="A few settings only, each timed once.")] = False,
     define: Annotated[

@@ -15,7 +15,7 @@ from . import study_errors, study_measure, study_plots, study_tables
 from .study_settings import settings
 from .study_subject import open_subject
 
-WIDTH, HEIGHT = 96, 64
+WIDTH, HEIGHT = 192, 128
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def run_study(
         "scene": subject.name, "variant": active, "size": [width, height], "extent": subject.extent, "step": subject.step,
         "tolerance": subject.tolerance, "reference": known.source, "reference_change_when_step_halved": known.convergence,
         "precision": study_measure.precision(), "gaze_kld_eps": study_errors.KLD_EPS, "repeats": repeats, "threads": dr.thread_count(),
-        "peak_mb": "peak of the arrays that Dr.Jit allocated during one render",
+        "peak_mb": "what Dr.Jit allocated at most during a first render, in MiB, beyond scene and field",
         "seconds_of_study": time.perf_counter() - begin,
         "versions": {"nerg_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__, "python": platform.python_version()},
         "against_paper": study_tables.against_paper(table), "rows": table, "scaling": scaling,

@@ -61,11 +61,14 @@ def _parameters(subject, row: Setting, integrator) -> dict:
 def _quality(subject, row: Setting, integrator, pixels: dict, pixel_spp: int) -> dict:
     import drjit as dr
 
+    backend = dr.JitBackend.CUDA if _on_cuda() else dr.JitBackend.LLVM
     gc.collect()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
+    # What other rows keep (their maps, say) is not this one's.
+    before = dr.detail.malloc_watermark(backend)
     picture = subject.channels(integrator, row.spp, SEED)
-    peak = dr.detail.malloc_watermark(dr.JitBackend.CUDA if _on_cuda() else dr.JitBackend.LLVM)
+    peak = dr.detail.malloc_watermark(backend) - before
     if row.spp > 1:
         if not pixels:
             pixels["truth"] = _pixel_truth(subject, pixel_spp)
