@@ -1,0 +1,110 @@
+"""What each part of a picture of the store costs: operations traced, evaluations made, seconds.
+
+    python benchmarks/operation_counts.py [--width 240] [--runs 5]
+
+Prints a markdown table (docs/leave-out.md) and writes out/operation_counts.csv. Counts do not depend on the machine;
+seconds are medians of several runs, and only their ratios mean anything.
+"""
+from __future__ import annotations
+
+import argparse
+import csv
+import statistics
+import time
+from pathlib import Path
+
+import mitsuba as mi
+
+import nerg_mi.scenes.store
+from nerg_mi.evaluation.operations import traced_operations
+
+STORE = Path(nerg_mi.scenes.store.__file__).parent
+CAMERA, OBSERVER, TARGET = [1.0, 0.8, 1.6], [1.0, 2.8, 1.6], [1.2, 5.0, 1.2]
+
+
+def look_at(origin):
+    return mi.ScalarTransform4f().look_at(origin, TARGET, [0, 0, 1])
+
+
+def configurations() -> dict[str, dict]:
+    """Name of each configuration and what it adds to a bare integrator."""
+    there = {"observer": {"type": "perspective", "to_world": look_at(OBSERVER)}}
+    here = {"observer": {"type": "perspective", "to_world": look_at(CAMERA)}}
+    dark = {"radiance": False}
+    return {
+        "nothing": dark | {"aovs": ""},
+        "depth": dark | {"aovs": "depth,opacity"},
+        "median depth": dark | {"aovs": "depth,opacity", "depth": "median"},
+        "colour, depth": {"aovs": "depth,opacity"},
+        "gaze given, not asked for": {"aovs": "depth,opacity"} | there,
+        "gaze, camera is the observer": {"aovs": "depth,opacity,gaze"},
+        "gaze, observer at the camera": {"aovs": "depth,opacity,gaze"} | here,
+        "gaze, observer elsewhere": {"aovs": "depth,opacity,gaze"} | there,
+        "... without occlusion": {"aovs": "depth,opacity,gaze", "occlusion": False} | there,
+        "... by transmittance": {"aovs": "depth,opacity,gaze", "visibility": "transmittance"} | there,
+        "... by a map, first frame": {"aovs": "depth,opacity,gaze", "visibility": "map"} | there,
+        "... by a map, next frames": {"aovs": "depth,opacity,gaze", "visibility": "map"} | there,
+    }
+
+
+def scene(width: int, options: dict):
+    integrator = {
+        "type": "nerg",
+        "field": {"type": "nerf", "filename": str(STORE / "store.safetensors")},
+        "gaze": {"type": "gazefield", "filename": str(STORE / "shoppers.safetensors")},
+        **options,
+    }
+    film = {"type": "hdrfilm", "width": width, "height": width * 3 // 4, "component_format": "float32",
+            "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": 75, "to_world": look_at(CAMERA), "film": film}
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+
+
+def evaluations(width: int, options: dict) -> list[float]:
+    """Mean density, colour and gaze evaluations a pixel, counted in a render of their own."""
+    asked = [a for a in options["aovs"].split(",") if a]
+    if not asked:
+        return [0.0, 0.0, 0.0]
+    counts = ["density_evals", "color_evals"] + (["gaze_evals"] if "gaze" in asked else [])
+    image = mi.render(scene(width, options | {"aovs": ",".join(asked + counts)}), spp=1).numpy()
+    means = image[..., 3 + len(asked):].mean((0, 1)).tolist()
+    return means + [0.0] * (3 - len(means))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--width", type=int, default=240)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--variant", default="llvm_ad_rgb")
+    args = parser.parse_args()
+    mi.set_variant(args.variant)
+
+    rows = []
+    for name, options in configurations().items():
+        place = scene(args.width, options)
+        if "first" not in name:
+            mi.render(place, spp=1).numpy()
+        operations = traced_operations(lambda: mi.render(place, spp=1))
+        seconds = []
+        for run in range(args.runs):
+            if "first" in name:
+                place = scene(args.width, options)
+            start = time.perf_counter()
+            mi.render(place, spp=1, seed=run).numpy()
+            seconds.append(time.perf_counter() - start)
+        rows.append([name, operations, *evaluations(args.width, options), statistics.median(seconds)])
+
+    print("| what | operations traced | density evals | colour evals | gaze evals | seconds |\n|---|---|---|---|---|---|")
+    for name, operations, density, color, gaze, seconds in rows:
+        print(f"| {name} | {operations:,} | {density:.1f} | {color:.1f} | {gaze:.2f} | {seconds:.3f} |")
+    out = Path("out/operation_counts.csv")
+    out.parent.mkdir(exist_ok=True)
+    with out.open("w", newline="") as f:
+        writer = csv.writer(f)
+        writer.writerow(["what", "operations", "density_evals", "color_evals", "gaze_evals", "seconds"])
+        writer.writerows(rows)
+    print(f"\nWrote {out}")
+
+
+if __name__ == "__main__":
+    main()
