@@ -27,7 +27,7 @@ def command(
 ) -> None:
     """Measure error against run time: render a scene at many settings, compare each with what is true, and plot it.
 
-    Writes study.csv (a row a setting), scaling.csv, study.json and two plots. A full study takes up to half an hour.
+    Writes study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. A full study takes up to half an hour.
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 

@@ -66,12 +66,52 @@ def _brief(row: dict) -> dict:
 
 
 def write_tables(out: Path, report: dict) -> list[Path]:
-    """Write ``study.csv`` (the rows), ``scaling.csv`` and ``study.json`` (all of ``report``); returns their paths."""
-    paths = [out / "study.csv", out / "scaling.csv", out / "study.json"]
-    for path, rows, columns in ((paths[0], report["rows"], COLUMNS), (paths[1], report["scaling"], None)):
+    """Write ``study.csv`` (the rows), ``study.md`` (the same by factor, to read), ``scaling.csv`` and ``study.json`` (all of
+    ``report``); returns their paths."""
+    paths = [out / "study.csv", out / "study.md", out / "scaling.csv", out / "study.json"]
+    for path, rows, columns in ((paths[0], report["rows"], COLUMNS), (paths[2], report["scaling"], None)):
         with path.open("w", newline="") as f:
             writer = csv.DictWriter(f, columns or list(rows[0]), restval="")
             writer.writeheader()
             writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows)
-    paths[2].write_text(json.dumps(report, indent=1) + "\n")
+    paths[1].write_text(markdown(report))
+    paths[3].write_text(json.dumps(report, indent=1) + "\n")
     return paths
+
+
+# Column of study.csv, its heading to read, and what it is multiplied with.
+_SHOWN = (
+    ("seconds", "ms", 1e3), ("density_evals", "density", 1), ("color_evals", "colour", 1), ("color_rmse", "colour RMSE", 1),
+    ("depth_mae", "depth MAE", 1), ("depth_p99", "depth 99 %", 1), ("surface_mae", "surface MAE", 1), ("visibility_mae", "visibility MAE", 1),
+    ("visibility_wrong", "wrong %", 100), ("gaze_mae", "gaze MAE", 1), ("gaze_kld", "gaze KLD", 1), ("peak_mb", "MiB", 1),
+)  # fmt: skip
+
+
+def markdown(report: dict) -> str:
+    """A table for each factor, the default first in all of them, and the comparison with the paper's marching."""
+    rows = report["rows"]
+    shown = [c for c in _SHOWN if any(c[0] in r for r in rows)]
+    default = rows[0]
+    head = ["setting", *(title for _, title, _ in shown)]
+    text = [f"{report['scene']}, {report['size'][0]} x {report['size'][1]}, {report['variant']}, reference: {report['reference']}"]
+    if report["reference_change_when_step_halved"]:
+        change = ", ".join(f"{k} {v:.2g}" for k, v in report["reference_change_when_step_halved"].items())
+        text.append(f"Steps twice as long change the reference by: {change}")
+    for group in dict.fromkeys(r["group"] for r in rows[1:]):
+        mine = [default, *(r for r in rows if r["group"] == group)]
+        cells = [[r["setting"], *(f"{r[k] * by:.3g}" if k in r else "" for k, _, by in shown)] for r in mine]
+        text.append(_table(group, head, cells))
+    head = ["paper", "ms", "depth MAE", "no slower", "times less error", "no worse", "times faster"]
+    cells = []
+    for pair in report["against_paper"]:
+        paper, time, error = pair["paper"], pair["equal_time"], pair["equal_error"]
+        cells.append([paper["setting"], f"{1e3 * paper['seconds']:.3g}", f"{paper['depth_mae']:.3g}"])
+        cells[-1] += [time["setting"], f"{time['error_ratio']:.3g}"] if time else ["none", ""]
+        cells[-1] += [error["setting"], f"{error['time_ratio']:.3g}"] if error else ["none", ""]
+    text.append(_table("against the paper's marching", head, cells))
+    return "\n\n".join(text) + "\n"
+
+
+def _table(title: str, head: list[str], rows: list[list[str]]) -> str:
+    lines = [f"### {title}", "", f"| {' | '.join(head)} |", f"|-{'|-' * (len(head) - 1)}|"]
+    return "\n".join([*lines, *(f"| {' | '.join(r)} |" for r in rows)])

@@ -190,7 +190,7 @@ def test12_quick_run_of_the_command(tmp_path, capsys):
     assert not end.value.code
     said = capsys.readouterr().out
     out = tmp_path / "new"
-    for name in ("study.csv", "scaling.csv", "study.json", "errors.png", "scaling.png"):
+    for name in ("study.csv", "study.md", "scaling.csv", "study.json", "errors.png", "scaling.png"):
         assert (out / name).is_file() and str(out / name) in said.replace("\n", "")
     with (out / "study.csv").open() as f:
         rows = list(csv.DictReader(f))
