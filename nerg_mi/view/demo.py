@@ -85,7 +85,7 @@ def run_demo(
     seen = _load(mi, scene, values)
     unhidden = _load(mi, scene, values | {"occlusion": "false", "radiance": "false", "aovs": "opacity,gaze"})
     if len(seen.sensors()) < 3:
-        raise NergError(f'"{scene}" has {len(seen.sensors())} sensor(s) and the demo needs 3: a camera, the own view, a panorama.')
+        raise NergError(f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama.')
     clock.start("camera")
     camera = _render(mi, seen, CAMERA, spp, seed)
     clock.start("own view")
@@ -175,7 +175,8 @@ def _pixel_of_observer(mi, scene):
     film = camera.film()
     fov = mi.traverse(camera)["x_fov"]
     local = camera.world_transform().inverse() @ center(scene.sensors()[OWN])
-    screen = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, camera.near_clip(), camera.far_clip())
+    clip = camera.near_clip(), camera.far_clip()
+    screen = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, *clip)
     x, y, _ = (float(v[0]) for v in np.array(screen @ local).reshape(3, -1))
     depth = float(np.array(local).reshape(3, -1)[2, 0])
     if depth <= 0 or not (0 < x < 1 and 0 < y < 1):

@@ -95,7 +95,8 @@ def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None):
         for axes in sheet.panels[1:]:
             axes.plot(*marker, marker="o", markersize=6, markerfacecolor="#35c2ff", markeredgecolor="white", markeredgewidth=1.2)
             axes.annotate("observer", marker, xytext=(6, 5), textcoords="offset points", fontsize=7, color="white")
-    sheet.bar(scale_strip(heat), 0.0, heat.top, "gaze density [1/sr]", above=_exceeds(heat, [own[1], moved_without[1], moved_with[1]]))
+    above = _exceeds(heat, [gaze for _, gaze, _ in (own, moved_without, moved_with)])
+    sheet.bar(scale_strip(heat), 0.0, heat.top, "gaze density [1/sr]", above=above)
     return sheet.figure
 
 

@@ -36,7 +36,7 @@ class Heat:
 
     def __post_init__(self):
         if not (np.isfinite(self.top) and self.top > 0):
-            raise NergError(f"the top of a heat map's scale must be positive, got {self.top}: give a range, or look at why the gaze is 0.")
+            raise NergError(f"the top of a heat map's scale must be positive, got {self.top}: give it a range.")
         if self.colors not in MAPS:
             raise NergError(f'"{self.colors}" is no perceptually uniform colour map: choose one of {", ".join(MAPS)}.')
 

@@ -57,7 +57,8 @@ def test01_writes_and_names_everything(rgb, standins, tmp_path, capsys):
 
 def test02_equal_seeds_equal_files(rgb, standins, tmp_path):
     def outputs(name, seed):
-        return demo.run_demo(tmp_path / name, defaults=standins, width=36, spp=1, seed=seed, variant="llvm_ad_rgb").report["outputs"]
+        sizes = {"width": 36, "spp": 1}
+        return demo.run_demo(tmp_path / name, defaults=standins, seed=seed, variant="llvm_ad_rgb", **sizes).report["outputs"]
 
     first, second, other = outputs("a", 3), outputs("b", 3), outputs("c", 4)
     assert first == second

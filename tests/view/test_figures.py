@@ -32,7 +32,7 @@ def test02_equal_input_equal_file(tmp_path, name):
         "gaze": lambda: figures.gaze_figure(COLOR, GAZE, MASK, HEAT),
         "visibility": lambda: figures.visibility_figure(COLOR, GAZE, MASK),
         "sphere": lambda: figures.sphere_figure(COLOR, GAZE, MASK, HEAT),
-        "occlusion": lambda: figures.occlusion_figure((COLOR, GAZE, MASK), (COLOR, GAZE, MASK), (COLOR, GAZE, MASK), HEAT, (3, 4)),
+        "occlusion": lambda: figures.occlusion_figure(*[(COLOR, GAZE, MASK)] * 3, HEAT, (3, 4)),
     }[name]
     for k in "ab":
         figures.save(draw(), tmp_path / f"{k}.png", {"Comment": "seed 1"})
