@@ -1,0 +1,134 @@
+"""Training a gaze field on probes (NeRG, Section 4.3): positions and directions in, densities out."""
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import drjit as dr
+import numpy as np
+from drjit.opt import AdamW
+
+from ..field.box import Box
+from ..field.gaze import GazeConfig, GazeField
+from .gaze_losses import gaze_loss
+from .gaze_model import gaze_density, used_parameters
+from .gaze_settings import LOSSES, GazeSettings
+from .gaze_supervision import Supervision
+
+# Samples of one launch of a validation.
+_CHUNK = 1 << 16
+
+
+class Scores(NamedTuple):
+    """Means over probes: ``loss`` as trained, ``kld`` (nats), ``cc``, ``mae`` (1/sr), ``integral`` over the sphere."""
+
+    loss: float
+    kld: float
+    cc: float
+    mae: float
+    integral: float
+
+
+class GazeTrainer:
+    """One run: state, ``step()``, ``measure()``, and ``field()`` for what it has come to.
+
+    ``supervision``: what to learn from; ``box``: where the field lives, in the same frame; ``schedule``: steps that the
+    learning rate's schedule spans, where that is not ``settings``' own length. Equal seeds draw equal batches; sums over
+    threads are not ordered, so that weights agree between runs to rounding (and bit for bit only with one thread).
+    """
+
+    def __init__(self, supervision: Supervision, box: Box, config: GazeConfig, settings: GazeSettings, ns,
+                 schedule: int | None = None):
+        self.config, self.settings, self.box, self.ns = config, settings, box, ns
+        self.rng = np.random.default_rng(settings.seed)
+        self.data, self._schedule = _Samples(supervision, ns), schedule
+        self.initial = GazeField.random(config, box, ns, settings.seed)
+        self.optimiser = AdamW(settings.learning_rate, used_parameters(config, self.initial.parameters()),
+                               beta_2=0.99, epsilon=1e-15, weight_decay=settings.weight_decay)
+        self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.optimiser.items()}
+        self.steps, self.loss = 0, None
+        self._started = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since the run began."""
+        return time.perf_counter() - self._started
+
+    @property
+    def progress(self) -> float:
+        """Share of the schedule that is done, 0..1."""
+        s, steps = self.settings, self._schedule or self.settings.steps
+        return min(1.0, self.steps / steps if steps else self.seconds / (60 * s.minutes))
+
+    def step(self) -> None:
+        """Draw probes and directions, and move the weights once."""
+        s, data = self.settings, self.data
+        probes = min(s.probes, data.probes)
+        D = min(s.directions, data.count)
+        probe = self.rng.choice(data.probes, probes, replace=False)
+        if D < data.count:
+            which = np.argpartition(self.rng.random((probes, data.count)), D, axis=1)[:, :D]
+        else:
+            which = np.broadcast_to(np.arange(D), (probes, D))
+        prediction, truth = data.evaluate(self.config, self.box, self.optimiser, probe, which)
+        self.loss = gaze_loss(prediction, truth, D, **LOSSES[s.loss])
+        dr.backward(self.loss.total)
+        self.optimiser.set_learning_rate(s.rate(self.progress))
+        self.optimiser.step()
+        self.steps += 1
+        # A short memory at first: the start of a run is not worth remembering.
+        decay = min(s.average, (1 + self.steps) / (10 + self.steps))
+        for k, old in self.averaged.items():
+            self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * dr.opaque(self.ns.Float, 1 - decay)
+        dr.eval(self.averaged)
+
+    def measure(self, supervision: Supervision, weights: dict | None = None) -> Scores:
+        """Scores of the averaged weights (or of ``weights``) on other probes, all of their directions."""
+        data = _Samples(supervision, self.ns)
+        block, rows = max(1, _CHUNK // data.count), []
+        which = np.arange(data.count)[None]
+        with dr.suspend_grad():
+            for a in range(0, data.probes, block):
+                probe = np.arange(a, min(a + block, data.probes))
+                prediction, truth = data.evaluate(self.config, self.box, weights or self.averaged, probe,
+                                                  np.broadcast_to(which, (len(probe), data.count)))
+                parts = gaze_loss(prediction, truth, data.count)
+                mean = dr.mean(prediction)
+                rows.append((len(probe), *(float(v[0]) for v in (parts.kld, parts.cc, parts.mae, mean))))
+        rows = np.array(rows)
+        kld, cc, mae, mean = rows[:, 0] @ rows[:, 1:] / rows[:, 0].sum()
+        w = LOSSES[self.settings.loss]
+        return Scores(w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae, kld, cc, mae, 4 * np.pi * mean)
+
+    def weights(self) -> dict:
+        """A copy of the averaged weights."""
+        return {k: type(v)(v) for k, v in self.averaged.items()}
+
+    def field(self, weights: dict | None = None) -> GazeField:
+        """The field with the averaged weights (or ``weights``)."""
+        out = GazeField.random(self.config, self.box, self.ns, self.settings.seed)
+        out.set_parameters(weights or self.weights())
+        return out
+
+
+class _Samples:
+    """A ``Supervision`` as arrays of a backend, from which batches are gathered."""
+
+    def __init__(self, s: Supervision, ns):
+        self.ns, self.probes, self.count = ns, *s.truth.shape
+        if self.probes == 0:
+            raise ValueError("there are no probes to train on")
+        flat = lambda v: ns.Float(np.ascontiguousarray(v, np.float32).ravel())
+        self._positions, self._directions = flat(s.positions), flat(s.directions)
+        self._truth, self._distance = flat(s.truth), flat(s.distance)
+
+    def evaluate(self, config, box, parameters, probe: np.ndarray, which: np.ndarray):
+        """``(prediction, truth)`` in directions ``which`` (B, D) of the probes ``probe`` (B,), flat."""
+        ns = self.ns
+        at = ns.UInt32(probe.astype(np.uint32))
+        index = ns.UInt32((probe[:, None] * self.count + which).astype(np.uint32).ravel())
+        p_o, r_o = dr.gather(ns.Array3f, self._positions, at), dr.gather(ns.Array3f, self._directions, index)
+        p_od = dr.gather(ns.Array3f, self._positions, index // self.count) + r_o * dr.gather(ns.Float, self._distance, index)
+        names = [k for k in parameters.keys()]
+        prediction = gaze_density(config, box, {k: parameters[k] for k in names}, p_od, p_o, r_o, ns)
+        return prediction, dr.gather(ns.Float, self._truth, index)

@@ -1,0 +1,110 @@
+"""What a gaze field learns from: probes, the directions around each, the true densities, and the surfaces they meet.
+
+The radiance field (or any medium) is frozen while gaze is trained and each probe keeps its directions, so every depth is
+traced once, before the training.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..attention.probes import Probes, place_probes
+from ..attention.rays import Rays
+from ..attention.sphere import fibonacci_directions
+from ..field.box import Box
+from ..transport.media import Similarity
+from ..transport.trace import trace_depth
+from .gaze_settings import ProbeSettings
+
+# Opacity from which on a ray has met a surface; the integrator's default.
+SURFACE_OPACITY = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Supervision:
+    """P probes with D directions of equal area each, in the field's frame and units, float32.
+
+    ``positions`` (P, 3), the observers p_o; ``directions`` (P, D, 3), unit, r_o; ``truth`` (P, D), 1/sr; ``distance``
+    (P, D), from p_o to p_od; ``escaped`` (P, D) bool: no surface was met, and p_od is where the box ends.
+    """
+
+    positions: np.ndarray
+    directions: np.ndarray
+    truth: np.ndarray
+    distance: np.ndarray
+    escaped: np.ndarray
+
+    @property
+    def escape_share(self) -> float:
+        """Share of the directions that meet no surface."""
+        return float(self.escaped.mean())
+
+    @property
+    def escaped_gaze(self) -> float:
+        """Share of the true gaze that goes where no surface is."""
+        return float((self.truth * self.escaped).sum() / self.truth.sum())
+
+
+def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | None = None, kind: str = "median",
+              seed: int = 0) -> Supervision:
+    """Directions, true densities and surfaces of ``probes``.
+
+    ``medium``: what depths are traced in (``FieldMedium`` or ``VolumeMedium``) and ``box``, where the gaze field will
+    live: both in the field's frame. ``count``: directions a probe, a Fibonacci set under a rotation of its own, so that
+    together the probes see what one set leaves out. ``align``: similarity from the rays' frame to the field's.
+    """
+    align = align or Similarity()
+    directions = rotated_sets(count, len(probes), np.random.default_rng(seed))
+    truth = probes.density(directions)
+    rotation = align.matrix[:3, :3] / align.scale
+    positions = probes.positions @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+    turned = directions @ rotation.T
+    distance, escaped = surfaces(medium, box, positions, turned, kind)
+    return Supervision(positions.astype(np.float32), turned.astype(np.float32), truth, distance, escaped)
+
+
+def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align: Similarity | None = None,
+                   queries: np.ndarray | None = None, seed: int = 0) -> Supervision:
+    """Probes on ``rays``, at ``queries`` (P, 3) metres where given, and what ``supervise`` makes of them."""
+    s = settings
+    probes = place_probes(rays, s.radius, count=s.count, queries=queries, cap=s.cap, min_rays=min(s.min_rays, s.cap),
+                          kappa_rule=s.kappa_rule, kappa=s.kappa, seed=seed)
+    return supervise(probes, medium, box, s.directions, align, s.depth, seed)
+
+
+def surfaces(medium, box: Box, positions, directions, kind: str = "median") -> tuple[np.ndarray, np.ndarray]:
+    """Distances from ``positions`` (P, 3) along ``directions`` (P, D, 3) to the surface that each meets, and which meet none.
+
+    Both (P, D): float32 in the field's units, and bool. A direction that meets no surface ends where it leaves the box
+    (or after the box's diagonal, where it never enters): it still needs a p_od at which the field is evaluated.
+    """
+    P, D = directions.shape[:2]
+    origins = np.repeat(np.asarray(positions, np.float64), D, axis=0)
+    flat = np.asarray(directions, np.float64).reshape(-1, 3)
+    depth, opacity = trace_depth(medium, origins, flat, kind=kind)
+    escaped = opacity < SURFACE_OPACITY
+    depth[escaped] = box_exit(box, origins[escaped], flat[escaped])
+    return depth.reshape(P, D), escaped.reshape(P, D)
+
+
+def box_exit(box: Box, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Distance (N,) at which rays leave ``box``; its diagonal for rays that never enter it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.stack([(np.asarray(c) - origins) / directions for c in (box.lower, box.upper)])
+    # A ray inside of a pair of planes that it is parallel to never leaves through them; 0/0 on a plane is neither.
+    near, far = np.fmin(t[0], t[1]).max(axis=1), np.fmax(t[0], t[1]).min(axis=1)
+    return np.where((far > 0) & (near <= far) & np.isfinite(far), far, box.diagonal)
+
+
+def rotated_sets(count: int, sets: int, rng: np.random.Generator) -> np.ndarray:
+    """``sets`` Fibonacci sets of ``count`` directions, each turned by a uniform random rotation, (sets, count, 3)."""
+    # Unit quaternions from normal numbers are uniform rotations (Shoemake 1992).
+    q = rng.normal(size=(sets, 4))
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rotation = np.stack([
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ], axis=1).reshape(-1, 3, 3)  # fmt: skip
+    return np.einsum("dj,pij->pdi", fibonacci_directions(count), rotation)
