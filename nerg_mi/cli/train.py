@@ -6,7 +6,10 @@ from typing import Annotated, Optional
 
 import typer
 
+from .train_gaze import train_gaze
+
 app = typer.Typer(no_args_is_help=True, help="Train fields from recordings.")
+app.command("gaze")(train_gaze)
 
 
 @app.command("radiance")

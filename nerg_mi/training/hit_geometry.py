@@ -1,0 +1,67 @@
+"""A place made from what people looked at, where there are no photos: the rays' hit points as a volume.
+
+Eye trackers in virtual reality record where each ray met the scene. Enough of these points outline what matters: the
+surfaces that are looked at. They become voxels, small holes are closed, and the result is a Mitsuba grid volume that
+depths are traced in and that the integrator ``nerg`` renders as its ``density``.
+"""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..attention.rays import Rays
+from ..field.box import Box
+
+VOXEL = 0.08
+# Optical depth of a voxel: one is opaque.
+_TAU = 8.0
+_PAD = 4
+_MOST = 1 << 26
+
+
+def voxelise_hits(rays: Rays, voxel: float = VOXEL) -> tuple[np.ndarray, Box]:
+    """Density (z, y, x) in 1/metre, float32, and the box that it fills, both in the rays' frame.
+
+    A voxel of edge ``voxel`` metres is solid where a ray ended. Gaps of up to four voxels are closed (morphological
+    closing), then voxels through which people put their heads, and their neighbours, are emptied. The box holds all hits
+    and all origins. Raises ``ValueError`` for rays without hit points, and where the voxels would be too many.
+    """
+    from scipy.ndimage import binary_closing, binary_dilation
+
+    hits = None if rays.hit is None else rays.hit[np.isfinite(rays.hit).all(axis=1)]
+    if hits is None or not len(hits):
+        raise ValueError("these rays have no hit points to make a place from; give a radiance field instead (--field)")
+    if not voxel > 0:
+        raise ValueError(f"a voxel's edge must be positive, got {voxel} m")
+    points = np.concatenate([hits, rays.origin])
+    lower = points.min(axis=0) - _PAD * voxel
+    shape = np.ceil((points.max(axis=0) - lower) / voxel).astype(int) + _PAD
+    if np.prod(shape, dtype=float) > _MOST:
+        raise ValueError(f"hit points spread over {' x '.join(map(str, shape))} voxels; drop outliers or enlarge the voxel of {voxel} m")
+    cells = lambda p: tuple(((p - lower) / voxel).astype(int).T[::-1])
+    solid, heads = np.zeros((2, *shape[::-1]), bool)
+    solid[cells(hits)] = True
+    cube = np.ones((3, 3, 3), bool)
+    solid = binary_closing(solid, cube, iterations=2)
+    heads[cells(rays.origin)] = True
+    solid &= ~binary_dilation(heads, cube)
+    return np.where(solid, np.float32(_TAU / voxel), np.float32(0)), Box(tuple(lower), tuple(lower + shape * voxel))
+
+
+def write_volume(path: str | Path, density: np.ndarray, box: Box) -> None:
+    """Write ``density`` (z, y, x) as a Mitsuba ``.vol`` file that knows its ``box``.
+
+    It is read by a ``gridvolume`` with ``use_grid_bbox`` set to true (file format: Mitsuba's ``VolumeGrid``, version 3).
+    """
+    z, y, x = density.shape
+    with open(path, "wb") as out:
+        out.write(b"VOL\x03")
+        out.write(np.array([1, x, y, z, 1], "<i4").tobytes())
+        out.write(np.array([*box.lower, *box.upper], "<f4").tobytes())
+        out.write(np.ascontiguousarray(density, "<f4").tobytes())
+
+
+def volume_dict(path: str | Path) -> dict:
+    """The Mitsuba plugin, as a dict, that shows what ``write_volume`` wrote."""
+    return {"type": "gridvolume", "filename": str(path), "use_grid_bbox": True}
