@@ -8,7 +8,8 @@ def one_minus_exp(x):
     """1 - exp(-x) for x >= 0, to full relative precision also for tiny x; 1 at infinity."""
     # tanh is accurate near 0 and saturates at 1: 1 - exp(-x) = 2 th / (1 + th), th = tanh(x / 2).
     th = dr.tanh(0.5 * x)
-    return 2 * th / (1 + th)
+    # The derivative is written out: that of tanh, 1 - th², cancels as x grows.
+    return dr.replace_grad(2 * th / (1 + th), -dr.exp(-x))
 
 
 def log1p(x):
