@@ -12,7 +12,7 @@ LOSSES = {"paper": gaze_losses.PAPER, "code": gaze_losses.CODE}
 # (levels, log2 rows, base and finest resolution, width, geometry features). "paper" has the paper's sizes, 10.6 million
 # entries; "small" is what generalises to positions that nobody trained on, and stores in 0.1 MB as fp16.
 _SIZES = {
-    "small": (5, 14, 4, 64, 64, 15),
+    "small": (6, 14, 4, 128, 64, 15),
     "paper": (16, 19, 16, 512, 64, 15),
 }
 SIZES = tuple(_SIZES)
@@ -78,7 +78,7 @@ class GazeSettings:
     learning_rate: float = 3e-3
     final_rate: float = 0.03
     hold: float = 0.3
-    weight_decay: float = 0.3
+    weight_decay: float = 3.0
     average: float = 0.98
     looks: int = 20
     patience: int = 6

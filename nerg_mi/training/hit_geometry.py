@@ -17,6 +17,9 @@ VOXEL = 0.08
 # Optical depth of a voxel: one is opaque.
 _TAU = 8.0
 _PAD = 4
+# Share of the hit points at either end of an axis that the box need not hold: a glance through a gap ends
+# tens of metres behind the place.
+_OUTLIERS = 0.005
 _MOST = 1 << 26
 
 
@@ -24,8 +27,8 @@ def voxelise_hits(rays: Rays, voxel: float = VOXEL) -> tuple[np.ndarray, Box]:
     """Density (z, y, x) in 1/metre, float32, and the box that it fills, both in the rays' frame.
 
     A voxel of edge ``voxel`` metres is solid where a ray ended. Gaps of up to four voxels are closed (morphological
-    closing), then voxels through which people put their heads, and their neighbours, are emptied. The box holds all hits
-    and all origins. Raises ``ValueError`` for rays without hit points, and where the voxels would be too many.
+    closing), then voxels through which people put their heads, and their neighbours, are emptied. The box holds all
+    origins and the hits but for half a percent at each end of each axis; hits outside of it are left out. Raises ``ValueError`` for rays without hit points, and where the voxels would be too many.
     """
     from scipy.ndimage import binary_closing, binary_dilation
 
@@ -34,14 +37,15 @@ def voxelise_hits(rays: Rays, voxel: float = VOXEL) -> tuple[np.ndarray, Box]:
         raise ValueError("these rays have no hit points to make a place from; give a radiance field instead (--field)")
     if not voxel > 0:
         raise ValueError(f"a voxel's edge must be positive, got {voxel} m")
-    points = np.concatenate([hits, rays.origin])
-    lower = points.min(axis=0) - _PAD * voxel
-    shape = np.ceil((points.max(axis=0) - lower) / voxel).astype(int) + _PAD
+    first, last = np.quantile(hits, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
+    lower = np.minimum(first, rays.origin.min(axis=0)) - _PAD * voxel
+    shape = np.ceil((np.maximum(last, rays.origin.max(axis=0)) - lower) / voxel).astype(int) + _PAD
     if np.prod(shape, dtype=float) > _MOST:
         raise ValueError(f"hit points spread over {' x '.join(map(str, shape))} voxels; drop outliers or enlarge the voxel of {voxel} m")
     cells = lambda p: tuple(((p - lower) / voxel).astype(int).T[::-1])
     solid, heads = np.zeros((2, *shape[::-1]), bool)
-    solid[cells(hits)] = True
+    inside = ((hits > lower) & (hits < lower + shape * voxel)).all(axis=1)
+    solid[cells(hits[inside])] = True
     cube = np.ones((3, 3, 3), bool)
     solid = binary_closing(solid, cube, iterations=2)
     heads[cells(rays.origin)] = True

@@ -1,0 +1,81 @@
+"""A trained gaze field beside its baselines: densities over the sphere at positions, and a table of scores."""
+from __future__ import annotations
+
+from typing import Callable
+
+import drjit as dr
+import numpy as np
+
+from ..field.backend import namespace
+from ..field.gaze import GazeField
+from ..training.gaze_supervision import surfaces
+from ..transport.media import Similarity
+from . import metrics
+from .gaze_baselines import Baseline
+
+# Of the uniform density: what a density of zero counts as in KLD. A truth that is a kernel density has
+# long empty stretches where nothing should hinge on how empty exactly.
+EPS = 1e-6
+_CHUNK = 1 << 18
+
+
+def gaze_field(field: GazeField, medium, align: Similarity | None = None, kind: str = "median") -> Baseline:
+    """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr, not normalised.
+
+    ``medium``: what the observer's depth is traced in, in the field's frame; ``align``: similarity from the frame of the
+    positions to the field's; directions (D, 3) for all positions or (P, D, 3). Where no surface is met, p_od is where the
+    field's box ends, as in training (``training.gaze_supervision``).
+    """
+    align = align or Similarity()
+    ns = namespace(field.grid.table)
+
+    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+        directions = np.asarray(directions, np.float64) @ (align.matrix[:3, :3] / align.scale).T
+        directions = np.broadcast_to(directions, (len(positions), *directions.shape[-2:]))
+        distance, _ = surfaces(medium, field.box, positions, directions, kind)
+        D = directions.shape[1]
+        out = np.empty(distance.size, np.float32)
+        o, d = np.repeat(positions, D, axis=0).astype(np.float32), directions.reshape(-1, 3).astype(np.float32)
+        for a in range(0, len(out), _CHUNK):
+            part = slice(a, a + _CHUNK)
+            p_o, r_o = (ns.Array3f(np.ascontiguousarray(v[part].T)) for v in (o, d))
+            p_od = p_o + r_o * ns.Float(distance.ravel()[part])
+            with dr.suspend_grad():
+                # A constant variant returns one lane for all.
+                out[part] = np.asarray(field.evaluate(p_od, p_o, r_o)[0] + dr.zeros(ns.Float, dr.width(r_o)))
+        return out.reshape(distance.shape)
+
+    return evaluate
+
+
+def scores(truth: np.ndarray, prediction: np.ndarray, eps: float = EPS) -> dict[str, float]:
+    """Means over positions of KLD (nats, both normalised over the sphere), CC, SIM, MAE (1/sr) and the prediction's integral.
+
+    ``truth``, ``prediction``: (P, D) in 1/sr, directions of equal area; ``eps`` as in ``metrics.kld``. MAE and the integral
+    are of the prediction as it is, not normalised.
+    """
+    return {
+        "KLD": float(metrics.kld(truth, prediction, eps=eps).mean()), "CC": float(metrics.cc(truth, prediction).mean()),
+        "SIM": float(metrics.sim(truth, prediction).mean()), "MAE": float(metrics.mae(truth, prediction).mean()),
+        "integral": float(4 * np.pi * np.mean(prediction)),
+    }  # fmt: skip
+
+
+def score_rows(truth: np.ndarray, positions: np.ndarray, directions: np.ndarray, methods: dict[str, Callable]) -> list[dict]:
+    """One row of ``scores`` for each of ``methods`` (name: density function), in order; ``method`` holds the name."""
+    return [{"method": name, **scores(truth, density(positions, directions))} for name, density in methods.items()]
+
+
+def print_scores(rows: list[dict], title: str) -> None:
+    """Print ``rows`` as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    out = Table(title=title, title_justify="left")
+    for k in rows[0]:
+        out.add_column(k, justify="left" if isinstance(rows[0][k], str) else "right")
+    for row in rows:
+        out.add_row(*(v if isinstance(v, str) else f"{v:.4f}" if k == "MAE" else f"{v:.3f}" for k, v in row.items()))
+    # A width of its own: a table in a file or a pipe must not be folded.
+    Console(width=120).print(out)
