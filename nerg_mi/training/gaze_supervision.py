@@ -90,10 +90,12 @@ def surfaces(medium, box: Box, positions, directions, kind: str = "median") -> t
 
 def box_exit(box: Box, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Distance (N,) at which rays leave ``box``; its diagonal for rays that never enter it."""
+    # Adding zero turns -0 into 0: parallel to a pair of planes, a ray between (or on) them never leaves through them.
+    directions = np.asarray(directions) + 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.stack([(np.asarray(c) - origins) / directions for c in (box.lower, box.upper)])
-    # A ray inside of a pair of planes that it is parallel to never leaves through them; 0/0 on a plane is neither.
-    near, far = np.fmin(t[0], t[1]).max(axis=1), np.fmax(t[0], t[1]).min(axis=1)
+        t = [(np.asarray(c) - origins) / directions for c in (box.lower, box.upper)]
+    t = [np.where(np.isnan(v), forever, v) for v, forever in zip(t, (-np.inf, np.inf))]
+    near, far = np.minimum(*t).max(axis=1), np.maximum(*t).min(axis=1)
     return np.where((far > 0) & (near <= far) & np.isfinite(far), far, box.diagonal)
 
 

@@ -56,7 +56,7 @@ def voxelise_hits(rays: Rays, voxel: float = VOXEL) -> tuple[np.ndarray, Box]:
 def write_volume(path: str | Path, density: np.ndarray, box: Box) -> None:
     """Write ``density`` (z, y, x) as a Mitsuba ``.vol`` file that knows its ``box``.
 
-    It is read by a ``gridvolume`` with ``use_grid_bbox`` set to true (file format: Mitsuba's ``VolumeGrid``, version 3).
+    It is read by a ``gridvolume`` with ``use_grid_bbox`` set to true and ``filter_type`` ``nearest`` (file format: Mitsuba's ``VolumeGrid``, version 3).
     """
     z, y, x = density.shape
     with open(path, "wb") as out:
@@ -67,5 +67,8 @@ def write_volume(path: str | Path, density: np.ndarray, box: Box) -> None:
 
 
 def volume_dict(path: str | Path) -> dict:
-    """The Mitsuba plugin, as a dict, that shows what ``write_volume`` wrote."""
-    return {"type": "gridvolume", "filename": str(path), "use_grid_bbox": True}
+    """The Mitsuba plugin, as a dict, that shows what ``write_volume`` wrote.
+
+    Without interpolation, which would bring every surface nearer by most of a voxel.
+    """
+    return {"type": "gridvolume", "filename": str(path), "use_grid_bbox": True, "filter_type": "nearest"}

@@ -1,0 +1,229 @@
+"""Gaze training: the fast path is the field, one probe is learnt, equal seeds agree, escapes, hit geometry, the command."""
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.attention.probes import place_probes
+from nerg_mi.attention.rays import Rays
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.box import Box
+from nerg_mi.field.gaze import GazeConfig, GazeField
+from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.training import gaze_run
+from nerg_mi.training.gaze import GazeTrainer
+from nerg_mi.training.gaze_model import gaze_density, used_parameters
+from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
+from nerg_mi.training.gaze_supervision import box_exit, rotated_sets, supervise, supervise_rays
+from nerg_mi.training.hit_geometry import volume_dict, voxelise_hits, write_volume
+from nerg_mi.transport.media import Similarity, VolumeMedium
+
+BOX = Box((-2, -2, 0), (2, 2, 3))
+GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=8)
+SMALL = GazeConfig(grid=GRID, width=16, geometry=4)
+PROBES = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
+
+
+def looking_at(target, n=400, seed=0, spread=1.2):
+    """Rays of two people who walk about and look at ``target``, with hits on the wall x = 1.5."""
+    rng = np.random.default_rng(seed)
+    origin = np.stack([rng.uniform(-1.2, 0, n), rng.uniform(-spread, spread, n), rng.uniform(1.5, 1.7, n)], axis=1)
+    direction = np.asarray(target) + rng.normal(0, 0.15, (n, 3)) - origin
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    hit = origin + direction * ((1.5 - origin[:, :1]) / direction[:, :1])
+    return Rays(np.arange(n), np.arange(n) % 2, ("a", "b"), origin, direction, np.ones(n), hit)
+
+
+@pytest.fixture
+def rays():
+    return looking_at((1.5, 0.4, 1.2))
+
+
+@pytest.fixture
+def wall(rgb):
+    """An opaque slab behind x = 1.5, in BOX."""
+    data = np.zeros((6, 8, 8, 1), np.float32)
+    data[:, :, 7] = 200
+    to_world = rgb.ScalarTransform4f().translate([-2, -2, 0]).scale([4, 4, 3])
+    volume = {"type": "gridvolume", "data": rgb.TensorXf(data), "filter_type": "nearest", "to_world": to_world}
+    return VolumeMedium(rgb.load_dict(volume))
+
+
+@pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
+@pytest.mark.parametrize("activation", ["softplus", "linear"])
+def test_the_fast_path_is_the_field(variant, activation):
+    ns, rng = namespace("llvm"), np.random.default_rng(3)
+    field = GazeField.random(replace(SMALL, variant=variant, activation=activation), BOX, ns, 5)
+    # Random tables are near zero: features of size one show an index that is wrong.
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    B, D = 3, 7
+    p_o, p_od = rng.uniform(0, 1.9, (3, B)), rng.uniform(-0.5, 2.5, (3, B * D))
+    r_o = rng.normal(size=(3, B * D))
+    r_o /= np.linalg.norm(r_o, axis=0)
+    p_o, p_od, r_o = (ns.Array3f(np.ascontiguousarray(v, np.float32)) for v in (p_o, p_od, r_o))
+    fast = gaze_density(field.config, BOX, field.parameters(), p_od, p_o, r_o, ns)
+    each = dr.gather(ns.Array3f, p_o, dr.arange(ns.UInt32, B * D) // D)
+    np.testing.assert_allclose(np.array(fast), np.array(field.evaluate(p_od, each, r_o)[0]), rtol=2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
+def test_gradients_reach_what_the_variant_uses(variant):
+    ns = namespace("llvm")
+    config = replace(SMALL, variant=variant)
+    parameters = used_parameters(config, GazeField.random(config, BOX, ns, 5).parameters())
+    dr.enable_grad(parameters)
+    p_o, r_o = ns.Array3f([0.1], [0.2], [1.0]), ns.Array3f([0, 0.6], [0.8, 0], [0.6, 0.8])
+    dr.backward(dr.sum(gaze_density(config, BOX, parameters, ns.Array3f([0.1, 1], [1, 0.2], [2, 2]), p_o, r_o, ns)))
+    for name, value in parameters.items():
+        assert np.any(np.array(dr.grad(value)) != 0), name
+
+
+def test_one_probe_is_learnt(rays, wall):
+    probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
+    supervision = supervise(probes, wall, BOX, 256)
+    np.testing.assert_allclose(4 * np.pi * supervision.truth.mean(), 1, atol=0.01)
+    settings = GazeSettings(steps=200, learning_rate=1e-2, weight_decay=0.0, zones=0)
+    trainer = GazeTrainer(supervision, BOX, SMALL, settings, namespace("llvm"))
+    before = trainer.measure(supervision)
+    for _ in range(200):
+        trainer.step()
+    after = trainer.measure(supervision)
+    assert before.kld > 0.5
+    assert after.kld < 0.05 and after.cc > 0.97 and abs(after.integral - 1) < 0.15
+
+
+def test_equal_seeds_train_equal_fields(rays, wall):
+    settings = GazeSettings(steps=6, zones=0, probes=2, directions=32, refit=False)
+    train = lambda s: gaze_run.train_gaze(rays, wall, BOX, SMALL, s, PROBES, namespace("llvm"))[0].parameters()
+    first, second, other = train(settings), train(settings), train(replace(settings, seed=1))
+    for name in first:
+        np.testing.assert_allclose(np.array(first[name]), np.array(second[name]), atol=1e-6)
+    assert np.abs(np.array(first["emit_head.0"]) - np.array(other["emit_head.0"])).max() > 1e-3
+
+
+def test_directions_that_meet_nothing_end_where_the_box_ends(rays, wall):
+    supervision = supervise_rays(rays, wall, BOX, PROBES)
+    p = supervision.positions[:, None] + supervision.directions * supervision.distance[..., None]
+    # The wall is met from x = 1.5 on, everything else ends on the box.
+    assert np.abs(p[~supervision.escaped][:, 0] - 1.5).max() < 0.02
+    lower, upper = np.array(BOX.lower), np.array(BOX.upper)
+    on_box = np.minimum(np.abs(p - lower), np.abs(p - upper)).min(axis=-1)
+    assert on_box[supervision.escaped].max() < 1e-5
+    assert 0.5 < supervision.escape_share < 0.95
+    # They look at the wall: what escapes is the tail of the kernels.
+    assert supervision.escaped_gaze < 0.1
+
+
+def test_exits_of_a_box():
+    o = np.array([[0, 0, 1.0], [0, 0, 1], [5, 0, 1], [5, 0, 1], [0, 2, 1]])
+    d = np.array([[1.0, 0, 0], [0, 0, -1], [-1, 0, 0], [1, 0, 0], [1, 0, 0]])
+    np.testing.assert_allclose(box_exit(BOX, o, d), [2, 1, 7, BOX.diagonal, 2])
+
+
+def test_sets_of_directions_are_turned_each_its_own_way():
+    sets = rotated_sets(64, 3, np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.norm(sets, axis=-1), 1)
+    np.testing.assert_allclose(sets @ sets.transpose(0, 2, 1), np.broadcast_to((sets @ sets.transpose(0, 2, 1))[0], (3, 64, 64)), atol=1e-12)
+    assert np.abs(sets[0] - sets[1]).max() > 0.1
+
+
+def test_rays_are_aligned_with_the_field(rays, wall):
+    """Half the size, turned and moved: the same supervision, in the field's frame."""
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = 2 * turn, (0.3, -0.4, 0.5)
+    inverse = np.linalg.inv(matrix)
+    moved = replace(rays, origin=rays.origin @ inverse[:3, :3].T + inverse[:3, 3], direction=rays.direction @ turn, hit=None)
+    probes = lambda r, radius: place_probes(r, radius, count=8, min_rays=8, kappa_rule="fixed", seed=1)
+    a = supervise(probes(rays, 0.5), wall, BOX, 32)
+    b = supervise(probes(moved, 0.25), wall, BOX, 32, Similarity(matrix))
+    np.testing.assert_allclose(b.positions, a.positions, atol=1e-5)
+    back = b.directions @ turn
+    np.testing.assert_allclose(back, a.directions, atol=1e-6)
+    # The distances are those from the field's frame: traced again along the same rays.
+    np.testing.assert_allclose(np.linalg.norm(b.directions, axis=-1), 1, atol=1e-6)
+    inside = ~b.escaped
+    p = b.positions[:, None] + b.directions * b.distance[..., None]
+    assert inside.any() and np.abs(p[inside][:, 0] - 1.5).max() < 0.02
+
+
+def test_held_out_positions_are_purged():
+    rays = looking_at((1.5, 0, 1.2), 3000, spread=6.0)
+    kept, account = gaze_run.hold_out(rays, 0.25, zones=2, positions=10, min_rays=8)
+    centres = np.array(account["centres"])
+    apart = np.linalg.norm(kept.origin[:, None] - centres[None], axis=2)
+    assert apart.min() > 0.5 and len(kept) == account["rays_to_train"] < len(rays)
+    assert json.loads(json.dumps(account)) == account
+
+
+def test_validation_stops_and_the_best_is_fitted_again(rgb):
+    rays = looking_at((1.5, 0, 1.2), 3000, spread=6.0)
+    density, box = voxelise_hits(rays, 0.2)
+    data = rgb.TensorXf(density[..., None])
+    to_world = rgb.ScalarTransform4f().translate(box.lower).scale([float(u - l) for l, u in zip(box.lower, box.upper)])
+    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "data": data, "to_world": to_world}))
+    settings = GazeSettings(steps=12, looks=4, zones=2, watched=6, probes=4, directions=32)
+    states = []
+    field, about = gaze_run.train_gaze(rays, medium, box, SMALL, settings, PROBES, namespace("llvm"), on_progress=states.append)
+    v = about["validation"]
+    assert v["best_step"] in [h["steps"] for h in v["history"]] and about["refitted"]
+    assert about["steps"] == v["best_step"] and v["loss"] == min(h["loss"] for h in v["history"])
+    assert {s.stage for s in states} == {"probes", "fit", "refit"} and states[-1].done == 1
+    assert 0 < v["rays_held_out"] < len(rays) and json.loads(json.dumps(about, allow_nan=False)) == about
+    assert field.config == SMALL
+
+
+def test_a_place_made_of_hits(rgb, rays, tmp_path):
+    density, box = voxelise_hits(rays, 0.1)
+    assert density.dtype == np.float32 and (density > 0).any()
+    write_volume(tmp_path / "place.vol", density, box)
+    medium = VolumeMedium(rgb.load_dict(volume_dict(tmp_path / "place.vol")))
+    np.testing.assert_allclose(medium.bounds(), [box.lower, box.upper], atol=1e-5)
+    from nerg_mi.transport.trace import trace_depth
+
+    central = np.abs(rays.hit - np.median(rays.hit, axis=0)).max(axis=1) < 0.1
+    depth, opacity = trace_depth(medium, rays.origin[central], rays.direction[central])
+    truth = np.linalg.norm(rays.hit - rays.origin, axis=1)[central]
+    assert central.sum() > 5 and (opacity > 0.99).all() and np.abs(depth - truth).max() < 0.15
+
+
+def test_a_place_needs_hits(rays):
+    with pytest.raises(ValueError, match="--field"):
+        voxelise_hits(replace(rays, hit=None))
+    with pytest.raises(ValueError, match="enlarge the voxel"):
+        voxelise_hits(rays, 1e-3)
+
+
+def test_settings_that_make_no_sense_are_refused():
+    for wrong in ({}, {"steps": 1, "minutes": 1.0}, {"steps": 0}, {"steps": 1, "loss": "mse"}, {"steps": 1, "probes": 0}):
+        with pytest.raises(ValueError):
+            GazeSettings(**wrong)
+    with pytest.raises(ValueError, match="size"):
+        sized_gaze_config("huge")
+    assert sized_gaze_config("paper").grid == GazeConfig().grid
+
+
+def test_the_command_trains_on_hits(rays, tmp_path, monkeypatch, capsys):
+    import typer
+
+    from nerg_mi.cli.train_gaze import train_gaze
+
+    rays.save(tmp_path / "rays.npz")
+    out = tmp_path / "out" / "gaze.safetensors"
+    app = typer.Typer()
+    app.command()(train_gaze)
+    arguments = f"{tmp_path / 'rays.npz'} --geometry hits --voxel 0.2 -o {out} --radius 0.5 --probes 8 --min-rays 8 --steps 3 --directions 32 --zones 0 --half"
+    app(arguments.split(), standalone_mode=False)
+    said = capsys.readouterr().out
+    assert "meet no surface" in said and out.with_suffix(".vol").exists()
+    field, meta = load_gaze(out, namespace("llvm"))
+    about = meta["provenance"]
+    assert about["steps"] == 3 and len(about["rays_file"]["sha256"]) == 64 and len(about["geometry_file"]["sha256"]) == 64
+    with pytest.raises(ValueError, match="either --field FILE or --geometry hits"):
+        app([str(tmp_path / "rays.npz"), "-o", str(out)], standalone_mode=False)
