@@ -1,0 +1,469 @@
+"""Numerical errors of one ray's march: slabs, sheets, profiles, odd rays, far and small places, derivatives."""
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.field.elementary import log1p, one_minus_exp
+from nerg_mi.field.radiance import density_from_log, sigmoid
+from nerg_mi.transport.depth import surface_depth
+from nerg_mi.transport.march import MarchSettings, march
+from nerg_mi.transport.media import LocalRay, VolumeMedium
+from nerg_mi.transport.quadrature import absorbed_share, mean_depth_share
+from nerg_mi.transport.ray_box import intersect_box
+from nerg_mi.transport.rules import KINDS, linear_crossing, linear_share
+from numerics import Row
+
+HEAD = ["case", "range", "quantity", "largest error", "reference"]
+# With nothing set, a 1024th of the diagonal of a unit cube.
+STEP = 3**0.5 / 1024
+
+
+def tables(mi):
+    yield slabs(mi)
+    for title, cases in GROUPS.items():
+        yield title, HEAD, [row.cells() for case in cases for row in case(mi)]
+
+
+def worst(got, expected, relative=True) -> float:
+    """Largest error; infinite where something is not finite that should be."""
+    got, expected = (np.asarray(v, float) for v in (got, expected))
+    if not np.all(np.isfinite(got)):
+        return math.inf
+    error = np.abs(got - expected)
+    return float(np.max(error / np.abs(expected)) if relative else np.max(error))
+
+
+def values(x) -> np.ndarray:
+    return np.array(x).astype(float)
+
+
+def gradient(x, f):
+    """``f(x)`` and its derivative, entry by entry, as float64 arrays; ``x`` a Float."""
+    x = type(x)(x)
+    dr.enable_grad(x)
+    y = f(x)
+    dr.backward(dr.sum(y))
+    return values(y), values(dr.grad(x))
+
+
+# ----------------------------------------------------------------------------
+# Closed forms
+# ----------------------------------------------------------------------------
+
+
+def share(x):
+    """1/x - 1/expm1(x) in float64, by its series where that cancels."""
+    x = np.asarray(x, float)
+    safe = np.clip(x, 0.05, 700)
+    return np.where(x < 0.05, 0.5 - x / 12 + x**3 / 720 - x**5 / 30240, 1 / np.maximum(x, 0.05) - 1 / np.expm1(safe))
+
+
+def share_slope(x):
+    x = np.asarray(x, float)
+    safe = np.clip(x, 0.2, 700)
+    series = -1 / 12 + x**2 / 240 - x**4 / 6048 + x**6 / 172800
+    return np.where(x < 0.2, series, -1 / np.maximum(x, 0.2) ** 2 + 1 / (4 * np.sinh(safe / 2) ** 2))
+
+
+def smooth(tau, length=1.0, panels=2000):
+    """``(opacity, expected depth)`` of a smooth optical depth ``tau(z)`` on [0, length], by Gauss-Legendre quadrature of
+    ∫ (T(z) - T(length)) dz / opacity."""
+    x, w = np.polynomial.legendre.leggauss(8)
+    z = ((np.arange(panels)[:, None] + 0.5 + 0.5 * x) / panels * length).ravel()
+    opacity = -np.expm1(-tau(length))
+    # T(z) - T(length) = T(z) (1 - exp(-(τ(length) - τ(z)))), which does not cancel.
+    gained = np.exp(-tau(z)) * -np.expm1(-(tau(length) - tau(z)))
+    return float(opacity), float((gained * np.tile(0.5 * w / panels * length, panels)).sum() / opacity)
+
+
+class Profile:
+    """A medium in z from 0 to ``length``, of density ``f(z, *parameters)``, that states no bound."""
+
+    occupancy = cells = step = None
+
+    def __init__(self, f, *parameters, length=1.0):
+        self.f, self._parameters, self.length = f, list(parameters), length
+
+    def parameters(self):
+        return self._parameters
+
+    def density(self, p, active):
+        return dr.select(active, self.f(p.z, *self._parameters), 0)
+
+    def density_features(self, p, active):
+        return self.density(p, active), []
+
+
+def along_z(mi, medium, settings, start=0.0, **options):
+    """A march along +z from the points z = ``start``."""
+    start = mi.Float(start)
+    ray = LocalRay(mi.Point3f(0, 0, start), mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Float(0), medium.length - start)
+    return ray, march(medium, ray, dr.zeros(mi.Float, dr.width(start)), medium.length - start, True, settings, **options)
+
+
+def box(mi, sigma, near=0.0, length=1.0):
+    to_world = mi.ScalarTransform4f().translate([0, 0, near]).scale(length)
+    return VolumeMedium(mi.load_dict({"type": "constvolume", "value": float(sigma), "to_world": to_world}))
+
+
+def grid(mi, data, **more):
+    return VolumeMedium(mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(np.asarray(data, np.float32)), "raw": True,
+                                      **more}))  # fmt: skip
+
+
+def through(mi, medium, o, d, settings):
+    """March of rays (N, 3) through a medium, and the ray and its ends."""
+    o, d = (np.atleast_2d(np.asarray(v, np.float32)) for v in (o, d))
+    ray = medium.local(mi.Point3f(o.T), mi.Vector3f(d.T))
+    t0, t1 = dr.maximum(ray.t_near, 0), ray.t_far
+    return march(medium, ray, t0, t1, True, settings, count=True), ray, t0, t1
+
+
+# ----------------------------------------------------------------------------
+# The slab, through the integrator with nothing set
+# ----------------------------------------------------------------------------
+
+SIGMAS = (1e-6, 1e-3, 0.1, 1.0, 10.0, 100.0, 1e3, 1e6, 1e9)
+
+
+def slab_errors(mi, kind: str, sigma: float, ahead: float, gradients: bool) -> dict[str, float]:
+    """Errors of opacity and depth of a unit slab whose face lies ``ahead`` of the ray's origin, and of their derivatives
+    with respect to the density."""
+    if kind == "constvolume":
+        volume = {"type": "constvolume", "value": float(sigma)}
+    else:
+        volume = {"type": "gridvolume", "grid": mi.VolumeGrid(np.full((3, 3, 3), sigma, np.float32)), "raw": True}
+    # Mitsuba starts the rays of this sensor a hair in front of it.
+    z = -ahead - float(mi.math.RayEpsilon)
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "component_format": "float32", "rfilter": {"type": "box"}}
+    sensor = {"type": "radiancemeter", "origin": [0.5, 0.5, z], "direction": [0, 0, 1],
+              "sampler": {"type": "independent", "sample_count": 1}, "film": film}  # fmt: skip
+    integrator = {"type": "nerg", "id": "integrator", "density": volume, "radiance": False, "aovs": "depth,opacity"}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "integrator": integrator})
+    depth, opacity = values(mi.render(scene, spp=1)).ravel()[3:]
+    x = float(np.float32(sigma))
+    expected = {"opacity": -math.expm1(-x), "depth": ahead + float(share(x))}
+    out = {"opacity": worst(opacity, expected["opacity"]), "depth": worst(depth, expected["depth"])}
+    if gradients:
+        params = mi.traverse(scene)
+        key = next(k for k in params.keys() if k.endswith(("value.value", "density.data")))
+        slopes = {"depth": (3, float(share_slope(x))), "opacity": (4, math.exp(-x))}
+        for name, (channel, slope) in slopes.items():
+            value = type(params[key])(dr.detach(params[key]))
+            dr.enable_grad(value)
+            params[key] = value
+            params.update()
+            dr.backward(dr.gather(mi.Float, mi.render(scene, params, spp=1).array, channel))
+            got = float(values(dr.grad(value)).sum())
+            out[f"d {name}"] = worst(got, slope, relative=name == "depth" or slope > 1e-6)
+    return out
+
+
+def slabs(mi):
+    head = ["σ", "opacity", "depth", "depth, face at the origin", "∂ opacity / ∂σ", "∂ depth / ∂σ"]
+    rows = []
+    for sigma in SIGMAS:
+        errors: dict[str, float] = {}
+        for kind in ("constvolume", "gridvolume"):
+            for ahead in (1.0, 0.0):
+                for name, e in slab_errors(mi, kind, sigma, ahead, True).items():
+                    name += ", face at the origin" if name == "depth" and ahead == 0 else ""
+                    errors[name] = max(errors.get(name, 0), e)
+        note = "" if math.exp(-sigma) > 1e-6 else " (absolute)"
+        rows.append([f"{sigma:g}", f"{errors['opacity']:.1e}", f"{errors['depth']:.1e}",
+                     f"{errors['depth, face at the origin']:.1e}", f"{errors['d opacity']:.1e}{note}",
+                     f"{errors['d depth']:.1e}"])  # fmt: skip
+    return "Slab of length 1, nothing set: largest error of `constvolume` and `gridvolume`, closed form", head, rows
+
+
+# ----------------------------------------------------------------------------
+# Steps
+# ----------------------------------------------------------------------------
+
+
+def one_step(mi):
+    x = np.float32(np.logspace(-7, 6, 400))
+    x64 = x.astype(float)
+    y, dy = gradient(mi.Float(x), absorbed_share)
+    counts = x64 < 80  # beyond, exp(-x) is below what single precision holds
+    reference, ends = "closed form", "1e-7 .. 1e6 a step"
+    yield Row("optical depth of a step", ends, "opacity", worst(y, -np.expm1(-x64)), reference)
+    yield Row("", "1e-7 .. 80", "its derivative", worst(dy[counts], np.exp(-x64[counts])), reference)
+    y, dy = gradient(mi.Float(x), mean_depth_share)
+    yield Row("", ends, "mean depth in the step", worst(y, share(x64)), reference)
+    yield Row("", ends, "its derivative", worst(dy, share_slope(x64)), reference)
+    y, dy = gradient(mi.Float(x), lambda v: linear_share(v, v))
+    yield Row("", ends, "mean depth, linear rule, equal ends (absolute, in steps)", worst(y, share(x64), False), reference)
+    errors, slopes = [], []
+    for a in (1e-6, 1e-2, 1.0, 30.0):
+        for b in (0.0, 1e-3, 1.0, 100.0):
+            expected = smooth(lambda z: a * z + (b - a) * z * z / 2)[1]  # noqa: B023
+            y, dy = gradient(mi.Float(a), lambda v: linear_share(v, mi.Float(b)))  # noqa: B023
+            errors.append(abs(y[0] - expected))
+            slopes.append(dy[0])
+    yield Row("", "ends 0 .. 100", "mean depth, linear rule (absolute, in steps)", max(errors), "float64 quadrature")
+    _, dy = gradient(mi.Float([0, 1e-30, 1, 1e30]), lambda v: linear_crossing(v, v * 0, mi.Float(1), mi.Float(0)))
+    yield Row("root at zero", "density 0 .. 1e30", "derivative of the crossing", said(slopes, dy), "finite")
+
+
+def said(*arrays) -> str:
+    return "finite" if all(np.all(np.isfinite(np.asarray(a, float))) for a in arrays) else "NOT FINITE"
+
+
+def any_number_of_samples(mi):
+    for n in (1, 2, 4096):
+        r, *_ = through(mi, box(mi, 3), (0.5, 0.5, -1), (0, 0, 1), MarchSettings(1 / n, stop=0))
+        errors = worst(r.opacity, -math.expm1(-3)), worst(r.expected_depth, 1 + share(3))
+        yield Row("samples a ray", str(n), "opacity; depth", f"{errors[0]:.1e}; {errors[1]:.1e}", "closed form")
+
+
+def million_rays(mi):
+    rng = np.random.default_rng(0)
+    n = 1_000_000
+    o = rng.normal(size=(n, 3)) * 2 + 0.5
+    d = rng.random((n, 3)) - o
+    o, d = o.astype(np.float32), (d / np.linalg.norm(d, axis=-1, keepdims=True)).astype(np.float32)
+    r, ray, *_ = through(mi, box(mi, 2), o, d, MarchSettings(1 / 16))
+    near, far = exact_box(o.astype(float), d.astype(float))
+    length = np.maximum(far - np.maximum(near, 0), 0)
+    yield Row("a million rays", "σ = 2, 16 steps", "opacity (absolute)", worst(r.opacity, -np.expm1(-2 * length), False),
+              "closed form of the float64 ray")  # fmt: skip
+    yield Row("", "", "depth where length > 1e-3 (absolute)",
+              worst(values(r.expected_depth)[length > 1e-3], (np.maximum(near, 0) + length * share(2 * length))[length > 1e-3],
+                    False), "closed form of the float64 ray")  # fmt: skip
+
+
+# ----------------------------------------------------------------------------
+# Profiles
+# ----------------------------------------------------------------------------
+
+THIN = 1e-4
+
+
+def sheets_in_a_grid(mi):
+    """10,000 voxels along z, two of them matter: τ = 0.1, then opaque."""
+    data = np.full((10000, 2, 2), 1e-8, np.float32)
+    data[3000], data[7000] = 1e3, 1e9
+    medium = grid(mi, data, filter_type="nearest")
+    rng = np.random.default_rng(1)
+    o = np.concatenate([rng.uniform(0.2, 0.8, (64, 2)), rng.uniform(-1, -0.5, (64, 1))], -1).astype(np.float32)
+    d = np.concatenate([rng.uniform(-0.1, 0.1, (64, 2)), np.ones((64, 1))], -1)
+    d = (d / np.linalg.norm(d, axis=-1, keepdims=True)).astype(np.float32)
+    to = lambda z: (z - o[:, 2].astype(float)) / d[:, 2]  # noqa: E731
+    a = -np.expm1(-1e3 * THIN / d[:, 2].astype(float))
+    front = to(0.3) + THIN / d[:, 2] * share(1e3 * THIN / d[:, 2].astype(float))
+    expected = a * front + (1 - a) * to(0.7)
+    for kind in ("constant", "linear", "cells"):
+        settings = MarchSettings(medium.step, quadrature=kind)
+        r, *_ = through(mi, medium, o, d, settings)
+        error = worst(r.expected_depth, expected, False)
+        found = np.mean(values(r.opacity) > 0.999)
+        yield Row("thin sheets in near-vacuum" if kind == "constant" else "", f"σ 1e-8, 1e3, 1e9; 1e-4 thick; {kind}",
+                  f"depth (absolute); {found:.0%} of the rays end at the sheet", error, "closed form")  # fmt: skip
+
+
+def sheets_and_steps(mi):
+    """Which share of rays meets an opaque sheet of a foreign volume, by step."""
+    n = 4096
+    z0 = mi.Float(np.linspace(0, 0.1, n, dtype=np.float32))
+    medium = Profile(lambda z: dr.select((z >= 0.5) & (z < 0.5 + THIN), 1e9, 1e-8))
+    found = []
+    for step in (0.5, 1, 2, 10):
+        _, r = along_z(mi, medium, MarchSettings(step * THIN), z0)
+        found.append(f"{step:g}: {np.mean(values(r.opacity) > 0.5):.1%}")
+    yield Row("the same sheet, a volume without bounds", "step / thickness 0.5 .. 10", "rays that meet it", ", ".join(found), "all")
+
+
+def jump(mi):
+    """Vacuum, then wall; the wall starts anywhere within a step."""
+    walls = np.linspace(0.3, 0.3 + 2 * STEP, 41)
+    for kind in ("constant", "linear"):
+        errors = []
+        for wall in walls:
+            medium = Profile(lambda z, w: dr.select(z >= w, 1e9, 1e-8), mi.Float(wall))
+            _, r = along_z(mi, medium, MarchSettings(STEP, quadrature=kind))
+            errors.append(abs(values(r.expected_depth)[0] - wall) / STEP)
+        yield Row("discontinuity" if kind == "constant" else "", f"σ 1e-8 to 1e9; {kind}", "depth (in steps)", max(errors), "closed form")
+
+
+def exponential(mi):
+    """σ = σ0 exp(k z), with the closed τ = σ0 (exp(k z) - 1) / k."""
+    for kind in ("constant", "linear"):
+        errors = np.zeros(4)
+        for s0, k in ((1e-8, 1.0), (1e-3, 30.0), (50.0, -20.0), (1e3, -5.0)):
+            exact = lambda a, b: smooth(lambda z: a * np.expm1(b * z) / b)  # noqa: E731
+            alpha, depth = exact(s0, k)
+            h = 1e-4
+            slope = [(np.array(exact(s0, k + h)) - np.array(exact(s0, k - h))) / (2 * h)]
+            k_ = mi.Float(k)
+            dr.enable_grad(k_)
+            medium = Profile(lambda z, k: s0 * dr.exp(k * z), k_)  # noqa: B023
+            _, r = along_z(mi, medium, MarchSettings(STEP, quadrature=kind, stop=1e-9))
+            got = [values(r.opacity)[0], values(r.expected_depth)[0]]
+            for y in (r.opacity, r.expected_depth):
+                dr.set_grad(k_, 0)
+                dr.backward(y, flags=dr.ADFlag.ClearVertices)
+                got.append(values(dr.grad(k_))[0])
+            expected = [alpha, depth, slope[0][0], slope[0][1]]
+            new = [worst(got[0], expected[0]), worst(got[1], expected[1]), worst(got[2], expected[2], abs(expected[2]) > 1e-6),
+                   worst(got[3], expected[3], abs(expected[3]) > 1e-6)]  # fmt: skip
+            errors = np.maximum(errors, new)
+        for i, name in enumerate(("opacity", "depth", "∂ opacity / ∂k", "∂ depth / ∂k")):
+            yield Row("exponential profiles" if i == 0 else "", f"1e-8 .. 1e10, falling and rising; {kind}" if i == 0 else "", name,
+                      errors[i], "closed τ, float64 quadrature, 577 steps")  # fmt: skip
+
+
+def odd_densities(mi):
+    for name, sigma, alpha in (("0", 0.0, 0), ("-1", -1.0, 0), ("NaN", math.nan, 0), ("inf", math.inf, 1), ("3e38", 3e38, 1)):
+        r, ray, t0, t1 = through(mi, box(mi, sigma, 1), (0.5, 0.5, 0), (0, 0, 1), MarchSettings(STEP))
+        got = values(r.opacity)[0], values(r.expected_depth)[0]
+        yield Row("densities that are none" if name == "0" else "", name, "opacity; depth (absolute)",
+                  f"{abs(got[0] - alpha):.0e}; {abs(got[1] - alpha):.0e}", "masked: vacuum, or opaque from 1 on")  # fmt: skip
+    data = np.ones((2, 2, 2), np.float32)
+    data[1, 0, 1] = np.nan
+    try:
+        grid(mi, data)
+        outcome = "ACCEPTED"
+    except ValueError as error:
+        outcome = f'refused: "{error}"'
+    yield Row("", "NaN in a grid", "", outcome, "an error that names the voxel")
+    y, dy = gradient(mi.Float([-1e4, -200, 29.9, 30.1, 88, 89, 1e4, np.inf]), lambda h: density_from_log(h, 1.0))
+    yield Row("exponential activation", "log σ -1e4 .. inf", "density and derivative (at most exp 30)", said(y, dy), "finite")
+
+
+def all_opacities(mi):
+    x = np.logspace(-6, 1.5, 60).astype(np.float32)
+    sigma = mi.Float(x)
+    medium = Profile(lambda z, s: s + 0 * z, sigma)
+    settings = MarchSettings(STEP, stop=1e-9)
+    ray, r = along_z(mi, medium, settings, dr.zeros(mi.Float, len(x)))
+    x64 = x.astype(float)
+    alpha = -np.expm1(-x64)
+    truth = {"expected": share(x64), "median": -np.log1p(-alpha / 2) / x64, "refined": -np.log1p(-alpha / 2) / x64}
+    for kind, expected in truth.items():
+        got = surface_depth(kind, r, medium, ray, mi.Float(0), mi.Float(1), mi.Mask(True), settings)
+        yield Row("depth at any opacity" if kind == "expected" else "", "1e-6 .. 1" if kind == "expected" else "",
+                  f"{kind} depth", worst(got, expected), "closed form")  # fmt: skip
+
+
+# ----------------------------------------------------------------------------
+# Rays and places
+# ----------------------------------------------------------------------------
+
+
+def exact_box(o, d, lower=0.0, upper=1.0):
+    parallel = d == 0
+    inverse = 1 / np.where(parallel, 1, d)
+    a, b = (lower - o) * inverse, (upper - o) * inverse
+    outside = parallel & ((o < lower) | (o > upper))
+    near = np.where(parallel, -np.inf, np.minimum(a, b)).max(-1)
+    return near, np.where(parallel, np.where(outside, -np.inf, np.inf), np.maximum(a, b)).min(-1)
+
+
+def odd_rays(mi):
+    s2, s3 = 0.5**0.5, 3**-0.5
+    rays = [
+        ((0.5, 0.5, -1), (0, 0, 1)), ((0, 0.5, -1), (0, 0, 1)), ((1, 1, -1), (0, 0, 1)),  # parallel: inside, on a face, an edge
+        ((2, 0.5, -1), (0, 0, 1)), ((-1, -1, 0.5), (s2, s2, 0)), ((1, -1, 0.5), (-s2, s2, 0)),  # miss, a zero component
+        ((-1, -1, -1), (s3, s3, s3)), ((0.5, 0.5, 0.5), (1, 0, 0)), ((0.5, 0.5, 0), (0, 0, 1)),  # corner, from inside, from a face
+        ((0.5, 0.5, 1), (0, 0, 1)), ((0.5, 0.5, 2), (0, 0, 1)), ((0.3, 0.4, -1), (1e-30, 1e-38, 1)),  # on the far face, behind, tiny
+        ((1, 0.25, 0.5), (-1, 0, 0)), ((0.25, 0.25, 0.25), (s3, s3, s3)),  # from a face, through cell corners
+    ]  # fmt: skip
+    o, d = (np.float32([r[i] for r in rays]) for i in (0, 1))
+    near, far = exact_box(o.astype(float), d.astype(float))
+    t_near, t_far = (values(t) for t in intersect_box(mi.Point3f(o.T), mi.Vector3f(d.T), (0, 0, 0), (1, 1, 1)))
+    length = lambda a, b: np.maximum(b - np.maximum(a, 0), 0)  # noqa: E731
+    yield Row("rays that miss, graze, start inside or on a face, run parallel", f"{len(rays)} rays", "length in the box (absolute)",
+              worst(length(t_near, t_far), length(near, far), False), "float64")  # fmt: skip
+    data = np.random.default_rng(0).exponential(1, (4, 4, 4)).astype(np.float32)
+    depth = np.array([length(near, far)[i] and fine_tau(data, o[i].astype(float), d[i].astype(float), max(near[i], 0), far[i])
+                      for i in range(len(rays))])  # fmt: skip
+    for kind in KINDS:
+        r, *_ = through(mi, grid(mi, data), o, d, MarchSettings(STEP, quadrature=kind, stop=0))
+        yield Row("", f"grid of 4³ voxels, {kind}", "optical depth (absolute)", worst(r.tau, depth, False), "float64, 20,000 samples")
+
+
+def fine_tau(data, o, d, near, far, n=20000):
+    t = near + (np.arange(n) + 0.5) / n * (far - near)
+    x = (o + t[:, None] * d) * 4 - 0.5
+    i = np.floor(x).astype(int)
+    f, total = x - i, 0.0
+    for corner in range(8):
+        bits = np.array([(corner >> axis) & 1 for axis in range(3)])
+        j = np.clip(i + bits, 0, 3)
+        total = total + np.where(bits == 1, f, 1 - f).prod(-1) * data[j[:, 2], j[:, 1], j[:, 0]]
+    return total.mean() * (far - near)
+
+
+def sizes(mi):
+    for size in (1e-3, 1e6):
+        r, *_ = through(mi, box(mi, 2 / size, size, size), (size / 2, size / 2, 0), (0, 0, 1), MarchSettings(size * STEP))
+        errors = worst(r.opacity, -math.expm1(-2)), worst(r.expected_depth, size * (1 + share(2)))
+        yield Row("box", f"{size:g} units", "opacity; depth", f"{errors[0]:.1e}; {errors[1]:.1e}", "closed form")
+    for distance in (1e3, 1e4, 1e5):
+        r, *_ = through(mi, box(mi, 3, distance), (0.5, 0.5, 0), (0, 0, 1), MarchSettings(STEP))
+        errors = worst(r.opacity, -math.expm1(-3)), worst(r.expected_depth, distance + share(3), False)
+        yield Row(f"unit slab {distance:g} units away", "σ = 3", "opacity; depth (absolute); evaluations",
+                  f"{errors[0]:.1e}; {errors[1]:.1e}; {values(r.density_evals)[0]:.0f}", "closed form")  # fmt: skip
+    medium = box(mi, 3)
+    ray = medium.local(mi.Point3f(0.5, 0.5, -1), mi.Vector3f(0, 0, 1))
+    r = march(medium, ray, mi.Float(1.5), mi.Float(1.5), True, MarchSettings(STEP))
+    yield Row("near = far", "", "opacity, depth", worst([values(r.opacity)[0], values(r.expected_depth)[0]], [0, 0], False), "0")
+    r, *_ = through(mi, box(mi, 3, 1e5), (0.5, 0.5, 0), (0, 0, 1), MarchSettings(1e-9))
+    yield Row("a step that cannot change t", "1e-9 at 1e5", "evaluations until it ends", f"{values(r.density_evals)[0]:.0f}", "finite")
+
+
+# ----------------------------------------------------------------------------
+# Derivatives at the ends of single precision
+# ----------------------------------------------------------------------------
+
+
+def hidden_matter(mi):
+    """A front of optical depth x, then σ behind it: ∂α/∂σ = (1/2) exp(-x - σ/2)."""
+    errors, finite = [], []
+    for x in (0.0, 1.0, 20.0, 60.0, 80.0, 100.0, 200.0, 1e4, 1e9):
+        behind = mi.Float(1.0)
+        dr.enable_grad(behind)
+        medium = Profile(lambda z, s: dr.select(z < 0.5, 2 * x, s), behind)  # noqa: B023
+        _, r = along_z(mi, medium, MarchSettings(1 / 256, stop=0))
+        got = []
+        for y in (r.opacity, r.expected_depth, dr.select(dr.isfinite(r.half), r.half, 0)):
+            dr.set_grad(behind, 0)
+            dr.backward(y, flags=dr.ADFlag.ClearVertices)
+            got.append(values(dr.grad(behind))[0])
+        finite.append(got)
+        exact = 0.5 * math.exp(-x - 0.5)
+        if exact > 1e-37:
+            errors.append(worst(got[0], exact))
+        else:
+            errors.append(abs(got[0]))
+    yield Row("transmittance underflows in front of matter", "τ 0 .. 1e9, no stopping", "∂ opacity / ∂ density behind", max(errors), "closed form")
+    yield Row("", "", "derivatives of expected and median depth", said(finite), "finite")
+
+
+def ends_of_functions(mi):
+    x = np.float32(np.concatenate([np.logspace(-30, 38, 200), -np.logspace(-30, 38, 200), [0]]))
+    x64 = x.astype(float)
+    with np.errstate(over="ignore"):
+        exact = np.where(x64 > 0, 1 / (1 + np.exp(-np.abs(x64))), np.exp(-np.abs(x64)) / (1 + np.exp(-np.abs(x64))))
+    y, dy = gradient(mi.Float(x), sigmoid)
+    yield Row("saturated sigmoid", "±1e38", "value; derivative (absolute)",
+              f"{worst(y, exact, False):.1e}; {worst(dy, exact * (1 - exact), False):.1e}", "float64")  # fmt: skip
+    x = np.float32(np.concatenate([[0], np.logspace(-38, 9, 300)]))
+    y, dy = gradient(mi.Float(x), one_minus_exp)
+    yield Row("1 - exp(-x)", "0 .. 1e9", "value; derivative (absolute)",
+              f"{worst(y, -np.expm1(-x.astype(float)), False):.1e}; {worst(dy, np.exp(-x.astype(float)), False):.1e}", "float64")  # fmt: skip
+    x = np.float32(np.concatenate([[0], np.logspace(-38, 0, 200), -np.logspace(-38, -0.01, 200)]))
+    y, _ = gradient(mi.Float(x), log1p)
+    yield Row("log(1 + x)", "-0.98 .. 1", "value (absolute)", worst(y, np.log1p(x.astype(float)), False), "float64")
+
+
+GROUPS = {
+    "Steps and samples": (one_step, any_number_of_samples, million_rays, all_opacities),
+    "Profiles and densities": (sheets_in_a_grid, sheets_and_steps, jump, exponential, odd_densities),
+    "Rays and places": (odd_rays, sizes),
+    "Derivatives at the ends of single precision": (hidden_matter, ends_of_functions),
+}
