@@ -11,7 +11,7 @@ import typer
 def command(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write into; it is made.")] = Path("out/demo"),
     width: Annotated[int, typer.Option(help="Width of a picture in pixels; pictures are 3:2.")] = 600,
-    spp: Annotated[int, typer.Option("--spp", help="Samples a pixel.")] = 16,
+    spp: Annotated[int, typer.Option("--spp", help="Samples a pixel.")] = 8,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random numbers.")] = 0,
     define: Annotated[
         Optional[list[str]],

@@ -61,7 +61,7 @@ class DemoResult:
 
 def run_demo(
     out: str | Path, *, scene: str | Path | None = None, defaults: Mapping[str, str] | None = None, width: int = 600,
-    spp: int = 16, seed: int = 0, variant: str | None = None, on_stage: Callable[[str], None] | None = None,
+    spp: int = 8, seed: int = 0, variant: str | None = None, on_stage: Callable[[str], None] | None = None,
 ) -> DemoResult:
     """Render all pictures of the demo into the folder ``out``, which is made.
 
