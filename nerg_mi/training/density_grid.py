@@ -140,7 +140,15 @@ class DensityGrid:
         mean = dr.sum(self.value) / self.seen_count
         bound = dr.minimum(self.threshold, 0.5 * mean)
         self.bits = dr.select((self.seen & (self.value > bound)) | self.always, self.ns.UInt8(1), 0)
+        self._off = dr.compress(self.seen & (self.bits == 0))
         dr.eval(self.bits)
+
+    def empty_points(self, count: int, rng: np.random.Generator):
+        """Random points (Array3f, world) in cells that are not sampled though cameras see them; None if there are none."""
+        if dr.width(self._off) == 0:
+            return None
+        pick = self.ns.UInt32(rng.integers(0, dr.width(self._off), count, np.uint32))
+        return self._point(dr.gather(self.ns.UInt32, self._off, pick), rng)
 
     def settle(self, density, rng: np.random.Generator, lit) -> None:
         """From now on sample every cell of the `bound` of this moment.

@@ -34,13 +34,24 @@ def density_color(config: RadianceConfig, box: Box, parameters: dict, p, d, ns):
     The same maths as ``RadianceField.density_features`` and ``color`` on ``parameters`` spelt as the field spells them; points
     must lie in ``box``. Gradients reach every entry of ``parameters``.
     """
-    def net(name):
-        count = sum(k.startswith(name + ".") for k in parameters)
-        return MLP([parameters[f"{name}.{i}"] for i in range(count)])
-
-    # Expand: every thread adds to a copy of the table of its own; a fraction of the cost of atomics.
-    features = HashGrid(config.grid, parameters["grid.table"])(box.to_unit(p), True, dr.ReduceMode.Expand)
-    h = unstack(net("density_net").tensor(stack(features, ns)), ns)
+    h = unstack(_net(parameters, "density_net").tensor(_features(config, box, parameters, p, ns)), ns)
     sigma = density_from_log(h[0], config.density_scale)
-    c = net("color_net").tensor(stack(encode_direction(d, config.sh_degree) + h[1:], ns))
+    c = _net(parameters, "color_net").tensor(stack(encode_direction(d, config.sh_degree) + h[1:], ns))
     return sigma, [sigmoid(x) for x in unstack(c, ns)]
+
+
+def density(config: RadianceConfig, box: Box, parameters: dict, p, ns):
+    """Density (1/unit) alone, at world points ``p`` in ``box``; see `density_color`."""
+    net = _net(parameters, "density_net")
+    head = MLP(net.weights[:-1] + [net.weights[-1][0:1, :]])
+    return density_from_log(head.tensor(_features(config, box, parameters, p, ns)).array, config.density_scale)
+
+
+def _features(config: RadianceConfig, box: Box, parameters: dict, p, ns):
+    # Expand: every thread adds to a copy of the table of its own; a fraction of the cost of atomics.
+    return stack(HashGrid(config.grid, parameters["grid.table"])(box.to_unit(p), True, dr.ReduceMode.Expand), ns)
+
+
+def _net(parameters: dict, name: str) -> MLP:
+    count = sum(k.startswith(name + ".") for k in parameters)
+    return MLP([parameters[f"{name}.{i}"] for i in range(count)])

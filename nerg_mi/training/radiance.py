@@ -18,7 +18,7 @@ from ..field.radiance import RadianceConfig, RadianceField
 from .compositing import weights
 from .density_grid import DensityGrid
 from .losses import color_loss, composite, depth_loss
-from .model import density_color
+from .model import density, density_color
 from .pixels import PixelBank
 from .preview import psnr, render_view
 from .sampling import StepTable, rays_in_box, visible_samples
@@ -153,7 +153,7 @@ class RadianceTrainer:
             self.misplaced = dr.detach(placed)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
         loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
-        dr.backward(loss)
+        dr.backward(loss + self._clear(parameters))
         self.optimiser.set_learning_rate(s.rate(self.progress))
         self.optimiser.step()
         self.loss, self.samples = loss, samples.count
@@ -163,6 +163,20 @@ class RadianceTrainer:
             for k, old in self.averaged.items():
                 self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * (1 - decay)
             dr.eval(self.averaged)
+
+    def _clear(self, parameters: dict):
+        """Penalty on density in cells that are not sampled.
+
+        Nothing else would hold them to what they are taken for, empty, and hashing fills them with the echoes of
+        surfaces elsewhere. The logarithm pulls at fog and at echoes alike.
+        """
+        s = self.settings
+        p = self.grid.empty_points(s.batch // 16, self.rng)
+        if p is None or s.empty_weight == 0:
+            return 0
+        cell = self.box.side / s.resolution
+        sigma = density(self.config, self.box, parameters, p, self.ns)
+        return s.empty_weight * dr.mean(dr.log(1 + sigma * cell))
 
     def _lit(self, density, occupied):
         """Points (Array3f) of the samples that give a training ray more than a thousandth of its light."""

@@ -31,27 +31,31 @@ def sized_config(size: str, box: Box) -> RadianceConfig:
 class RadianceSettings:
     """Controls of a training run; lengths are shares of the scene box's side.
 
-    ``steps`` or ``minutes``: how long, exactly one of them. ``batch``: samples a step; ``learning_rate``: held for
-    the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself; ``average``: decay a step
-    of the averaged weights, which are the result. ``march_step``: shortest step (instant-ngp's √3/1024);
-    ``growth``: steps are at least this share of their distance; ``near``: where rays start; ``stop``: samples
-    that less light reaches are left out. ``resolution``: of the density grid; ``min_views``: cells that fewer
-    cameras see stay empty; ``strides``: the first steps of the run march this many times coarser, ``stride_steps`` each,
-    which clears early fog cheaply. ``settle``: share of the run after which all cells that rendering will visit are sampled. ``huber``: error at which the colour loss turns linear. ``depth_weight``:
-    weight of the depth terms where depth is known, falling to ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in march
-    steps, within which a ray's weight should lie; ``replay``: share of the rays drawn from those whose depth was wrong.
+    ``steps`` or ``minutes``: how long, exactly one of them. ``batch``: samples a step.
+    ``learning_rate``: held for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times
+    itself. ``average``: decay a step of the averaged weights, which are the result.
+    ``march_step``: shortest step (instant-ngp's √3/1024); ``growth``: steps are at least this share of their
+    distance; ``near``: where rays start; ``stop``: samples that less light reaches are left out.
+    ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells
+    that fewer cameras see stay empty; ``settle``: share of the run after which all cells that rendering will visit
+    are sampled. ``strides``: the first steps of the run march this many times coarser, ``stride_steps`` each, which
+    clears early fog cheaply.
+    ``huber``: error at which the colour loss turns linear; ``empty_weight``: weight of the penalty on density in
+    cells that are not sampled; ``depth_weight``: of the depth terms where depth is known, falling to
+    ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in march steps, within which a
+    ray's weight should lie; ``replay``: share of the rays drawn from those whose depth was wrong.
     """
 
     steps: int | None = None
     minutes: float | None = None
     seed: int = 0
     batch: int = 2**15
-    learning_rate: float = 1e-2
+    learning_rate: float = 2.5e-2
     final_rate: float = 0.03
     hold: float = 0.4
     average: float = 0.99
     march_step: float = 3**0.5 / 1024
-    growth: float = 1 / 256
+    growth: float = 1 / 128
     near: float = 0.005
     stop: float = 2e-3
     resolution: int = 128
@@ -61,6 +65,7 @@ class RadianceSettings:
     strides: tuple[int, ...] = field(default=(8, 4, 2))
     stride_steps: int = 96
     huber: float = 0.1
+    empty_weight: float = 0.003
     depth_weight: float = 0.02
     final_depth: float = 0.25
     depth_margin: float = 1.5
