@@ -64,7 +64,7 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray],
 
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f'the checkpoint "{path}" does not exist')
+        raise FileNotFoundError(f'the checkpoint "{path}" does not exist: correct its name, or make one with "nerg train"')
     try:
         with safe_open(path, framework="numpy") as f:
             raw = (f.metadata() or {}).get("nerg")
