@@ -15,6 +15,8 @@ import numpy as np
 from .study_scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
 
 PANELS, NODES = 32, 16
+SOLID = 1.0
+"""Density (1/unit) that counts as a solid in a scene of hard surfaces; the vacuum between has 1e-4."""
 FUZZ = 1 / 64
 """Most that a surface is moved towards the camera for being soft, as a share of its depth."""
 
@@ -70,12 +72,26 @@ def look(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | N
     return (_pieces if scene.optical_depth is None else _profile)(scene, o, d, near, far)
 
 
-def _pieces(scene, o, d, near, far) -> Seen:
+def first_solid(scene: AnalyticScene, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Distance (N,) at which float64 rays meet the solid of a scene that is constant between breaks: matter denser than
+    `SOLID`; inf on a miss."""
+    start, length, sigma = _intervals(scene, o, d, *box_distances(o, d))
+    solid = (sigma > SOLID) & (length > 0)
+    return np.where(solid.any(-1), start[np.arange(len(o)), np.argmax(solid, -1)], np.inf)
+
+
+def _intervals(scene, o, d, near, far):
+    """Starts, lengths and densities (N, K) of the pieces between breaks."""
     t = np.concatenate([near[:, None], scene.breaks(o, d), far[:, None]], -1)
     t = np.sort(np.clip(t, near[:, None], far[:, None]), -1)
     start, length = t[:, :-1], np.diff(t, axis=-1)
     p = o[:, None] + d[:, None] * (start + length / 2)[..., None]
-    tau = scene.density(p[..., 0], p[..., 1], p[..., 2], NUMPY) * length
+    return start, length, scene.density(p[..., 0], p[..., 1], p[..., 2], NUMPY)
+
+
+def _pieces(scene, o, d, near, far) -> Seen:
+    start, length, sigma = _intervals(scene, o, d, near, far)
+    tau = sigma * length
     before = np.cumsum(tau, -1) - tau
     share = mean_share(tau)
     moment = (np.exp(-before) * -np.expm1(-tau) * (start + length * share)).sum(-1)

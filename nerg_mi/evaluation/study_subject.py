@@ -149,8 +149,15 @@ class AnalyticSubject(Subject):
     def exact(self, seed: int):
         if not self.opaque:
             return None
-        known = self.truth(seed, "median", "depth")
-        return np.where(known.opacity >= 0.5, known.depth, np.inf), known.visibility > 0.5
+        o, d = self.rays(seed)
+        t = study_reference.first_solid(self.analytic, o, d)
+        hit = np.isfinite(t)
+        eye = np.asarray(self.analytic.observer, float)
+        towards = o + d * np.where(hit, t, 0)[:, None] - eye
+        distance = np.linalg.norm(towards, axis=-1)
+        met = study_reference.first_solid(self.analytic, np.broadcast_to(eye, o.shape), towards / distance[:, None])
+        # Both distances lead to the same point, but for rounding.
+        return t, hit & (met > distance - 1e-6)
 
 
 class FileSubject(Subject):

@@ -70,6 +70,21 @@ def test03_a_look_that_ends_is_the_front_of_a_whole_one():
         assert np.allclose(half.opacity, seen.opacity / 2, rtol=1e-9)
 
 
+def test03_solids_are_met_where_geometry_says():
+    subject = open_subject("sphere", "auto", 24, 16)
+    t, visible = subject.exact(1)
+    o, d = subject.rays(1)
+    hit = np.isfinite(t)
+    center, radius = study_scenes.SPHERE_CENTER, study_scenes.SPHERE_RADIUS
+    p = o[hit] + d[hit] * t[hit, None]
+    normal = (p - center) / radius
+    assert hit.any() and np.allclose(np.linalg.norm(normal, axis=-1), 1, atol=1e-6)
+    # A convex body hides from an observer what faces away.
+    towards = np.asarray(subject.analytic.observer) - p
+    assert np.array_equal(visible[hit], (towards * normal).sum(-1) > 0) and 0 < visible[hit].mean() < 1
+    assert not visible[~hit].any() and open_subject("fog", "auto", 4, 4).exact(1) is None
+
+
 @pytest.mark.parametrize("x", [0, 1e-300, 1e-6, 9.9e-3, 1.01e-2, 1, 50, 1e9])
 def test04_mean_share(x):
     value = study_reference.mean_share(np.array([x]))[0]
