@@ -182,7 +182,7 @@ class RadianceTrainer:
         """Points (Array3f) of the samples that give a training ray more than a thousandth of its light."""
         s, ns = self.settings, self.ns
         rng = np.random.default_rng(s.seed)
-        for _ in range(_LOOKS):
+        for _ in range(min(_LOOKS, -(-self.pixels.size // _LOOK_RAYS))):
             pixels = self.pixels.batch(ns.UInt32(rng.integers(0, self.pixels.size, _LOOK_RAYS, np.uint32)))
             rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
             offset = ns.Float(rng.random(_LOOK_RAYS, np.float32))

@@ -65,6 +65,7 @@ def settings(**changes):
     return RadianceSettings(**given)
 
 
+@pytest.mark.slow
 def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
     """20 dB on held-out views after 300 small steps; the checkpoint says how."""
     seen = []
@@ -77,6 +78,7 @@ def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
     assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
 
 
+@pytest.mark.slow
 def test_learns_without_depth(dataset):
     _, provenance = train_radiance(dataset, TINY, settings(), ns, depth=False)
     assert provenance["psnr_held_out"]["mean"] > 19 and not provenance["depth_supervision"]
@@ -94,6 +96,7 @@ def test_equal_seeds_give_equal_fields_to_rounding(dataset):
     assert not np.allclose(weights(3), weights(4), atol=1e-2)
 
 
+@pytest.mark.slow
 def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
     """Held-out views through the occupied cells and through the whole box; free space is empty."""
     trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns)
