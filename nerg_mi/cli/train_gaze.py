@@ -29,6 +29,7 @@ def train_gaze(
     activation: Annotated[str, typer.Option(help="Of the emit head: softplus, exp or linear.")] = "softplus",
     size: Annotated[str, typer.Option(help="Size of the field: small or paper.")] = "small",
     loss: Annotated[str, typer.Option(help="paper: KLD + (1 - CC) + MAE; code: MAE + 0.1 (1 - CC).")] = "paper",
+    integral: Annotated[Optional[float], typer.Option(help="Weight of the error of the integral over the sphere.")] = None,
     minutes: Annotated[Optional[float], typer.Option(help="Train for this long, both fits together.")] = None,
     steps: Annotated[Optional[int], typer.Option(help="Or: train for so many steps. Default: 600.")] = None,
     learning_rate: Annotated[Optional[float], typer.Option(help="Learning rate at the start.")] = None,
@@ -63,7 +64,7 @@ def train_gaze(
     if threads is not None:
         dr.set_thread_count(threads)
     config = sized_gaze_config(size, gaze, activation)
-    given = {"learning_rate": learning_rate, "weight_decay": weight_decay}
+    given = {"learning_rate": learning_rate, "weight_decay": weight_decay, "integral": integral}
     settings = GazeSettings(
         steps=600 if steps is None and minutes is None else steps, minutes=minutes, seed=seed, loss=loss, zones=zones,
         refit=refit, **{k: v for k, v in given.items() if v is not None},

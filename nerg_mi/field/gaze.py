@@ -47,7 +47,8 @@ class GazeConfig:
 
     ``variant``: ``emit`` (a property of the surface alone), ``capture`` (the observer alone,
     sigmoid output) or ``emit_capture`` (their product). ``activation`` of the emit head:
-    ``softplus`` and ``exp`` give densities, ``linear`` is the paper's and may be negative.
+    ``softplus`` and ``exp`` give densities, ``linear`` is the paper's and may be negative. ``emit_scale`` multiplies
+    its output: what the untrained field comes to, and what weight decay draws a field towards.
     """
 
     grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(finest=512))
@@ -56,8 +57,11 @@ class GazeConfig:
     width: int = 64
     geometry: int = 15
     sh_degree: int = 4
+    emit_scale: float = 1.0
 
     def __post_init__(self):
+        if not 0 < self.emit_scale < float("inf"):
+            raise ValueError(f"the scale of the emit head must be positive and finite, got {self.emit_scale}")
         if self.variant not in VARIANTS:
             raise ValueError(f'the gaze variant must be one of {", ".join(VARIANTS)}, got "{self.variant}"')
         if self.activation not in ACTIVATIONS:
@@ -142,7 +146,8 @@ class GazeField:
 
     def emit(self, p_od, r_o, active=True):
         """F_e(p_od, -r_o) after its activation, in 1/sr. ``r_o``: unit, from observer to surface."""
-        return activate(self.emit_head(self._trunk(p_od, -r_o, active))[0], self.config.activation)
+        c = self.config
+        return activate(self.emit_head(self._trunk(p_od, -r_o, active))[0], c.activation) * c.emit_scale
 
     def capture(self, p_o, r_o, active=True):
         """sigmoid(F_c(p_o, r_o)), the probability that what is emitted is perceived."""

@@ -72,7 +72,11 @@ class GazeTrainer:
             which = np.broadcast_to(np.arange(D), (probes, D))
         prediction, truth = data.evaluate(self.config, self.box, self.optimiser, probe, which)
         self.loss = gaze_loss(prediction, truth, D, **LOSSES[s.loss])
-        dr.backward(self.loss.total)
+        total = self.loss.total
+        if s.integral:
+            # Against the truth in the same directions, so that drawing few of them is no bias.
+            total += s.integral * dr.mean(dr.square(_integral(prediction - truth, D)))
+        dr.backward(total)
         self.optimiser.set_learning_rate(s.rate(self.progress))
         self.optimiser.step()
         self.steps += 1
@@ -93,12 +97,14 @@ class GazeTrainer:
                 prediction, truth = data.evaluate(self.config, self.box, weights or self.averaged, probe,
                                                   np.broadcast_to(which, (len(probe), data.count)))
                 parts = gaze_loss(prediction, truth, data.count)
-                mean = dr.mean(prediction)
-                rows.append((len(probe), *(float(v[0]) for v in (parts.kld, parts.cc, parts.mae, mean))))
+                integral = _integral(prediction, data.count)
+                means = parts.kld, parts.cc, parts.mae, dr.mean(integral), dr.mean(dr.square(1 - integral))
+                rows.append((len(probe), *(float(v[0]) for v in means)))
         rows = np.array(rows)
-        kld, cc, mae, mean = rows[:, 0] @ rows[:, 1:] / rows[:, 0].sum()
+        kld, cc, mae, integral, off = rows[:, 0] @ rows[:, 1:] / rows[:, 0].sum()
         w = LOSSES[self.settings.loss]
-        return Scores(w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae, kld, cc, mae, 4 * np.pi * mean)
+        loss = w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae + self.settings.integral * off
+        return Scores(loss, kld, cc, mae, integral)
 
     def weights(self) -> dict:
         """A copy of the averaged weights."""
@@ -109,6 +115,11 @@ class GazeTrainer:
         out = GazeField.random(self.config, self.box, self.ns, self.settings.seed)
         out.set_parameters(weights or self.weights())
         return out
+
+
+def _integral(density, directions: int):
+    """Integral over the sphere of each probe's density in ``directions`` directions of equal area."""
+    return dr.block_sum(density, directions) * (4 * np.pi / directions)
 
 
 class _Samples:

@@ -39,7 +39,7 @@ def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o,
 
     gaze = ns.Float(1)
     if config.variant != "capture":
-        gaze *= activate(head("emit_head", geometry(p_od), -r_o), config.activation)
+        gaze *= activate(head("emit_head", geometry(p_od), -r_o), config.activation) * config.emit_scale
     if config.variant != "emit":
         gaze *= sigmoid(head("capture_head", [dr.repeat(g, repeats) for g in geometry(p_o)], r_o))
     return gaze

@@ -48,11 +48,57 @@ def make_shoppers(job: Job) -> list[Path]:
     return [path]
 
 
+def make_rays(job: Job) -> list[Path]:
+    """Rays of attention from the tracking data, as `nerg rays import --preset skeleton22 --tick 0.001` makes them."""
+    from nerg_mi.attention.presets import preset
+
+    tracking, path = job.build / "shoppers.csv", job.build / "rays.npz"
+    _require(tracking, "shoppers")
+    preset("skeleton22").read([tracking], tick=1e-3).save(path)
+    return [path]
+
+
+def make_gaze(job: Job) -> list[Path]:
+    """The gaze field, trained on the rays in the store's radiance field; 64 positions are held out and recorded in it."""
+    import mitsuba as mi
+
+    from nerg_mi.attention.collecting import file_sha256
+    from nerg_mi.attention.rays import Rays
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.formats.fields import load_radiance, save_gaze
+    from nerg_mi.training.gaze_run import hold_out, train_gaze
+    from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
+    from nerg_mi.transport.media import FieldMedium
+
+    source, place = job.build / "rays.npz", job.store / "store.safetensors"
+    _require(source, "rays")
+    _require(place, "field")
+    ns = namespace(mi.variant())
+    field, _ = load_radiance(place, ns)
+    # Heads are drawn from the law at 5 Hz, so rays are independent and a narrow kernel is not noise.
+    probes = ProbeSettings(kappa=100.0)
+    rays, test = hold_out(Rays.load(source), probes.radius, zones=8, positions=64, seed=job.seed)
+    gaze, about = train_gaze(rays, FieldMedium(field), field.box, sized_gaze_config(),
+                             GazeSettings(steps=800, seed=job.seed), probes, ns)
+    files = {"rays_file": source, "field_file": place}
+    about |= {k: {"file": p.name, "sha256": file_sha256(p)} for k, p in files.items()} | {"test": test}
+    path = job.store / "shoppers.safetensors"
+    save_gaze(gaze, path, about, half=True)
+    return [path]
+
+
+def _require(path: Path, stage: str) -> None:
+    if not path.exists():
+        raise FileNotFoundError(f'"{path}" is missing; make it with: python -m nerg_mi.scenes.store.make --stage {stage}')
+
+
 # Name and function, in order. A stage returns the files that it wrote.
 STAGES = {
     "twin": make_twin,
     "views": make_views,
     "shoppers": make_shoppers,
+    "rays": make_rays,
+    "gaze": make_gaze,
 }
 
 

@@ -59,7 +59,7 @@ def wall(rgb):
 @pytest.mark.parametrize("activation", ["softplus", "linear"])
 def test_the_fast_path_is_the_field(variant, activation):
     ns, rng = namespace("llvm"), np.random.default_rng(3)
-    field = GazeField.random(replace(SMALL, variant=variant, activation=activation), BOX, ns, 5)
+    field = GazeField.random(replace(SMALL, variant=variant, activation=activation, emit_scale=0.3), BOX, ns, 5)
     # Random tables are near zero: features of size one show an index that is wrong.
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
     B, D = 3, 7
@@ -198,6 +198,19 @@ def test_a_place_needs_hits(rays):
         voxelise_hits(replace(rays, hit=None))
     with pytest.raises(ValueError, match="enlarge the voxel"):
         voxelise_hits(rays, 1e-3)
+
+
+@pytest.mark.parametrize("variant", ["emit", "emit_capture"])
+@pytest.mark.parametrize("activation", ["softplus", "exp"])
+def test_weights_of_zero_are_the_uniform_density(variant, activation):
+    config = sized_gaze_config("small", variant, activation)
+    field = GazeField.random(config, BOX, namespace("llvm"), 0)
+    field.set_parameters({k: v * 0 for k, v in field.parameters().items()})
+    ns = namespace("llvm")
+    p, d = ns.Array3f(0.1, 0.2, 1.0), ns.Array3f(0.6, 0, 0.8)
+    assert float(field.evaluate(p, p, d)[0][0]) == pytest.approx(1 / (4 * np.pi), rel=1e-5)
+    with pytest.raises(ValueError, match="scale"):
+        replace(config, emit_scale=0.0)
 
 
 def test_settings_that_make_no_sense_are_refused():
