@@ -1,9 +1,10 @@
 """Largest numerical errors of transport and gaze, over the ranges that scenes may ask for.
 
-    python benchmarks/numerics.py [--only march,pictures,gaze] [--out docs/numerics-table.md]
+    python benchmarks/numerics.py [--only march,pictures,gaze] [--update docs/numerics.md]
 
 Every case is compared with a closed form or with float64, forwards and for its derivative, and gives one row: case,
-range, quantity, largest error found, reference. Prints markdown (docs/numerics.md quotes it). Errors are relative unless
+range, quantity, largest error found, reference. Prints markdown; `--update` puts the tables
+into a document in place of those that stand there under the same headings. Errors are relative unless
 the row says otherwise. Nothing passes or fails here: bounds are kept by the tests.
 """
 from __future__ import annotations
@@ -36,10 +37,24 @@ def table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(str(c).replace("|", "\\|") for c in line) + " |" for line in lines)
 
 
+def replaced(document: str, title: str, text: str) -> str:
+    """``document`` with the first table below the heading ``title`` exchanged for ``text``."""
+    lines = document.split("\n")
+    if f"### {title}" not in lines:
+        raise ValueError(f'the document has no heading "### {title}" to put a table under; add it')
+    start = lines.index(f"### {title}") + 1
+    while start < len(lines) and not lines[start].startswith(("|", "#")):
+        start += 1
+    end = start
+    while end < len(lines) and lines[end].startswith("|"):
+        end += 1
+    return "\n".join(lines[:start] + text.split("\n") + ([""] if end == start else []) + lines[end:])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default=",".join(GROUPS), help="comma-separated groups")
-    parser.add_argument("--out", type=Path, help="also write the tables to this file")
+    parser.add_argument("--update", type=Path, help="a document whose tables are replaced, heading by heading")
     args = parser.parse_args()
     names = args.only.split(",")
     for name in names:
@@ -50,16 +65,16 @@ def main() -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    parts = []
+    document = args.update.read_text(encoding="utf-8") if args.update else None
     for name in names:
         for title, head, rows in importlib.import_module(f"numerics_{name}").tables(mi):
-            text = f"### {title}\n\n{table(head, rows)}\n"
-            print(text, flush=True)
-            parts.append(text)
-    if args.out:
-        args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_text("\n".join(parts), encoding="utf-8")
-        print(f"wrote {args.out}")
+            text = table(head, rows)
+            print(f"### {title}\n\n{text}\n", flush=True)
+            if document is not None:
+                document = replaced(document, title, text)
+    if args.update:
+        args.update.write_text(document, encoding="utf-8")
+        print(f"updated {args.update}")
 
 
 if __name__ == "__main__":
