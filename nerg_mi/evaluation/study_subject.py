@@ -20,7 +20,8 @@ AOVS = "depth,opacity,visibility,gaze"
 FALLOFF = 0.1
 # The reference of a scene file has steps this many times shorter than the scene's own.
 FINER = 32
-_FRONT = {"coarse": 1.0, "dt_gamma": 0.0, "jitter": False, "color_cutoff": 0.0, "stop": 1e-9, "quadrature": "constant"}
+# Nothing is skipped, merged or cut short in a reference.
+_CONVERGED = {"coarse": 1.0, "dt_gamma": 0.0, "jitter": False, "color_cutoff": 0.0, "stop": 1e-9, "quadrature": "constant"}
 
 
 def open_subject(scene: str, kind: str, width: int, height: int, defaults: Mapping[str, str] | None = None) -> Subject:
@@ -200,7 +201,7 @@ class FileSubject(Subject):
         """A render with steps `FINER` times shorter, and how far one with steps twice as long is from it."""
         from .study_errors import errors
 
-        kinds = {**_FRONT, "depth": depth, "visibility": visibility, "radiance": True}
+        kinds = {**_CONVERGED, "depth": depth, "visibility": visibility, "radiance": True}
         fine, half = (
             self.channels(self.integrator({**kinds, "step": self.step / n}), 1, seed) for n in (FINER, FINER // 2)
         )
