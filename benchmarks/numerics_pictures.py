@@ -15,6 +15,7 @@ from nerg_mi.field.harmonics import encode_direction
 from nerg_mi.field.hashgrid import HashGridConfig
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.transport.color import composite_to_linear
+from nerg_mi.transport.observer import towards
 from nerg_mi.transport.visibility import visibility
 from numerics import Row
 from numerics_march import HEAD, gradient, said, share, values, worst
@@ -103,11 +104,9 @@ def observers(mi):
         except (ValueError, RuntimeError) as error:
             outcome = f'refused: "{str(error).strip().splitlines()[-1]}"'
         yield Row("observer not finite", str(bad), "", outcome, "an error that names the observer")
-    from nerg_mi.plugins.nerg import _towards
-
     v = mi.Point3f([0, 1e-18, 0], [0, 0, 1e-9], 0)
     dr.enable_grad(v)
-    distance, r_o = _towards(mi.Point3f(0), v)
+    distance, r_o = towards(mi.Point3f(0), v)
     dr.backward(distance + dr.sum(r_o))
     yield Row("norm at zero", "d_o* = 0, 1e-18, 1e-9", "distance, direction and their derivatives", said(values(distance), values(r_o), values(dr.grad(v))), "finite")
 
