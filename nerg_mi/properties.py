@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 
 def number(props, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
     """A finite number in ``low .. high``."""
@@ -46,3 +48,19 @@ def text(props, name: str, default: str | None = None) -> str:
         found = "nothing" if value is None else repr(value)
         raise ValueError(f'"{name}" must be a string, got {found}')
     return value
+
+
+def color(props, name: str, default: float) -> list[float]:
+    """A linear rgb colour that is finite and not negative; a number is a grey."""
+    import mitsuba as mi
+
+    value = props.get(name, default)
+    if hasattr(value, "eval_3"):  # a texture: what dict scenes make of {'type': 'rgb'}
+        value = value.eval_3(mi.SurfaceInteraction3f())
+    if isinstance(value, (str, bool)):
+        raise ValueError(f'"{name}" must be a number or an rgb colour, got {value!r}')
+    rgb = [float(c) for c in np.ravel(value)]
+    rgb = rgb * 3 if len(rgb) == 1 else rgb
+    if len(rgb) != 3 or not all(math.isfinite(c) and c >= 0 for c in rgb):
+        raise ValueError(f'"{name}" must be one number or three, finite and not negative, got {value}')
+    return rgb

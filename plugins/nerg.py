@@ -178,17 +178,17 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from nerg_mi.properties import boolean, choice, integer, number, text
+from nerg_mi.properties import boolean, choice, color, integer, number, text
 from nerg_mi.registration import register
 from nerg_mi.transport import viewpoint
 from nerg_mi.transport.color import composite_to_linear
 from nerg_mi.transport.depth import KINDS, surface_depth
-from nerg_mi.transport.march import MarchSettings, fine_start, march
+from nerg_mi.transport.march import MarchSettings, scouted_march
 from nerg_mi.transport.media import VolumeMedium
-from nerg_mi.transport.observer_map import ObserverMap
+from nerg_mi.transport.observer import KINDS as VISIBILITIES
+from nerg_mi.transport.observer import ObserverPass, Sight, towards
 from nerg_mi.transport.rules import KINDS as QUADRATURES
 from nerg_mi.transport.rules import rule
-from nerg_mi.transport.visibility import visibility
 
 CHANNELS = {
     "depth": "T", "opacity": "Y", "position": "XYZ", "gaze": "Y", "emit": "Y", "capture": "Y", "visibility": "Y",
@@ -208,28 +208,25 @@ class NergIntegrator(mi.SamplingIntegrator):
                 f'"nerg" renders rgb and mono variants, not "{mi.variant()}": radiance fields are trained on rgb photos; '
                 'call mi.set_variant("llvm_ad_rgb")'
             )
-        field, density, color = (props.get(k, None) for k in ("field", "density", "color"))
+        field, density, paint = (props.get(k, None) for k in ("field", "density", "color"))
         gaze, observer = props.get("gaze", None), props.get("observer", None)
-        self.medium = _medium(field, density, color)
+        self.medium = _medium(field, density, paint)
         if gaze is not None and not hasattr(gaze, "gaze_medium"):
             raise ValueError('"gaze" must be a volume of type "gazefield"')
         if observer is not None and not isinstance(observer, mi.Sensor):
             raise ValueError('"observer" must be a sensor; its to_world places the observer')
-        self._children = {"field": field, "density": density, "color": color, "gaze": gaze, "observer": observer}
+        self._children = {"field": field, "density": density, "color": paint, "gaze": gaze, "observer": observer}
         self.gaze = None if gaze is None else gaze.gaze_medium()
         self.observer = observer
         self._check_observer()
 
         self.occlusion = boolean(props, "occlusion", True)
         self.falloff = mi.Float(number(props, "falloff", 0.1, low=0))
-        self.tolerance = number(props, "tolerance", 0, low=0)
-        self.visibility_kind = choice(props, "visibility", "depth", ("depth", "transmittance", "map"))
-        self.map_height = integer(props, "map_height", 512, low=2, high=16384)
-        self._map = None
         self.depth_kind = choice(props, "depth", "expected", KINDS)
         self.surface_opacity = number(props, "surface_opacity", 0.5, low=0, high=1)
         self.radiance = boolean(props, "radiance", True)
-        self.background = _background(props)
+        background = mi.Color3f(color(props, "background", 0.0))
+        self.background = mi.Spectrum(mi.luminance(background) if mi.is_monochromatic else background)
         self.aovs = _aovs(text(props, "aovs", "depth,opacity"), gaze is not None)
         self.jitter = boolean(props, "jitter", False)
         step = number(props, "step", 0, low=0)
@@ -242,6 +239,11 @@ class NergIntegrator(mi.SamplingIntegrator):
             coarse=number(props, "coarse", 1, low=1),
         )
         rule(self.settings.quadrature, self.medium)
+        self.observer_pass = ObserverPass(
+            self.medium, self.settings, choice(props, "visibility", "depth", VISIBILITIES), self.depth_kind,
+            self.surface_opacity, number(props, "tolerance", 0, low=0),
+            integer(props, "map_height", 512, low=2, high=16384),
+        )
         # The sensors of the render in progress; None when another integrator drives ours.
         self._sensors = None
         self._warned = False
@@ -275,8 +277,10 @@ class NergIntegrator(mi.SamplingIntegrator):
         local = self.medium.local(ray.o, ray.d)
         t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, ray.maxt)
         lit = self.radiance and self.medium.has_color
-        result = self._march(local, t0, t1, active, offset=offset, count=count,
-                             color=_color_type(self.medium) if lit else None)
+        result = scouted_march(
+            self.medium, local, t0, t1, active, self.settings, offset=offset, count=count,
+            color=_color_type(self.medium) if lit else None,
+        )
         alpha = result.opacity
         some = active & (alpha > 0)
         out = {"opacity": dr.select(active, alpha, 0)}
@@ -309,15 +313,6 @@ class NergIntegrator(mi.SamplingIntegrator):
         aovs = [c for name in self.aovs for c in (out[name] if name == "position" else [out[name]])]
         return dr.select(active, L, 0), some, aovs
 
-    def _march(self, local, t0, t1, active, **options):
-        fine_from, scouted = None, 0
-        if self.settings.coarse > 1:
-            fine_from, scouted = fine_start(self.medium, local, t0, t1, active, self.settings)
-        result = march(self.medium, local, t0, t1, active, self.settings, fine_from=fine_from, **options)
-        if result.density_evals is not None:
-            result.density_evals += scouted
-        return result
-
     def traverse(self, cb):
         for name, child in self._children.items():
             if child is not None:
@@ -325,7 +320,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
-        self._map = None
+        self.observer_pass.forget()
         if hasattr(self.medium, "refresh"):
             self.medium.refresh()
         self._check_observer()
@@ -344,7 +339,8 @@ class NergIntegrator(mi.SamplingIntegrator):
         if self.observer is not None:
             body["observer"] = viewpoint.center(self.observer)
         body |= {
-            "occlusion": self.occlusion, "visibility": self.visibility_kind, "falloff": self.falloff, "tolerance": self.tolerance or "2 steps",
+            "occlusion": self.occlusion, "visibility": self.observer_pass.kind, "falloff": self.falloff,
+            "tolerance": self.observer_pass.tolerance or "2 steps",
             "depth": self.depth_kind, "surface_opacity": self.surface_opacity, "radiance": self.radiance,
             "aovs": ",".join(self.aovs), "quadrature": s.quadrature, "step": s.step, "coarse": s.coarse, "dt_gamma": s.dt_gamma, "stop": s.stop,
             "color_cutoff": s.color_cutoff, "jitter": self.jitter,
@@ -365,66 +361,23 @@ class NergIntegrator(mi.SamplingIntegrator):
             p_o = viewpoint.center(self.observer)
             aligned = viewpoint.same_center(sensors, p_o)
 
-        distance, r_o = _towards(p_o, p_d)
-        p_od, d_o, seen, evals = p_d, distance, mi.Float(1), mi.Float(0)
+        distance, r_o = towards(p_o, p_d)
+        sight = Sight(p_d, distance, mi.Float(1), mi.Float(0))
         if self.occlusion and not aligned:
-            p_od, d_o, seen, evals = self._observe(ray, p_d, p_o, fuzz, surface, count)
-        out["visibility"] = dr.select(surface, seen, 0)
-        out["observer_depth"] = dr.select(surface, d_o, 0)
+            sight = self.observer_pass.look(ray, p_d, p_o, fuzz, surface, self.falloff, count)
+        out["visibility"] = dr.select(surface, sight.visibility, 0)
+        out["observer_depth"] = dr.select(surface, sight.depth, 0)
 
         if asked & _GAZE_AOVS:
             # Where the observer cannot see, gaze is 0 whatever the field says.
-            attended = surface & (seen > 0)
+            attended = surface & (sight.visibility > 0)
             gaze, emit, capture = self.gaze.evaluate(
-                p_od, p_o, r_o, surface if asked & {"emit", "capture"} else attended
+                sight.p_od, p_o, r_o, surface if asked & {"emit", "capture"} else attended
             )
-            out["gaze"] = dr.select(attended, gaze * seen, 0)
+            out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
             out["emit"], out["capture"] = dr.select(surface, emit, 0), dr.select(surface, capture, 0)
             out["gaze_evals"] = dr.select(surface, 2.0 if self.gaze.field.config.variant == "emit_capture" else 1.0, 0.0)
-        return evals
-
-    def _observe(self, ray, p_d, p_o, fuzz, surface, count):
-        """What the observer meets towards ``p_d``: ``(p_od, d_o, visibility, density evaluations)``.
-
-        The point that is looked for lies a little in front of the surface, towards the camera: by the
-        tolerance, and by ``fuzz``, how far light goes into the surface. A surface then never hides itself,
-        however obliquely the observer looks along it, because the ray stays above it. A tolerance along the
-        observer's ray alone would have to grow without bound.
-        """
-        tolerance = self.tolerance or 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o))
-        in_front = tolerance + fuzz
-        if self.visibility_kind == "map":
-            # Entries of a map are this far apart where the ray ends.
-            in_front += dr.norm(p_d - p_o) * (dr.pi / self.map_height)
-        distance, r_o = _towards(p_o, p_d - ray.d * in_front)
-
-        if self.visibility_kind == "transmittance":
-            local = self.medium.local(p_o, r_o)
-            t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, distance)
-            between = self._march(local, t0, t1, surface, count=count)
-            return p_d, distance, dr.exp(-between.tau), between.density_evals
-        if self.visibility_kind == "map":
-            met, seen = self._observer_map(p_o).look_up(r_o, distance, self.falloff, tolerance, surface)
-            evals = mi.Float(0)
-        else:
-            local = self.medium.local(p_o, r_o)
-            t0, t1 = dr.maximum(local.t_near, 0), local.t_far
-            result = self._march(local, t0, t1, surface, count=count)
-            depth = surface_depth(self.depth_kind, result, self.medium, local, t0, t1, surface, self.settings)
-            met = dr.select(surface & (result.opacity >= self.surface_opacity), depth, dr.inf)
-            seen, evals = visibility(distance, met, self.falloff, tolerance), result.density_evals
-        # An observer who meets nothing before the point sees the point itself.
-        blocked = met < distance - tolerance
-        d_o = dr.select(dr.isfinite(met), met, distance)
-        return dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals
-
-    def _observer_map(self, p_o):
-        """The observer's map, marched anew only when the observer has moved or a parameter has changed."""
-        if self._map is None or not dr.all(self._map.center == dr.detach(p_o), axis=None):
-            self._map = ObserverMap(
-                self.medium, p_o, self.map_height, self.settings, self.depth_kind, self.surface_opacity, mi.Vector3f
-            )
-        return self._map
+        return sight.density_evals
 
     def _behind(self, scene, ray, active):
         """Radiance behind everything: the scene's environment, else the background."""
@@ -434,15 +387,6 @@ class NergIntegrator(mi.SamplingIntegrator):
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi, si.wavelengths = -ray.d, ray.wavelengths
         return environment.eval(si, active)
-
-
-def _towards(p_o, p):
-    """Distance and unit direction from ``p_o`` to ``p``, finite with their derivatives where both coincide."""
-    v = p - p_o
-    square = dr.squared_norm(v)
-    apart = square > 0
-    distance = dr.select(apart, dr.sqrt(dr.select(apart, square, 1)), 0)
-    return distance, dr.select(apart, v / dr.select(apart, distance, 1), mi.Vector3f(0, 0, 1))
 
 
 # ----------------------------------------------------------------------------
@@ -475,18 +419,6 @@ def _aovs(value, has_gaze):
     if len(set(names)) < len(names):
         raise ValueError(f'"aovs" names something twice: "{value}"')
     return names
-
-
-def _background(props):
-    value = props.get("background", 0.0)
-    if hasattr(value, "eval_3"):  # a texture: what dict scenes make of {'type': 'rgb'}
-        value = value.eval_3(dr.zeros(mi.SurfaceInteraction3f))
-    if isinstance(value, (str, bool)):
-        raise ValueError(f'"background" must be a number or an rgb colour, got {value!r}')
-    rgb = mi.Color3f(value)
-    if not dr.all(dr.isfinite(rgb) & (rgb >= 0), axis=None):
-        raise ValueError(f'"background" must be finite and not negative, got {value}')
-    return mi.Spectrum(mi.luminance(rgb)) if mi.is_monochromatic else mi.Spectrum(rgb)
 
 
 def _color_type(medium):

@@ -52,7 +52,7 @@ def _parameters(subject, row: Setting, integrator) -> dict:
         "setting": row.name, "group": row.group, "quadrature": "paper" if paper else s.quadrature, "step": step,
         "steps": subject.extent / step, "coarse": s.coarse, "dt_gamma": dt_gamma, "stop": 1e-4 if paper else s.stop,
         "color_cutoff": 0.0 if paper else s.color_cutoff, "depth": "unnormalised" if paper else integrator.depth_kind,
-        "visibility": integrator.visibility_kind, "map_height": integrator.map_height if integrator.visibility_kind == "map" else "",
+        "visibility": integrator.observer_pass.kind, "map_height": integrator.observer_pass.map_height if integrator.observer_pass.kind == "map" else "",
         "jitter": integrator.jitter, "radiance": integrator.radiance, "aovs": ",".join(integrator.aovs), "spp": row.spp,
         "resolution": row.resolution or "", "precision": precision(),
     }  # fmt: skip
@@ -74,7 +74,7 @@ def _quality(subject, row: Setting, integrator, pixels: dict, pixel_spp: int) ->
             pixels["truth"] = _pixel_truth(subject, pixel_spp)
         known, exact = pixels["truth"], None
     else:
-        known = subject.truth(SEED, integrator.depth_kind, integrator.visibility_kind)
+        known = subject.truth(SEED, integrator.depth_kind, integrator.observer_pass.kind)
         exact = subject.exact(SEED)
     return errors(picture, known, exact) | {"peak_mb": peak / 2**20, "reference": known.source}
 

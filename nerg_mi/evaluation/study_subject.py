@@ -189,7 +189,7 @@ class FileSubject(Subject):
         settings = integrator.settings
         base = {
             **children, "occlusion": integrator.occlusion, "falloff": float(integrator.falloff[0]), "depth": integrator.depth_kind,
-            "visibility": integrator.visibility_kind, "map_height": integrator.map_height, "radiance": integrator.radiance,
+            "visibility": integrator.observer_pass.kind, "map_height": integrator.observer_pass.map_height, "radiance": integrator.radiance,
             "surface_opacity": integrator.surface_opacity, "jitter": integrator.jitter, "step": settings.step,
             "dt_gamma": settings.dt_gamma, "stop": settings.stop, "color_cutoff": settings.color_cutoff,
             "quadrature": settings.quadrature, "coarse": settings.coarse, "aovs": self.aovs(),

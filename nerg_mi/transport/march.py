@@ -180,6 +180,17 @@ def fine_start(medium, ray, t0, t1, active, settings: MarchSettings):
         return dr.select(dr.isfinite(found.half), found.enter - scout.step, dr.inf), found.density_evals
 
 
+def scouted_march(medium, ray, t0, t1, active, settings: MarchSettings, **options) -> MarchResult:
+    """``march`` with coarse steps in front of all matter, where ``settings.coarse`` asks for them."""
+    if settings.coarse <= 1:
+        return march(medium, ray, t0, t1, active, settings, **options)
+    fine_from, scouted = fine_start(medium, ray, t0, t1, active, settings)
+    result = march(medium, ray, t0, t1, active, settings, fine_from=fine_from, **options)
+    if result.density_evals is not None:
+        result.density_evals = result.density_evals + scouted
+    return result
+
+
 def advance(medium, ray, t, t1, share, settings, active, planes=None, fine_from=None):
     """The next step to evaluate: ``(active, t, delta, t_next)``, from ``t`` on, ``delta`` long.
 
