@@ -99,7 +99,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - stop
    - |float|
-   - Transmittance below which what lies behind is left out. (Default: 1e-6)
+   - Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times that, in mean free paths. (Default: 1e-7)
 
  * - color_cutoff
    - |float|
@@ -233,7 +233,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.settings = MarchSettings(
             step=step or self.medium.step or self.medium.length_scale / 1024,
             dt_gamma=number(props, "dt_gamma", 0, low=0, high=1),
-            stop=number(props, "stop", 1e-6, low=0, high=1),
+            stop=number(props, "stop", 1e-7, low=0, high=1),
             color_cutoff=number(props, "color_cutoff", 1e-4, low=0, high=1),
             quadrature=choice(props, "quadrature", "constant", QUADRATURES),
             coarse=number(props, "coarse", 1, low=1),
@@ -261,6 +261,8 @@ class NergIntegrator(mi.SamplingIntegrator):
         if not self._warned and len(scene.shapes()) > 0:
             self._warned = True
             mi.Log(mi.LogLevel.Warn, f'"nerg" does not render the {len(scene.shapes())} shapes of this scene.')
+        if 0 in sensor.film().crop_size():
+            raise ValueError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
         try:
             return super().render(scene, sensor, seed, spp, develop, evaluate)

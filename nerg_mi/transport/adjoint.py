@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from .march import MarchResult, advance, limits, march_primal
+from .march import MarchResult, add, advance, limits, march_primal
 from .media import LocalRay
 from .quadrature import absorbed_share
 from .rules import rule
@@ -59,6 +59,7 @@ class _State:
     share: object
     tau: object
     moment: object
+    lost: object
     color: object
 
 
@@ -160,7 +161,7 @@ class _March(dr.CustomOp):
         offset, color = self.fixed[3], self.fixed[4]
         Float = type(self.inputs[3])
         start = _State(active, self.inputs[3], Float(1 if offset is None else offset), Float(0), Float(0),
-                       None if color is None else dr.zeros(color))
+                       (Float(0), Float(0)), None if color is None else dr.zeros(color))
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             _, extra = dr.while_loop(
                 (start, extra), lambda state, _: state.active, lambda state, extra: body(state, extra),
@@ -188,7 +189,9 @@ class _March(dr.CustomOp):
         transmittance = dr.exp(-tau)
         weight = transmittance * absorbed_share(dtau)
         mean = dr.fma(length, step.share, t - primal_t0)
-        moment, total, painted = dr.fma(weight, dr.detach(mean), state.moment), state.color, None
+        total, painted = state.color, None
+        moment, lost_moment = add(state.moment, state.lost[1], weight * dr.detach(mean))
+        tau_after, lost_tau = add(tau, state.lost[0], dtau)
         if color is not None:
             lit = active & (weight > 0)
             painted = dr.select(lit, step.color(lit), 0)
@@ -197,7 +200,8 @@ class _March(dr.CustomOp):
         crosses = active & ~before & (tau < goal)
         crossing = begin + step.crossing(dr.select(crosses, goal - tau, 0))
         replayed = _Replayed(active, step.dtau, mean, painted, transmittance, before, crosses, crossing)
-        after = _State(active & (t_next < primal_t1) & (tau + dtau < end), t_next, Float(1), tau + dtau, moment, total)
+        after = _State(active & (t_next < primal_t1) & (tau_after < end), t_next, Float(1), tau_after, moment,
+                       (lost_tau, lost_moment), total)
         return replayed, after
 
     def name(self):

@@ -32,7 +32,8 @@ def towards(p_o, p):
     """Distance and unit direction from ``p_o`` to ``p``, finite with their derivatives where both coincide."""
     v = p - p_o
     square = dr.squared_norm(v)
-    apart = square > 0
+    # Nearer than 1e-15 units the derivative of the direction leaves single precision.
+    apart = square > 1e-30
     distance = dr.select(apart, dr.sqrt(dr.select(apart, square, 1)), 0)
     # Any direction will do for an observer exactly on the surface.
     return distance, dr.select(apart, v / dr.select(apart, distance, 1), type(v)(0, 0, 1))
