@@ -48,6 +48,24 @@ def make_shoppers(job: Job) -> list[Path]:
     return [path]
 
 
+def make_field(job: Job) -> list[Path]:
+    """The radiance field, trained on the pictures and their exact depth; the test views are held out."""
+    import mitsuba as mi
+
+    from nerg_mi.capture.dataset import open_dataset
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.training.radiance_run import save_trained, train_radiance
+    from nerg_mi.training.settings import RadianceSettings, sized_config
+
+    _require(job.build / "transforms.json", "views")
+    data = open_dataset(job.build, None, None, None, None, True)
+    settings = RadianceSettings(steps=6500, minutes=None, seed=job.seed)
+    field, about = train_radiance(data, sized_config("small", data.box), settings, namespace(mi.variant()))
+    path = job.store / "store.safetensors"
+    save_trained(field, about, path, True)
+    return [path]
+
+
 def make_rays(job: Job) -> list[Path]:
     """Rays of attention from the tracking data, as `nerg rays import --preset skeleton22 --tick 0.001` makes them."""
     from nerg_mi.attention.presets import preset
@@ -96,6 +114,7 @@ def _require(path: Path, stage: str) -> None:
 STAGES = {
     "twin": make_twin,
     "views": make_views,
+    "field": make_field,
     "shoppers": make_shoppers,
     "rays": make_rays,
     "gaze": make_gaze,
