@@ -13,9 +13,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from . import study_paper
 from .study_errors import errors
 from .study_reference import Truth
 from .study_settings import Setting
+from .study_subject import parameters
 
 COLUMNS = (
     "setting", "group", "seconds", "cpu_seconds", "density_evals", "color_evals", "gaze_evals", "color_rmse", "color_psnr", "opacity_mae",
@@ -36,7 +38,8 @@ def measure(subject, rows: list[Setting], repeats: int, pixel_spp: int = PIXEL_S
     for row in rows:
         on_step(row.name)
         integrator = row.integrator(subject)
-        table.append(_parameters(subject, row, integrator) | _quality(subject, row, integrator, pixels, pixel_spp) | _counts(subject, row))
+        values = _parameters(subject, row, subject.integrator(row.params, row.resolution))
+        table.append(values | _quality(subject, row, integrator, values, pixels, pixel_spp) | _counts(subject, row))
         made.append(integrator)
     times = _times(subject, rows, made, repeats, on_step)
     for line, (wall, cpu) in zip(table, times):
@@ -45,20 +48,20 @@ def measure(subject, rows: list[Setting], repeats: int, pixel_spp: int = PIXEL_S
 
 
 def _parameters(subject, row: Setting, integrator) -> dict:
-    s = integrator.settings
-    step, dt_gamma = (s.step, s.dt_gamma) if row.paper is None else (subject.extent / row.paper[0], row.paper[1])
-    paper = row.paper is not None
-    return {
-        "setting": row.name, "group": row.group, "quadrature": "paper" if paper else s.quadrature, "step": step,
-        "steps": subject.extent / step, "coarse": s.coarse, "dt_gamma": dt_gamma, "stop": 1e-4 if paper else s.stop,
-        "color_cutoff": 0.0 if paper else s.color_cutoff, "depth": "unnormalised" if paper else integrator.depth_kind,
-        "visibility": integrator.observer_pass.kind, "map_height": integrator.observer_pass.map_height if integrator.observer_pass.kind == "map" else "",
-        "jitter": integrator.jitter, "radiance": integrator.radiance, "aovs": ",".join(integrator.aovs), "spp": row.spp,
-        "resolution": row.resolution or "", "precision": precision(),
+    values = parameters(integrator)
+    if row.paper is not None:
+        steps, dt_gamma = row.paper
+        values |= {"quadrature": "paper", "step": subject.extent / steps, "dt_gamma": dt_gamma, "stop": study_paper.STOP}
+        values |= {"color_cutoff": 0.0, "coarse": 1.0, "jitter": False, "depth": "unnormalised"}
+    if values["visibility"] != "map":
+        values["map_height"] = ""
+    return {n: values[n] for n in values if n in COLUMNS} | {
+        "setting": row.name, "group": row.group, "steps": subject.extent / values["step"], "aovs": ",".join(integrator.aovs),
+        "spp": row.spp, "resolution": row.resolution or "", "precision": precision(),
     }  # fmt: skip
 
 
-def _quality(subject, row: Setting, integrator, pixels: dict, pixel_spp: int) -> dict:
+def _quality(subject, row: Setting, integrator, values: dict, pixels: dict, pixel_spp: int) -> dict:
     import drjit as dr
 
     backend = dr.JitBackend.CUDA if _on_cuda() else dr.JitBackend.LLVM
@@ -74,7 +77,9 @@ def _quality(subject, row: Setting, integrator, pixels: dict, pixel_spp: int) ->
             pixels["truth"] = _pixel_truth(subject, pixel_spp)
         known, exact = pixels["truth"], None
     else:
-        known = subject.truth(SEED, integrator.depth_kind, integrator.observer_pass.kind)
+        # Unnormalised depths are meant to be expected ones.
+        depth = "expected" if row.paper is not None else values["depth"]
+        known = subject.truth(SEED, depth, values["visibility"])
         exact = subject.exact(SEED)
     return errors(picture, known, exact) | {"peak_mb": peak / 2**20, "reference": known.source}
 

@@ -29,7 +29,7 @@ class Setting:
     def integrator(self, subject, **more):
         """The integrator that renders this row; ``more``: further parameters, such as AOVs that count."""
         made = subject.integrator({**self.params, **more}, self.resolution)
-        return made if self.paper is None else as_in_the_paper(made, *self.paper)
+        return made if self.paper is None else as_in_the_paper(made, subject.sensor, subject.tolerance, *self.paper)
 
 
 def settings(subject, quick: bool = False) -> list[Setting]:

@@ -186,15 +186,7 @@ class FileSubject(Subject):
         self.opaque = self.twin.is_file()
         children = _children(integrator)
         self.has_gaze = "gaze" in children
-        settings = integrator.settings
-        base = {
-            **children, "occlusion": integrator.occlusion, "falloff": float(integrator.falloff[0]), "depth": integrator.depth_kind,
-            "visibility": integrator.observer_pass.kind, "map_height": integrator.observer_pass.map_height, "radiance": integrator.radiance,
-            "surface_opacity": integrator.surface_opacity, "jitter": integrator.jitter, "step": settings.step,
-            "dt_gamma": settings.dt_gamma, "stop": settings.stop, "color_cutoff": settings.color_cutoff,
-            "quadrature": settings.quadrature, "coarse": settings.coarse, "aovs": self.aovs(),
-        }  # fmt: skip
-        self._set_up(loaded, sensor, base)
+        self._set_up(loaded, sensor, {**children, **parameters(integrator), "aovs": self.aovs()})
         self.resize(width, height)
 
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
@@ -226,6 +218,18 @@ class FileSubject(Subject):
         # A millimetre before the surface: the point itself must not hide itself.
         seen[hit] = twin.visible(eye, o[hit] + d[hit] * (t[hit, None] - 1e-3), shapes)
         return t, seen
+
+
+def parameters(integrator) -> dict:
+    """The parameters of an integrator of type ``nerg``, read back by the names of its manual page."""
+    names = ("occlusion", "surface_opacity", "radiance", "jitter")
+    march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse")
+    out = {n: getattr(integrator, n) for n in names} | {n: getattr(integrator.settings, n) for n in march}
+    observer = integrator.observer_pass
+    return out | {
+        "falloff": float(integrator.falloff[0]), "depth": integrator.depth_kind, "visibility": observer.kind,
+        "map_height": observer.map_height, "background": np.array(integrator.background, float).ravel().tolist(),
+    }  # fmt: skip
 
 
 def _children(integrator) -> dict:

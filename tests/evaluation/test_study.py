@@ -124,7 +124,7 @@ def test07_the_papers_depth_is_unnormalised_and_at_the_steps_end():
     o, d = subject.rays(1)
     steps = 64
     step = subject.extent / steps
-    seen = subject.channels(study_paper.as_in_the_paper(subject.integrator({"depth": "expected"}), steps), 1, 1)
+    seen = subject.channels(study_paper.as_in_the_paper(subject.integrator(), subject.sensor, subject.tolerance, steps), 1, 1)
     for i in range(0, len(o), 7):
         hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
         depth, T = 0.0, 1.0
