@@ -5,8 +5,8 @@
 Runs `nerg rays import --preset vr_supermarket` and, for each fold, `nerg train gaze --geometry hits --test-zones 3`. In
 each fold the zones are others; every ray within 2R of a test position is left out of training, of the place and of the
 baselines. Truth at a test position is the kernel density (`--kappa`) of the rays within R of it, in 2,048 directions of
-equal area. `bits` is the information that the densities, normalised over the sphere, have about those rays themselves
-beyond the position-blind density (kappa 50), a ray, at the position of the ray's own test centre.
+equal area. `bits` is the information that the densities, normalised over the sphere, have about 128 of those rays
+themselves beyond the position-blind density (kappa 50), a ray, as seen from the test position.
 
 `split half` predicts one half of the people around a test position by the other half: a reference, not a bound, and scored
 against its own half (at positions where either half has 64 rays).
@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 DIRECTIONS = 2048
+RAYS = 128  # of each test position, for the information
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -57,17 +58,18 @@ def split_half(rays, centres, radius: float, kappa: float, directions) -> dict:
     return {"method": "split half", **scores(*density), "bits": np.nan}
 
 
-def information(truth_probes, density, blind, positions, directions) -> float:
-    """Bits a ray of ``density`` beyond ``blind``, both normalised over ``directions``."""
-    gains = []
-    for n in range(len(positions)):
-        rays = truth_probes.directions[truth_probes.offsets[n] : truth_probes.offsets[n + 1]]
-        at, sphere = (density(positions[n : n + 1], d)[0].astype(float) for d in (rays, directions))
-        base, base_sphere = (blind(positions[n : n + 1], d)[0] for d in (rays, directions))
-        tiny = np.finfo(float).eps
-        share = lambda v, whole: np.log2(np.maximum(v, 0) / (4 * np.pi * np.maximum(whole, 0).mean()) + tiny)
-        gains.append(np.mean(share(at, sphere) - share(base, base_sphere)))
-    return float(np.mean(gains))
+def information(tests, density, blind, positions, directions) -> float:
+    """Bits a ray of ``density`` beyond ``blind``, both normalised over ``directions``, at `RAYS` random rays of each test."""
+    rng = np.random.default_rng(0)
+    which = np.stack([rng.integers(a, b, RAYS) for a, b in zip(tests.offsets[:-1], tests.offsets[1:])])
+    at = tests.directions[which]
+    tiny = np.finfo(float).eps
+
+    def bits(method):
+        sphere = np.maximum(method(positions, directions).astype(float), 0).mean(axis=1)
+        return np.log2(np.maximum(method(positions, at).astype(float), 0) / (4 * np.pi * sphere[:, None]) + tiny)
+
+    return float(np.mean(bits(density) - bits(blind)))
 
 
 def run_fold(rays_file: Path, seed: int, args) -> list[dict]:

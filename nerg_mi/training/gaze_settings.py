@@ -92,10 +92,10 @@ class GazeSettings:
     integral: float = 1.0
     probes: int = 16
     directions: int = 256
-    learning_rate: float = 3e-3
+    learning_rate: float = 1e-2
     final_rate: float = 0.03
     hold: float = 0.3
-    weight_decay: float = 1.0
+    weight_decay: float = 0.3
     average: float = 0.98
     looks: int = 20
     patience: int = 6
