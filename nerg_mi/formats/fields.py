@@ -23,7 +23,8 @@ def _dump(parameters: dict, half: bool) -> dict[str, np.ndarray]:
     out = {}
     for name, value in parameters.items():
         value = value.numpy()
-        stored = value.astype(np.float16 if half else np.float32)
+        with np.errstate(over="ignore"):  # what exceeds fp16 is refused below, by name
+            stored = value.astype(np.float16 if half else np.float32)
         if not np.all(np.isfinite(stored)):
             why = "exceeds what fp16 can hold; store it in fp32" if np.all(np.isfinite(value)) else "is not finite"
             raise ValueError(f'the weight array "{name}" {why}')

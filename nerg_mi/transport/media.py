@@ -33,10 +33,10 @@ class Similarity:
     def __init__(self, matrix=None):
         m = np.eye(4) if matrix is None else np.asarray(matrix, float)
         linear = m[:3, :3]
-        determinant = np.linalg.det(linear)
+        determinant = np.linalg.det(linear) if np.all(np.isfinite(m)) else np.nan
         scale = abs(determinant) ** (1 / 3)
         if not (
-            np.all(np.isfinite(m)) and determinant > 0 and np.array_equal(m[3], [0, 0, 0, 1])
+            determinant > 0 and np.array_equal(m[3], [0, 0, 0, 1])
             and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
         ):
             raise ValueError(
