@@ -159,6 +159,20 @@ def test08_pareto():
     assert study_tables.pareto(points) == [not b for b in beaten]
 
 
+def test08b_against_paper_takes_the_best_of_either_kind():
+    def row(setting, group, seconds, depth_mae):
+        return {"setting": setting, "group": group, "seconds": seconds, "cpu_seconds": 2 * seconds, "depth_mae": depth_mae,
+                "density_evals": 1.0, "spp": 1, "resolution": "", "visibility": "depth"}  # fmt: skip
+
+    rows = [row("default", "default", 3, 0.1), row("short", "steps", 1, 0.4), row("map", "visibility", 0.1, 0.1) | {"visibility": "map"},
+            row("slow", "steps", 9, 0.01), row("p", "paper", 4, 0.5), row("fast", "paper", 0.5, 0.001)]  # fmt: skip
+    for clock in ("seconds", "cpu_seconds"):
+        first, second = study_tables.against_paper(rows, clock)
+        assert first["equal_time"]["setting"] == "default" and math.isclose(first["equal_time"]["error_ratio"], 5)
+        assert first["equal_error"]["setting"] == "short" and math.isclose(first["equal_error"]["time_ratio"], 4)
+        assert second["equal_time"] is None and second["equal_error"] is None
+
+
 def test09_exponent():
     x = np.array([1.0, 2, 8, 64])
     assert math.isclose(study_plots.exponent(x, 3 * x**1.5), 1.5)
