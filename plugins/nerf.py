@@ -23,7 +23,8 @@ Trained radiance field (:monosp:`nerf`)
 
 Density and view-dependent colour of a place, as a multiresolution hash grid with two small networks. It is meant as the
 ``field`` of the integrator :ref:`nerg <integrator-nerg>`. As a plain volume it returns the density, in 1 / scene unit,
-through ``eval_1``: 0 outside of ``bbox()``. (A plain volume is not told the direction that its colour depends on.)
+through ``eval_1``: 0 outside of ``bbox()``, and in the cells that the checkpoint's occupancy grid calls empty, which are
+vacuum by definition: training has left them unsampled, and whatever the networks say there is skipped when marching. (A plain volume is not told the direction that its colour depends on.)
 
 .. tabs::
     .. code-tab:: xml
@@ -74,7 +75,7 @@ class NerfVolume(mi.Volume):
         return 1
 
     def eval_1(self, it, active=True):
-        return self.medium().density(self._similarity.point_to_local(it.p), active)
+        return self.medium().occupied_density(self._similarity.point_to_local(it.p), active)
 
     def traverse(self, cb):
         for name, value in self.field.parameters().items():

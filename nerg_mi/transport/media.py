@@ -126,6 +126,12 @@ class FieldMedium:
     def density(self, p, active):
         return self.field.density(p, active) * self._per_unit
 
+    def occupied_density(self, p, active):
+        """Density where no march has looked up the occupancy grid before: 0 in its empty cells."""
+        if self.occupancy is not None:
+            active = active & (self.occupancy.empty_cells(self.to_unit(p), active) == 0)
+        return dr.select(active, self.density(p, active), 0)
+
     def density_features(self, p, active):
         """Density, and what ``color`` needs of the same point."""
         sigma, features = self.field.density_features(p, active)

@@ -1,6 +1,9 @@
 """The volume `nerf`: what it returns, where it lies, and what it says about wrong files."""
+import drjit.llvm.ad as ns
 import numpy as np
 import pytest
+
+from nerg_mi.field.occupancy import OccupancyGrid
 
 from . import fields
 
@@ -69,8 +72,18 @@ def test05_wrong_files(rgb, tmp_path):
         load(rgb, tmp_path / "f.safetensors", bogus=1.0)
 
 
-def test06_stock_integrators_take_it_as_a_medium(rgb, tmp_path, field):
-    # A heterogeneous medium asks for the maximum, and for spectra.
+def test06_says_what_it_is(rgb, tmp_path, field):
     volume = load(rgb, tmp_path / "f.safetensors")
     assert volume.channel_count() == 1
     assert "NerfVolume[" in str(volume) and "f.safetensors" in str(volume)
+
+
+def test07_empty_cells_are_vacuum_also_for_others(rgb, tmp_path):
+    # Training leaves them unsampled: the networks' density there means nothing, and marching passes over it.
+    bits = np.zeros((4, 4, 4), bool)
+    bits[:, :, 2:] = True
+    field = fields.radiance(tmp_path / "half.safetensors", occupancy=OccupancyGrid(bits, ns, 0.01))
+    p = np.random.default_rng(1).uniform(-0.99, 0.99, (50, 3)).astype(np.float32)
+    raw, got = field.density(rgb.Point3f(p.T)).numpy(), evaluate(rgb, load(rgb, tmp_path / "half.safetensors"), p)
+    assert (raw > 0).all() and not got[p[:, 0] < 0].any()
+    assert np.allclose(got[p[:, 0] > 0], raw[p[:, 0] > 0], rtol=1e-6) and (p[:, 0] > 0).any()
