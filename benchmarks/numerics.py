@@ -14,7 +14,7 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
-GROUPS = ("march", "pictures", "gaze")
+GROUPS = ("march", "rays", "pictures", "gaze")
 
 
 @dataclass
