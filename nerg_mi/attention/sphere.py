@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-FULL_SPHERE = 4.0 * np.pi  # sr
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 

@@ -133,12 +133,6 @@ class Layout:
         return np.maximum(np.minimum(solid, wall), 0.0)
 
 
-def _shades(rng, base, cells, spread=0.12):
-    """A colour function over cells: the base with a random brightness for each cell."""
-    gains = 1.0 + spread * rng.uniform(-1, 1, cells)
-    return lambda i, j: np.clip(np.asarray(base) * gains[i, j], 0.02, 0.9)
-
-
 def _shell(place: Place, rng) -> None:
     """Floor, walls and ceiling with the light panels."""
     X, Y, Z = ROOM

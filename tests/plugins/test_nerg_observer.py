@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from .scenes import GAZE, camera, channels, hidden_scene, look_at, named, observer_at, render, wall, with_gaze
+from .scenes import GAZE, camera, channels, hidden_scene, look_at, named, observer_at, render, with_gaze
 
 
 @pytest.mark.parametrize("near_clip", [0.01, 1.0])
