@@ -10,6 +10,8 @@ from .march import LOG2, MarchResult, MarchSettings, march, step_length
 
 KINDS = ("expected", "median", "refined")
 
+# Most that a surface is moved towards the camera for being soft, as a share of its depth.
+_SOFTEST = 1 / 64
 # Sub-steps in which a refined depth searches the step that crosses.
 _PARTS = 16
 
@@ -50,3 +52,13 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
         # A finer march may find a little less in the step than the coarse one did.
         moved = dr.select(found & dr.isfinite(fine.half), fine.half - depth, 0)
     return depth + moved
+
+
+def way_out(kind: str, result: MarchResult, depth):
+    """How far light goes into the matter before it meets the surface at ``depth`` (of ``kind``).
+
+    In mean free paths where transmittance is 1/2: 1 for the expected depth of thick matter, ln 2 for its median.
+    At most 1/64 of ``depth``; 0 where half of the light passes.
+    """
+    paths = 1 if kind == "expected" else LOG2
+    return dr.minimum(result.half_slope * paths, depth * _SOFTEST)
