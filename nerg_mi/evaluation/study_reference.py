@@ -178,8 +178,10 @@ def truth(scene: AnalyticScene, gaze, o, d, *, depth: str, visibility: str, fall
     surface = seen.opacity >= surface_opacity
     p_d = o + d * t[:, None]
     p_o = np.asarray(scene.observer, float)
-    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it.
-    in_front = tolerance + np.minimum(seen.free_path, t * FUZZ)
+    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it: one mean free
+    # path to the expected depth of thick matter, ln 2 of it to the median.
+    paths = 1 if depth == "expected" else np.log(2)
+    in_front = tolerance + np.minimum(paths * seen.free_path, t * FUZZ)
     distance, r_o = _towards(p_o, p_d - d * in_front[:, None])
     start = np.broadcast_to(p_o, o.shape)
     p_od = p_d

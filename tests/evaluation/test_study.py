@@ -85,6 +85,19 @@ def test03_solids_are_met_where_geometry_says():
     assert not visible[~hit].any() and open_subject("fog", "auto", 4, 4).exact(1) is None
 
 
+def test03_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth():
+    # A lift beyond the face would show a strip beyond the terminator, one short of it would hide a strip before it.
+    subject = open_subject("sphere", "auto", 96, 64)
+    t, visible = subject.exact(1)
+    o, d = subject.rays(1)
+    seen = study_reference.look(subject.analytic, o, d)
+    thick = np.isfinite(t) & (seen.tau > 12)
+    for kind in ("expected", "median"):
+        known = study_reference.truth(subject.analytic, None, o, d, depth=kind, visibility="transmittance", falloff=0.1,
+                                      tolerance=1e-9, surface_opacity=0.5)  # fmt: skip
+        assert thick.sum() > 100 and np.array_equal(known.visibility[thick] > 0.999, visible[thick]), kind
+
+
 @pytest.mark.parametrize("x", [0, 1e-300, 1e-6, 9.9e-3, 1.01e-2, 1, 50, 1e9])
 def test04_mean_share(x):
     value = study_reference.mean_share(np.array([x]))[0]
