@@ -1,4 +1,4 @@
-"""Rays of posed cameras: pinhole with OpenCV's radial and tangential distortion.
+"""Rays of posed cameras.
 
 Frames: image x right, y down, pixel centres at half-integers; camera OpenGL (x right,
 y up, looking along -z); world the data set's own.
@@ -9,10 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..formats.transforms import Intrinsics
+from ..formats.intrinsics import Intrinsics
+from . import lens
 
 # OpenGL cameras look along -z with x to the right, Mitsuba's along +z with x to the left.
 _OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
+# OpenCV's cameras look along +z with y down.
+_OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -32,70 +35,24 @@ class Camera:
         return -self.to_world[:3, 2]
 
 
-def distort(xy: np.ndarray, distortion: tuple) -> np.ndarray:
-    """Distorted normalised coordinates (N, 2) of ideal ones: OpenCV's model with k1, k2, p1, p2."""
-    k1, k2, p1, p2 = distortion
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * k2)
-    return np.stack([
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    ], axis=-1)
-
-
-def undistort(xy: np.ndarray, distortion: tuple, iterations: int = 20) -> np.ndarray:
-    """Ideal normalised coordinates (N, 2) of distorted ones, by Newton's iteration on `distort`.
-
-    Raises ``ValueError`` where the model folds over inside the image, so that no inverse exists.
-    """
-    k1, k2, p1, p2 = distortion
-    goal = np.asarray(xy, np.float64)
-    if not any(distortion):
-        return goal.copy()
-    u = goal.copy()
-    for _ in range(iterations):
-        x, y = u[..., 0], u[..., 1]
-        r2 = x * x + y * y
-        radial, slope = 1 + r2 * (k1 + r2 * k2), k1 + 2 * k2 * r2
-        residual = distort(u, distortion) - goal
-        # The Jacobian of `distort`; it is symmetric.
-        a = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-        b = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-        d = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-        det = a * d - b * b
-        det = np.where(np.abs(det) > 1e-6, det, 1e-6)
-        u = u - np.stack([d * residual[..., 0] - b * residual[..., 1],
-                          a * residual[..., 1] - b * residual[..., 0]], axis=-1) / det[..., None]
-        if np.abs(residual).max() < 1e-12:
-            break
-    error = np.abs(distort(u, distortion) - goal).max()
-    if not error < 1e-6:
-        raise ValueError(
-            f"the distortion k1={k1:g}, k2={k2:g}, p1={p1:g}, p2={p2:g} cannot be inverted over the whole image; "
-            "undistort the images beforehand, or crop them"
-        )
-    return u
+def pixel_grid(intrinsics: Intrinsics) -> np.ndarray:
+    """Normalised image coordinates (height, width, 2) of the pixels' centres."""
+    i = intrinsics
+    x, y = np.meshgrid((np.arange(i.width) + 0.5 - i.cx) / i.fx, (np.arange(i.height) + 0.5 - i.cy) / i.fy)
+    return np.stack([x, y], axis=-1)
 
 
 def pixel_directions(intrinsics: Intrinsics) -> np.ndarray:
     """Unit directions (height, width, 3), float64, of the pixels' centres in the OpenGL camera frame."""
-    i = intrinsics
-    x, y = np.meshgrid((np.arange(i.width) + 0.5 - i.cx) / i.fx, (np.arange(i.height) + 0.5 - i.cy) / i.fy)
-    xy = undistort(np.stack([x, y], axis=-1), i.distortion)
-    d = np.stack([xy[..., 0], -xy[..., 1], -np.ones_like(x)], axis=-1)
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+    return lens.rays(pixel_grid(intrinsics), intrinsics) * _OPENGL_FROM_OPENCV
 
 
 def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel coordinates (N, 2) of world ``points`` (N, 3), and a mask (N,) of those in front of the camera."""
+    """Pixel coordinates (N, 2) of world ``points`` (N, 3), and a mask (N,) of those that the lens can show."""
     i = camera.intrinsics
     local = (np.asarray(points) - camera.center) @ camera.to_world[:3, :3]
-    depth = -local[:, 2]
-    front = depth > 1e-9
-    safe = np.where(front, depth, 1.0)
-    xy = distort(np.stack([local[:, 0] / safe, -local[:, 1] / safe], axis=-1), i.distortion)
-    return xy * [i.fx, i.fy] + [i.cx, i.cy], front
+    xy, shown = lens.image(local * _OPENGL_FROM_OPENCV, i)
+    return xy * [i.fx, i.fy] + [i.cx, i.cy], shown
 
 
 def sensor_dict(camera: Camera) -> dict:
@@ -109,8 +66,8 @@ def sensor_dict(camera: Camera) -> dict:
     i = camera.intrinsics
     if i.is_distorted:
         raise ValueError(
-            f"Mitsuba's perspective sensor has no lens distortion, but this camera has k1, k2, p1, p2 = {i.distortion}; "
-            "undistort the images first"
+            "Mitsuba's perspective sensor has no lens distortion, but this camera has "
+            f"{'a fisheye lens' if i.fisheye else f'k1, k2, p1, p2 = {i.distortion[:4]}'}; undistort the images first"
         )
     if abs(i.fx / i.fy - 1) > 1e-3:
         raise ValueError(f"Mitsuba's perspective sensor has square pixels, but this camera has fx={i.fx:g}, fy={i.fy:g}")

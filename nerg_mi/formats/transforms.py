@@ -7,50 +7,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from .intrinsics import Intrinsics
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG")
 # Keys that may stand at the top of the file or in a frame, the frame's own counting.
 _LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "camera_angle_x", "camera_angle_y")
 _UNKNOWN_LENSES = ("k3", "k4", "k5", "k6")
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """Pinhole camera with OpenCV distortion, for an image of ``width`` x ``height`` pixels.
-
-    ``fx, fy, cx, cy``: pixels, the centre of the first pixel being (0.5, 0.5); ``k1, k2``: radial
-    and ``p1, p2``: tangential coefficients, which act on normalised coordinates and do not
-    depend on the size of the image.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-
-    @property
-    def distortion(self) -> tuple[float, float, float, float]:
-        return self.k1, self.k2, self.p1, self.p2
-
-    @property
-    def is_distorted(self) -> bool:
-        return any(self.distortion)
-
-    def resized(self, width: int, height: int) -> Intrinsics:
-        """The same lens on an image of another size."""
-        sx, sy = width / self.width, height / self.height
-        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy,
-                       cx=self.cx * sx, cy=self.cy * sy)
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import Camera, distort, pixel_directions, project, sensor_dict, undistort
-from nerg_mi.formats.transforms import Intrinsics
+from nerg_mi.capture.cameras import Camera, pixel_directions, project, sensor_dict
+from nerg_mi.formats.intrinsics import Intrinsics
 
 FOX = Intrinsics(135, 240, 171.94, 171.81, 69.3, 120.7, 0.0578421, -0.0805099, -0.000980296, 0.00015575)
 
@@ -16,17 +16,6 @@ def pose(rng):
     m = np.eye(4)
     m[:3, :3], m[:3, 3] = q, rng.normal(size=3)
     return m
-
-
-@pytest.mark.parametrize("distortion", [FOX.distortion, (0.1, 0.02, 0.001, -0.002), (-0.2, 0.05, 0, 0), (0, 0, 0, 0)])
-def test_undistort_inverts_distort(distortion):
-    xy = np.random.default_rng(0).uniform(-0.8, 0.8, (500, 2))
-    assert np.allclose(undistort(distort(xy, distortion), distortion), xy, atol=1e-9)
-
-
-def test_folding_distortion_is_refused():
-    with pytest.raises(ValueError, match="cannot be inverted"):
-        undistort(np.array([[1.5, 1.5]]), (-0.5, 0.0, 0.0, 0.0))
 
 
 def test_pixel_rays_project_back_to_their_pixels():
@@ -45,6 +34,12 @@ def test_points_behind_a_camera_are_not_in_front():
     assert project(np.array([[0.0, 0.0, -1.0]]), camera)[1][0]
 
 
+def test_a_fisheye_shows_points_behind_its_plane():
+    camera = Camera(Intrinsics(64, 64, 16.0, 16.0, 32.0, 32.0, fisheye=True), np.eye(4))
+    pixel, shown = project(np.array([[1.0, 0.0, 0.1]]), camera)
+    assert shown[0] and np.allclose(pixel, [[32 + 16 * np.arctan2(1, -0.1), 32]])
+
+
 def test_mitsuba_sensor_sends_the_same_rays(rgb):
     """Principal point off the centre, no square picture."""
     i = Intrinsics(32, 20, 25.0, 25.0, 14.0, 11.5)
@@ -59,5 +54,7 @@ def test_mitsuba_sensor_sends_the_same_rays(rgb):
 def test_sensor_refuses_what_it_cannot_express():
     with pytest.raises(ValueError, match="distortion"):
         sensor_dict(Camera(FOX, np.eye(4)))
+    with pytest.raises(ValueError, match="fisheye"):
+        sensor_dict(Camera(Intrinsics(8, 8, 10.0, 10.0, 4.0, 4.0, fisheye=True), np.eye(4)))
     with pytest.raises(ValueError, match="square pixels"):
         sensor_dict(Camera(Intrinsics(8, 8, 10.0, 11.0, 4.0, 4.0), np.eye(4)))
