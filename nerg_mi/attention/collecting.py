@@ -42,15 +42,16 @@ class RaysBuilder:
     def __init__(self, *, transform: np.ndarray | None = None, **about: Any) -> None:
         self._transform = np.eye(4) if transform is None else np.asarray(transform, dtype=np.float64)
         self._about = about
-        self._parts: list[tuple[np.ndarray, ...]] = []
-        self._has_hit: list[bool] = []
+        self._parts: list[dict[str, np.ndarray]] = []
+        self._kept: list[int] = []
+        self._persons, self._cohorts = _Names(), _Names()
         self._sources: list[dict[str, Any]] = []
         self._dropped: list[dict[str, Any]] = []
         self._rows_read = 0
 
-    def source(self, path: Path) -> None:
-        """Begin a file; only its name is recorded, with its checksum."""
-        self._sources.append({"file": path.name, "sha256": file_sha256(path)})
+    def source(self, path: Path, name: str | None = None) -> None:
+        """Begin a file; only its name (or another one, where files share theirs) is recorded, with its checksum."""
+        self._sources.append({"file": name or path.name, "sha256": file_sha256(path)})
 
     def add(
         self,
@@ -62,24 +63,28 @@ class RaysBuilder:
         rows: np.ndarray,
         confidence: np.ndarray | None = None,
         hit: np.ndarray | None = None,
+        cohort: Sequence[str] | np.ndarray | None = None,
         drop: dict[str, np.ndarray] | None = None,
     ) -> None:
         """Add n rows in the source's frame; directions need not be unit.
 
-        ``rows`` (n,): 1-based rows of the source. ``drop``: further reasons,
-        each with its mask (n,). A row counts under the first reason it meets.
+        ``rows`` (n,): 1-based rows of the source. ``drop``: reasons of the
+        recording's own, each with its mask (n,), before those found here. A row
+        counts under the first reason it meets; one without a person's name is dropped, one without a cohort is of the
+        cohort "unknown".
         """
         n = len(t)
-        person = np.broadcast_to(np.asarray(person, dtype=str), (n,))
+        person = self._persons.codes(person, n)
         length = np.linalg.norm(direction, axis=1)
         confidence = np.ones(n) if confidence is None else np.asarray(confidence, dtype=np.float64)
         reasons = {
+            **(drop or {}),
+            "person is missing": person == self._persons.code(""),
             "time is missing": ~np.isfinite(t),
             "origin is missing": ~np.isfinite(origin).all(axis=1),
             "direction is missing": ~np.isfinite(length),
             "direction is zero": length == 0,
             "confidence is missing or outside [0, 1]": ~((confidence >= 0) & (confidence <= 1)),
-            **(drop or {}),
         }
         keep = np.ones(n, dtype=bool)
         for reason, mask in reasons.items():
@@ -88,19 +93,21 @@ class RaysBuilder:
                 self._drop(reason, np.asarray(rows)[gone])
                 keep &= ~mask
         self._rows_read += n
-        self._has_hit.append(hit is not None)
         R, shift = self._transform[:3, :3], self._transform[:3, 3]
         scale = np.cbrt(abs(np.linalg.det(R)))
-        self._parts.append(
-            (
-                np.asarray(t, dtype=np.float64)[keep],
-                person[keep],
-                origin[keep] @ R.T + shift,
-                (direction[keep] / length[keep, None]) @ (R / scale).T,
-                confidence[keep],
-                np.full((keep.sum(), 3), np.nan) if hit is None else hit[keep] @ R.T + shift,
-            )
-        )
+        part = {
+            "t": np.asarray(t, dtype=np.float64)[keep],
+            "person": person[keep],
+            "origin": origin[keep] @ R.T + shift,
+            "direction": (direction[keep] / length[keep, None]) @ (R / scale).T,
+            "confidence": confidence[keep],
+        }
+        if hit is not None:
+            part["hit"] = hit[keep] @ R.T + shift
+        if cohort is not None:
+            part["cohort"] = self._cohorts.codes(cohort, n)[keep]
+        self._parts.append(part)
+        self._kept.append(int(keep.sum()))
 
     def _drop(self, reason: str, rows: np.ndarray) -> None:
         name = self._sources[-1]["file"] if self._sources else ""
@@ -113,12 +120,9 @@ class RaysBuilder:
 
     def build(self) -> Rays:
         """The rays collected. Raises ``ValueError`` when none is left."""
-        columns = [np.concatenate(c) for c in zip(*self._parts)] if self._parts else []
-        if not columns or not len(columns[0]):
+        if not sum(self._kept):
             why = "; ".join(f"{d['count']} rows: {d['reason']}" for d in self._dropped[:4]) or "the files hold no rows"
             raise ValueError(f"no ray is left of {self._rows_read} rows ({why}); check the column map and the preset")
-        t, names, origin, direction, confidence, hit = columns
-        persons, codes = np.unique(names, return_inverse=True)
         metadata = {
             "frame": dict(FRAME),
             "transform": self._transform.tolist(),
@@ -127,4 +131,46 @@ class RaysBuilder:
             "dropped": self._dropped,
             **self._about,
         }
-        return Rays(t, codes, tuple(persons), origin, direction, confidence, hit if any(self._has_hit) else None, metadata)
+        columns = {name: self._column(name) for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")}
+        columns["person"], persons = self._persons.sorted(columns["person"])
+        cohorts: tuple[str, ...] = ()
+        if columns["cohort"] is not None:
+            columns["cohort"], cohorts = self._cohorts.sorted(columns["cohort"])
+            cohorts = tuple(c or "unknown" for c in cohorts)
+        return Rays(**columns, persons=persons, cohorts=cohorts, metadata=metadata)
+
+    def _column(self, name: str) -> np.ndarray | None:
+        """A column of all parts; parts without hits or cohorts get NaN or the cohort ""; ``None`` where all are without.
+        The parts' own are let go, so that no more than one column is there twice."""
+        if not any(name in part for part in self._parts):
+            return None
+        lacking = {"hit": lambda n: np.full((n, 3), np.nan), "cohort": lambda n: self._cohorts.codes("", n)}
+        return np.concatenate([part.pop(name) if name in part else lacking[name](n) for part, n in zip(self._parts, self._kept)])
+
+
+class _Names:
+    """Numbers for names, in the order met: texts of millions of rows are not kept."""
+
+    def __init__(self) -> None:
+        self._code: dict[str, int] = {}
+
+    def code(self, name: str) -> int:
+        return self._code.setdefault(name, len(self._code))
+
+    def codes(self, names: Sequence[str] | np.ndarray | str, n: int) -> np.ndarray:
+        """Codes (n,) int32 of one name for all or of n names."""
+        if isinstance(names, str):
+            return np.full(n, self.code(names.strip()), dtype=np.int32)
+        names = np.asarray(names, dtype=str)
+        # Rows of one person mostly follow each other: names are looked up where they change.
+        starts = np.flatnonzero(np.r_[True, names[1:] != names[:-1]][:n])
+        codes = np.array([self.code(name.strip()) for name in names[starts].tolist()], dtype=np.int32)
+        return np.repeat(codes, np.diff(np.r_[starts, n]))
+
+    def sorted(self, codes: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Codes into the sorted names of those that occur, and these names."""
+        names = list(self._code)
+        used = sorted(np.unique(codes), key=lambda c: names[c])
+        place = np.zeros(len(names), dtype=np.int32)
+        place[used] = np.arange(len(used))
+        return place[codes], tuple(names[c] for c in used)

@@ -1,88 +1,23 @@
-"""From tracking files to rays: column maps, and presets for known recordings.
+"""Presets: recordings whose columns, frame and validity marks are known.
 
-A preset knows a recording's columns, frame and validity marks. Each is a
-function of files; :data:`PRESETS` names them for the command line.
+Each is a function of files; :data:`PRESETS` names them for the command line.
 """
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable, Sequence
+from typing import Callable
 
 import numpy as np
 
-from ..formats.ray_tables import ColumnMap, iterate_table
+from ..formats.ray_tables import iterate_table
+from . import headsets
 from .collecting import RaysBuilder
 from .frames import to_rays_frame
 from .rays import Rays
 from .skeleton import rays_from_skeleton
-
-Paths = Sequence[str | os.PathLike]
-
-
-def person_from_filename(path: str | os.PathLike) -> str:
-    """The file's name without its endings (``anna.csv.gz`` is ``anna``)."""
-    return Path(path).name.split(".")[0]
-
-
-def rays_from_table(
-    paths: Paths,
-    columns: ColumnMap | str,
-    *,
-    up: str = "z",
-    handedness: str = "right",
-    units: str = "m",
-    person_from: str = "column",
-    min_confidence: float = 0.0,
-    tick: float = 1.0,
-) -> Rays:
-    """Rays of CSV or Parquet tables through a column map.
-
-    ``up``, ``handedness`` and ``units`` declare the tables' frame; rays come out
-    right-handed, z up, in metres, and the transform is recorded. Directions need
-    not be unit. ``person_from``: ``column`` (the map's ``person``) or
-    ``filename``. Rows with a confidence below ``min_confidence`` are dropped.
-    ``tick``: seconds in one unit of the time column; without one, in one row.
-    Raises ``ValueError`` for missing columns, cells that are no numbers, or when
-    no ray is left.
-    """
-    columns = ColumnMap.parse(columns) if isinstance(columns, str) else columns
-    if person_from not in ("column", "filename"):
-        raise ValueError(f'person_from is "{person_from}"; it is "column" or "filename"')
-    by_file = person_from == "filename" or columns.person is None
-    scalars = [c for c in (columns.t, columns.confidence) if c]
-    numbers = [*columns.origin, *columns.direction, *(columns.hit or ()), *scalars]
-    texts = [] if by_file else [columns.person]
-
-    builder = RaysBuilder(
-        transform=to_rays_frame(up=up, handedness=handedness, units=units),
-        columns=str(columns), source_frame={"up": up, "handedness": handedness, "units": units},
-        tick=tick, min_confidence=min_confidence,
-    )  # fmt: skip
-    for path in map(Path, paths):
-        builder.source(path)
-        rows = 0
-        for block in iterate_table(path, numbers, texts):
-            value = dict(zip(numbers, block.numbers.T))
-            vector = lambda names: np.stack([value[c] for c in names], axis=1)
-            n = len(block.lines)
-            t = value[columns.t] if columns.t else np.arange(rows, rows + n, dtype=np.float64)
-            rows += n
-            confidence = value[columns.confidence] if columns.confidence else np.ones(n)
-            builder.add(
-                t * tick,
-                person_from_filename(path) if by_file else block.texts[:, 0],
-                vector(columns.origin),
-                vector(columns.direction),
-                rows=block.lines,
-                confidence=confidence,
-                hit=vector(columns.hit) if columns.hit else None,
-                drop={f"confidence below {min_confidence:g}": confidence < min_confidence},
-            )
-    return builder.build()
-
+from .tables import Paths, person_from_filename
 
 def vr_supermarket(paths: Paths, *, min_openness: float = 0.5) -> Rays:
     """Eye gaze of people in a VR supermarket, one gzip CSV a person, 50 Hz.
@@ -136,13 +71,21 @@ class Preset:
 
 
 PRESETS = {
-    "skeleton22": Preset("22-keypoint skeletons, id|time|[66 floats], metres, z up: ears to nose", rays_from_skeleton, ("tick",)),
+    "skeleton22": Preset(
+        "22-keypoint skeletons, id|time|[66 floats], metres, z up: ears to nose", rays_from_skeleton, ("tick", "keypoints", "pitch")
+    ),
     "vr_supermarket": Preset("VR supermarket eye gaze, one CSV a person (Unity frame)", vr_supermarket),
+    "unity": Preset("Unity logs of gaze in the world: gaze_origin_*, gaze_dir_* (or gaze_direction_*, gaze_forward_*)", headsets.unity, ("tick",)),
+    "unity_local": Preset("Unity logs of gaze in the head's frame, beside head_pos_* and head_rot_*", headsets.unity_local, ("tick",)),
+    "unity_head": Preset("Unity logs of heads: head_pos_*, head_rot_*", headsets.unity_head, ("tick",)),
+    "varjo": Preset("the log of Varjo's eye tracking example for Unity", headsets.varjo),
+    "hololens": Preset("*_head_hand_eye.csv of HoloLens 2's StreamRecorder", headsets.hololens),
+    "pupil": Preset("Pupil Core exports with the head pose tracker's", headsets.pupil, ("marker", "up", "min_confidence")),
 }
 
 
 def preset(name: str) -> Preset:
     """The preset of this name. Raises ``ValueError`` naming those there are."""
     if name not in PRESETS:
-        raise ValueError(f'there is no preset "{name}"; choose {" or ".join(PRESETS)}, or give a column map')
+        raise ValueError(f'there is no preset "{name}"; choose one of {", ".join(PRESETS)}, or give a column map')
     return PRESETS[name]

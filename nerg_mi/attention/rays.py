@@ -26,7 +26,8 @@ class Rays:
     [0, 1]; ``hit`` (N, 3) metres, the point looked at, NaN where unknown, or
     ``None``; ``metadata``: ``frame`` (units, up, handedness), ``sources`` (file
     name and sha256), ``transform`` (4x4 from the source's frame), ``rows_read``
-    and ``dropped`` (reason, count, and rows of each source).
+    and ``dropped`` (reason, count, and rows of each source); ``cohort`` (N,)
+    int32 index into ``cohorts``, the names of groups of people, or ``None``.
 
     Raises ``ValueError`` naming the first offending ray for NaN, zero or
     non-unit directions, non-finite origins or times, persons out of range, and
@@ -41,18 +42,24 @@ class Rays:
     confidence: np.ndarray
     hit: np.ndarray | None = None
     metadata: dict[str, Any] = field(default_factory=lambda: {"frame": dict(FRAME)})
+    cohort: np.ndarray | None = None
+    cohorts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)
         put("t", np.ascontiguousarray(self.t, dtype=np.float64))
         put("person", np.ascontiguousarray(self.person, dtype=np.int32))
         put("persons", tuple(str(p) for p in self.persons))
+        put("cohorts", tuple(str(c) for c in self.cohorts))
+        if self.cohort is not None:
+            put("cohort", np.ascontiguousarray(self.cohort, dtype=np.int32))
         for name in ("origin", "direction", "confidence", "hit"):
             if getattr(self, name) is not None:
                 put(name, np.ascontiguousarray(getattr(self, name), dtype=np.float64))
 
         n = len(self.t)
-        for name, shape in (("person", (n,)), ("origin", (n, 3)), ("direction", (n, 3)), ("confidence", (n,)), ("hit", (n, 3))):
+        shapes = {"person": (n,), "origin": (n, 3), "direction": (n, 3), "confidence": (n,), "hit": (n, 3), "cohort": (n,)}
+        for name, shape in shapes.items():
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise ValueError(f"{name} has shape {value.shape}, expected {shape}: one row for each of {n} times")
@@ -66,6 +73,8 @@ class Rays:
         _refuse(~np.isfinite(self.origin).all(axis=1), "an origin that is not finite", "drop it before building Rays")
         _refuse(~np.isfinite(self.t), "a time that is not finite", "drop it before building Rays")
         _refuse((self.person < 0) | (self.person >= len(self.persons)), "an unknown person", "extend persons")
+        if self.cohort is not None:
+            _refuse((self.cohort < 0) | (self.cohort >= len(self.cohorts)), "an unknown cohort", "extend cohorts")
         _refuse(~((self.confidence >= 0) & (self.confidence <= 1)), "a confidence outside [0, 1]", "rescale it")
 
     def __len__(self) -> int:
@@ -82,20 +91,26 @@ class Rays:
             direction=self.direction[which],
             confidence=self.confidence[which],
             hit=None if self.hit is None else self.hit[which],
+            cohort=None if self.cohort is None else self.cohort[which],
         )
+
+    def noting(self, **what: Any) -> Rays:
+        """The same rays with a step added to the list ``steps`` of the metadata: what was done to them since the import."""
+        return replace(self, metadata={**self.metadata, "steps": [*self.metadata.get("steps", []), what]})
 
     def save(self, path: str | os.PathLike) -> None:
         """Write ``.npz`` or ``.parquet``; see :mod:`nerg_mi.formats.rays_file`."""
-        columns = {k: getattr(self, k) for k in ("t", "person", "origin", "direction", "confidence", "hit")}
+        columns = {k: getattr(self, k) for k in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")}
         columns = {k: v for k, v in columns.items() if v is not None}
-        write_rays_file(path, columns, {**self.metadata, "persons": list(self.persons)})
+        cohorts = {"cohorts": list(self.cohorts)} if self.cohort is not None else {}
+        write_rays_file(path, columns, {**self.metadata, "persons": list(self.persons), **cohorts})
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Rays:
         """Read what :meth:`save` wrote, checking it as on construction."""
         columns, metadata = read_rays_file(path)
         persons = metadata.pop("persons")
-        return cls(**columns, persons=persons, metadata=metadata)
+        return cls(**columns, persons=persons, metadata=metadata, cohorts=metadata.pop("cohorts", ()))
 
 
 def _refuse(bad: np.ndarray, what: str, remedy: str) -> None:

@@ -35,21 +35,37 @@ _BODY = {
 _LEFT_EYE, _RIGHT_EYE = 4, 15
 
 
-def head_poses(keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def head_poses(
+    keypoints: np.ndarray, *, ears: tuple[int, int] = (LEFT_EAR, RIGHT_EAR), nose: int = NOSE, pitch: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Rays of the heads: from the midpoint of the ears through the nose.
 
-    ``keypoints``: (N, 22, 3). Returns ``origin`` (N, 3) in the unit given and
-    ``direction`` (N, 3), unit; where an ear or the nose is NaN or the nose lies
-    on the midpoint, the direction is NaN. NeRG, Section 5.1.
+    ``keypoints``: (N, 22, 3). ``ears``, ``nose``: which of them. ``pitch``: degrees by which a ray is turned up about the
+    line through the ears, since a nose lies below the ears and a level head then seems to look down. Returns ``origin``
+    (N, 3) in the unit given and ``direction`` (N, 3), unit; where an ear or the nose is NaN or the nose lies on the
+    midpoint, the direction is NaN. NeRG, Section 5.1.
     """
     keypoints = np.asarray(keypoints, dtype=np.float64)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (KEYPOINTS, 3):
         raise ValueError(f"keypoints have shape {keypoints.shape}, expected (N, {KEYPOINTS}, 3)")
-    origin = 0.5 * (keypoints[:, LEFT_EAR] + keypoints[:, RIGHT_EAR])
-    offset = keypoints[:, NOSE] - origin
-    length = np.linalg.norm(offset, axis=1, keepdims=True)
-    direction = np.divide(offset, length, out=np.full_like(offset, np.nan), where=length > 0)
+    if len({*ears, nose}) != 3 or not all(0 <= k < KEYPOINTS for k in (*ears, nose)):
+        raise ValueError(f"ears {ears} and nose {nose} must be three different keypoints of 0 to {KEYPOINTS - 1}")
+    left, right = (keypoints[:, k] for k in ears)
+    origin = 0.5 * (left + right)
+    offset = keypoints[:, nose] - origin
+    direction = _unit(offset)
+    if pitch:
+        # Only the part across the ears turns; the ears' line need not be square to the nose.
+        side = _unit(left - right)
+        along = np.sum(direction * side, axis=1, keepdims=True) * side
+        angle = np.radians(pitch)
+        direction = along + np.cos(angle) * (direction - along) + np.sin(angle) * np.cross(direction, side)
     return origin, direction
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(v, axis=1, keepdims=True)
+    return np.divide(v, length, out=np.full_like(v, np.nan), where=length > 0)
 
 
 def keypoints_from_head(
@@ -100,19 +116,30 @@ def keypoints_from_head(
     return out
 
 
-def rays_from_skeleton(paths: str | os.PathLike | Sequence[str | os.PathLike], *, tick: float = 1.0) -> Rays:
+def rays_from_skeleton(
+    paths: str | os.PathLike | Sequence[str | os.PathLike],
+    *,
+    tick: float = 1.0,
+    keypoints: Sequence[int] = (LEFT_EAR, RIGHT_EAR, NOSE),
+    pitch: float = 0.0,
+) -> Rays:
     """Head-pose rays of skeleton files, one ray a pose.
 
-    ``tick``: seconds in one unit of the file's integer time. Poses without ears
+    ``tick``: seconds in one unit of the file's integer time. ``keypoints``: left
+    ear, right ear and nose among the 22. ``pitch``: see :func:`head_poses`. Poses without ears
     or nose are dropped; the metadata counts them with the lines they stand on.
     Raises ``ValueError`` for a broken line (naming it) or when no pose is left.
     """
     if isinstance(paths, (str, os.PathLike)):
         paths = [paths]
-    builder = RaysBuilder(preset="skeleton22", tick=tick)
+    left, right, nose = keypoints
+    builder = RaysBuilder(
+        preset="skeleton22", tick=tick, source_frame={"up": "z", "handedness": "right", "units": "m"},
+        keypoints=[left, right, nose], pitch=pitch,
+    )  # fmt: skip
     for path in paths:
         builder.source(Path(path))
-        for rows in iterate_skeleton(path):
-            origin, direction = head_poses(rows.keypoints)
+        for rows in iterate_skeleton(path, keypoints=(left, right, nose)):
+            origin, direction = head_poses(rows.keypoints, ears=(left, right), nose=nose, pitch=pitch)
             builder.add(rows.times * tick, rows.ids, origin, direction, rows=rows.lines)
     return builder.build()

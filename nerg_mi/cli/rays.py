@@ -27,11 +27,12 @@ def import_rays(
 ) -> None:
     """Convert tracking files to rays: right-handed, z up, metres, seconds."""
     from ..attention import presets
+    from ..attention.tables import rays_from_table
 
     if (preset is None) == (columns is None):
         raise ValueError("say what the files are: either --preset NAME or --map COLUMNS")
     if columns is not None:
-        rays = presets.rays_from_table(
+        rays = rays_from_table(
             files, columns, up=up, handedness=hand, units=units,
             person_from=person_from, min_confidence=min_confidence, tick=tick,
         )  # fmt: skip

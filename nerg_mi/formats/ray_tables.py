@@ -1,15 +1,10 @@
-"""Tables of rays: CSV (also ``.gz``) and Parquet, read by named columns.
-
-A column map says which columns of a table mean what, in the order of the axes:
-``origin=x,y,z direction=dx,dy,dz t=time person=id confidence=valid hit=hx,hy,hz``.
-"""
+"""Tables of rays: CSV (also ``.gz``) and Parquet, read by named columns."""
 from __future__ import annotations
 
 import csv
 import gzip
 import itertools
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Iterator, NamedTuple, Sequence
 
@@ -18,50 +13,6 @@ import numpy as np
 BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
 
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
-_FIELDS = {"origin": 3, "direction": 3, "hit": 3, "t": 1, "person": 1, "confidence": 1}
-
-
-@dataclass(frozen=True)
-class ColumnMap:
-    """Names of a table's columns. ``origin`` and ``direction`` are required;
-    without ``t`` rows are numbered, without ``person`` the file is the person,
-    without ``confidence`` it is one."""
-
-    origin: tuple[str, str, str]
-    direction: tuple[str, str, str]
-    t: str | None = None
-    person: str | None = None
-    confidence: str | None = None
-    hit: tuple[str, str, str] | None = None
-
-    @classmethod
-    def parse(cls, text: str) -> ColumnMap:
-        """From ``"origin=x,y,z direction=dx,dy,dz t=time ..."``.
-
-        Raises ``ValueError`` for an unknown or repeated field, a wrong number
-        of columns, or when origin or direction is missing.
-        """
-        found: dict[str, tuple[str, ...] | str] = {}
-        for word in text.split():
-            key, _, value = word.partition("=")
-            columns = tuple(c for c in value.split(",") if c)
-            if key not in _FIELDS or key in found:
-                raise ValueError(f"column map: {key!r} is unknown or given twice; use {', '.join(_FIELDS)}, each once")
-            if len(columns) != _FIELDS[key]:
-                raise ValueError(f"column map: {key} needs {_FIELDS[key]} column name(s), got {len(columns)} in {word!r}")
-            found[key] = columns if _FIELDS[key] == 3 else columns[0]
-        for key in ("origin", "direction"):
-            if key not in found:
-                raise ValueError(f"column map: {key} is missing; add {key}=x,y,z with the names of its columns")
-        return cls(**found)  # type: ignore[arg-type]
-
-    def __str__(self) -> str:
-        words = []
-        for key in _FIELDS:
-            value = getattr(self, key)
-            if value is not None:
-                words.append(f"{key}={value if isinstance(value, str) else ','.join(value)}")
-        return " ".join(words)
 
 
 class TableBlock(NamedTuple):
@@ -74,32 +25,53 @@ class TableBlock(NamedTuple):
     lines: np.ndarray
 
 
-def iterate_table(path: str | os.PathLike, numbers: Sequence[str], texts: Sequence[str] = ()) -> Iterator[TableBlock]:
+def table_columns(path: str | os.PathLike) -> list[str]:
+    """Names of a table's columns; of a CSV those of its first line."""
+    if str(path).lower().endswith(".parquet"):
+        from .rays_file import pyarrow_modules
+
+        return list(pyarrow_modules()[1].ParquetFile(path).schema_arrow.names)
+    with _open(path) as source:
+        return _header(source.readline())[0]
+
+
+def iterate_table(
+    path: str | os.PathLike, numbers: Sequence[str], texts: Sequence[str] = (), header: Sequence[str] | None = None
+) -> Iterator[TableBlock]:
     """Yield named columns of a table in blocks of at most ``BLOCK`` rows.
 
     The separator (comma, semicolon or tab) is taken from the header. Cells
-    that are empty or say nan, na, null or none are NaN. Raises ``ValueError``
+    that are empty or say nan, na, null or none are NaN. ``header``: the names
+    of the columns of a CSV whose first line is none. Raises ``ValueError``
     for a missing column (naming those there are), a row with too few cells, or
     a cell that is no number (naming its line).
     """
-    name = str(path).lower()
-    if name.endswith(".parquet"):
+    if str(path).lower().endswith(".parquet"):
         yield from _iterate_parquet(path, numbers, texts)
         return
     with _open(path) as source:
-        header = source.readline().rstrip("\r\n").lstrip("\ufeff")
-        separator = max(",;\t", key=header.count)
-        columns = [c.strip() for c in next(csv.reader([header], delimiter=separator))] if header else []
-        where = {c: i for i, c in enumerate(columns)}
+        if header is None:
+            columns, separator = _header(source.readline())
+            count = 1
+        else:
+            columns, separator, count = list(header), ",", 0
+        where = {c: i for i, c in reversed(list(enumerate(columns)))}
         _require(path, [*numbers, *texts], columns)
         number_at, text_at = [where[c] for c in numbers], [where[c] for c in texts]
-        count = 1
         while raw := list(itertools.islice(source, BLOCK)):
-            lines = count + 1 + np.flatnonzero([bool(line.strip()) for line in raw])
-            kept = [line for line in raw if line.strip()]
+            blank = [line.isspace() for line in raw]
+            lines = count + 1 + np.flatnonzero(~np.array(blank))
+            kept = raw if len(lines) == len(raw) else [line for line, gone in zip(raw, blank) if not gone]
             count += len(raw)
             if kept:
                 yield _convert(path, kept, lines, separator, columns, number_at, text_at)
+
+
+def _header(line: str) -> tuple[list[str], str]:
+    """Column names and the separator between them."""
+    line = line.rstrip("\r\n").lstrip("\ufeff")
+    separator = max(",;\t", key=line.count)
+    return [c.strip() for c in next(csv.reader([line], delimiter=separator))] if line else [], separator
 
 
 def _convert(
@@ -108,7 +80,9 @@ def _convert(
     # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast
     # reader refuses them, so they are spelt out first.
     gap = separator * 2
-    filled = [r.replace(gap, f"{separator}nan{separator}").replace(gap, f"{separator}nan{separator}") if gap in r else r for r in rows]
+    filled = rows
+    if any(gap in row for row in rows):
+        filled = [r.replace(gap, f"{separator}nan{separator}").replace(gap, f"{separator}nan{separator}") if gap in r else r for r in rows]
     options = dict(delimiter=separator, comments=None, quotechar='"', ndmin=2)
     try:
         values = np.loadtxt(filled, usecols=number_at, dtype=np.float64, **options)
@@ -124,7 +98,7 @@ def _convert_slowly(
     """Cell by cell: knows more spellings of "missing", and names the bad cell."""
     out = np.empty((len(rows), len(number_at)))
     for i, cells in enumerate(csv.reader(rows, delimiter=separator)):
-        if len(cells) <= max(number_at):
+        if len(cells) <= max(number_at, default=0):
             raise ValueError(f"{path}, line {lines[i]}: {len(cells)} cells, the header has {len(columns)}; mend or remove the line")
         for j, k in enumerate(number_at):
             word = cells[k].strip()
@@ -148,7 +122,7 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
         n = batch.num_rows
         column = lambda c: batch.column(batch.schema.get_field_index(c))
         values = [column(c).to_numpy(zero_copy_only=False).astype(np.float64) for c in numbers]
-        words = [np.array([str(v) for v in column(c).to_pylist()], dtype=str) for c in texts]
+        words = [np.array(["" if v is None else str(v) for v in column(c).to_pylist()], dtype=str) for c in texts]
         yield TableBlock(
             np.stack(values, axis=1) if values else np.empty((n, 0)),
             np.stack(words, axis=1) if words else np.empty((n, 0), dtype=str),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import operator
 import os
 from pathlib import Path
 from typing import IO, Iterator, NamedTuple, Sequence
@@ -69,11 +70,14 @@ def write_skeleton(
             out.write(f"{name}|{int(time)}|[{form % tuple(values)}]\n")
 
 
-def iterate_skeleton(path: str | os.PathLike, chunk: int = 8192) -> Iterator[SkeletonRows]:
+def iterate_skeleton(
+    path: str | os.PathLike, chunk: int = 8192, keypoints: Sequence[int] | None = None
+) -> Iterator[SkeletonRows]:
     """Yield the poses of a file in runs of at most ``chunk`` lines, so that
     memory stays bounded (a day of a store is some 2.6 million lines).
 
-    Empty lines are skipped. Raises ``ValueError`` naming file and line for a
+    ``keypoints``: which of the 22 are wanted; the others are counted but not
+    converted, and come out NaN. Empty lines are skipped. Raises ``ValueError`` naming file and line for a
     line that does not follow the format.
     """
     ids: list[str] = []
@@ -106,10 +110,10 @@ def iterate_skeleton(path: str | os.PathLike, chunk: int = 8192) -> Iterator[Ske
             texts.append(body[1:-1])
             lines.append(number)
             if len(ids) == chunk:
-                yield _rows(path, ids, times, texts, lines)
+                yield _rows(path, ids, times, texts, lines, keypoints)
                 ids, times, texts, lines = [], [], [], []
     if ids:
-        yield _rows(path, ids, times, texts, lines)
+        yield _rows(path, ids, times, texts, lines, keypoints)
 
 
 def read_skeleton(path: str | os.PathLike) -> SkeletonRows:
@@ -120,18 +124,29 @@ def read_skeleton(path: str | os.PathLike) -> SkeletonRows:
     return SkeletonRows(*(np.concatenate(column) for column in zip(*runs)))
 
 
-def _rows(path: object, ids: list[str], times: list[int], texts: list[str], lines: list[int]) -> SkeletonRows:
+def _rows(
+    path: object, ids: list[str], times: list[int], texts: list[str], lines: list[int], keypoints: Sequence[int] | None
+) -> SkeletonRows:
     # One conversion for the whole run; only when it fails is the line searched for.
+    wanted = range(KEYPOINTS) if keypoints is None else sorted(set(keypoints))
+    columns = [3 * k + i for k in wanted for i in range(3)]
     try:
-        values = np.loadtxt(texts, delimiter=",", comments=None, dtype=np.float64, ndmin=2)
+        if keypoints is None:
+            found = np.loadtxt(texts, delimiter=",", comments=None, dtype=np.float64, ndmin=2)
+        else:
+            # Faster than loadtxt's usecols, which converts what it leaves out.
+            pick = operator.itemgetter(*columns)
+            found = np.array([pick(text.split(",")) for text in texts]).astype(np.float64)
     except ValueError:
         for number, text in zip(lines, texts):
-            for word in text.split(","):
+            for word in operator.itemgetter(*columns)(text.split(",")):
                 try:
                     float(word)
                 except ValueError:
                     raise ValueError(f"{path}, line {number}: {word.strip()!r} is not a number") from None
         raise
+    values = np.full((len(ids), VALUES), np.nan)
+    values[:, columns] = found
     return SkeletonRows(
         np.array(ids, dtype=str),
         np.array(times, dtype=np.int64),

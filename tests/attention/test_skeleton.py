@@ -50,3 +50,25 @@ def test_rays_of_a_file(tmp_path):
     assert np.allclose(rays.t, np.arange(50)[keep] * 0.1)
     assert np.abs(rays.direction - direction[keep]).max() < 2e-5  # micrometres in the file
     assert rays.metadata["dropped"] == [{"reason": "origin is missing", "file": "day.csv.gz", "count": 1, "rows": [[8, 8]]}]
+
+
+def test_other_keypoints_and_pitch(tmp_path):
+    origin, direction = heads(40)
+    origin, direction = origin[2:], direction[2:]  # level-able heads
+    body = skeleton.keypoints_from_head(origin, direction)
+    swapped = body[:, ::-1]
+    o, d = skeleton.head_poses(swapped, ears=(21 - skeleton.LEFT_EAR, 21 - skeleton.RIGHT_EAR), nose=21 - skeleton.NOSE)
+    assert np.allclose(o, origin) and np.allclose(d, direction)
+    _, up = skeleton.head_poses(body, pitch=10)
+    elevation = lambda v: np.degrees(np.arcsin(v[:, 2]))
+    low = elevation(direction) < 75
+    assert np.allclose(elevation(up)[low] - elevation(direction)[low], 10)
+    path = tmp_path / "day.csv"
+    write_skeleton(path, ["ann"] * 38, np.arange(38), swapped)
+    rays = skeleton.rays_from_skeleton(path, keypoints=(19, 8, 10), pitch=10)
+    assert np.allclose(rays.direction, up, atol=2e-5) and rays.metadata["pitch"] == 10
+    path.write_text(path.read_text().replace(f"{swapped[3, 8, 0]:.6f}", "left"))
+    with pytest.raises(ValueError, match="line 4: 'left' is not a number"):
+        skeleton.rays_from_skeleton(path, keypoints=(19, 8, 10))
+    with pytest.raises(ValueError, match="three different keypoints"):
+        skeleton.head_poses(body, nose=skeleton.LEFT_EAR)

@@ -2,28 +2,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.formats import ray_tables
-from nerg_mi.formats.ray_tables import ColumnMap, iterate_table
-
-
-def test_column_map_round_trip():
-    text = "origin=x,y,z direction=dx,dy,dz hit=hx,hy,hz t=time person=id confidence=c"
-    columns = ColumnMap.parse(text)
-    assert columns.origin == ("x", "y", "z") and columns.t == "time" and str(columns) == text
-    assert ColumnMap.parse("direction=a,b,c origin=d,e,f").hit is None
-
-
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("origin=x,y,z", "direction is missing"),
-        ("origin=x,y direction=a,b,c", "origin needs 3"),
-        ("origin=x,y,z direction=a,b,c speed=v", "'speed' is unknown"),
-        ("origin=x,y,z origin=x,y,z direction=a,b,c", "given twice"),
-    ],
-)
-def test_column_map_refuses(text, message):
-    with pytest.raises(ValueError, match=message):
-        ColumnMap.parse(text)
+from nerg_mi.formats.ray_tables import iterate_table, table_columns
 
 
 def read(path, numbers, texts=()):
@@ -71,3 +50,12 @@ def test_parquet(tmp_path):
     (block,) = read(path, ["n", "a"], ["who"])
     assert np.array_equal(block.numbers, [[1, 1], [2, np.nan], [3, 3]], equal_nan=True)
     assert list(block.texts[:, 0]) == ["x", "y", "z"]
+
+
+def test_table_without_a_header_and_its_columns(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("1,2,3\n4,,6\n")
+    (block,) = list(iterate_table(path, ["c", "b"], header=["a", "b", "c"]))
+    assert np.array_equal(block.numbers, [[3, 2], [6, np.nan]], equal_nan=True) and list(block.lines) == [1, 2]
+    path.write_text("\ufeffx; y ;z\n")
+    assert table_columns(path) == ["x", "y", "z"]
