@@ -13,14 +13,10 @@ from typing import Callable
 
 import drjit as dr
 
-from ..field.elementary import one_minus_exp
-from .quadrature import mean_depth_share
+from .quadrature import linear_crossing, linear_share, mean_depth_share
 
 KINDS = ("constant", "linear", "cells")
 
-# Sub-steps in which a linear density's mean depth is summed; they cost no evaluation of the field.
-_PARTS = 12
-_DEEP = 12.0
 _GAUSS = 0.5 / 3**0.5
 
 
@@ -40,38 +36,6 @@ class Step:
     color: Callable
     carry: object
     evals: object
-
-
-def linear_share(first, last):
-    """Mean absorption distance, as a share of the step, of a density that is linear over it.
-
-    ``first``, ``last``: density at the ends times the step's length. Summed over sub-steps of constant
-    density with their exact first moments; equals ``mean_depth_share`` where both are equal.
-    """
-    # Light is absorbed in front: parts that lie behind an optical depth of 12 would be wasted.
-    whole = 0.5 * (first + last)
-    end = dr.detach(dr.select(whole > _DEEP, linear_crossing(first, last, 1, _DEEP), 1))
-    part = end / _PARTS
-    moment, absorbed, tau = 0, 0, 0
-    for j in range(_PARTS):
-        d = dr.lerp(first, last, (j + 0.5) * part) * part
-        weight = dr.exp(-tau) * one_minus_exp(d)
-        moment += weight * (j + mean_depth_share(d)) * part
-        absorbed += weight
-        tau += d
-    some = absorbed > 0
-    return dr.select(some, moment / dr.select(some, absorbed, 1), 0.5)
-
-
-def linear_crossing(first, last, length, missing):
-    """Distance into a step of linear density at which the optical depth ``missing`` is reached.
-
-    ``first``, ``last``: density at its ends. The stable root of first s + (last - first) s²/(2 length) =
-    missing.
-    """
-    root = dr.sqrt(dr.maximum(first * first + 2 * (last - first) / length * missing, 1e-30))
-    total = first + root
-    return dr.minimum(2 * missing / dr.select(total > 0, total, 1), length)
 
 
 class Constant:

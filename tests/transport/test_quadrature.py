@@ -6,7 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.quadrature import absorbed_share, mean_depth_share
+from nerg_mi.transport.quadrature import absorbed_share, linear_share, mean_depth_share
 
 TAU = np.logspace(-8, 8, 1601).astype(np.float32)
 
@@ -87,3 +87,79 @@ def test06_permuting_steps_preserves_opacity():
             light *= 1 - share
         opacities.append(total)
     assert np.allclose(opacities, -np.expm1(-tau.astype(float).sum()), rtol=1e-6)
+
+
+# ------------------------------------------------------------------------
+#  Density that is linear over a step
+# ------------------------------------------------------------------------
+
+
+def exact_linear_share(a, b):
+    """∫ s σ exp(-τ) ds / ∫ σ exp(-τ) ds in float64, by Gauss-Legendre panels to an optical depth of 45 or the end."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    goal = np.minimum(45, (a + b) / 2)
+    end = np.minimum(2 * goal / (a + np.sqrt(np.maximum(a * a + 2 * (b - a) * goal, 0))), 1)
+    moment = total = 0
+    x, w = np.polynomial.legendre.leggauss(24)
+    for k in range(8):
+        for share, weight in zip((k + (x + 1) / 2) / 8, w):
+            s = end * share
+            f = weight * (a + (b - a) * s) * np.exp(-(a * s + (b - a) * s * s / 2))
+            moment, total = moment + s * f, total + f
+    return moment / total
+
+
+def ends():
+    """Pairs of densities times length: from 0 and 1e-8 to 1e9 each, and pairs that hardly differ."""
+    grid = np.concatenate([[0], np.logspace(-8, 9, 86)])
+    rng = np.random.default_rng(0)
+    near = 10 ** rng.uniform(-2, 3, 4000)
+    far = np.maximum(near * (1 + rng.normal(size=4000) * 10 ** rng.uniform(-7, 0, 4000)), 0)
+    a, b = (np.ravel(v) for v in np.meshgrid(grid, grid))
+    return np.concatenate([a[1:], near]).astype(np.float32), np.concatenate([b[1:], far]).astype(np.float32)
+
+
+def test07_the_linear_reference_agrees_with_closed_forms():
+    assert np.allclose(exact_linear_share(TAU, TAU), exact_share(TAU), rtol=1e-13)
+    # From 0 up a half normal distribution, down to 0 Dawson's integral.
+    from scipy.special import dawsn, erf
+
+    c = np.array([3.0, 10, 60, 800, 1e6])
+    passed = np.exp(-c / 2)
+    assert np.allclose(exact_linear_share(0 * c, c), (np.sqrt(np.pi / 2 / c) * erf(np.sqrt(c / 2)) - passed) / (1 - passed), rtol=1e-13)
+    assert np.allclose(exact_linear_share(c, 0 * c), (np.sqrt(2 / c) * dawsn(np.sqrt(c / 2)) - passed) / (1 - passed), rtol=1e-13)
+
+
+def test08_linear_share():
+    a, b = ends()
+    got = linear_share(ns.Float(a), ns.Float(b)).numpy()
+    assert np.abs(got / exact_linear_share(a, b) - 1).max() < 1e-6
+    equal = linear_share(ns.Float(TAU), ns.Float(TAU)).numpy()
+    assert np.allclose(equal, mean_depth_share(ns.Float(TAU)).numpy(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test09_its_derivatives(which):
+    a, b = ends()
+    x = [ns.Float(a), ns.Float(b)]
+    dr.enable_grad(x[which])
+    dr.backward(dr.sum(linear_share(*x)))
+    got = dr.grad(x[which]).numpy()
+    assert np.all(np.isfinite(got))
+    a, b = a.astype(float), b.astype(float)
+    # One-sided differences of second order: densities are not negative.
+    h = 1e-4 * (np.minimum(np.maximum(a, np.sqrt(a + b)), a + b) if which == 0 else a + b)
+    at = lambda k: exact_linear_share(a + k * h * (which == 0), b + k * h * (which == 1))  # noqa: E731
+    want = (4 * at(1) - 3 * at(0) - at(2)) / (2 * h)
+    assert np.all(np.abs(got - want) <= 2e-4 * (np.abs(want) + at(0) / (a + b)))
+
+
+def test10_its_ends():
+    a = np.float32([0, 0, 1e-38, np.inf, 1, 1e30, 3e38, 0])
+    b = np.float32([0, 1e-38, 0, 1, np.inf, 1e30, 0, 3e38])
+    x, y = ns.Float(a), ns.Float(b)
+    dr.enable_grad(x, y)
+    share = linear_share(x, y)
+    dr.backward(dr.sum(share))
+    assert np.allclose(dr.detach(share).numpy(), [0.5, 0.5, 0.5, 0, 0, 0, 0, 0], atol=1e-8)
+    assert np.all(np.isfinite(dr.grad(x).numpy())) and np.all(np.isfinite(dr.grad(y).numpy()))

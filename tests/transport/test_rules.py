@@ -28,8 +28,7 @@ def test01_linear_share(first, last):
     tau, expected = linear_moments(first, last)
     assert np.isclose(tau, (first + last) / 2, rtol=1e-6)
     got = linear_share(ns.Float(first), ns.Float(last)).numpy()[0]
-    # Eight sub-steps: good to a fortieth of the step also where all is absorbed in one of them.
-    assert abs(got - expected) < 0.025
+    assert abs(got - expected) < 1e-5
 
 
 @pytest.mark.parametrize("first, last, length", [(1, 1, 1), (0, 2, 1), (2, 0, 3), (1, 9, 0.1), (5, 1e-3, 1)])
