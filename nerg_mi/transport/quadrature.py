@@ -86,7 +86,7 @@ def linear_share(first, last):
 
     # ∫ exp(-τ) from where density is σ to infinity, along the line with the step's slope, is the tail of σ.
     # Where density is nearly constant both have the same series, and Dawson's is smooth there in its slope.
-    rises = ~thin & (slope > 4e-3 * first * first)
+    rises = ~thin & (slope > 1e-3 * first * first)
     falls = ~thin & ~rises
     tau = 0.5 * dr.select(thin, 1, total)
     passed = dr.exp(-tau)
