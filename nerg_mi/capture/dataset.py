@@ -7,71 +7,119 @@ from pathlib import Path
 import numpy as np
 
 from ..field.box import Box
-from ..formats.transforms import Transforms, find_transforms, read_transforms
-from .bounds import scene_box
-from .images import View, describe_missing, load_views, split_holdout
+from ..formats.posed import PosedImages, Unused
+from .bounds import lonely, scene_box
+from .cameras import pixel_directions
+from .images import View, load_usable
+from .sources import read_split
 
 # A surface on a face of the box needs cells behind it: rays end at the box, and a half step before it nothing can absorb.
 _PAD = 1 / 80
+# Of each view's depth, at most so many points help to find the box.
+_DEPTH_POINTS = 2000
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """``train``, ``held_out``: views in the data set's own coordinates; ``box``: where density may be, and ``box_from``
-    how that was found; ``missing``: a sentence about listed images that do not exist, or None; ``source``: for
-    provenance."""
+    """``train``, ``held_out``: views in the coordinates asked for; ``box``: where density may be, and ``box_from``
+    how that was found; ``unused``: frames that were left out, each with its reason; ``source``: for provenance;
+    ``notes``: sentences about frames that are used with something missing; ``unit``: a sentence on the length of a unit."""
 
     train: list[View]
     held_out: list[View]
     box: Box
     box_from: str
-    missing: str | None
+    unused: list[Unused]
     source: dict
+    notes: list[str] | tuple = ()
+    unit: str = ""
 
 
 def open_dataset(
     path: str | Path, holdout: int | None = None, width: int | None = None, downscale: float | None = None,
-    aabb: tuple | None = None, depth: bool = True,
+    aabb: tuple | None = None, depth: bool = True, scale: float = 1.0, coordinates: str = "file",
 ) -> Dataset:
-    """Read the data set ``path`` (a folder or its transforms file).
+    """Read the data set ``path``: a folder with a transforms file or a COLMAP model, or one of these itself.
 
-    ``holdout``: hold out every so many frames, 0 none; None holds out the frames of a ``transforms_test.json`` beside
-    the file, all others training, or every 8th where there is none. ``width``, ``downscale``: size of the
-    pictures. ``aabb``: six numbers x0, y0, z0, x1, y1, z1 bounding what is seen; else "aabb" of the file, else
-    a guess from the cameras. ``depth``: read the depth files that the frames name.
+    ``holdout``, ``coordinates``, ``scale``: as `read_split` has them. ``width``, ``downscale``: size of the
+    pictures. ``aabb``: six numbers x0, y0, z0, x1, y1, z1 bounding what is seen, in the coordinates asked for; else "aabb"
+    of the file, else a guess from points on surfaces (COLMAP's, or from depth) or from the cameras. ``depth``: read
+    the depth files that the frames name.
+
+    Frames that cannot be used are left out and listed; ``ValueError``, naming file and frame, when none can.
     """
-    transforms = read_transforms(find_transforms(path))
-    test = transforms.path.with_name("transforms_test.json")
-    own_test = holdout is None and test.is_file() and test != transforms.path
-    if own_test:
-        frames, held, how = transforms.frames, read_transforms(test).frames, test.name
-    else:
-        every = 8 if holdout is None else holdout
-        frames, held = split_holdout(transforms.frames, every)
-        how = f"every {every}th frame" if every else "none"
-    train = load_views(frames, width, downscale, depth)
-    box, box_from = _box(transforms, train, aabb)
+    split = read_split(path, holdout, coordinates, scale)
+    train, bad = load_usable(split.posed.frames, width, downscale, depth)
+    if not train:
+        raise ValueError(f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '
+                         f'"{bad[0].name}": {bad[0].reason}')
+    held_out, bad_held = load_usable(split.held_out, width, downscale, depth)
+    box, box_from = _box(split.posed, train, aabb)
+    alone = lonely([v.camera for v in train], box) if len(train) > 1 else []
+    if len(alone) == len(train):
+        raise ValueError(
+            f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") look at the '
+            f"same place within the box {_corners(box)}; check the poses, or give a box that holds what they show with --aabb"
+        )
+    if alone:
+        bad += [Unused(train[k].name, "no other frame looks at what it shows") for k in alone]
+        train = [v for k, v in enumerate(train) if k not in set(alone)]
+        box, box_from = _box(split.posed, train, aabb)
+    unused = [*split.posed.unused, *bad, *bad_held]
     source = {
-        "dataset": transforms.path.resolve().parent.name,
-        "transforms": transforms.path.name,
-        "sha256": transforms.sha256,
-        "training_frames": len(frames),
-        "held_out": {"how": how, "frames": [f.name for f in held]},
-        "width": train[0].color.shape[1],
-        "height": train[0].color.shape[0],
+        "dataset": split.posed.path.resolve().parent.name,
+        "transforms": split.posed.path.name,
+        "sha256": split.posed.sha256,
+        "training_frames": len(train),
+        "held_out": {"how": split.how, "frames": [v.name for v in held_out]},
+        "unused": {u.name: u.reason for u in unused},
+        "width": train[0].shape[1],
+        "height": train[0].shape[0],
+        "to_file": split.posed.to_file.tolist(),
     }
-    return Dataset(train, load_views(held, width, downscale, depth), box, box_from, describe_missing(transforms), source)
+    return Dataset(train, held_out, box, box_from, unused, source, split.posed.notes, _unit(split.posed, train, box, scale))
 
 
-def _box(transforms: Transforms, views: list[View], aabb) -> tuple[Box, str]:
+def _box(posed: PosedImages, views: list[View], aabb) -> tuple[Box, str]:
     if aabb is not None:
         if len(aabb) != 6:
             raise ValueError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
         given, how = np.reshape(np.asarray(aabb, float), (2, 3)), "as given"
-    elif transforms.aabb is not None:
-        given, how = transforms.aabb, f'"aabb" of {transforms.path.name}'
+    elif posed.aabb is not None:
+        given, how = posed.aabb, f'"aabb" of {posed.path.name}'
     else:
-        return scene_box([v.camera for v in views], object_only=all(v.has_alpha for v in views))
+        points = posed.points if posed.points is not None else _depth_points(views)
+        return scene_box([v.camera for v in views], all(v.has_alpha for v in views), points)
     tight = Box(tuple(given[0]), tuple(given[1]))
     pad = _PAD * tight.side
     return Box(tuple(given[0] - pad), tuple(given[1] + pad)), f"{how}, grown by {pad:.3g} on every side"
+
+
+def _depth_points(views: list[View]) -> np.ndarray | None:
+    """World points that views with depth see, evenly over their pixels; None where a view has no depth."""
+    if not all(v.depth is not None for v in views):
+        return None
+    points = []
+    for view in views:
+        step = max(1, int(np.sqrt(view.depth.size / _DEPTH_POINTS)))
+        t = view.depth[::step, ::step]
+        d = pixel_directions(view.camera.intrinsics)[::step, ::step][t > 0] @ view.camera.to_world[:3, :3].T
+        points.append(view.camera.center + d * t[t > 0][:, None])
+    return np.concatenate(points)
+
+
+def _corners(box: Box) -> str:
+    return " to ".join("(" + ", ".join(f"{x:.3g}" for x in c) + ")" for c in (box.lower, box.upper))
+
+
+def _unit(posed: PosedImages, views: list[View], box: Box, scale: float) -> str:
+    """What is known of the length of a unit."""
+    centers = np.array([v.camera.center for v in views])
+    size = " x ".join(f"{u - l:.3g}" for l, u in zip(box.lower, box.upper))
+    spread = " x ".join(f"{x:.3g}" for x in np.ptp(centers, axis=0))
+    said = f"the box measures {size} units, the cameras spread over {spread}"
+    if scale != 1:
+        return f"{said}; a unit of the data set counts {scale:g}"
+    if any(f.depth is not None and f.depth.along_axis and f.depth.path.suffix.lower() == ".png" for f in posed.frames):
+        return f"{said}; a unit is a metre if the depth files count millimetres"
+    return f"{said}; if a unit is not a metre, give its length in metres with --scale"

@@ -2,38 +2,54 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from ..formats.transforms import Frame, Transforms
-from .cameras import Camera
+from ..formats.posed import Frame, Unused
+from . import lens
+from .cameras import Camera, pixel_directions, pixel_grid
+from .reading import read_depth, read_image, read_mask
+from .resize import all_used, area_average, nearest
 
 
 @dataclass(frozen=True)
 class View:
     """One picture with its camera.
 
-    ``color``: (h, w, 3) or (h, w, 4) float32, sRGB as stored, alpha straight (not premultiplied);
-    ``depth``: (h, w) float32 distance along each pixel's ray in scene units, 0 where unknown, or None.
+    ``pixels``: (h, w, 3) or (h, w, 4), sRGB as stored, alpha straight (not premultiplied): uint8, uint16 or floats in
+    0..1; ``depth``: (h, w) float32 distance along each pixel's ray in scene units, 0 where unknown, or None;
+    ``mask``: (h, w) bool, the pixels that count, or None for all.
     """
 
     name: str
     camera: Camera
-    color: np.ndarray
+    pixels: np.ndarray
     depth: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.pixels.shape[:2]
+
+    @property
+    def color(self) -> np.ndarray:
+        """The pixels as float32 in 0..1; made anew at every call."""
+        if self.pixels.dtype in (np.uint8, np.uint16):
+            return self.pixels.astype(np.float32) / np.iinfo(self.pixels.dtype).max
+        return self.pixels.astype(np.float32, copy=False)
 
     @property
     def has_alpha(self) -> bool:
-        return self.color.shape[2] == 4
+        return self.pixels.shape[2] == 4
 
     def over(self, background: float) -> np.ndarray:
-        """The picture (h, w, 3) before a grey ``background``."""
-        rgb = self.color[..., :3]
+        """The picture (h, w, 3), float32, before a grey ``background``."""
+        color = self.color
         if not self.has_alpha:
-            return rgb
-        alpha = self.color[..., 3:]
-        return rgb * alpha + (1 - alpha) * background
+            return color
+        alpha = color[..., 3:]
+        return color[..., :3] * alpha + (1 - alpha) * background
 
 
 def split_holdout(frames: list[Frame], every: int) -> tuple[list[Frame], list[Frame]]:
@@ -50,117 +66,71 @@ def split_holdout(frames: list[Frame], every: int) -> tuple[list[Frame], list[Fr
     return train, held
 
 
-def load_views(
+def load_usable(
     frames: list[Frame], width: int | None = None, downscale: float | None = None, depth: bool = False
-) -> list[View]:
-    """Load ``frames`` at their own size, at ``width`` pixels, or divided by ``downscale``.
+) -> tuple[list[View], list[Unused]]:
+    """`load_view` of all ``frames``, and those for which it failed."""
+    check_size(width, downscale)
+    views, unused = [], []
+    for frame in frames:
+        try:
+            views.append(load_view(frame, width, downscale, depth))
+        except ValueError as e:
+            unused.append(Unused(frame.name, str(e)))
+    return views, unused
 
-    Pictures are averaged over the area of the new pixels, on their stored (sRGB) values, as other
-    trainers do; depth takes the value nearest to each new pixel's centre. ``depth``: read depth files.
-    """
+
+def check_size(width: int | None, downscale: float | None) -> None:
+    """``ValueError`` for sizes that no picture can have."""
     if width is not None and downscale is not None:
         raise ValueError("give either width or downscale, not both")
     if width is not None and width < 1:
         raise ValueError(f"width must be at least 1 pixel, got {width}")
-    if downscale is not None and downscale < 1:
+    if downscale is not None and not downscale >= 1:
         raise ValueError(f"downscale must be at least 1, got {downscale}")
-    views = []
-    for frame in frames:
-        color = read_image(frame.image)
-        h, w = color.shape[:2]
-        lens = frame.intrinsics(w, h)
-        factor = w / width if width is not None else downscale or 1.0
-        if factor < 1:
-            raise ValueError(f'the image "{frame.image}" is only {w} pixels wide; choose a width of at most {w}')
-        size = max(1, round(w / factor)), max(1, round(h / factor))
-        distance = read_depth(frame.depth, (h, w)) if depth and frame.depth is not None else None
-        if size != (w, h):
-            color = _resize(color, *size)
-            if distance is not None:
-                distance = _nearest(distance, *size)
-        views.append(View(frame.name, Camera(lens.resized(*size), frame.to_world), color, distance))
-    return views
 
 
-def read_image(path: str | Path) -> np.ndarray:
-    """The image (h, w, 3 or 4), float32, sRGB in 0..1; linear files (EXR) are converted."""
-    import mitsuba as mi
+def load_view(frame: Frame, width: int | None = None, downscale: float | None = None, depth: bool = False) -> View:
+    """Load ``frame`` at its own size, at ``width`` pixels, or divided by ``downscale``.
 
-    try:
-        bitmap = mi.Bitmap(str(path))
-    except RuntimeError as e:
-        raise ValueError(f'the image "{path}" cannot be read: {str(e).strip().splitlines()[-1]}') from e
-    alpha = bitmap.has_alpha()
-    formats = (mi.Bitmap.PixelFormat.RGB, mi.Bitmap.PixelFormat.RGBA)
-    most = {mi.Struct.Type.UInt8: 255, mi.Struct.Type.UInt16: 65535}.get(bitmap.component_format())
-    if most is not None and bitmap.srgb_gamma() and bitmap.pixel_format() in formats:
-        # The usual case needs no conversion, which Mitsuba would make by way of linear values.
-        out = np.array(bitmap).astype(np.float32) / most
-    else:
-        pixels = formats[alpha]
-        out = np.array(bitmap.convert(pixels, mi.Struct.Type.Float32, srgb_gamma=True), np.float32)
-    if not np.all(np.isfinite(out)):
-        raise ValueError(f'the image "{path}" holds values that are not finite')
-    return np.clip(out, 0, 1)
-
-
-def read_depth(path: str | Path, shape: tuple[int, int]) -> np.ndarray:
-    """Distances along the rays (h, w) in scene units from ``.npy`` or ``.exr`` (first channel); 0: unknown."""
-    path = Path(path)
-    if path.suffix == ".npy":
-        out = np.load(path, allow_pickle=False)
-    elif path.suffix == ".exr":
-        import mitsuba as mi
-
-        out = np.array(mi.Bitmap(str(path)).convert(component_format=mi.Struct.Type.Float32))
-        out = out[..., 0] if out.ndim == 3 else out
-    else:
-        raise ValueError(f'the depth file "{path}" must be .npy or .exr, holding distances along the rays')
-    out = np.asarray(out, np.float32)
-    if out.shape != shape:
-        raise ValueError(f'the depth file "{path}" has shape {out.shape} but its image is {shape} (height, width)')
-    return np.where(np.isfinite(out) & (out > 0), out, 0).astype(np.float32)
+    Pictures are averaged over the area of the new pixels, on their stored (sRGB) values, as other
+    trainers do; depth takes the value nearest to each new pixel's centre; a pixel counts where all that it covers is
+    on in the mask. ``depth``: read depth files. ``ValueError`` names the file that cannot be used.
+    """
+    check_size(width, downscale)
+    pixels = read_image(frame.image)
+    h, w = pixels.shape[:2]
+    stated = frame.intrinsics(w, h)
+    factor = w / width if width is not None else downscale or 1.0
+    if factor < 1:
+        raise ValueError(f'the image "{frame.image}" is only {w} pixels wide; choose a width of at most {w}')
+    size = max(1, round(w / factor)), max(1, round(h / factor))
+    intrinsics = stated.resized(*size)
+    # Every pixel must have a ray; the borders are where lenses fold over.
+    pixel_directions(stated.resized(*(min(n, 48) for n in (w, h))))
+    mask = None if frame.mask is None else all_used(read_mask(frame.mask, (h, w)), *size)
+    if intrinsics.fisheye:
+        shown = np.linalg.norm(pixel_grid(intrinsics), axis=-1) < lens.fisheye_limit(intrinsics)[1]
+        mask = mask if shown.all() else shown if mask is None else mask & shown
+    if mask is not None and not mask.any():
+        raise ValueError("its mask leaves out every pixel")
+    distance = _distances(frame, (h, w), intrinsics) if depth and frame.depth is not None else None
+    if size != (w, h):
+        pixels = area_average(View(frame.name, None, pixels).color, *size)
+    if pixels.dtype == np.float32:
+        # 16 bits tell more than the photo and take half the room.
+        pixels = np.round(pixels * 65535).astype(np.uint16)
+    return View(frame.name, Camera(intrinsics, frame.to_world), pixels, distance, mask)
 
 
-def _overlap(old: int, new: int):
-    """Sparse matrix (new, old): the share that each old pixel has in each new one."""
-    from scipy.sparse import csr_array
-
-    edges = np.arange(new + 1) * (old / new)
-    reach = int(np.ceil(old / new)) + 1
-    pixel = np.floor(edges[:-1, None] + 1e-9).astype(int) + np.arange(reach)
-    share = np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel)
-    share = np.clip(share, 0, None) * (pixel < old) * (new / old)
-    rows = np.repeat(np.arange(new), reach)
-    return csr_array((share.ravel().astype(np.float32), (rows, np.minimum(pixel, old - 1).ravel())), shape=(new, old))
-
-
-def _resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Area average of ``image`` (h, w, c); colours count by their alpha where there is one."""
-    h, w, c = image.shape
-    if c == 4:
-        image = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], axis=2)
-    out = (_overlap(h, height) @ image.reshape(h, w * c)).reshape(height, w, c)
-    out = out.transpose(1, 0, 2).reshape(w, height * c)
-    out = (_overlap(w, width) @ out).reshape(width, height, c).transpose(1, 0, 2)
-    if c == 4:
-        alpha = out[..., 3:]
-        color = np.where(alpha > 0, out[..., :3] / np.where(alpha > 0, alpha, 1), 0)
-        out = np.concatenate([color, alpha], axis=2)
-    return np.ascontiguousarray(np.clip(out, 0, 1), np.float32)
-
-
-def _nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
-    h, w = values.shape
-    y = ((np.arange(height) + 0.5) * h / height).astype(int)
-    x = ((np.arange(width) + 0.5) * w / width).astype(int)
-    return values[np.ix_(y, x)]
-
-
-def describe_missing(transforms: Transforms, most: int = 5) -> str | None:
-    """A sentence naming the listed images that do not exist, or None."""
-    if not transforms.missing:
-        return None
-    names = ", ".join(transforms.missing[:most]) + (", ..." if len(transforms.missing) > most else "")
-    total = len(transforms.missing) + len(transforms.frames)
-    return f"{len(transforms.missing)} of the {total} images that {transforms.path.name} lists do not exist: {names}"
+def _distances(frame: Frame, shape: tuple[int, int], intrinsics) -> np.ndarray:
+    """Distances along the rays of the resized picture; depth cameras may have fewer pixels than the photo."""
+    out, (h, w) = read_depth(frame.depth), shape
+    if abs(out.shape[1] * h - out.shape[0] * w) > 0.01 * w * out.shape[0]:
+        raise ValueError(f'the depth file "{frame.depth.path}" has {out.shape[1]} x {out.shape[0]} pixels, which is not the '
+                         f"shape of its image, {w} x {h}")
+    out = nearest(out, intrinsics.width, intrinsics.height)
+    if frame.depth.along_axis:
+        ahead = -pixel_directions(intrinsics)[..., 2]
+        out = np.where(ahead > 1e-3, out / np.maximum(ahead, 1e-3), 0).astype(np.float32)
+    return np.ascontiguousarray(out)

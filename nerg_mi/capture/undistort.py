@@ -93,8 +93,7 @@ def _forward(intrinsics: Intrinsics) -> np.ndarray:
 
 
 def _own_mask(view: View) -> np.ndarray:
-    mask = getattr(view, "mask", None)
-    return np.ones(view.color.shape[:2], bool) if mask is None else mask
+    return np.ones(view.shape, bool) if view.mask is None else view.mask
 
 
 def _unfolded(at: np.ndarray, plain: Intrinsics, i: Intrinsics, inside: np.ndarray) -> np.ndarray:

@@ -25,6 +25,10 @@ def train_radiance(
     minutes: Annotated[Optional[float], typer.Option(help="Train for this long. Default: 5.")] = None,
     steps: Annotated[Optional[int], typer.Option(help="Or: train for so many steps.")] = None,
     aabb: Annotated[Optional[str], typer.Option(help="Bounds of what is seen: x0,y0,z0,x1,y1,z1.")] = None,
+    scale: Annotated[float, typer.Option(help="Multiply all lengths by this: what a unit of the data set measures, in metres.")] = 1.0,
+    coordinates: Annotated[
+        str, typer.Option(help="Of the field: file, original (applied_transform undone), or a dataparser_transforms.json.")
+    ] = "file",
     seed: Annotated[int, typer.Option(help="Seed of the weights, rays and jitter.")] = 0,
     threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store the weights in fp16.")] = False,
@@ -46,12 +50,13 @@ def train_radiance(
     if minutes is None and steps is None:
         minutes = 5.0
     settings = RadianceSettings(steps=steps, minutes=minutes, seed=seed)
-    data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth)
+    data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth, scale, coordinates)
     config = sized_config(size, data.box)
-    if data.missing:
-        typer.echo(data.missing)
+    for line in (*data.unused, *data.notes):
+        typer.echo(line)
     show = lambda corner: ", ".join(f"{x:.3g}" for x in corner)
     typer.echo(f"box: ({show(data.box.lower)}) to ({show(data.box.upper)}), {data.box_from}")
+    typer.echo(data.unit)
     typer.echo(f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
                f"{data.source['width']} x {data.source['height']} pixels")
     with _Bar() as bar:
@@ -67,7 +72,7 @@ def _numbers(text: str | None) -> tuple | None:
     if text is None:
         return None
     try:
-        return tuple(float(x) for x in text.split(","))
+        return tuple(float(x) for x in text.replace(",", " ").split())
     except ValueError as e:
         raise ValueError(f'--aabb needs numbers x0,y0,z0,x1,y1,z1, got "{text}"') from e
 

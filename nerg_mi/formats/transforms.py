@@ -1,125 +1,99 @@
 """Posed image sets as instant-ngp, nerfstudio and the Blender NeRF scenes write them: ``transforms.json``.
 
-Poses are OpenGL camera-to-world matrices (x right, y up, z back) in the data set's own
-coordinates and units; nothing is re-centred, scaled or turned here.
+What differs between the three, and how it is read:
+
+- depth: nerfstudio's ``depth_file_path`` and instant-ngp's ``depth_path``. 16-bit PNG counts millimetres
+  (or ``depth_unit_scale_factor``, or ``integer_depth_scale``, scene units a step) along the viewing axis; NPY and
+  EXR hold scene units along each pixel's ray. ``is_euclidean_depth`` in the file says true (ray) or false (axis) for all.
+- masks: ``mask_path``, black left out; instant-ngp's ``dynamic_mask_NAME.png`` beside the image, white left out.
+- ``applied_transform``, ``applied_scale``: what the writer did to the original coordinates; `PosedImages.original` undoes
+  it. ``dataparser_transforms.json``: from there to the coordinates that nerfstudio trained in.
 """
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from .intrinsics import Intrinsics
+from .posed import LENS_KEYS, DepthFile, Frame, MaskFile, PosedImages, Unused, drop_repeated, none_usable, rigid_pose
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG")
-# Keys that may stand at the top of the file or in a frame, the frame's own counting.
-_LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "camera_angle_x", "camera_angle_y")
-_UNKNOWN_LENSES = ("k3", "k4", "k5", "k6")
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One posed image. ``name``: its path as the file spells it; ``to_world``: (4, 4) OpenGL
-    camera-to-world; ``depth``: file of distances along the rays, or None; ``lens``: its camera keys."""
-
-    name: str
-    image: Path
-    depth: Path | None
-    to_world: np.ndarray
-    lens: dict
-
-    def intrinsics(self, width: int, height: int) -> Intrinsics:
-        """Intrinsics for this frame's image, whose file has ``width`` x ``height`` pixels.
-
-        Focal lengths in pixels (``fl_x``) are preferred to angles, which some writers round.
-        Raises ``ValueError`` when the file gives neither, or another shape than the image's.
-        """
-        lens = self.lens
-        w, h = lens.get("w", width), lens.get("h", height)
-        if abs(w * height - h * width) > 0.01 * h * width:
-            raise ValueError(
-                f'the image "{self.image}" has {width} x {height} pixels but its transforms file says {w:g} x {h:g}; '
-                'correct "w" and "h", or the image'
-            )
-        fx, fy = lens.get("fl_x"), lens.get("fl_y")
-        if fx is None and "camera_angle_x" in lens:
-            fx = w / (2 * np.tan(lens["camera_angle_x"] / 2))
-        if fy is None and "camera_angle_y" in lens:
-            fy = h / (2 * np.tan(lens["camera_angle_y"] / 2))
-        # One focal length means square pixels.
-        fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-        if fx is None or not (np.isfinite(fx) and fx > 0 and np.isfinite(fy) and fy > 0):
-            raise ValueError(
-                f'frame "{self.name}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in radians'
-            )
-        stated = Intrinsics(
-            w, h, float(fx), float(fy), lens.get("cx", w / 2), lens.get("cy", h / 2),
-            *(lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2")),
-        )
-        return stated.resized(width, height)
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
+_PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV")
+_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_MILLIMETRE = 1e-3
 
 
-@dataclass(frozen=True)
-class Transforms:
-    """What a transforms file says about the frames whose images exist, sorted by file name.
+def read_transforms(path: str | Path) -> PosedImages:
+    """Read a transforms file. Frames that cannot be used are listed, not fatal.
 
-    ``missing``: names of the listed images that do not exist; ``aabb``: (2, 3) scene box from the
-    file, or None; ``sha256``: of the file itself, for provenance.
+    Raises ``ValueError``, naming file and frame, for malformed JSON and when not a single frame can be used.
     """
-
-    path: Path
-    frames: list[Frame]
-    missing: list[str]
-    aabb: np.ndarray | None
-    sha256: str
-
-
-def find_transforms(dataset: str | Path) -> Path:
-    """The transforms file of ``dataset``, a folder or the file itself."""
-    dataset = Path(dataset)
-    if dataset.is_file():
-        return dataset
-    for name in ("transforms.json", "transforms_train.json"):
-        if (dataset / name).is_file():
-            return dataset / name
-    raise FileNotFoundError(
-        f'"{dataset}" holds neither transforms.json nor transforms_train.json; name the folder of a posed image set'
-    )
-
-
-def read_transforms(path: str | Path) -> Transforms:
-    """Read a transforms file. Images that do not exist are listed, not fatal.
-
-    Raises ``ValueError``, naming file and frame, for what cannot be used: malformed JSON, poses that
-    are not rigid, lenses of unknown models, or not a single existing image.
-    """
-    path = find_transforms(path)
+    path = Path(path)
     raw = path.read_bytes()
+    data = _json(path, raw)
+    if not isinstance(data.get("frames"), list):
+        raise ValueError(f'"{path}" is not a transforms file: it has no list "frames"')
+    original = _original(data, path)
+    # Millimetres are of the original coordinates.
+    metre = 1.0 if original is None else 1 / float(np.cbrt(np.linalg.det(original[:3, :3])))
+    frames, unused, notes = [], [], []
+    for index, entry in enumerate(data["frames"]):
+        name = entry.get("file_path") if isinstance(entry, dict) else None
+        if not isinstance(name, str):
+            unused.append(Unused(f"frame {index}", 'it has no "file_path"'))
+            continue
+        try:
+            frames.append(_frame({**data, **entry}, entry, path.parent, name, metre, notes))
+        except ValueError as e:
+            unused.append(Unused(name, str(e)))
+    frames.sort(key=lambda f: f.name)
+    frames, repeated = drop_repeated(frames)
+    unused = sorted(unused + repeated, key=lambda u: u.name)
+    if not frames:
+        raise none_usable(path, unused)
+    held_out, spare = _splits(data, frames)
+    return PosedImages(path, frames, unused, _aabb(data, path), hashlib.sha256(raw).hexdigest(), notes,
+                       held_out=held_out, spare=spare, original=original)
+
+
+def read_dataparser(path: str | Path) -> np.ndarray:
+    """The similarity (4, 4) of nerfstudio's ``dataparser_transforms.json``: original coordinates to trained ones."""
+    path = Path(path)
+    data = _json(path, path.read_bytes())
+    try:
+        m, scale = np.asarray(data["transform"], np.float64), float(data["scale"])
+    except (KeyError, TypeError, ValueError) as e:
+        raise ValueError(f'"{path}" needs "transform", 3 x 4 numbers, and "scale"') from e
+    if m.shape not in ((3, 4), (4, 4)) or not (np.all(np.isfinite(m)) and np.isfinite(scale) and scale > 0):
+        raise ValueError(f'"{path}" needs "transform", 3 x 4 finite numbers, and a positive "scale"')
+    return np.vstack([scale * m[:3], [0, 0, 0, 1]])
+
+
+def _json(path: Path, raw: bytes) -> dict:
     try:
         data = json.loads(raw)
     except ValueError as e:
         raise ValueError(f'"{path}" is not valid JSON: {e}') from e
-    if not isinstance(data, dict) or not isinstance(data.get("frames"), list):
-        raise ValueError(f'"{path}" is not a transforms file: it has no list "frames"')
+    if not isinstance(data, dict):
+        raise ValueError(f'"{path}" is not a transforms file: it holds no JSON object')
+    return data
 
-    frames, missing = [], []
-    for index, entry in enumerate(data["frames"]):
-        name = entry.get("file_path")
-        if not isinstance(name, str):
-            raise ValueError(f'frame {index} of "{path}" has no "file_path"')
-        image = _image_file(path.parent / name)
-        if image is None:
-            missing.append(name)
-            continue
-        frames.append(Frame(name, image, _depth_file(entry, path, name), _pose(entry, path, name),
-                            _lens({**data, **entry}, path, name)))
-    if not frames:
-        raise ValueError(f'none of the {len(missing)} images that "{path}" lists exists, the first being "{missing[:1]}"')
-    frames.sort(key=lambda f: f.name)
-    return Transforms(path, frames, sorted(missing), _aabb(data, path), hashlib.sha256(raw).hexdigest())
+
+def _frame(data: dict, entry: dict, folder: Path, name: str, metre: float, notes: list[str]) -> Frame:
+    """One frame; ``data``: its keys over those of the file."""
+    image = _image_file(folder / name)
+    if image is None:
+        raise ValueError("its image does not exist")
+    if "transform_matrix" not in entry:
+        raise ValueError('it has no "transform_matrix"')
+    pose, lens, mask = rigid_pose(entry["transform_matrix"]), _lens(data), _mask(entry, folder, image)
+    depth = _depth(data, entry, folder, metre)
+    if depth is not None and not depth.path.is_file():
+        notes.append(f'"{name}" is used without depth: its depth file "{depth.path}" does not exist')
+        depth = None
+    return Frame(name, image, pose, lens, depth, mask)
 
 
 def _image_file(path: Path) -> Path | None:
@@ -130,53 +104,86 @@ def _image_file(path: Path) -> Path | None:
     return None
 
 
-def _depth_file(entry: dict, path: Path, name: str) -> Path | None:
-    if "depth_file_path" not in entry:
+def _mask(entry: dict, folder: Path, image: Path) -> MaskFile | None:
+    if entry.get("mask_path") is not None:
+        mask = folder / entry["mask_path"]
+        if not mask.is_file():
+            raise ValueError(f'its mask "{entry["mask_path"]}" does not exist; restore it, or remove its "mask_path"')
+        return MaskFile(mask)
+    dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
+    return MaskFile(dynamic, hides=True) if dynamic.is_file() else None
+
+
+def _depth(data: dict, entry: dict, folder: Path, metre: float) -> DepthFile | None:
+    name = entry.get("depth_file_path", entry.get("depth_path"))
+    if name is None:
         return None
-    depth = path.parent / entry["depth_file_path"]
-    if not depth.is_file():
-        raise ValueError(
-            f'the depth file "{entry["depth_file_path"]}" of frame "{name}" in "{path}" does not exist; '
-            'restore it, or remove its "depth_file_path"'
-        )
-    return depth
+    path = folder / name
+    counted = path.suffix.lower() == ".png"
+    unit, axis = (_MILLIMETRE * metre, True) if counted else (1.0, False)
+    if counted and data.get("depth_unit_scale_factor") is not None:
+        unit = _number(data, "depth_unit_scale_factor") * metre
+    elif counted and data.get("integer_depth_scale") is not None:
+        unit = _number(data, "integer_depth_scale")
+    if not unit > 0:
+        raise ValueError("the unit of its depth file is not positive")
+    if data.get("is_euclidean_depth") is not None:
+        axis = not data["is_euclidean_depth"]
+    return DepthFile(path, unit, axis)
 
 
-def _pose(entry: dict, path: Path, name: str) -> np.ndarray:
-    where = f'frame "{name}" of "{path}"'
+def _number(data: dict, key: str) -> float:
     try:
-        pose = np.asarray(entry["transform_matrix"], np.float64)
-    except (KeyError, TypeError, ValueError) as e:
-        raise ValueError(f'{where} needs a "transform_matrix" of 4 x 4 numbers') from e
-    if pose.shape == (3, 4):
-        pose = np.vstack([pose, [0, 0, 0, 1]])
-    if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
-        raise ValueError(f'{where} needs a "transform_matrix" of 4 x 4 finite numbers')
-    rotation = pose[:3, :3]
-    scale = np.cbrt(np.linalg.det(rotation))
-    if scale <= 0 or np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() > 1e-2:
-        raise ValueError(f"the pose of {where} is not a rotation and a translation (mirrored, sheared or singular)")
-    # Some writers leave a scale in the rotation, or round it: the nearest rotation is what they meant.
-    u, _, vt = np.linalg.svd(rotation)
-    pose = pose.copy()
-    pose[:3, :3] = u @ vt
-    return pose
+        return float(data[key])
+    except (TypeError, ValueError) as e:
+        raise ValueError(f'its "{key}" is not a number') from e
 
 
-def _lens(data: dict, path: Path, name: str) -> dict:
+def _lens(data: dict) -> dict:
     model = data.get("camera_model", "OPENCV")
-    unknown = [k for k in _UNKNOWN_LENSES if data.get(k)]
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") or data.get("is_fisheye") or unknown:
-        said = f"coefficients {', '.join(unknown)}" if unknown else f'"{"fisheye" if data.get("is_fisheye") else model}"'
-        raise ValueError(
-            f'frame "{name}" of "{path}" has a lens of unsupported model ({said}); undistort the images to '
-            '"OPENCV" with k1, k2, p1, p2 or to "PINHOLE"'
-        )
-    lens = {}
-    for key in _LENS_KEYS:
-        if data.get(key) is not None:
-            lens[key] = float(data[key])
-    return lens
+    fisheye = bool(data.get("is_fisheye")) or model in _FISHEYE
+    if model not in _PINHOLE + _FISHEYE or data.get("is_equirectangular") or any(str(k).startswith("ftheta") for k in data):
+        raise ValueError(f'its lens model "{model}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, p2, '
+                         'to "OPENCV_FISHEYE" with k1 to k4, or to "PINHOLE"')
+    lens = {k: _number(data, k) for k in LENS_KEYS if k != "fisheye" and data.get(k) is not None}
+    if not all(np.isfinite(v) for v in lens.values()):
+        raise ValueError("its intrinsics are not finite")
+    if not fisheye and model != "FULL_OPENCV" and any(lens.get(k) for k in ("k4", "k5", "k6")):
+        raise ValueError('its k4, k5, k6 mean different things to different programs; name "camera_model": "FULL_OPENCV" if '
+                         "they are OpenCV's rational model, or undistort the images")
+    return {**lens, "fisheye": 1.0} if fisheye else lens
+
+
+def _original(data: dict, path: Path) -> np.ndarray | None:
+    """Similarity from the file's coordinates to the original ones; None where the file does not tell."""
+    if data.get("applied_transform") is None and data.get("applied_scale") is None:
+        return None
+    try:
+        m = np.asarray(data.get("applied_transform", np.eye(4)), np.float64)
+        scale = float(data.get("applied_scale", 1.0))
+        applied = np.vstack([scale * m[:3], [0, 0, 0, 1]])
+        shape = m.shape in ((3, 4), (4, 4))
+        rigid = shape and np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() < 1e-3 and np.linalg.det(m[:3, :3]) > 0
+    except (TypeError, ValueError):
+        rigid, scale = False, 0.0
+    if not rigid or not scale > 0:
+        raise ValueError(f'"applied_transform" of "{path}" must be a rotation and a translation, 3 x 4 numbers, and '
+                         '"applied_scale" positive')
+    return np.linalg.inv(applied)
+
+
+def _splits(data: dict, frames: list[Frame]) -> tuple[list[str] | None, list[str]]:
+    """Held-out and spare frames by nerfstudio's lists of file names."""
+    listed = {k: {Path(x).as_posix() for x in data[f"{k}_filenames"]}
+              for k in ("train", "val", "test") if isinstance(data.get(f"{k}_filenames"), list)}
+    if not listed:
+        return None, []
+    test = listed.get("test") or listed.get("val", set())
+    train = listed.get("train")
+    held = [f.name for f in frames if Path(f.name).as_posix() in test]
+    spare = [f.name for f in frames
+             if f.name not in held and train is not None and Path(f.name).as_posix() not in train]
+    return held, spare
 
 
 def _aabb(data: dict, path: Path) -> np.ndarray | None:

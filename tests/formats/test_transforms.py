@@ -4,21 +4,22 @@ import json
 import numpy as np
 import pytest
 
-from nerg_mi.formats.transforms import read_transforms
+from nerg_mi.formats.posed import DepthFile, MaskFile
+from nerg_mi.formats.transforms import read_dataparser, read_transforms
 
 POSE = np.eye(4).tolist()
 
 
 @pytest.fixture
 def write(tmp_path):
-    """`write(content, images)`: a transforms file beside empty files of the names given."""
+    """`write(content, images)`: a transforms file beside empty files of the names given; its path."""
 
     def make(content, images=("b.png", "a.png"), name="transforms.json"):
         for image in images:
             (tmp_path / image).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / image).write_bytes(b"")
         (tmp_path / name).write_text(json.dumps(content))
-        return tmp_path
+        return tmp_path / name
 
     return make
 
@@ -38,20 +39,29 @@ def test_shared_intrinsics_prefer_the_focal_length(write):
 
 
 def test_intrinsics_of_a_frame_overrule_shared_ones(write):
-    t = read_transforms(write({"fl_x": 30.0, "frames": [frame("a.png", fl_x=40.0), frame("b.png")]}))
+    t = read_transforms(write({"fl_x": 30.0, "k1": 0.1, "frames": [frame("a.png", fl_x=40.0, k1=0.0), frame("b.png")]}))
     assert [f.intrinsics(8, 8).fx for f in t.frames] == [40.0, 30.0]
+    assert [f.intrinsics(8, 8).k1 for f in t.frames] == [0.0, 0.1]
+
+
+@pytest.mark.parametrize("keys", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_fisheyes_of_nerfstudio_and_instant_ngp(write, keys):
+    i = read_transforms(write({"fl_x": 3.0, "k1": 0.1, "k4": 0.01, **keys, "frames": [frame("a.png")]})).frames[0].intrinsics(8, 8)
+    assert i.fisheye and (i.k1, i.k4) == (0.1, 0.01)
+
+
+def test_rational_lens_only_where_it_is_named(write):
+    content = {"fl_x": 3.0, "k4": 0.2, "frames": [frame("a.png")]}
+    with pytest.raises(ValueError, match="FULL_OPENCV"):
+        read_transforms(write(content))
+    assert read_transforms(write({**content, "camera_model": "FULL_OPENCV"})).frames[0].intrinsics(8, 8).k4 == 0.2
 
 
 def test_blender_style(write):
-    folder = write({"camera_angle_x": np.pi / 2, "frames": [frame("./train/r_0")]}, ["train/r_0.png"], "transforms_train.json")
-    t = read_transforms(folder)
+    path = write({"camera_angle_x": np.pi / 2, "frames": [frame("./train/r_0")]}, ["train/r_0.png"], "transforms_train.json")
+    t = read_transforms(path)
     assert t.frames[0].image.name == "r_0.png"
     assert np.isclose(t.frames[0].intrinsics(800, 800).fx, 400)
-
-
-def test_missing_images_are_listed(write):
-    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png"), frame("gone.png")]}))
-    assert len(t.frames) == 1 and t.missing == ["gone.png"]
 
 
 def test_scene_box(write):
@@ -59,21 +69,83 @@ def test_scene_box(write):
     assert np.array_equal(read_transforms(write(content)).aabb, [[0, 0, 0], [1, 2, 3]])
 
 
-def mirrored():
-    return np.diag([-1.0, 1, 1, 1]).tolist()
+def test_masks_of_nerfstudio_and_instant_ngp(write):
+    path = write({"fl_x": 1.0, "frames": [frame("a.png", mask_path="m/a.png"), frame("b.jpg"), frame("c.png")]},
+                 ["a.png", "m/a.png", "b.jpg", "dynamic_mask_b.png", "c.png"])
+    folder = path.parent
+    assert [f.mask for f in read_transforms(path).frames] == \
+        [MaskFile(folder / "m/a.png"), MaskFile(folder / "dynamic_mask_b.png", hides=True), None]
+
+
+def test_units_and_kinds_of_depth(write):
+    images = ["a.png", "d.png", "d.npy", "d.exr"]
+
+    def depth(name, key="depth_file_path", **keys):
+        path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png", **{key: name})]}, images)
+        return read_transforms(path).frames[0].depth
+
+    folder = write({}).parent
+    assert depth("d.png") == DepthFile(folder / "d.png", 1e-3, True)
+    assert depth("d.png", "depth_path", integer_depth_scale=0.01) == DepthFile(folder / "d.png", 0.01, True)
+    assert depth("d.png", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
+    assert depth("d.npy") == DepthFile(folder / "d.npy", 1.0, False)
+    assert depth("d.exr", is_euclidean_depth=False) == DepthFile(folder / "d.exr", 1.0, True)
+
+
+def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
+    mirrored, sheared, transposed = np.diag([-1.0, 1, 1, 1]), np.eye(4), np.eye(4)
+    sheared[0, 1], transposed[3, :3] = 0.3, [1, 2, 3]
+    names = [f"{c}.png" for c in "abcdefghij"]
+    path = write({"fl_x": 1.0, "frames": [
+        frame("a.png"),
+        frame("b.png", transform_matrix=mirrored.tolist()),
+        frame("c.png", transform_matrix=sheared.tolist()),
+        frame("d.png", transform_matrix=transposed.tolist()),
+        frame("e.png", transform_matrix=[[float("nan")] * 4] * 4),
+        frame("f.png", mask_path="none.png"),
+        frame("./a.png"),
+        frame("g.png", camera_model="EQUIRECTANGULAR"),
+        {"file_path": "h.png"},
+        {"transform_matrix": POSE},
+        frame("gone.png"),
+        frame("i.png", fl_x="wide"),
+        frame("j.png", transform_matrix=[[1, 2], [3]]),
+    ]}, names)
+    t = read_transforms(path)
+    # The name that sorts first of the two spellings of one file is the one kept.
+    assert [f.name for f in t.frames] == ["./a.png"]
+    reasons = {u.name: u.reason for u in t.unused}
+    for name, part in {
+        "b.png": "mirrored", "c.png": "sheared", "d.png": "transposed", "e.png": "finite", "f.png": "none.png",
+        "a.png": "twice", "g.png": "EQUIRECTANGULAR", "h.png": "transform_matrix", "frame 9": "file_path",
+        "gone.png": "does not exist", "i.png": "fl_x", "j.png": "4 x 4",
+    }.items():
+        assert part in reasons.pop(name), name
+    assert not reasons
+
+
+def test_a_missing_depth_file_costs_the_depth_only(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", depth_file_path="d.npy")]}))
+    assert t.frames[0].depth is None and "a.png" in t.notes[0] and "d.npy" in t.notes[0]
+
+
+def test_a_scale_within_a_pose_is_taken_out(write):
+    scaled = np.diag([2.0, 2, 2, 1])
+    scaled[:3, 3] = 5
+    f = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", transform_matrix=scaled.tolist())]})).frames[0]
+    assert np.allclose(f.to_world[:3, :3], np.eye(3)) and np.allclose(f.to_world[:3, 3], 5)
 
 
 @pytest.mark.parametrize(
     "content, message",
     [
-        ({"frames": [frame("gone.png")], "fl_x": 1.0}, "gone.png"),
+        ({"frames": [frame("gone.png")], "fl_x": 1.0}, "gone.png.*does not exist"),
         ({"fl_x": 1.0}, '"frames"'),
+        ({"fl_x": 1.0, "frames": []}, "no frames"),
         ({"fl_x": 1.0, "frames": [{"transform_matrix": POSE}]}, "frame 0"),
-        ({"fl_x": 1.0, "frames": [{"file_path": "a.png"}]}, "a.png"),
-        ({"fl_x": 1.0, "frames": [{"file_path": "a.png", "transform_matrix": mirrored()}]}, "a.png.*mirrored"),
-        ({"fl_x": 1.0, "camera_model": "OPENCV_FISHEYE", "frames": [frame("a.png")]}, "OPENCV_FISHEYE"),
-        ({"fl_x": 1.0, "frames": [frame("a.png", depth_file_path="d.npy")]}, "d.npy"),
         ({"fl_x": 1.0, "aabb": [[0, 0, 0], [1, 0, 1]], "frames": [frame("a.png")]}, "aabb"),
+        ({"fl_x": 1.0, "applied_transform": [[1, 0], [2]], "frames": [frame("a.png")]}, "applied_transform"),
+        ({"fl_x": 1.0, "applied_scale": 0, "frames": [frame("a.png")]}, "applied_scale"),
     ],
 )
 def test_bad_files_are_named(write, content, message):
@@ -93,14 +165,51 @@ def test_bad_intrinsics_name_the_frame(write):
 def test_broken_json_is_named(tmp_path):
     (tmp_path / "transforms.json").write_text("{")
     with pytest.raises(ValueError, match="not valid JSON"):
-        read_transforms(tmp_path)
-    with pytest.raises(FileNotFoundError, match="neither"):
-        read_transforms(tmp_path / "nowhere")
+        read_transforms(tmp_path / "transforms.json")
+
+
+def test_original_coordinates_undo_what_was_applied(write):
+    """x_file = s (A x + t): a pose of the original goes there and comes back."""
+    turn, shift, s = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.array([1.0, 2, 3]), 2.5
+    pose = np.eye(4)
+    pose[:3, 3] = [4, 5, 6]
+    applied = np.eye(4)
+    applied[:3, :3], applied[:3, 3] = turn, s * (turn @ pose[:3, 3] + shift)
+    t = read_transforms(write({"fl_x": 1.0, "applied_transform": np.column_stack([turn, shift]).tolist(), "applied_scale": s,
+                               "aabb": [[0, 0, 0], [1, 2, 3]],
+                               "frames": [frame("a.png", transform_matrix=applied.tolist())]}))
+    back = t.moved(t.original)
+    assert np.allclose(back.frames[0].to_world, pose)
+    assert np.allclose(back.original, np.eye(4)) and np.allclose(back.to_file @ t.original, np.eye(4))
+    assert np.allclose(back.aabb[1] - back.aabb[0], np.array([2, 1, 3]) / s)
+
+
+def test_dataparser_transforms(tmp_path):
+    path = tmp_path / "dataparser_transforms.json"
+    path.write_text(json.dumps({"transform": [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], "scale": 0.5}))
+    assert np.allclose(read_dataparser(path) @ [1, 1, 1, 1], [0, 1.5, 2, 1])
+    path.write_text(json.dumps({"transform": [[0, -1, 0, 1]], "scale": 0.5}))
+    with pytest.raises(ValueError, match="dataparser_transforms.json"):
+        read_dataparser(path)
+
+
+def test_a_mirroring_change_of_coordinates_is_refused(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png")]}))
+    with pytest.raises(ValueError, match="mirroring"):
+        t.moved(np.diag([1.0, 1, -1, 1]))
+
+
+def test_nerfstudios_lists_of_files_split(write):
+    names = ["a.png", "b.png", "c.png", "d.png"]
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame(n) for n in names], "train_filenames": ["a.png", "./b.png"],
+                               "test_filenames": ["d.png"]}, names))
+    assert (t.held_out, t.spare) == (["d.png"], ["c.png"])
 
 
 def test_the_fox(recorded):
     """Real photos: 17 of the 67 listed images do not exist."""
-    t = read_transforms(recorded("fox"))
-    assert (len(t.frames), len(t.missing)) == (50, 17)
+    t = read_transforms(recorded("fox") / "transforms.json")
+    assert (len(t.frames), len(t.unused)) == (50, 17)
+    assert all(u.reason == "its image does not exist" for u in t.unused)
     i = t.frames[0].intrinsics(1080, 1920)
     assert (i.fx, i.fy, i.k2) == (1375.52, 1374.49, -0.0805099)

@@ -11,7 +11,7 @@ from nerg_mi.field.box import Box
 from nerg_mi.field.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.transforms import Intrinsics
+from nerg_mi.formats.intrinsics import Intrinsics
 from nerg_mi.training.losses import color_loss, composite, depth_loss
 from nerg_mi.training.model import density_color
 from nerg_mi.training.pixels import PixelBank
@@ -56,7 +56,7 @@ def dataset():
     rng = np.random.default_rng(0)
     centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
     views = [ball(looking_at_origin(2 * c / np.linalg.norm(c))) for c in centers]
-    return Dataset(views[4:], views[:4], BOX, "as given", None, {"dataset": "ball"})
+    return Dataset(views[4:], views[:4], BOX, "as given", [], {"dataset": "ball"})
 
 
 def settings(**changes):

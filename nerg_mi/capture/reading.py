@@ -1,0 +1,101 @@
+"""Pictures, depth and masks from files."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..formats.posed import DepthFile, MaskFile
+
+
+def read_image(path: str | Path) -> np.ndarray:
+    """The image (h, w, 3 or 4), sRGB with straight alpha: uint8 or uint16 as stored, else float32 in 0..1.
+
+    EXR is linear, with premultiplied alpha where it has any: it is made straight and converted, and what is
+    brighter than white is clipped. Raises ``ValueError``, naming the file, for what cannot be read.
+    """
+    import mitsuba as mi
+
+    bitmap = _open(path, "image")
+    formats, kinds = mi.Bitmap.PixelFormat, mi.Struct.Type
+    kind, pixels = bitmap.component_format(), bitmap.pixel_format()
+    if kind in (kinds.UInt8, kinds.UInt16) and bitmap.srgb_gamma():
+        # As stored: Mitsuba's own conversion goes by way of linear values.
+        out = np.array(bitmap)
+        out = out if out.ndim == 3 else out[..., None]
+        if pixels in (formats.RGB, formats.RGBA):
+            return out
+        if pixels in (formats.Y, formats.YA):
+            return np.ascontiguousarray(out[..., [0, 0, 0, 1][:3 if pixels == formats.Y else 4]])
+    if pixels == formats.MultiChannel:
+        bitmap = _layer(bitmap, path)
+    alpha = bitmap.has_alpha()
+    straight = mi.Bitmap.AlphaTransform.Unpremultiply if alpha and bitmap.premultiplied_alpha() else \
+        mi.Bitmap.AlphaTransform.Empty
+    linear = bitmap.convert(formats.RGBA if alpha else formats.RGB, kinds.Float32, srgb_gamma=False, alpha_transform=straight)
+    out = np.array(linear, np.float32)
+    if alpha:
+        # Without any light and without opacity a colour is 0 over 0.
+        out[..., :3][out[..., 3] == 0] = 0
+    if not np.all(np.isfinite(out)):
+        raise ValueError(f'the image "{path}" holds values that are not finite')
+    out[..., :3] = _to_srgb(np.clip(out[..., :3], 0, 1))
+    return np.clip(out, 0, 1)
+
+
+def _open(path: str | Path, what: str):
+    import mitsuba as mi
+
+    try:
+        return mi.Bitmap(str(path))
+    except RuntimeError as e:
+        raise ValueError(f'the {what} "{path}" cannot be read: {str(e).strip().splitlines()[-1]}') from e
+
+
+def _layer(bitmap, path):
+    """The colour layer of a multichannel EXR."""
+    layers = dict(bitmap.split())
+    for name in ("<root>", "rgba", "color"):
+        if name in layers:
+            return layers[name]
+    raise ValueError(f'the image "{path}" has no channels R, G and B, only the layers {", ".join(sorted(layers))}')
+
+
+def _to_srgb(x: np.ndarray) -> np.ndarray:
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def read_depth(source: DepthFile) -> np.ndarray:
+    """The values (h, w) of ``.npy``, ``.exr`` (first channel) or 16-bit ``.png`` in scene units, float32; 0: unknown."""
+    path, suffix = source.path, source.path.suffix.lower()
+    if suffix == ".npy":
+        try:
+            out = np.load(path, allow_pickle=False)
+        except (OSError, EOFError) as e:
+            raise ValueError(f'the depth file "{path}" cannot be read: {e}') from e
+    elif suffix in (".exr", ".png"):
+        out = np.array(_open(path, "depth file"))
+        if suffix == ".png" and out.dtype != np.uint16:
+            raise ValueError(f'the depth file "{path}" must be a 16-bit PNG, but has {out.dtype.itemsize * 8} bits')
+        if out.ndim == 3 and (suffix == ".exr" or out.shape[2] == 1):
+            out = out[..., 0]
+    else:
+        raise ValueError(f'the depth file "{path}" must be .npy, .exr or a 16-bit .png')
+    if out.ndim == 3 and out.shape[2] == 1:
+        out = out[..., 0]
+    if out.ndim != 2 or not np.issubdtype(out.dtype, np.number):
+        raise ValueError(f'the depth file "{path}" must hold one number a pixel, got shape {out.shape}')
+    out = out.astype(np.float32)
+    return np.where(np.isfinite(out) & (out > 0), out * np.float32(source.unit), 0).astype(np.float32)
+
+
+def read_mask(source: MaskFile, shape: tuple[int, int]) -> np.ndarray:
+    """Which pixels (h, w) are used, bool. The mask must have the image's ``shape``."""
+    out = np.array(_open(source.path, "mask"))
+    out = out[..., None] if out.ndim == 2 else out
+    if out.shape[:2] != shape:
+        raise ValueError(f'the mask "{source.path}" has {out.shape[1]} x {out.shape[0]} pixels, but its image '
+                         f"{shape[1]} x {shape[0]}")
+    # An alpha channel says nothing here; as in nerfstudio and instant-ngp, whatever is not black is white.
+    white = np.any((out[..., :1] if out.shape[2] <= 2 else out[..., :3]) != 0, axis=2)
+    return ~white if source.hides else white

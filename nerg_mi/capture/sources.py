@@ -1,0 +1,123 @@
+"""Which files a data set's folder consists of, and which of its frames are held out."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..formats.colmap import model_files, read_colmap
+from ..formats.posed import Frame, PosedImages, Unused
+from ..formats.transforms import read_dataparser, read_transforms
+from .images import split_holdout
+
+_MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+COORDINATES = ("file", "original")
+
+
+@dataclass(frozen=True)
+class Split:
+    """``posed``: the training file, its frames those to train on; ``held_out``: frames; ``how`` they were chosen."""
+
+    posed: PosedImages
+    held_out: list[Frame]
+    how: str
+
+
+def find_source(dataset: str | Path) -> Path:
+    """The transforms file of ``dataset``, or the folder of its COLMAP model. ``dataset``: a folder, or that file itself."""
+    dataset = Path(dataset)
+    if dataset.is_file():
+        # A file of a COLMAP model stands for the model.
+        return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
+    for name in ("transforms.json", "transforms_train.json"):
+        if (dataset / name).is_file():
+            return dataset / name
+    for name in _MODELS:
+        if model_files(dataset / name) is not None:
+            return dataset / name
+    raise FileNotFoundError(
+        f'"{dataset}" holds neither transforms.json nor transforms_train.json nor a COLMAP model (sparse/0/cameras.bin); '
+        "name the folder of a posed image set"
+    )
+
+
+def read_posed(source: Path) -> PosedImages:
+    """Read what `find_source` found."""
+    if source.is_file():
+        return read_transforms(source)
+    folders = [source, *list(source.resolve().parents)[:3]]
+    images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
+    if images is None:
+        raise FileNotFoundError(f'there is no folder "images" beside or above the COLMAP model "{source}"; put the photos there')
+    masks = images.with_name("masks")
+    return read_colmap(source, images, masks if masks.is_dir() else None)
+
+
+def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str = "file", scale: float = 1.0) -> Split:
+    """Read ``dataset`` and set its held-out frames apart.
+
+    ``holdout``: every so many frames, 0 none. None: the frames of a ``transforms_test.json`` or else
+    ``transforms_val.json`` beside the file, or those that the file itself lists for testing, or every 8th.
+    ``coordinates``: "file"; "original", before the writer applied its ``applied_transform``; or a
+    ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that.
+    """
+    source = find_source(dataset)
+    posed = read_posed(source)
+    similarity = _similarity(posed, coordinates, scale)
+    posed = posed.moved(similarity)
+    if posed.spare:
+        spare = set(posed.spare)
+        posed = replace(posed, frames=[f for f in posed.frames if f.name not in spare],
+                        notes=[*posed.notes, f"{len(spare)} frames are in no training or test list of {posed.path.name}"])
+    other = _test_file(source) if holdout is None else None
+    if other is not None:
+        test = read_transforms(other).moved(similarity)
+        hidden = {f.image.resolve() for f in test.frames}
+        both = [f for f in posed.frames if f.image.resolve() in hidden]
+        train = [f for f in posed.frames if f.image.resolve() not in hidden]
+        if not train:
+            raise ValueError(f'all frames of "{posed.path}" are also in "{other.name}", which holds them out; use holdout 0')
+        unused = [*posed.unused, *(Unused(f.name, f"it is held out by {other.name}") for f in both), *test.unused]
+        posed = replace(posed, frames=train, unused=unused, notes=[*posed.notes, *test.notes])
+        return Split(posed, test.frames, other.name)
+    if holdout is None and posed.held_out:
+        names = set(posed.held_out)
+        train = [f for f in posed.frames if f.name not in names]
+        if not train:
+            raise ValueError(f'"{posed.path}" holds out all of its frames; use holdout 0')
+        return Split(replace(posed, frames=train), [f for f in posed.frames if f.name in names],
+                     f"listed in {posed.path.name}")
+    every = 8 if holdout is None else holdout
+    train, held = split_holdout(posed.frames, every)
+    return Split(replace(posed, frames=train), held, f"every {every}th frame" if every else "none")
+
+
+def _test_file(source: Path) -> Path | None:
+    if not source.is_file():
+        return None
+    for name in ("transforms_test.json", "transforms_val.json"):
+        path = source.with_name(name)
+        if path.is_file() and path != source:
+            return path
+    return None
+
+
+def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarray:
+    """From the file's coordinates to those asked for."""
+    if not (np.isfinite(scale) and scale > 0):
+        raise ValueError(f"scale must be a positive number, got {scale}")
+    original = np.eye(4) if posed.original is None else posed.original
+    if coordinates == "file":
+        to = np.eye(4)
+    elif coordinates == "original":
+        if posed.original is None:
+            raise ValueError(f'"{posed.path}" has no "applied_transform", so that its original coordinates are not known; '
+                             'use the coordinates "file"')
+        to = original
+    elif coordinates.endswith(".json"):
+        to = read_dataparser(coordinates) @ original
+    else:
+        raise ValueError(f'coordinates must be {", ".join(COORDINATES)} or the path of a dataparser_transforms.json, '
+                         f'got "{coordinates}"')
+    return np.diag([scale, scale, scale, 1.0]) @ to
