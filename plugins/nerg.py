@@ -8,7 +8,8 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - field
    - :paramtype:`volume`
-   - A trained radiance field (:ref:`nerf <volume-nerf>`): density and colour. Either this or ``density``.
+   - A trained radiance field (:ref:`nerf <volume-nerf>`): density and colour. Either this, or ``density``, or neither:
+     the shapes of the scene are then all there is, and nothing is marched.
 
  * - density, color
    - :paramtype:`volume`
@@ -18,6 +19,11 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - gaze
    - :paramtype:`volume`
    - A trained gaze field (:ref:`gazefield <volume-gazefield>`). Without it no gaze is computed.
+
+ * - (nested)
+   - :paramtype:`integrator`
+   - Lights the shapes of the scene; its AOVs follow ours. Without one it is ``path`` where the scene has emitters, and
+     shapes show their plain albedo where it has none.
 
  * - observer
    - :paramtype:`sensor`
@@ -39,16 +45,16 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - tolerance
    - |float|
    - How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands for two march
-     steps. The point that the observer looks for lies this far, and one mean free path (at most a 64th of the depth),
+     steps, or, without a field, for 1e-4 of the scene's diagonal. The point that the observer looks for lies this far, and one mean free path (at most a 64th of the depth),
      in front of the camera's surface, so that no surface hides itself. (Default: 0)
 
  * - visibility
    - |string|
    - How occlusion is decided. ``depth``: what the observer meets is compared with the distance to the surface (the
      paper). ``transmittance``: the share of light that passes between observer and surface; ``falloff`` has no part in
-     it. ``map``: as ``depth``, with the observer's depths marched once for all directions and kept until the observer
-     or the field changes; right for many pixels or frames of one observer, and without derivatives with respect to it.
-     (Default: ``depth``)
+     it. ``map``: as ``depth``, with depths and gaze around the observer computed once for all directions and kept until
+     the observer, the field or a shape changes; right for many pixels or frames of one observer. Its depths carry no
+     derivatives; gaze is then looked up only while none of it are wanted either. (Default: ``depth``)
 
  * - map_height
    - |int|
@@ -141,9 +147,13 @@ mode, with memory that does not grow with the number of steps. They do not see t
 marching stops. Empty voxels of a ``gridvolume`` are skipped: change its data through the scene's or the integrator's
 parameters (``mi.traverse``), whose ``update()`` refreshes what is known to be empty.
 
+Shapes of the scene hide the field behind them, from the camera and from the observer, and the field in front of them
+attenuates them. Depth on a shape is that of the exact ray cast, and gaze is evaluated there as on any surface. Light does
+not pass between the two: a shape casts no shadow on the field, whose light is baked in, nor the field on a shape. The
+radiance of the default ``path`` carries no derivatives (nest ``direct``); distances to shapes do, except over silhouettes.
+
 Inside of another integrator (``aov``, ``moment``) the camera is looked for among the scene's sensors; give ``mi.render`` one
-of these, or the integrator an explicit ``observer``. Shapes in the scene are not rendered: a warning says so. Spectral and
-polarized variants are not supported.
+of these, or the integrator an explicit ``observer``. Spectral and polarized variants are not supported.
 
 .. tabs::
     .. code-tab:: xml
@@ -182,13 +192,15 @@ from nerg_mi.properties import boolean, choice, color, integer, number, text
 from nerg_mi.registration import register
 from nerg_mi.transport import viewpoint
 from nerg_mi.transport.color import composite_to_linear
-from nerg_mi.transport.depth import KINDS, surface_depth
-from nerg_mi.transport.march import MarchSettings, scouted_march
+from nerg_mi.transport.depth import KINDS
+from nerg_mi.transport.march import MarchSettings
 from nerg_mi.transport.media import VolumeMedium
 from nerg_mi.transport.observer import KINDS as VISIBILITIES
 from nerg_mi.transport.observer import ObserverPass, Sight, towards
+from nerg_mi.transport.place import Place
 from nerg_mi.transport.rules import KINDS as QUADRATURES
 from nerg_mi.transport.rules import rule
+from nerg_mi.transport.shading import Shading
 
 CHANNELS = {
     "depth": "T", "opacity": "Y", "position": "XYZ", "gaze": "Y", "emit": "Y", "capture": "Y", "visibility": "Y",
@@ -218,6 +230,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self._children = {"field": field, "density": density, "color": paint, "gaze": gaze, "observer": observer}
         self.gaze = None if gaze is None else gaze.gaze_medium()
         self.observer = observer
+        self.shading = Shading(_nested(props))
         self._check_observer()
 
         self.occlusion = boolean(props, "occlusion", True)
@@ -231,36 +244,35 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.jitter = boolean(props, "jitter", False)
         step = number(props, "step", 0, low=0)
         self.settings = MarchSettings(
-            step=step or self.medium.step or self.medium.length_scale / 1024,
+            step=step or (1 if self.medium is None else self.medium.step or self.medium.length_scale / 1024),
             dt_gamma=number(props, "dt_gamma", 0, low=0, high=1),
             stop=number(props, "stop", 1e-7, low=0, high=1),
             color_cutoff=number(props, "color_cutoff", 1e-4, low=0, high=1),
             quadrature=choice(props, "quadrature", "constant", QUADRATURES),
             coarse=number(props, "coarse", 1, low=1),
         )
-        rule(self.settings.quadrature, self.medium)
+        if self.medium is not None:
+            rule(self.settings.quadrature, self.medium)
         self.observer_pass = ObserverPass(
-            self.medium, self.settings, choice(props, "visibility", "depth", VISIBILITIES), self.depth_kind,
+            self.settings, choice(props, "visibility", "depth", VISIBILITIES), self.depth_kind,
             self.surface_opacity, number(props, "tolerance", 0, low=0),
             integer(props, "map_height", 512, low=2, high=16384),
         )
         # The sensors of the render in progress; None when another integrator drives ours.
         self._sensors = None
-        self._warned = False
 
     # ------------------------------------------------------------------------
     # Mitsuba's interface
     # ------------------------------------------------------------------------
 
     def aov_names(self):
-        return [f"{name}.{c}" for name in self.aovs for c in CHANNELS[name]]
+        return [f"{name}.{c}" for name in self.aovs for c in CHANNELS[name]] + self.shading.aov_names()
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        if not self._warned and len(scene.shapes()) > 0:
-            self._warned = True
-            mi.Log(mi.LogLevel.Warn, f'"nerg" does not render the {len(scene.shapes())} shapes of this scene.')
+        if self.medium is None and len(scene.shapes()) == 0:
+            raise ValueError('there is nothing to render: give "nerg" a "field" or a "density", or the scene shapes')
         if 0 in sensor.film().crop_size():
             raise ValueError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
@@ -276,47 +288,48 @@ class NergIntegrator(mi.SamplingIntegrator):
         count = bool(asked & {"density_evals", "color_evals"})
 
         # ---------------------- The camera's ray ----------------------------
-        local = self.medium.local(ray.o, ray.d)
-        t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, ray.maxt)
-        lit = self.radiance and self.medium.has_color
-        result = scouted_march(
-            self.medium, local, t0, t1, active, self.settings, offset=offset, count=count,
-            color=_color_type(self.medium) if lit else None,
+        place = Place(self.medium, scene)
+        lit = self.radiance and self.medium is not None and self.medium.has_color
+        view = place.look(
+            ray, active, self.settings, offset=offset, count=count, color=_color_type(self.medium) if lit else None
         )
-        alpha = result.opacity
+        alpha = view.opacity
         some = active & (alpha > 0)
         out = {"opacity": dr.select(active, alpha, 0)}
         if asked - {"opacity", "density_evals", "color_evals"}:
-            out["depth"] = dr.select(
-                some, surface_depth(self.depth_kind, result, self.medium, local, t0, t1, some, self.settings), 0
-            )
+            out["depth"] = view.depth(self.depth_kind, some)
 
         # ---------------------- The surface and its gaze ---------------------
-        density_evals = result.density_evals
+        density_evals = mi.Float(0)
         if asked & (_GAZE_AOVS | _OBSERVER_AOVS | {"position"}):
             surface = some & (alpha >= self.surface_opacity)
             p_d = ray.o + ray.d * out["depth"]
             out["position"] = dr.select(surface, p_d, 0)
             if asked & (_GAZE_AOVS | _OBSERVER_AOVS):
-                # A mean free path at the surface's own density. In fog, which has no surface, it is kept small.
-                fuzz = dr.minimum(result.half_slope, out["depth"] / 64)
-                more = self._gaze(scene, ray, p_d, fuzz, surface, asked, count, out)
-                density_evals = density_evals + more if count else None
-        out["density_evals"], out["color_evals"] = density_evals, result.color_evals
-        if count and not lit:
-            out["color_evals"] = mi.Float(0)
+                fuzz = view.fuzz(self.depth_kind, out["depth"])
+                more = self._gaze(scene, place, ray, p_d, fuzz, surface, asked, count, out)
+                density_evals = density_evals + more if more is not None else density_evals
+        if count:
+            # Finding the depth may have added to what the march counted.
+            if view.march is not None:
+                density_evals = density_evals + view.march.density_evals
+            out["density_evals"] = density_evals
+            out["color_evals"] = view.march.color_evals if lit else mi.Float(0)
 
         # ---------------------- Colour ---------------------------------------
-        L = mi.Spectrum(0)
+        L, nested = mi.Spectrum(0), [mi.Float(0)] * len(self.shading.aov_names())
         if self.radiance:
-            L = (1 - alpha) * self._behind(scene, ray, active)
+            behind, nested = self.shading.radiance(
+                scene, sampler, ray, view, self.background, self.hide_emitters, active
+            )
+            L = (1 - view.front) * behind
             if lit:
-                L += composite_to_linear(result.color, alpha, self.medium.color_space)
+                L += composite_to_linear(view.march.color, view.front, self.medium.color_space)
         aovs = [c for name in self.aovs for c in (out[name] if name == "position" else [out[name]])]
-        return dr.select(active, L, 0), some, aovs
+        return dr.select(active, L, 0), some, aovs + nested
 
     def traverse(self, cb):
-        for name, child in self._children.items():
+        for name, child in (self._children | {"integrator": self.shading.nested}).items():
             if child is not None:
                 cb.put(name, child, mi.ParamFlags.Differentiable)
         cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
@@ -353,8 +366,8 @@ class NergIntegrator(mi.SamplingIntegrator):
     # The observer
     # ------------------------------------------------------------------------
 
-    def _gaze(self, scene, ray, p_d, fuzz, surface, asked, count, out):
-        """Add the AOVs that depend on the observer to ``out``; returns the density evaluations made."""
+    def _gaze(self, scene, place, ray, p_d, fuzz, surface, asked, count, out):
+        """Add the AOVs that depend on the observer to ``out``; returns the density evaluations made (None: not counted)."""
         sensors = self._sensors or scene.sensors()
         if self.observer is None:
             p_o = viewpoint.center_of_ray(sensors, ray)
@@ -366,29 +379,32 @@ class NergIntegrator(mi.SamplingIntegrator):
         distance, r_o = towards(p_o, p_d)
         sight = Sight(p_d, distance, mi.Float(1), mi.Float(0))
         if self.occlusion and not aligned:
-            sight = self.observer_pass.look(ray, p_d, p_o, fuzz, surface, self.falloff, count)
+            looked_up = self.gaze if asked & _GAZE_AOVS <= {"gaze", "gaze_evals"} else None
+            sight = self.observer_pass.look(place, ray, p_d, p_o, fuzz, surface, self.falloff, count, looked_up)
         out["visibility"] = dr.select(surface, sight.visibility, 0)
         out["observer_depth"] = dr.select(surface, sight.depth, 0)
 
         if asked & _GAZE_AOVS:
             # Where the observer cannot see, gaze is 0 whatever the field says.
             attended = surface & (sight.visibility > 0)
+            networks = 2.0 if self.gaze.field.config.variant == "emit_capture" else 1.0
+            if sight.gaze is not None:
+                unknown = attended & (sight.gaze < 0)
+                gaze = dr.if_stmt(
+                    (unknown, sight.gaze), unknown,
+                    lambda unknown, gaze: self.gaze.evaluate(sight.p_od, p_o, r_o, unknown)[0],
+                    lambda unknown, gaze: gaze, label="gaze",
+                )
+                out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
+                out["gaze_evals"] = dr.select(unknown, networks, 0.0)
+                return sight.density_evals
             gaze, emit, capture = self.gaze.evaluate(
                 sight.p_od, p_o, r_o, surface if asked & {"emit", "capture"} else attended
             )
             out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
             out["emit"], out["capture"] = dr.select(surface, emit, 0), dr.select(surface, capture, 0)
-            out["gaze_evals"] = dr.select(surface, 2.0 if self.gaze.field.config.variant == "emit_capture" else 1.0, 0.0)
+            out["gaze_evals"] = dr.select(surface, networks, 0.0)
         return sight.density_evals
-
-    def _behind(self, scene, ray, active):
-        """Radiance behind everything: the scene's environment, else the background."""
-        environment = scene.environment()
-        if environment is None or self.hide_emitters:
-            return self.background
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        si.wi, si.wavelengths = -ray.d, ray.wavelengths
-        return environment.eval(si, active)
 
 
 # ----------------------------------------------------------------------------
@@ -397,18 +413,32 @@ class NergIntegrator(mi.SamplingIntegrator):
 
 
 def _medium(field, density, color):
-    if (field is None) == (density is None):
-        raise ValueError('"nerg" needs either "field" (a volume of type "nerf") or "density" (any volume), and not both')
+    if field is not None and density is not None:
+        raise ValueError('"nerg" takes either "field" (a volume of type "nerf") or "density" (any volume), and not both')
     if field is not None:
         if color is not None:
             raise ValueError('"color" goes with "density"; a "field" brings its own colour')
         if not hasattr(field, "medium"):
             raise ValueError('"field" must be a volume of type "nerf"; give other volumes as "density" and "color"')
         return field.medium()
+    if density is None:
+        if color is not None:
+            raise ValueError('"color" goes with "density", which is missing')
+        return None
     for name, volume in (("density", density), ("color", color)):
         if volume is not None and not isinstance(volume, mi.Volume):
             raise ValueError(f'"{name}" must be a volume')
     return VolumeMedium(density, color)
+
+
+def _nested(props):
+    found = [child for _, child in props.objects() if isinstance(child, mi.Integrator)]
+    for name, child in props.objects():
+        if isinstance(child, mi.Integrator):
+            props.mark_queried(name)
+    if len(found) > 1:
+        raise ValueError(f'"nerg" takes one nested integrator, got {len(found)}')
+    return found[0] if found else None
 
 
 def _aovs(value, has_gaze):

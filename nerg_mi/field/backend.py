@@ -9,6 +9,7 @@ from __future__ import annotations
 from types import ModuleType
 
 import drjit as dr
+import numpy as np
 
 
 def namespace(source: object) -> ModuleType:
@@ -39,3 +40,16 @@ def namespace(source: object) -> ModuleType:
 def is_cuda(ns: ModuleType) -> bool:
     """True when ``ns`` is the CUDA backend, where networks run in fp16."""
     return ns.__name__.startswith("drjit.cuda")
+
+
+def aligned(array: np.ndarray) -> np.ndarray:
+    """A float32 copy of ``array`` that begins at a multiple of 64 bytes.
+
+    Dr.Jit reads NumPy memory in place, and gathers several features in one load only from aligned memory.
+    """
+    array = np.asarray(array, np.float32)
+    memory = np.empty(array.nbytes + 64, np.uint8)
+    start = -memory.ctypes.data % 64
+    out = memory[start : start + array.nbytes].view(np.float32).reshape(array.shape)
+    out[...] = array
+    return out

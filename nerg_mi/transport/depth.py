@@ -16,7 +16,8 @@ _SOFTEST = 1 / 64
 _PARTS = 16
 
 
-def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, settings: MarchSettings):
+def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, settings: MarchSettings,
+                  backed=None):
     """Depth of ``kind`` from a march's result, 0 where nothing absorbs.
 
     Evaluations that finding it takes are added to ``result.density_evals``, if that is counted.
@@ -24,12 +25,18 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
     The median is where half of this ray's own accumulated opacity is reached, which is the crossing
     of transmittance 1/2 for rays that became opaque. The others (few) are marched again for theirs.
     ``refined`` searches the crossing step again with finer steps, for densities that change within one.
+    ``backed``: rays that end on something opaque, whose own opacity is 1; 0 where they reach it first.
     """
     if kind == "expected":
         return result.expected_depth
-    opaque = (result.tau >= settings.opaque) & dr.isfinite(result.half)
+    opaque = result.tau >= settings.opaque
     alpha = result.opacity
-    rest = active & ~opaque & (alpha > 0)
+    rest = active & (alpha > 0)
+    if backed is not None:
+        opaque |= backed
+        rest &= ~backed
+    opaque &= dr.isfinite(result.half)
+    rest &= ~opaque
     goal = -log1p(-0.5 * alpha)
     count = result.density_evals is not None
     again = march(medium, ray, t0, t1, rest, settings, until=dr.select(rest, goal, 1), count=count)

@@ -238,6 +238,10 @@ class GazeMedium:
     def __init__(self, field: GazeField, to_world: Similarity | None = None):
         self.field, self.to_world = field, to_world or Similarity()
 
+    def parameters(self) -> list:
+        """Arrays that gaze depends on, for derivatives."""
+        return list(self.field.parameters().values())
+
     def evaluate(self, p_od, p_o, r_o, active):
         """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``."""
         local = self.to_world

@@ -9,23 +9,30 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from .depth import surface_depth
-from .march import MarchSettings, scouted_march
+from .march import MarchSettings
 from .observer_map import ObserverMap
+from .place import Place
 from .visibility import visibility
 
 KINDS = ("depth", "transmittance", "map")
+
+# An entry of a map sees the same surface as a point if it lies at most this many times the point's lift behind it.
+_PAST = 4
+# Ray casts agree on a shape to this share of the scene's diagonal.
+_EXACT = 1e-4
 
 
 @dataclass
 class Sight:
     """``p_od``: the surface that the observer meets; ``depth``: d_o, the distance to the point where nothing is
-    met; ``visibility``: 1 visible .. 0 hidden; ``density_evals``: evaluations that it took."""
+    met; ``visibility``: 1 visible .. 0 hidden; ``density_evals``: evaluations that it took (None unless counted);
+    ``gaze``: the density, from a map that keeps it, negative where it does not know it; else None."""
 
     p_od: object
     depth: object
     visibility: object
     density_evals: object
+    gaze: object = None
 
 
 def towards(p_o, p):
@@ -40,15 +47,16 @@ def towards(p_o, p):
 
 
 class ObserverPass:
-    """Looks from an observer at points of ``medium``.
+    """Looks from an observer at points of a place.
 
     ``kind``: one of ``KINDS``; ``depth``: kind of d_o; ``surface_opacity``: opacity from which a ray meets a
-    surface; ``tolerance``: in scene units, 0 for two steps; ``map_height``: rows of the map.
+    surface; ``tolerance``: in scene units, 0 for two steps (without a medium, ``_EXACT`` of the scene's diagonal);
+    ``map_height``: rows of the map.
     """
 
-    def __init__(self, medium, settings: MarchSettings, kind: str, depth: str, surface_opacity: float,
+    def __init__(self, settings: MarchSettings, kind: str, depth: str, surface_opacity: float,
                  tolerance: float, map_height: int):
-        self.medium, self.settings, self.kind, self.depth = medium, settings, kind, depth
+        self.settings, self.kind, self.depth = settings, kind, depth
         self.surface_opacity, self.tolerance, self.map_height = surface_opacity, tolerance, map_height
         self._map = None
 
@@ -56,46 +64,64 @@ class ObserverPass:
         """Drop the cached map: the field has changed."""
         self._map = None
 
-    def look(self, ray, p_d, p_o, fuzz, active, falloff, count: bool) -> Sight:
+    def look(self, place: Place, ray, p_d, p_o, fuzz, active, falloff, count: bool, gaze=None) -> Sight:
         """What the observer at ``p_o`` meets towards the camera's surface ``p_d`` on ``ray``.
 
         The point that is looked for lies a little in front of the surface, towards the camera: by the
         tolerance, and by ``fuzz``, how far light goes into the surface. A surface then never hides itself,
         however obliquely the observer looks along it, because the ray stays above it. A tolerance along the
-        observer's ray alone would have to grow without bound.
+        observer's ray alone would have to grow without bound. ``gaze`` (``media.GazeMedium``): have a map keep
+        the gaze as well, where no derivative needs the field itself.
         """
-        step = dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o))
-        tolerance = self.tolerance or 2 * step
+        import mitsuba as mi
+
+        tolerance = self._tolerance(place, ray, p_d)
         in_front = tolerance + fuzz
         if self.kind == "map":
-            # Entries of a map are this far apart where the ray ends.
-            in_front += dr.norm(p_d - p_o) * (dr.pi / self.map_height)
+            # Entries of a map are this far apart where the ray ends, and depths on slopes as much.
+            apart = dr.norm(p_d - p_o) * (dr.pi / self.map_height)
+            in_front += apart
+            tolerance = tolerance + apart
         distance, r_o = towards(p_o, p_d - ray.d * in_front)
+        attended = None
 
         if self.kind == "map":
-            met, seen = self._map_from(p_o, type(p_d)).look_up(r_o, distance, falloff, tolerance, active)
+            known = self._map_from(place, p_o)
+            if gaze is not None and not dr.grad_enabled(p_o, *gaze.parameters()):
+                known.keep(gaze)
+            met, seen, attended = known.look_up(
+                r_o, distance, falloff, tolerance, _PAST * in_front, active
+            )
             evals = type(distance)(0)
         else:
-            local = self.medium.local(p_o, r_o)
-            t0, t1 = dr.maximum(local.t_near, 0), local.t_far
+            towards_point = mi.Ray3f(p_o, r_o)
             if self.kind == "transmittance":
-                between = scouted_march(
-                    self.medium, local, t0, dr.minimum(t1, distance), active, self.settings, count=count
-                )
-                return Sight(p_d, distance, dr.exp(-between.tau), between.density_evals)
-            result = scouted_march(self.medium, local, t0, t1, active, self.settings, count=count)
-            depth = surface_depth(self.depth, result, self.medium, local, t0, t1, active, self.settings)
-            met = dr.select(active & (result.opacity >= self.surface_opacity), depth, dr.inf)
-            seen, evals = visibility(distance, met, falloff, tolerance), result.density_evals
+                towards_point.maxt = distance
+                between = place.look(towards_point, active, self.settings, count=count)
+                seen = dr.select(between.hit, 0, 1 if between.march is None else dr.exp(-between.march.tau))
+                return Sight(p_d, distance, seen, _evals(between))
+            view = place.look(towards_point, active, self.settings, count=count)
+            met = dr.select(active & (view.opacity >= self.surface_opacity), view.depth(self.depth, active), dr.inf)
+            seen, evals = visibility(distance, met, falloff, tolerance), _evals(view)
         # An observer who meets nothing before the point sees the point itself.
         blocked = met < distance - tolerance
         d_o = dr.select(dr.isfinite(met), met, distance)
-        return Sight(dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals)
+        return Sight(dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals, attended)
 
-    def _map_from(self, p_o, vector) -> ObserverMap:
-        """The observer's map, marched anew only when the observer has moved or a parameter has changed."""
-        if self._map is None or not dr.all(self._map.center == dr.detach(p_o), axis=None):
-            self._map = ObserverMap(
-                self.medium, p_o, self.map_height, self.settings, self.depth, self.surface_opacity, vector
-            )
+    def _tolerance(self, place, ray, p_d):
+        if self.tolerance:
+            return self.tolerance
+        if place.medium is None:
+            return _EXACT * place.diagonal
+        return 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o))
+
+    def _map_from(self, place, p_o) -> ObserverMap:
+        """The observer's map, marched anew only when the observer, the field or a shape has changed."""
+        known = self._map
+        if known is None or not known.serves(place) or not dr.all(known.center == dr.detach(p_o), axis=None):
+            self._map = ObserverMap(place, p_o, self.map_height, self.settings, self.depth, self.surface_opacity)
         return self._map
+
+
+def _evals(view):
+    return None if view.march is None else view.march.density_evals

@@ -1,6 +1,6 @@
 """What an observer meets in every direction, marched once and looked up ever after.
 
-A latitude-longitude map of depth around the observer. A point is compared with the
+A latitude-longitude map of depth, and of gaze, around the observer. A point is compared with the
 four nearest entries and the results are interpolated (percentage-closer filtering,
 Reeves et al. 1987), not the depths themselves, which would float between surfaces.
 """
@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from .depth import surface_depth
-from .march import march
+from .place import Place
 from .visibility import visibility
 
 
@@ -17,39 +16,60 @@ class ObserverMap:
     """Depths (scene units, infinite where nothing is met) around ``p_o``, ``2 height`` x ``height`` entries.
 
     Detached: no derivative passes through the map. Rows run from +z to -z, columns from azimuth 0 on,
-    entries at pixel centres.
+    entries at pixel centres. ``gaze``: densities of a gaze field, once ``keep`` was called.
     """
 
-    def __init__(self, medium, p_o, height: int, settings, kind: str, surface_opacity: float, vector):
+    def __init__(self, place: Place, p_o, height: int, settings, kind: str, surface_opacity: float):
+        import mitsuba as mi
+
         self.height, self.width = height, 2 * height
-        self._uint = dr.uint32_array_t(type(p_o.x))
+        self._uint, self._vector = mi.UInt32, mi.Vector3f
+        self._shapes = _fingerprint(place)
+        self.gaze, self._gaze_of = None, None
         with dr.suspend_grad():
             self.center = type(p_o)(dr.detach(p_o))
-            index = dr.arange(self._uint, self.width * height)
-            d = self._direction(index % self.width, index // self.width, vector)
-            local = medium.local(self.center, d)
-            t0, t1 = dr.maximum(local.t_near, 0), local.t_far
-            everywhere = dr.mask_t(t0)(True)
-            result = march(medium, local, t0, t1, everywhere, settings)
-            met = result.opacity >= surface_opacity
-            depth = surface_depth(kind, result, medium, local, t0, t1, met, settings)
-            self.depth = dr.select(met, depth, dr.inf)
+            everywhere = dr.full(mi.Bool, True, self.width * height)
+            view = place.look(mi.Ray3f(self.center, self._directions()), everywhere, settings)
+            met = view.opacity >= surface_opacity
+            self.depth = dr.select(met, view.depth(kind, met), dr.inf)
             dr.eval(self.depth)
+
+    def serves(self, place: Place) -> bool:
+        """Whether the shapes are still those that were cast at."""
+        return self._shapes == _fingerprint(place)
+
+    def keep(self, gaze) -> None:
+        """Have ``look_up`` know the density of ``gaze`` (``media.GazeMedium``) where the observer meets a surface."""
+        if self._gaze_of is not None and self._gaze_of == _indices(gaze.parameters()):
+            return
+        with dr.suspend_grad():
+            r_o = self._directions()
+            met = dr.isfinite(self.depth)
+            p_od = self.center + r_o * dr.select(met, self.depth, 0)
+            self.gaze = dr.select(met, gaze.evaluate(p_od, self.center, r_o, met)[0], 0)
+            dr.eval(self.gaze)
+        self._gaze_of = _indices(gaze.parameters())
 
     @property
     def spacing(self) -> float:
         """Angle between neighbouring entries, in radian."""
         return dr.pi / self.height
 
-    def _direction(self, column, row, vector):
-        Float = type(self.center.x)
-        phi, theta = (Float(column) + 0.5) * self.spacing, (Float(row) + 0.5) * self.spacing
+    def _directions(self):
+        index = dr.arange(self._uint, self.width * self.height)
+        Float = dr.float32_array_t(type(index))
+        phi = (Float(index % self.width) + 0.5) * self.spacing
+        theta = (Float(index // self.width) + 0.5) * self.spacing
         sin_theta, cos_theta = dr.sincos(theta)
         sin_phi, cos_phi = dr.sincos(phi)
-        return vector(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
+        return self._vector(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
 
-    def look_up(self, r_o, distance, falloff, tolerance, active):
-        """``(nearest depth, visibility)`` of points at ``distance`` along unit ``r_o`` from the centre."""
+    def look_up(self, r_o, distance, falloff, tolerance, slack, active):
+        """``(nearest depth, visibility, gaze)`` of points at ``distance`` along unit ``r_o``.
+
+        ``gaze``: None where none is kept, else a density, negative where the map does not know it: an entry that looks
+        past the point, by more than ``slack``, sees another surface.
+        """
         Float, UInt32 = type(distance), self._uint
         r_o = dr.detach(r_o)
         theta = dr.atan2(dr.sqrt(r_o.x * r_o.x + r_o.y * r_o.y), r_o.z)
@@ -60,12 +80,40 @@ class ObserverMap:
         i, j = UInt32(x), dr.minimum(UInt32(y), self.height - 1)
         fx, fy = x - Float(i), y - Float(j)
         seen, nearest, best = Float(0), Float(dr.inf), Float(-1)
+        total, share = Float(0), Float(0)
         for dj in (0, 1):
             for di in (0, 1):
                 row, column = dr.minimum(j + dj, self.height - 1), (i + di) % self.width
-                depth = dr.gather(Float, self.depth, column + self.width * row, active)
+                entry = column + self.width * row
+                depth = dr.gather(Float, self.depth, entry, active)
                 weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
-                seen += weight * visibility(distance, depth, falloff, tolerance)
+                passes = weight * visibility(distance, depth, falloff, tolerance)
+                seen += passes
+                if self.gaze is not None:
+                    known = dr.select(depth < distance + slack, passes, 0)
+                    total += known * dr.gather(Float, self.gaze, entry, active)
+                    share += known
                 closer = weight > best
                 nearest, best = dr.select(closer, depth, nearest), dr.select(closer, weight, best)
-        return nearest, seen
+        gaze = None if self.gaze is None else dr.select(share > 0, total / dr.select(share > 0, share, 1), -1)
+        return nearest, seen, gaze
+
+
+class _Fingerprint(list):
+    """Values by identity. They are held, so that no later variable can take the place of one."""
+
+    def __init__(self, values):
+        super().__init__(i for v in values for i in dr.detail.collect_indices(v))
+        self._held = list(values)
+
+
+def _indices(values) -> list:
+    return _Fingerprint(values)
+
+
+def _fingerprint(place):
+    import mitsuba as mi
+
+    if place.scene is None:
+        return _indices([])
+    return _indices([v for shape in place.scene.shapes() for v in dict(mi.traverse(shape)).values()])

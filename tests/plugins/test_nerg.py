@@ -89,8 +89,6 @@ def test04_wrong_values_are_named(rgb, name, value):
 
 def test05_wrong_children_are_named(rgb, files):
     with pytest.raises(RuntimeError, match='either "field".*or "density".*not both'):
-        rgb.load_dict({"type": "nerg"})
-    with pytest.raises(RuntimeError, match="not both"):
         rgb.load_dict(with_field(files, density={"type": "constvolume", "value": 1.0}))
     with pytest.raises(RuntimeError, match='"color" goes with "density"'):
         rgb.load_dict(with_field(files, color={"type": "constvolume", "value": 1.0}))
@@ -104,6 +102,16 @@ def test05_wrong_children_are_named(rgb, files):
         rgb.load_dict(constant(observer={"type": "constvolume", "value": 1.0}))
     with pytest.raises(RuntimeError, match='"observer" is a .*no centre'):
         rgb.load_dict(constant(observer={"type": "orthographic"}))
+
+
+def test05b_an_empty_place_is_refused(rgb):
+    scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}, "sensor": camera(rgb)})
+    with pytest.raises(ValueError, match="nothing to render.*or the scene shapes"):
+        scene.integrator().render(scene, scene.sensors()[0])
+    with pytest.raises(RuntimeError, match='"color" goes with "density", which is missing'):
+        rgb.load_dict({"type": "nerg", "color": {"type": "constvolume", "value": 1.0}})
+    with pytest.raises(RuntimeError, match="PRBIntegrator.*one ray"):
+        rgb.load_dict({"type": "nerg", "i": {"type": "prb"}})
 
 
 def test06_an_observer_who_is_a_batch_is_refused(rgb):

@@ -1,0 +1,63 @@
+"""What light comes from behind a field: from shapes, lit by a nested integrator or in their plain albedo, or from the
+background."""
+from __future__ import annotations
+
+import drjit as dr
+
+
+class Shading:
+    """``nested``: a Mitsuba sampling integrator that lights the shapes, or None: ``path`` where the scene has emitters
+    and shapes, otherwise every shape shows its albedo.
+
+    Raises ``ValueError`` for integrators whose radiance is not to be had ray by ray.
+    """
+
+    def __init__(self, nested=None):
+        import mitsuba as mi
+        from mitsuba.ad.integrators.common import ADIntegrator
+
+        if nested is not None and (isinstance(nested, ADIntegrator) or not isinstance(nested, mi.SamplingIntegrator)):
+            raise ValueError(
+                f'the integrator nested in "nerg" is a {type(nested).__name__}, which cannot be asked for the radiance of '
+                'one ray; use "path", "direct", "volpath" or another one that samples pixels'
+            )
+        self.nested, self._path = nested, None
+
+    def radiance(self, scene, sampler, ray, view, background, hide_emitters, active):
+        """``(radiance, AOVs of the nested integrator)`` that arrive from behind the field, or from a place without one.
+
+        ``view``: ``place.View`` of ``ray``; ``background``: radiance where nothing is, if the scene has no environment.
+        """
+        import mitsuba as mi
+
+        seen = active & (view.front < 1)
+        environment = None if hide_emitters else scene.environment()
+        if self.nested is not None:
+            color, valid, aovs = self.nested.sample(scene, sampler, ray, None, seen)
+            if environment is None:
+                # Directly seen emitters are shapes; where there is nothing at all, there is the background.
+                color = dr.select(view.hit | valid, color, background)
+            return color, aovs
+        behind = background if environment is None else environment.eval(_beyond(mi, ray), seen)
+        if view.cast is None:
+            return behind, []
+        hit = seen & view.hit
+        if len(scene.emitters()) > 0:
+            # Paths are not differentiated: Dr.Jit has no reverse mode through their loop.
+            with dr.suspend_grad():
+                self._path = self._path or mi.load_dict({"type": "path", "hide_emitters": bool(hide_emitters)})
+                shape = self._path.sample(scene, sampler, ray, None, hit)[0]
+        else:
+            si = view.cast.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, hit)
+            shape = si.bsdf().eval_diffuse_reflectance(si, hit)
+        return dr.select(hit, shape, behind), []
+
+    def aov_names(self) -> list:
+        """Names of the AOVs that the nested integrator adds."""
+        return [] if self.nested is None else list(self.nested.aov_names())
+
+
+def _beyond(mi, ray):
+    si = dr.zeros(mi.SurfaceInteraction3f)
+    si.wi, si.wavelengths = -ray.d, ray.wavelengths
+    return si
