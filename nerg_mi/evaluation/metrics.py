@@ -115,13 +115,22 @@ def _relative(density: np.ndarray, w: np.ndarray) -> np.ndarray:
 def _moments(values: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Weighted mean and population standard deviation, (..., 1); a deviation
     within rounding of a constant is zero."""
+    # In units of the largest: squares of the values themselves under- or overflow beyond 1e±154.
+    top = _largest(values)
+    values = values / top
     mean = np.sum(w * values, axis=-1, keepdims=True)
     deviation = np.sqrt(np.sum(w * (values - mean) ** 2, axis=-1, keepdims=True))
-    rounding = 1e-13 * np.abs(values).max(axis=-1, keepdims=True)
-    return mean, np.where(deviation > rounding, deviation, 0.0)
+    return mean * top, np.where(deviation > 1e-13, deviation, 0.0) * top
+
+
+def _largest(values: np.ndarray) -> np.ndarray:
+    """Largest magnitude along the last axis, (..., 1); 1 where all are zero."""
+    top = np.abs(values).max(axis=-1, keepdims=True)
+    return np.where(top > 0, top, 1.0)
 
 
 def _standardised(values: np.ndarray, w: np.ndarray) -> np.ndarray:
     values = np.asarray(values, dtype=np.float64)
+    values = values / _largest(values)
     mean, deviation = _moments(values, w)
     return np.where(deviation > 0, (values - mean) / np.where(deviation > 0, deviation, 1.0), 0.0)

@@ -78,6 +78,16 @@ def test_defined_everywhere(a, b):
         assert np.isclose(metrics.kld(p, maps["zeros"]), 0)  # zeros know nothing: uniform
 
 
+@pytest.mark.parametrize("scale", [1e-307, 1e-200, 1e-150, 1e150, 1e300])
+def test_correlation_of_maps_of_any_scale(scale):
+    rng = np.random.default_rng(0)
+    a, b = rng.random((2, 500)) - 0.3
+    assert np.isclose(metrics.cc(a * scale, b), metrics.cc(a, b), rtol=1e-12)
+    assert np.isclose(metrics.cc(a, b * scale), np.corrcoef(a, b)[0, 1], rtol=1e-12)
+    assert np.isclose(metrics.nss(a * scale, a[:1] * scale), metrics.nss(a, a[:1]), rtol=1e-12)
+    assert metrics.cc(np.full(500, scale), b) == 0
+
+
 def test_log_score_and_information():
     density = np.array([[0.2, 0.4], [0.1, 0.1]])
     assert np.allclose(metrics.log_score(density), np.log(density).mean(axis=1))
