@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import itertools
 import operator
 import os
 from pathlib import Path
@@ -136,7 +137,8 @@ def _rows(
         else:
             # Faster than loadtxt's usecols, which converts what it leaves out.
             pick = operator.itemgetter(*columns)
-            found = np.array([pick(text.split(",")) for text in texts]).astype(np.float64)
+            words = itertools.chain.from_iterable(pick(text.split(",")) for text in texts)
+            found = np.fromiter(map(float, words), dtype=np.float64, count=len(texts) * len(columns)).reshape(-1, len(columns))
     except ValueError:
         for number, text in zip(lines, texts):
             for word in operator.itemgetter(*columns)(text.split(",")):
