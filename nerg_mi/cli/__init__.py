@@ -24,6 +24,7 @@ COMMANDS = {
     "render": "Render a scene file to an EXR or PNG file.",
     "rays": "Import tracking files as rays of attention, and look at what they hold.",
     "train": "Train a radiance field on posed photos, or a gaze field on rays.",
+    "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
     "study": "Measure error against run time: a scene at many settings, compared with what is true.",
 }
 """Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""

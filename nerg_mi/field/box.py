@@ -13,10 +13,13 @@ class Box:
 
     Points map to the unit cube by one uniform scale about the centre (grid cells
     stay cubes), so the longest edge spans [0, 1] and the others a part of it.
+    ``bound``: the unit cube is [-bound, bound]³ instead, of which the box is a part, and the map is torch-ngp's
+    (p + bound) / (2 bound), rounded as there: in a fine hash grid the last bit of a coordinate can be seen.
     """
 
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
+    bound: float | None = None
 
     def __post_init__(self):
         lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
@@ -24,17 +27,20 @@ class Box:
             raise ValueError(f"a box needs two finite corners of 3 numbers, got {self.lower} and {self.upper}")
         if not np.all(upper > lower):
             raise ValueError(f"the upper corner {self.upper} of a box must exceed its lower corner {self.lower}")
+        if self.bound is not None and not (np.isfinite(self.bound) and max(np.abs(lower).max(), np.abs(upper).max()) <= self.bound):
+            raise ValueError(f"a box of {self.lower} to {self.upper} does not lie within a bound of {self.bound}")
         object.__setattr__(self, "lower", tuple(lower.tolist()))
         object.__setattr__(self, "upper", tuple(upper.tolist()))
 
     @property
     def side(self) -> float:
-        """Longest edge: the length of the unit cube in the field's units."""
-        return max(u - l for l, u in zip(self.lower, self.upper))
+        """Length of the unit cube in the field's units: the longest edge, where no ``bound`` is given."""
+        return 2 * self.bound if self.bound is not None else max(u - l for l, u in zip(self.lower, self.upper))
 
     @property
     def center(self) -> tuple[float, float, float]:
-        return tuple((l + u) / 2 for l, u in zip(self.lower, self.upper))
+        """Centre of the unit cube."""
+        return (0.0, 0.0, 0.0) if self.bound is not None else tuple((l + u) / 2 for l, u in zip(self.lower, self.upper))
 
     @property
     def diagonal(self) -> float:
@@ -42,13 +48,27 @@ class Box:
 
     def to_unit(self, p):
         """Unit-cube coordinates of ``p`` (Array3f or (N, 3) array)."""
+        if self.bound is not None:
+            return self._divided(p + self.bound, 2 * self.bound)
         if dr.is_array_v(p):
             return (p - type(p)(*self.center)) / self.side + 0.5
         return (np.asarray(p) - np.asarray(self.center)) / self.side + 0.5
+
+    @staticmethod
+    def _divided(x, divisor: float):
+        """``x / divisor``, correctly rounded: for Dr.Jit a division by a constant is a product with its reciprocal."""
+        if not dr.is_array_v(x):
+            return np.asarray(x) / np.asarray(x).dtype.type(divisor)
+        inverse = float(np.float32(1 / divisor))
+        quotient = x * inverse
+        if np.frexp(divisor)[0] == 0.5:
+            return quotient
+        return dr.fma(dr.fma(-quotient, divisor, x), inverse, quotient)
 
     def contains(self, p):
         """Mask of the points ``p`` (Array3f) inside the box."""
         return dr.all((p >= type(p)(*self.lower)) & (p <= type(p)(*self.upper)))
 
     def to_dict(self) -> dict:
-        return {"lower": list(self.lower), "upper": list(self.upper)}
+        corners = {"lower": list(self.lower), "upper": list(self.upper)}
+        return corners if self.bound is None else {**corners, "bound": self.bound}

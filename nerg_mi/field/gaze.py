@@ -24,6 +24,7 @@ from .radiance import assign, sigmoid
 
 VARIANTS = ("emit", "capture", "emit_capture")
 ACTIVATIONS = ("softplus", "exp", "linear")
+TRUNKS = ("relu", "layernorm", "linear")
 
 
 def softplus(x):
@@ -49,6 +50,10 @@ class GazeConfig:
     sigmoid output) or ``emit_capture`` (their product). ``activation`` of the emit head:
     ``softplus`` and ``exp`` give densities, ``linear`` is the paper's and may be negative. ``emit_scale`` multiplies
     its output: what the untrained field comes to, and what weight decay draws a field towards.
+
+    ``trunk``: ``relu`` hands what the direction net returns to the heads through a ReLU; ``layernorm`` normalises the
+    inputs of every layer, adds biases, and puts a ReLU behind the position net too (what the paper's authors train by
+    default); ``linear`` has no ReLU behind either net (their other choice).
     """
 
     grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(finest=512))
@@ -58,8 +63,11 @@ class GazeConfig:
     geometry: int = 15
     sh_degree: int = 4
     emit_scale: float = 1.0
+    trunk: str = "relu"
 
     def __post_init__(self):
+        if self.trunk not in TRUNKS:
+            raise ValueError(f'the trunk of a gaze field must be one of {", ".join(TRUNKS)}, got "{self.trunk}"')
         if not 0 < self.emit_scale < float("inf"):
             raise ValueError(f"the scale of the emit head must be positive and finite, got {self.emit_scale}")
         if self.variant not in VARIANTS:
@@ -103,21 +111,25 @@ class GazeField:
             ("position_net", position_net, config.position_sizes), ("direction_net", direction_net, config.direction_sizes),
             ("emit_head", emit_head, [config.width, 1]), ("capture_head", capture_head, [config.width, 1]),
         ):
-            net.require(sizes, name)
+            net.require(sizes, name, self._is_normalized(config, name))
         self.config, self.box, self.grid = config, box, grid
         self.position_net, self.direction_net = position_net, direction_net
         self.emit_head, self.capture_head = emit_head, capture_head
         self.pack()
 
     @staticmethod
+    def _is_normalized(config: GazeConfig, name: str) -> bool:
+        return config.trunk == "layernorm" and not name.endswith("head")
+
+    @staticmethod
     def random(config: GazeConfig, box: Box, ns: ModuleType, seed: int = 0) -> GazeField:
         """An untrained field of backend ``ns``; equal seeds give equal weights."""
-        rng = np.random.default_rng(seed)
+        rng, normalized = np.random.default_rng(seed), config.trunk == "layernorm"
         return GazeField(
             config, box,
             HashGrid.random(config.grid, ns, rng),
-            MLP.random(config.position_sizes, ns, rng),
-            MLP.random(config.direction_sizes, ns, rng),
+            MLP.random(config.position_sizes, ns, rng, normalized),
+            MLP.random(config.direction_sizes, ns, rng, normalized),
             MLP.random([config.width, 1], ns, rng),
             MLP.random([config.width, 1], ns, rng),
         )
@@ -126,7 +138,7 @@ class GazeField:
         """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
         out = {"grid.table": self.grid.table}
         for name in self._NETS:
-            out |= {f"{name}.{i}": w for i, w in enumerate(getattr(self, name).weights)}
+            out |= {f"{name}.{key}": value for key, value in getattr(self, name).named().items()}
         return out
 
     def set_parameters(self, values: dict) -> None:
@@ -141,8 +153,10 @@ class GazeField:
 
     def _trunk(self, p, d, active):
         geometry = self.position_net(self.grid(self.box.to_unit(p), active))
+        if self.config.trunk == "layernorm":
+            geometry = [dr.maximum(g, 0) for g in geometry]
         hidden = self.direction_net(encode_direction(d, self.config.sh_degree) + geometry)
-        return [dr.maximum(h, 0) for h in hidden]
+        return hidden if self.config.trunk == "linear" else [dr.maximum(h, 0) for h in hidden]
 
     def emit(self, p_od, r_o, active=True):
         """F_e(p_od, -r_o) after its activation, in 1/sr. ``r_o``: unit, from observer to surface."""

@@ -22,13 +22,15 @@ _PRIMES = (1, 2654435761, 805459861)
 @dataclass(frozen=True)
 class HashGridConfig:
     """Shape of a grid: ``levels`` x ``features``, ``2**log2_rows`` rows a level at
-    most, resolutions growing geometrically from ``base`` to ``finest``."""
+    most, resolutions growing geometrically from ``base`` to ``finest``, over a
+    cube (or, with 2 ``dimensions``, over a square)."""
 
     levels: int = 16
     features: int = 2
     log2_rows: int = 19
     base: int = 16
     finest: int = 2048
+    dimensions: int = 3
 
     def __post_init__(self):
         if self.levels < 1 or self.base < 1 or self.finest < self.base:
@@ -36,6 +38,8 @@ class HashGridConfig:
                 f"a hash grid needs levels >= 1 and finest >= base >= 1, got levels={self.levels}, "
                 f"base={self.base}, finest={self.finest}"
             )
+        if self.dimensions not in (2, 3):
+            raise ValueError(f"a hash grid has 2 or 3 dimensions, got {self.dimensions}")
         if self.features not in (2, 4):
             raise ValueError(f"features must be 2 or 4 (one packet load a vertex), got {self.features}")
         if not 3 <= self.log2_rows <= 26:
@@ -61,7 +65,7 @@ class HashGridConfig:
         rows = []
         for level in range(self.levels):
             resolution = int(np.ceil(self.base * growth**level))
-            vertices = min(2**self.log2_rows, (resolution + 1) ** 3)
+            vertices = min(2**self.log2_rows, (resolution + 1) ** self.dimensions)
             rows.append(int(np.ceil(vertices / 8) * 8))
         return rows
 
@@ -102,10 +106,10 @@ class HashGrid:
 
     def is_hashed(self, level: int) -> bool:
         stride = int(np.ceil(self._scales[level])) + 2
-        return stride**3 > self._rows[level]
+        return stride**self.config.dimensions > self._rows[level]
 
     def __call__(self, p, active=True, mode: dr.ReduceMode = dr.ReduceMode.Auto) -> list:
-        """Features at ``p`` (Array3f in the unit cube): ``levels * features`` Floats.
+        """Features at ``p`` (Array3f in the unit cube, or Array2f): ``levels * features`` Floats.
 
         Points outside of the cube give zeros. ``mode`` chooses how gradients are
         added to the table.
@@ -122,22 +126,21 @@ class HashGrid:
         ns = namespace(p)
         packet = {2: ns.Array2f, 4: ns.Array4f}[self.config.features]
         scale = float(self._scales[level])
-        pos = [dr.fma(c, scale, 0.5) for c in (p.x, p.y, p.z)]
+        pos = [dr.fma(c, scale, 0.5) for c in p]
         cell = [ns.UInt32(c) for c in pos]
         w = [c - ns.Float(i) for c, i in zip(pos, cell)]
         lo, hi = self._corner_indices(level, cell)
         offset = self._offsets[level]
 
-        def corner(ix, iy, iz):
-            row = self._combine(level, ix, iy, iz) + offset
-            return dr.gather(packet, self.table, row, active, mode=mode)
+        def blend(axis: int, index: tuple):
+            # Lerps from the last axis inwards: seven a feature instead of eight weights and eight products.
+            if axis < 0:
+                row = self._combine(level, index) + offset
+                return dr.gather(packet, self.table, row, active, mode=mode)
+            low, high = (blend(axis - 1, (i[axis], *index)) for i in (lo, hi))
+            return dr.lerp(low, high, w[axis])
 
-        # Seven lerps a feature instead of eight weights and eight products.
-        planes = []
-        for iz in (lo[2], hi[2]):
-            rows = [dr.lerp(corner(lo[0], iy, iz), corner(hi[0], iy, iz), w[0]) for iy in (lo[1], hi[1])]
-            planes.append(dr.lerp(rows[0], rows[1], w[1]))
-        return list(dr.select(active, dr.lerp(planes[0], planes[1], w[2]), 0))
+        return list(dr.select(active, blend(self.config.dimensions - 1, ()), 0))
 
     def _corner_indices(self, level: int, cell):
         """Per-axis parts of the vertex index, for the lower and the upper corner."""
@@ -145,13 +148,15 @@ class HashGrid:
             steps = _PRIMES
         else:
             stride = int(np.ceil(self._scales[level])) + 2
-            steps = (1, stride, stride * stride)
+            steps = (1, stride, stride * stride)  # as far as there are axes
         lo = [c * s for c, s in zip(cell, steps)]
         return lo, [a + s for a, s in zip(lo, steps)]
 
-    def _combine(self, level: int, ix, iy, iz):
+    def _combine(self, level: int, index: tuple):
         if not self.is_hashed(level):
-            return ix + iy + iz
-        h = ix ^ iy ^ iz
+            return sum(index[1:], index[0])
+        h = index[0]
+        for i in index[1:]:
+            h = h ^ i
         rows = self._rows[level]
         return h & (rows - 1) if rows & (rows - 1) == 0 else h % rows

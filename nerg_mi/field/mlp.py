@@ -16,18 +16,27 @@ import numpy as np
 from .backend import is_cuda, namespace
 
 
+# torch's LayerNorm adds it to the variance.
+_NORM_EPSILON = 1e-5
+
+
 class MLP:
-    """ReLU network without biases; the last layer is linear.
+    """ReLU network; the last layer is linear.
 
     ``weights``: one TensorXf of shape (outputs, inputs) a layer, in fp32. On
     CUDA the cooperative-vector path converts them to fp16, which the hardware's
     matrix units require; on LLVM fp16 is slower than fp32 and is not used.
+
+    ``norms``: None, or for each layer ``{"gain", "shift", "bias"}``, TensorXf of shapes (inputs,), (inputs,)
+    and (outputs,): its inputs go through torch's LayerNorm (gain and shift included) first, and the bias is
+    added to what it returns.
     """
 
-    DRJIT_STRUCT = {"weights": list}
+    DRJIT_STRUCT = {"weights": list, "norms": None}
 
-    def __init__(self, weights: list):
+    def __init__(self, weights: list, norms: list | None = None):
         self.weights = list(weights)
+        self.norms = None if norms is None else [dict(n) for n in norms]
         self._views = None
         # What the kernels read: the packed weights of all layers, attached to ``weights``.
         self.buffer = None
@@ -36,21 +45,48 @@ class MLP:
                 raise ValueError(
                     f"layers of this network do not fit together: shapes {[w.shape for w in self.weights]}"
                 )
+        for w, norm in zip(self.weights, self.norms or []):
+            shapes = {k: tuple(v.shape) for k, v in norm.items()}
+            expected = {"gain": (w.shape[1],), "shift": (w.shape[1],), "bias": (w.shape[0],)}
+            if shapes != expected:
+                raise ValueError(f"a normalised layer of shape {w.shape} needs {expected}, got {shapes}")
 
     @staticmethod
-    def random(sizes: list[int], ns: ModuleType, rng: np.random.Generator) -> MLP:
+    def random(sizes: list[int], ns: ModuleType, rng: np.random.Generator, normalized: bool = False) -> MLP:
         """Kaiming-uniform weights (as torch's Linear) for layer ``sizes`` [inputs, ..., outputs]."""
-        weights = []
+        weights, norms = [], []
         for fan_in, fan_out in zip(sizes, sizes[1:]):
             bound = 1 / np.sqrt(fan_in)
             weights.append(ns.TensorXf(rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32)))
-        return MLP(weights)
+            if normalized:
+                norms.append({"gain": dr.ones(ns.TensorXf, (fan_in,)), "shift": dr.zeros(ns.TensorXf, (fan_in,)),
+                              "bias": ns.TensorXf(rng.uniform(-bound, bound, fan_out).astype(np.float32))})
+        return MLP(weights, norms or None)
 
-    def require(self, sizes: list[int], name: str) -> None:
-        """Raise ``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs]."""
+    def require(self, sizes: list[int], name: str, normalized: bool = False) -> None:
+        """Raise ``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs] and are ``normalized`` or not."""
         shapes, expected = [tuple(w.shape) for w in self.weights], [(o, i) for i, o in zip(sizes, sizes[1:])]
         if shapes != expected:
             raise ValueError(f'"{name}" has layers of shapes {shapes} where its architecture needs {expected}')
+        if normalized != (self.norms is not None):
+            raise ValueError(f'"{name}" {"lacks" if normalized else "has"} layer normalisation, unlike its architecture')
+
+    def named(self) -> dict:
+        """Arrays by name: ``"0"``, ``"1"``, ... the weights; of a normalised layer also ``"0.gain"``, ``"0.shift"``, ``"0.bias"``."""
+        out = {}
+        for i, w in enumerate(self.weights):
+            out[str(i)] = w
+            if self.norms is not None:
+                out |= {f"{i}.{k}": v for k, v in self.norms[i].items()}
+        return out
+
+    def replace(self, name: str, value) -> None:
+        """Put ``value`` in the place of the array ``name``; ``pack`` makes it count."""
+        layer, _, part = name.partition(".")
+        if part:
+            self.norms[int(layer)][part] = value
+        else:
+            self.weights[int(layer)] = value
 
     @property
     def inputs(self) -> int:
@@ -63,10 +99,19 @@ class MLP:
     def pack(self) -> None:
         """Refresh what the kernels read after a change of ``weights``; gradients flow through."""
         ns = namespace(self.weights[0])
-        weights = [ns.TensorXf16(w) if is_cuda(ns) else w for w in self.weights]
+        weights = self.weights
+        if self.norms is not None:
+            # Gain and shift are part of the next product: W (g x + s) + b = (W g) x + (W s + b).
+            folded = [self._folded(i) for i in range(len(weights))]
+            weights = [array for pair in folded for array in pair]
+        weights = [ns.TensorXf16(w) if is_cuda(ns) else w for w in weights]
         packed = nn.pack(*weights, layout="training")
         self._views = [packed] if len(weights) == 1 else list(packed)
         self.buffer = self._views[0].buffer
+
+    def _folded(self, layer: int) -> tuple:
+        w, norm = self.weights[layer], self.norms[layer]
+        return w * norm["gain"], norm["bias"] + dr.sum(w * norm["shift"], axis=1)
 
     def __call__(self, x: list) -> list:
         """Outputs (list of Floats) at inputs ``x`` (list of Floats), as cooperative vectors."""
@@ -77,6 +122,8 @@ class MLP:
         # Cooperative vectors do not sum the derivatives of a lane that is shared by all the others.
         width = max(dr.width(c) for c in x)
         x = [c + dr.zeros(ns.Float, width) if dr.width(c) < width else c for c in x]
+        if self.norms is not None:
+            return self._normalized(x, ns, half)
         v = nn.CoopVec(*([ns.Float16(c) for c in x] if half else x))
         for i, view in enumerate(self._views):
             v = nn.matvec(view, v)
@@ -85,10 +132,27 @@ class MLP:
         out = list(v)
         return [ns.Float(c) for c in out] if half else out
 
+    def _normalized(self, x: list, ns: ModuleType, half: bool) -> list:
+        for i in range(len(self.weights)):
+            if i > 0:
+                x = [dr.maximum(c, 0) for c in x]
+            mean = sum(x) / len(x)
+            x = [c - mean for c in x]
+            scale = dr.rsqrt(sum(c * c for c in x) / len(x) + _NORM_EPSILON)
+            v = nn.CoopVec(*[ns.Float16(c * scale) if half else c * scale for c in x])
+            x = [ns.Float(c) if half else c for c in nn.matvec(self._views[2 * i], v, self._views[2 * i + 1])]
+        return x
+
     def tensor(self, x):
         """Outputs (outputs, N) at inputs ``x`` (inputs, N), both TensorXf, as tensor products."""
         for i, w in enumerate(self.weights):
-            x = w @ x
+            if self.norms is None:
+                x = w @ x
+            else:
+                x = x - dr.mean(x, axis=0)
+                x = x * dr.rsqrt(dr.mean(x * x, axis=0) + _NORM_EPSILON)
+                w, bias = self._folded(i)
+                x = w @ x + dr.reshape(type(x), bias, (-1, 1))
             if i + 1 < len(self.weights):
                 x = dr.maximum(x, 0)
         return x

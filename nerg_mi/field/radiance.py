@@ -12,7 +12,9 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from .background import Background
 from .box import Box
+from .cascades import CascadeGrid
 from .harmonics import encode_direction
 from .hashgrid import HashGrid, HashGridConfig
 from .mlp import MLP
@@ -71,11 +73,11 @@ def assign(field, values: dict) -> None:
         if value.shape != known[name].shape:
             raise ValueError(f'"{name}" has shape {known[name].shape}, and cannot become one of {value.shape}')
     for name, value in values.items():
-        owner, index = name.split(".")
-        if name == "grid.table":
-            field.grid.table = value
+        owner, part = name.split(".", 1)
+        if part == "table":
+            getattr(field, owner).table = value
         else:
-            getattr(field, owner).weights[int(index)] = value
+            getattr(field, owner).replace(part, value)
 
 
 def density_from_log(h, scale: float):
@@ -94,10 +96,13 @@ class RadianceField:
     ``color_space``: ``"srgb"`` or ``"linear"``, the space in which samples are
     composited because the field was trained in it. ``occupancy``: where density
     may exceed its threshold; None marches the whole box.
-    ``march_step``: step length, in units, that the field was trained with.
+    ``march_step``: step length, in units, that the field was trained with. ``background``: colour behind
+    the field where it was trained with one: what a ray shows in ``color_space`` is then C + (1 - α) background(o, d).
     """
 
-    DRJIT_STRUCT = {"grid": None, "density_net": None, "color_net": None, "_head": None, "occupancy": None}
+    DRJIT_STRUCT = {
+        "grid": None, "density_net": None, "color_net": None, "_head": None, "occupancy": None, "background": None,
+    }
 
     def __init__(
         self,
@@ -106,9 +111,10 @@ class RadianceField:
         grid: HashGrid,
         density_net: MLP,
         color_net: MLP,
-        occupancy: OccupancyGrid | None = None,
+        occupancy: OccupancyGrid | CascadeGrid | None = None,
         color_space: str = "srgb",
         march_step: float | None = None,
+        background: Background | None = None,
     ):
         if color_space not in ("srgb", "linear"):
             raise ValueError(f'color_space must be "srgb" or "linear", got "{color_space}"')
@@ -117,7 +123,7 @@ class RadianceField:
         color_net.require(config.color_sizes, "color_net")
         self.config, self.box, self.color_space = config, box, color_space
         self.grid, self.density_net, self.color_net = grid, density_net, color_net
-        self.occupancy, self.march_step = occupancy, march_step
+        self.occupancy, self.march_step, self.background = occupancy, march_step, background
         self.pack()
 
     @staticmethod
@@ -138,7 +144,18 @@ class RadianceField:
         out = {"grid.table": self.grid.table}
         for name, net in (("density_net", self.density_net), ("color_net", self.color_net)):
             out |= {f"{name}.{i}": w for i, w in enumerate(net.weights)}
+        if self.background is not None:
+            out["background_grid.table"] = self.background.grid.table
+            out |= {f"background_net.{i}": w for i, w in enumerate(self.background.net.weights)}
         return out
+
+    @property
+    def background_grid(self) -> HashGrid:
+        return self.background.grid
+
+    @property
+    def background_net(self) -> MLP:
+        return self.background.net
 
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
@@ -153,6 +170,8 @@ class RadianceField:
         last = self.density_net.weights[-1]
         self._head = MLP(self.density_net.weights[:-1] + [last[0:1, :]])
         self._head.pack()
+        if self.background is not None:
+            self.background.net.pack()
 
     def kernel_parameters(self) -> list:
         """The arrays that evaluations read: the table and the packed networks, attached to ``parameters()``."""

@@ -10,7 +10,10 @@ from types import ModuleType
 
 import numpy as np
 
+from ..field.backend import aligned
+from ..field.background import Background, BackgroundConfig
 from ..field.box import Box
+from ..field.cascades import CascadeGrid
 from ..field.gaze import GazeConfig, GazeField
 from ..field.hashgrid import HashGrid
 from ..field.mlp import MLP
@@ -44,18 +47,28 @@ def _reading(path):
 
 
 def _finite(tensors: dict, name: str) -> np.ndarray:
-    value = tensors[name].astype(np.float32)
+    value = aligned(tensors[name])
     if not np.all(np.isfinite(value)):
         raise ValueError(f'the weight array "{name}" is not finite')
     return value
 
 
-def _net(tensors: dict, name: str, sizes: list[int], ns: ModuleType) -> MLP:
-    return MLP([ns.TensorXf(_finite(tensors, f"{name}.{i}")) for i in range(len(sizes) - 1)])
+def _net(tensors: dict, name: str, sizes: list[int], ns: ModuleType, normalized: bool = False) -> MLP:
+    array = lambda key: ns.TensorXf(_finite(tensors, f"{name}.{key}"))
+    layers = range(len(sizes) - 1)
+    norms = [{part: array(f"{i}.{part}") for part in ("gain", "shift", "bias")} for i in layers] if normalized else None
+    return MLP([array(i) for i in layers], norms)
 
 
-def _grid(tensors: dict, config, ns: ModuleType) -> HashGrid:
-    return HashGrid(config, ns.Float(_finite(tensors, "grid.table")))
+def _grid(tensors: dict, config, ns: ModuleType, name: str = "grid") -> HashGrid:
+    return HashGrid(config, ns.Float(_finite(tensors, f"{name}.table")))
+
+
+def _occupancy(tensors: dict, about: dict, ns: ModuleType) -> OccupancyGrid | CascadeGrid:
+    bits, resolution, threshold = tensors["occupancy.bits"], about["resolution"], about["threshold"]
+    if "bound" in about:
+        return CascadeGrid.from_packed(bits, resolution, about["bound"], ns, threshold)
+    return OccupancyGrid.from_packed(bits, resolution, ns, threshold)
 
 
 def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half: bool = False) -> None:
@@ -72,6 +85,10 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
     if field.occupancy is not None:
         tensors["occupancy.bits"] = field.occupancy.packed()
         metadata["occupancy"] = {"resolution": field.occupancy.resolution, "threshold": field.occupancy.threshold}
+        if isinstance(field.occupancy, CascadeGrid):
+            metadata["occupancy"]["bound"] = field.occupancy.bound
+    if field.background is not None:
+        metadata["background"] = field.background.config.to_dict()
     write_checkpoint(path, "radiance", tensors, metadata)
 
 
@@ -79,14 +96,18 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
     """The field in ``path`` on backend ``ns`` (see ``field.backend.namespace``), and its metadata."""
     tensors, meta = read_checkpoint(path, "radiance")
     with _reading(path):
-        config, occupancy = RadianceConfig.from_dict(meta["architecture"]), None
+        config, occupancy, background = RadianceConfig.from_dict(meta["architecture"]), None, None
         if "occupancy" in meta:
-            about = meta["occupancy"]
-            occupancy = OccupancyGrid.from_packed(tensors["occupancy.bits"], about["resolution"], ns, about["threshold"])
+            occupancy = _occupancy(tensors, meta["occupancy"], ns)
+        if "background" in meta:
+            behind = BackgroundConfig.from_dict(meta["background"])
+            background = Background(
+                behind, _grid(tensors, behind.grid, ns, "background_grid"), _net(tensors, "background_net", behind.sizes, ns)
+            )
         field = RadianceField(
             config, Box(**meta["box"]), _grid(tensors, config.grid, ns),
             _net(tensors, "density_net", config.density_sizes, ns), _net(tensors, "color_net", config.color_sizes, ns),
-            occupancy, meta["color_space"], meta["march_step"],
+            occupancy, meta["color_space"], meta["march_step"], background,
         )
     return field, meta
 
@@ -111,6 +132,7 @@ def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField, dict]:
             "position_net": config.position_sizes, "direction_net": config.direction_sizes,
             "emit_head": [config.width, 1], "capture_head": [config.width, 1],
         }
-        nets = {name: _net(tensors, name, size, ns) for name, size in sizes.items()}
+        layernorm = lambda name: config.trunk == "layernorm" and not name.endswith("head")
+        nets = {name: _net(tensors, name, size, ns, layernorm(name)) for name, size in sizes.items()}
         field = GazeField(config, Box(**meta["box"]), _grid(tensors, config.grid, ns), **nets)
     return field, meta

@@ -43,6 +43,7 @@ def test02_which_levels_are_dense(finest, dense):
     # Level 6 of finest 512 has a table of 66^3 rows and a stride of 65: dense all the same.
     config = HashGridConfig(finest=finest)
     grid = HashGrid.__new__(HashGrid)
+    grid.config = config
     grid._scales, grid._rows = config.level_scales(), config.level_rows()
     assert [grid.is_hashed(level) for level in range(16)] == [False] * dense + [True] * (16 - dense)
 

@@ -1,0 +1,79 @@
+"""Colour behind everything, on a sphere around the scene: torch-ngp's background network.
+
+The ray's far intersection with the sphere, as two angles, goes through a small 2-D hash grid; its features
+and the harmonics of the direction go through a small network to a colour.
+"""
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from .backend import namespace
+from .harmonics import encode_direction
+from .hashgrid import HashGrid, HashGridConfig
+from .mlp import MLP
+
+
+@dataclass(frozen=True)
+class BackgroundConfig:
+    """``radius`` of the sphere about the field's origin, in the field's units, and the sizes. Defaults: torch-ngp's."""
+
+    radius: float
+    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
+    width: int = 64
+    hidden: int = 1
+    sh_degree: int = 4
+
+    def __post_init__(self):
+        if not (np.isfinite(self.radius) and self.radius > 0):
+            raise ValueError(f"the radius of a background must be positive and finite, got {self.radius}")
+        if self.grid.dimensions != 2 or min(self.width, self.hidden) < 1:
+            raise ValueError(f"a background needs a grid of 2 dimensions and sizes of at least 1, got {self}")
+
+    @property
+    def sizes(self) -> list[int]:
+        return [self.sh_degree**2 + self.grid.size] + [self.width] * self.hidden + [3]
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(d: dict) -> BackgroundConfig:
+        return BackgroundConfig(**{**d, "grid": HashGridConfig(**d["grid"])})
+
+
+class Background:
+    """Colour (0..1, in the colour space of its radiance field) that rays meet behind the field."""
+
+    DRJIT_STRUCT = {"grid": None, "net": None}
+
+    def __init__(self, config: BackgroundConfig, grid: HashGrid, net: MLP):
+        grid.require(config.grid)
+        net.require(config.sizes, "background_net")
+        self.config, self.grid, self.net = config, grid, net
+
+    @staticmethod
+    def random(config: BackgroundConfig, ns: ModuleType, seed: int = 0) -> Background:
+        """An untrained background; equal seeds give equal weights."""
+        rng = np.random.default_rng(seed)
+        return Background(config, HashGrid.random(config.grid, ns, rng), MLP.random(config.sizes, ns, rng))
+
+    def coordinates(self, o, d) -> list:
+        """[2 θ / π - 1, φ / π] where the ray ``o + t d`` (unit ``d``) leaves the sphere; θ from +y, φ from +x to +z."""
+        b = dr.dot(o, d)
+        # A ray that misses the sphere takes the point of it nearest to its own nearest point.
+        inside = dr.maximum(b * b - dr.squared_norm(o) + self.config.radius**2, 0)
+        p = o + d * (dr.sqrt(inside) - b)
+        theta = dr.atan2(dr.sqrt(p.x * p.x + p.z * p.z), p.y)
+        return [2 / dr.pi * theta - 1, dr.atan2(p.z, p.x) / dr.pi]
+
+    def __call__(self, o, d):
+        """Colour (Array3f like ``d``) of rays from ``o`` along unit ``d``, in the field's own coordinates."""
+        ns = namespace(d)
+        square = ns.Array2f(*[dr.clip(0.5 * c + 0.5, 0, 1) for c in self.coordinates(o, d)])
+        # torch-ngp puts the direction first.
+        rgb = self.net(encode_direction(d, self.config.sh_degree) + self.grid(square))
+        return type(d)(*[dr.fma(0.5, dr.tanh(0.5 * c), 0.5) for c in rgb])

@@ -1,0 +1,132 @@
+"""Occupancy in nested cubes about the origin, coarser outwards, as instant-ngp and torch-ngp keep it."""
+from __future__ import annotations
+
+from types import ModuleType
+
+import drjit as dr
+import numpy as np
+
+from .occupancy import OccupancyGrid
+
+_MOST_PARTS = 64
+
+
+class CascadeGrid:
+    """Levels of R³ bits over the cubes [-b, b]³, b = min(2^l, ``bound``): a point belongs to the least that holds it.
+
+    ``bits``: bool array (levels, R, R, R), indexed [level, z, y, x]. Marching sees one grid of equal cells over
+    [-bound, bound]³, so fine that no cell of any level is divided; it is never stored. ``threshold``: as for
+    ``OccupancyGrid``.
+    """
+
+    DRJIT_STRUCT = {"distance": None}
+
+    def __init__(self, bits: np.ndarray, bound: float, ns: ModuleType, threshold: float):
+        bits = np.asarray(bits, bool)
+        if bits.ndim != 4 or len(set(bits.shape[1:])) != 1 or bits.shape[1] % 2 or len(bits) != levels_of(bound):
+            raise ValueError(
+                f"cascades of a bound of {bound} are {levels_of(bound)} cubes with an even number of cells along each edge, "
+                f"got shape {bits.shape}"
+            )
+        self.bits, self.bound, self.threshold = bits, float(bound), float(threshold)
+        r = bits.shape[1]
+        self._halves = [min(2.0**level, self.bound) for level in range(len(bits))]
+        parts = [m for m in range(1, _MOST_PARTS + 1) if (self.bound * m).is_integer()]
+        if not parts:
+            raise ValueError(f"the bound {bound} of cascades must be a whole number, or one of at most {_MOST_PARTS} parts")
+        # Cells of the common grid along a cell of each level.
+        self._ratios = [int(h * parts[0]) for h in self._halves]
+        self.cells = (r * self._ratios[-1],) * 3
+        self.distance = ns.UInt8(np.stack(self._distances()).ravel())
+
+    @property
+    def resolution(self) -> int:
+        """Cells along an edge of each level."""
+        return self.bits.shape[1]
+
+    @property
+    def fraction(self) -> float:
+        """Share of the volume that is occupied."""
+        volume, inner = 0.0, 0.0
+        for level, half in enumerate(self._halves):
+            outside = self.bits[level] & ~self._within(level, inner)
+            volume += outside.sum() * (2 * half / self.resolution) ** 3
+            inner = half
+        return float(volume / (2 * self.bound) ** 3)
+
+    def _within(self, level: int, half: float) -> np.ndarray:
+        """Cells of ``level`` wholly inside of [-half, half]³."""
+        edges = np.linspace(-1, 1, self.resolution + 1) * self._halves[level]
+        inside = (edges[:-1] >= -half) & (edges[1:] <= half)
+        return inside[:, None, None] & inside[:, None] & inside
+
+    def _distances(self) -> list[np.ndarray]:
+        """For each level, chessboard distances in its own cells to what is occupied or beyond it; 0: occupied."""
+        r, out, finer, inner = self.resolution, [], None, 0.0
+        for level, bits in enumerate(self.bits):
+            full = bits & ~self._within(level, inner)
+            if finer is not None:
+                full |= self._coarsened(finer, level)
+            last = level + 1 == len(self.bits)
+            # What lies around a level is not known to be empty, except around the last.
+            padded = np.pad(full, 1, constant_values=not last)
+            reach = OccupancyGrid._chessboard(padded)[1:-1, 1:-1, 1:-1]
+            out.append(np.where(bits, 0, np.maximum(reach, 1)).astype(np.uint8))
+            finer, inner = full, self._halves[level]
+        return out
+
+    def _coarsened(self, finer: np.ndarray, level: int) -> np.ndarray:
+        """Cells of ``level`` that overlap an occupied one of the level below."""
+        r, small, large = self.resolution, self._ratios[level - 1], self._ratios[level]
+        first = (np.arange(r) * small + r // 2 * (large - small)) // large
+        last = (np.arange(r) * small + small - 1 + r // 2 * (large - small)) // large
+        z, y, x = np.nonzero(finer)
+        out = np.zeros((r, r, r), bool)
+        for az in (first, last):
+            for ay in (first, last):
+                for ax in (first, last):
+                    out[az[z], ay[y], ax[x]] = True
+        return out
+
+    def empty_cells(self, u, active=True):
+        """Distance in cells of the common grid (UInt32) from that of ``u`` (unit cube) to an occupied one; 0: occupied.
+
+        Points outside of the cube are clamped to its nearest cell.
+        """
+        uint, r, n = dr.uint32_array_t(type(u.x)), self.resolution, self.cells[0]
+        # Whole numbers from here on, so that a point lies in the same cell for whoever asks.
+        cell = [uint(dr.clip(x * n, 0, n - 1)) for x in (u.x, u.y, u.z)]
+        # Twice the distance of the cell's middle from the centre.
+        away = [dr.abs(dr.int32_array_t(type(u.x))(c) * 2 + 1 - n) for c in cell]
+        far = dr.maximum(dr.maximum(away[0], away[1]), away[2])
+        last = self._ratios[-1]
+        ratio, level, inverse = uint(last), uint(len(self._ratios) - 1), type(u.x)(1 / last)
+        for k in range(len(self._ratios) - 2, -1, -1):
+            inside, part = far < r * self._ratios[k], self._ratios[k]
+            ratio, level = dr.select(inside, part, ratio), dr.select(inside, k, level)
+            inverse = dr.select(inside, 1 / part, inverse)
+        shift = (n - r * ratio) // 2
+        # Half a cell from the next whole number at least, which no rounding bridges.
+        c = [uint((type(u.x)(c - shift) + 0.5) * inverse) for c in cell]
+        index = c[0] + r * (c[1] + r * (c[2] + r * level))
+        k = uint(dr.gather(type(self.distance), self.distance, index, active))
+        return dr.select(k > 1, (k - 1) * ratio + 1, k)
+
+    def packed(self) -> np.ndarray:
+        """The bits as bytes, level by level, x fastest, lowest bit first."""
+        return np.packbits(self.bits.ravel(), bitorder="little")
+
+    @staticmethod
+    def from_packed(data: np.ndarray, resolution: int, bound: float, ns: ModuleType, threshold: float) -> CascadeGrid:
+        count = levels_of(bound) * resolution**3
+        if data.size * 8 < count:
+            raise ValueError(f"cascades of resolution {resolution} to a bound of {bound} need {count // 8} bytes, got {data.size}")
+        bits = np.unpackbits(data, bitorder="little")[:count].reshape(-1, *(resolution,) * 3)
+        return CascadeGrid(bits.astype(bool), bound, ns, threshold)
+
+
+def levels_of(bound: float) -> int:
+    """Number of cubes that torch-ngp keeps for a scene of [-bound, bound]³."""
+    if not (np.isfinite(bound) and bound >= 1):
+        raise ValueError(f"the bound of cascades must be at least 1, got {bound}")
+    return 1 + int(np.ceil(np.log2(bound)))
