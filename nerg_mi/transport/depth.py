@@ -51,9 +51,11 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
         enter = dr.select(rest, again.enter, result.enter)
         missing = dr.select(rest, goal - again.enter_tau, LOG2 - result.enter_tau)
         found = active & (rest | opaque) & (missing > 0) & dr.isfinite(dr.select(rest, again.half, result.half))
-        step = step_length(enter, settings)
-        fine = march(medium, ray, enter, dr.minimum(enter + step, t1), found,
-                     replace(settings, step=settings.step / _PARTS), until=dr.select(found, missing, 1), count=count)
+        # Steps of cells are as long as their voxels: they are searched until the crossing is found.
+        end = t1 if settings.quadrature == "cells" else dr.minimum(enter + step_length(enter, settings), t1)
+        part = settings.step / _PARTS
+        fine = march(medium, ray, enter, end, found, replace(settings, step=part, cell_step=part),
+                     until=dr.select(found, missing, 1), count=count)
         if count:
             result.density_evals = result.density_evals + fine.density_evals
         # A finer march may find a little less in the step than the coarse one did.

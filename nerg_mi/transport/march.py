@@ -32,7 +32,9 @@ class MarchSettings:
     what lies behind is left out; ``color_cutoff``: samples are gathered until they weigh this much,
     and share the last one's colour;
     ``quadrature``: see ``rules``; ``coarse``: steps in front of all matter are this many times longer
-    (``fine_start`` finds where it begins; 1: one step length everywhere).
+    (``fine_start`` finds where it begins; 1: one step length everywhere); ``cell_step``: longest step of ``cells``,
+    whose steps otherwise end at voxel boundaries only (``step``, ``dt_gamma``, ``coarse`` and a first step's
+    ``offset`` do not apply to them).
     """
 
     step: float
@@ -41,6 +43,7 @@ class MarchSettings:
     color_cutoff: float = 1e-4
     quadrature: str = "constant"
     coarse: float = 1.0
+    cell_step: float = math.inf
 
     @property
     def opaque(self) -> float:
@@ -205,17 +208,23 @@ def scouted_march(medium, ray, t0, t1, active, settings: MarchSettings, **option
 def advance(medium, ray, t, t1, share, settings, active, planes=None, fine_from=None):
     """The next step to evaluate: ``(active, t, delta, t_next)``, from ``t`` on, ``delta`` long.
 
-    ``planes`` (``cells.VoxelCells``): also end the step where the ray leaves a voxel.
+    ``planes`` (``cells.VoxelCells``): end the step where the ray leaves a voxel instead.
     """
+    if planes is not None:
+        # Empty cells are left by strides that are too short to pass over any matter beside them.
+        stride = min(settings.step, 0.5 * planes.edge, settings.cell_step)
+        settings, fine_from = replace(settings, step=stride, dt_gamma=0.0), None
     if medium.occupancy is not None:
         t, share = _leap(medium, ray, t, t1, share, settings, active, fine_from)
         active = active & (t < t1)
-    # The last step ends at the exit.
-    t_next = dr.minimum(t + step_length(t, settings, fine_from) * share, t1)
-    if planes is not None:
+    if planes is None:
+        t_next = t + step_length(t, settings, fine_from) * share
+    else:
         # Rounding may put a boundary that has just been reached before t: a march must still go on.
         least = t + dr.maximum(t * _SPACING, settings.step * _SPACING)
-        t_next = dr.minimum(dr.minimum(t_next, dr.maximum(planes.next_boundary(ray, t), least)), t1)
+        t_next = dr.maximum(dr.minimum(planes.next_boundary(ray, t), t + settings.cell_step), least)
+    # The last step ends at the exit.
+    t_next = dr.minimum(t_next, t1)
     # What a step covers is what t moves by, rounding included, so that steps leave no gap and no overlap.
     return active, t, t_next - t, t_next
 

@@ -5,6 +5,8 @@ al. 2020). ``linear``: one sample at each end, shared between neighbours, densit
 linear in between (Uy et al. 2023, "NeRF Revisited: Fixing Quadrature Instability in
 Volume Rendering"). ``cells``: steps end at the voxel boundaries of a grid, where its
 interpolant is a cubic along the ray that two Gauss-Legendre samples integrate exactly.
+Opacity is then exact, depth to a hundredth of a voxel: it takes the density between as
+the line through both samples.
 """
 from __future__ import annotations
 
@@ -36,6 +38,17 @@ class Step:
     color: Callable
     carry: object
     evals: object
+
+
+def color_share(first, last, share):
+    """Where a step of linear density takes its colour, as a share of its length.
+
+    At the mean absorption, ``share``, which is exact for a linear colour, where both ends are nearly as dense; at the
+    denser end where one is nearly empty: in the air before a wall a trained field's colour means nothing. The square
+    of the relative difference decides, so that colour stays of second order in the step.
+    """
+    r = (last - first) / dr.maximum(first + last, 1e-18)
+    return dr.lerp(share, dr.select(r > 0, 1.0, 0.0), r * r)
 
 
 class Constant:
@@ -84,7 +97,7 @@ class Linear:
         share = linear_share(first * delta, last * delta)
 
         def paint(lit):
-            p = ray.o + ray.d * dr.fma(delta, dr.detach(share), t)
+            p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
             return color(medium.color(medium.density_features(p, lit)[1], p, ray.w, lit))
 
         return Step(dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint,
@@ -111,7 +124,7 @@ class Cells:
         share = linear_share(first * delta, last * delta)
 
         def paint(lit):
-            p = ray.o + ray.d * dr.fma(delta, dr.detach(share), t)
+            p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
             return color(medium.color(medium.density_features(p, lit)[1], p, ray.w, lit))
 
         return Step(dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint,

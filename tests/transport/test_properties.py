@@ -223,7 +223,7 @@ def test11_cells_do_not_depend_on_the_step(rgb):
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True}))
     ray = medium.local(rgb.Point3f(0.2, 0.3, -1), rgb.Vector3f(*(np.array([0.1, 0.2, 1]) / math.sqrt(1.05)).tolist()))
     tau = [
-        one(march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / n, stop=0, quadrature="cells")).tau)
+        one(march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / n, stop=0, quadrature="cells", cell_step=1 / n)).tau)
         for n in (1, 4, 16, 64)
     ]
     assert np.allclose(tau, tau[0], rtol=5e-6)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.transport.march import MarchSettings, march
-from nerg_mi.transport.media import VolumeMedium
+from nerg_mi.transport.media import LocalRay, VolumeMedium
 from nerg_mi.transport.rules import KINDS, linear_crossing, linear_share, rule
 
 from ..reference import march_numpy as reference
@@ -92,6 +92,88 @@ def test06_wrong_rules(rgb):
         rule("simpson", medium)
 
 
+class Colored:
+    """Density and colour that depend on z only: ``density(z, x)``, ``color(z)``; ``x`` is what derivatives are asked of."""
+
+    occupancy = cells = step = None
+
+    def __init__(self, density, color, x):
+        self._density, self._color, self.x = density, color, x
+
+    def parameters(self):
+        return [self.x]
+
+    def density(self, p, active):
+        return dr.select(active, self._density(p.z, self.x), 0)
+
+    def density_features(self, p, active):
+        return self.density(p, active), [p.z]
+
+    def color(self, features, p, w, active):
+        return ns.Array3f(self._color(features[0]))
+
+
+def along_z(medium, n, **controls):
+    z, t0, t1 = ns.Array3f(0, 0, 1), dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 1)
+    ray = LocalRay(ns.Array3f(0), z, z, t0, t1)
+    return march(medium, ray, t0, t1, True, MarchSettings(1 / n, stop=0, color_cutoff=0, **controls), color=ns.Array3f)
+
+
+@pytest.mark.parametrize("n", [1, 3, 10, 64])
+def test08_the_colour_of_a_wall_is_not_that_of_the_air_before_it(n):
+    wall = lambda z, x: dr.select((z > 0.487) & (z < 0.513 + 1 / n), 1e4 * x, 1e-6)  # noqa: E731
+    tint = lambda z: dr.select((z > 0.48) & (z < 0.52 + 1 / n), 0.25, -9)  # noqa: E731
+    r = along_z(Colored(wall, tint, ns.Float(1)), n, quadrature="linear")
+    if r.opacity.numpy()[0] > 0.5:
+        assert np.isclose(np.array(r.color)[0, 0], 0.25, rtol=1e-3)
+    assert n < 3 or r.opacity.numpy()[0] > 0.5
+
+
+def smooth(z, x, exp=dr.exp, sin=dr.sin):
+    return x * 4 * exp(-2 * z) * (1.2 + sin(9 * z))
+
+
+def test09_colour_is_of_second_order_in_smooth_matter():
+    tint = lambda z, exp=dr.exp: exp(-z) * z  # noqa: E731
+    total = reference.march(lambda p: smooth(p[:, 2], 1, np.exp, np.sin), (0, 0, 0), (0, 0, 1), np.linspace(0, 1, 20001),
+                            lambda p: tint(p[:, 2:], np.exp))[3][0]  # fmt: skip
+    errors = [
+        abs(np.array(along_z(Colored(smooth, tint, ns.Float(1)), n, quadrature="linear").color)[0, 0] - total)
+        for n in (8, 16, 32, 64)
+    ]
+    assert errors[3] < errors[0] / 40, errors
+
+
+def test10_derivatives_are_those_of_the_colour_that_is_shown():
+    # The place where a step takes its colour moves with the density, and the colour with it.
+    tint = lambda z: dr.sin(7 * z)  # noqa: E731
+    for density in (smooth, lambda z, x: x * dr.select(z > 0.43, 30.0, 0.5)):
+        x = ns.Float(1)
+        dr.enable_grad(x)
+        dr.backward(dr.sum(along_z(Colored(density, tint, x), 6, quadrature="linear").color.x))
+        shown = [
+            along_z(Colored(density, tint, ns.Float(1 + h)), 6, quadrature="linear").color.x[0] for h in (-4e-3, 4e-3)
+        ]
+        assert np.isclose(dr.grad(x)[0], (shown[1] - shown[0]) / 8e-3, rtol=3e-3)
+
+
+@pytest.mark.parametrize("gain", [1, 100, 1e4])
+def test11_cells_step_from_wall_to_wall_of_voxels(rgb, gain):
+    data = (gain * np.random.default_rng(0).exponential(1, (8, 8, 8))).astype(np.float32)
+    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True}))
+    o, d = np.array((0.21, 0.34, -1)), np.array((0.1, 0.17, 1)) / math.sqrt(1 + 0.1**2 + 0.17**2)
+    near, far = reference.box(o, d, (0, 0, 0), (1, 1, 1))
+    borders = np.unique(np.concatenate([np.linspace(near, far, 20001), np.linspace(near, min(far, near + 100 / gain), 20001)]))
+    tau, expected, _, _, _ = reference.march(lambda p: reference.trilinear(data, p), o, d, borders)
+    r = gather(rgb, medium, o, d, MarchSettings(1e-3, quadrature="cells", stop=0), count=True)
+    assert np.isclose(r.tau.numpy()[0], tau, rtol=1e-5)
+    # The density between is a line through two samples of a cubic: good to a hundredth of a voxel or so.
+    assert abs(r.expected_depth.numpy()[0] - expected) < 0.015 / 8
+    assert r.density_evals.numpy()[0] <= 2 * (9 + 3 + 3)
+    short = gather(rgb, medium, o, d, MarchSettings(1e-3, quadrature="cells", stop=0, cell_step=1 / 80), count=True)
+    assert short.density_evals.numpy()[0] > 2 * 80 and abs(short.expected_depth.numpy()[0] - expected) < 2e-4 / 8
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test07_every_march_ends(kind):
     # Far away the voxels are as small as the spacing of floats. In a process of its own, which can be ended.
@@ -99,7 +181,7 @@ def test07_every_march_ends(kind):
 import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.transport.march import MarchSettings, march
-from nerg_mi.transport.media import VolumeMedium
+from nerg_mi.transport.media import LocalRay, VolumeMedium
 data = np.full((64, 64, 64), 1.5, np.float32)
 data[::2] = 0.5
 medium = VolumeMedium(mi.load_dict({{"type": "gridvolume", "grid": mi.VolumeGrid(data)}}))
