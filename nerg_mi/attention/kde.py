@@ -75,6 +75,14 @@ class SphericalKde:
         self._kappa = self.ns.Float(kappa.astype(np.float32))
         self._log_c = self.ns.Float(log_normaliser(kappa).astype(np.float32))
 
+    def part(self, first: int, last: int) -> SphericalKde:
+        """The densities of probes ``first`` to ``last`` - 1 as an object of their own."""
+        if (first, last) == (0, self.count):
+            return self
+        offsets = np.array(self._offsets)[first : last + 1].astype(np.int64)
+        packed = np.array(self._rays).reshape(-1, 4)[offsets[0] : offsets[-1]]
+        return SphericalKde(packed[:, :3], offsets - offsets[0], np.array(self._kappa)[first:last], packed[:, 3], self.ns)
+
     def density(self, probe, direction):
         """Density of probe ``probe`` (UInt32, M lanes) in ``direction``
         (Array3f, unit, M lanes), in 1/sr; a Float of M lanes, traced, not

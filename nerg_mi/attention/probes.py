@@ -5,16 +5,19 @@ their directions into a density on the sphere (NeRG, Section 5.1).
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from . import vmf
+from .bandwidth import loo_kappas, silverman_kappas
+from .index import RayIndex
 from .kde import SphericalKde
+from .placement import PLACEMENTS, place_queries
 from .rays import Rays
 
 KAPPA_RULES = ("silverman", "loo", "fixed")
-PLACEMENTS = ("data", "grid", "random")
+WEIGHTS = ("equal", "distance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +57,11 @@ class Probes:
         unit. Each integrates to one over the sphere."""
         return self.kde(backend).evaluate(directions)
 
+    def widened(self, kappa: float) -> Probes:
+        """The probes seen through a von Mises-Fisher law of ``kappa`` about each ray: where eyes look, of rays that say
+        where heads point (κ about 37 was measured on people in a shop). See :func:`nerg_mi.attention.vmf.convolved_kappa`."""
+        return replace(self, kappa=vmf.convolved_kappa(self.kappa, kappa))
+
 
 def place_probes(
     rays: Rays,
@@ -68,24 +76,35 @@ def place_probes(
     kappa_rule: str = "silverman",
     kappa: float = 20.0,
     kappa_max: float = 1000.0,
+    kappa_shared: bool = False,
+    widen: float | None = None,
+    weights: str = "equal",
+    ray_weights: np.ndarray | None = None,
     centre: str = "mean",
+    index: RayIndex | None = None,
     seed: int = 0,
 ) -> Probes:
     """Probes on a set of rays.
 
     ``radius``: R in metres (the paper: 0.1 m at 2.6 million rays; with some
-    10^5 rays 0.25 m). ``placement``: ``data`` at ``count`` distinct random ray
-    origins; ``grid`` on a lattice of ``spacing`` metres (default 2R) over the
-    origins' box; ``random`` uniform in that box; or explicit ``queries`` (P, 3).
-    A query with fewer than ``min_rays`` rays makes no probe; of more than
-    ``cap`` the nearest are kept (the published code: 8 and 4,096).
+    10^5 rays 0.25 m). ``placement``, ``count``, ``spacing``: see
+    :func:`nerg_mi.attention.placement.place_queries`; or explicit ``queries``
+    (P, 3). A query with fewer than ``min_rays`` rays makes no probe; of more than
+    ``cap`` the nearest are kept (the published code: 8 and 4,096). ``index``: that
+    of these rays, where there is one already.
 
     ``kappa_rule``: ``silverman`` (the published code's), ``fixed`` (``kappa``)
     or ``loo`` (likelihood of each ray under those of *other people* where there
-    are any, else under the other rays). ``kappa_max`` bounds the first and last:
+    are any, else under the other rays; unweighted). ``kappa_max`` bounds the first and last:
     a person who stares makes a spike that no few thousand directions resolve.
+    ``kappa_shared``: one κ for all probes (:mod:`nerg_mi.attention.bandwidth`).
+    ``widen``: κ of the law of the eyes about the heads, see :meth:`Probes.widened`.
 
-    ``centre``: where the density is said to hold. ``mean``, the mean of the
+    ``weights``: of a probe's rays, ``equal`` or ``distance`` (1 - d/R, as an option of the
+    published code has it with the farthest ray's distance for R). ``ray_weights`` (N,):
+    non-negative factors besides, such as those of :func:`person_weights`; rays of weight zero are left out.
+
+    ``centre``: where the density is said to hold. ``mean``, the (weighted) mean of the
     rays' origins, as in the published code and by default: it is where people
     stood, also at the edge of where they walk. ``query``: the ball's centre, as
     in the paper's text. The two differ by less than R.
@@ -95,100 +114,59 @@ def place_probes(
     _check_one_of("placement", placement, PLACEMENTS)
     _check_one_of("kappa_rule", kappa_rule, KAPPA_RULES)
     _check_one_of("centre", centre, ("mean", "query"))
+    _check_one_of("weights", weights, WEIGHTS)
     if not radius > 0 or min_rays < 1 or cap < min_rays:
         raise ValueError(f"radius {radius}, min_rays {min_rays}, cap {cap}: need radius > 0 and 1 <= min_rays <= cap")
     rng = np.random.default_rng(seed)
+    if ray_weights is not None:
+        ray_weights = np.asarray(ray_weights, dtype=np.float64)
+        if ray_weights.shape != (len(rays),) or not (ray_weights >= 0).all():
+            raise ValueError(f"ray_weights {ray_weights.shape} must be {len(rays)} non-negative numbers, one a ray")
+        if not ray_weights.all():
+            some = np.flatnonzero(ray_weights)
+            kept = place_probes(
+                rays.select(some), radius, placement=placement, count=count, queries=queries, spacing=spacing, cap=cap,
+                min_rays=min_rays, kappa_rule=kappa_rule, kappa=kappa, kappa_max=kappa_max, kappa_shared=kappa_shared,
+                widen=widen, weights=weights, ray_weights=ray_weights[some], centre=centre, seed=seed,
+            )  # fmt: skip
+            return replace(kept, indices=some[kept.indices])
     if queries is None:
-        queries = _queries(rays.origin, placement, count, spacing or 2.0 * radius, rng)
+        queries = place_queries(rays.origin, placement, count, spacing, radius, rng)
     queries = np.asarray(queries, dtype=np.float64).reshape(-1, 3)
 
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(rays.origin)
-    within = tree.query_ball_point(queries, radius, return_length=True)
-    # A block of queries at a time: the neighbours of thousands are millions.
-    kept, runs = np.flatnonzero(within >= min_rays), []
-    most = int(min(cap, within.max(initial=1)))
-    block = max(1, (1 << 20) // most)
-    for start in range(0, len(kept), block):
-        which = kept[start : start + block]
-        # A hair more than R, so that rounding loses none of those counted; the
-        # nearest so many are they.
-        bound = radius * (1.0 + 1e-9)
-        _, found = tree.query(queries[which], k=np.arange(1, most + 1), distance_upper_bound=bound)
-        runs += [near[: min(count, most)] for near, count in zip(found, within[which])]
-    if not len(kept):
+    near = (index or RayIndex(rays)).nearest(queries, cap, radius)
+    counts = np.diff(near.offsets)
+    enough = counts >= min_rays
+    if not enough.any():
         raise ValueError(
             f"none of {len(queries)} probes holds {min_rays} rays within {radius} m; enlarge the radius or lower min_rays"
         )
-
-    queries = queries[kept]
-    counts = np.array([len(r) for r in runs])
+    held = np.repeat(enough, counts)
+    queries, counts = queries[enough], counts[enough]
+    indices, distances = near.indices[held], near.distances[held]
     offsets = np.concatenate([[0], np.cumsum(counts)])
-    indices = np.concatenate(runs)
     directions = rays.direction[indices]
-    means = np.add.reduceat(rays.origin[indices], offsets[:-1]) / counts[:, None]
+
+    w = None if ray_weights is None else ray_weights[indices]
+    if weights == "distance":
+        # Never quite zero: a probe may hold nothing but rays at its rim.
+        w = np.maximum(1.0 - distances / radius, 1e-6) * (1.0 if w is None else w)
+    share = (1.0 / counts if w is None else 1.0 / np.add.reduceat(w, offsets[:-1]))[:, None]
+    means = np.add.reduceat(rays.origin[indices] * (1.0 if w is None else w[:, None]), offsets[:-1]) * share
     if kappa_rule == "fixed":
-        kappas = np.full(len(kept), float(kappa))
+        kappas = np.full(len(counts), float(kappa))
     elif kappa_rule == "silverman":
-        resultant = np.linalg.norm(np.add.reduceat(directions, offsets[:-1]), axis=1) / counts
-        kappas = np.minimum(vmf.silverman_kappa(np.minimum(resultant, 1.0), counts), kappa_max)
+        kappas = silverman_kappas(directions, w, offsets, kappa_max, kappa_shared)
     else:
-        kappas = np.array([leave_one_out_kappa(rays.direction[r], rays.person[r], kappa_max=kappa_max, rng=rng) for r in runs])
-    return Probes(means if centre == "mean" else queries, queries, float(radius), indices, offsets, directions, kappas)
+        kappas = loo_kappas(directions, rays.person[indices], offsets, kappa_max, kappa_shared, rng)
+    probes = Probes(means if centre == "mean" else queries, queries, float(radius), indices, offsets, directions, kappas, w)
+    return probes if widen is None else probes.widened(widen)
 
 
-def leave_one_out_kappa(
-    directions: np.ndarray,
-    groups: np.ndarray | None = None,
-    *,
-    kappa_min: float = 1.0,
-    kappa_max: float = 1000.0,
-    most: int = 256,
-    rng: np.random.Generator | None = None,
-) -> float:
-    """κ under which rays are best predicted by the others.
-
-    Maximises Σ_i log mean_j f(x_i; x_j, κ) over a geometric grid (25 % steps),
-    j running over rays of other ``groups`` (n,) where there are two or more,
-    else over j ≠ i. Leaving out people and not only the ray itself matters at
-    50 Hz: successive rays repeat each other, and the sharpest κ would win.
-    ``directions`` (n, 3) unit; of more than ``most`` a random choice is used.
-    """
-    rng = rng or np.random.default_rng(0)
-    if len(directions) < 2:
-        return kappa_min
-    if len(directions) > most:
-        chosen = rng.choice(len(directions), most, replace=False)
-        directions, groups = directions[chosen], None if groups is None else np.asarray(groups)[chosen]
-    if groups is None or len(np.unique(groups)) < 2:
-        groups = np.arange(len(directions))
-    others = groups[:, None] != groups[None, :]
-    apart = vmf.one_minus_cosine(directions[:, None], directions[None, :])
-    apart = np.where(others, apart, np.inf)
-    nearest = apart.min(axis=1, keepdims=True)
-    log_count = np.log(others.sum(axis=1))
-    grid = np.geomspace(kappa_min, kappa_max, max(2, 1 + round(np.log(kappa_max / kappa_min) / np.log(1.25))))
-    # exp(-κ (a - a_min)) with the nearest taken out: no ray ever has log 0.
-    score = [
-        np.sum(np.log(np.exp(-k * (apart - nearest)).sum(axis=1)) - k * nearest[:, 0] - log_count) + len(apart) * vmf.log_normaliser(k)
-        for k in grid
-    ]
-    return float(grid[int(np.argmax(score))])
-
-
-def _queries(origin: np.ndarray, placement: str, count: int, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    if placement == "data":
-        return origin[rng.choice(len(origin), min(count, len(origin)), replace=False)]
-    low, high = origin.min(axis=0), origin.max(axis=0)
-    if placement == "random":
-        return rng.uniform(low, high, (count, 3))
-    # The lattice is centred in the box, so that it does not favour one wall.
-    axes = []
-    for a, b in zip(low, high):
-        n = max(1, int(np.floor((b - a) / spacing)) + 1)
-        axes.append(0.5 * (a + b) + spacing * (np.arange(n) - 0.5 * (n - 1)))
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+def person_weights(rays: Rays) -> np.ndarray:
+    """Weights (N,) under which every person counts as much, whatever the number of their rays; their mean is one."""
+    counts = np.bincount(rays.person, minlength=len(rays.persons))
+    return len(rays) / np.count_nonzero(counts) / counts[rays.person]
 
 
 def _check_one_of(name: str, value: str, words: tuple[str, ...]) -> None:

@@ -70,6 +70,26 @@ def kappa_from_resultant(resultant: np.ndarray | float) -> np.ndarray:
     return np.clip(solved, KAPPA_MIN, KAPPA_MAX)
 
 
+def convolved_kappa(kappa: np.ndarray | float, by: np.ndarray | float) -> np.ndarray:
+    """κ of a von Mises-Fisher law seen through another one: A(κ) = A(κ_1) A(κ_2).
+
+    The convolution of two such laws is none, but hardly differs from the one with its mean direction and mean resultant
+    length (Mardia & Jupp 2000, section 9.3.2), which is what this gives. Broadcasts; as ``by`` grows, κ is unchanged.
+    """
+    kappa, by = _checked(kappa), _checked(by)
+    # 1 - A B from 1 - A and 1 - B: A itself has no digits left for large κ.
+    a, b = _one_minus_resultant(kappa), _one_minus_resultant(by)
+    short = a + b - a * b
+    with np.errstate(divide="ignore"):
+        sharp = 1.0 / np.maximum(short, 1.0 / KAPPA_MAX)  # coth κ = 1 from 20 on
+    return np.clip(np.where(short < 0.05, sharp, kappa_from_resultant(1.0 - short)), KAPPA_MIN, KAPPA_MAX)
+
+
+def _one_minus_resultant(kappa: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.where(kappa > 20.0, 1.0 / kappa, 1.0 - mean_resultant_length(kappa))
+
+
 def silverman_kappa(resultant: np.ndarray | float, count: np.ndarray | int) -> np.ndarray:
     """κ of the published code's kernels: 1/h², h = 1.06 σ̂ N^(-1/5), σ̂ = κ̂^(-1/2)
     with κ̂ from the mean resultant length; σ̂ = 1 for a single ray.

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.attention import vmf
-from nerg_mi.attention.probes import leave_one_out_kappa, place_probes
+from nerg_mi.attention.bandwidth import leave_one_out_kappa
+from nerg_mi.attention.probes import place_probes
 from nerg_mi.attention.rays import Rays
 from nerg_mi.attention.sphere import fibonacci_directions
 

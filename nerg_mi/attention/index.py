@@ -1,0 +1,65 @@
+"""Which rays start near a place: a spatial index of millions of origins."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .rays import Rays
+
+_BLOCK = 1 << 21  # neighbours held at a time: memory stays bounded
+
+
+class Neighbours(NamedTuple):
+    """Of Q places: ``indices`` (n,) of rays, place after place, nearest first, ``distances`` (n,) metres, and ``offsets``
+    (Q + 1,): place q has ``indices[offsets[q]:offsets[q + 1]]``."""
+
+    indices: np.ndarray
+    distances: np.ndarray
+    offsets: np.ndarray
+
+
+class RayIndex:
+    """A k-d tree of ray origins: built in a second or two for millions, thousands of places in less than that.
+
+    ``rays``: a set of rays, or origins (N, 3) in metres.
+    """
+
+    def __init__(self, rays: Rays | np.ndarray) -> None:
+        from scipy.spatial import cKDTree
+
+        origin = rays.origin if isinstance(rays, Rays) else np.asarray(rays, dtype=np.float64)
+        self.count = len(origin)
+        # Without balancing: half the time to build, and as fast to ask.
+        self._tree = cKDTree(origin, balanced_tree=False)
+
+    def nearest(self, places: np.ndarray, most: int, radius: float = np.inf) -> Neighbours:
+        """The ``most`` nearest rays of each of ``places`` (Q, 3), within ``radius`` metres (those at exactly R count)."""
+        places = np.asarray(places, dtype=np.float64).reshape(-1, 3)
+        if most < 1 or not radius > 0:
+            raise ValueError(f"most {most}, radius {radius}: ask for at least one ray within a positive radius")
+        most = min(most, self.count)
+        # A hair more than R: scipy leaves out what lies at the bound.
+        bound = np.nextafter(radius, np.inf) if np.isfinite(radius) else np.inf
+        step = max(1, _BLOCK // most)
+        indices, distances, counts = [], [], []
+        for start in range(0, len(places), step):
+            d, i = self._tree.query(places[start : start + step], k=np.arange(1, most + 1), distance_upper_bound=bound, workers=-1)
+            found = np.isfinite(d)
+            indices.append(i[found])
+            distances.append(d[found])
+            counts.append(found.sum(axis=1))
+        offsets = np.concatenate([[0], np.cumsum(np.concatenate(counts))]) if counts else np.zeros(1, np.int64)
+        join = lambda parts, kind: np.concatenate(parts) if parts else np.empty(0, kind)
+        return Neighbours(join(indices, np.int64), join(distances, np.float64), offsets.astype(np.int64))
+
+    def counts(self, places: np.ndarray, radius: float) -> np.ndarray:
+        """How many rays lie within ``radius`` metres of each of ``places`` (Q, 3): (Q,) int64."""
+        return self._tree.query_ball_point(np.asarray(places, dtype=np.float64), radius, return_length=True, workers=-1)
+
+    def within(self, places: np.ndarray, radius: float) -> np.ndarray:
+        """Rays within ``radius`` metres of any of ``places``: (N,) bool."""
+        from scipy.spatial import cKDTree
+
+        near = cKDTree(np.asarray(places, dtype=np.float64).reshape(-1, 3)).query(self._tree.data, workers=-1)[0]
+        return near <= radius
