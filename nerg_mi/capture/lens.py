@@ -69,6 +69,18 @@ def _ratio(r2, lens: Intrinsics):
     return over / under, (slope - over / under * under_slope) / under
 
 
+def pinhole_limit(lens: Intrinsics) -> float:
+    """Squared tangent of the angle at which a pinhole lens folds over: what lies beyond is not in the photo, though the
+    model gives it a pixel. The radial part alone; infinite where it never does."""
+    # With t = r², the image radius is r N(t)/D(t); its slope has the sign of N D + 2 t (N' D - N D').
+    over = np.polynomial.Polynomial([1, lens.k1, lens.k2, lens.k3])
+    under = np.polynomial.Polynomial([1, lens.k4, lens.k5, lens.k6])
+    slope = over * under + np.polynomial.Polynomial([0, 2]) * (over.deriv() * under - over * under.deriv())
+    roots = np.concatenate([p.trim().roots() for p in (slope, under)])
+    real = roots[np.abs(roots.imag) < 1e-9 * np.maximum(1, np.abs(roots))].real
+    return float(min(real[real > 0], default=np.inf))
+
+
 def _jacobian(xy, lens: Intrinsics):
     """∂x'/∂x, ∂x'/∂y = ∂y'/∂x and ∂y'/∂y of `distort`."""
     x, y = xy[..., 0], xy[..., 1]
@@ -123,7 +135,9 @@ def image(d: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
     d = np.asarray(d, np.float64)
     if not lens.fisheye:
         front = d[..., 2] > 1e-9
-        return distort(d[..., :2] / np.where(front, d[..., 2], 1.0)[..., None], lens), front
+        xy = d[..., :2] / np.where(front, d[..., 2], 1.0)[..., None]
+        front &= np.sum(xy * xy, axis=-1) < pinhole_limit(lens)
+        return distort(np.where(front[..., None], xy, 0.0), lens), front
     r = np.linalg.norm(d[..., :2], axis=-1)
     theta = np.arctan2(r, d[..., 2])
     radius, _ = _fisheye_radius(theta, lens)

@@ -71,7 +71,7 @@ def read_depth(source: DepthFile) -> np.ndarray:
     if suffix == ".npy":
         try:
             out = np.load(path, allow_pickle=False)
-        except (OSError, EOFError) as e:
+        except (OSError, EOFError, ValueError) as e:
             raise ValueError(f'the depth file "{path}" cannot be read: {e}') from e
     elif suffix in (".exr", ".png"):
         out = np.array(_open(path, "depth file"))

@@ -75,3 +75,13 @@ def test_a_fisheye_ends_where_its_polynomial_turns():
     assert angle == pytest.approx(1, abs=1e-3) and radius == pytest.approx(2 / 3, abs=1e-5)
     assert lens.fisheye_limit(replace(i, k1=0.0)) == pytest.approx((np.pi, np.pi))
     assert not lens.image(np.array([1.0, 0, -1.0]), i)[1]
+
+
+def test_what_lies_beyond_the_fold_of_a_pinhole_lens_is_not_shown():
+    """r (1 - r²/3) turns at r = 1; the model alone would put a point at r = 1.7 near the centre."""
+    i = Intrinsics(10, 10, 5.0, 5.0, 5.0, 5.0, -1 / 3)
+    assert lens.pinhole_limit(i) == pytest.approx(1)
+    assert np.array_equal(lens.image(np.array([[0.99, 0, 1], [1.01, 0, 1], [1.7, 0, 1]]), i)[1], [True, False, False])
+    assert lens.pinhole_limit(LENSES["plain"]) == np.inf
+    # A pole of the rational model: 1 - t/4.
+    assert lens.pinhole_limit(replace(i, k1=0.0, k4=-0.25)) == pytest.approx(4)

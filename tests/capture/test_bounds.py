@@ -1,0 +1,84 @@
+"""The scene box around an object, in a room and around points; and cameras that see what no other does."""
+import numpy as np
+import pytest
+
+from nerg_mi.capture.bounds import lonely, scene_box
+from nerg_mi.capture.cameras import Camera
+from nerg_mi.field.box import Box
+from nerg_mi.formats.intrinsics import Intrinsics
+
+LENS = Intrinsics(10, 10, 10.0, 10.0, 5.0, 5.0)
+
+
+def looking(center, at):
+    z = np.subtract(center, at) / np.linalg.norm(np.subtract(center, at))
+    x = np.cross([0, 0.3, 1.0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), center
+    return Camera(LENS, pose)
+
+
+def directions(count, seed=4):
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+AROUND = [looking(np.array([1, 2, 3]) + 4 * d, [1, 2, 3]) for d in directions(20)]
+INSIDE = [looking(c, c + d) for c, d in zip(np.random.default_rng(4).uniform(0, 4, (20, 3)), directions(20))]
+
+
+def test_around_an_object():
+    box, _ = scene_box(AROUND)
+    assert np.allclose(box.center, [1, 2, 3], atol=1e-6) and box.side == pytest.approx(10)
+    assert scene_box(AROUND, object_only=True)[0].side == pytest.approx(4)
+
+
+def test_in_a_room():
+    box, how = scene_box(INSIDE)
+    assert "around the cameras" in how
+    assert np.all(np.array(box.lower) < 0) and np.all(np.array(box.upper) > 4)
+
+
+def test_at_one_point():
+    with pytest.raises(ValueError, match="--aabb"):
+        scene_box([looking(np.zeros(3), d) for d in directions(5)])
+
+
+def walls(count=4000):
+    """Points on the walls of a room of 6 x 5 x 3."""
+    p = np.random.default_rng(5).uniform(0, 1, (count, 3))
+    side = np.random.default_rng(6).integers(0, 3, count)
+    p[np.arange(count), side] = np.round(p[np.arange(count), side])
+    return p * [6, 5, 3] - 1
+
+
+def test_points_on_the_walls_of_a_room_give_its_box():
+    """Stray points behind mirrors and windows do not widen it; the walls lie inside by a few percent."""
+    strays = np.random.default_rng(7).uniform(-60, 60, (12, 3))
+    box, how = scene_box(INSIDE, points=np.concatenate([walls(), strays]))
+    assert "points" in how
+    assert np.all(np.array(box.lower) < -1) and np.all(np.array(box.lower) > -1.5)
+    assert np.all(np.array(box.upper) > [5, 4, 2]) and np.all(np.array(box.upper) < [5.5, 4.5, 2.5])
+
+
+def test_points_far_behind_an_object_do_not_count():
+    far = 300 * directions(500, 8)
+    near = np.array([1, 2, 3]) + directions(2000, 9)
+    box, _ = scene_box(AROUND, points=np.concatenate([far, near]))
+    assert box.side == pytest.approx(10)
+    assert scene_box(AROUND, points=near)[0].side == pytest.approx(2.2, rel=0.02)
+
+
+def test_few_points_are_no_evidence():
+    assert "cameras" in scene_box(INSIDE, points=walls(50))[1]
+
+
+def test_a_camera_that_sees_what_no_other_does_is_found():
+    box = Box((-3, -3, -3), (5, 7, 9))
+    assert lonely(AROUND, box) == []
+    away = looking(np.array([1, 2, 8.9]), [1, 2, 30])
+    ring = [looking(np.array([1 + 4 * np.cos(a), 2 + 4 * np.sin(a), 3]), [1, 2, 3]) for a in np.arange(0, 6, 0.5)]
+    assert lonely([*ring[:4], away, *ring[4:]], Box((-3, -3, -3), (5, 7, 40))) == [4]
+    outside = looking(np.array([100.0, 0, 0]), [200, 0, 0])
+    assert lonely([*AROUND, outside], box) == [20]
