@@ -16,6 +16,7 @@ from . import lens
 _OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
 # OpenCV's cameras look along +z with y down.
 _OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0])
+_WIDEST = float(np.tan(np.radians(85)))
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,24 @@ def pixel_grid(intrinsics: Intrinsics) -> np.ndarray:
 def pixel_directions(intrinsics: Intrinsics) -> np.ndarray:
     """Unit directions (height, width, 3), float64, of the pixels' centres in the OpenGL camera frame."""
     return lens.rays(pixel_grid(intrinsics), intrinsics) * _OPENGL_FROM_OPENCV
+
+
+def view_tangents(intrinsics: Intrinsics) -> tuple[float, float, float, float]:
+    """How far a picture reaches left, right, up and down: tangents of the angles from its axis, lens included.
+
+    At most tan 85°: what a fisheye sees beyond that no frustum holds.
+    """
+    i = intrinsics
+    x = np.linspace(0, i.width, 33)
+    y = np.linspace(0, i.height, 33)
+    border = [(u, v) for u in x for v in (0, i.height)] + [(u, v) for v in y for u in (0, i.width)]
+    xy = (np.array(border) - [i.cx, i.cy]) / [i.fx, i.fy]
+    d = lens.rays(xy, i)
+    ahead = np.maximum(d[:, 2], 1e-9)
+    tangent = np.clip(d[:, :2] / ahead[:, None], -_WIDEST, _WIDEST)
+    left, up = -tangent.min(axis=0)
+    right, down = tangent.max(axis=0)
+    return float(left), float(right), float(up), float(down)
 
 
 def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

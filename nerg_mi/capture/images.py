@@ -7,7 +7,7 @@ import numpy as np
 
 from ..formats.posed import Frame, Unused
 from . import lens
-from .cameras import Camera, pixel_directions, pixel_grid
+from .cameras import Camera, pixel_directions, pixel_grid, view_tangents
 from .reading import read_depth, read_image, read_mask
 from .resize import all_used, area_average, nearest
 
@@ -106,8 +106,8 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
         raise ValueError(f'the image "{frame.image}" is only {w} pixels wide; choose a width of at most {w}')
     size = max(1, round(w / factor)), max(1, round(h / factor))
     intrinsics = stated.resized(*size)
-    # Every pixel must have a ray; the borders are where lenses fold over.
-    pixel_directions(stated.resized(*(min(n, 48) for n in (w, h))))
+    # Every pixel must have a ray; lenses fold over at the borders first.
+    view_tangents(intrinsics)
     mask = None if frame.mask is None else all_used(read_mask(frame.mask, (h, w)), *size)
     if intrinsics.fisheye:
         shown = np.linalg.norm(pixel_grid(intrinsics), axis=-1) < lens.fisheye_limit(intrinsics)[1]

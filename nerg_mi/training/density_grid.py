@@ -8,7 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from ..capture.cameras import Camera
+from ..capture.cameras import Camera, view_tangents
 from ..field.box import Box
 from ..field.occupancy import OccupancyGrid
 
@@ -57,7 +57,7 @@ class DensityGrid:
     def _seen(self, cameras: list[Camera], min_views: int):
         """Cells whose centre lies within the box and in at least ``min_views`` pictures.
 
-        Occlusion and distortion are not considered; pictures are taken to be 10 % wider instead.
+        Occlusion is not considered, and pictures are taken to be 10 % wider than their borders' rays.
         """
         Float, UInt32 = self.ns.Float, self.ns.UInt32
         p = self._to_world(self._corner(self.index) + 0.5 / self.resolution)
@@ -67,10 +67,9 @@ class DensityGrid:
         count = dr.zeros(UInt32, self.resolution**3)
         dr.eval(p, inside)
         for camera in cameras:
-            i = camera.intrinsics
             rows = [Float(v) for v in camera.to_world[:3, :3].T.ravel()]
             origin = [Float(v) for v in camera.center]
-            edge = [Float(v) for v in (i.cx / i.fx, (i.width - i.cx) / i.fx, i.cy / i.fy, (i.height - i.cy) / i.fy)]
+            edge = [Float(v) for v in view_tangents(camera.intrinsics)]
             # As literals the pose would compile one kernel a camera.
             dr.make_opaque(rows, origin, edge)
             d = [p[k] - origin[k] for k in range(3)]

@@ -1,8 +1,10 @@
 """Rays of cameras: distortion, projection, and agreement with Mitsuba's own camera."""
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import Camera, pixel_directions, project, sensor_dict
+from nerg_mi.capture.cameras import Camera, pixel_directions, project, sensor_dict, view_tangents
 from nerg_mi.formats.intrinsics import Intrinsics
 
 FOX = Intrinsics(135, 240, 171.94, 171.81, 69.3, 120.7, 0.0578421, -0.0805099, -0.000980296, 0.00015575)
@@ -26,6 +28,19 @@ def test_pixel_rays_project_back_to_their_pixels():
     x, y = np.meshgrid(np.arange(135) + 0.5, np.arange(240) + 0.5)
     assert front.all()
     assert np.allclose(pixel, np.stack([x.ravel(), y.ravel()], axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize("fisheye", [False, True])
+def test_view_tangents_hold_every_pixel(fisheye):
+    i = replace(FOX, fisheye=True, p1=0.0, p2=0.0) if fisheye else FOX
+    d = pixel_directions(i)
+    x, y = d[..., 0] / -d[..., 2], d[..., 1] / d[..., 2]
+    left, right, up, down = view_tangents(i)
+    # The outermost centres lie half a pixel inside.
+    for limit, reached in ((left, -x.min()), (right, x.max()), (up, -y.min()), (down, y.max())):
+        assert reached < limit < reached + 0.01
+    assert view_tangents(Intrinsics(10, 20, 10.0, 10.0, 4.0, 9.0)) == pytest.approx((0.4, 0.6, 0.9, 1.1))
+    assert max(view_tangents(Intrinsics(10, 10, 2.0, 2.0, 5.0, 5.0, fisheye=True))) == pytest.approx(np.tan(np.radians(85)))
 
 
 def test_points_behind_a_camera_are_not_in_front():
