@@ -25,6 +25,7 @@ COMMANDS = {
     "rays": "Import tracking files as rays of attention, and look at what they hold.",
     "train": "Train a radiance field on posed photos, or a gaze field on rays.",
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
+    "export": "Write a radiance field as a mesh, points, grid volumes or a torch-ngp checkpoint.",
     "study": "Measure error against run time: a scene at many settings, compared with what is true.",
 }
 """Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""

@@ -1,0 +1,150 @@
+"""Surfaces and lattices of a radiance field, as arrays for other tools.
+
+A surface is where density crosses a threshold. It is looked for in the opacity of a lattice cell, 1 - exp(-σ h), which is
+bounded where density is not, and then found along the lattice's edges in the field itself.
+"""
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from .backend import namespace
+from .radiance import RadianceField
+
+# Points a kernel launch: some hundred megabytes of intermediate values at most.
+_BATCH = 1 << 21
+_BISECTIONS = 8
+# Tilted directions beside the head-on one that a surface's colour is the mean of.
+_TILTED = 4
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Points at the middles of cubic cells of edge ``step`` that fill a box from ``lower`` on; ``shape``: cells along x, y, z."""
+
+    lower: tuple[float, float, float]
+    step: float
+    shape: tuple[int, int, int]
+
+    @staticmethod
+    def over(field: RadianceField, resolution: int) -> Lattice:
+        """``resolution`` cells along the longest edge of the field's box."""
+        if resolution < 2:
+            raise ValueError(f"a lattice needs at least 2 cells along its longest edge, got {resolution}")
+        edges = np.subtract(field.box.upper, field.box.lower)
+        step = float(edges.max() / resolution)
+        shape = np.maximum(np.ceil(edges / step - 1e-6).astype(int), 2)
+        # What the last cells overhang is shared by both sides.
+        lower = (np.add(field.box.upper, field.box.lower) - shape * step) / 2
+        return Lattice(tuple(lower.tolist()), step, tuple(shape.tolist()))
+
+    def points(self, index: np.ndarray) -> np.ndarray:
+        """Positions of (fractional) cell indices (N, 3), in the field's units."""
+        return np.asarray(self.lower) + (np.asarray(index) + 0.5) * self.step
+
+
+class Sampler:
+    """Asks a field about many points, in batches; densities are 0 in the empty cells of its occupancy grid."""
+
+    def __init__(self, field: RadianceField):
+        self.field, self.ns = field, namespace(field.grid.table)
+
+    def _point(self, p):
+        return self.ns.Array3f(np.ascontiguousarray(np.asarray(p, np.float32).T))
+
+    def _density(self, p, masked: bool = True):
+        active = self.ns.Bool(True)
+        if masked and self.field.occupancy is not None:
+            active = self.field.occupancy.empty_cells(self.field.box.to_unit(p)) == 0
+        return dr.select(active, self.field.density(p, active), 0)
+
+    def density(self, p: np.ndarray, masked: bool = True) -> np.ndarray:
+        """Density (1/unit) at points (N, 3); with ``masked`` False also what the networks say of empty cells."""
+        with dr.suspend_grad():
+            return _joined(lambda q: self._density(self._point(q), masked).numpy(), p)
+
+    def on(self, lattice: Lattice, samples: int = 1, then=None) -> np.ndarray:
+        """Density (z, y, x) at the lattice's points, or the mean over ``samples``³ points of each cell."""
+        ns, (nx, ny, nz) = self.ns, lattice.shape
+        out = np.zeros(nx * ny * nz, np.float32)
+        with dr.suspend_grad():
+            for start in range(0, out.size, _BATCH):
+                count = min(_BATCH, out.size - start)
+                index = dr.arange(ns.UInt32, count) + dr.opaque(ns.UInt32, start)
+                cell = index % nx, index // nx % ny, index // (nx * ny)
+                for k in range(samples**3):
+                    offsets = [(k // samples**axis % samples + 0.5) / samples for axis in range(3)]
+                    offsets = [dr.opaque(ns.Float, o) for o in offsets]
+                    p = ns.Array3f(*[l + (ns.Float(c) + o) * lattice.step for l, c, o in zip(lattice.lower, cell, offsets)])
+                    out[start:start + count] += self._density(p).numpy()
+        return (out / samples**3).reshape(nz, ny, nx)
+
+    def color(self, p: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Colour (N, 3) in the field's colour space of points (N, 3), as seen along unit ``directions`` (N, 3)."""
+        def ask(q):
+            features = self.field.density_features(self._point(q[:, :3]))[1]
+            c = self.field.color(features, self._point(q[:, 3:]))
+            dr.eval(c)
+            return np.array(c).T if np.array(c).shape[0] == 3 else np.array(c)
+
+        with dr.suspend_grad():
+            return _joined(ask, np.concatenate([p, directions], 1), 3)
+
+    def diffuse(self, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Colour (N, 3) of surface points seen head on and at 45 degrees, averaged: the field's colour depends on direction."""
+        first = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
+        u = np.cross(normals, first)
+        u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-12)
+        v = np.cross(normals, u)
+        total = self.color(p, -normals)
+        for k in range(_TILTED):
+            a = 2 * math.pi * k / _TILTED
+            total += self.color(p, -(normals + math.cos(a) * u + math.sin(a) * v) / math.sqrt(2))
+        return total / (1 + _TILTED)
+
+
+def _joined(ask, rows: np.ndarray, columns: int = 0) -> np.ndarray:
+    shape = (len(rows), columns) if columns else (len(rows),)
+    out = np.zeros(shape, np.float32)
+    for start in range(0, len(rows), _BATCH):
+        out[start:start + _BATCH] = ask(rows[start:start + _BATCH])
+    return out
+
+
+def surface_density(lattice: Lattice) -> float:
+    """Density at which one cell of the lattice absorbs half of the light: what a surface is, to this lattice."""
+    return math.log(2) / lattice.step
+
+
+def opacity(density: np.ndarray, lattice: Lattice) -> np.ndarray:
+    """Opacity of a cell of that density."""
+    return -np.expm1(-density * lattice.step)
+
+
+def crossings(sampler: Sampler, lattice: Lattice, index: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+    """``index`` (N, 3), fractional on one axis, moved along that edge to where density crosses ``threshold``; and where no
+    surface is, but only the end of what the field's occupancy grid has looked at (mask (N,)).
+
+    Points stay where they are if the field does not cross there: filled holes have put them there. Beyond an unseen
+    one the networks go on with dense matter: the backs of walls and the insides of things, which no picture shows.
+    """
+    away = np.abs(index - np.round(index))
+    axis = np.argmax(away, axis=1)
+    # Vertices on lattice points have no edge to move along.
+    on_edge = away.max(1) > 1e-4
+    low = np.round(index)
+    low[np.arange(len(index)), axis] = np.floor(index[np.arange(len(index)), axis] + 1e-6)
+    step = np.eye(3)[axis]
+    first = sampler.density(lattice.points(low)) >= threshold
+    crosses = on_edge & (first != (sampler.density(lattice.points(low + step)) >= threshold))
+    a, b = np.zeros(len(index)), np.ones(len(index))
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (a + b)
+        same = (sampler.density(lattice.points(low + middle[:, None] * step)) >= threshold) == first
+        a, b = np.where(same, middle, a), np.where(same, b, middle)
+    moved = np.where(crosses[:, None], low + (0.5 * (a + b))[:, None] * step, index)
+    thin = lattice.points(low + np.where(first, 1.0, 0.0)[:, None] * step)
+    return moved, crosses & (sampler.density(thin, masked=False) >= threshold)

@@ -1,0 +1,220 @@
+"""Surfaces of a radiance field as files: a mesh by marching cubes, a point cloud (PLY, glTF)."""
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..field.extraction import Lattice, Sampler, crossings, opacity, surface_density
+from ..field.radiance import RadianceField
+
+
+@dataclass
+class Surface:
+    """``vertices`` (V, 3) in the field's units, ``faces`` (F, 3) counter-clockwise from outside (None: points), unit
+    ``normals`` (V, 3), ``colors`` (V, 3) sRGB in 0..1, and ``report``: what was done, by name."""
+
+    vertices: np.ndarray
+    faces: np.ndarray | None
+    normals: np.ndarray
+    colors: np.ndarray
+    report: dict
+
+
+def mesh(field: RadianceField, resolution: int = 256, threshold: float | None = None, fill: int = 1, keep: float = 0.001,
+         unseen: bool = False) -> Surface:
+    """The surface where density crosses ``threshold`` (default: ``surface_density``), by marching cubes.
+
+    ``fill``: holes and cracks of up to twice so many cells are closed first; ``keep``: connected pieces with less
+    than this share of the area of the largest are dropped; ``unseen``: keep faces where the occupancy grid ends and the
+    density does not (backs of walls, insides of things: nothing that a picture shows). Needs scikit-image.
+    """
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError:
+        raise ImportError('a mesh needs scikit-image, which is not installed: pip install "nerg-mi[mesh]"') from None
+    import trimesh
+
+    sampler, lattice = Sampler(field), Lattice.over(field, resolution)
+    threshold = surface_density(lattice) if threshold is None else threshold
+    density = sampler.on(lattice)
+    level = float(opacity(np.array(threshold), lattice))
+    volume, filled = _closed(opacity(density, lattice), level, fill)
+    if not volume.min() < level < volume.max():
+        raise ValueError(
+            f"density crosses {threshold:g} per unit nowhere (it lies in {density.min():g} .. {density.max():g} on {lattice.shape} "
+            "points): choose another --density"
+        )
+    index, faces, _, _ = marching_cubes(volume.transpose(2, 1, 0), level, allow_degenerate=False)
+    index, hidden = crossings(sampler, lattice, index.astype(np.float64), threshold)
+    vertices, total = lattice.points(index), len(faces)
+    if not unseen:
+        faces = faces[hidden[faces].sum(1) < 2]
+        if len(faces) == 0:
+            raise ValueError("no face of this surface has free space in front of it: the occupancy grid ends in it everywhere")
+    left = len(faces)
+    body = trimesh.Trimesh(vertices, faces[:, ::-1] if _inside_out(vertices, faces, sampler) else faces, process=False)
+    body, pieces, kept = _without_floaters(body, keep)
+    normals = np.array(body.vertex_normals)
+    edges, open_edges = _open_edges(body, lattice)
+    report = {
+        "threshold": threshold, "cell": lattice.step, "lattice": lattice.shape, "cells_filled": int(filled),
+        "pieces": int(pieces), "pieces_kept": int(kept), "floater_faces": left - len(body.faces),
+        "unseen_faces": total - left, "edges_at_the_box": edges, "edges_of_holes": open_edges,
+    }
+    return Surface(np.array(body.vertices), np.array(body.faces), normals, _srgb(field, sampler, body.vertices, normals), report)
+
+
+def _closed(volume: np.ndarray, level: float, cells: int) -> tuple[np.ndarray, int]:
+    """Opacities with holes of up to ``2 cells`` closed, the rest unchanged, and the number of cells that were filled."""
+    if cells < 1:
+        return volume, 0
+    from scipy.ndimage import grey_closing
+
+    closed = grey_closing(volume, 2 * cells + 1, mode="nearest")
+    holes = (volume < level) & (closed >= level)
+    return np.where(holes, closed, volume), np.count_nonzero(holes)
+
+
+def _inside_out(vertices, faces, sampler: Sampler) -> bool:
+    """Whether normals point towards higher density, by the majority of some faces."""
+    some = faces[:: max(len(faces) // 2000, 1)]
+    a, b, c = (vertices[some[:, k]] for k in range(3))
+    n = np.cross(b - a, c - a)
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    n *= np.sqrt(np.maximum(length, 1e-30)) / np.maximum(length, 1e-30)
+    middle = (a + b + c) / 3
+    return float(np.mean(np.sign(sampler.density(middle + n) - sampler.density(middle - n)))) > 0
+
+
+def _without_floaters(body, keep: float):
+    """The mesh without small connected pieces: ``(mesh, number of pieces, number kept)``."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = body.faces[:, [0, 1]], body.faces[:, [1, 2]]
+    pairs = np.concatenate(edges)
+    count = len(body.vertices)
+    graph = coo_matrix((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), (count, count))
+    _, label = connected_components(graph, directed=False)
+    piece = label[body.faces[:, 0]]
+    areas = np.bincount(piece, body.area_faces)
+    good = areas >= keep * areas.max()
+    body.update_faces(good[piece])
+    body.remove_unreferenced_vertices()
+    return body, np.count_nonzero(np.bincount(piece)), np.count_nonzero(good)
+
+
+def _open_edges(body, lattice: Lattice) -> tuple[int, int]:
+    """Edges with one face only: where the box cuts the surface, and elsewhere."""
+    edges = np.sort(body.edges, axis=1)
+    unique, counts = np.unique(edges, axis=0, return_counts=True)
+    single = unique[counts == 1]
+    middle = body.vertices[single].mean(1)
+    first, last = lattice.points(np.zeros(3)), lattice.points(np.array(lattice.shape) - 1)
+    near = np.any((middle < first + 0.01 * lattice.step) | (middle > last - 0.01 * lattice.step), axis=1)
+    return int(near.sum()), int((~near).sum())
+
+
+def points(field: RadianceField, resolution: int = 256, threshold: float | None = None, count: int | None = None, seed: int = 0) -> Surface:
+    """Points where the edges of a lattice cross the surface, with normals down the density's gradient; at most ``count``."""
+    sampler, lattice = Sampler(field), Lattice.over(field, resolution)
+    threshold = surface_density(lattice) if threshold is None else threshold
+    dense = sampler.on(lattice).transpose(2, 1, 0) >= threshold
+    index = []
+    for axis in range(3):
+        low, high = (np.moveaxis(dense, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        found = np.argwhere(np.moveaxis(low != high, 0, axis)).astype(np.float64)
+        found[:, axis] += 0.5
+        index.append(found)
+    index = np.concatenate(index)
+    if len(index) == 0:
+        raise ValueError(f"density crosses {threshold:g} per unit nowhere on {lattice.shape} points: choose another --density")
+    if count is not None and count < len(index):
+        index = index[np.sort(np.random.default_rng(seed).choice(len(index), count, replace=False))]
+    index, hidden = crossings(sampler, lattice, index, threshold)
+    p = lattice.points(index[~hidden])
+    h = 0.5 * lattice.step
+    slope = np.stack([
+        opacity(sampler.density(p - h * e), lattice) - opacity(sampler.density(p + h * e), lattice) for e in np.eye(3)
+    ], 1)
+    normals = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+    report = {"threshold": threshold, "cell": lattice.step, "lattice": lattice.shape}
+    return Surface(p, None, normals, _srgb(field, sampler, p, normals), report)
+
+
+def _srgb(field: RadianceField, sampler: Sampler, p, normals) -> np.ndarray:
+    c = np.clip(sampler.diffuse(np.asarray(p), np.asarray(normals)), 0, 1)
+    if field.color_space == "linear":
+        c = np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.maximum(c, 0.0031308) ** (1 / 2.4) - 0.055)
+    return c
+
+
+# ----------------------------------------------------------------------------
+# Files
+# ----------------------------------------------------------------------------
+
+
+def write_ply(surface: Surface, path: str | Path) -> None:
+    """Binary PLY: positions, normals, 8-bit sRGB colours, and faces if there are any."""
+    v = np.zeros(len(surface.vertices), [
+        *((n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")), *((n, "u1") for n in ("red", "green", "blue")),
+    ])  # fmt: skip
+    for i, n in enumerate(v.dtype.names):
+        block = (surface.vertices, surface.normals, np.rint(surface.colors * 255))[i // 3]
+        v[n] = block[:, i % 3]
+    types = {"<f4": "float", "|u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(v)}"]
+    header += [f"property {types[v.dtype[n].str]} {n}" for n in v.dtype.names]
+    data = v.tobytes()
+    if surface.faces is not None:
+        f = np.zeros(len(surface.faces), [("n", "u1"), ("v", "<i4", 3)])
+        f["n"], f["v"] = 3, surface.faces
+        header += [f"element face {len(f)}", "property list uchar int vertex_indices"]
+        data += f.tobytes()
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes("\n".join([*header, "end_header", ""]).encode() + data)
+
+
+def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
+    """Binary glTF 2.0 with linear 16-bit vertex colours that are shown unlit: a field's colours hold its light.
+
+    ``up``: axis of the field that is up; glTF's is y, and the node is turned for z.
+    """
+    linear = np.where(surface.colors <= 0.04045, surface.colors / 12.92, ((np.maximum(surface.colors, 0.04045) + 0.055) / 1.055) ** 2.4)
+    rgba = np.full((len(linear), 4), 65535, "<u2")
+    rgba[:, :3] = np.rint(linear * 65535)
+    position = surface.vertices.astype("<f4")
+    arrays = [("POSITION", position, 5126, "VEC3"), ("NORMAL", surface.normals.astype("<f4"), 5126, "VEC3"), ("COLOR_0", rgba, 5123, "VEC4")]
+    if surface.faces is not None:
+        arrays.append(("indices", surface.faces.astype("<u4").ravel(), 5125, "SCALAR"))
+    views, accessors, data = [], [], b""
+    for name, array, kind, shape in arrays:
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": 34963 if name == "indices" else 34962})
+        accessors.append({"bufferView": len(views) - 1, "componentType": kind, "count": len(array), "type": shape})
+        data += array.tobytes()
+    accessors[0] |= {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
+    accessors[2]["normalized"] = True
+    primitive = {"attributes": {a[0]: i for i, a in enumerate(arrays[:3])}, "mode": 0 if surface.faces is None else 4, "material": 0}
+    if surface.faces is not None:
+        primitive["indices"] = 3
+    node = {"mesh": 0} | ({"rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]} if up == "z" else {})
+    document = {
+        "asset": {"version": "2.0", "generator": "nerg_mi"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [{"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicFactor": 0}}],
+        "extensionsUsed": ["KHR_materials_unlit"], "buffers": [{"byteLength": len(data)}], "bufferViews": views, "accessors": accessors,
+    }  # fmt: skip
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(
+        struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(data)) + struct.pack("<II", len(text), 0x4E4F534A) + text
+        + struct.pack("<II", len(data), 0x004E4942) + data
+    )

@@ -1,0 +1,152 @@
+"""Meshes, points and voxels of a field whose surface is known: a ball, in front of what nobody has looked at."""
+import json
+import math
+import struct
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+import trimesh
+
+from nerg_mi.field.box import Box
+from nerg_mi.field.extraction import Lattice, Sampler, surface_density
+from nerg_mi.field.hashgrid import HashGrid, HashGridConfig
+from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.formats.surfaces import mesh, points, write_glb, write_ply
+from nerg_mi.formats.volumes import density_and_color, write_volume
+
+CENTER, RADIUS = np.array([1.2, 1.0, 0.9]), 0.6
+
+
+class Ball:
+    """Stands in for a radiance field: density in a ball, a speck beside it, and colour from position and direction."""
+
+    def __init__(self, occupancy=None, speck=False, hole=False, color_space="srgb", sharp=200.0):
+        self.box, self.occupancy, self.color_space = Box((0, 0, 0), (2.4, 2, 1.8)), occupancy, color_space
+        self.grid = HashGrid.random(HashGridConfig(levels=1, log2_rows=6, base=2, finest=2), ns, np.random.default_rng(0))
+        self.speck, self.hole, self.sharp = speck, hole, sharp
+
+    def density(self, p, active=True):
+        to = lambda c: dr.norm(p - ns.Array3f(*c))
+        sigma = self.sharp * dr.exp(60 * (RADIUS - to(CENTER.tolist())))
+        if self.speck:
+            sigma += 1e3 * dr.exp(200 * (0.1 - to([0.2, 0.2, 0.2])))
+        if self.hole:
+            # A shaft along z about one line of lattice points.
+            sigma = dr.select(dr.sqrt((p.x - 1.225)**2 + (p.y - 1.025)**2) < 0.02, 0, sigma)
+        return dr.select(active & self.box.contains(p), dr.minimum(sigma, 1e4), 0)
+
+    def density_features(self, p, active=True):
+        return self.density(p, active), [p.x, p.y, p.z]
+
+    def color(self, features, d):
+        return ns.Array3f(features[0] / 2.4, 0.5 + 0.1 * d.z, 0.25)
+
+
+def expected_radius(ball, threshold):
+    return RADIUS - math.log(threshold / ball.sharp) / 60
+
+
+def test01_a_mesh_lies_on_the_surface():
+    pytest.importorskip("skimage")
+    ball = Ball()
+    m = mesh(ball, 48)
+    threshold = math.log(2) / (2.4 / 48)
+    assert m.report["threshold"] == pytest.approx(threshold) == surface_density(Lattice.over(ball, 48))
+    r = np.linalg.norm(m.vertices - CENTER, axis=1)
+    # Bisection of an edge: a 2^9th of a cell.
+    assert np.abs(r - expected_radius(ball, threshold)).max() < 2.4 / 48 / 300
+    body = trimesh.Trimesh(m.vertices, m.faces, process=False)
+    assert body.is_watertight and body.volume > 0
+    assert np.isclose(body.volume, 4 / 3 * math.pi * expected_radius(ball, threshold) ** 3, rtol=0.01)
+    assert ((m.vertices - CENTER) / r[:, None] * m.normals).sum(1).min() > 0.95
+    assert m.report["edges_of_holes"] == m.report["edges_at_the_box"] == 0
+    # Seen head on and at 45 degrees all around, the part that depends on direction is the mean of its cosines.
+    share = (1 + 4 / math.sqrt(2)) / 5
+    assert np.allclose(m.colors[:, 0], m.vertices[:, 0] / 2.4, atol=1e-5)
+    assert np.allclose(m.colors[:, 1], 0.5 - 0.1 * share * m.normals[:, 2], atol=1e-5)
+
+
+def test02_floaters_and_holes():
+    pytest.importorskip("skimage")
+    both, alone = mesh(Ball(speck=True), 48, keep=0), mesh(Ball(speck=True), 48, keep=0.05)
+    assert both.report["pieces"] == both.report["pieces_kept"] == 2 and alone.report["pieces_kept"] == 1
+    assert np.linalg.norm(alone.vertices - CENTER, axis=1).min() > 0.5
+    assert alone.report["floater_faces"] == len(both.faces) - len(alone.faces) > 0
+    pierced, whole = mesh(Ball(hole=True), 48, fill=0), mesh(Ball(hole=True), 48, fill=1)
+    euler = lambda m: trimesh.Trimesh(m.vertices, m.faces, process=False).euler_number
+    assert (euler(pierced), euler(whole)) == (0, 2) and whole.report["cells_filled"] > 10
+
+
+def test03_what_nobody_has_looked_at():
+    # Cells beyond the middle of the ball were never looked at: there is no surface where they begin.
+    pytest.importorskip("skimage")
+    bits = np.zeros((24, 24, 24), bool)
+    bits[:, :, :12] = True
+    half = Ball(OccupancyGrid(bits, ns, 0.1))
+    m, closed = mesh(half, 48), mesh(half, 48, unseen=True)
+    assert trimesh.Trimesh(closed.vertices, closed.faces, process=False).is_watertight
+    r = np.linalg.norm(m.vertices - CENTER, axis=1)
+    assert (r > 0.55).all() and (np.linalg.norm(closed.vertices - CENTER, axis=1) < 0.3).any()
+    assert m.report["unseen_faces"] > 100 and m.report["edges_of_holes"] > 50 and m.vertices[:, 0].max() < 1.25
+    cloud = points(half, 48)
+    assert (np.linalg.norm(cloud.vertices - CENTER, axis=1) > 0.55).all()
+
+
+def test04_points_and_the_box():
+    ball = Ball()
+    cloud = points(ball, 48, threshold=100.0)
+    r = np.linalg.norm(cloud.vertices - CENTER, axis=1)
+    assert np.abs(r - expected_radius(ball, 100.0)).max() < 2.4 / 48 / 300 and cloud.faces is None
+    assert ((cloud.vertices - CENTER) / r[:, None] * cloud.normals).sum(1).min() > 0.97
+    assert len(points(ball, 48, count=100).vertices) == 100
+    with pytest.raises(ValueError, match="nowhere"):
+        points(ball, 48, threshold=1e6)
+    pytest.importorskip("skimage")
+    with pytest.raises(ValueError, match="nowhere.*--density"):
+        mesh(ball, 48, threshold=1e6)
+    ball.box = Box((0, 0, 0), (1.2, 2, 1.8))
+    assert mesh(ball, 36).report["edges_at_the_box"] > 20
+
+
+def test05_files(tmp_path):
+    cloud = points(Ball(color_space="linear"), 24)
+    triangles = cloud.__class__(cloud.vertices[:30], np.arange(30).reshape(10, 3), cloud.normals[:30], cloud.colors[:30], {})
+    write_ply(triangles, tmp_path / "m.ply")
+    body = trimesh.load(tmp_path / "m.ply", process=False)
+    assert np.allclose(body.vertices, triangles.vertices, atol=1e-6) and np.array_equal(body.faces, triangles.faces)
+    assert np.abs(body.visual.vertex_colors[:, :3] / 255 - triangles.colors).max() < 0.51 / 255
+    write_ply(cloud, tmp_path / "c.ply")
+    assert len(trimesh.load(tmp_path / "c.ply").vertices) == len(cloud.vertices)
+    for up in ("z", "y"):
+        write_glb(triangles, tmp_path / "m.glb", up)
+        shown = trimesh.load(tmp_path / "m.glb").to_geometry()
+        v = triangles.vertices
+        assert np.allclose(shown.vertices, v if up == "y" else np.stack([v[:, 0], v[:, 2], -v[:, 1]], 1), atol=1e-6)
+    raw = (tmp_path / "m.glb").read_bytes()
+    size = struct.unpack("<I", raw[12:16])[0]
+    document = json.loads(raw[20:20 + size])
+    view = document["bufferViews"][2]
+    rgba = np.frombuffer(raw, "<u2", view["byteLength"] // 2, 28 + size + view["byteOffset"]).reshape(-1, 4) / 65535
+    # The stand-in's colours are linear; glTF's are too.
+    assert np.allclose(rgba[:, 0], triangles.vertices[:, 0] / 2.4, atol=1e-4) and len(raw) == struct.unpack("<I", raw[8:12])[0]
+
+
+def test06_voxels_render_as_the_field(rgb, tmp_path):
+    ball = Ball()
+    density, color, lower, upper = density_and_color(ball, 24, samples=3)
+    assert density.shape == (18, 20, 24) and np.allclose(lower, 0) and np.allclose(upper, ball.box.upper)
+    cell = 0.1
+    q = (np.stack(np.meshgrid(*[(np.arange(3) + 0.5) / 3] * 3), -1).reshape(-1, 3) + [6, 9, 8]) * cell
+    assert np.isclose(density[8, 9, 6], Sampler(ball).density(q).mean(), rtol=1e-4)
+    assert np.allclose(color[8, 9, 6, 1], ((0.5 + 0.055) / 1.055) ** 2.4, atol=2e-3)
+    write_volume(tmp_path / "d.vol", density, lower, upper)
+    write_volume(tmp_path / "c.vol", color, lower, upper)
+    for name, data in (("d", density), ("c", color)):
+        volume = rgb.load_dict({"type": "gridvolume", "filename": str(tmp_path / f"{name}.vol"), "use_grid_bbox": True, "raw": True})
+        assert np.allclose(volume.bbox().max, upper)
+        it = dr.zeros(rgb.Interaction3f)
+        it.p = rgb.Point3f(*((np.array([6, 9, 8]) + 0.5) * cell).tolist())
+        got = np.ravel(volume.eval_1(it) if name == "d" else volume.eval_3(it))
+        assert np.allclose(got, data[8, 9, 6], rtol=1e-4)
