@@ -11,6 +11,7 @@ from typing import Sequence
 
 import numpy as np
 
+from .index import RayIndex
 from .rays import Rays
 
 
@@ -56,18 +57,15 @@ def split_by_position(
 
     Raises ``ValueError`` when the rays hold no such zone or too little is left.
     """
-    from scipy.spatial import cKDTree
-
     if zones < 1 or not radius > 0 or not zone_radius > 0:
         raise ValueError(f"zones {zones}, radius {radius}, zone_radius {zone_radius}: all must be positive")
     rng = np.random.default_rng(seed)
-    tree = cKDTree(rays.origin)
-    floor = cKDTree(rays.origin[:, :2])
+    index = RayIndex(rays)
 
     # Farthest-point choice among random origins, which follow where people are;
     # candidates with too few rays around are no use as a test.
     candidates = rays.origin[rng.permutation(len(rays))[:256]]
-    candidates = candidates[tree.query_ball_point(candidates, radius, return_length=True) >= min_rays]
+    candidates = candidates[_enough(index, candidates, radius, min_rays)]
     if len(candidates) < zones:
         raise ValueError(
             f"only {len(candidates)} of 256 positions have {min_rays} rays within {radius} m; enlarge the radius or lower min_rays"
@@ -80,11 +78,12 @@ def split_by_position(
         chosen.append(int(rng.choice(order[: max(1, len(order) // 4)])))
     zone_centres = candidates[chosen]
 
-    members = floor.query_ball_point(zone_centres[:, :2], zone_radius)
     centres, zone = [], []
-    for z, found in enumerate(members):
-        found = rng.permutation(np.sort(found))
-        enough = found[tree.query_ball_point(rays.origin[found], radius, return_length=True) >= min_rays]
+    for z, centre in enumerate(zone_centres):
+        found = rng.permutation(np.flatnonzero(((rays.origin[:, :2] - centre[:2]) ** 2).sum(axis=1) <= zone_radius**2))
+        # A few times as many as are wanted will do; of millions of rays not each can be asked.
+        found = found[: 16 * test_probes]
+        enough = found[_enough(index, rays.origin[found], radius, min_rays)]
         share = test_probes // zones + (z < test_probes % zones)
         centres.append(rays.origin[enough[:share]])
         zone.append(np.full(len(centres[-1]), z))
@@ -125,6 +124,49 @@ def split_by_person(
     if test.all() or not test.any():
         raise ValueError(f"{len(present)} persons cannot be split into training and test; give rays of at least two")
     return ~test, test
+
+
+def split_by_time(
+    rays: Rays, *, test_share: float = 0.2, gap: float = 5.0, of: str = "all"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Hold out the end: masks (N,) of training and test rays.
+
+    Test is the last ``test_share`` of the time from the first ray to the last one, training what lies more than ``gap``
+    seconds before it; rays between are on neither side, since gaze repeats itself for seconds. ``of``: ``all``, one cut
+    for all (a day of a shop), or ``person``, each person's own time (recordings with clocks of their own). Raises
+    ``ValueError`` when a side is empty.
+    """
+    if of not in ("all", "person") or not 0 < test_share < 1 or not gap >= 0:
+        raise ValueError(f'of "{of}", test_share {test_share}, gap {gap}: need "all" or "person", a share in (0, 1), a gap >= 0')
+    group = np.zeros(len(rays), np.int64) if of == "all" else rays.person
+    first, last = np.full(group.max(initial=0) + 1, np.inf), np.full(group.max(initial=0) + 1, -np.inf)
+    np.minimum.at(first, group, rays.t)
+    np.maximum.at(last, group, rays.t)
+    cut = (last - test_share * (last - first))[group]
+    train, test = rays.t < cut - gap, rays.t >= cut
+    if not train.any() or not test.any():
+        raise ValueError(f"{train.sum()} rays are left to train on and {test.sum()} to test; choose a smaller gap or another share")
+    return train, test
+
+
+def both(*splits: PositionSplit | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Several splits at once: training rays are those of every training side, test rays those of every test side (unseen
+    people at unseen places, say). What is on the training side of one and the test side of another is used on neither.
+
+    Raises ``ValueError`` when a side is empty.
+    """
+    masks = [(s.train, s.test) if isinstance(s, PositionSplit) else s for s in splits]
+    if not masks:
+        raise ValueError("say how to split: by position, person or time")
+    train, test = (np.logical_and.reduce(side) for side in zip(*masks))
+    if not train.any() or not test.any():
+        raise ValueError(f"together the splits leave {train.sum()} rays to train on and {test.sum()} to test; hold out more of one of them")
+    return train, test
+
+
+def _enough(index: RayIndex, places: np.ndarray, radius: float, least: int) -> np.ndarray:
+    """Which places have at least ``least`` rays within ``radius``: no need to count the others."""
+    return np.diff(index.nearest(places, least, radius).offsets) >= least
 
 
 def _distance_to(centres: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .plausibility import warnings
 from .rays import Rays
 
 GAP = 1.0  # seconds: a longer pause of a person does not count as recorded time
@@ -19,8 +20,9 @@ class RaysSummary:
     second. ``rate``: rays a second of a person (one over the median step), NaN
     when no person has two times. ``eye_height``: 5, 50 and 95 % of the origins'
     heights. ``speed_p95``: 95 % of the origins' speeds. ``duplicates``: rays with
-    person and time of another. ``dropped``: rows by reason. ``warnings``:
-    sentences about figures that people cannot produce.
+    person and time of another. ``dropped``: rows by reason; ``cohorts``: rays
+    by cohort. ``warnings``: sentences about figures that people cannot produce
+    (:mod:`nerg_mi.attention.plausibility`).
     """
 
     rays: int
@@ -36,6 +38,7 @@ class RaysSummary:
     duplicates: int
     rows_read: int
     dropped: dict[str, int]
+    cohorts: dict[str, int]
     warnings: tuple[str, ...]
 
 
@@ -76,23 +79,6 @@ def summarise(rays: Rays) -> RaysSummary:
         duplicates=int((step == 0).sum()),
         rows_read=int(rays.metadata.get("rows_read", len(rays))),
         dropped=dict(dropped),
-        warnings=tuple(_warnings(height, high - low, speed_p95)),
+        cohorts={} if rays.cohort is None else dict(zip(rays.cohorts, np.bincount(rays.cohort, minlength=len(rays.cohorts)).tolist())),
+        warnings=tuple(warnings(rays, height, high - low, speed_p95, step)),
     )
-
-
-def _warnings(height: np.ndarray, extent: np.ndarray, speed: float) -> list[str]:
-    # The bounds are wide: they catch a wrong unit or axis, not an unusual shop.
-    out = []
-    if extent.max() > 1000:
-        out.append(f"the origins span {extent.max():.0f} m: is the unit millimetres or centimetres? (--units mm)")
-    elif extent.max() < 0.05:
-        out.append(f"the origins span {extent.max():.3f} m: is the unit larger than declared?")
-    if extent[2] > 2.0 and extent[2] > min(extent[0], extent[1]):
-        out.append("the origins vary more in height than sideways: is the up axis another one? (--up)")
-    elif not 0.4 <= height[1] <= 2.3:
-        out.append(
-            f"the median eye height is {height[1]:.2f} m: check the up axis and the unit, or the floor is not at height 0"
-        )
-    if speed > 5:
-        out.append(f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: check the unit of time (--tick) or length")
-    return out

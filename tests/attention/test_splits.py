@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 
 from nerg_mi.attention.probes import place_probes
 from nerg_mi.attention.rays import Rays
-from nerg_mi.attention.splits import purge, split_by_person, split_by_position
+from nerg_mi.attention.splits import both, purge, split_by_person, split_by_position, split_by_time
 
 R = 0.25
 
@@ -73,3 +74,50 @@ def test_refusals(rays):
         split_by_position(rays, 0.01)
     with pytest.raises(ValueError, match="left to train on"):
         split_by_position(rays, 3.0)
+
+
+def test_by_time_with_a_gap(rays):
+    train, test = split_by_time(rays, test_share=0.25, gap=10)
+    span = rays.t.max() - rays.t.min()
+    assert np.isclose(rays.t[test].min(), 0.75 * span, atol=0.02) and rays.t[test].min() - rays.t[train].max() >= 10
+    # Clocks of their own: everybody's last quarter.
+    own = Rays(rays.t + 5000 * rays.person, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence)
+    train, test = split_by_time(own, test_share=0.25, gap=10, of="person")
+    for p in range(5):
+        mine = own.person == p
+        assert own.t[test & mine].min() - own.t[train & mine].max() >= 10 and 0.24 < test[mine].mean() < 0.26
+    with pytest.raises(ValueError, match="smaller gap"):
+        split_by_time(rays, gap=1e6)
+    with pytest.raises(ValueError, match='"all" or "person"'):
+        split_by_time(rays, of="day")
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 2**16), st.sampled_from(["position", "person", "time", "position person", "person time", "position person time"]))
+def test_no_combination_shares_a_ray(rays, seed, kinds):
+    made = {
+        "position": lambda: split_by_position(rays, R, test_probes=20, seed=seed),
+        "person": lambda: split_by_person(rays, test_share=0.4, seed=seed),
+        "time": lambda: split_by_time(rays, test_share=0.4, gap=2.0),
+    }
+    splits = [made[k]() for k in kinds.split()]
+    train, test = both(*splits)
+    assert train.any() and test.any() and not (train & test).any()
+    if "person" in kinds:
+        assert not set(rays.person[train]) & set(rays.person[test])
+    if "time" in kinds:
+        assert rays.t[test].min() - rays.t[train].max() >= 2
+    if "position" in kinds:
+        a = place_probes(rays.select(train), R, placement="blue", count=300, min_rays=4)
+        b = place_probes(rays.select(test), R, queries=splits[0].test_centres, min_rays=1)
+        assert not rows(train, a) & rows(test, b)
+        apart = np.linalg.norm(rays.origin[train][:, None] - splits[0].test_centres[None], axis=2)
+        assert apart.min() > 2 * R
+
+
+def test_both_refuses_what_leaves_nothing(rays):
+    nobody = np.zeros(len(rays), bool)
+    with pytest.raises(ValueError, match="0 rays to train on"):
+        both((nobody, ~nobody))
+    with pytest.raises(ValueError, match="how to split"):
+        both()

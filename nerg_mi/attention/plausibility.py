@@ -1,0 +1,146 @@
+"""What is implausible about a set of rays, and the mistake that is likely behind it.
+
+Units and axes show in the heights and the extent. A mirrored or reversed direction shows where it disagrees with the hit
+point, or with where people walk: people look ahead. A frame mirrored as a whole, positions with directions, contradicts
+nothing and cannot be seen without the place itself.
+"""
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from .rays import Rays
+
+# The bounds are wide: they catch a wrong unit or axis, not an unusual shop.
+_OFF = 5.0  # degrees between direction and hit point
+_AHEAD = 0.2  # correlation of gaze and walking along an axis
+_MOST = 200_000  # rays looked at
+
+
+def warnings(rays: Rays, height: np.ndarray, extent: np.ndarray, speed: float, step: np.ndarray) -> list[str]:
+    """Sentences about rays in our frame. ``height``: 5, 50 and 95 % of the origins' heights; ``extent`` (3,) of their box;
+    ``speed``: 95 % of the speeds; ``step``: times between a person's rays."""
+    return [*_lengths(rays, height, extent), *_times(speed, step), *_directions(rays)]
+
+
+def _to_source(rays: Rays) -> np.ndarray:
+    """Rotation, or mirror, from our frame back to the file's, (3, 3): file = R ours."""
+    matrix = np.asarray(rays.metadata.get("transform", np.eye(4)), dtype=np.float64)[:3, :3]
+    return np.linalg.inv(matrix / np.cbrt(abs(np.linalg.det(matrix))))
+
+
+def _lengths(rays: Rays, height: np.ndarray, extent: np.ndarray) -> list[str]:
+    median, out = height[1], []
+    if 100 <= median <= 230:
+        out.append(f"the median height is {median:.0f} m: is the unit centimetres? (--units cm)")
+    elif extent.max() > 1000 or 1000 <= median <= 2300:
+        out.append(f"the origins span {extent.max():.0f} m, at a median height of {median:.0f} m: is the unit millimetres? (--units mm)")
+    elif extent.max() < 0.05:
+        out.append(f"the origins span {extent.max():.3f} m: is the unit larger than declared?")
+    elif extent[2] > 2.0 and extent[2] > min(extent[0], extent[1]) or not 0.4 <= median <= 2.3:
+        what = (
+            "the origins vary more in height than sideways" if 0.4 <= median <= 2.3 else f"the median eye height is {median:.2f} m"
+        )
+        axis = _standing_axis(rays)
+        remedy = (
+            f"{axis} of the file looks like the height: is it the up axis? (--up {axis})"
+            if axis
+            else "check the up axis and the unit, or the floor is not at height 0"
+        )
+        out.append(f"{what}; {remedy}")
+    return out
+
+
+def _standing_axis(rays: Rays) -> str | None:
+    """The axis of the file along which origins stay where heads are, if there is one besides the declared."""
+    part = rays.origin[:: max(1, len(rays) // _MOST)] @ _to_source(rays).T
+    low, mid, high = np.percentile(part, [5, 50, 95], axis=0)
+    like_heads = (np.abs(mid) > 0.9) & (np.abs(mid) < 2.2) & (high - low < 1.0)
+    like_heads[np.argmax(np.abs(_to_source(rays)[:, 2]))] = False
+    (found,) = np.nonzero(like_heads)
+    return None if len(found) != 1 else ("-" if mid[found[0]] < 0 else "") + "xyz"[found[0]]
+
+
+def _times(speed: float, step: np.ndarray) -> list[str]:
+    out = []
+    if speed > 5:
+        out.append(f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: check the unit of time (--tick) or length")
+    forward = step[step > 0]
+    if forward.size and not 1e-4 <= np.median(forward) <= 10:
+        out.append(f"a ray comes every {np.median(forward):.3g} s: check the unit of time (--tick)")
+    return out
+
+
+def _directions(rays: Rays) -> list[str]:
+    R = _to_source(rays)
+    signs = np.array(list(itertools.product((1.0, -1.0), repeat=3)))[1:]
+    name = lambda s: " and ".join("xyz"[i] for i in np.flatnonzero(s < 0))
+    if rays.hit is not None:
+        some = np.flatnonzero(np.isfinite(rays.hit).all(axis=1))
+        some = some[:: max(1, len(some) // _MOST)]
+        to_hit = (rays.hit[some] - rays.origin[some]) @ R.T
+        length = np.linalg.norm(to_hit, axis=1)
+        far = length > 0.2
+        if far.sum() >= 20:
+            to_hit, d = to_hit[far] / length[far, None], rays.direction[some][far] @ R.T
+            off = lambda v: float(np.median(np.degrees(np.arccos(np.clip(np.sum(v * to_hit, axis=1), -1, 1)))))
+            now = off(d)
+            if now > _OFF:
+                tried = {name(s): off(d * s) for s in signs}
+                best = min(tried, key=tried.get)
+                fits = f"with {best} of the directions negated they would, to {tried[best]:.2g}: check their frame"
+                return [
+                    f"the directions miss the hit points by {now:.0f} degrees (median); "
+                    + (fits if tried[best] < min(_OFF, 0.5 * now) else "check that they are of one frame and one unit")
+                ]
+    out = []
+    elevation = np.degrees(np.arcsin(np.clip(rays.direction[:: max(1, len(rays) // _MOST), 2], -1, 1)))
+    if abs(np.median(elevation)) > 50:
+        up = "up" if np.median(elevation) > 0 else "down"
+        out.append(f"half of the rays look more than {abs(np.median(elevation)):.0f} degrees {up}: check the axes of the directions, or which way is forward")
+    agree = walking_agreement(rays)
+    if agree is not None:
+        against = [i for i in range(3) if agree[i] < -_AHEAD]
+        along = [i for i in range(3) if agree[i] > _AHEAD]
+        if against and not along:
+            out.append("people look back to where they came from: are the directions reversed? (--forward, or the sign of the direction)")
+        elif against:
+            axis = " and ".join("xyz"[i] for i in against)
+            out.append(f"along {axis} of the file people look away from where they walk: are positions and directions mirrored against each other? (--hand)")
+    return out
+
+
+def walking_agreement(rays: Rays) -> np.ndarray | None:
+    """Correlation of gaze with walking along each axis of the file, (3,), 0 along the up axis; ``None`` where nobody walks.
+
+    Steps of half a second, at 0.3 to 3 m/s. People look ahead: far above zero along each axis on which they walk.
+    """
+    from .filters import person_order
+
+    order, starts = person_order(rays)
+    t = rays.t[order]
+    later = np.minimum(np.searchsorted(np.arange(len(t)), np.arange(len(t)) + _lag(t, starts)), len(t) - 1)
+    dt = t[later] - t
+    together = (rays.person[order][later] == rays.person[order]) & (dt > 0) & (dt < 2.0)
+    moved = (rays.origin[order][later] - rays.origin[order])[together]
+    moved[:, 2] = 0
+    speed = np.linalg.norm(moved, axis=1) / dt[together]
+    walks = (speed > 0.3) & (speed < 3.0)
+    if walks.sum() < 200:
+        return None
+    R = _to_source(rays)
+    d = rays.direction[order][together][walks] * (1, 1, 0)
+    v, d = moved[walks] / np.linalg.norm(moved[walks], axis=1, keepdims=True) @ R.T, d @ R.T
+    norm = np.sqrt((v**2).mean(axis=0) * (d**2).mean(axis=0))
+    # An axis on which hardly anybody walks says nothing.
+    share = (v**2).mean(axis=0)
+    return np.where(share > 0.05, (v * d).mean(axis=0) / np.maximum(norm, 1e-12), 0.0)
+
+
+def _lag(t: np.ndarray, starts: np.ndarray) -> int:
+    """Rays in half a second."""
+    step = np.diff(t)
+    step[starts[1:-1] - 1] = np.inf
+    step = step[(step > 0) & (step <= 1.0)]
+    return max(1, round(0.5 / np.median(step))) if step.size else 1
