@@ -91,8 +91,9 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - quadrature
    - |string|
    - ``constant``: density is constant over a step, sampled at its middle. ``linear``: linear between samples at the
-     steps' ends. ``cells``: for an axis-aligned ``gridvolume`` as density, steps also end at voxel boundaries, where two
-     samples integrate its interpolant exactly. (Default: ``constant``)
+     steps' ends. ``cells``: for an axis-aligned ``gridvolume`` as density, steps end at voxel boundaries only, where two
+     samples integrate its interpolant exactly (opacity to rounding, depth to a hundredth of a voxel); a ``step`` that is
+     given bounds them, ``dt_gamma``, ``coarse`` and ``jitter`` do not apply. (Default: ``constant``)
 
  * - coarse
    - |float|
@@ -140,7 +141,8 @@ alpha is 1 wherever opacity > 0; use the ``opacity`` AOV for the fractional one.
 Use a box filter and ``component_format`` ``float32`` for AOVs: other filters blend depths across edges, and fp16 rounds
 them. With a box filter equal seeds give equal pictures to the bit.
 
-Densities that are negative or NaN count as 0, infinite ones as 1e30.
+Densities that are negative or NaN count as 0, infinite ones as 1e30 (a checkpoint with weights that are not finite is
+refused when it is loaded; weights set later are not looked at).
 
 Derivatives reach field and gaze weights, volumes, ``falloff``, camera and observer positions, in forward and in reverse
 mode, with memory that does not grow with the number of steps. They do not see the edges of visibility, nor where
@@ -184,6 +186,8 @@ of these, or the integrator an explicit ``observer``. Spectral and polarized var
 """
 
 from __future__ import annotations
+
+import math
 
 import drjit as dr
 import mitsuba as mi
@@ -235,7 +239,7 @@ class NergIntegrator(mi.SamplingIntegrator):
 
         self.occlusion = boolean(props, "occlusion", True)
         self.falloff = mi.Float(number(props, "falloff", 0.1, low=0))
-        self.depth_kind = choice(props, "depth", "expected", KINDS)
+        self.depth_kind = choice(props, "depth", "median", KINDS)
         self.surface_opacity = number(props, "surface_opacity", 0.5, low=0, high=1)
         self.radiance = boolean(props, "radiance", True)
         background = mi.Color3f(color(props, "background", 0.0))
@@ -247,9 +251,10 @@ class NergIntegrator(mi.SamplingIntegrator):
             step=step or (1 if self.medium is None else self.medium.step or self.medium.length_scale / 1024),
             dt_gamma=number(props, "dt_gamma", 0, low=0, high=1),
             stop=number(props, "stop", 1e-7, low=0, high=1),
-            color_cutoff=number(props, "color_cutoff", 1e-4, low=0, high=1),
+            color_cutoff=number(props, "color_cutoff", 1e-3, low=0, high=1),
             quadrature=choice(props, "quadrature", "constant", QUADRATURES),
             coarse=number(props, "coarse", 1, low=1),
+            cell_step=step or math.inf,
         )
         if self.medium is not None:
             rule(self.settings.quadrature, self.medium)

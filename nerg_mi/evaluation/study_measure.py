@@ -25,6 +25,8 @@ COLUMNS = (
     "pareto", "reference", "quadrature", "step", "steps", "coarse", "dt_gamma", "stop", "color_cutoff", "depth", "visibility", "map_height",
     "jitter", "radiance", "aovs", "spp", "resolution", "precision",
 )  # fmt: skip
+MARCHING = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "depth", "jitter")
+"""The parameters that mean nothing where nothing is marched."""
 COUNTS = ("density_evals", "color_evals", "gaze_evals")
 SEED = 1
 # Samples a pixel of the picture that settings with several are compared with.
@@ -55,8 +57,10 @@ def _parameters(subject, row: Setting, integrator) -> dict:
         values |= {"color_cutoff": 0.0, "coarse": 1.0, "jitter": False, "depth": "unnormalised"}
     if values["visibility"] != "map":
         values["map_height"] = ""
+    if not subject.marched:
+        values |= {n: "" for n in MARCHING}
     return {n: values[n] for n in values if n in COLUMNS} | {
-        "setting": row.name, "group": row.group, "steps": subject.extent / values["step"], "aovs": ",".join(integrator.aovs),
+        "setting": row.name, "group": row.group, "steps": subject.extent / values["step"] if subject.marched else "", "aovs": ",".join(integrator.aovs),
         "spp": row.spp, "resolution": row.resolution or "", "precision": precision(),
     }  # fmt: skip
 
@@ -146,7 +150,8 @@ def scaling(subject, repeats: int, quick: bool = False, on_step: Callable[[str],
     size = subject.size
     plan = [("pixels", k, {}) for k in ((16, 32) if quick else (16, 32, 64, 128, 256, 512))]
     plan += [("samples", k, {}) for k in ((1, 2) if quick else (1, 2, 4, 8, 16, 32))]
-    plan += [("extent", k, {"step": subject.step / k}) for k in ((1, 2) if quick else (1, 2, 4, 8, 16))]
+    if subject.marched:
+        plan += [("extent", k, {"step": subject.step / k}) for k in ((1, 2) if quick else (1, 2, 4, 8, 16))]
     out = []
     for axis, value, params in plan:
         on_step(f"{axis} {value}")

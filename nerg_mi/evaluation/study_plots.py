@@ -62,12 +62,13 @@ def plot_scaling(path: Path, rows: list[dict], title: str) -> None:
     figure = Figure(figsize=(9.6, 3.2), dpi=100)
     FigureCanvasAgg(figure)
     names = {"pixels": "pixels", "samples": "samples a pixel", "extent": "extent of the scene at equal step"}
-    for axes, (axis, label) in zip(figure.subplots(1, 3), names.items()):
+    varied = [axis for axis in names if any(r["axis"] == axis for r in rows)]
+    for axes, axis in zip(figure.subplots(1, len(varied)), varied):
         x, y = np.array([(r["value"], r["seconds"]) for r in rows if r["axis"] == axis]).T
         axes.loglog(x, y, "o-", color="C0", markersize=4, linewidth=1)
         half = len(x) // 2
         axes.set_title(f"exponent {exponent(x[half - 1 :], y[half - 1 :]):.2f} in the upper half", fontsize=8)
-        axes.set_xlabel(label, fontsize=8)
+        axes.set_xlabel(names[axis], fontsize=8)
         axes.set_ylabel("seconds a picture", fontsize=8)
         axes.tick_params(labelsize=7, which="both")
         axes.grid(True, which="major", color="0.9", linewidth=0.6)

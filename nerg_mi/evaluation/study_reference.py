@@ -182,7 +182,7 @@ def truth(scene: AnalyticScene, gaze, o, d, *, depth: str, visibility: str, fall
     # path to the expected depth of thick matter, ln 2 of it to the median.
     paths = 1 if depth == "expected" else np.log(2)
     in_front = tolerance + np.minimum(paths * seen.free_path, t * FUZZ)
-    distance, r_o = _towards(p_o, p_d - d * in_front[:, None])
+    distance, r_o = towards(p_o, p_d - d * in_front[:, None])
     start = np.broadcast_to(p_o, o.shape)
     p_od = p_d
     if visibility == "transmittance":
@@ -195,11 +195,11 @@ def truth(scene: AnalyticScene, gaze, o, d, *, depth: str, visibility: str, fall
         blocked = excess > 0
         p_od = np.where(blocked[:, None], p_o + r_o * np.where(blocked, d_o, 0)[:, None], p_d)
     share = np.where(surface, share, 0)
-    density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, _towards(p_o, p_d)[1]) * share
+    density = np.zeros(len(o)) if gaze is None else evaluate_gaze(gaze, p_od, p_o, towards(p_o, p_d)[1]) * share
     return Truth(seen.color(o, d), seen.opacity, t, share, density, "float64 closed form", {})
 
 
-def _towards(p_o, p):
+def towards(p_o, p):
     """Distance (N,) and unit direction (N, 3) from ``p_o`` to ``p``."""
     v = p - p_o
     distance = np.linalg.norm(v, axis=-1)

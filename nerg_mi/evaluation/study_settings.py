@@ -35,6 +35,9 @@ class Setting:
 def settings(subject, quick: bool = False) -> list[Setting]:
     """All rows for ``subject``; ``quick``: one or two of each factor."""
 
+    if not subject.marched:
+        return [Setting("default", "default"), *_visibility(quick), *_left_out(subject), *_samples(quick)]
+
     def some(values):
         return values[:: max(len(values) - 1, 1)] if quick else values
 
@@ -58,15 +61,7 @@ def settings(subject, quick: bool = False) -> list[Setting]:
         for n in () if quick else (128, 256, 512, 1024):
             rows.append(Setting(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
     rows.append(Setting("jitter", "jitter", {"jitter": True}))
-    for k in ("depth", "transmittance"):
-        rows.append(Setting(f"visibility {k}", "visibility", {"visibility": k}))
-    for h in (16,) if quick else (64, 128, 256, 512, 1024):
-        params = {"visibility": "map", "map_height": h}
-        rows.append(Setting(f"visibility map {h}", "visibility", params))
-        rows.append(Setting(f"visibility map {h}, first frame", "visibility", params, first_frame=True))
-    rows += _left_out(subject)
-    for k in (2,) if quick else (4, 16, 64):
-        rows.append(Setting(f"spp {k}", "spp", spp=k))
+    rows += _visibility(quick) + _left_out(subject) + _samples(quick)
     if hasattr(subject, "analytic"):
         for r in RESOLUTIONS[:1] if quick else RESOLUTIONS:
             for rule in ("constant", "linear", "cells"):
@@ -76,6 +71,19 @@ def settings(subject, quick: bool = False) -> list[Setting]:
                 rows.append(Setting(f"grid 64, {rule}, {n} steps", "resolution", {"quadrature": rule, **steps(n)}, resolution=64))
     rows += [] if quick else _together(subject)
     return rows + _paper(quick)
+
+
+def _visibility(quick: bool) -> list[Setting]:
+    rows = [Setting(f"visibility {k}", "visibility", {"visibility": k}) for k in ("depth", "transmittance")]
+    for h in (16,) if quick else (64, 128, 256, 512, 1024):
+        params = {"visibility": "map", "map_height": h}
+        rows.append(Setting(f"visibility map {h}", "visibility", params))
+        rows.append(Setting(f"visibility map {h}, first frame", "visibility", params, first_frame=True))
+    return rows
+
+
+def _samples(quick: bool) -> list[Setting]:
+    return [Setting(f"spp {k}", "spp", spp=k) for k in ((2,) if quick else (4, 16, 64))]
 
 
 def _left_out(subject) -> list[Setting]:

@@ -1,7 +1,7 @@
 """What is studied: a scene of which integrators with any parameters can be made, its rays, and its truth.
 
-Two kinds: analytic scenes, with float64 references, and scene files, whose reference is a render with much smaller steps.
-A further kind (a scene of shapes) is a class with the same members and a line in `open_subject`.
+Three kinds: analytic scenes and scenes of shapes, with float64 references, and scene files with a field, whose reference is
+a render with much smaller steps.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import NergError, sentence
-from . import study_reference, study_scenes
+from . import study_reference, study_scenes, study_shapes
+from ..transport.observer import EXACT
+from ..transport.place import Place
 from .study_reference import Truth
 
 KINDS = ("auto", "analytic", "file")
@@ -35,7 +37,7 @@ def open_subject(scene: str, kind: str, width: int, height: int, defaults: Mappi
     if not Path(scene).is_file():
         names = ", ".join(study_scenes.SCENES)
         raise NergError(f'there is no scene file "{scene}", and no analytic scene of that name; those are {names}.')
-    return FileSubject(Path(scene), width, height, defaults or {})
+    return _load(Path(scene), width, height, defaults or {})
 
 
 class Subject:
@@ -46,13 +48,19 @@ class Subject:
     name: str
     opaque: bool
     has_gaze = True
+    marched = True
+    """Whether there is a medium, whose marching can be set."""
 
     def _set_up(self, scene, sensor, base: dict) -> None:
         self.scene, self.sensor, self.base = scene, sensor, base
         self._truths: dict = {}
         first = self.integrator()
-        self.extent, self.step = first.medium.length_scale, first.settings.step
-        self.tolerance = 2 * self.step
+        self.step = first.settings.step
+        if self.marched:
+            self.extent, self.tolerance = first.medium.length_scale, 2 * self.step
+        else:
+            self.extent = Place(None, scene).diagonal
+            self.tolerance = EXACT * self.extent
         self.base = {**base, "tolerance": self.tolerance}
 
     def integrator(self, params: Mapping = {}, resolution: int = 0):
@@ -167,27 +175,21 @@ class FileSubject(Subject):
     Where a ``twin.xml`` lies beside it, its shapes say where surfaces exactly are.
     """
 
-    def __init__(self, path: Path, width: int, height: int, defaults: Mapping[str, str]):
-        import mitsuba as mi
-
-        try:
-            loaded = mi.load_file(str(path), **defaults)
-        except RuntimeError as error:
-            raise NergError(sentence(error)) from error
-        integrator = loaded.integrator()
-        if type(integrator).__name__ != "NergIntegrator":
-            raise NergError(f'the integrator of "{path}" is not "nerg": name a scene whose integrator is.')
-        if not loaded.sensors():
-            raise NergError(f'"{path}" has no sensor: add the camera that takes the pictures.')
-        sensor = loaded.sensors()[0]
-        if not sensor.film().rfilter().is_box_filter():
-            raise NergError(f'the film of "{path}" does not have a box filter, without which depths cannot be compared: give it one.')
+    def __init__(self, path: Path, loaded, width: int, height: int):
+        integrator, sensor = loaded.integrator(), loaded.sensors()[0]
         self.name, self.twin = path.stem if path.stem != "scene" else path.resolve().parent.name, path.parent / "twin.xml"
         self.opaque = self.twin.is_file()
         children = _children(integrator)
         self.has_gaze = "gaze" in children
         self._set_up(loaded, sensor, {**children, **parameters(integrator), "aovs": self.aovs()})
         self.resize(width, height)
+
+    def eye(self) -> np.ndarray:
+        """Where the observer stands (3,)."""
+        from ..transport.viewpoint import center
+
+        observer = self.base.get("observer")
+        return np.array(center(observer if observer is not None else self.sensor), float).reshape(3)
 
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
         """A render with steps `FINER` times shorter, and how far one with steps twice as long is from it."""
@@ -206,18 +208,69 @@ class FileSubject(Subject):
         if not self.opaque:
             return None
         from ..scenes.store import twin
-        from ..transport.viewpoint import center
 
         o, d = self.rays(seed)
         shapes = twin.load_twin(self.twin)
         t = twin.cast(o, d, shapes)
-        observer = self.base.get("observer")
-        eye = np.array(center(observer if observer is not None else self.sensor), float).reshape(3)
+        eye = self.eye()
         hit = np.isfinite(t)
         seen = np.zeros(len(t), bool)
         # A millimetre before the surface: the point itself must not hide itself.
         seen[hit] = twin.visible(eye, o[hit] + d[hit] * (t[hit, None] - 1e-3), shapes)
         return t, seen
+
+
+class ShapesSubject(FileSubject):
+    """A scene file of meshes and no field."""
+
+    marched = False
+
+    def __init__(self, path: Path, loaded, width: int, height: int):
+        self.corners = study_shapes.triangles(loaded)
+        self._hits: dict = {}
+        super().__init__(path, loaded, width, height)
+        self.opaque = True
+
+    def resize(self, width: int, height: int) -> None:
+        super().resize(width, height)
+        self._hits.clear()
+
+    def first_hits(self, seed: int) -> np.ndarray:
+        """Distances (N,) to the shapes along the rays of ``seed``; inf on a miss."""
+        if seed not in self._hits:
+            self._hits[seed] = study_shapes.first_hit(self.corners, *self.rays(seed))
+        return self._hits[seed]
+
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+        color = self.channels(self.integrator({"aovs": ""}), study_shapes.COLOR_SPP, seed + 1)["color"]
+        return study_shapes.truth(self, seed, visibility, color)
+
+    def exact(self, seed: int):
+        o, d = self.rays(seed)
+        t = self.first_hits(seed)
+        hit = np.isfinite(t)
+        distance, r_o = study_reference.towards(self.eye(), o + d * np.where(hit, t, 0)[:, None])
+        met = study_shapes.first_hit(self.corners, np.broadcast_to(self.eye(), o.shape), r_o)
+        # Both distances lead to the same point, but for rounding.
+        return t, hit & (met > distance - 1e-6)
+
+
+def _load(path: Path, width: int, height: int, defaults: Mapping[str, str]) -> FileSubject:
+    import mitsuba as mi
+
+    try:
+        loaded = mi.load_file(str(path), **defaults)
+    except RuntimeError as error:
+        raise NergError(sentence(error)) from error
+    if type(loaded.integrator()).__name__ != "NergIntegrator":
+        raise NergError(f'the integrator of "{path}" is not "nerg": name a scene whose integrator is.')
+    if not loaded.sensors():
+        raise NergError(f'"{path}" has no sensor: add the camera that takes the pictures.')
+    if not loaded.sensors()[0].film().rfilter().is_box_filter():
+        raise NergError(f'the film of "{path}" does not have a box filter, without which depths cannot be compared: give it one.')
+    if loaded.integrator().medium is not None and len(loaded.shapes()) > 0:
+        raise NergError(f'"{path}" holds a field and shapes, of which there is no reference: study each alone.')
+    return (ShapesSubject if loaded.integrator().medium is None else FileSubject)(path, loaded, width, height)
 
 
 def parameters(integrator) -> dict:
@@ -240,7 +293,7 @@ def _children(integrator) -> dict:
 
     class Collect(mi.TraversalCallback):
         def put(self, name, value, *rest):
-            if isinstance(value, (mi.Volume, mi.Sensor)):
+            if isinstance(value, (mi.Volume, mi.Sensor, mi.Integrator)):
                 found[name] = value
 
     integrator.traverse(Collect())

@@ -82,6 +82,11 @@ class LocalRay:
     t_far: object
 
 
+def _bounded(sigma):
+    # A negative value of an interpolated or fitted grid would create light; comparing also drops NaN.
+    return dr.select(sigma > 0, dr.minimum(sigma, MAX_DENSITY), 0)
+
+
 class FieldMedium:
     """A radiance field placed in the scene."""
 
@@ -124,7 +129,7 @@ class FieldMedium:
         return v / self.field.box.side
 
     def density(self, p, active):
-        return self.field.density(p, active) * self._per_unit
+        return _bounded(self.field.density(p, active) * self._per_unit)
 
     def occupied_density(self, p, active):
         """Density where no march has looked up the occupancy grid before: 0 in its empty cells."""
@@ -135,7 +140,7 @@ class FieldMedium:
     def density_features(self, p, active):
         """Density, and what ``color`` needs of the same point."""
         sigma, features = self.field.density_features(p, active)
-        return sigma * self._per_unit, features
+        return _bounded(sigma * self._per_unit), features
 
     def color(self, features, p, w, active):
         """Colour in ``color_space`` (Array3f)."""
@@ -221,9 +226,7 @@ class VolumeMedium:
         return it
 
     def density(self, p, active):
-        # A negative value of an interpolated or fitted grid would create light; comparing also drops NaN.
-        sigma = self._density.eval_1(self._at(p), active)
-        return dr.select(sigma > 0, dr.minimum(sigma, MAX_DENSITY), 0)
+        return _bounded(self._density.eval_1(self._at(p), active))
 
     def density_features(self, p, active):
         return self.density(p, active), []

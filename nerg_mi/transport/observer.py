@@ -19,7 +19,7 @@ KINDS = ("depth", "transmittance", "map")
 # An entry of a map sees the same surface as a point if it lies at most this many times the point's lift behind it.
 _PAST = 4
 # Ray casts agree on a shape to this share of the scene's diagonal.
-_EXACT = 1e-4
+EXACT = 1e-4
 
 
 @dataclass
@@ -50,7 +50,7 @@ class ObserverPass:
     """Looks from an observer at points of a place.
 
     ``kind``: one of ``KINDS``; ``depth``: kind of d_o; ``surface_opacity``: opacity from which a ray meets a
-    surface; ``tolerance``: in scene units, 0 for two steps (without a medium, ``_EXACT`` of the scene's diagonal);
+    surface; ``tolerance``: in scene units, 0 for two steps (without a medium, ``EXACT`` of the scene's diagonal);
     ``map_height``: rows of the map.
     """
 
@@ -112,7 +112,7 @@ class ObserverPass:
         if self.tolerance:
             return self.tolerance
         if place.medium is None:
-            return _EXACT * place.diagonal
+            return EXACT * place.diagonal
         return 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o))
 
     def _map_from(self, place, p_o) -> ObserverMap:

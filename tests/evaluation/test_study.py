@@ -122,7 +122,7 @@ def test06_a_grid_tends_to_its_density():
     subject = open_subject("fog", "auto", 12, 8)
     known = subject.truth(1, "expected", "depth")
     off = [
-        errors(subject.channels(subject.integrator({"quadrature": "cells"}, resolution=r), 1, 1), known)["depth_mae"] for r in (8, 32)
+        errors(subject.channels(subject.integrator({"quadrature": "cells", "depth": "expected"}, resolution=r), 1, 1), known)["depth_mae"] for r in (8, 32)
     ]
     assert off[1] < off[0] / 6 < 1e-2
 

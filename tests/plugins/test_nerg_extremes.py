@@ -29,7 +29,7 @@ def volume(mi, kind, sigma):
 
 
 def slab_scene(mi, kind, sigma, ahead):
-    integrator = {"type": "nerg", "id": "integrator", "density": volume(mi, kind, sigma), "radiance": False}
+    integrator = {"type": "nerg", "id": "integrator", "density": volume(mi, kind, sigma), "depth": "expected", "radiance": False}
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": probe(mi, ahead)})
 
 
@@ -98,7 +98,7 @@ def test04_places_of_any_size(rgb, size):
 def test05_a_place_far_from_the_origin_keeps_what_floats_hold(rgb):
     # 1e5 units away positions are 0.008 apart: opacity stays, depth is good to that.
     to_world = rgb.ScalarTransform4f().translate([1e5, 0, 0])
-    integrator = {"type": "nerg", "density": {"type": "constvolume", "value": 3.0, "to_world": to_world}}
+    integrator = {"type": "nerg", "density": {"type": "constvolume", "value": 3.0, "to_world": to_world}, "depth": "expected"}
     out = channels(rgb, integrator, camera(rgb, (1e5 + 0.5, 0.5, -2), (1e5 + 0.5, 0.5, 0), fov=2))
     alpha, expected, _ = reference.slab(3, 1.99, 2.99)
     assert np.allclose(out["opacity.Y"], alpha, rtol=1e-2)
@@ -109,7 +109,7 @@ def test05_a_place_far_from_the_origin_keeps_what_floats_hold(rgb):
 def test06_samples(rgb, step, spp):
     # Constant density is exact at any step, and so is the mean of equal samples.
     to_world = rgb.ScalarTransform4f().translate([-9, -9, 0]).scale([18, 18, 1])
-    integrator = {"type": "nerg", "density": {"type": "constvolume", "value": 2.0, "to_world": to_world}, "step": step}
+    integrator = {"type": "nerg", "density": {"type": "constvolume", "value": 2.0, "to_world": to_world}, "depth": "expected", "step": step}
     sensor = {"type": "orthographic", "to_world": rgb.ScalarTransform4f().translate([0, 0, -1]),
               "film": camera(rgb, size=2)["film"], "sampler": {"type": "independent"}, "near_clip": 0.5}  # fmt: skip
     out = channels(rgb, integrator, sensor, spp=spp)
@@ -235,3 +235,13 @@ def test15_the_median_puts_no_surface_in_mid_air(rgb):
         off = np.linalg.norm(p - (0, 0, -0.4), axis=-1) > 0.6
         flying[kind] = np.sum((out["opacity.Y"] > 0.5) & off & (p[..., 2] < 0.7))
     assert flying["median"] == flying["refined"] == 0 < flying["expected"]
+
+
+def test16_weights_set_to_nan_are_empty_space(rgb, files):
+    scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files, "depth,opacity,visibility"), "sensor": camera(rgb)})
+    params = rgb.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("field.density_net.1"))
+    params[key] = params[key] * math.nan
+    params.update()
+    out = np.array(rgb.render(scene, spp=1))
+    assert np.all(out[..., 3:] == 0) and np.all(np.isfinite(out))

@@ -30,7 +30,7 @@ def camera(mi, origin=(0.3, 0.2, -3)):
 
 def neural(mi, files, aovs="depth,opacity,gaze", observer=None, **kwargs):
     out = {
-        "type": "nerg", "field": {"type": "nerf", "filename": str(files / "field.safetensors")},
+        "type": "nerg", "depth": "expected", "field": {"type": "nerf", "filename": str(files / "field.safetensors")},
         "gaze": {"type": "gazefield", "filename": str(files / "gaze.safetensors")}, "aovs": aovs, "step": 0.1,
         "stop": 1e-12, "color_cutoff": 0.0, "surface_opacity": 0.0, "background": 0.3, **kwargs,
     }  # fmt: skip
@@ -125,7 +125,7 @@ def test07_gridvolume(rgb, quadrature):
     data = np.random.default_rng(0).exponential(1, (4, 5, 6)).astype(np.float32)
     data[1] = 0  # empty voxels have derivatives too
     integrator = {
-        "type": "nerg", "aovs": "depth,opacity", "step": 0.1, "stop": 1e-12, "color_cutoff": 0.0, "background": 0.3,
+        "type": "nerg", "depth": "expected", "aovs": "depth,opacity", "step": 0.1, "stop": 1e-12, "color_cutoff": 0.0, "background": 0.3,
         "quadrature": quadrature,
         "density": {"type": "gridvolume", "grid": rgb.VolumeGrid(data),
                     "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)},

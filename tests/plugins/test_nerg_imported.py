@@ -60,7 +60,7 @@ def test01_a_picture_of_a_checkpoint(rgb, tmp_path, bound, aligned):
 
     eye = np.array([0.4, 0.3, -1.5]) if aligned else np.array([1.1, -0.7, 0.6])
     integrator = {
-        "type": "nerg", "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
+        "type": "nerg", "depth": "expected", "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
         "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")}, "step": STEP,
         "aovs": "depth,opacity,gaze,emit,capture", "surface_opacity": 0.0, "color_cutoff": 0.0, "stop": 0.0,
     }  # fmt: skip
