@@ -6,24 +6,43 @@ from typing import Annotated, List, Optional
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Import tracking files as rays of attention, and inspect them.")
+app = typer.Typer(no_args_is_help=True, help="Import tracking files as rays of attention, look at them, choose among them and split them.")
+
+_Rays = Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet).")]
+_Output = Annotated[Path, typer.Option("-o", "--output", help="Rays file to write (.npz or .parquet).")]
 
 
 @app.command("import")
 def import_rays(
-    files: Annotated[List[Path], typer.Argument(help="Tracking files (CSV, CSV.gz, Parquet or skeleton files).")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Rays file to write (.npz or .parquet).")],
-    preset: Annotated[Optional[str], typer.Option(help="Known recording: skeleton22, vr_supermarket.")] = None,
+    files: Annotated[List[Path], typer.Argument(help="Tracking files (CSV, CSV.gz, Parquet or skeleton files; for pupil, folders).")],
+    output: _Output,
+    preset: Annotated[
+        Optional[str],
+        typer.Option(help="Known recording: skeleton22, vr_supermarket, unity, unity_local, unity_head, varjo, hololens or pupil."),
+    ] = None,
     columns: Annotated[
         Optional[str],
-        typer.Option("--map", help='Column map: "origin=x,y,z direction=dx,dy,dz t=time person=id confidence=c hit=hx,hy,hz".'),
+        typer.Option(
+            "--map",
+            help='Column map: "origin=x,y,z direction=dx,dy,dz t=time person=id confidence=c hit=hx,hy,hz cohort=g"; for heads, in place '
+            "of direction: xyzw=..., wxyz=..., ypr=yaw,pitch,roll or matrix=... (12 or 16 columns, instead of origin too).",
+        ),
     ] = None,
-    units: Annotated[str, typer.Option(help="Unit of length of a mapped table: m, cm or mm.")] = "m",
-    up: Annotated[str, typer.Option(help="Up axis of a mapped table: y or z.")] = "z",
-    hand: Annotated[str, typer.Option(help="Handedness of a mapped table: right, or left (Unity).")] = "right",
-    person_from: Annotated[str, typer.Option(help="Persons of a mapped table: column or filename.")] = "column",
-    min_confidence: Annotated[float, typer.Option(help="Drop rows of a mapped table below this confidence.")] = 0.0,
-    tick: Annotated[float, typer.Option(help="Seconds in one unit of the file's time.")] = 1.0,
+    units: Annotated[Optional[str], typer.Option(help="Unit of length of a mapped table: m, cm or mm.  [default: m]")] = None,
+    up: Annotated[Optional[str], typer.Option(help="Up axis: x, y, z, -x, -y or -z.  [default: z; pupil: y]")] = None,
+    hand: Annotated[Optional[str], typer.Option(help="Handedness of a mapped table: right, or left (Unity).  [default: right]")] = None,
+    forward: Annotated[
+        Optional[str], typer.Option(help="Axis of a head's frame along which it looks.  [default: y up z (left-handed) or -z, else x]")
+    ] = None,
+    radians: Annotated[bool, typer.Option("--radians", help="Angles of a mapped table are in radians.")] = False,
+    person_from: Annotated[Optional[str], typer.Option(help="Persons of a mapped table: column or filename.  [default: column]")] = None,
+    min_confidence: Annotated[
+        Optional[float], typer.Option(help="Drop rows below this confidence.  [default: 0; pupil: 0.6]")
+    ] = None,
+    tick: Annotated[Optional[float], typer.Option(help="Seconds in one unit of the file's time.  [default: 1]")] = None,
+    keypoints: Annotated[Optional[str], typer.Option(help="skeleton22: left ear, right ear, nose.  [default: 2,13,11]")] = None,
+    pitch: Annotated[Optional[float], typer.Option(help="skeleton22: degrees by which rays are turned up.  [default: 0]")] = None,
+    marker: Annotated[Optional[float], typer.Option(help="pupil: edge of a tracking marker in metres.")] = None,
 ) -> None:
     """Convert tracking files to rays: right-handed, z up, metres, seconds."""
     from ..attention import presets
@@ -31,30 +50,197 @@ def import_rays(
 
     if (preset is None) == (columns is None):
         raise ValueError("say what the files are: either --preset NAME or --map COLUMNS")
+    given = {
+        "units": units, "up": up, "hand": hand, "forward": forward, "radians": radians or None, "person_from": person_from,
+        "min_confidence": min_confidence, "tick": tick, "pitch": pitch, "marker": marker, "keypoints": keypoints,
+    }  # fmt: skip
+    given = {name: value for name, value in given.items() if value is not None}
+    if "keypoints" in given:
+        given["keypoints"] = _three_numbers(given["keypoints"])
     if columns is not None:
-        rays = rays_from_table(
-            files, columns, up=up, handedness=hand, units=units,
-            person_from=person_from, min_confidence=min_confidence, tick=tick,
-        )  # fmt: skip
+        foreign = [name for name in ("keypoints", "pitch", "marker") if name in given]
+        if foreign:
+            raise ValueError(f"{_options(foreign)} belongs to a preset; leave it out, or give --preset in place of --map")
+        if given.pop("radians", False):
+            given["degrees"] = False
+        if "hand" in given:
+            given["handedness"] = given.pop("hand")
+        rays = rays_from_table(files, columns, **given)
     else:
         known = presets.preset(preset)
-        declared = {"units": units != "m", "up": up != "z", "hand": hand != "right", "person-from": person_from != "column",
-                    "min-confidence": min_confidence != 0.0, "tick": tick != 1.0 and "tick" not in known.options}  # fmt: skip
-        unused = [f"--{option}" for option, given in declared.items() if given]
+        unused = [name for name in given if name not in known.options]
         if unused:
-            raise ValueError(f"preset {preset} knows its own conventions; leave out {', '.join(unused)}")
-        rays = known.read(files, **({"tick": tick} if "tick" in known.options else {}))
+            raise ValueError(f"preset {preset} knows its own conventions; leave out {_options(unused)}")
+        rays = known.read(files, **given)
     rays.save(output)
     _card(rays, output)
     typer.echo(f"wrote {output}")
 
 
 @app.command("show")
-def show_rays(rays: Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet).")]) -> None:
+def show_rays(rays: _Rays) -> None:
     """The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height."""
     from ..attention.rays import Rays
 
     _card(Rays.load(rays), rays)
+
+
+@app.command("filter")
+def filter_rays(
+    rays: _Rays,
+    output: _Output,
+    start: Annotated[Optional[float], typer.Option("--from", help="Rays from this time on, seconds.")] = None,
+    end: Annotated[Optional[float], typer.Option("--to", help="Rays before this time, seconds.")] = None,
+    person: Annotated[Optional[List[str]], typer.Option(help="Only this person; repeatable.")] = None,
+    without_person: Annotated[Optional[List[str]], typer.Option(help="Not this person; repeatable.")] = None,
+    cohort: Annotated[Optional[List[str]], typer.Option(help="Only this cohort; repeatable.")] = None,
+    box: Annotated[Optional[str], typer.Option(help="Origins in this box: x0,x1,y0,y1,z0,z1, metres.")] = None,
+    min_confidence: Annotated[Optional[float], typer.Option(help="Only rays of at least this confidence.")] = None,
+    with_hit: Annotated[bool, typer.Option("--with-hit", help="Only rays whose hit point is known.")] = False,
+    fixations: Annotated[Optional[str], typer.Option(help="Only rays of fixations: ivt (by velocity) or idt (by dispersion).")] = None,
+    velocity: Annotated[float, typer.Option(help="ivt: degrees a second that end a fixation.")] = 100.0,
+    dispersion: Annotated[float, typer.Option(help="idt: degrees within which a fixation stays.")] = 3.0,
+    least: Annotated[Optional[float], typer.Option(help="Shortest fixation, seconds.  [default: ivt 0.06, idt 0.1]")] = None,
+    one_ray: Annotated[bool, typer.Option("--one-ray", help="One ray a fixation, its mean.")] = False,
+    thin: Annotated[Optional[float], typer.Option(help="A stop counts as at most this many seconds of rays.")] = None,
+    thin_distance: Annotated[float, typer.Option(help="--thin: a stop is a stay within this many metres.")] = 0.1,
+) -> None:
+    """Keep some rays: conditions first, then fixations, then thinning of those who stand still."""
+    from ..attention import filters, fixations as fix
+    from ..attention.rays import Rays
+
+    if fixations not in (None, "ivt", "idt"):
+        raise ValueError(f'--fixations is "{fixations}"; it is ivt or idt')
+    if one_ray and fixations is None:
+        raise ValueError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
+    data = Rays.load(rays)
+    what = {
+        "time": None if start is None and end is None else (start, end), "persons": person or None, "without_persons": without_person or None,
+        "cohorts": cohort or None, "box": None if box is None else _numbers(box, "--box"), "min_confidence": min_confidence,
+        "with_hit": with_hit or None,
+    }  # fmt: skip
+    what = {name: value for name, value in what.items() if value is not None}
+    if not what and fixations is None and thin is None:
+        raise ValueError("say which rays to keep, for instance with --from, --person, --box, --fixations or --thin (--help lists all)")
+    if what:
+        data = _step(data, filters.select_mask(data, **what), "filter", what)
+    if fixations is not None:
+        limit = {"velocity": velocity} if fixations == "ivt" else {"dispersion": dispersion}
+        limit.update({} if least is None else {"least": least})
+        label = (fix.ivt if fixations == "ivt" else fix.idt)(data, **limit)
+        typer.echo(f"{len(set(label.tolist()) - {-1}):,} fixations ({fixations})")
+        if one_ray:
+            before, (data, _) = len(data), fix.fixation_rays(data, label)
+            data = data.noting(step="fixations", by=fixations, one_ray=True, kept=len(data), of=before, **limit)
+            typer.echo(f"fixations: one ray each, {len(data):,} of {before:,} rays")
+        else:
+            data = _step(data, label >= 0, "fixations", {"by": fixations, **limit})
+    if thin is not None:
+        data = _step(data, filters.thin_mask(data, thin, thin_distance), "thin", {"seconds": thin, "distance": thin_distance})
+    data.save(output)
+    typer.echo(f"wrote {output}")
+
+
+@app.command("split")
+def split_rays(
+    rays: _Rays,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Rays file; -train and -test are put before its ending.")],
+    zones: Annotated[int, typer.Option(help="By position: zones held out; 0: not by position.")] = 0,
+    radius: Annotated[float, typer.Option(help="By position: R of probes, metres; rays within 2R of a test position are purged.")] = 0.25,
+    zone_radius: Annotated[float, typer.Option(help="By position: radius of a zone, metres.")] = 0.2,
+    positions: Annotated[int, typer.Option(help="By position: test positions in the zones.")] = 150,
+    min_rays: Annotated[int, typer.Option(help="By position: rays that a test position has within R.")] = 64,
+    people: Annotated[float, typer.Option(help="By person: share held out, at random; 0: not by person.")] = 0.0,
+    person: Annotated[Optional[List[str]], typer.Option(help="By person: this one is held out; repeatable.")] = None,
+    time: Annotated[float, typer.Option(help="By time: share at the end that is held out; 0: not by time.")] = 0.0,
+    gap: Annotated[float, typer.Option(help="By time: seconds purged before the end part.")] = 5.0,
+    clock: Annotated[str, typer.Option(help="By time: all (one clock), or person (each their own).")] = "all",
+    seed: Annotated[int, typer.Option(help="Seed of zones, positions and people.")] = 0,
+) -> None:
+    """Split into training and test rays that share none: by position, person, time, or several of them at once.
+
+    Of several, training rays are on the training side of each and test rays on the test side of each; the rest is purged.
+    """
+    from ..attention import splits
+    from ..attention.rays import Rays
+
+    data = Rays.load(rays)
+    parts, about = [], {}
+    if zones:
+        where = splits.split_by_position(data, radius, zones=zones, zone_radius=zone_radius, test_probes=positions, min_rays=min_rays, seed=seed)
+        parts.append(where)
+        about["position"] = {"radius": radius, "zones": zones, "zone_radius": zone_radius, "test_centres": where.test_centres.tolist()}
+    if people or person:
+        held = splits.split_by_person(data, test_share=people or 0.5, test_persons=person or None, seed=seed)
+        parts.append(held)
+        about["person"] = {"test": sorted({data.persons[p] for p in set(data.person[held[1]].tolist())})}
+    if time:
+        parts.append(splits.split_by_time(data, test_share=time, gap=gap, of=clock))
+        about["time"] = {"share": time, "gap": gap, "of": clock}
+    if not parts:
+        raise ValueError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
+    train, test = splits.both(*parts)
+    typer.echo(f"{train.sum():,} training rays, {test.sum():,} test rays, {(~(train | test)).sum():,} purged of {len(data):,}")
+    for side, mask in (("train", train), ("test", test)):
+        path = output.with_name(f"{output.stem}-{side}{output.suffix}")
+        data.select(mask).noting(step="split", side=side, seed=seed, kept=int(mask.sum()), of=len(data), by=about).save(path)
+        typer.echo(f"wrote {path}")
+
+
+@app.command("plot")
+def plot_rays(
+    rays: _Rays,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write (.png).")],
+    kind: Annotated[str, typer.Option(help="density: rays/m² with mean directions; layout: each ray's place, with dimensions.")] = "density",
+    cell: Annotated[Optional[float], typer.Option(help="density: edge of a cell, metres.  [default: a fiftieth of the plan]")] = None,
+    test: Annotated[Optional[Path], typer.Option(help="layout: the test rays of a split, drawn beside.")] = None,
+) -> None:
+    """The floor plan: where people stood and how densely, or the layout."""
+    from ..attention.rays import Rays
+    from ..view import ray_figures
+    from ..view.figures import save
+
+    if kind not in ("density", "layout"):
+        raise ValueError(f'--kind is "{kind}"; it is density or layout')
+    if output.suffix.lower() != ".png":
+        raise ValueError(f"{output}: plots are written as PNG; choose a name that ends in .png")
+    if kind == "density":
+        if test is not None:
+            raise ValueError("--test is drawn in the layout; add --kind layout")
+        figure = ray_figures.floor_plan(Rays.load(rays), cell)
+    else:
+        held = None if test is None else Rays.load(test)
+        where = {} if held is None else next((s["by"].get("position", {}) for s in held.metadata.get("steps", []) if s["step"] == "split"), {})
+        figure = ray_figures.layout_figure(Rays.load(rays), held, where.get("test_centres"), where.get("radius"))
+    save(figure, output)
+    typer.echo(f"wrote {output}")
+
+
+def _step(data, mask, step: str, what: dict):
+    """The rays of a mask, with a line that says how many, and a note of it in their metadata."""
+    if not mask.any():
+        raise ValueError(f"{step} leaves none of {len(data):,} rays; widen its conditions")
+    typer.echo(f"{step}: {mask.sum():,} of {len(data):,} rays")
+    return data.select(mask).noting(step=step, kept=int(mask.sum()), of=len(data), **what)
+
+
+def _options(names: list[str]) -> str:
+    return ", ".join("--" + name.replace("_", "-") for name in names)
+
+
+def _numbers(text: str, what: str) -> list[float]:
+    try:
+        return [float(v) for v in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{what} is numbers with commas between them, got {text!r}") from None
+
+
+def _three_numbers(text: str) -> tuple[int, ...]:
+    try:
+        left, right, nose = (int(v) for v in text.split(","))
+    except ValueError:
+        raise ValueError(f"--keypoints is three numbers: left ear, right ear, nose; got {text!r}") from None
+    return left, right, nose
 
 
 def _card(rays, path: Path) -> None:
@@ -67,10 +253,18 @@ def _card(rays, path: Path) -> None:
     card = Table(show_header=False, box=None, title=str(path), title_justify="left")
     triple = lambda v: " ".join(f"{x:.2f}" for x in v)
     card.add_row("rays", f"{s.rays:,} of {s.rows_read:,} rows")
-    card.add_row("persons", f"{s.persons}: {', '.join(rays.persons[:8])}{', ...' if len(rays.persons) > 8 else ''}")
+    there = [rays.persons[p] for p in sorted(set(rays.person.tolist()))]
+    card.add_row("persons", f"{s.persons}: {', '.join(there[:8])}{', ...' if len(there) > 8 else ''}")
+    if s.cohorts:
+        card.add_row("cohorts", ", ".join(f"{name} {count:,}" for name, count in s.cohorts.items()))
     card.add_row("recorded time", f"{s.duration:,.1f} s at {s.rate:.4g} rays a second")
     for reason, count in s.dropped.items():
         card.add_row("dropped", f"{count:,} ({100 * count / max(s.rows_read, 1):.1f} %): {reason}; {_rows(rays, reason)}")
+    for step in rays.metadata.get("steps", []):
+        card.add_row("then", f"{step['step']}{' ' + step['side'] if 'side' in step else ''}: {step['kept']:,} of {step['of']:,} rays kept")
+    source = rays.metadata.get("source_frame")
+    if source:
+        card.add_row("from", f"{source['up']} up, {source['handedness']}-handed, {source['units']}")
     card.add_row("origins", f"{triple(s.box_low)} to {triple(s.box_high)} m (right-handed, z up)")
     card.add_row("eye height", f"{s.eye_height[1]:.2f} m (5 to 95 %: {s.eye_height[0]:.2f} to {s.eye_height[2]:.2f})")
     card.add_row("speed", f"95 % below {s.speed_p95:.2f} m/s")
