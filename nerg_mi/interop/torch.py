@@ -1,0 +1,146 @@
+"""Fields as ``torch.nn.Module``: forward and backward through Dr.Jit, weights as torch parameters.
+
+    module = RadianceModule(load_radiance("field.safetensors", namespace("llvm"))[0])
+    optimizer = torch.optim.Adam(module.parameters(), 1e-2)
+    sigma, color = module(p, d)
+    ...
+    save_radiance(module.field(), "trained.safetensors", {})
+
+First derivatives only, with respect to the weights and to positions and directions. Tensors are float32, on the CPU for a
+field of the LLVM backend and on the GPU for one of the CUDA backend.
+"""
+from __future__ import annotations
+
+import copy
+
+import drjit as dr
+import numpy as np
+import torch
+
+from ..field.backend import is_cuda, namespace
+from ..field.background import Background
+from ..field.gaze import GazeField
+from ..field.hashgrid import HashGrid
+from ..field.mlp import MLP
+from ..field.radiance import RadianceField
+
+
+class _FieldModule(torch.nn.Module):
+    """The parameters of a field, by the field's names with "__" for "."."""
+
+    def __init__(self, field):
+        super().__init__()
+        self._field, self._ns = field, namespace(field.grid.table)
+        self.device_type = "cuda" if is_cuda(self._ns) else "cpu"
+        for name, value in field.parameters().items():
+            tensor = torch.tensor(value.numpy(), device=self.device_type)
+            self.register_parameter(name.replace(".", "__"), torch.nn.Parameter(tensor))
+
+    def _values(self) -> dict:
+        return {name: self.get_parameter(name.replace(".", "__")) for name in self._field.parameters()}
+
+    def field(self):
+        """A field of its own with the weights as they are now."""
+        out = _with(self._field, {})
+        out.set_parameters({k: self._array(k, v.detach().cpu().numpy()) for k, v in self._values().items()})
+        return out
+
+    def _array(self, name: str, value: np.ndarray):
+        return self._ns.Float(value) if name.endswith("table") else self._ns.TensorXf(value)
+
+    def _rows(self, **tensors) -> list:
+        """Inputs (N, 3), checked."""
+        count = {len(t) for t in tensors.values() if t.ndim == 2 and t.shape[1] == 3}
+        for name, t in tensors.items():
+            if t.ndim != 2 or t.shape[1] != 3 or t.dtype != torch.float32 or t.device.type != self.device_type or len(count) != 1:
+                raise ValueError(
+                    f"{name} must be a float32 tensor (N, 3) on {self.device_type}, of one N with the others, got {t.dtype} "
+                    f"{tuple(t.shape)} on {t.device.type}"
+                )
+        return [t.contiguous() for t in tensors.values()]
+
+    def _evaluate(self, function, *inputs):
+        """``function(field, *Array3f)``, a list of rows, at torch ``inputs`` (N, 3): a torch tensor (rows, N)."""
+        ns, field = self._ns, self._field
+
+        @dr.wrap(source="torch", target="drjit")
+        def evaluate(values, *points):
+            arrays = {k: ns.Float(v.array) if k.endswith("table") else ns.TensorXf(v) for k, v in values.items()}
+            here = _with(field, arrays)
+            columns = [_columns(ns, p) for p in points]
+            out = function(here, *columns)
+            return ns.TensorXf(dr.ravel(ns.ArrayXf([ns.Float(c) for c in out]), order="C"), (len(out), dr.width(columns[0])))
+
+        # dr.wrap knows tensors, and passes by their subclass for parameters.
+        return evaluate({k: v.view_as(v) for k, v in self._values().items()}, *inputs)
+
+
+class RadianceModule(_FieldModule):
+    """Density and colour of a radiance field. Its occupancy grid is not applied: training in torch may fill empty cells."""
+
+    def __init__(self, field: RadianceField):
+        super().__init__(field)
+
+    def forward(self, p: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Density (N,) in 1/unit and colour (N, 3) in the field's colour space at ``p`` (N, 3) seen along unit ``d`` (N, 3)."""
+        def both(field, p, d):
+            sigma, features = field.density_features(p)
+            return [sigma, *field.color(features, d)]
+
+        out = self._evaluate(both, *self._rows(p=p, d=d))
+        return out[0], out[1:].T
+
+    def density(self, p: torch.Tensor) -> torch.Tensor:
+        """Density (N,) in 1/unit at ``p`` (N, 3); 0 outside of the box."""
+        return self._evaluate(lambda field, p: [field.density(p)], *self._rows(p=p))[0]
+
+    def background(self, o: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+        """Colour (N, 3) behind the field of rays from ``o`` (N, 3) along unit ``d`` (N, 3)."""
+        if self._field.background is None:
+            raise ValueError("this field was trained without a background network")
+        return self._evaluate(lambda field, o, d: list(field.background(o, d)), *self._rows(o=o, d=d)).T
+
+
+class GazeModule(_FieldModule):
+    """The gaze density of a gaze field."""
+
+    def __init__(self, field: GazeField):
+        super().__init__(field)
+
+    def forward(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor) -> torch.Tensor:
+        """Gaze (N,) in 1/sr of observers ``p_o`` (N, 3) who see ``p_od`` (N, 3) along unit ``r_o`` (N, 3)."""
+        return self._evaluate(lambda field, *q: [field.evaluate(*q)[0]], *self._rows(p_od=p_od, p_o=p_o, r_o=r_o))[0]
+
+
+def _columns(ns, p):
+    index = 3 * dr.arange(ns.UInt32, p.shape[0])
+    # No two points share a number, so that derivatives need no atomic additions.
+    return ns.Array3f(*[dr.gather(ns.Float, p.array, index + k, mode=dr.ReduceMode.Permute) for k in range(3)])
+
+
+def _with(field, values: dict):
+    """A copy of ``field`` whose parameters of these names are ``values``, attached to them."""
+    out = copy.copy(field)
+    for name in out.DRJIT_STRUCT:
+        part = getattr(out, name)
+        if isinstance(part, HashGrid):
+            setattr(out, name, _grid(part, values.get(f"{name}.table")))
+        elif isinstance(part, MLP) and not name.startswith("_"):
+            setattr(out, name, _net(part, name, values))
+        elif isinstance(part, Background):
+            grid, net = _grid(part.grid, values.get("background_grid.table")), _net(part.net, "background_net", values)
+            setattr(out, name, Background(part.config, grid, net))
+    out.pack()
+    return out
+
+
+def _grid(grid: HashGrid, table) -> HashGrid:
+    return HashGrid(grid.config, type(grid.table)(grid.table) if table is None else table)
+
+
+def _net(net: MLP, name: str, values: dict) -> MLP:
+    out = MLP(net.weights, net.norms)
+    for key in net.named():
+        if f"{name}.{key}" in values:
+            out.replace(key, values[f"{name}.{key}"])
+    return out

@@ -1,0 +1,163 @@
+"""Fields as torch modules: values of the field, gradients of a restatement in torch and of central differences."""
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.field.background import Background, BackgroundConfig
+from nerg_mi.field.box import Box
+from nerg_mi.field.gaze import GazeConfig, GazeField
+from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+
+GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
+BOX = Box((-1, -1, -1), (1, 1, 1))
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture
+def interop(torch):
+    import nerg_mi.interop.torch
+
+    return nerg_mi.interop.torch
+
+
+def varied(field):
+    field.set_parameters({"grid.table": ns.Float(RNG.normal(size=len(field.grid.table)).astype(np.float32))})
+    return field
+
+
+def radiance(background=False):
+    behind = Background.random(BackgroundConfig(3.0, HashGridConfig(levels=2, log2_rows=8, base=4, finest=16, dimensions=2), 16), ns)
+    return varied(RadianceField.random(RadianceConfig(GRID, width=16, geometry=7), BOX, ns, background=behind if background else None))
+
+
+def rays(torch, n=200):
+    p = RNG.uniform(-1.05, 1.05, (n, 3)).astype(np.float32)
+    d = RNG.normal(size=(n, 3))
+    return torch.tensor(p), torch.tensor((d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32))
+
+
+def test01_values_of_the_field(torch, interop):
+    field = radiance(background=True)
+    module, (p, d) = interop.RadianceModule(field), rays(torch)
+    sigma, color = module(p, d)
+    density, features = field.density_features(ns.Array3f(p.numpy().T))
+    assert np.array_equal(sigma.detach().numpy(), density.numpy()) and (sigma == 0).any()
+    assert np.array_equal(color.detach().numpy(), np.array(field.color(features, ns.Array3f(d.numpy().T))).T)
+    assert np.allclose(module.density(p).detach().numpy(), density.numpy(), rtol=1e-5)
+    shown = np.array(field.background(ns.Array3f(p.numpy().T), ns.Array3f(d.numpy().T))).T
+    assert np.array_equal(module.background(p, d).detach().numpy(), shown)
+    assert {k.replace("__", ".") for k, _ in module.named_parameters()} == set(field.parameters())
+    with pytest.raises(ValueError, match="without a background"):
+        interop.RadianceModule(radiance()).background(p, d)
+
+
+def test02_gradients_of_a_restatement_in_torch(torch, interop):
+    # The same networks in torch behind the same features, so that its autograd shares nothing with ours.
+    from nerg_mi.field.harmonics import encode_direction
+
+    field = radiance()
+    module, (p, d) = interop.RadianceModule(field), rays(torch)
+    mix = torch.tensor(RNG.normal(size=(len(p), 4)).astype(np.float32))
+    sigma, color = module(p, d)
+    loss = (torch.log1p(sigma) * mix[:, 0]).sum() + (color * mix[:, 1:]).sum()
+    loss.backward()
+
+    features = np.array([f.numpy() for f in field.grid(field.box.to_unit(ns.Array3f(p.numpy().T)))]).T
+    sh = np.array([np.broadcast_to(h.numpy(), len(p)) for h in encode_direction(ns.Array3f(d.numpy().T), 4)]).T
+    features, sh = torch.tensor(features, requires_grad=True), torch.tensor(sh.copy())
+    weights = {k: torch.tensor(v.numpy(), requires_grad=True) for k, v in field.parameters().items() if k != "grid.table"}
+    h = torch.relu(features @ weights["density_net.0"].T) @ weights["density_net.1"].T
+    inside = torch.all(torch.abs(p) <= 1, 1)
+    theirs = torch.where(inside, torch.exp(h[:, 0]), torch.zeros(()))
+    c = torch.cat([sh, h[:, 1:]], 1)
+    c = torch.relu(torch.relu(c @ weights["color_net.0"].T) @ weights["color_net.1"].T) @ weights["color_net.2"].T
+    other = (torch.log1p(theirs) * mix[:, 0]).sum() + (torch.sigmoid(c) * mix[:, 1:]).sum()
+    other.backward()
+    assert torch.allclose(loss, other, rtol=1e-4, atol=1e-4)
+    for name, value in weights.items():
+        ours = module.get_parameter(name.replace(".", "__")).grad
+        assert torch.allclose(ours, value.grad, rtol=1e-3, atol=1e-4), name
+    table = module.grid__table.grad
+    # Interpolation weights of a point sum to one in each level and feature.
+    assert torch.isclose(table.sum(), features.grad[inside].sum(), rtol=1e-3, atol=1e-3) and (table != 0).sum() > 100
+
+
+def test03_gradients_equal_central_differences(torch, interop):
+    module, (p, d) = interop.RadianceModule(radiance(background=True)), rays(torch, 40)
+    p = (p * 0.9).requires_grad_()
+    d.requires_grad_()
+
+    def loss(p, d):
+        sigma, color = module(p, d)
+        # Sums in float64, for the differences' sake.
+        parts = sigma * 0.1, color * torch.tensor([1.0, 2.0, 3.0]), module.background(p, d)
+        return sum(part.double().sum() for part in parts)
+
+    loss(p, d).backward()
+    check = {"p": (p, p.grad), "d": (d, d.grad)}
+    check |= {k: (v, v.grad) for k, v in module.named_parameters() if k in ("color_net__1", "background_net__0", "density_net__0")}
+    for name, (value, gradient) in check.items():
+        direction = torch.tensor(np.random.default_rng(1).normal(size=value.shape).astype(np.float32))
+        h = 2e-4
+        with torch.no_grad():
+            ends = []
+            for sign in (1, -1):
+                value += sign * h * direction
+                ends.append(float(loss(p, d)))
+                value -= sign * h * direction
+        assert np.isclose(float((gradient * direction).sum()), (ends[0] - ends[1]) / (2 * h), rtol=0.03, atol=0.02), name
+
+
+@pytest.mark.parametrize("trunk", ["relu", "layernorm", "linear"])
+def test04_a_gaze_field(torch, interop, trunk):
+    field = varied(GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, trunk=trunk), BOX, ns))
+    module = interop.GazeModule(field)
+    (p_od, r_o), (p_o, _) = rays(torch, 60), rays(torch, 60)
+    gaze = module(p_od, p_o, r_o)
+    expected = field.evaluate(*[ns.Array3f(x.numpy().T) for x in (p_od, p_o, r_o)])[0].numpy()
+    assert np.array_equal(gaze.detach().numpy(), expected)
+    mix = torch.tensor(RNG.normal(size=60).astype(np.float32))
+    (gaze * mix).sum().backward()
+    for name, value in module.named_parameters():
+        direction = torch.tensor(np.random.default_rng(2).normal(size=value.shape).astype(np.float32))
+        ends, h = [], 3e-4
+        with torch.no_grad():
+            for sign in (1, -1):
+                value += sign * h * direction
+                ends.append(float((module(p_od, p_o, r_o) * mix).double().sum()))
+                value -= sign * h * direction
+        assert np.isclose(float((value.grad * direction).sum()), (ends[0] - ends[1]) / (2 * h), rtol=0.03, atol=0.02), name
+
+
+def test05_training_in_torch_and_back(torch, interop, tmp_path):
+    from nerg_mi.formats.fields import load_radiance, save_radiance
+
+    field = radiance()
+    before = {k: v.numpy() for k, v in field.parameters().items()}
+    module, (p, d) = interop.RadianceModule(field), rays(torch)
+    p, optimizer = p * 0.9, torch.optim.Adam(module.parameters(), 3e-2)
+    goal = torch.stack([0.5 + 0.4 * p[:, 0], 0.5 - 0.3 * p[:, 1], torch.full((len(p),), 0.2)], 1)
+    losses = []
+    for _ in range(30):
+        optimizer.zero_grad()
+        loss = ((module(p, d)[1] - goal) ** 2).mean()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.3 * losses[0], losses
+    save_radiance(module.field(), tmp_path / "t.safetensors", {})
+    trained, _ = load_radiance(tmp_path / "t.safetensors", ns)
+    for name, value in trained.parameters().items():
+        assert np.array_equal(value.numpy(), module.get_parameter(name.replace(".", "__")).detach().numpy())
+        assert np.array_equal(field.parameters()[name].numpy(), before[name])
+    assert np.array_equal(trained.density(ns.Array3f(p.numpy().T)).numpy(), module.density(p).detach().numpy())
+
+
+@pytest.mark.parametrize("change", [
+    lambda p: p.double(), lambda p: p[:, :2], lambda p: p[:10], lambda p: p[0],
+])  # fmt: skip
+def test06_wrong_tensors(torch, interop, change):
+    module, (p, d) = interop.RadianceModule(radiance()), rays(torch, 20)
+    with pytest.raises(ValueError, match=r"must be a float32 tensor \(N, 3\) on cpu"):
+        module(change(p), d)
