@@ -66,8 +66,15 @@ class Sampler:
         with dr.suspend_grad():
             return _joined(lambda q: self._density(self._point(q), masked).numpy(), p)
 
-    def on(self, lattice: Lattice, samples: int = 1, then=None) -> np.ndarray:
-        """Density (z, y, x) at the lattice's points, or the mean over ``samples``³ points of each cell."""
+    def on(self, lattice: Lattice) -> np.ndarray:
+        """Density (z, y, x) at the lattice's points."""
+        return self._over(lattice, 1, lambda sigma: sigma)
+
+    def opacity_on(self, lattice: Lattice, samples: int) -> np.ndarray:
+        """Opacity (z, y, x) of the lattice's cells along their edges, the mean over ``samples``³ points of each."""
+        return self._over(lattice, samples, lambda sigma: 1 - dr.exp(-sigma * lattice.step))
+
+    def _over(self, lattice: Lattice, samples: int, of) -> np.ndarray:
         ns, (nx, ny, nz) = self.ns, lattice.shape
         out = np.zeros(nx * ny * nz, np.float32)
         with dr.suspend_grad():
@@ -79,7 +86,7 @@ class Sampler:
                     offsets = [(k // samples**axis % samples + 0.5) / samples for axis in range(3)]
                     offsets = [dr.opaque(ns.Float, o) for o in offsets]
                     p = ns.Array3f(*[l + (ns.Float(c) + o) * lattice.step for l, c, o in zip(lattice.lower, cell, offsets)])
-                    out[start:start + count] += self._density(p).numpy()
+                    out[start:start + count] += of(self._density(p)).numpy()
         return (out / samples**3).reshape(nz, ny, nx)
 
     def color(self, p: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -138,9 +138,14 @@ def test06_voxels_render_as_the_field(rgb, tmp_path):
     density, color, lower, upper = density_and_color(ball, 24, samples=3)
     assert density.shape == (18, 20, 24) and np.allclose(lower, 0) and np.allclose(upper, ball.box.upper)
     cell = 0.1
-    q = (np.stack(np.meshgrid(*[(np.arange(3) + 0.5) / 3] * 3), -1).reshape(-1, 3) + [6, 9, 8]) * cell
-    assert np.isclose(density[8, 9, 6], Sampler(ball).density(q).mean(), rtol=1e-4)
-    assert np.allclose(color[8, 9, 6, 1], ((0.5 + 0.055) / 1.055) ** 2.4, atol=2e-3)
+    points_of = lambda x, y, z: (np.stack(np.meshgrid(*[(np.arange(3) + 0.5) / 3] * 3), -1).reshape(-1, 3) + [x, y, z]) * cell
+    for x, y, z in ((6, 9, 8), (5, 9, 8), (5, 8, 8), (8, 9, 8)):
+        share = np.mean(-np.expm1(-Sampler(ball).density(points_of(x, y, z)) * cell))
+        assert np.isclose(density[z, y, x], min(-math.log(max(1 - share, 1e-9)), 5) / cell, rtol=1e-3)
+    # On the surface, from the side that the surface faces: its green depends on z of the direction alone.
+    assert np.allclose(color[8, 9, 6, 0], ((1.2 - 0.6) / 2.4 / 1.055 + 0.055 / 1.055) ** 2.4, atol=0.01)
+    assert np.allclose(color[8, 9, 6, 1], ((0.5 + 0.055) / 1.055) ** 2.4, atol=0.01)
+    assert np.array_equal(color[8, 9, 3], color[8, 9, 4]) and not color[0, 0, 0].any()
     write_volume(tmp_path / "d.vol", density, lower, upper)
     write_volume(tmp_path / "c.vol", color, lower, upper)
     for name, data in (("d", density), ("c", color)):
