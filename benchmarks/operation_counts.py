@@ -21,6 +21,10 @@ from nerg_mi.evaluation.operations import traced_operations
 STORE = Path(nerg_mi.scenes.store.__file__).parent
 CAMERA, OBSERVER, TARGET = [1.0, 0.8, 1.6], [1.0, 2.8, 1.6], [1.2, 5.0, 1.2]
 
+# The store's twin, unlit, and a box in the aisle.
+SHAPES = {"field": None, "shapes": {"store": {"type": "ply", "filename": str(STORE / "twin.ply")}}}
+BOX = {"box": {"type": "cube", "to_world": mi.scalar_rgb.Transform4f().translate([1.2, 4, 0.6]).scale(0.3)}}
+
 
 def look_at(origin):
     return mi.ScalarTransform4f().look_at(origin, TARGET, [0, 0, 1])
@@ -34,7 +38,7 @@ def configurations() -> dict[str, dict]:
     return {
         "nothing": dark | {"aovs": ""},
         "depth": dark | {"aovs": "depth,opacity"},
-        "median depth": dark | {"aovs": "depth,opacity", "depth": "median"},
+        "expected depth": dark | {"aovs": "depth,opacity", "depth": "expected"},
         "colour, depth": {"aovs": "depth,opacity"},
         "gaze given, not asked for": {"aovs": "depth,opacity"} | there,
         "gaze, camera is the observer": {"aovs": "depth,opacity,gaze"},
@@ -44,6 +48,11 @@ def configurations() -> dict[str, dict]:
         "... by transmittance": {"aovs": "depth,opacity,gaze", "visibility": "transmittance"} | there,
         "... by a map, first frame": {"aovs": "depth,opacity,gaze", "visibility": "map"} | there,
         "... by a map, next frames": {"aovs": "depth,opacity,gaze", "visibility": "map"} | there,
+        "shapes in place of the field: depth": dark | {"aovs": "depth,opacity"} | SHAPES,
+        "... gaze, observer elsewhere": dark | {"aovs": "depth,opacity,gaze"} | there | SHAPES,
+        "... albedo, depth": {"aovs": "depth,opacity"} | SHAPES,
+        "field and a shape: depth": dark | {"aovs": "depth,opacity", "shapes": BOX},
+        "... gaze, observer elsewhere ": dark | {"aovs": "depth,opacity,gaze", "shapes": BOX} | there,
     }
 
 
@@ -54,10 +63,12 @@ def scene(width: int, options: dict):
         "gaze": {"type": "gazefield", "filename": str(STORE / "shoppers.safetensors")},
         **options,
     }
+    shapes = integrator.pop("shapes", {})
+    integrator = {k: v for k, v in integrator.items() if v is not None}
     film = {"type": "hdrfilm", "width": width, "height": width * 3 // 4, "component_format": "float32",
             "rfilter": {"type": "box"}}
     sensor = {"type": "perspective", "fov": 75, "to_world": look_at(CAMERA), "film": film}
-    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **shapes})
 
 
 def evaluations(width: int, options: dict) -> list[float]:

@@ -16,6 +16,7 @@ def command(
     height: Annotated[int, typer.Option(help="Height of a picture in pixels.")] = 128,
     repeats: Annotated[int, typer.Option(help="Timed renders of each setting; their median counts.")] = 5,
     quick: Annotated[bool, typer.Option("--quick", help="A few settings only, each timed once.")] = False,
+    only: Annotated[str, typer.Option(metavar="REGEX", help="Only the default, and settings whose name matches.")] = "",
     define: Annotated[
         Optional[list[str]],
         typer.Option("-D", "--define", metavar="KEY=VALUE", help="Value for a <default> of the scene file; repeatable."),
@@ -38,7 +39,7 @@ def command(
     with Progress(TextColumn("{task.description:<44}"), BarColumn(), TimeElapsedColumn()) as progress:
         bar = progress.add_task("start", total=1.0)
         result = run_study(
-            scene, out, kind=scene_kind, width=width, height=height, repeats=repeats, quick=quick, defaults=defaults, variant=variant,
+            scene, out, kind=scene_kind, width=width, height=height, repeats=repeats, quick=quick, only=only, defaults=defaults, variant=variant,
             on_step=lambda name, share: progress.update(bar, description=name, completed=share),
         )  # fmt: skip
         progress.update(bar, description="done", completed=1.0)

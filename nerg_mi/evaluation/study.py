@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,16 +29,21 @@ class StudyResult:
 
 def run_study(
     scene: str, out: str | Path, *, kind: str = "auto", width: int = WIDTH, height: int = HEIGHT, repeats: int = 5, quick: bool = False,
-    defaults: Mapping[str, str] | None = None, variant: str | None = None, on_step: Callable[[str, float], None] = lambda name, share: None,
+    only: str = "", defaults: Mapping[str, str] | None = None, variant: str | None = None, on_step: Callable[[str, float], None] = lambda name, share: None,
 ) -> StudyResult:
     """Study ``scene`` (a scene file, or the name of an analytic scene) and write tables and plots into the folder ``out``.
 
     ``kind``: see `study_subject.KINDS`; ``width``, ``height`` in pixels; ``repeats``: timed renders of each setting;
-    ``quick``: few settings, timed once; ``defaults``: of a scene file; ``on_step`` is told what is done and the share done
+    ``quick``: few settings, timed once; ``only``: regular expression that the names of further settings than the default
+    match; ``defaults``: of a scene file; ``on_step`` is told what is done and the share done
     so far. Raises NergError for what the user can mend.
     """
     if min(width, height) < 4 or repeats < 1:
         raise NergError(f"a study needs pictures of at least 4 x 4 pixels and one timed render, got {width} x {height} and {repeats}.")
+    try:
+        wanted = re.compile(only)
+    except re.error as error:
+        raise NergError(f'"{only}" is no regular expression ({error}): name settings as in "depth|paper".') from error
     active = activate(variant)
     import drjit as dr
     import mitsuba as mi
@@ -45,7 +51,10 @@ def run_study(
     begin = time.perf_counter()
     on_step("open", 0.0)
     subject = open_subject(scene, kind, width, height, defaults)
-    rows = settings(subject, quick)
+    default, *others = settings(subject, quick)
+    rows = [default, *(row for row in others if wanted.search(row.name))]
+    if only and len(rows) == 1:
+        raise NergError(f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}".')
     repeats = 1 if quick else repeats
     done = 0
 

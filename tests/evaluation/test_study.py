@@ -254,6 +254,13 @@ def test12_quick_run_of_the_command(tmp_path, capsys):
     assert paper["paper"]["depth_mae"] > 1000 * paper["default"]["depth_mae"]
 
 
+def test12b_only_some_settings(tmp_path):
+    from nerg_mi.evaluation.study import run_study
+
+    report = run_study("slab", tmp_path, width=12, height=8, quick=True, only="jitter|paper, 1024 steps$", variant="llvm_ad_rgb").report
+    assert [r["setting"] for r in report["rows"]] == ["default", "jitter", "paper, 1024 steps"]
+
+
 @pytest.mark.parametrize(
     "arguments, said",
     [
@@ -261,6 +268,8 @@ def test12_quick_run_of_the_command(tmp_path, capsys):
         (["nowhere", "--scene-kind", "analytic"], "choose one of slab, sphere"),
         (["slab", "--scene-kind", "shapes"], 'no kind of scene "shapes"'),
         (["slab", "--width", "2"], "at least 4 x 4 pixels"),
+        (["slab", "--only", "nothing of it"], 'no setting matches "nothing of it"'),
+        (["slab", "--only", "("], '"(" is no regular expression'),
     ],
 )
 def test13_one_sentence(tmp_path, capsys, arguments, said):
