@@ -14,7 +14,7 @@ app.command("gaze")(train_gaze)
 
 @app.command("radiance")
 def train_radiance(
-    dataset: Annotated[Path, typer.Argument(help="Folder of a posed image set, or its transforms.json.")],
+    dataset: Annotated[Path, typer.Argument(help="Folder of posed photos, its transforms.json, or a COLMAP model.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Checkpoint to write (.safetensors).")],
     holdout: Annotated[
         Optional[int], typer.Option(help="Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.")

@@ -106,7 +106,7 @@ def _image_file(path: Path) -> Path | None:
 
 def _mask(entry: dict, folder: Path, image: Path) -> MaskFile | None:
     if entry.get("mask_path") is not None:
-        mask = folder / entry["mask_path"]
+        mask = folder / _path(entry, "mask_path")
         if not mask.is_file():
             raise ValueError(f'its mask "{entry["mask_path"]}" does not exist; restore it, or remove its "mask_path"')
         return MaskFile(mask)
@@ -115,10 +115,10 @@ def _mask(entry: dict, folder: Path, image: Path) -> MaskFile | None:
 
 
 def _depth(data: dict, entry: dict, folder: Path, metre: float) -> DepthFile | None:
-    name = entry.get("depth_file_path", entry.get("depth_path"))
-    if name is None:
+    key = next((k for k in ("depth_file_path", "depth_path") if entry.get(k) is not None), None)
+    if key is None:
         return None
-    path = folder / name
+    path = folder / _path(entry, key)
     counted = path.suffix.lower() == ".png"
     unit, axis = (_MILLIMETRE * metre, True) if counted else (1.0, False)
     if counted and data.get("depth_unit_scale_factor") is not None:
@@ -130,6 +130,12 @@ def _depth(data: dict, entry: dict, folder: Path, metre: float) -> DepthFile | N
     if data.get("is_euclidean_depth") is not None:
         axis = not data["is_euclidean_depth"]
     return DepthFile(path, unit, axis)
+
+
+def _path(entry: dict, key: str) -> str:
+    if not isinstance(entry[key], str):
+        raise ValueError(f'its "{key}" is not the path of a file')
+    return entry[key]
 
 
 def _number(data: dict, key: str) -> float:
@@ -189,7 +195,10 @@ def _splits(data: dict, frames: list[Frame]) -> tuple[list[str] | None, list[str
 def _aabb(data: dict, path: Path) -> np.ndarray | None:
     if data.get("aabb") is None:
         return None
-    box = np.asarray(data["aabb"], np.float64)
+    try:
+        box = np.asarray(data["aabb"], np.float64)
+    except (TypeError, ValueError):
+        box = np.zeros(0)
     box = box.reshape(2, 3) if box.size == 6 else box
     if box.shape != (2, 3) or not np.all(np.isfinite(box)) or not np.all(box[1] > box[0]):
         raise ValueError(f'"aabb" in "{path}" must be two corners of 3 numbers, the second above the first')

@@ -95,7 +95,7 @@ def test_units_and_kinds_of_depth(write):
 def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
     mirrored, sheared, transposed = np.diag([-1.0, 1, 1, 1]), np.eye(4), np.eye(4)
     sheared[0, 1], transposed[3, :3] = 0.3, [1, 2, 3]
-    names = [f"{c}.png" for c in "abcdefghij"]
+    names = [f"{c}.png" for c in "abcdefghijk"]
     path = write({"fl_x": 1.0, "frames": [
         frame("a.png"),
         frame("b.png", transform_matrix=mirrored.tolist()),
@@ -110,6 +110,7 @@ def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
         frame("gone.png"),
         frame("i.png", fl_x="wide"),
         frame("j.png", transform_matrix=[[1, 2], [3]]),
+        frame("k.png", mask_path=5),
     ]}, names)
     t = read_transforms(path)
     # The name that sorts first of the two spellings of one file is the one kept.
@@ -119,6 +120,7 @@ def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
         "b.png": "mirrored", "c.png": "sheared", "d.png": "transposed", "e.png": "finite", "f.png": "none.png",
         "a.png": "twice", "g.png": "EQUIRECTANGULAR", "h.png": "transform_matrix", "frame 9": "file_path",
         "gone.png": "does not exist", "i.png": "fl_x", "j.png": "4 x 4",
+        "k.png": "mask_path",
     }.items():
         assert part in reasons.pop(name), name
     assert not reasons
@@ -144,6 +146,7 @@ def test_a_scale_within_a_pose_is_taken_out(write):
         ({"fl_x": 1.0, "frames": []}, "no frames"),
         ({"fl_x": 1.0, "frames": [{"transform_matrix": POSE}]}, "frame 0"),
         ({"fl_x": 1.0, "aabb": [[0, 0, 0], [1, 0, 1]], "frames": [frame("a.png")]}, "aabb"),
+        ({"fl_x": 1.0, "aabb": "wide", "frames": [frame("a.png")]}, "aabb"),
         ({"fl_x": 1.0, "applied_transform": [[1, 0], [2]], "frames": [frame("a.png")]}, "applied_transform"),
         ({"fl_x": 1.0, "applied_scale": 0, "frames": [frame("a.png")]}, "applied_scale"),
     ],
