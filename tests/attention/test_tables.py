@@ -119,3 +119,19 @@ def test_refusals(tmp_path):
         rays_from_table([path], "origin=x,y,z ypr=a,b,c", forward="ahead")
     with pytest.raises(ValueError, match="both z"):
         rays_from_table([path], "origin=x,y,z ypr=a,b,c", forward="z")
+
+
+def test_parquet_is_read_as_csv_is(tmp_path, heads):
+    pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
+    import pyarrow.parquet as pq
+
+    origin, turn = heads
+    names = list("xyzabcd")
+    values = np.hstack([origin, turn.as_quat()])
+    path = write(tmp_path / "t.csv", ",".join(names), values)
+    people = [f"p{i % 3}" for i in range(19)] + [None]
+    pq.write_table(pa.table({**dict(zip(names, values.T)), "who": people}), tmp_path / "t.parquet")
+    mapping = "origin=x,y,z xyzw=a,b,c,d"
+    one, two = rays_from_table([path], mapping), rays_from_table([tmp_path / "t.parquet"], mapping + " person=who")
+    assert np.array_equal(one.direction[:19], two.direction) and two.persons == ("p0", "p1", "p2")
+    assert two.metadata["dropped"] == [{"reason": "person is missing", "file": "t.parquet", "count": 1, "rows": [[20, 20]]}]

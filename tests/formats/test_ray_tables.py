@@ -59,3 +59,19 @@ def test_table_without_a_header_and_its_columns(tmp_path):
     assert np.array_equal(block.numbers, [[3, 2], [6, np.nan]], equal_nan=True) and list(block.lines) == [1, 2]
     path.write_text("\ufeffx; y ;z\n")
     assert table_columns(path) == ["x", "y", "z"]
+
+
+def test_with_and_without_pyarrow(tmp_path, monkeypatch):
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
+    rng = np.random.default_rng(0)
+    path = tmp_path / "t.csv"
+    values = rng.normal(size=(50, 3)) * 10.0 ** rng.integers(-12, 12, (50, 3))
+    cells = [[repr(float(v)) for v in row] for row in values]
+    cells[3][1], cells[7][0], cells[9][2], cells[11][1] = "", "NaN", "null", "inf"
+    path.write_text("a,who,b,a\n" + "\n".join(f'{a},"p {i % 3}",{b},{c}' + ("\n" if i == 20 else "") for i, (a, b, c) in enumerate(cells)))
+    fast = read(path, ["b", "a"], ["who"])
+    used = []
+    monkeypatch.setattr(ray_tables, "_fast_reader", lambda *a: used.append(1))
+    slow = read(path, ["b", "a"], ["who"])
+    assert used and np.array_equal(fast[0].numbers, slow[0].numbers, equal_nan=True) and np.isinf(fast[0].numbers[11, 0])
+    assert np.array_equal(fast[0].texts, slow[0].texts) and np.array_equal(fast[0].lines, slow[0].lines) and fast[0].lines[21] == 24
