@@ -17,7 +17,8 @@ from . import __version__, llvm
 from .errors import sentence
 
 EXTRAS = {
-    "torch": 'checkpoints of torch-ngp and exchange of arrays: pip install "nerg-mi[torch]"',
+    "torch": 'fields as torch modules: pip install "nerg-mi[torch]"',
+    "skimage": 'meshes of radiance fields: pip install "nerg-mi[mesh]"',
     "pyarrow": 'ray tables in Parquet: pip install "nerg-mi[parquet]"',
 }
 """Optional packages, each with what it is for and how to get it."""

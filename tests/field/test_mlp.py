@@ -85,3 +85,38 @@ def test06_inputs_of_one_and_of_many_lanes():
     h = np.array([1e-4, 0, 0])
     difference = (reference.mlp(x + h, weights)[:, 0] - reference.mlp(x - h, weights)[:, 0]).sum() / 2e-4
     assert np.isclose(dr.grad(one).numpy()[0], difference, rtol=1e-3)
+
+
+@pytest.mark.parametrize("mode", ["coop", "tensor"])
+def test07_layer_normalisation(mode):
+    # Values and the gradients of every array against a restatement and its central differences.
+    rng = np.random.default_rng(2)
+    net = MLP.random([5, 16, 3], ns, rng, normalized=True)
+    for name, value in net.named().items():
+        net.replace(name, ns.TensorXf((value.numpy() + rng.normal(0, 0.3, value.shape)).astype(np.float32)))
+    arrays = {k: v.numpy().astype(np.float64) for k, v in net.named().items()}
+    x, mix = rng.normal(size=(30, 5)).astype(np.float32), rng.normal(size=(30, 3)).astype(np.float32)
+
+    def restated(a):
+        h = x.astype(np.float64)
+        for i in ("0", "1"):
+            h = (h - h.mean(1, keepdims=True)) / np.sqrt(h.var(1, keepdims=True) + 1e-5)
+            h = (h * a[f"{i}.gain"] + a[f"{i}.shift"]) @ a[i].T + a[f"{i}.bias"]
+            h = np.maximum(h, 0) if i == "0" else h
+        return h
+
+    dr.enable_grad(list(net.named().values()))
+    net.pack()
+    if mode == "coop":
+        out = net([ns.Float(c) for c in x.T])
+        value, loss = np.array([o.numpy() for o in out]).T, sum(o * ns.Float(m) for o, m in zip(out, mix.T))
+    else:
+        out = net.tensor(ns.TensorXf(x.T.copy()))
+        value, loss = out.numpy().T, out * ns.TensorXf(mix.T.copy())
+    assert np.allclose(value, restated(arrays), atol=1e-5)
+    dr.backward(dr.sum(loss, axis=None))
+    for name, array in net.named().items():
+        direction, ends = rng.normal(size=array.shape), []
+        for h in (1e-6, -1e-6):
+            ends.append((restated({**arrays, name: arrays[name] + h * direction}) * mix).sum())
+        assert np.isclose((dr.grad(array).numpy() * direction).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-3, atol=1e-4), name

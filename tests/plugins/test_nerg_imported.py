@@ -23,15 +23,11 @@ def expected(state, nerf, bound, origins, directions, eye):
     for o, d in zip(origins, directions):
         near, far = march_numpy.box(o, d, [-bound] * 3, [bound] * 3)
         borders = march_numpy.steps(max(near, 0), far, STEP)
-        direction = lambda p: np.tile(d.astype(np.float32), (len(p), 1))
-
-        def density(p):
-            seen = reference.occupied(nerf["density_bitfield"], bound, p)
-            return np.where(seen, reference.nerf(nerf, bound, p, direction(p))[0].astype(np.float64), 0)
-
-        tau, depth, _, total, _ = march_numpy.march(
-            density, o, d, borders, lambda p: reference.nerf(nerf, bound, p, direction(p))[1]
-        )
+        middles = o + d * (borders[:-1] + np.diff(borders) / 2)[:, None]
+        seen = reference.occupied(nerf["density_bitfield"], bound, middles)
+        sigma, color = np.zeros(len(seen)), np.zeros((len(seen), 3))
+        sigma[seen], color[seen], _ = reference.nerf(nerf, bound, middles[seen], np.tile(d.astype(np.float32), (seen.sum(), 1)))
+        tau, depth, _, total, _ = march_numpy.march(lambda p: sigma, o, d, borders, lambda p: color)
         alpha = -np.expm1(-tau)
         p_d = o + d * depth
         r_o = (p_d - eye) / np.linalg.norm(p_d - eye)
