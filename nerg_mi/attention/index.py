@@ -52,14 +52,3 @@ class RayIndex:
         offsets = np.concatenate([[0], np.cumsum(np.concatenate(counts))]) if counts else np.zeros(1, np.int64)
         join = lambda parts, kind: np.concatenate(parts) if parts else np.empty(0, kind)
         return Neighbours(join(indices, np.int64), join(distances, np.float64), offsets.astype(np.int64))
-
-    def counts(self, places: np.ndarray, radius: float) -> np.ndarray:
-        """How many rays lie within ``radius`` metres of each of ``places`` (Q, 3): (Q,) int64."""
-        return self._tree.query_ball_point(np.asarray(places, dtype=np.float64), radius, return_length=True, workers=-1)
-
-    def within(self, places: np.ndarray, radius: float) -> np.ndarray:
-        """Rays within ``radius`` metres of any of ``places``: (N,) bool."""
-        from scipy.spatial import cKDTree
-
-        near = cKDTree(np.asarray(places, dtype=np.float64).reshape(-1, 3)).query(self._tree.data, workers=-1)[0]
-        return near <= radius

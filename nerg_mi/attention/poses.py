@@ -32,7 +32,9 @@ def rotations_from_quaternions(q: np.ndarray, order: str = "xyzw") -> np.ndarray
     if order not in ("xyzw", "wxyz") or q.ndim != 2 or q.shape[1] != 4:
         raise ValueError(f'quaternions {q.shape} in order "{order}": expected (N, 4), xyzw or wxyz')
     length = np.linalg.norm(q, axis=1)
-    return _where(np.isfinite(length) & (length > 1e-12), q, lambda rotation, q: rotation.from_quat(q, scalar_first=order == "wxyz"))
+    if order == "wxyz":
+        q = np.roll(q, -1, axis=1)
+    return _where(np.isfinite(length) & (length > 1e-12), q, lambda rotation, q: rotation.from_quat(q))
 
 
 def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bool = True) -> np.ndarray:
