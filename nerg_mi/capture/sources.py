@@ -49,7 +49,8 @@ def read_posed(source: Path) -> PosedImages:
     folders = [source, *list(source.resolve().parents)[:3]]
     images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
     if images is None:
-        raise FileNotFoundError(f'there is no folder "images" beside or above the COLMAP model "{source}"; put the photos there')
+        raise FileNotFoundError(f'there is no folder "images" beside or above the COLMAP model "{source}"; '
+                                "put the photos there")
     masks = images.with_name("masks")
     return read_colmap(source, images, masks if masks.is_dir() else None)
 

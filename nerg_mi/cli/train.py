@@ -25,7 +25,9 @@ def train_radiance(
     minutes: Annotated[Optional[float], typer.Option(help="Train for this long. Default: 5.")] = None,
     steps: Annotated[Optional[int], typer.Option(help="Or: train for so many steps.")] = None,
     aabb: Annotated[Optional[str], typer.Option(help="Bounds of what is seen: x0,y0,z0,x1,y1,z1.")] = None,
-    scale: Annotated[float, typer.Option(help="Multiply all lengths by this: what a unit of the data set measures, in metres.")] = 1.0,
+    scale: Annotated[
+        float, typer.Option(help="Multiply all lengths by this: what a unit of the data set measures, in metres.")
+    ] = 1.0,
     coordinates: Annotated[
         str, typer.Option(help="Of the field: file, original (applied_transform undone), or a dataparser_transforms.json.")
     ] = "file",

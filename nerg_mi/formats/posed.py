@@ -183,7 +183,8 @@ def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
             kept.append(frame)
             continue
         same = np.allclose(first[key].to_world, frame.to_world, atol=1e-6)
-        unused.append(Unused(frame.name, "its image is listed twice" + ("" if same else ", with another pose; the first counts")))
+        said = "" if same else ", with another pose; the first counts"
+        unused.append(Unused(frame.name, f"its image is listed twice{said}"))
     return kept, unused
 
 

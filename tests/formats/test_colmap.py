@@ -148,7 +148,8 @@ def test_a_zero_quaternion_is_listed(tmp_path):
     assert [f.name for f in posed.frames] == ["b.png"] and "quaternion" in posed.unused[0].reason
 
 
-@pytest.mark.parametrize("name, record", [("cameras", "camera record"), ("images", "image record"), ("points3D", "point record")])
+@pytest.mark.parametrize("name, record", [("cameras", "camera record"), ("images", "image record"),
+                                          ("points3D", "point record")])
 def test_a_binary_file_cut_short_is_told_with_its_place(tmp_path, name, record):
     (tmp_path / "a.png").write_bytes(b"")
     write_bin(tmp_path, ["a.png"])

@@ -46,7 +46,8 @@ def test_intrinsics_of_a_frame_overrule_shared_ones(write):
 
 @pytest.mark.parametrize("keys", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
 def test_fisheyes_of_nerfstudio_and_instant_ngp(write, keys):
-    i = read_transforms(write({"fl_x": 3.0, "k1": 0.1, "k4": 0.01, **keys, "frames": [frame("a.png")]})).frames[0].intrinsics(8, 8)
+    t = read_transforms(write({"fl_x": 3.0, "k1": 0.1, "k4": 0.01, **keys, "frames": [frame("a.png")]}))
+    i = t.frames[0].intrinsics(8, 8)
     assert i.fisheye and (i.k1, i.k4) == (0.1, 0.01)
 
 
