@@ -129,7 +129,6 @@ class SphericalKde:
         base = 0 if directions.ndim == 2 else probe * D
         flat = ns.Float(np.ascontiguousarray(directions).ravel())
         x = [dr.gather(ns.Array3f, flat, base + dr.minimum(first + j, D - 1)) for j in range(G)]
-        dr.eval(x)
         scale = dr.gather(ns.Float, self._kappa, probe) * (-0.5 / math.log(2.0))
         last = dr.gather(ns.UInt32, self._offsets, probe + 1)
 

@@ -53,7 +53,8 @@ def layout_figure(rays, test=None, centres=None, radius: float | None = None, ti
     if walls is not None:
         axes.plot(*_some(walls).T, ",", color=_SURFACES, rasterized=True, zorder=1)
     for xy, color in zip(points, (_POINTS, "#d9730d")):
-        axes.plot(*_some(xy).T, ".", markersize=1.1, markeredgewidth=0, color=color, rasterized=True, zorder=2)
+        size = 3.5 - 0.5 * np.log10(max(len(xy), 10))  # few points are drawn larger
+        axes.plot(*_some(xy).T, ".", markersize=max(size, 1.1), markeredgewidth=0, color=color, rasterized=True, zorder=2)
     if centres is not None and radius is not None:
         from matplotlib.collections import PatchCollection
         from matplotlib.patches import Circle
