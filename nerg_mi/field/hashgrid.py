@@ -29,7 +29,7 @@ class HashGridConfig:
     features: int = 2
     log2_rows: int = 19
     base: int = 16
-    finest: int = 2048
+    finest: int | float = 2048
     dimensions: int = 3
 
     def __post_init__(self):

@@ -10,7 +10,7 @@ from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
 from ..field.mlp import MLP
 from ..field.radiance import RadianceField
-from .torch_ngp import Given, StateDict, grid, grid_config, open_checkpoint, origin, radiance_field, sh_degree
+from .torch_ngp import Given, StateDict, decimals, grid, grid_config, open_checkpoint, origin, radiance_field, sh_degree
 from .unpickling import NamedValue
 
 _VARIANTS = {"Emit": "emit", "Capture": "capture", "EmitCapture": "emit_capture"}
@@ -59,7 +59,7 @@ def _variant(state: StateDict, stored) -> str:
 
 def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
     """The gaze field that the authors' state dictionary describes."""
-    bound = float(np.abs(state["aabb_train"]).max())
+    bound = float(np.abs(decimals(state["aabb_train"])).max())
     normalized = "net1.lin0.weight" in state
     read = _normalized if normalized else _plain
     position, direction = read(state, "net1", ns), read(state, "net2", ns)

@@ -142,12 +142,21 @@ def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density:
 
 
 def _box(state: StateDict) -> tuple[Box, float]:
-    train = state["aabb_train"].astype(np.float64)
-    aabb = state["aabb_infer"].astype(np.float64) if "aabb_infer" in state else train
+    train = decimals(state["aabb_train"])
+    aabb = decimals(state["aabb_infer"]) if "aabb_infer" in state else train
     bound = float(np.abs(train).max())
     if train.shape != (6,) or aabb.shape != (6,) or not bound >= 1:
         raise ValueError(f'the boxes of "{state.path}", {train} and {aabb}, are not those of a bound of at least 1')
     return Box(aabb[:3], aabb[3:], bound), bound
+
+
+def decimals(values: np.ndarray) -> np.ndarray:
+    """The numbers that were typed: a bound of 2.7 stands in the file as the float32 next to it."""
+    return np.array([float(str(v)) for v in values.astype(np.float32).ravel()])
+
+
+def whole(value: float) -> int | float:
+    return int(value) if value == int(value) else value
 
 
 def sh_degree(state: StateDict, inputs: int) -> int:
@@ -163,15 +172,13 @@ def grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3)
     levels, largest = len(offsets) - 1, max(np.diff(offsets), default=0)
     if levels < 1 or largest < 8 or len(table.shape) != 2:
         raise ValueError(f'the hash grid "{state.prefix}{name}" of "{state.path}" has no levels')
-    if finest != int(finest):
-        raise ValueError(f'the hash grid of "{state.path}" has a finest resolution of {finest}, which is no whole number')
     config = HashGridConfig(
-        levels, table.shape[1], max(int(largest) - 1, 1).bit_length(), finest=int(finest), dimensions=dimensions
+        levels, table.shape[1], max(int(largest) - 1, 1).bit_length(), finest=whole(finest), dimensions=dimensions
     )
     if config.offsets() != offsets:
         raise ValueError(
             f'the levels of "{state.prefix}{name}" in "{state.path}" begin at rows {offsets}, which is not a grid from 16 to '
-            f"{int(finest)}: give its finest resolution with --finest"
+            f"{finest:g}: give its finest resolution with --finest"
         )
     return config
 
@@ -251,9 +258,9 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     c, box = field.config, field.box
     bound = box.side / 2
     expected = HashGridConfig(levels=c.grid.levels, features=c.grid.features, log2_rows=c.grid.log2_rows,
-                              finest=max(int(2048 * bound), 16))
+                              finest=max(whole(2048 * bound), 16))
     wrong = [words for fits, words in (
-        (box.center == (0, 0, 0) and levels_fit(bound), f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}"),
+        (box.center == (0, 0, 0) and bound >= 1, f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}"),
         (c.grid == expected, f"its grid must be from 16 to {expected.finest}, not {c.grid.base} to {c.grid.finest}"),
         ((c.grid.levels, c.grid.features, c.grid.log2_rows) == (16, 2, 19), "its grid must have 16 levels of 2 features and 2^19 rows"),
         ((c.width, c.density_hidden, c.color_hidden, c.geometry, c.sh_degree) == (64, 1, 2, 15, 4), "its networks must be 64 wide (paper size)"),
@@ -271,10 +278,6 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
         _put_grid(state, "encoder_bg", field.background.grid)
         _put_layers(state, "bg_net", field.background.net)
     return state
-
-
-def levels_fit(bound: float) -> bool:
-    return bound >= 1 and float(2048 * bound).is_integer()
 
 
 def _put_grid(state: dict, name: str, grid: HashGrid) -> None:
