@@ -27,7 +27,8 @@ class Box:
             raise ValueError(f"a box needs two finite corners of 3 numbers, got {self.lower} and {self.upper}")
         if not np.all(upper > lower):
             raise ValueError(f"the upper corner {self.upper} of a box must exceed its lower corner {self.lower}")
-        if self.bound is not None and not (np.isfinite(self.bound) and max(np.abs(lower).max(), np.abs(upper).max()) <= self.bound):
+        farthest = max(np.abs(lower).max(), np.abs(upper).max())
+        if self.bound is not None and not (np.isfinite(self.bound) and farthest <= self.bound):
             raise ValueError(f"a box of {self.lower} to {self.upper} does not lie within a bound of {self.bound}")
         object.__setattr__(self, "lower", tuple(lower.tolist()))
         object.__setattr__(self, "upper", tuple(upper.tolist()))

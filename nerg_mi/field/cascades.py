@@ -120,7 +120,9 @@ class CascadeGrid:
     def from_packed(data: np.ndarray, resolution: int, bound: float, ns: ModuleType, threshold: float) -> CascadeGrid:
         count = levels_of(bound) * resolution**3
         if data.size * 8 < count:
-            raise ValueError(f"cascades of resolution {resolution} to a bound of {bound} need {count // 8} bytes, got {data.size}")
+            raise ValueError(
+                f"cascades of resolution {resolution} to a bound of {bound} need {count // 8} bytes, got {data.size}"
+            )
         bits = np.unpackbits(data, bitorder="little")[:count].reshape(-1, *(resolution,) * 3)
         return CascadeGrid(bits.astype(bool), bound, ns, threshold)
 

@@ -23,7 +23,7 @@ _TILTED = 4
 
 @dataclass(frozen=True)
 class Lattice:
-    """Points at the middles of cubic cells of edge ``step`` that fill a box from ``lower`` on; ``shape``: cells along x, y, z."""
+    """Middles of cubic cells of edge ``step`` that fill a box from ``lower`` on; ``shape``: cells along x, y, z."""
 
     lower: tuple[float, float, float]
     step: float

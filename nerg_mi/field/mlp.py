@@ -72,7 +72,7 @@ class MLP:
             raise ValueError(f'"{name}" {"lacks" if normalized else "has"} layer normalisation, unlike its architecture')
 
     def named(self) -> dict:
-        """Arrays by name: ``"0"``, ``"1"``, ... the weights; of a normalised layer also ``"0.gain"``, ``"0.shift"``, ``"0.bias"``."""
+        """Arrays by name: ``"0"``, ``"1"``, ...: weights; ``"0.gain"``, ``"0.shift"``, ``"0.bias"`` of a normalised layer."""
         out = {}
         for i, w in enumerate(self.weights):
             out[str(i)] = w

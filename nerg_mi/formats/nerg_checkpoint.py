@@ -22,7 +22,9 @@ def is_nerg(model: dict) -> bool:
     return "net1.lin0.weight" in model or "net1.0.weight" in model
 
 
-def read_nerg(path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = Given()) -> tuple[RadianceField | None, GazeField, dict]:
+def read_nerg(
+    path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = Given()
+) -> tuple[RadianceField | None, GazeField, dict]:
     """Radiance field (None where the file holds none), gaze field and origin (JSON) of a NeRG checkpoint.
 
     The gaze field's finest resolution is 256 x bound, whatever ``given`` says of the NeRF's. Raises ``ValueError``
@@ -71,7 +73,8 @@ def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
         sh_degree(state, direction.inputs - geometry), trunk="layernorm" if normalized else "linear",
     )
     heads = [_head(state, names, width, ns) for names in _HEADS.values()]
-    return GazeField(config, Box((-bound,) * 3, (bound,) * 3, bound), grid(state, "encoder", config.grid, ns), position, direction, *heads)
+    box, table = Box((-bound,) * 3, (bound,) * 3, bound), grid(state, "encoder", config.grid, ns)
+    return GazeField(config, box, table, position, direction, *heads)
 
 
 def _head(state: StateDict, names: tuple, width: int, ns: ModuleType) -> MLP:

@@ -45,8 +45,8 @@ def mesh(field: RadianceField, resolution: int = 256, threshold: float | None = 
     volume, filled = _closed(opacity(density, lattice), level, fill)
     if not volume.min() < level < volume.max():
         raise ValueError(
-            f"density crosses {threshold:g} per unit nowhere (it lies in {density.min():g} .. {density.max():g} on {lattice.shape} "
-            "points): choose another --density"
+            f"density crosses {threshold:g} per unit nowhere (it lies in {density.min():g} .. {density.max():g} on "
+            f"{lattice.shape} points): choose another --density"
         )
     index, faces, _, _ = marching_cubes(volume.transpose(2, 1, 0), level, allow_degenerate=False)
     index, hidden = crossings(sampler, lattice, index.astype(np.float64), threshold)
@@ -119,7 +119,8 @@ def _open_edges(body, lattice: Lattice) -> tuple[int, int]:
     return int(near.sum()), int((~near).sum())
 
 
-def points(field: RadianceField, resolution: int = 256, threshold: float | None = None, count: int | None = None, seed: int = 0) -> Surface:
+def points(field: RadianceField, resolution: int = 256, threshold: float | None = None, count: int | None = None,
+           seed: int = 0) -> Surface:
     """Points where the edges of a lattice cross the surface, with normals down the density's gradient; at most ``count``."""
     sampler, lattice = Sampler(field), Lattice.over(field, resolution)
     threshold = surface_density(lattice) if threshold is None else threshold
@@ -185,21 +186,25 @@ def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
 
     ``up``: axis of the field that is up; glTF's is y, and the node is turned for z.
     """
-    linear = np.where(surface.colors <= 0.04045, surface.colors / 12.92, ((np.maximum(surface.colors, 0.04045) + 0.055) / 1.055) ** 2.4)
+    c = surface.colors
+    linear = np.where(c <= 0.04045, c / 12.92, ((np.maximum(c, 0.04045) + 0.055) / 1.055) ** 2.4)
     rgba = np.full((len(linear), 4), 65535, "<u2")
     rgba[:, :3] = np.rint(linear * 65535)
     position = surface.vertices.astype("<f4")
-    arrays = [("POSITION", position, 5126, "VEC3"), ("NORMAL", surface.normals.astype("<f4"), 5126, "VEC3"), ("COLOR_0", rgba, 5123, "VEC4")]
+    normal = surface.normals.astype("<f4")
+    arrays = [("POSITION", position, 5126, "VEC3"), ("NORMAL", normal, 5126, "VEC3"), ("COLOR_0", rgba, 5123, "VEC4")]
     if surface.faces is not None:
         arrays.append(("indices", surface.faces.astype("<u4").ravel(), 5125, "SCALAR"))
     views, accessors, data = [], [], b""
     for name, array, kind, shape in arrays:
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": 34963 if name == "indices" else 34962})
+        target = 34963 if name == "indices" else 34962
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
         accessors.append({"bufferView": len(views) - 1, "componentType": kind, "count": len(array), "type": shape})
         data += array.tobytes()
     accessors[0] |= {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
     accessors[2]["normalized"] = True
-    primitive = {"attributes": {a[0]: i for i, a in enumerate(arrays[:3])}, "mode": 0 if surface.faces is None else 4, "material": 0}
+    mode = 0 if surface.faces is None else 4
+    primitive = {"attributes": {a[0]: i for i, a in enumerate(arrays[:3])}, "mode": mode, "material": 0}
     if surface.faces is not None:
         primitive["indices"] = 3
     node = {"mesh": 0} | ({"rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]} if up == "z" else {})
@@ -207,7 +212,8 @@ def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
         "asset": {"version": "2.0", "generator": "nerg_mi"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
         "materials": [{"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicFactor": 0}}],
-        "extensionsUsed": ["KHR_materials_unlit"], "buffers": [{"byteLength": len(data)}], "bufferViews": views, "accessors": accessors,
+        "extensionsUsed": ["KHR_materials_unlit"], "buffers": [{"byteLength": len(data)}], "bufferViews": views,
+        "accessors": accessors,
     }  # fmt: skip
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)

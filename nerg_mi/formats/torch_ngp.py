@@ -110,7 +110,9 @@ def averaged_weights(path: str | Path, whole: dict, model: dict, wanted: bool | 
 # ----------------------------------------------------------------------------
 
 
-def read_torch_ngp(path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = Given()) -> tuple[RadianceField, dict]:
+def read_torch_ngp(
+    path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = Given()
+) -> tuple[RadianceField, dict]:
     """The radiance field in a torch-ngp checkpoint on backend ``ns``, and what to say about its origin (JSON)."""
     whole, model = open_checkpoint(path)
     averaged = averaged_weights(path, whole, model, ema)
@@ -260,10 +262,13 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     expected = HashGridConfig(levels=c.grid.levels, features=c.grid.features, log2_rows=c.grid.log2_rows,
                               finest=max(whole(2048 * bound), 16))
     wrong = [words for fits, words in (
-        (box.center == (0, 0, 0) and bound >= 1, f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}"),
+        (box.center == (0, 0, 0) and bound >= 1,
+         f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}"),
         (c.grid == expected, f"its grid must be from 16 to {expected.finest}, not {c.grid.base} to {c.grid.finest}"),
-        ((c.grid.levels, c.grid.features, c.grid.log2_rows) == (16, 2, 19), "its grid must have 16 levels of 2 features and 2^19 rows"),
-        ((c.width, c.density_hidden, c.color_hidden, c.geometry, c.sh_degree) == (64, 1, 2, 15, 4), "its networks must be 64 wide (paper size)"),
+        ((c.grid.levels, c.grid.features, c.grid.log2_rows) == (16, 2, 19),
+         "its grid must have 16 levels of 2 features and 2^19 rows"),
+        ((c.width, c.density_hidden, c.color_hidden, c.geometry, c.sh_degree) == (64, 1, 2, 15, 4),
+         "its networks must be 64 wide (paper size)"),
         (c.density_scale == 1, f"its density scale must be 1, not {c.density_scale:g}"),
     ) if not fits]  # fmt: skip
     if wrong:

@@ -52,7 +52,8 @@ class _FieldModule(torch.nn.Module):
         """Inputs (N, 3), checked."""
         count = {len(t) for t in tensors.values() if t.ndim == 2 and t.shape[1] == 3}
         for name, t in tensors.items():
-            if t.ndim != 2 or t.shape[1] != 3 or t.dtype != torch.float32 or t.device.type != self.device_type or len(count) != 1:
+            rows = t.ndim == 2 and t.shape[1] == 3 and len(count) == 1
+            if not rows or t.dtype != torch.float32 or t.device.type != self.device_type:
                 raise ValueError(
                     f"{name} must be a float32 tensor (N, 3) on {self.device_type}, of one N with the others, got {t.dtype} "
                     f"{tuple(t.shape)} on {t.device.type}"
