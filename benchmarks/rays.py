@@ -107,8 +107,10 @@ def main() -> None:
         probe = probe_at(rays, observer, 0.25, cap=cap, kappa_rule="fixed", kappa=50.0, index=index)
         frames = {}
         for method in ("exact", "table"):
-            frames[method] = timed(f"720p density of {probe.counts[0]:,} rays, {method}", lambda: kde_frame(probe, directions, method=method), 4)
-        print(f"  table against exact: {np.abs(frames['table'] - frames['exact']).max() / frames['exact'].max():.1e} of the largest density")
+            name = f"720p density of {probe.counts[0]:,} rays, {method}"
+            frames[method] = timed(name, lambda: kde_frame(probe, directions, method=method), 4)
+        off = np.abs(frames["table"] - frames["exact"]).max() / frames["exact"].max()
+        print(f"  table against exact: {off:.1e} of the largest density")
     with open(options.out, "w", newline="") as out:
         writer = csv.DictWriter(out, list(table[0]))
         writer.writeheader()

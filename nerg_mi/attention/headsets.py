@@ -104,7 +104,8 @@ class _Finder:
                 return tuple(self.by_name[n] for n in names)
         if need:
             wanted = " or ".join(f"{s}_{{{','.join(axes)}}}" for s in stems)
-            raise ValueError(f"{self.path} has no columns {wanted}; its columns are {', '.join(self.columns[:16])}; name them with --map")
+            there = ", ".join(self.columns[:16])
+            raise ValueError(f"{self.path} has no columns {wanted}; its columns are {there}; name them with --map")
         return None
 
     def one(self, names: tuple[str, ...]) -> str | None:
@@ -216,7 +217,9 @@ def pupil(paths: Paths, *, marker: float | None = None, up: str = "y", min_confi
     if marker is None or not marker > 0:
         raise ValueError("Pupil's head poses count in edges of the tracking markers; give the edge's length in metres (--marker 0.05)")
     frame = {"up": up, "handedness": "right", "units": "m"}
-    builder = RaysBuilder(transform=to_rays_frame(**frame), preset="pupil", source_frame=frame, marker=marker, min_confidence=min_confidence)
+    builder = RaysBuilder(
+        transform=to_rays_frame(**frame), preset="pupil", source_frame=frame, marker=marker, min_confidence=min_confidence
+    )
     normals = [f"gaze_normal{eye}_{axis}" for eye in "01" for axis in "xyz"]
     centres = [f"eye_center{eye}_3d_{axis}" for eye in "01" for axis in "xyz"]
     for given in map(Path, paths):

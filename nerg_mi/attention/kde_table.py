@@ -70,7 +70,8 @@ class SphericalKdeTable:
         a = dr.abs(d)
         on_x, on_y = (a.x >= a.y) & (a.x >= a.z), (a.y > a.x) & (a.y >= a.z)
         major = dr.select(on_x, d.x, dr.select(on_y, d.y, d.z))
-        face = dr.select(on_x, ns.UInt32(0), dr.select(on_y, ns.UInt32(2), ns.UInt32(4))) + dr.select(major < 0, ns.UInt32(1), ns.UInt32(0))
+        face = dr.select(on_x, ns.UInt32(0), dr.select(on_y, ns.UInt32(2), ns.UInt32(4)))
+        face += dr.select(major < 0, ns.UInt32(1), ns.UInt32(0))
         u = dr.select(on_x, d.y, d.x) / dr.abs(major)
         v = dr.select(on_x | on_y, d.z, d.y) / dr.abs(major)
         place = [dr.fma(dr.atan(w), 2.0 / math.pi, 0.5) * self.n + (_PAD - 0.5) for w in (u, v)]

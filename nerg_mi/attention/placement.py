@@ -6,7 +6,9 @@ import numpy as np
 PLACEMENTS = ("data", "grid", "random", "blue")
 
 
-def place_queries(origin: np.ndarray, placement: str, count: int, spacing: float | None, radius: float, rng: np.random.Generator) -> np.ndarray:
+def place_queries(
+    origin: np.ndarray, placement: str, count: int, spacing: float | None, radius: float, rng: np.random.Generator
+) -> np.ndarray:
     """Centres (Q, 3) of probes of ``radius`` R among ray origins (N, 3), metres.
 
     ``data``: ``count`` distinct ray origins at random. ``grid``: a lattice of ``spacing`` (2R) over the origins' box.

@@ -98,7 +98,10 @@ def _directions(rays: Rays) -> list[str]:
     elevation = np.degrees(np.arcsin(np.clip(rays.direction[:: max(1, len(rays) // _MOST), 2], -1, 1)))
     if abs(np.median(elevation)) > 50:
         up = "up" if np.median(elevation) > 0 else "down"
-        out.append(f"half of the rays look more than {abs(np.median(elevation)):.0f} degrees {up}: check the axes of the directions, or which way is forward")
+        out.append(
+            f"half of the rays look more than {abs(np.median(elevation)):.0f} degrees {up}: "
+            "check the axes of the directions, or which way is forward"
+        )
     agree = walking_agreement(rays)
     if agree is not None:
         against = [i for i in range(3) if agree[i] < -_AHEAD]
@@ -107,7 +110,10 @@ def _directions(rays: Rays) -> list[str]:
             out.append("people look back to where they came from: are the directions reversed? (--forward, or the sign of the direction)")
         elif against:
             axis = " and ".join("xyz"[i] for i in against)
-            out.append(f"along {axis} of the file people look away from where they walk: are positions and directions mirrored against each other? (--hand)")
+            out.append(
+                f"along {axis} of the file people look away from where they walk: "
+                "are positions and directions mirrored against each other? (--hand)"
+            )
     return out
 
 

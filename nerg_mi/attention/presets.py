@@ -75,8 +75,12 @@ PRESETS = {
         "22-keypoint skeletons, id|time|[66 floats], metres, z up: ears to nose", rays_from_skeleton, ("tick", "keypoints", "pitch")
     ),
     "vr_supermarket": Preset("VR supermarket eye gaze, one CSV a person (Unity frame)", vr_supermarket),
-    "unity": Preset("Unity logs of gaze in the world: gaze_origin_*, gaze_dir_* (or gaze_direction_*, gaze_forward_*)", headsets.unity, ("tick",)),
-    "unity_local": Preset("Unity logs of gaze in the head's frame, beside head_pos_* and head_rot_*", headsets.unity_local, ("tick",)),
+    "unity": Preset(
+        "Unity logs of gaze in the world: gaze_origin_*, gaze_dir_* (or gaze_direction_*, gaze_forward_*)", headsets.unity, ("tick",)
+    ),
+    "unity_local": Preset(
+        "Unity logs of gaze in the head's frame, beside head_pos_* and head_rot_*", headsets.unity_local, ("tick",)
+    ),
     "unity_head": Preset("Unity logs of heads: head_pos_*, head_rot_*", headsets.unity_head, ("tick",)),
     "varjo": Preset("the log of Varjo's eye tracking example for Unity", headsets.varjo),
     "hololens": Preset("*_head_hand_eye.csv of HoloLens 2's StreamRecorder", headsets.hololens),

@@ -160,7 +160,9 @@ def both(*splits: PositionSplit | tuple[np.ndarray, np.ndarray]) -> tuple[np.nda
         raise ValueError("say how to split: by position, person or time")
     train, test = (np.logical_and.reduce(side) for side in zip(*masks))
     if not train.any() or not test.any():
-        raise ValueError(f"together the splits leave {train.sum()} rays to train on and {test.sum()} to test; hold out more of one of them")
+        raise ValueError(
+            f"together the splits leave {train.sum()} rays to train on and {test.sum()} to test; hold out more of one of them"
+        )
     return train, test
 
 

@@ -6,7 +6,9 @@ from typing import Annotated, List, Optional
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Import tracking files as rays of attention, look at them, choose among them and split them.")
+app = typer.Typer(
+    no_args_is_help=True, help="Import tracking files as rays of attention, look at them, choose among them and split them."
+)
 
 _Rays = Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet).")]
 _Output = Annotated[Path, typer.Option("-o", "--output", help="Rays file to write (.npz or .parquet).")]
@@ -115,7 +117,8 @@ def filter_rays(
         raise ValueError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
     data = Rays.load(rays)
     what = {
-        "time": None if start is None and end is None else (start, end), "persons": person or None, "without_persons": without_person or None,
+        "time": None if start is None and end is None else (start, end),
+        "persons": person or None, "without_persons": without_person or None,
         "cohorts": cohort or None, "box": None if box is None else _numbers(box, "--box"), "min_confidence": min_confidence,
         "with_hit": with_hit or None,
     }  # fmt: skip
@@ -167,7 +170,9 @@ def split_rays(
     data = Rays.load(rays)
     parts, about = [], {}
     if zones:
-        where = splits.split_by_position(data, radius, zones=zones, zone_radius=zone_radius, test_probes=positions, min_rays=min_rays, seed=seed)
+        where = splits.split_by_position(
+            data, radius, zones=zones, zone_radius=zone_radius, test_probes=positions, min_rays=min_rays, seed=seed
+        )
         parts.append(where)
         about["position"] = {"radius": radius, "zones": zones, "zone_radius": zone_radius, "test_centres": where.test_centres.tolist()}
     if people or person:
@@ -191,7 +196,9 @@ def split_rays(
 def plot_rays(
     rays: _Rays,
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write (.png).")],
-    kind: Annotated[str, typer.Option(help="density: rays/m² with mean directions; layout: each ray's place, with dimensions.")] = "density",
+    kind: Annotated[
+        str, typer.Option(help="density: rays/m² with mean directions; layout: each ray's place, with dimensions.")
+    ] = "density",
     cell: Annotated[Optional[float], typer.Option(help="density: edge of a cell, metres.  [default: a fiftieth of the plan]")] = None,
     test: Annotated[Optional[Path], typer.Option(help="layout: the test rays of a split, drawn beside.")] = None,
 ) -> None:
@@ -210,7 +217,8 @@ def plot_rays(
         figure = ray_figures.floor_plan(Rays.load(rays), cell)
     else:
         held = None if test is None else Rays.load(test)
-        where = {} if held is None else next((s["by"].get("position", {}) for s in held.metadata.get("steps", []) if s["step"] == "split"), {})
+        steps = [] if held is None else held.metadata.get("steps", [])
+        where = next((s["by"].get("position", {}) for s in steps if s["step"] == "split"), {})
         figure = ray_figures.layout_figure(Rays.load(rays), held, where.get("test_centres"), where.get("radius"))
     save(figure, output)
     typer.echo(f"wrote {output}")
@@ -261,7 +269,8 @@ def _card(rays, path: Path) -> None:
     for reason, count in s.dropped.items():
         card.add_row("dropped", f"{count:,} ({100 * count / max(s.rows_read, 1):.1f} %): {reason}; {_rows(rays, reason)}")
     for step in rays.metadata.get("steps", []):
-        card.add_row("then", f"{step['step']}{' ' + step['side'] if 'side' in step else ''}: {step['kept']:,} of {step['of']:,} rays kept")
+        name = f"{step['step']} {step.get('side', '')}".strip()
+        card.add_row("then", f"{name}: {step['kept']:,} of {step['of']:,} rays kept")
     source = rays.metadata.get("source_frame")
     if source:
         card.add_row("from", f"{source['up']} up, {source['handedness']}-handed, {source['units']}")

@@ -48,7 +48,8 @@ class ColumnMap:
             raise ValueError("column map: origin is given twice, since matrix holds it; leave out origin")
         if self.direction is None and not poses:
             raise ValueError(
-                "column map: direction is missing; add direction=x,y,z with the names of its columns, or a pose (xyzw, wxyz, ypr or matrix)"
+                "column map: direction is missing; add direction=x,y,z with the names of its columns, "
+                "or a pose (xyzw, wxyz, ypr or matrix)"
             )
         if self.eye is not None and not poses:
             raise ValueError("column map: eye is in the head's frame and needs a pose; add one (xyzw, wxyz, ypr or matrix)")

@@ -43,8 +43,8 @@ def floor_plan(rays, cell: float | None = None, title: str = "Where people stood
 def layout_figure(rays, test=None, centres=None, radius: float | None = None, title: str = "Layout"):
     """The paper's layout figure: a point for every ray's place (blue) within the place and its dimensions in metres.
 
-    The place is drawn as what was looked at: hit points between knee and reach (0.3 to 2 m above the floor), in grey. ``test``: rays held
-    out, in orange. ``centres`` (T, 3) with ``radius``: test positions, as circles.
+    The place is drawn as what was looked at: hit points between knee and reach (0.3 to 2 m above the floor), in grey.
+    ``test``: rays held out, in orange. ``centres`` (T, 3) with ``radius``: test positions, as circles.
     """
     points = [rays.origin[:, :2]] + ([] if test is None else [test.origin[:, :2]])
     walls = _walls([rays] if test is None else [rays, test])
@@ -66,12 +66,16 @@ def layout_figure(rays, test=None, centres=None, radius: float | None = None, ti
     names = [(_POINTS, "rays" if test is None else "training rays")]
     names += ([] if test is None else [("#d9730d", "test rays")]) + ([] if walls is None else [(_SURFACES, "what was looked at")])
     handles = [axes.plot([], [], "s", markersize=5, color=color, label=name)[0] for color, name in names]
-    axes.legend(handles=handles, fontsize=7, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2, handletextpad=0.1)
+    axes.legend(
+        handles=handles, fontsize=7, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3,
+        borderaxespad=0.2, handletextpad=0.1,
+    )  # fmt: skip
     return figure
 
 
 def _walls(sets) -> np.ndarray | None:
-    found = [r.hit[np.isfinite(r.hit).all(axis=1) & (r.hit[:, 2] > 0.3) & (r.hit[:, 2] < 2.0)][:, :2] for r in sets if r.hit is not None]
+    hits = [r.hit[np.isfinite(r.hit).all(axis=1)] for r in sets if r.hit is not None]
+    found = [h[(h[:, 2] > 0.3) & (h[:, 2] < 2.0), :2] for h in hits]
     found = [f for f in found if len(f)]
     if not found:
         return None
