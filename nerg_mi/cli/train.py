@@ -35,6 +35,12 @@ def train_radiance(
     threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store the weights in fp16.")] = False,
     depth: Annotated[bool, typer.Option(help="Supervise with the data set's depth, where it has any.")] = True,
+    depth_weight: Annotated[Optional[float], typer.Option(help="Weight of the depth's loss.")] = None,
+    distortion_weight: Annotated[
+        float, typer.Option(help="Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.")
+    ] = 0.0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run of this output.")] = False,
+    save_every: Annotated[float, typer.Option(help="Seconds between two states for --resume; 0 keeps none.")] = 60.0,
     variant: Annotated[str, typer.Option(help="Mitsuba variant.")] = "llvm_ad_rgb",
 ) -> None:
     """Train a radiance field on posed pictures, and report the error on those held out."""
@@ -42,6 +48,7 @@ def train_radiance(
     import mitsuba as mi
 
     from ..capture.dataset import open_dataset
+    from ..errors import NergError
     from ..field.backend import namespace
     from ..training.radiance_run import save_trained, train_radiance
     from ..training.settings import RadianceSettings, sized_config
@@ -51,7 +58,13 @@ def train_radiance(
         dr.set_thread_count(threads)
     if minutes is None and steps is None:
         minutes = 5.0
-    settings = RadianceSettings(steps=steps, minutes=minutes, seed=seed)
+    weights = {"distortion_weight": distortion_weight}
+    if depth_weight is not None:
+        weights["depth_weight"] = depth_weight
+    settings = RadianceSettings(steps=steps, minutes=minutes, seed=seed, **weights)
+    state = output.with_suffix(".run")
+    if resume and not state.is_file():
+        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
     data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth, scale, coordinates)
     config = sized_config(size, data.box)
     for line in (*data.unused, *data.notes):
@@ -62,8 +75,12 @@ def train_radiance(
     typer.echo(f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
                f"{data.source['width']} x {data.source['height']} pixels")
     with _Bar() as bar:
-        field, provenance = train_radiance(data, config, settings, namespace(variant), depth, bar.update)
+        field, provenance = train_radiance(data, config, settings, namespace(variant), depth, bar.update,
+                                           state=state if save_every > 0 or resume else None, resume=resume,
+                                           save_every=save_every or 60.0, preview=output.with_suffix(".preview.png"))
     save_trained(field, provenance, output, half)
+    if provenance["interrupted"] and state.is_file():
+        typer.echo(f"interrupted; go on with --resume (state in {state})")
     typer.echo(f"{provenance['steps']} steps in {provenance['seconds']:.0f} s")
     if data.held_out:
         typer.echo(f"held-out PSNR: {provenance['psnr_held_out']['mean']:.2f} dB")

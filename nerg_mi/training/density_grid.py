@@ -36,7 +36,7 @@ class DensityGrid:
                 "give a box that holds what the pictures show with --aabb"
             )
         self.always = dr.full(ns.Bool, False, cells)
-        self._turn = 0
+        self.turn = 0
 
     def _corner(self, index):
         """Lower corner of cells in the unit cube."""
@@ -126,8 +126,8 @@ class DensityGrid:
         """
         parts = 1 if everywhere else _PARTS
         index = dr.arange(self.ns.UInt32, self.resolution**3 // parts) * parts
-        index += dr.opaque(self.ns.UInt32, self._turn % parts)
-        self._turn += not everywhere
+        index += dr.opaque(self.ns.UInt32, self.turn % parts)
+        self.turn += not everywhere
         index = dr.gather(self.ns.UInt32, index, dr.compress(dr.gather(self.ns.Bool, self.seen, index)))
         if dr.width(index) > 0:
             # Beyond some optical depth more says nothing, and would drown the mean.
@@ -139,8 +139,15 @@ class DensityGrid:
         mean = dr.sum(self.value) / self.seen_count
         bound = dr.minimum(self.threshold, 0.5 * mean)
         self.bits = dr.select((self.seen & (self.value > bound)) | self.always, self.ns.UInt8(1), 0)
-        self._off = dr.compress(self.seen & (self.bits == 0))
         dr.eval(self.bits)
+        self._off = dr.compress(self.seen & (self.bits == 0))
+
+    def restore(self, value, bits, seen, always, turn: int) -> None:
+        """Go on from a stored state (arrays of the attributes of these names)."""
+        ns = self.ns
+        self.value, self.bits, self.seen, self.always = ns.Float(value), ns.UInt8(bits), ns.Bool(seen), ns.Bool(always)
+        self.seen_count, self.turn = int(seen.sum()), turn
+        self._off = dr.compress(self.seen & (self.bits == 0))
 
     def empty_points(self, count: int, rng: np.random.Generator):
         """Random points (Array3f, world) in cells that are not sampled though cameras see them; None if there are none."""

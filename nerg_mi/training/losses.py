@@ -50,6 +50,45 @@ def depth_loss(weight, tau, samples: Samples, pixels: PixelBatch, margin: float,
     return dr.select(pixels.depth > 0, loss, 0)
 
 
+def distortion_loss(weight, samples: Samples, scale: float):
+    """Loss a ray that draws its weight together: Σ_ij w_i w_j |m_i - m_j| + Σ_i w_i² δ_i / 3 with midpoints m and lengths
+    δ of the samples, in units of ``scale`` (Barron et al. 2022, mip-NeRF 360, eq. 15; summed in O(n) as samples are
+    in order). The samples' places have no derivative."""
+    length = samples.length / scale
+    return ray_sum(dr.custom(_Spread, weight, samples.t / scale + 0.5 * length, length, samples.segments), samples.segments)
+
+
+class _Spread(dr.CustomOp):
+    """Each sample's part of the distortion: 2 w_i (m_i Σ_{j<i} w_j - Σ_{j<i} w_j m_j) + w_i² δ_i / 3."""
+
+    def eval(self, weight, middle, length, segments):
+        Float = type(weight)
+        self.weight, self.length, self.segments = weight, length, segments
+        # From the ray's first sample on: the two sums are of like size, and cancel.
+        start = dr.gather(Float, middle, dr.gather(type(segments.ray), segments.start, segments.ray, segments.active))
+        self.middle = dr.select(segments.active, middle - start, 0)
+        return Float(2 * weight * self._before(weight)) + weight * weight * length / 3
+
+    def _before(self, x):
+        moment = x * self.middle
+        return self.middle * self.segments.before(x) - self.segments.before(moment)
+
+    def forward(self):
+        g, w = self.grad_in("weight"), self.weight
+        Float = type(g)
+        self.set_grad_out(Float(2 * (g * self._before(w) + w * self._before(g))) + 2 * w * g * self.length / 3)
+
+    def backward(self):
+        g, w = self.grad_out(), self.weight
+        Float = type(g)
+        a = g * w
+        later = self.segments.after(a * self.middle) - self.middle * self.segments.after(a)
+        self.set_grad_in("weight", Float(2 * (g * self._before(w) + later)) + 2 * g * w * self.length / 3)
+
+    def name(self):
+        return "distortion of a ray"
+
+
 def composite(sigma, rgb: list, samples: Samples):
     """Weights, optical depths, colour (3 Floats) and opacity of every ray."""
     s = samples.segments

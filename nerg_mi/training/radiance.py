@@ -14,18 +14,19 @@ from drjit.opt import Adam
 
 from ..capture.images import View
 from ..field.box import Box
+from ..field.hashgrid import HashGrid
 from ..field.radiance import RadianceConfig, RadianceField
 from .compositing import weights
 from .density_grid import DensityGrid
-from .losses import color_loss, composite, depth_loss
-from .model import density, density_color
+from .losses import color_loss, composite, depth_loss, distortion_loss
+from .model import density, density_color, density_of
 from .pixels import PixelBank
-from .preview import psnr, render_view
+from .preview import Preview, psnr, render_view
 from .sampling import StepTable, rays_in_box, visible_samples
 from .settings import RadianceSettings
 
-# The density pass may run on weights a few steps old: it only decides which samples are worth a look.
-_REFRESH = 4
+# The average is taken of every fourth step.
+_AVERAGE_EVERY = 4
 _MAX_RAYS = 2**14
 # Training rays that decide, at the end, which cells matter.
 _LOOKS, _LOOK_RAYS = 64, 2**12
@@ -61,13 +62,18 @@ class RadianceTrainer:
             self.grid.carve(self.pixels.surface_points())
         self.grid.update(self.density, self.rng, everywhere=True)
         self._tables: dict[int, StepTable] = {}
-        self._settled, self._hard, self.misplaced = False, np.zeros(0, np.uint32), None
+        self.settled, self.hard, self.misplaced = False, np.zeros(0, np.uint32), None
         self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
         self._started = time.perf_counter()
 
+    def restore(self, steps: int, rays: int, samples: int, seconds: float, settled: bool, hard: np.ndarray) -> None:
+        """Go on from stored numbers; see ``run_state``."""
+        self.steps, self.rays, self.samples, self.settled, self.hard = steps, rays, samples, settled, hard
+        self._started = time.perf_counter() - seconds
+
     @property
     def seconds(self) -> float:
-        """Wall time since the run began."""
+        """Wall time of the run, without that between an interruption and its resumption."""
         return time.perf_counter() - self._started
 
     @property
@@ -95,23 +101,31 @@ class RadianceTrainer:
         with dr.suspend_grad():
             return self.live.density(p, active)
 
+    def _look(self, p, active):
+        """Density at ``p`` for the choice of samples, and the grid's features, which need no second look-up."""
+        now = {k: dr.detach(v) for k, v in self._parameters().items()}
+        features = HashGrid(self.config.grid, now["grid.table"])(self.box.to_unit(p), active)
+        return density_of(self.config, now, features), features
+
+    def _parameters(self) -> dict:
+        return {k: self.optimiser[k] for k in self.averaged}
+
     def step(self) -> None:
         """Draw rays, march, composite, and move the weights once."""
         s, ns = self.settings, self.ns
-        if self.steps % _REFRESH == 0:
-            self.live.set_parameters({k: dr.detach(self.optimiser[k]) for k in self.averaged})
         if self.steps % s.grid_every == 0 and self.steps > 0:
-            if not self._settled and self.progress >= s.settle:
+            self.live.set_parameters({k: dr.detach(v) for k, v in self._parameters().items()})
+            if not self.settled and self.progress >= s.settle:
                 with dr.suspend_grad():
                     self.grid.settle(self.density, self.rng, self._lit)
-                self._settled = True
+                self.settled = True
             self.grid.update(self.density, self.rng)
         index = self._draw()
         pixels = self.pixels.batch(ns.UInt32(index))
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
         offset = ns.Float(self.rng.random(self.rays, np.float32))
         stride = 1 if self.carved else s.stride(self.steps)
-        samples, covered = visible_samples(rays, self.table(stride), offset, self.grid.occupied, self.density,
+        samples, covered = visible_samples(rays, self.table(stride), offset, self.grid.occupied, self._look,
                                            s.stop, pad=s.batch)
         self.steps += 1
         if samples is None:
@@ -126,9 +140,9 @@ class RadianceTrainer:
     def _draw(self) -> np.ndarray:
         """Indices of the pixels of a batch: at random, a share of them from those whose depth was wrong before."""
         index = self.rng.integers(0, self.pixels.size, self.rays, np.uint32)
-        if self._hard.size and self.progress > self.settings.hold:
+        if self.hard.size and self.progress > self.settings.hold:
             again = int(self.settings.replay * self.rays)
-            index[:again] = self._hard[self.rng.integers(0, self._hard.size, again)]
+            index[:again] = self.hard[self.rng.integers(0, self.hard.size, again)]
             # In mixed order, because the last rays of a batch may not fit into it.
             self.rng.shuffle(index)
         return index
@@ -136,13 +150,15 @@ class RadianceTrainer:
     def _remember(self, index: np.ndarray) -> None:
         """Keep the pixels of this batch whose depth was wrong, in place of the oldest kept."""
         wrong = self.misplaced.numpy()[:len(index)] > _WRONG
-        self._hard = np.concatenate([self._hard, index[wrong]])[-_HARD:]
+        self.hard = np.concatenate([self.hard, index[wrong]])[-_HARD:]
 
     def _descend(self, samples, pixels, background, covered: int, stride: int) -> None:
         s, ns = self.settings, self.ns
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
-        parameters = {k: self.optimiser[k] for k in self.averaged}
-        sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns)
+        parameters = self._parameters()
+        sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns, samples.features)
+        # Now: each sum along the rays would evaluate the networks again.
+        dr.eval(sigma, rgb)
         weight, tau, color, opacity = composite(sigma, rgb, samples)
         loss = color_loss(color, opacity, pixels, background, s.huber)
         if self.use_depth:
@@ -151,15 +167,17 @@ class RadianceTrainer:
             # Places first, colours later: once surfaces stand, colour has more to say.
             loss += s.depth_weight * s.final_depth ** self.progress * placed
             self.misplaced = dr.detach(placed)
+        if s.distortion_weight > 0:
+            loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
         loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
         dr.backward(loss + self._clear(parameters))
         self.optimiser.set_learning_rate(s.rate(self.progress))
         self.optimiser.step()
         self.loss, self.samples = loss, samples.count
-        if self.steps % _REFRESH == 0:
+        if self.steps % _AVERAGE_EVERY == 0:
             # A short memory at first: the start of a run is not worth remembering.
-            decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** _REFRESH
+            decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** _AVERAGE_EVERY
             for k, old in self.averaged.items():
                 self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * (1 - decay)
             dr.eval(self.averaged)
@@ -203,15 +221,15 @@ class RadianceTrainer:
 
         Of ``field``, by its own occupancy; without one, of the averaged weights so far.
         """
-        occupied = self.grid.occupied
-        if field is not None:
+        field = field or self.field(bound=False)
+        return [psnr(self.render(v, every, field).color, v.over(0)[every // 2::every, every // 2::every]) for v in views]
+
+    def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
+        """``view`` by the trainer's own marcher; ``every`` and ``field`` as `measure` has them."""
+        field, occupied = field or self.field(bound=False), self.grid.occupied
+        if field.occupancy is not None:
             occupied = lambda p, active: active & (field.occupancy.empty_cells(self.box.to_unit(p), active) == 0)
-        shown, near = field or self.field(bound=False), self.settings.near * self.box.side
-        out = []
-        for view in views:
-            seen = render_view(shown, occupied, self.table(), view, near, every=every)
-            out.append(psnr(seen.color, view.over(0)[every // 2::every, every // 2::every]))
-        return out
+        return render_view(field, occupied, self.table(), view, self.settings.near * self.box.side, every=every)
 
     def field(self, bound: bool = True) -> RadianceField:
         """The field with averaged weights. ``bound``: with the occupancy that rendering may rest on."""

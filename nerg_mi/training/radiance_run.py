@@ -10,9 +10,11 @@ from typing import Callable
 import numpy as np
 
 from ..capture.dataset import Dataset
+from ..capture.images import View
 from ..field.radiance import RadianceConfig, RadianceField
 from ..formats.fields import save_radiance
 from .radiance import RadianceTrainer
+from .run_state import load_run, save_run
 from .settings import RadianceSettings
 
 # Shares of the run at which the held-out error is looked at.
@@ -35,18 +37,29 @@ class Progress:
 
 def train_radiance(
     dataset: Dataset, config: RadianceConfig, settings: RadianceSettings, ns: ModuleType, depth: bool = True,
-    on_progress: Callable[[Progress], None] | None = None,
+    on_progress: Callable[[Progress], None] | None = None, *, state: Path | None = None, resume: bool = False,
+    save_every: float = 60.0, preview: Path | None = None,
 ) -> tuple[RadianceField, dict]:
     """Train a field on ``dataset``; returns it, with its occupancy, and its provenance (JSON).
 
     The held-out views are looked at and never learnt from: a few of them, coarsely, at some shares of the run, and
     all of them, fully, at the end. Ctrl-C ends the run early with what it has come to.
+
+    ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
+    interrupted, removed when it is done; ``resume``: go on from there. ``preview``: PNG of the first watched view,
+    its picture beside what is true, rewritten at every look.
     """
     trainer = RadianceTrainer(dataset.train, dataset.box, config, settings, ns, depth)
     spread = np.linspace(0, len(dataset.held_out) - 1, min(_LOOK_VIEWS, len(dataset.held_out))).round().astype(int)
     watched = [dataset.held_out[i] for i in spread]
-    looks = list(_LOOKS) if watched else []
-    history, last, interrupted = [], None, False
+    about = {
+        **{k: dataset.source.get(k) for k in ("sha256", "training_frames", "width", "height")},
+        "settings": settings.to_dict(), "architecture": config.to_dict(), "box": dataset.box.to_dict(), "depth": depth,
+    }  # fmt: skip
+    history = load_run(trainer, state, about) if resume else []
+    last = history[-1]["psnr"] if history else None
+    looks = [x for x in _LOOKS if x > trainer.progress] if watched else []
+    saved, interrupted = trainer.seconds, False
     try:
         while trainer.progress < 1:
             trainer.step()
@@ -54,10 +67,17 @@ def train_radiance(
                 looks = [x for x in looks if x > trainer.progress]
                 last = float(np.mean(trainer.measure(watched, _LOOK_EVERY)))
                 history.append({"steps": trainer.steps, "seconds": round(trainer.seconds, 1), "psnr": round(last, 2)})
+                if preview is not None:
+                    _write_preview(trainer, watched[0], preview)
+            if state is not None and trainer.seconds - saved > save_every:
+                save_run(trainer, state, about, history)
+                saved = trainer.seconds
             if on_progress is not None:
                 on_progress(Progress(trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last))
     except KeyboardInterrupt:
         interrupted = True
+    if state is not None and interrupted:
+        save_run(trainer, state, about, history)
     seconds = trainer.seconds
     field = trainer.field()
     provenance = {
@@ -76,7 +96,17 @@ def train_radiance(
             "mean": round(float(np.mean(psnr)), 3),
             "views": {v.name: round(p, 3) for v, p in zip(dataset.held_out, psnr)},
         }
+    if state is not None and not interrupted:
+        state.unlink(missing_ok=True)
     return field, provenance
+
+
+def _write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
+    import mitsuba as mi
+
+    seen = trainer.render(view)
+    both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)], axis=1)
+    mi.Bitmap((255 * both + 0.5).astype(np.uint8)).write(str(path))
 
 
 def save_trained(field: RadianceField, provenance: dict, output: str | Path, half: bool = False) -> None:

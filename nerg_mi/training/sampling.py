@@ -69,7 +69,8 @@ def rays_in_box(o, d, box: Box, near: float) -> Rays:
 @dataclass
 class Samples:
     """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint
-    (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding."""
+    (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding; ``features``: what the
+    density pass knew of them, or None."""
 
     ray: object
     t: object
@@ -77,6 +78,7 @@ class Samples:
     p: object
     segments: Segments
     count: int
+    features: list | None = None
 
 
 def occupied_steps(rays: Rays, table: StepTable, offset, occupied) -> tuple | None:
@@ -116,8 +118,8 @@ def visible_samples(
 ) -> tuple[Samples | None, int]:
     """Samples that may matter, and the number of leading rays that they cover completely.
 
-    ``density``: function of points and a mask giving σ without a gradient; samples that less than
-    ``stop`` of the light reaches are dropped. ``pad``: make exactly so many samples, dropping the last rays
+    ``density``: function of points and a mask giving σ without a gradient, or σ and a list of Floats that the samples
+    are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make exactly so many samples, dropping the last rays
     that do not fit. Returns (None, rays) when no ray meets anything.
     """
     steps = occupied_steps(rays, table, offset, occupied)
@@ -127,7 +129,11 @@ def visible_samples(
     Bool = dr.mask_t(t)
     everywhere = dr.full(Bool, True, dr.width(t))
     segments = Segments(ray, everywhere, rays.count)
-    tau = dr.minimum(density(p, everywhere) * length, 60.0)
+    sigma = density(p, everywhere)
+    sigma, features = sigma if isinstance(sigma, tuple) else (sigma, None)
+    tau = dr.minimum(sigma * length, 60.0)
+    # At once: each on its own would evaluate the field again.
+    dr.eval(tau, features)
     light = dr.exp(-type(t)(segments.before(tau)))
     kept = dr.compress(light > stop)
     count, covered = dr.width(kept), rays.count
@@ -142,5 +148,7 @@ def visible_samples(
     ray = dr.gather(UInt32, ray, source)
     active = (j < dr.opaque(UInt32, count)) & (ray < dr.opaque(UInt32, covered))
     t, length, p = (dr.gather(type(v), v, source) for v in (t, length, p))
-    dr.eval(ray, active, t, length, p)
-    return Samples(ray, t, length, p, Segments(ray, active, rays.count), min(count, pad or count)), covered
+    if features is not None:
+        features = [dr.gather(type(f), f, source) for f in features]
+    dr.eval(ray, active, t, length, p, features)
+    return Samples(ray, t, length, p, Segments(ray, active, rays.count), min(count, pad or count), features), covered

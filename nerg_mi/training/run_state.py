@@ -1,0 +1,64 @@
+"""The whole state of a radiance training in a file, so that an interrupted run goes on as if it had not been.
+
+With one thread the weights then equal those of a run without interruption bit for bit; with more, sums over threads come in
+no fixed order in either.
+"""
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import drjit as dr
+
+from ..errors import NergError
+from ..formats.checkpoint import read_checkpoint, write_checkpoint
+
+KIND = "radiance run"
+_GRID = ("value", "bits", "seen", "always")
+
+
+def save_run(trainer, path: str | Path, about: dict, history: list) -> None:
+    """Write the state of ``trainer`` (`RadianceTrainer`) atomically. ``about``: what the run must agree on to be resumed
+    (JSON); ``history``: of its held-out error so far."""
+    tensors, taken = {}, {}
+    for name, (value, _, _, (count, first, second, _)) in trainer.optimiser.state.items():
+        taken[name] = int(count.numpy()[0])
+        parts = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
+        tensors |= {f"{part}.{name}": x.numpy() for part, x in parts.items()}
+    for name in _GRID:
+        tensors[f"grid.{name}"] = getattr(trainer.grid, name).numpy()
+    tensors["hard"] = trainer.hard
+    metadata = {
+        "about": about, "history": history, "taken": taken, "steps": trainer.steps, "rays": trainer.rays,
+        "samples": trainer.samples, "seconds": trainer.seconds, "settled": trainer.settled, "turn": trainer.grid.turn,
+        "random": trainer.rng.bit_generator.state,
+    }  # fmt: skip
+    write_checkpoint(path, KIND, tensors, metadata)
+
+
+def load_run(trainer, path: str | Path, about: dict) -> list:
+    """Set ``trainer`` to the state in ``path``; returns the history.
+
+    Raises `NergError` unless the state is one of a run with the same ``about``.
+    """
+    tensors, meta = read_checkpoint(path, KIND)
+    then, now = meta["about"], json.loads(json.dumps(about))
+    different = [k for k in now if then.get(k) != now[k]]
+    if different:
+        raise NergError(
+            f'the run in "{path}" cannot go on: it was started with other {", ".join(different)}; give the options and the '
+            "data set that it was started with, or start anew without --resume"
+        )
+    optimiser = trainer.optimiser
+    for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
+        old = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
+        new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
+        dr.enable_grad(new["weights"])
+        count = dr.opaque(type(count), meta["taken"][name])
+        optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
+        trainer.averaged[name] = new["averaged"]
+    trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], meta["turn"])
+    trainer.rng.bit_generator.state = meta["random"]
+    trainer.restore(meta["steps"], meta["rays"], meta["samples"], meta["seconds"], meta["settled"], tensors["hard"])
+    dr.eval(optimiser.state, trainer.averaged)
+    return meta["history"]

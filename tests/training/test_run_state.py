@@ -1,0 +1,111 @@
+"""A training that is killed and resumed comes to what an uninterrupted one comes to."""
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.training.radiance import RadianceTrainer
+from nerg_mi.training.radiance_run import train_radiance
+from nerg_mi.training.run_state import load_run, save_run
+from .test_radiance import BOX, TINY, dataset, settings  # noqa: F401  (fixture)
+
+
+@pytest.fixture
+def one_thread():
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    yield
+    dr.set_thread_count(threads)
+
+
+def trainer(dataset, **changes):
+    return RadianceTrainer(dataset.train, BOX, TINY, settings(**{"steps": 40, "settle": 0.75, **changes}), ns)
+
+
+def state(t):
+    arrays = {k: v[0].numpy() for k, v in t.optimiser.state.items()}
+    arrays |= {f"first.{k}": v[3][1].numpy() for k, v in t.optimiser.state.items()}
+    arrays |= {f"averaged.{k}": v.numpy() for k, v in t.averaged.items()}
+    return arrays | {"bits": t.grid.bits.numpy(), "value": t.grid.value.numpy(), "hard": t.hard, "rays": t.rays}
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thread, tmp_path):  # noqa: F811
+    """Past updates of the grid, its settling and the drawing of hard pixels, on either side of the interruption."""
+    whole, first, second = (trainer(dataset) for _ in range(3))
+    while whole.progress < 1:
+        whole.step()
+    while first.steps < 21:
+        first.step()
+    save_run(first, tmp_path / "a.run", {"sha": 1}, [{"psnr": 3.0}])
+    assert load_run(second, tmp_path / "a.run", {"sha": 1}) == [{"psnr": 3.0}]
+    assert second.steps == 21
+    while second.progress < 1:
+        second.step()
+    expected, got = state(whole), state(second)
+    for name, value in expected.items():
+        assert np.array_equal(value, got[name]), name
+    assert whole.settled and second.settled
+
+
+def test_another_run_is_not_resumed(dataset, tmp_path):  # noqa: F811
+    t = trainer(dataset)
+    save_run(t, tmp_path / "a.run", {"sha": 1, "width": 24}, [])
+    with pytest.raises(NergError, match="other width"):
+        load_run(t, tmp_path / "a.run", {"sha": 1, "width": 48})
+
+
+def test_ctrl_c_keeps_the_state_and_the_end_removes_it(dataset, tmp_path):  # noqa: F811
+    path, seen = tmp_path / "a.run", []
+
+    def stop(progress):
+        seen.append(progress)
+        if progress.steps == 5 and len(seen) == 5:
+            raise KeyboardInterrupt
+
+    how = {"state": path, "preview": tmp_path / "a.png"}
+    _, about = train_radiance(dataset, TINY, settings(steps=12), ns, on_progress=stop, **how)
+    assert about["interrupted"] and about["steps"] == 5 and path.is_file()
+    _, about = train_radiance(dataset, TINY, settings(steps=12), ns, on_progress=stop, resume=True, **how)
+    assert not about["interrupted"] and about["steps"] == 12 and seen[5].steps == 6
+    assert not path.exists() and (tmp_path / "a.png").stat().st_size > 100
+
+
+_CHILD = """
+import sys
+import drjit as dr, drjit.llvm.ad as ns
+from pathlib import Path
+from tests.training.test_radiance import *
+from nerg_mi.training import radiance_run
+dr.set_thread_count(1)
+rng = np.random.default_rng(0)
+centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
+views = [ball(looking_at_origin(2 * c / np.linalg.norm(c))) for c in centers]
+data = Dataset(views[4:], views[:4], BOX, "as given", None, {"dataset": "ball"})
+radiance_run.train_radiance(data, TINY, settings(steps=10**6), ns, state=Path(sys.argv[1]), save_every=0.0)
+"""
+
+
+def test_a_killed_run_leaves_a_whole_state(dataset, one_thread, tmp_path):  # noqa: F811
+    path = tmp_path / "a.run"
+    child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
+    until = time.time() + 120
+    while not path.exists() and child.poll() is None and time.time() < until:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    about = {k: None for k in ("sha256", "training_frames", "width", "height")}
+    killed = trainer(dataset, steps=10**6)
+    load_run(killed, path, about)
+    same = trainer(dataset, steps=10**6)
+    while same.steps < killed.steps:
+        same.step()
+    for name, value in state(same).items():
+        assert np.array_equal(value, state(killed)[name]), name
