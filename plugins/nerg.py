@@ -327,9 +327,15 @@ class NergIntegrator(mi.SamplingIntegrator):
             behind, nested = self.shading.radiance(
                 scene, sampler, ray, view, self.background, self.hide_emitters, active
             )
-            L = (1 - view.front) * behind
+            front, color = view.front, view.march.color if lit else None
+            learnt = self.medium.background(ray.o, ray.d) if lit and scene.environment() is None else None
+            if learnt is not None:
+                # Trained together, composited together: in the field's colour space.
+                color = dr.select(view.hit, color, dr.fma(1 - front, mi.Color3f(learnt), color))
+                front = dr.select(view.hit, front, 1)
+            L = (1 - front) * behind
             if lit:
-                L += composite_to_linear(view.march.color, view.front, self.medium.color_space)
+                L += composite_to_linear(color, front, self.medium.color_space)
         aovs = [c for name in self.aovs for c in (out[name] if name == "position" else [out[name]])]
         return dr.select(active, L, 0), some, aovs + nested
 

@@ -146,6 +146,12 @@ class FieldMedium:
         """Colour in ``color_space`` (Array3f)."""
         return self.field.color(features, w)
 
+    def background(self, o, d):
+        """Colour behind the field of scene rays, in ``color_space``; None for a field without a background network."""
+        if self.field.background is None:
+            return None
+        return self.field.background(self.to_world.point_to_local(o), self.to_world.direction_to_local(d))
+
 
 class VolumeMedium:
     """Any Mitsuba volume as density (1/scene unit), optionally with a second one as colour.
@@ -233,6 +239,9 @@ class VolumeMedium:
 
     def color(self, features, p, w, active):
         return self._color.eval(self._at(p), active)
+
+    def background(self, o, d):
+        return None
 
 
 class GazeMedium:
