@@ -1,0 +1,71 @@
+"""``nerg eval``: how good a trained field is."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Score trained fields.")
+
+
+@app.callback()
+def _fields() -> None:
+    """Score trained fields."""
+
+
+@app.command("radiance")
+def eval_radiance(
+    field: Annotated[Path, typer.Argument(help="Checkpoint of a radiance field (.safetensors).")],
+    dataset: Annotated[Path, typer.Argument(help="Posed image set with the views to compare with.")],
+    holdout: Annotated[
+        Optional[int], typer.Option(help="As it was trained with. Default: transforms_test.json, else 8.")
+    ] = None,
+    train: Annotated[bool, typer.Option("--train", help="Score the training views instead.")] = False,
+    width: Annotated[Optional[int], typer.Option(help="Width of the pictures. Default: as it was trained.")] = None,
+    scale: Annotated[float, typer.Option(help="As it was trained with.")] = 1.0,
+    coordinates: Annotated[str, typer.Option(help="As it was trained with.")] = "file",
+    spp: Annotated[int, typer.Option(min=1, help="Rays a pixel.")] = 4,
+    output: Annotated[
+        Optional[Path], typer.Option("-o", "--output", help="Folder for the pictures. Default: FIELD.eval")
+    ] = None,
+    json_file: Annotated[Optional[Path], typer.Option("--json", help="Write the scores to this file.")] = None,
+    threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
+    variant: Annotated[str, typer.Option(help="Mitsuba variant.")] = "llvm_ad_rgb",
+) -> None:
+    """PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the integrator."""
+    import json
+
+    import drjit as dr
+    import mitsuba as mi
+
+    from ..capture.dataset import open_dataset
+    from ..evaluation.radiance_scores import score_views
+    from ..formats.checkpoint import read_checkpoint
+
+    mi.set_variant(variant)
+    if threads is not None:
+        dr.set_thread_count(threads)
+    about = read_checkpoint(field, "radiance")[1].get("provenance", {})
+    data = open_dataset(dataset, holdout, width or about.get("width"), None, None, True, scale, coordinates)
+    trained = about.get("held_out", {}).get("frames")
+    if not train and trained is not None and about.get("sha256") == data.source["sha256"]:
+        seen = sorted({v.name for v in data.held_out} - set(trained))
+        if seen:
+            raise ValueError(f'"{field}" was trained on {seen[0]} and {len(seen) - 1} other of the views that would be scored; '
+                             "give --holdout as it was trained with")
+    views = data.train if train else data.held_out
+    typer.echo(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")
+    show = lambda name, psnr, ssim: typer.echo(f"{name[-32:]:32s} {psnr:8.2f} {ssim:7.4f}")
+    output = output or field.with_suffix(".eval")
+    scores = score_views(field, views, spp, output, show)
+    show("mean", scores["psnr_mean"], scores["ssim_mean"])
+    if "depth" in scores:
+        d = scores["depth"]
+        typer.echo(f"depth: median error {d['median']:.4f} units, {d['off']:.1%} of the pixels off by more than 10 %; "
+                   f"opacity {d['opacity']:.3f}, {d['translucent']:.1%} of the pixels below 0.9")
+    typer.echo(f"wrote {len(views)} pictures to {output}")
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps({"field": field.name, "dataset": data.source["dataset"], **scores}, indent=1) + "\n")
+        typer.echo(f"wrote {json_file}")
