@@ -132,6 +132,8 @@ AOVs (0 where nothing is met):
 - ``emit``, ``capture`` (``.Y``): the two factors after their activations; 1 for one that the variant lacks
 - ``visibility`` (``.Y``): 1 visible to the observer .. 0 hidden
 - ``observer_depth`` (``.T``): :math:`d_o`; the distance to the surface where no occlusion is computed
+- ``features`` (``.0``, ``.1``, ...): the field's geometry features, accumulated like colour (not divided by opacity)
+- ``features_at`` (``.0``, ``.1``, ...): the same features at the surface :math:`p_d`; 0 on shapes
 - ``density_evals``, ``color_evals``, ``gaze_evals`` (``.Y``): evaluations made for the pixel
 
 Colours are composited in the colour space that the field was trained in, then converted to linear:
@@ -197,6 +199,7 @@ from nerg_mi.registration import register
 from nerg_mi.transport import viewpoint
 from nerg_mi.transport.color import composite_to_linear
 from nerg_mi.transport.depth import KINDS
+from nerg_mi.transport.features import Featured, snapshot
 from nerg_mi.transport.march import MarchSettings
 from nerg_mi.transport.media import VolumeMedium
 from nerg_mi.transport.observer import KINDS as VISIBILITIES
@@ -210,6 +213,7 @@ CHANNELS = {
     "depth": "T", "opacity": "Y", "position": "XYZ", "gaze": "Y", "emit": "Y", "capture": "Y", "visibility": "Y",
     "observer_depth": "T", "density_evals": "Y", "color_evals": "Y", "gaze_evals": "Y",
 }
+_FEATURES = ("features", "features_at")
 _GAZE_AOVS = {"gaze", "emit", "capture", "gaze_evals"}
 _OBSERVER_AOVS = {"visibility", "observer_depth"}
 
@@ -244,7 +248,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.radiance = boolean(props, "radiance", True)
         background = mi.Color3f(color(props, "background", 0.0))
         self.background = mi.Spectrum(mi.luminance(background) if mi.is_monochromatic else background)
-        self.aovs = _aovs(text(props, "aovs", "depth,opacity"), gaze is not None)
+        self.aovs = _aovs(text(props, "aovs", "depth,opacity"), gaze is not None, field is not None)
         self.jitter = boolean(props, "jitter", False)
         step = number(props, "step", 0, low=0)
         self.settings = MarchSettings(
@@ -271,7 +275,10 @@ class NergIntegrator(mi.SamplingIntegrator):
     # ------------------------------------------------------------------------
 
     def aov_names(self):
-        return [f"{name}.{c}" for name in self.aovs for c in CHANNELS[name]] + self.shading.aov_names()
+        return [f"{name}.{c}" for name in self.aovs for c in self._parts(name)] + self.shading.aov_names()
+
+    def _parts(self, name):
+        return map(str, range(self.medium.feature_count)) if name in _FEATURES else CHANNELS[name]
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
@@ -295,21 +302,32 @@ class NergIntegrator(mi.SamplingIntegrator):
         # ---------------------- The camera's ray ----------------------------
         place = Place(self.medium, scene)
         lit = self.radiance and self.medium is not None and self.medium.has_color
-        view = place.look(
-            ray, active, self.settings, offset=offset, count=count, color=_color_type(self.medium) if lit else None
-        )
+        paint = _color_type(self.medium) if lit else None
+        seen = place
+        if "features" in asked:
+            seen = Place(Featured(self.medium, lit), scene)
+            paint = seen.medium.blank
+        view = seen.look(ray, active, self.settings, offset=offset, count=count, color=paint)
+        if "features" in asked:
+            painted = list(view.march.color)
+            view.march.color = mi.Color3f(painted[:3]) if lit else None
+            out_features = [dr.select(active, f, 0) for f in painted[3 * lit :]]
         alpha = view.opacity
         some = active & (alpha > 0)
         out = {"opacity": dr.select(active, alpha, 0)}
-        if asked - {"opacity", "density_evals", "color_evals"}:
+        if "features" in asked:
+            out["features"] = out_features
+        if asked - {"opacity", "density_evals", "color_evals", "features"}:
             out["depth"] = view.depth(self.depth_kind, some)
 
         # ---------------------- The surface and its gaze ---------------------
         density_evals = mi.Float(0)
-        if asked & (_GAZE_AOVS | _OBSERVER_AOVS | {"position"}):
+        if asked & (_GAZE_AOVS | _OBSERVER_AOVS | {"position", "features_at"}):
             surface = some & (alpha >= self.surface_opacity)
             p_d = ray.o + ray.d * out["depth"]
             out["position"] = dr.select(surface, p_d, 0)
+            if "features_at" in asked:
+                out["features_at"] = snapshot(self.medium, p_d, surface & (out["depth"] < view.distance))
             if asked & (_GAZE_AOVS | _OBSERVER_AOVS):
                 fuzz = view.fuzz(self.depth_kind, out["depth"])
                 more = self._gaze(scene, place, ray, p_d, fuzz, surface, asked, count, out)
@@ -336,7 +354,8 @@ class NergIntegrator(mi.SamplingIntegrator):
             L = (1 - front) * behind
             if lit:
                 L += composite_to_linear(color, front, self.medium.color_space)
-        aovs = [c for name in self.aovs for c in (out[name] if name == "position" else [out[name]])]
+        several = ("position", *_FEATURES)
+        aovs = [c for name in self.aovs for c in (out[name] if name in several else [out[name]])]
         return dr.select(active, L, 0), some, aovs + nested
 
     def traverse(self, cb):
@@ -452,11 +471,13 @@ def _nested(props):
     return found[0] if found else None
 
 
-def _aovs(value, has_gaze):
+def _aovs(value, has_gaze, has_field):
     names = [n.strip() for n in value.split(",") if n.strip()]
     for name in names:
-        if name not in CHANNELS:
-            raise ValueError(f'"aovs" does not know "{name}"; it knows {", ".join(CHANNELS)}')
+        if name not in CHANNELS and name not in _FEATURES:
+            raise ValueError(f'"aovs" does not know "{name}"; it knows {", ".join([*CHANNELS, *_FEATURES])}')
+        if name in _FEATURES and not has_field:
+            raise ValueError(f'"aovs" asks for "{name}", which needs a "field"')
         if name in _GAZE_AOVS and not has_gaze:
             raise ValueError(f'"aovs" asks for "{name}", which needs a "gaze" volume')
     if len(set(names)) < len(names):

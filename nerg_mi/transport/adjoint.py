@@ -150,7 +150,7 @@ class _March(dr.CustomOp):
                 color_dot = color_dot + own[3] - dr.select(step.active, tau_dot * dr.detach(outputs[3]), 0)
             return state, (tau_dot + own[0], moment_dot, half_dot, color_dot)
 
-        zero = (Float(0), Float(0), Float(0), None if color is None else dr.zeros(color))
+        zero = (Float(0), Float(0), Float(0), None if color is None else color(0))
         tau_dot, moment_dot, half_dot, color_dot = self._march_again(body, active, zero)
         nothing = Float(0)
         counts = [None if x is None else nothing for x in (primal.density_evals, primal.color_evals)]
@@ -161,7 +161,7 @@ class _March(dr.CustomOp):
         offset, color = self.fixed[3], self.fixed[4]
         Float = type(self.inputs[3])
         start = _State(active, self.inputs[3], Float(1 if offset is None else offset), Float(0), Float(0),
-                       (Float(0), Float(0)), None if color is None else dr.zeros(color))
+                       (Float(0), Float(0)), None if color is None else color(0))
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             _, extra = dr.while_loop(
                 (start, extra), lambda state, _: state.active, lambda state, extra: body(state, extra),

@@ -93,7 +93,7 @@ def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, 
     """March ``ray`` (``media.LocalRay``) from ``t0`` to ``t1``.
 
     ``offset`` in [0, 1]: length of the first step as a share of a full one (jitter; None: a full
-    step). ``color``: array type of the medium's colour, or None for a density-only pass. ``until``:
+    step). ``color``: array type of the medium's colour, or a function of one's entry that makes it; None for a density-only pass. ``until``:
     optical depth at which to end, for a march that only looks for that crossing. ``count``: count
     evaluations. ``fine_from``: distance up to which steps are coarse. Differentiable in the ray, ``t0``, ``t1``, ``until`` and the medium's parameters.
     """
@@ -138,7 +138,7 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
             pending = pending + weight
             lit = active & (pending > settings.color_cutoff)
             total = total + pending * dr.if_stmt(
-                (lit,), lit, step.color, lambda lit: dr.zeros(color), label="colour"
+                (lit,), lit, step.color, lambda lit: color(0), label="colour"
             )
             pending = dr.select(lit, 0, pending)
             if count:
@@ -153,7 +153,7 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
 
     start = (
         active, t0, Float(1 if offset is None else offset), quadrature.start(Float), (Float(0), Float(0)), Float(0), Float(0),
-        Float(dr.inf), Float(0), Float(0), Float(0), None if color is None else dr.zeros(color),
+        Float(dr.inf), Float(0), Float(0), Float(0), None if color is None else color(0),
         None if color is None else Float(0), Float(0) if count else None, Float(0) if count and color is not None else None,
     )
     state = dr.while_loop(start, lambda active, *_: active, body, label="march")

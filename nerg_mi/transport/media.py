@@ -121,6 +121,15 @@ class FieldMedium:
         near, far = intersect_box(o_l, d_l, self.field.box.lower, self.field.box.upper)
         return LocalRay(o_l, d_l, self.to_world.direction_to_local(d), near, far)
 
+    @property
+    def feature_count(self) -> int:
+        """Geometry features of a point, which ``density_features`` returns."""
+        return self.field.config.geometry
+
+    def to_local(self, p):
+        """Scene points in the field's coordinates."""
+        return self.to_world.point_to_local(p)
+
     def to_unit(self, p):
         """Occupancy-grid coordinates (unit cube) of local points."""
         return self.field.box.to_unit(p)
