@@ -1,0 +1,112 @@
+"""PSNR against minutes of training on real photos: the fox, every 8th photo held out, rendered by the integrator.
+
+    python benchmarks/fox_radiance.py [--minutes 1,2,4,7,10] [--width 135] [--validate] [--set hold=0.5] [--size small]
+
+One training of the last of the ``--minutes``, with the learning rate's schedule over all of it; at each of them the weights so far
+are written, the clock stopping, and scored as `nerg eval radiance` does, after training. A row for a shorter time is thus what
+a longer run has come to, not what a run of that length ends with: give a single number for that.
+``--validate`` never opens the held-out photos: every 8th of the *training* photos takes their place; choices are made with it.
+``--data DIR``: another posed image set. A CSV is written beside the printed table.
+"""
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import time
+from pathlib import Path
+
+# BLAS threads wait in a busy loop, in the way of the others.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def default_data() -> Path:
+    root = Path(os.environ.get("NERG_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    return root / "fox"
+
+
+def open_split(path: Path, width: int, validate: bool):
+    """The data set, with the held-out photos; with ``validate`` these are dropped, and every 8th training photo replaces them."""
+    from dataclasses import replace
+
+    from nerg_mi.capture.dataset import open_dataset
+
+    data = open_dataset(path, None, width)
+    if not validate:
+        return data
+    held = data.train[::8]
+    return replace(data, held_out=held, train=[v for k, v in enumerate(data.train) if k % 8])
+
+
+def parse_settings(pairs: list[str]) -> dict:
+    """``key=value`` as arguments of `RadianceSettings`."""
+    import ast
+
+    return {k: ast.literal_eval(v) for k, v in (p.split("=", 1) for p in pairs)}
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=default_data())
+    parser.add_argument("--minutes", default="1,2,4,7,10")
+    parser.add_argument("--width", type=int, default=135)
+    parser.add_argument("--size", default="small")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--validate", action="store_true")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--spp", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/fox_radiance"))
+    args = parser.parse_args(argv)
+
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    mi.set_variant("llvm_ad_rgb")
+    dr.set_thread_count(args.threads)
+    from nerg_mi.evaluation.radiance_scores import score_views
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.training.radiance import RadianceTrainer
+    from nerg_mi.training.settings import RadianceSettings, sized_config
+
+    ns = namespace("llvm_ad_rgb")
+    if not args.data.exists():
+        raise SystemExit(f"{args.data} does not exist; give a posed image set with --data")
+    data = open_split(args.data, args.width, args.validate)
+    stops = sorted(float(m) for m in args.minutes.split(","))
+    settings = RadianceSettings(minutes=stops[-1], seed=args.seed, **parse_settings(args.set))
+    args.out.mkdir(parents=True, exist_ok=True)
+    print(f"{len(data.train)} views to train on, {len(data.held_out)} to score, width {args.width}; load {os.getloadavg()[0]:.1f}")
+    begin = time.perf_counter()
+    trainer = RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
+    rows = []
+    for stop in stops:
+        while trainer.seconds < 60 * stop and trainer.progress < 1:
+            trainer.step()
+        seconds = trainer.seconds
+        path = args.out / f"{args.width}_{stop:g}.safetensors"
+        save_radiance(trainer.field(), path, {"minutes": stop, "settings": settings.to_dict()})
+        train = float(np.mean(trainer.measure(data.train[::8], 2)))
+        # What was spent on looking is no training.
+        trainer.restore(trainer.steps, trainer.rays, trainer.samples, seconds, trainer.settled, trainer.hard)
+        rows.append({"minutes": stop, "steps": trainer.steps, "ms_a_step": round(1e3 * seconds / trainer.steps, 1),
+                     "psnr_train": round(train, 2), "load": round(os.getloadavg()[0], 1), "file": path})
+        print(f"{stop:g} min: {trainer.steps} steps, training views {train:.2f} dB, load {os.getloadavg()[0]:.1f}", flush=True)
+    print(f"{'minutes':>8s} {'steps':>7s} {'ms/step':>8s} {'PSNR dB':>8s} {'SSIM':>7s} {'training dB':>12s}")
+    for row in rows:
+        scores = score_views(row["file"], data.held_out, args.spp, args.out / f"{args.width}_{row['minutes']:g}")
+        row |= {"psnr": round(scores["psnr_mean"], 3), "ssim": round(scores["ssim_mean"], 4), "file": row["file"].name}
+        print(f"{row['minutes']:8g} {row['steps']:7d} {row['ms_a_step']:8.1f} {row['psnr']:8.2f} {row['ssim']:7.4f} "
+              f"{row['psnr_train']:12.2f}", flush=True)
+    table = args.out / f"fox_radiance_{args.width}.csv"
+    with open(table, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"whole benchmark {time.perf_counter() - begin:.0f} s; wrote {table}")
+
+
+if __name__ == "__main__":
+    main()
