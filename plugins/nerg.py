@@ -199,7 +199,7 @@ from nerg_mi.registration import register
 from nerg_mi.transport import viewpoint
 from nerg_mi.transport.color import composite_to_linear
 from nerg_mi.transport.depth import KINDS
-from nerg_mi.transport.features import Featured, snapshot
+from nerg_mi.transport.features import Featured, accumulated, snapshot
 from nerg_mi.transport.march import MarchSettings
 from nerg_mi.transport.media import VolumeMedium
 from nerg_mi.transport.observer import KINDS as VISIBILITIES
@@ -237,6 +237,7 @@ class NergIntegrator(mi.SamplingIntegrator):
             raise ValueError('"observer" must be a sensor; its to_world places the observer')
         self._children = {"field": field, "density": density, "color": paint, "gaze": gaze, "observer": observer}
         self.gaze = None if gaze is None else gaze.gaze_medium()
+        _check_semantics(self.gaze, field, self.medium)
         self.observer = observer
         self.shading = Shading(_nested(props))
         self._check_observer()
@@ -409,7 +410,8 @@ class NergIntegrator(mi.SamplingIntegrator):
         distance, r_o = towards(p_o, p_d)
         sight = Sight(p_d, distance, mi.Float(1), mi.Float(0))
         if self.occlusion and not aligned:
-            looked_up = self.gaze if asked & _GAZE_AOVS <= {"gaze", "gaze_evals"} else None
+            keeps = self.gaze is not None and not self.gaze.field.config.semantic and asked & _GAZE_AOVS <= {"gaze", "gaze_evals"}
+            looked_up = self.gaze if keeps else None
             sight = self.observer_pass.look(place, ray, p_d, p_o, fuzz, surface, self.falloff, count, looked_up)
         out["visibility"] = dr.select(surface, sight.visibility, 0)
         out["observer_depth"] = dr.select(surface, sight.depth, 0)
@@ -428,13 +430,23 @@ class NergIntegrator(mi.SamplingIntegrator):
                 out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
                 out["gaze_evals"] = dr.select(unknown, networks, 0.0)
                 return sight.density_evals
-            gaze, emit, capture = self.gaze.evaluate(
-                sight.p_od, p_o, r_o, surface if asked & {"emit", "capture"} else attended
-            )
+            needed = surface if asked & {"emit", "capture"} else attended
+            semantic = self._semantic(place, sight.p_od, p_o, r_o, needed)
+            gaze, emit, capture = self.gaze.evaluate(sight.p_od, p_o, r_o, needed, semantic)
             out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
             out["emit"], out["capture"] = dr.select(surface, emit, 0), dr.select(surface, capture, 0)
             out["gaze_evals"] = dr.select(surface, networks, 0.0)
         return sight.density_evals
+
+
+    def _semantic(self, place, p_od, p_o, r_o, active):
+        """The radiance field's features of what the observer sees, for a gaze field that wants them."""
+        kind = self.gaze.field.config.semantic
+        if kind == "snapshot":
+            return snapshot(self.medium, p_od, active)
+        if kind == "accumulated":
+            return accumulated(place, mi.Ray3f(p_o, r_o), active, self.settings)
+        return None
 
 
 # ----------------------------------------------------------------------------
@@ -459,6 +471,15 @@ def _medium(field, density, color):
         if volume is not None and not isinstance(volume, mi.Volume):
             raise ValueError(f'"{name}" must be a volume')
     return VolumeMedium(density, color)
+
+
+def _check_semantics(gaze, field, medium):
+    if gaze is None or not gaze.field.config.semantic:
+        return
+    wanted = gaze.field.config.geometry
+    if field is None or medium.feature_count != wanted:
+        has = "there is none" if field is None else f"that has {medium.feature_count}"
+        raise ValueError(f'the "gaze" field asks for {wanted} semantic features of a "field", but {has}')
 
 
 def _nested(props):

@@ -25,6 +25,7 @@ from .radiance import assign, sigmoid
 VARIANTS = ("emit", "capture", "emit_capture")
 ACTIVATIONS = ("softplus", "exp", "linear")
 TRUNKS = ("relu", "layernorm", "linear")
+SEMANTICS = ("", "accumulated", "snapshot")
 
 
 def softplus(x):
@@ -54,6 +55,11 @@ class GazeConfig:
     ``trunk``: ``relu`` hands what the direction net returns to the heads through a ReLU; ``layernorm`` normalises the
     inputs of every layer, adds biases, and puts a ReLU behind the position net too (what the paper's authors train by
     default); ``linear`` has no ReLU behind either net (their other choice).
+
+    ``semantic``: what emit knows of the surface besides, or (without ``semantic_own``) instead of, the field's own
+    grid: the ``geometry`` features of a radiance field, ``accumulated`` along the observer's ray by volume rendering
+    or as a ``snapshot`` at p_od (the paper's semantic variants; ``semantic_own``, a sum of both, is their fine-tuned
+    one). Capture has none.
     """
 
     grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(finest=512))
@@ -64,8 +70,16 @@ class GazeConfig:
     sh_degree: int = 4
     emit_scale: float = 1.0
     trunk: str = "relu"
+    semantic: str = ""
+    semantic_own: bool = False
 
     def __post_init__(self):
+        if self.semantic not in SEMANTICS:
+            raise ValueError(f'the semantics of a gaze field must be one of {", ".join(SEMANTICS[1:])} or none, got "{self.semantic}"')
+        if self.semantic and self.variant == "capture":
+            raise ValueError("a gaze field of the variant capture has no emit that semantic features could go to")
+        if self.semantic_own and not self.semantic:
+            raise ValueError("semantic_own adds a field's own features to semantic ones; say which those are")
         if self.trunk not in TRUNKS:
             raise ValueError(f'the trunk of a gaze field must be one of {", ".join(TRUNKS)}, got "{self.trunk}"')
         if not 0 < self.emit_scale < float("inf"):
@@ -151,28 +165,36 @@ class GazeField:
         for name in self._NETS:
             getattr(self, name).pack()
 
-    def _trunk(self, p, d, active):
-        geometry = self.position_net(self.grid(self.box.to_unit(p), active))
-        if self.config.trunk == "layernorm":
-            geometry = [dr.maximum(g, 0) for g in geometry]
+    def _trunk(self, p, d, active, semantic=None):
+        geometry = semantic
+        if semantic is None or self.config.semantic_own:
+            geometry = self.position_net(self.grid(self.box.to_unit(p), active))
+            if self.config.trunk == "layernorm":
+                geometry = [dr.maximum(g, 0) for g in geometry]
+        if semantic is not None and self.config.semantic_own:
+            geometry = [g + s for g, s in zip(geometry, semantic)]
         hidden = self.direction_net(encode_direction(d, self.config.sh_degree) + geometry)
         return hidden if self.config.trunk == "linear" else [dr.maximum(h, 0) for h in hidden]
 
-    def emit(self, p_od, r_o, active=True):
-        """F_e(p_od, -r_o) after its activation, in 1/sr. ``r_o``: unit, from observer to surface."""
+    def emit(self, p_od, r_o, active=True, semantic=None):
+        """F_e(p_od, -r_o) after its activation, in 1/sr. ``r_o``: unit, from observer to surface. ``semantic``: list of
+        ``geometry`` features, for a field whose configuration asks for them."""
         c = self.config
-        return activate(self.emit_head(self._trunk(p_od, -r_o, active))[0], c.activation) * c.emit_scale
+        if (semantic is None) == bool(c.semantic) or (semantic is not None and len(semantic) != c.geometry):
+            raise ValueError(f"this gaze field takes {c.geometry if c.semantic else 'no'} semantic features, got "
+                             f"{'none' if semantic is None else len(semantic)}")
+        return activate(self.emit_head(self._trunk(p_od, -r_o, active, semantic))[0], c.activation) * c.emit_scale
 
     def capture(self, p_o, r_o, active=True):
         """sigmoid(F_c(p_o, r_o)), the probability that what is emitted is perceived."""
         return sigmoid(self.capture_head(self._trunk(p_o, r_o, active))[0])
 
-    def evaluate(self, p_od, p_o, r_o, active=True):
+    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None):
         """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``.
 
-        A variant that lacks a part has 1 in its place and does not evaluate it.
+        A variant that lacks a part has 1 in its place and does not evaluate it. ``semantic``: see ``emit``.
         """
         one = type(p_od.x)(1)
-        emit = one if self.config.variant == "capture" else self.emit(p_od, r_o, active)
+        emit = one if self.config.variant == "capture" else self.emit(p_od, r_o, active, semantic)
         capture = one if self.config.variant == "emit" else self.capture(p_o, r_o, active)
         return emit * capture, emit, capture

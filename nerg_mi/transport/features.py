@@ -9,6 +9,7 @@ from __future__ import annotations
 import drjit as dr
 
 from ..field.backend import namespace
+from .place import Place
 
 
 class Featured:
@@ -44,3 +45,10 @@ def snapshot(medium, p, active) -> list:
     """Features (Floats) at scene points ``p``; 0 where not ``active``."""
     features = medium.density_features(medium.to_local(p), active)[1]
     return [dr.select(active, f, 0) for f in features]
+
+
+def accumulated(place, ray, active, settings) -> list:
+    """Features (Floats) accumulated along a Mitsuba ``ray`` through ``place`` (``place.Place`` with a field)."""
+    featured = Featured(place.medium, False)
+    march = Place(featured, place.scene).look(ray, active, settings, color=featured.blank).march
+    return [dr.select(active, f, 0) for f in march.color]

@@ -263,9 +263,9 @@ class GazeMedium:
         """Arrays that gaze depends on, for derivatives."""
         return list(self.field.parameters().values())
 
-    def evaluate(self, p_od, p_o, r_o, active):
-        """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``."""
+    def evaluate(self, p_od, p_o, r_o, active, semantic=None):
+        """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``; ``semantic`` as the field wants it."""
         local = self.to_world
         return self.field.evaluate(
-            local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active
+            local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active, semantic
         )

@@ -23,8 +23,8 @@ def radiance(path, density_scale=2.0, seed=0, occupancy=None, **kwargs):
     return field
 
 
-def gaze(path, variant="emit_capture", seed=1):
-    field = GazeField.random(GazeConfig(GRID, variant, width=16, geometry=7, sh_degree=2), BOX, ns, seed)
+def gaze(path, variant="emit_capture", seed=1, **kwargs):
+    field = GazeField.random(GazeConfig(GRID, variant, width=16, geometry=7, sh_degree=2, **kwargs), BOX, ns, seed)
     table = 2 * np.random.default_rng(seed).normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
     save_gaze(field, path, {"test": seed})
