@@ -24,7 +24,8 @@ Trained gaze field (:monosp:`gazefield`)
 How much surfaces attract an observer: equation 1 of the paper,
 :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o) \cdot \mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions
 around the observer. It is the ``gaze`` of the integrator :ref:`nerg <integrator-nerg>`; having two positions for an
-argument, it cannot be evaluated as a plain volume.
+argument, it cannot be evaluated as a plain volume. A field that was trained on a radiance field's features (``nerg train
+gaze --semantic``) needs that radiance field beside it, as the integrator's ``field``.
 
 .. tabs::
     .. code-tab:: xml

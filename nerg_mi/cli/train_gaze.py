@@ -1,6 +1,7 @@
 """``nerg train gaze``: a gaze field from rays of attention, in a trained place or in one made from hit points."""
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -28,6 +29,12 @@ def train_gaze(
     gaze: Annotated[str, typer.Option("--variant", help="emit, capture or emit_capture.")] = "emit_capture",
     activation: Annotated[str, typer.Option(help="Of the emit head: softplus, exp or linear.")] = "softplus",
     size: Annotated[str, typer.Option(help="Size of the field: small or paper.")] = "small",
+    semantic: Annotated[
+        str, typer.Option(help="Give emit the features of --field: accumulated along the ray, or snapshot at the surface.")
+    ] = "",
+    semantic_own: Annotated[bool, typer.Option("--semantic-own", help="Besides the gaze field's own, not in their place.")] = False,
+    begin: Annotated[str, typer.Option(help="Weights of the trunk to begin with: random, or those of the radiance field (field).")] = "random",
+    freeze: Annotated[bool, typer.Option("--freeze", help="Do not train the weights that --begin field gives.")] = False,
     loss: Annotated[str, typer.Option(help="paper: KLD + (1 - CC) + MAE; code: MAE + 0.1 (1 - CC).")] = "paper",
     integral: Annotated[Optional[float], typer.Option(help="Weight of the error of the integral over the sphere.")] = None,
     minutes: Annotated[Optional[float], typer.Option(help="Train for this long, both fits together.")] = None,
@@ -63,11 +70,11 @@ def train_gaze(
     mi.set_variant(mode)
     if threads is not None:
         dr.set_thread_count(threads)
-    config = sized_gaze_config(size, gaze, activation)
+    _check_start(begin, freeze, semantic, field)
     given = {"learning_rate": learning_rate, "weight_decay": weight_decay, "integral": integral}
     settings = GazeSettings(
         steps=600 if steps is None and minutes is None else steps, minutes=minutes, seed=seed, loss=loss, zones=zones,
-        refit=refit, **{k: v for k, v in given.items() if v is not None},
+        refit=refit, frozen=freeze, **{k: v for k, v in given.items() if v is not None},
     )  # fmt: skip
     how = ProbeSettings(radius, probes, cap, min_rays, kappa_rule, kappa, directions)
     data, ns = Rays.load(rays), namespace(mode)
@@ -80,11 +87,30 @@ def train_gaze(
         medium, box, about["field_file"] = _trained_place(field, ns, file_sha256)
     else:
         medium, box, about["geometry_file"] = _place_of_hits(data, output, voxel, file_sha256)
+    more, initial = {"semantic": semantic, "semantic_own": semantic_own}, None
+    if begin == "field":
+        from ..training.gaze_semantics import config_like, trunk_of
+
+        config = config_like(medium.field.config, gaze, activation, **more)
+        initial, about["begins_as"] = trunk_of(medium.field, config), field.name
+    else:
+        config = replace(sized_gaze_config(size, gaze, activation), **more)
+        if semantic:
+            config = replace(config, geometry=medium.feature_count)
     with _Bar() as bar:
-        trained, provenance = train_gaze(data, medium, box, config, settings, how, ns, _similarity(align), bar.update)
+        trained, provenance = train_gaze(data, medium, box, config, settings, how, ns, _similarity(align), bar.update, initial)
     save_gaze(trained, output, {**about, **provenance}, half)
     _report(provenance)
     typer.echo(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
+
+
+def _check_start(begin: str, freeze: bool, semantic: str, field: Path | None) -> None:
+    if begin not in ("random", "field"):
+        raise ValueError(f'--begin must be "random" or "field", got "{begin}"')
+    if freeze and begin != "field":
+        raise ValueError("--freeze keeps the weights that --begin field gives; add it, or leave --freeze out")
+    if field is None and (semantic or begin == "field"):
+        raise ValueError(f'{"--semantic" if semantic else "--begin field"} needs a radiance field: give it with --field')
 
 
 def _trained_place(path: Path, ns, sha256):

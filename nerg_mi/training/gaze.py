@@ -33,17 +33,22 @@ class GazeTrainer:
     """One run: state, ``step()``, ``measure()``, and ``field()`` for what it has come to.
 
     ``supervision``: what to learn from; ``box``: where the field lives, in the same frame; ``schedule``: steps that the
-    learning rate's schedule spans, where that is not ``settings``' own length. Equal seeds draw equal batches; sums over
+    learning rate's schedule spans, where that is not ``settings``' own length; ``initial``: arrays to begin with in
+    place of random ones, which with ``settings.frozen`` stay as they are. Equal seeds draw equal batches; sums over
     threads are not ordered, so that weights agree between runs to rounding (and bit for bit only with one thread).
     """
 
     def __init__(self, supervision: Supervision, box: Box, config: GazeConfig, settings: GazeSettings, ns,
-                 schedule: int | None = None):
+                 schedule: int | None = None, initial: dict | None = None):
         self.config, self.settings, self.box, self.ns = config, settings, box, ns
         self.rng = np.random.default_rng(settings.seed)
         self.data, self._schedule = _Samples(supervision, ns), schedule
         self.initial = GazeField.random(config, box, ns, settings.seed)
-        self.optimiser = AdamW(settings.learning_rate, used_parameters(config, self.initial.parameters()),
+        if initial:
+            self.initial.set_parameters(initial)
+        self.constant = dict(initial or {}) if settings.frozen else {}
+        trained = {k: v for k, v in used_parameters(config, self.initial.parameters()).items() if k not in self.constant}
+        self.optimiser = AdamW(settings.learning_rate, trained,
                                beta_2=0.99, epsilon=1e-15, weight_decay=settings.weight_decay)
         self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.optimiser.items()}
         self.steps, self.loss = 0, None
@@ -70,7 +75,7 @@ class GazeTrainer:
             which = np.argpartition(self.rng.random((probes, data.count)), D, axis=1)[:, :D]
         else:
             which = np.broadcast_to(np.arange(D), (probes, D))
-        prediction, truth = data.evaluate(self.config, self.box, self.optimiser, probe, which)
+        prediction, truth = data.evaluate(self.config, self.box, {**self.constant, **dict(self.optimiser.items())}, probe, which)
         self.loss = gaze_loss(prediction, truth, D, **LOSSES[s.loss])
         total = self.loss.total
         if s.integral:
@@ -94,7 +99,7 @@ class GazeTrainer:
         with dr.suspend_grad():
             for a in range(0, data.probes, block):
                 probe = np.arange(a, min(a + block, data.probes))
-                prediction, truth = data.evaluate(self.config, self.box, weights or self.averaged, probe,
+                prediction, truth = data.evaluate(self.config, self.box, {**self.constant, **(weights or self.averaged)}, probe,
                                                   np.broadcast_to(which, (len(probe), data.count)))
                 parts = gaze_loss(prediction, truth, data.count)
                 integral = _integral(prediction, data.count)
@@ -113,7 +118,7 @@ class GazeTrainer:
     def field(self, weights: dict | None = None) -> GazeField:
         """The field with the averaged weights (or ``weights``)."""
         out = GazeField.random(self.config, self.box, self.ns, self.settings.seed)
-        out.set_parameters(weights or self.weights())
+        out.set_parameters({**self.constant, **(weights or self.weights())})
         return out
 
 
@@ -132,6 +137,9 @@ class _Samples:
         flat = lambda v: ns.Float(np.ascontiguousarray(v, np.float32).ravel())
         self._positions, self._directions = flat(s.positions), flat(s.directions)
         self._truth, self._distance = flat(s.truth), flat(s.distance)
+        self._features = 0 if s.semantic is None else s.semantic.shape[-1]
+        if self._features:
+            self._semantic = ns.Float16(np.ascontiguousarray(s.semantic).ravel())
 
     def evaluate(self, config, box, parameters, probe: np.ndarray, which: np.ndarray):
         """``(prediction, truth)`` in directions ``which`` (B, D) of the probes ``probe`` (B,), flat."""
@@ -140,6 +148,9 @@ class _Samples:
         index = ns.UInt32((probe[:, None] * self.count + which).astype(np.uint32).ravel())
         p_o, r_o = dr.gather(ns.Array3f, self._positions, at), dr.gather(ns.Array3f, self._directions, index)
         p_od = dr.gather(ns.Array3f, self._positions, index // self.count) + r_o * dr.gather(ns.Float, self._distance, index)
-        names = [k for k in parameters.keys()]
-        prediction = gaze_density(config, box, {k: parameters[k] for k in names}, p_od, p_o, r_o, ns)
+        semantic = None
+        if config.semantic:
+            F = self._features
+            semantic = [ns.Float(dr.gather(ns.Float16, self._semantic, index * F + k)) for k in range(F)]
+        prediction = gaze_density(config, box, parameters, p_od, p_o, r_o, ns, semantic)
         return prediction, dr.gather(ns.Float, self._truth, index)

@@ -15,11 +15,11 @@ from ..field.radiance import sigmoid
 from .model import stack, unstack
 
 
-def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, ns):
+def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, ns, semantic: list | None = None):
     """Gaze (1/sr) of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D for each in turn) at ``p_od``.
 
     The same maths as ``GazeField.evaluate`` on ``parameters`` spelt as the field spells them. Gradients reach every entry
-    that the variant uses.
+    that the variant uses. ``semantic``: features (Floats, a lane a direction) where ``config`` wants them.
     """
     def net(name):
         count = sum(k.startswith(name + ".") for k in parameters)
@@ -37,9 +37,14 @@ def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o,
         # Expand: every thread adds to a copy of the table of its own; a fraction of the cost of atomics.
         return unstack(position.tensor(stack(grid(box.to_unit(p), True, dr.ReduceMode.Expand), ns)), ns)
 
+    def surface():
+        if semantic is None:
+            return geometry(p_od)
+        return [g + s for g, s in zip(geometry(p_od), semantic)] if config.semantic_own else semantic
+
     gaze = ns.Float(1)
     if config.variant != "capture":
-        gaze *= activate(head("emit_head", geometry(p_od), -r_o), config.activation) * config.emit_scale
+        gaze *= activate(head("emit_head", surface(), -r_o), config.activation) * config.emit_scale
     if config.variant != "emit":
         gaze *= sigmoid(head("capture_head", [dr.repeat(g, repeats) for g in geometry(p_o)], r_o))
     return gaze

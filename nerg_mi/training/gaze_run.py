@@ -60,7 +60,7 @@ def hold_out(rays: Rays, radius: float, zones: int, positions: int, seed: int = 
 
 def train_gaze(
     rays: Rays, medium, box: Box, config: GazeConfig, settings: GazeSettings, probes: ProbeSettings, ns: ModuleType,
-    align: Similarity | None = None, on_progress: Callable[[GazeProgress], None] | None = None,
+    align: Similarity | None = None, on_progress: Callable[[GazeProgress], None] | None = None, initial: dict | None = None,
 ) -> tuple[GazeField, dict]:
     """Train a gaze field on ``rays`` in a place; returns it and its provenance (JSON).
 
@@ -68,7 +68,8 @@ def train_gaze(
     similarity ``align`` takes the rays. Some zones of positions are held out, purged by 2R, and watched: the weights that
     score best there count (the loss that is trained), and the run ends when they get no better. With ``settings.refit`` a
     second fit then uses all rays for as many steps; the scores stay those of the first. Ctrl-C ends the run early with
-    what it has come to. Raises ``ValueError`` when the rays make no probe.
+    what it has come to. ``initial``: arrays to begin with (``gaze_semantics.trunk_of``). Raises ``ValueError`` when the
+    rays make no probe.
     """
     say = on_progress or (lambda state: None)
     started = time.perf_counter()
@@ -79,16 +80,16 @@ def train_gaze(
                                   min_rays=probes.min_rays, seed=settings.seed + 1)
         learn, held = rays.select(split.train), int((~split.train).sum())
         # With all rays around them: what is scored is what people there really looked at.
-        watched = supervise_rays(rays, medium, box, probes, align, split.test_centres, settings.seed + 2)
-    supervision = supervise_rays(learn, medium, box, probes, align, seed=settings.seed)
+        watched = supervise_rays(rays, medium, box, probes, align, split.test_centres, settings.seed + 2, config.semantic)
+    supervision = supervise_rays(learn, medium, box, probes, align, seed=settings.seed, semantic=config.semantic)
     prepared = time.perf_counter() - started
 
     refit = settings.refit and watched is not None
-    fit = _fit(supervision, watched, box, config, settings, ns, say, 0.5 if refit else 1.0)
+    fit = _fit(supervision, watched, box, config, settings, ns, say, 0.5 if refit else 1.0, initial)
     first, last, used = fit, fit, supervision
     if refit and not fit.interrupted:
-        used = supervise_rays(rays, medium, box, probes, align, seed=settings.seed)
-        last = _refit(used, box, config, settings, ns, say, first)
+        used = supervise_rays(rays, medium, box, probes, align, seed=settings.seed, semantic=config.semantic)
+        last = _refit(used, box, config, settings, ns, say, first, initial)
     field = last.trainer.field(last.weights)
     provenance = {
         "settings": settings.to_dict(),
@@ -113,12 +114,12 @@ def train_gaze(
     return field, provenance
 
 
-def _fit(supervision: Supervision, watched: Supervision | None, box, config, settings, ns, say, share: float) -> _Fit:
+def _fit(supervision: Supervision, watched: Supervision | None, box, config, settings, ns, say, share: float, initial) -> _Fit:
     """Train until the schedule ends, or validation has not improved for ``patience`` looks. ``share``: of the minutes."""
     timed = settings.minutes is not None
     if timed:
         settings = _with(settings, minutes=settings.minutes * share)
-    trainer = GazeTrainer(supervision, box, config, settings, ns)
+    trainer = GazeTrainer(supervision, box, config, settings, ns, initial=initial)
     out = _Fit(trainer, {}, 0, settings.steps or 0, None, [], False)
     looks, since, recent = np.arange(1, settings.looks + 1) / settings.looks, 0, None
     next_look = 0
@@ -145,9 +146,9 @@ def _fit(supervision: Supervision, watched: Supervision | None, box, config, set
     return out
 
 
-def _refit(supervision: Supervision, box, config, settings, ns, say, first: _Fit) -> _Fit:
+def _refit(supervision: Supervision, box, config, settings, ns, say, first: _Fit, initial) -> _Fit:
     """As many steps as were best, along the same schedule."""
-    trainer = GazeTrainer(supervision, box, config, _with(settings, steps=first.best_step, minutes=None), ns, first.schedule)
+    trainer = GazeTrainer(supervision, box, config, _with(settings, steps=first.best_step, minutes=None), ns, first.schedule, initial)
     interrupted = False
     try:
         while trainer.steps < first.best_step:

@@ -82,7 +82,7 @@ class GazeSettings:
     which are the result. ``looks``: how often in a run the validation is looked at; ``patience``: looks without an
     improvement after which the run ends (0: never). ``zones``, ``watched``: of the validation, groups of positions
     and probes in them; no zones, no validation. ``refit``: train again on all rays, the validation's too, for as many
-    steps as were best.
+    steps as were best. ``frozen``: weights that were given to begin with are not trained.
     """
 
     steps: int | None = None
@@ -102,6 +102,7 @@ class GazeSettings:
     zones: int = 3
     watched: int = 60
     refit: bool = True
+    frozen: bool = False
 
     def __post_init__(self):
         if (self.steps is None) == (self.minutes is None):

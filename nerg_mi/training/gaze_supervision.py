@@ -15,6 +15,7 @@ from ..attention.sphere import fibonacci_directions
 from ..field.box import Box
 from ..transport.media import Similarity
 from ..transport.trace import trace_depth
+from .gaze_semantics import semantic_features
 from .gaze_settings import ProbeSettings
 
 # Opacity from which on a ray has met a surface; the integrator's default.
@@ -26,7 +27,8 @@ class Supervision:
     """P probes with D directions of equal area each, in the field's frame and units, float32.
 
     ``positions`` (P, 3), the observers p_o; ``directions`` (P, D, 3), unit, r_o; ``truth`` (P, D), 1/sr; ``distance``
-    (P, D), from p_o to p_od; ``escaped`` (P, D) bool: no surface was met, and p_od is where the box ends.
+    (P, D), from p_o to p_od; ``escaped`` (P, D) bool: no surface was met, and p_od is where the box ends. ``semantic``
+    (P, D, F), float16: features of a radiance field, for a gaze field that wants them.
     """
 
     positions: np.ndarray
@@ -34,6 +36,7 @@ class Supervision:
     truth: np.ndarray
     distance: np.ndarray
     escaped: np.ndarray
+    semantic: np.ndarray | None = None
 
     @property
     def escape_share(self) -> float:
@@ -47,12 +50,13 @@ class Supervision:
 
 
 def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | None = None, kind: str = "median",
-              seed: int = 0) -> Supervision:
+              seed: int = 0, semantic: str = "") -> Supervision:
     """Directions, true densities and surfaces of ``probes``.
 
     ``medium``: what depths are traced in (``FieldMedium`` or ``VolumeMedium``) and ``box``, where the gaze field will
     live: both in the field's frame. ``count``: directions a probe, a Fibonacci set under a rotation of its own, so that
     together the probes see what one set leaves out. ``align``: similarity from the rays' frame to the field's.
+    ``semantic``: which features of ``medium`` to keep (``field.gaze.SEMANTICS``).
     """
     align = align or Similarity()
     directions = rotated_sets(count, len(probes), np.random.default_rng(seed))
@@ -61,16 +65,21 @@ def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | 
     positions = probes.positions @ align.matrix[:3, :3].T + align.matrix[:3, 3]
     turned = directions @ rotation.T
     distance, escaped = surfaces(medium, box, positions, turned, kind)
-    return Supervision(positions.astype(np.float32), turned.astype(np.float32), truth, distance, escaped)
+    features = None
+    if semantic:
+        origins = np.repeat(positions, count, axis=0)
+        features = semantic_features(medium, origins, turned.reshape(-1, 3), distance.ravel(), semantic)
+        features = features.reshape(len(positions), count, -1)
+    return Supervision(positions.astype(np.float32), turned.astype(np.float32), truth, distance, escaped, features)
 
 
 def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align: Similarity | None = None,
-                   queries: np.ndarray | None = None, seed: int = 0) -> Supervision:
+                   queries: np.ndarray | None = None, seed: int = 0, semantic: str = "") -> Supervision:
     """Probes on ``rays``, at ``queries`` (P, 3) metres where given, and what ``supervise`` makes of them."""
     s = settings
     probes = place_probes(rays, s.radius, count=s.count, queries=queries, cap=s.cap, min_rays=min(s.min_rays, s.cap),
                           kappa_rule=s.kappa_rule, kappa=s.kappa, seed=seed)
-    return supervise(probes, medium, box, s.directions, align, s.depth, seed)
+    return supervise(probes, medium, box, s.directions, align, s.depth, seed, semantic)
 
 
 def surfaces(medium, box: Box, positions, directions, kind: str = "median") -> tuple[np.ndarray, np.ndarray]:
