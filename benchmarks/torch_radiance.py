@@ -1,0 +1,295 @@
+"""Our trainer beside a plain PyTorch trainer of the same model: steps a second, and PSNR after equal minutes.
+
+    python benchmarks/torch_radiance.py [--minutes 2] [--width 135] [--validate] [--data DIR]
+
+Same grid, networks, initial weights, rays, step table, occupancy grid, density pass, losses, optimiser and schedule, on the same
+machine in the same run, one after the other; the peer is eager PyTorch, gathers and sums, autograd. Before they start, both
+evaluate the same random points, and the program stops if they differ. Without our trainer's extras: cleared cells, and the settling
+of the grid, which are switched off in both. Both fields are scored by the integrator, under the occupancy found in the same way.
+"""
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import sys
+import time
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import numpy as np  # noqa: E402
+from fox_radiance import default_data, open_split  # noqa: E402
+
+_PRIMES = (1, 2654435761, 805459861)
+
+
+class TorchModel:
+    """Hash grid and networks, evaluated as torch-ngp's fallback does: eight gathers a level, weighted and summed."""
+
+    def __init__(self, field):
+        import torch
+
+        self.torch, self.config, self.box = torch, field.config, field.box
+        self.weights = {k: torch.from_numpy(np.array(v.numpy())).requires_grad_() for k, v in field.parameters().items()}
+        g = field.config.grid
+        self.scales, self.rows, self.offsets = g.level_scales(), g.level_rows(), g.offsets()
+        self.hashed = [(int(np.ceil(s)) + 2) ** 3 > r for s, r in zip(self.scales, self.rows)]
+        self.corners = torch.tensor(list(np.ndindex(2, 2, 2)))
+        self.center = torch.tensor(field.box.center, dtype=torch.float32)
+
+    def encode(self, p):
+        torch = self.torch
+        u = ((p - self.center) / self.box.side + 0.5).clamp(0, 1)
+        table, out = self.weights["grid.table"].view(-1, self.config.grid.features), []
+        for scale, rows, offset, hashed in zip(self.scales, self.rows, self.offsets, self.hashed):
+            x = u * float(scale) + 0.5
+            cell = x.floor()
+            w = (x - cell)[:, None]
+            vertex = cell.long()[:, None] + self.corners
+            stride = int(np.ceil(scale)) + 2
+            steps = _PRIMES if hashed else (1, stride, stride**2)
+            a, b, c = (vertex[..., k] * steps[k] for k in range(3))
+            row = ((a ^ b ^ c) & 0xFFFFFFFF) % rows if hashed else a + b + c
+            weight = torch.where(self.corners.bool(), w, 1 - w).prod(-1)
+            out.append((table[row + offset] * weight[..., None]).sum(1))
+        return torch.cat(out, 1)
+
+    def _net(self, name, x):
+        layers = [w for k, w in self.weights.items() if k.startswith(name + ".")]
+        for i, w in enumerate(layers):
+            x = x @ w.T
+            x = x.relu() if i + 1 < len(layers) else x
+        return x
+
+    def sigma(self, p):
+        return self.config.density_scale * self._net("density_net", self.encode(p))[:, 0].clamp(max=30).exp()
+
+    def sigma_color(self, p, harmonics):
+        torch = self.torch
+        h = self._net("density_net", self.encode(p))
+        color = self._net("color_net", torch.cat([harmonics, h[:, 1:]], 1)).sigmoid()
+        return self.config.density_scale * h[:, 0].clamp(max=30).exp(), color
+
+
+def harmonics(d):
+    """Real spherical harmonics to degree 3, (N, 16), of unit directions (N, 3), as torch-ngp has them."""
+    import torch
+
+    x, y, z = d.unbind(1)
+    xx, yy, zz = x * x, y * y, z * z
+    return torch.stack([
+        torch.full_like(x, 0.28209479), -0.48860251 * y, 0.48860251 * z, -0.48860251 * x,
+        1.09254843 * x * y, -1.09254843 * y * z, 0.94617470 * zz - 0.31539157, -1.09254843 * x * z, 0.54627422 * (xx - yy),
+        0.59004359 * y * (yy - 3 * xx), 2.89061144 * x * y * z, 0.45704580 * y * (1 - 5 * zz),
+        0.37317633 * z * (5 * zz - 3), 0.45704580 * x * (1 - 5 * zz), 1.44530572 * z * (xx - yy), 0.59004359 * x * (3 * yy - xx),
+    ], 1)
+
+
+class TorchTrainer:
+    """The scheme of ``nerg_mi.training``, in eager PyTorch. ``ours``: a trainer that has made no step, to start as it does."""
+
+    def __init__(self, ours, views):
+        import torch
+
+        self.torch, self.s, self.ours = torch, ours.settings, ours
+        self.model = TorchModel(ours.live)
+        self.averaged = {k: v.detach().clone() for k, v in self.model.weights.items()}
+        self.optimiser = torch.optim.Adam(self.model.weights.values(), lr=self.s.learning_rate, betas=(0.9, 0.99), eps=1e-15)
+        from nerg_mi.capture.cameras import pixel_directions
+
+        o, d, c = [], [], []
+        for v in views:
+            e = (pixel_directions(v.camera.intrinsics).reshape(-1, 3) @ v.camera.to_world[:3, :3].T).astype(np.float32)
+            d.append(e)
+            o.append(np.broadcast_to(v.camera.center.astype(np.float32), e.shape))
+            c.append(v.color[..., :3].reshape(-1, 3))
+        self.o, self.d, self.c = (torch.from_numpy(np.concatenate(a).astype(np.float32)) for a in (o, d, c))
+        self.edges = {k: torch.from_numpy(np.array(ours.table(k).edges.numpy())) for k in (*self.s.strides, 1)}
+        g = ours.grid
+        self.seen, self.value, self.bits = (torch.from_numpy(np.array(x.numpy())) for x in (g.seen, g.value, g.bits))
+        self.bits, self.turn, self.r = self.bits.bool(), 0, g.resolution
+        self.lower = self.model.center - ours.box.side / 2
+        self.low, self.high = (torch.tensor(x, dtype=torch.float32) for x in (ours.box.lower, ours.box.upper))
+        self.generator = torch.Generator().manual_seed(self.s.seed)
+        self.steps, self.rays, self.begin = 0, 256, time.perf_counter()
+
+    @property
+    def seconds(self):
+        return time.perf_counter() - self.begin
+
+    @property
+    def progress(self):
+        return min(1.0, self.seconds / (60 * self.s.minutes))
+
+    def cell(self, p):
+        c = ((p - self.lower) / self.ours.box.side * self.r).long().clamp(0, self.r - 1)
+        return c[..., 0] + self.r * (c[..., 1] + self.r * c[..., 2])
+
+    def update(self):
+        torch, r = self.torch, self.r
+        index = torch.arange(self.turn % 8, r**3, 8)
+        index = index[self.seen[index]]
+        self.turn += 1
+        corner = torch.stack([index % r, index // r % r, index // r**2], 1)
+        p = self.lower + (corner + torch.rand(len(index), 3, generator=self.generator)) / r * self.ours.box.side
+        with torch.no_grad():
+            new = (self.model.sigma(p) * self.ours.grid.step).clamp(max=10)
+        self.value[index] = torch.maximum(self.value[index] * 0.6, new)
+        bound = min(self.ours.grid.threshold, 0.5 * float(self.value.sum()) / int(self.seen.sum()))
+        self.bits = self.seen & (self.value > bound)
+
+    def samples(self, o, d, stride):
+        """Ray, start, length and midpoint of the steps that matter, ray after ray."""
+        torch, s = self.torch, self.s
+        t = torch.stack([(self.low - o) / d, (self.high - o) / d])
+        t0, t1 = t.amin(0).amax(1).clamp(min=s.near * self.ours.box.side), t.amax(0).amin(1)
+        e = self.edges[stride]
+        u = torch.rand(len(o), 1, generator=self.generator)
+        start = torch.lerp(e[:-2], e[1:-1], u)
+        length = torch.lerp(e[1:-1], e[2:], u) - start
+        middle = start + 0.5 * length
+        ray, k = ((middle > t0[:, None]) & (middle < t1[:, None])).nonzero(as_tuple=True)
+        p = o[ray] + d[ray] * middle[ray, k][:, None]
+        kept = self.bits[self.cell(p)]
+        ray, k, p = ray[kept], k[kept], p[kept]
+        t, length = start[ray, k], length[ray, k]
+        with torch.no_grad():
+            tau = (self.model.sigma(p) * length).clamp(max=60)
+        kept = (-self.before(tau, ray)).exp() > s.stop
+        return ray[kept], t[kept], length[kept], p[kept]
+
+    def before(self, x, ray):
+        """Sum over the earlier samples of the same ray, float64 within."""
+        torch = self.torch
+        running = torch.cumsum(x.double(), 0) - x.double()
+        first = torch.ones_like(ray, dtype=torch.bool)
+        first[1:] = ray[1:] != ray[:-1]
+        start = torch.cummax(torch.where(first, torch.arange(len(ray)), 0), 0).values
+        return (running - running[start]).float()
+
+    def step(self):
+        torch, s = self.torch, self.s
+        if self.steps % s.grid_every == 0 and self.steps:
+            self.update()
+        index = torch.randint(len(self.o), (self.rays,), generator=self.generator)
+        o, d, truth = self.o[index], self.d[index], self.c[index]
+        ray, _, length, p = self.samples(o, d, s.stride(self.steps))
+        self.steps += 1
+        covered = self.rays
+        if len(ray) > s.batch:
+            covered = int(ray[s.batch])
+            kept = ray < covered
+            ray, length, p = ray[kept], length[kept], p[kept]
+        if len(ray):
+            self.descend(d, truth, ray, length, p, covered)
+        wanted = 0.95 * s.batch / max(len(ray) / max(covered, 1), 1e-3)
+        self.rays = int(np.clip(min(max(0.5 * (self.rays + wanted), self.rays / 2), 2 * self.rays), 64, 2**14))
+
+    def descend(self, d, truth, ray, length, p, covered):
+        torch, s = self.torch, self.s
+        sigma, rgb = self.model.sigma_color(p, harmonics(d[ray]))
+        tau = (sigma * length).clamp(max=60)
+        weight = (-self.before(tau, ray)).exp() * -torch.expm1(-tau)
+        color = torch.zeros(covered, 3).index_add(0, ray, weight[:, None] * rgb)
+        opacity = torch.zeros(covered).index_add(0, ray, weight)
+        background = torch.rand(covered, 3, generator=self.generator)
+        error = (color + (1 - opacity)[:, None] * background - truth[:covered]).abs()
+        loss = torch.where(error < s.huber, 0.5 * error**2, s.huber * (error - 0.5 * s.huber)).mean(1).mean()
+        self.optimiser.zero_grad()
+        loss.backward()
+        for group in self.optimiser.param_groups:
+            group["lr"] = s.rate(self.progress)
+        self.optimiser.step()
+        if self.steps % 4 == 0:
+            decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** 4
+            for k, v in self.averaged.items():
+                v.lerp_(self.model.weights[k].detach(), 1 - decay)
+
+
+def same_model(trainer, peer) -> float:
+    """Largest relative difference of densities, and of colours, at random points."""
+    import drjit as dr
+    import torch
+    from nerg_mi.training.model import density_color
+
+    rng = np.random.default_rng(0)
+    p = rng.uniform(trainer.box.lower, trainer.box.upper, (4096, 3)).astype(np.float32)
+    d = rng.normal(size=p.shape).astype(np.float32)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    ns = trainer.ns
+    scaled = {k: dr.detach(v) * (3e3 if k == "grid.table" else 1) for k, v in trainer.live.parameters().items()}
+    old = {k: v.detach().clone() for k, v in peer.weights.items()}
+    with torch.no_grad():
+        peer.weights["grid.table"] *= 3e3
+        theirs = peer.sigma_color(torch.from_numpy(p), harmonics(torch.from_numpy(d)))
+        peer.weights["grid.table"].copy_(old["grid.table"])
+    ours = density_color(trainer.config, trainer.box, scaled, ns.Array3f(p.T), ns.Array3f(d.T), ns)
+    a, b = ours[0].numpy(), np.stack([c.numpy() for c in ours[1]], 1)
+    return max(float(np.abs(a / theirs[0].numpy() - 1).max()), float(np.abs(b - theirs[1].numpy()).max()))
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=default_data())
+    parser.add_argument("--minutes", type=float, default=2.0)
+    parser.add_argument("--width", type=int, default=135)
+    parser.add_argument("--size", default="small")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--validate", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/torch_radiance"))
+    args = parser.parse_args(argv)
+
+    import drjit as dr
+    import mitsuba as mi
+    import torch
+
+    mi.set_variant("llvm_ad_rgb")
+    dr.set_thread_count(args.threads)
+    torch.set_num_threads(args.threads)
+    from nerg_mi.evaluation.radiance_scores import score_views
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.training.radiance import RadianceTrainer
+    from nerg_mi.training.settings import RadianceSettings, sized_config
+
+    ns = namespace("llvm_ad_rgb")
+    data = open_split(args.data, args.width, args.validate)
+    if any(v.has_alpha or v.mask is not None for v in data.train):
+        raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
+    settings = RadianceSettings(minutes=args.minutes, settle=2.0, empty_weight=0.0)
+    make = lambda: RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
+    args.out.mkdir(parents=True, exist_ok=True)
+    ours, judge = make(), make()
+    peer = TorchTrainer(judge, data.train)
+    difference = same_model(ours, peer.model)
+    print(f"same weights, same points: densities and colours differ by {difference:.1e} at most")
+    if not difference < 1e-3:
+        raise SystemExit("the two are not the same model")
+    rows = []
+    for name, trainer in (("nerg_mi", ours), ("PyTorch", peer)):
+        load = os.getloadavg()[0]
+        for _ in range(3):  # compiled, and warm
+            trainer.step()
+        trainer._started = trainer.begin = time.perf_counter() - 1e-3
+        while trainer.progress < 1:
+            trainer.step()
+        seconds, steps = trainer.seconds, trainer.steps
+        if trainer is peer:
+            judge.averaged = {k: type(v)(peer.averaged[k].numpy()) for k, v in judge.averaged.items()}
+        path = args.out / f"{name}.safetensors"
+        save_radiance((judge if trainer is peer else ours).field(), path, {"trainer": name})
+        scores = score_views(path, data.held_out)
+        rows.append({"trainer": name, "minutes": args.minutes, "steps": steps, "steps_per_s": round(steps / seconds, 2),
+                     "psnr": round(scores["psnr_mean"], 2), "ssim": round(scores["ssim_mean"], 4), "load_before": round(load, 1)})
+        print(rows[-1], flush=True)
+    print(f"steps a second: {rows[0]['steps_per_s'] / rows[1]['steps_per_s']:.1f} times PyTorch's")
+    with open(args.out / "torch_radiance.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
