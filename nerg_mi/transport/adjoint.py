@@ -196,7 +196,7 @@ class _March(dr.CustomOp):
             lit = active & (weight > 0)
             painted = dr.select(lit, step.color(lit), 0)
             total = total + weight * dr.detach(painted)
-        before = active & (tau + dtau < goal)
+        before = active & (tau_after < goal)
         crosses = active & ~before & (tau < goal)
         crossing = begin + step.crossing(dr.select(crosses, goal - tau, 0))
         replayed = _Replayed(active, step.dtau, mean, painted, transmittance, before, crosses, crossing)

@@ -129,7 +129,9 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
         step = quadrature.step(medium, ray, t, delta, t_next, carry, active, color)
         weight = dr.exp(-tau) * absorbed_share(step.dtau)
         moment, lost_moment = add(moment, lost[1], weight * dr.fma(delta, step.share, t - t0))
-        crosses = active & (tau < goal) & (tau + step.dtau >= goal)
+        # The sum that the next step starts from: a goal between it and a plain sum would be crossed by no step.
+        after, lost_tau = add(tau, lost[0], step.dtau)
+        crosses = active & (tau < goal) & (after >= goal)
         half = dr.select(crosses, t + step.crossing(goal - tau), half)
         slope = dr.select(crosses, delta / dr.select(crosses, step.dtau, 1), slope)
         enter, enter_tau = dr.select(crosses, t, enter), dr.select(crosses, tau, enter_tau)
@@ -146,7 +148,7 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
         if count:
             n = n + step.evals
 
-        tau, lost_tau = add(tau, lost[0], step.dtau)
+        tau = after
         active = active & (t_next < t1) & (tau < end)
         return (active, t_next, Float(1), step.carry, (lost_tau, lost_moment), tau, moment, half, slope, enter, enter_tau,
                 total, pending, n, m)

@@ -312,3 +312,16 @@ def test18_colour_only_where_the_weight_counts(rgb):
 def test19_nothing_is_counted_unless_asked(rgb):
     r = run(rgb, slab(rgb, 1, 1), (0.5, 0.5, 0), (0, 0, 1))
     assert r.density_evals is None and r.color_evals is None and r.color is None
+
+
+@pytest.mark.parametrize("quadrature", ["constant", "linear"])
+def test20_no_goal_falls_between_two_sums(rgb, quadrature):
+    sigma, n = 2.9, 1000
+    # Goals within some spacings of floats around the optical depth at each step's end.
+    t = np.add.accumulate(np.concatenate([[np.float32(1)], np.full(n - 1, np.float32(1 / n))]), dtype=np.float32)[1:]
+    goals = np.float32(sigma * (t.astype(float) - 1))[:, None]
+    goals = (goals + np.arange(-8, 9) * np.spacing(goals)).astype(np.float32).ravel()
+    medium = slab(rgb, sigma, 1)
+    r = run(rgb, medium, np.tile(np.float32([0.5, 0.5, 0]), (len(goals), 1)), np.tile(np.float32([0, 0, 1]), (len(goals), 1)),
+            MarchSettings(1 / n, quadrature=quadrature), until=rgb.Float(goals))  # fmt: skip
+    assert np.allclose(np.array(r.half), 1 + goals / sigma, rtol=1e-6)
