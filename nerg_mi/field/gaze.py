@@ -56,6 +56,9 @@ class GazeConfig:
     inputs of every layer, adds biases, and puts a ReLU behind the position net too (what the paper's authors train by
     default); ``linear`` has no ReLU behind either net (their other choice).
 
+    ``normalized``: the density is divided by its integral over the observer's sphere wherever it is evaluated, so that it
+    integrates to one whatever the weights are.
+
     ``semantic``: what emit knows of the surface besides, or (without ``semantic_own``) instead of, the field's own
     grid: the ``geometry`` features of a radiance field, ``accumulated`` along the observer's ray by volume rendering
     or as a ``snapshot`` at p_od (the paper's semantic variants; ``semantic_own``, a sum of both, is their fine-tuned
@@ -72,6 +75,7 @@ class GazeConfig:
     trunk: str = "relu"
     semantic: str = ""
     semantic_own: bool = False
+    normalized: bool = False
 
     def __post_init__(self):
         if self.semantic not in SEMANTICS:
@@ -189,12 +193,24 @@ class GazeField:
         """sigmoid(F_c(p_o, r_o)), the probability that what is emitted is perceived."""
         return sigmoid(self.capture_head(self._trunk(p_o, r_o, active))[0])
 
-    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None):
-        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``.
+    def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
+        """``(emit, capture)``, whose product a normalised field divides by its integral; ``escaped`` makes no difference.
 
         A variant that lacks a part has 1 in its place and does not evaluate it. ``semantic``: see ``emit``.
         """
         one = type(p_od.x)(1)
         emit = one if self.config.variant == "capture" else self.emit(p_od, r_o, active, semantic)
-        capture = one if self.config.variant == "emit" else self.capture(p_o, r_o, active)
+        return emit, one if self.config.variant == "emit" else self.capture(p_o, r_o, active)
+
+    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None):
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``.
+
+        ``semantic``: see ``emit``. ``integral``: of a normalised field over the sphere at ``p_o``
+        (``transport.gaze_integral``), by which ``emit`` is divided; ``ValueError`` without it.
+        """
+        emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic)
+        if self.config.normalized:
+            if integral is None:
+                raise ValueError("this gaze field is normalised over the observer's sphere: evaluating it needs its integral there")
+            emit = emit / integral
         return emit * capture, emit, capture

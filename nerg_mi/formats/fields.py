@@ -16,6 +16,7 @@ from ..field.box import Box
 from ..field.cascades import CascadeGrid
 from ..field.gaze import GazeConfig, GazeField
 from ..field.hashgrid import HashGrid
+from ..field.log_gaze import LogGazeConfig, LogGazeField
 from ..field.mlp import MLP
 from ..field.occupancy import OccupancyGrid
 from ..field.radiance import RadianceConfig, RadianceField
@@ -112,10 +113,12 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
     return field, meta
 
 
-def save_gaze(field: GazeField, path: str | Path, provenance: dict, half: bool = False) -> None:
+def save_gaze(field: GazeField | LogGazeField, path: str | Path, provenance: dict, half: bool = False) -> None:
     """Write ``field``; ``provenance`` (JSON) says what it was trained on and with."""
+    c = field.config
     metadata = {
-        "architecture": field.config.to_dict(),
+        "architecture": c.to_dict(),
+        "output": {"activation": c.activation, "normalized": c.normalized},
         "box": field.box.to_dict(),
         "units": {"length": "scene unit", "gaze": "1 / steradian"},
         "provenance": provenance,
@@ -123,10 +126,15 @@ def save_gaze(field: GazeField, path: str | Path, provenance: dict, half: bool =
     write_checkpoint(path, "gaze", _dump(field.parameters(), half), metadata)
 
 
-def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField, dict]:
+def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField | LogGazeField, dict]:
     """The gaze field in ``path`` on backend ``ns``, and its metadata."""
     tensors, meta = read_checkpoint(path, "gaze")
     with _reading(path):
+        kind = meta["architecture"].get("kind", "product")
+        if kind == "log_density":
+            return _log_gaze(tensors, meta, ns), meta
+        if kind != "product":
+            raise ValueError(f'it is a gaze field of the kind "{kind}", which this version does not know')
         config = GazeConfig.from_dict(meta["architecture"])
         sizes = {
             "position_net": config.position_sizes, "direction_net": config.direction_sizes,
@@ -136,3 +144,12 @@ def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField, dict]:
         nets = {name: _net(tensors, name, size, ns, layernorm(name)) for name, size in sizes.items()}
         field = GazeField(config, Box(**meta["box"]), _grid(tensors, config.grid, ns), **nets)
     return field, meta
+
+
+def _log_gaze(tensors: dict, meta: dict, ns: ModuleType) -> LogGazeField:
+    config = LogGazeConfig.from_dict(meta["architecture"])
+    return LogGazeField(
+        config, Box(**meta["box"]), _grid(tensors, config.grid, ns), _net(tensors, "emit_net", config.emit_sizes, ns),
+        _net(tensors, "capture_net", config.capture_sizes, ns), ns.Float(_finite(tensors, "escaped")),
+        ns.TensorXf(_finite(tensors, "prior")),
+    )

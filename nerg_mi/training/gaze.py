@@ -43,11 +43,11 @@ class GazeTrainer:
         self.config, self.settings, self.box, self.ns = config, settings, box, ns
         self.rng = np.random.default_rng(settings.seed)
         self.data, self._schedule = _Samples(supervision, ns), schedule
-        self.initial = GazeField.random(config, box, ns, settings.seed)
+        self.initial = self._untrained()
         if initial:
             self.initial.set_parameters(initial)
         self.constant = dict(initial or {}) if settings.frozen else {}
-        trained = {k: v for k, v in used_parameters(config, self.initial.parameters()).items() if k not in self.constant}
+        trained = {k: v for k, v in self._trainable(self.initial.parameters()).items() if k not in self.constant}
         self.optimiser = AdamW(settings.learning_rate, trained,
                                beta_2=0.99, epsilon=1e-15, weight_decay=settings.weight_decay)
         self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.optimiser.items()}
@@ -65,8 +65,30 @@ class GazeTrainer:
         s, steps = self.settings, self._schedule or self.settings.steps
         return min(1.0, self.steps / steps if steps else self.seconds / (60 * s.minutes))
 
+    def _untrained(self) -> GazeField:
+        return GazeField.random(self.config, self.box, self.ns, self.settings.seed)
+
+    def _trainable(self, parameters: dict) -> dict:
+        return used_parameters(self.config, parameters)
+
+    def _now(self) -> dict:
+        """All arrays, as they are while training."""
+        return {**self.constant, **dict(self.optimiser.items())}
+
     def step(self) -> None:
         """Draw probes and directions, and move the weights once."""
+        self._backward()
+        self.optimiser.set_learning_rate(self.settings.rate(self.progress))
+        self.optimiser.step()
+        self.steps += 1
+        # A short memory at first: the start of a run is not worth remembering.
+        decay = min(self.settings.average, (1 + self.steps) / (10 + self.steps))
+        for k, old in self.averaged.items():
+            self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * dr.opaque(self.ns.Float, 1 - decay)
+        dr.eval(self.averaged)
+
+    def _backward(self) -> None:
+        """Draw a batch, and leave the gradients of its loss in the weights."""
         s, data = self.settings, self.data
         probes = min(s.probes, data.probes)
         D = min(s.directions, data.count)
@@ -75,21 +97,13 @@ class GazeTrainer:
             which = np.argpartition(self.rng.random((probes, data.count)), D, axis=1)[:, :D]
         else:
             which = np.broadcast_to(np.arange(D), (probes, D))
-        prediction, truth = data.evaluate(self.config, self.box, {**self.constant, **dict(self.optimiser.items())}, probe, which)
+        prediction, truth = data.evaluate(self.config, self.box, self._now(), probe, which)
         self.loss = gaze_loss(prediction, truth, D, **LOSSES[s.loss])
         total = self.loss.total
         if s.integral:
             # Against the truth in the same directions, so that drawing few of them is no bias.
             total += s.integral * dr.mean(dr.square(_integral(prediction - truth, D)))
         dr.backward(total)
-        self.optimiser.set_learning_rate(s.rate(self.progress))
-        self.optimiser.step()
-        self.steps += 1
-        # A short memory at first: the start of a run is not worth remembering.
-        decay = min(s.average, (1 + self.steps) / (10 + self.steps))
-        for k, old in self.averaged.items():
-            self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * dr.opaque(self.ns.Float, 1 - decay)
-        dr.eval(self.averaged)
 
     def measure(self, supervision: Supervision, weights: dict | None = None) -> Scores:
         """Scores of the averaged weights (or of ``weights``) on other probes, all of their directions."""
@@ -99,17 +113,24 @@ class GazeTrainer:
         with dr.suspend_grad():
             for a in range(0, data.probes, block):
                 probe = np.arange(a, min(a + block, data.probes))
-                prediction, truth = data.evaluate(self.config, self.box, {**self.constant, **(weights or self.averaged)}, probe,
-                                                  np.broadcast_to(which, (len(probe), data.count)))
+                prediction, truth = self._densities(data, {**self.constant, **(weights or self.averaged)}, probe,
+                                                    np.broadcast_to(which, (len(probe), data.count)))
                 parts = gaze_loss(prediction, truth, data.count)
                 integral = _integral(prediction, data.count)
                 means = parts.kld, parts.cc, parts.mae, dr.mean(integral), dr.mean(dr.square(1 - integral))
                 rows.append((len(probe), *(float(v[0]) for v in means)))
         rows = np.array(rows)
         kld, cc, mae, integral, off = rows[:, 0] @ rows[:, 1:] / rows[:, 0].sum()
+        return Scores(self._loss(kld, cc, mae, off), kld, cc, mae, integral)
+
+    def _densities(self, data: _Samples, parameters: dict, probe: np.ndarray, which: np.ndarray) -> tuple:
+        """``(prediction, truth)`` in 1/sr for a validation."""
+        return data.evaluate(self.config, self.box, parameters, probe, which)
+
+    def _loss(self, kld: float, cc: float, mae: float, off: float) -> float:
+        """What a validation is judged by."""
         w = LOSSES[self.settings.loss]
-        loss = w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae + self.settings.integral * off
-        return Scores(loss, kld, cc, mae, integral)
+        return w["kld"] * kld + w["cc"] * (1 - cc) + w["mae"] * mae + self.settings.integral * off
 
     def weights(self) -> dict:
         """A copy of the averaged weights."""
@@ -117,7 +138,7 @@ class GazeTrainer:
 
     def field(self, weights: dict | None = None) -> GazeField:
         """The field with the averaged weights (or ``weights``)."""
-        out = GazeField.random(self.config, self.box, self.ns, self.settings.seed)
+        out = self._untrained()
         out.set_parameters({**self.constant, **(weights or self.weights())})
         return out
 
@@ -144,13 +165,23 @@ class _Samples:
     def evaluate(self, config, box, parameters, probe: np.ndarray, which: np.ndarray):
         """``(prediction, truth)`` in directions ``which`` (B, D) of the probes ``probe`` (B,), flat."""
         ns = self.ns
-        at = ns.UInt32(probe.astype(np.uint32))
-        index = ns.UInt32((probe[:, None] * self.count + which).astype(np.uint32).ravel())
-        p_o, r_o = dr.gather(ns.Array3f, self._positions, at), dr.gather(ns.Array3f, self._directions, index)
-        p_od = dr.gather(ns.Array3f, self._positions, index // self.count) + r_o * dr.gather(ns.Float, self._distance, index)
+        p_od, p_o, r_o, index = self.gather(probe, which)
         semantic = None
         if config.semantic:
             F = self._features
             semantic = [ns.Float(dr.gather(ns.Float16, self._semantic, index * F + k)) for k in range(F)]
         prediction = gaze_density(config, box, parameters, p_od, p_o, r_o, ns, semantic)
-        return prediction, dr.gather(ns.Float, self._truth, index)
+        return prediction, self.truth(index)
+
+    def gather(self, probe: np.ndarray, which: np.ndarray) -> tuple:
+        """``(p_od, p_o, r_o, index)`` of directions ``which`` (B, D) of the probes ``probe`` (B,); p_o has B lanes."""
+        ns = self.ns
+        at = ns.UInt32(probe.astype(np.uint32))
+        index = ns.UInt32((probe[:, None] * self.count + which).astype(np.uint32).ravel())
+        p_o, r_o = dr.gather(ns.Array3f, self._positions, at), dr.gather(ns.Array3f, self._directions, index)
+        p_od = dr.gather(ns.Array3f, self._positions, index // self.count) + r_o * dr.gather(ns.Float, self._distance, index)
+        return p_od, p_o, r_o, index
+
+    def truth(self, index):
+        """True densities (1/sr) at ``index`` of ``gather``."""
+        return dr.gather(self.ns.Float, self._truth, index)

@@ -12,8 +12,10 @@ from ..attention.rays import Rays
 from ..attention.splits import split_by_position
 from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
+from ..field.log_gaze import LogGazeConfig, LogGazeField
 from ..transport.media import Similarity
 from .gaze import GazeTrainer, Scores
+from .gaze_likelihood import LikelihoodTrainer
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_supervision import Supervision, supervise_rays
 
@@ -59,9 +61,9 @@ def hold_out(rays: Rays, radius: float, zones: int, positions: int, seed: int = 
 
 
 def train_gaze(
-    rays: Rays, medium, box: Box, config: GazeConfig, settings: GazeSettings, probes: ProbeSettings, ns: ModuleType,
+    rays: Rays, medium, box: Box, config: GazeConfig | LogGazeConfig, settings: GazeSettings, probes: ProbeSettings, ns: ModuleType,
     align: Similarity | None = None, on_progress: Callable[[GazeProgress], None] | None = None, initial: dict | None = None,
-) -> tuple[GazeField, dict]:
+) -> tuple[GazeField | LogGazeField, dict]:
     """Train a gaze field on ``rays`` in a place; returns it and its provenance (JSON).
 
     ``medium``: what depths are traced in; ``box``: where the gaze field lives; both in the field's frame, into which the
@@ -80,15 +82,15 @@ def train_gaze(
                                   min_rays=probes.min_rays, seed=settings.seed + 1)
         learn, held = rays.select(split.train), int((~split.train).sum())
         # With all rays around them: what is scored is what people there really looked at.
-        watched = supervise_rays(rays, medium, box, probes, align, split.test_centres, settings.seed + 2, config.semantic)
-    supervision = supervise_rays(learn, medium, box, probes, align, seed=settings.seed, semantic=config.semantic)
+        watched = supervise_rays(rays, medium, box, probes, align, split.test_centres, settings.seed + 2, config.semantic, config)
+    supervision = supervise_rays(learn, medium, box, probes, align, seed=settings.seed, semantic=config.semantic, config=config)
     prepared = time.perf_counter() - started
 
     refit = settings.refit and watched is not None
     fit = _fit(supervision, watched, box, config, settings, ns, say, 0.5 if refit else 1.0, initial)
     first, last, used = fit, fit, supervision
     if refit and not fit.interrupted:
-        used = supervise_rays(rays, medium, box, probes, align, seed=settings.seed, semantic=config.semantic)
+        used = supervise_rays(rays, medium, box, probes, align, seed=settings.seed, semantic=config.semantic, config=config)
         last = _refit(used, box, config, settings, ns, say, first, initial)
     field = last.trainer.field(last.weights)
     provenance = {
@@ -114,12 +116,17 @@ def train_gaze(
     return field, provenance
 
 
+def trainer_of(config) -> type[GazeTrainer]:
+    """The kind of trainer that a gaze field of this configuration has."""
+    return LikelihoodTrainer if isinstance(config, LogGazeConfig) else GazeTrainer
+
+
 def _fit(supervision: Supervision, watched: Supervision | None, box, config, settings, ns, say, share: float, initial) -> _Fit:
     """Train until the schedule ends, or validation has not improved for ``patience`` looks. ``share``: of the minutes."""
     timed = settings.minutes is not None
     if timed:
         settings = _with(settings, minutes=settings.minutes * share)
-    trainer = GazeTrainer(supervision, box, config, settings, ns, initial=initial)
+    trainer = trainer_of(config)(supervision, box, config, settings, ns, initial=initial)
     out = _Fit(trainer, {}, 0, settings.steps or 0, None, [], False)
     looks, since, recent = np.arange(1, settings.looks + 1) / settings.looks, 0, None
     next_look = 0
@@ -148,7 +155,7 @@ def _fit(supervision: Supervision, watched: Supervision | None, box, config, set
 
 def _refit(supervision: Supervision, box, config, settings, ns, say, first: _Fit, initial) -> _Fit:
     """As many steps as were best, along the same schedule."""
-    trainer = GazeTrainer(supervision, box, config, _with(settings, steps=first.best_step, minutes=None), ns, first.schedule, initial)
+    trainer = trainer_of(config)(supervision, box, config, _with(settings, steps=first.best_step, minutes=None), ns, first.schedule, initial)
     interrupted = False
     try:
         while trainer.steps < first.best_step:

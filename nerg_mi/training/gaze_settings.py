@@ -8,7 +8,8 @@ from ..field.gaze import GazeConfig
 from ..field.hashgrid import HashGridConfig
 from . import gaze_losses
 
-LOSSES = {"paper": gaze_losses.PAPER, "code": gaze_losses.CODE}
+# The likelihood has a trainer of its own; what is here weighs the parts of a validation.
+LOSSES = {"paper": gaze_losses.PAPER, "code": gaze_losses.CODE, "likelihood": {"kld": 1.0, "cc": 0.0, "mae": 0.0}}
 
 # (levels, log2 rows, base and finest resolution, width, geometry features). "paper" has the paper's sizes, 10.6 million
 # entries; "small" is what generalises to positions that nobody trained on, and stores in 0.4 MB as fp16.
@@ -73,8 +74,9 @@ class ProbeSettings:
 class GazeSettings:
     """Controls of a training run.
 
-    ``steps`` or ``minutes``: how long, exactly one of them. ``loss``: ``paper`` (KLD + (1 - CC) + MAE) or ``code`` (MAE +
-    0.1 (1 - CC), as the authors published); ``integral``: weight of the squared error of a probe's integral, which the authors
+    ``steps`` or ``minutes``: how long, exactly one of them. ``loss``: ``paper`` (KLD + (1 - CC) + MAE), ``code`` (MAE +
+    0.1 (1 - CC), as the authors published) or, for a log density, ``likelihood`` (``gaze_likelihood``), for which a step
+    draws ``rays`` rays of each probe besides; ``integral``: weight of the squared error of a probe's integral, which the authors
     compute and do not train (0: not here either; KLD and CC do not see the scale, and MAE alone pulls it towards the
     median, far below a peaked density's mean). ``probes``, ``directions``: of a step, drawn at random. ``learning_rate``: held
     for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself; ``weight_decay``: decoupled
@@ -92,6 +94,7 @@ class GazeSettings:
     integral: float = 1.0
     probes: int = 16
     directions: int = 256
+    rays: int = 64
     learning_rate: float = 1e-2
     final_rate: float = 0.03
     hold: float = 0.3
@@ -111,7 +114,7 @@ class GazeSettings:
             raise ValueError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
         if self.loss not in LOSSES:
             raise ValueError(f'the loss must be one of {", ".join(LOSSES)}, got "{self.loss}"')
-        if min(self.probes, self.directions, self.looks) < 1 or min(self.weight_decay, self.integral) < 0 or min(self.zones, self.patience) < 0:
+        if min(self.probes, self.directions, self.rays, self.looks) < 1 or min(self.weight_decay, self.integral) < 0 or min(self.zones, self.patience) < 0:
             raise ValueError(f"a training needs probes, directions and looks, and nothing negative, got {self}")
 
     def rate(self, progress: float) -> float:

@@ -5,19 +5,26 @@ traced once, before the training.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..attention.kde import SphericalKde
 from ..attention.probes import Probes, place_probes
 from ..attention.rays import Rays
 from ..attention.sphere import fibonacci_directions
 from ..field.box import Box
+from ..field.log_gaze import LogGazeConfig, blind_table, table_directions
 from ..transport.media import Similarity
 from ..transport.trace import trace_depth
 from .gaze_semantics import semantic_features
 from .gaze_settings import ProbeSettings
 
+# Concentration of the blind density's kernels, and of how many rays it is made at most.
+BLIND_KAPPA = 50.0
+_BLIND_RAYS = 1 << 16
+# How far everything is where no geometry is known, in the field's units.
+NOWHERE = 2.0
 # Opacity from which on a ray has met a surface; the integrator's default.
 SURFACE_OPACITY = 0.5
 
@@ -28,7 +35,8 @@ class Supervision:
 
     ``positions`` (P, 3), the observers p_o; ``directions`` (P, D, 3), unit, r_o; ``truth`` (P, D), 1/sr; ``distance``
     (P, D), from p_o to p_od; ``escaped`` (P, D) bool: no surface was met, and p_od is where the box ends. ``semantic``
-    (P, D, F), float16: features of a radiance field, for a gaze field that wants them.
+    (P, D, F), float16: features of a radiance field, for a gaze field that wants them. ``blind``: table of the log of the
+    rays' density whatever their position (``field.log_gaze``), for one that begins with it.
     """
 
     positions: np.ndarray
@@ -37,6 +45,7 @@ class Supervision:
     distance: np.ndarray
     escaped: np.ndarray
     semantic: np.ndarray | None = None
+    blind: np.ndarray | None = None
 
     @property
     def escape_share(self) -> float:
@@ -50,13 +59,13 @@ class Supervision:
 
 
 def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | None = None, kind: str = "median",
-              seed: int = 0, semantic: str = "") -> Supervision:
+              seed: int = 0, semantic: str = "", fill: bool = False) -> Supervision:
     """Directions, true densities and surfaces of ``probes``.
 
     ``medium``: what depths are traced in (``FieldMedium`` or ``VolumeMedium``) and ``box``, where the gaze field will
     live: both in the field's frame. ``count``: directions a probe, a Fibonacci set under a rotation of its own, so that
     together the probes see what one set leaves out. ``align``: similarity from the rays' frame to the field's.
-    ``semantic``: which features of ``medium`` to keep (``field.gaze.SEMANTICS``).
+    ``semantic``: which features of ``medium`` to keep (``field.gaze.SEMANTICS``); ``fill``: see ``surfaces``.
     """
     align = align or Similarity()
     directions = rotated_sets(count, len(probes), np.random.default_rng(seed))
@@ -64,7 +73,7 @@ def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | 
     rotation = align.matrix[:3, :3] / align.scale
     positions = probes.positions @ align.matrix[:3, :3].T + align.matrix[:3, 3]
     turned = directions @ rotation.T
-    distance, escaped = surfaces(medium, box, positions, turned, kind)
+    distance, escaped = surfaces(medium, box, positions, turned, kind, fill)
     features = None
     if semantic:
         origins = np.repeat(positions, count, axis=0)
@@ -74,27 +83,61 @@ def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | 
 
 
 def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align: Similarity | None = None,
-                   queries: np.ndarray | None = None, seed: int = 0, semantic: str = "") -> Supervision:
-    """Probes on ``rays``, at ``queries`` (P, 3) metres where given, and what ``supervise`` makes of them."""
-    s = settings
+                   queries: np.ndarray | None = None, seed: int = 0, semantic: str = "",
+                   config=None) -> Supervision:
+    """Probes on ``rays``, at ``queries`` (P, 3) metres where given, and what ``supervise`` makes of them. ``config``: of
+    the gaze field; a ``LogGazeConfig`` has the blind density made, and says what to do with directions that escape."""
+    s, log = settings, isinstance(config, LogGazeConfig)
     probes = place_probes(rays, s.radius, count=s.count, queries=queries, cap=s.cap, min_rays=min(s.min_rays, s.cap),
                           kappa_rule=s.kappa_rule, kappa=s.kappa, seed=seed)
-    return supervise(probes, medium, box, s.directions, align, s.depth, seed, semantic)
+    out = supervise(probes, medium, box, s.directions, align, s.depth, seed, semantic,
+                    log and config.escaped == "nearest")
+    return replace(out, blind=blind_prior(rays, config.prior, align, seed)) if log else out
 
 
-def surfaces(medium, box: Box, positions, directions, kind: str = "median") -> tuple[np.ndarray, np.ndarray]:
+def blind_prior(rays: Rays, rows: int, align: Similarity | None = None, seed: int = 0) -> np.ndarray:
+    """``field.log_gaze.blind_table`` of what people look at wherever they stand, in the field's frame."""
+    align = align or Similarity()
+    which = np.random.default_rng(seed).permutation(len(rays))[:_BLIND_RAYS]
+    # The table's directions in the rays' frame: its inverse is a rotation's transpose.
+    kde = SphericalKde(rays.direction[which], np.array([0, len(which)]), BLIND_KAPPA)
+    density = kde.evaluate(table_directions(rows) @ (align.matrix[:3, :3] / align.scale))[0]
+    return blind_table(density, rows, kde.ns, fibonacci_directions(1 << 16))
+
+
+def surfaces(medium, box: Box, positions, directions, kind: str = "median", fill: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Distances from ``positions`` (P, 3) along ``directions`` (P, D, 3) to the surface that each meets, and which meet none.
 
-    Both (P, D): float32 in the field's units, and bool. A direction that meets no surface ends where it leaves the box
-    (or after the box's diagonal, where it never enters): it still needs a p_od at which the field is evaluated.
+    Both (P, D): float32 in the field's units, and bool. ``medium``: see ``trace_depth``; None: no geometry, everything is
+    ``NOWHERE`` away and nothing counts as escaped. A direction that meets no surface ends where it leaves the box (or after
+    the box's diagonal, where it never enters): it still needs a p_od at which the field is evaluated. With ``fill`` it ends
+    at the depth of the directions of its position nearest to it that do meet one: where the geometry has holes.
     """
     P, D = directions.shape[:2]
+    if medium is None:
+        return np.full((P, D), NOWHERE, np.float32), np.zeros((P, D), bool)
     origins = np.repeat(np.asarray(positions, np.float64), D, axis=0)
     flat = np.asarray(directions, np.float64).reshape(-1, 3)
     depth, opacity = trace_depth(medium, origins, flat, kind=kind)
     escaped = opacity < SURFACE_OPACITY
     depth[escaped] = box_exit(box, origins[escaped], flat[escaped])
-    return depth.reshape(P, D), escaped.reshape(P, D)
+    depth, escaped = depth.reshape(P, D), escaped.reshape(P, D)
+    if fill:
+        for p in np.flatnonzero(escaped.any(axis=1) & ~escaped.all(axis=1)):
+            met = ~escaped[p]
+            depth[p, escaped[p]] = nearest_depth(directions[p, met], depth[p, met], directions[p, escaped[p]])
+    return depth, escaped
+
+
+def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Depth in directions ``wanted`` (M, 3) from that of the up to eight nearest of ``known`` (N, 3): the mean of its
+    logarithm, weighted by the inverse square of the distance."""
+    from scipy.spatial import cKDTree
+
+    apart, which = cKDTree(known).query(wanted, k=np.arange(1, min(8, len(known)) + 1))
+    weight = 1 / (apart**2 + 1e-3)
+    log = np.log(np.maximum(depth, 1e-6))[which]
+    return np.exp((weight * log).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
 
 
 def box_exit(box: Box, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

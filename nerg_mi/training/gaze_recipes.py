@@ -1,0 +1,49 @@
+"""Ready-made ways to train a gaze field, by one word."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..field.gaze import GazeConfig
+from ..field.log_gaze import LogGazeConfig
+from .gaze_settings import SIZES, sized_gaze_config
+
+RECIPES = ("default", "small", "paper")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """``config``: of the field; ``settings``, ``probes``: keywords of ``GazeSettings`` and ``ProbeSettings`` (steps too)."""
+
+    config: GazeConfig | LogGazeConfig
+    settings: dict
+    probes: dict
+
+
+def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation: str | None = None, size: str | None = None) -> Recipe:
+    """The recipe ``name``.
+
+    ``default``: a log density that is normalised over the sphere, trained by the likelihood of rays; the one that generalises
+    best to positions and people that it was not trained on. ``small``: a density without normalisation on a small grid,
+    trained on the paper's losses and its integral. ``paper``: the paper's networks and losses, R = 0.1 m, 4,096 probes with
+    the bandwidth of the authors' code, as many steps as 50 epochs have. ``activation``, ``size``: of ``small`` and ``paper``.
+    Raises ``ValueError`` for another name, and for an activation or a size of ``default``.
+    """
+    if name == "default":
+        if activation or size:
+            raise ValueError("the default recipe has an activation and sizes of its own; choose --recipe small or paper to set them")
+        return Recipe(
+            LogGazeConfig(variant=variant, mix=0.1),
+            {"steps": 300, "loss": "likelihood", "integral": 0.0, "probes": 12, "directions": 192, "rays": 64, "learning_rate": 3e-3,
+             "final_rate": 0.1, "hold": 0.5, "weight_decay": 1.0, "average": 0.95},
+            {"count": 1024, "min_rays": 16, "kappa": 20.0, "directions": 2048},
+        )
+    if name == "small":
+        return Recipe(sized_gaze_config(size or "small", variant, activation or "softplus"), {"steps": 600}, {})
+    if name == "paper":
+        return Recipe(
+            sized_gaze_config(size or "paper", variant, activation or "linear"),
+            {"steps": 12_800, "loss": "paper", "integral": 0.0, "probes": 16, "directions": 1024, "learning_rate": 1e-3,
+             "final_rate": 0.1, "hold": 0.0, "weight_decay": 0.0},
+            {"radius": 0.1, "count": 4096, "cap": 1024, "kappa_rule": "silverman", "directions": 1024, "min_rays": 8},
+        )
+    raise ValueError(f'the recipe must be one of {", ".join(RECIPES)}, got "{name}" (sizes: {", ".join(SIZES)})')

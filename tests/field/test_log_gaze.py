@@ -1,0 +1,111 @@
+"""The normalised gaze field: against NumPy, its table, its limits, its file."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.attention.sphere import fibonacci_directions
+from nerg_mi.attention.vmf import log_normaliser
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.box import Box
+from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.field.log_gaze import LogGazeConfig, LogGazeField, blind_table, look_up, table_directions
+from nerg_mi.formats.fields import load_gaze, save_gaze
+
+BOX = Box((-2, -2, 0), (2, 2, 3))
+GRID = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
+SMALL = LogGazeConfig(grid=GRID, width=16, prior=8, heads=((-1, -1, 1.4), (1, 0.5, 1.8)), mix=0.2)
+
+
+def made(config=SMALL, seed=1):
+    ns, rng = namespace("llvm"), np.random.default_rng(seed)
+    field = LogGazeField.random(config, BOX, ns, seed, rng.normal(size=(config.prior, 2 * config.prior)))
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32)), "escaped": ns.Float(0.7)})
+    return field
+
+
+def vectors(n=5, seed=2):
+    rng = np.random.default_rng(seed)
+    r = rng.normal(size=(n, 3))
+    r /= np.linalg.norm(r, axis=1, keepdims=True)
+    p_o = rng.uniform((-1, -1, 1.4), (1, 0.5, 1.8), (n, 3))
+    return p_o, p_o + r * rng.uniform(0.1, 1.0, (n, 1)), r
+
+
+def jit(v):
+    return namespace("llvm").Array3f(np.ascontiguousarray(np.asarray(v).T, np.float32))
+
+
+def test_is_what_it_says():
+    """The product of the factors in NumPy, of what the encodings return."""
+    field = made()
+    p_o, p_od, r = vectors()
+    net = lambda weights, x: weights[-1] @ np.maximum(weights[1] @ np.maximum(weights[0] @ x, 0), 0)
+    numpy = lambda rows: np.stack([np.broadcast_to(np.array(v, np.float64), len(r)) for v in rows])
+    inputs = numpy(field.emit_inputs(jit(p_od), jit(p_o), jit(r)))
+    np.testing.assert_allclose(inputs[0], 1)
+    np.testing.assert_allclose(inputs[1], np.log(np.linalg.norm(p_od - p_o, axis=1)), atol=1e-5)
+    u = (p_o - (-1, -1, 1.4)) / 2 * 2 - 1
+    heads = numpy(field.capture_position(jit(p_o)))
+    np.testing.assert_allclose(heads, np.concatenate([u, np.sin(u * np.pi / 2), np.cos(u * np.pi / 2)], axis=1).T, atol=1e-5)
+    weights = lambda net: [np.array(w, np.float64) for w in net.weights]
+    emit = net(weights(field.emit_net), inputs)[0]
+    capture = 1 / (1 + np.exp(-net(weights(field.capture_net), numpy(field.capture_inputs([namespace("llvm").Float(h.astype(np.float32)) for h in heads], jit(r))))[0]))
+    blind = np.exp(np.array(field.log_blind(jit(r)), np.float64))
+    gaze, e, c = (np.array(v) for v in field.evaluate(jit(p_od), jit(p_o), jit(r), integral=2.0))
+    np.testing.assert_allclose(e, np.exp(emit) * blind / 2, rtol=1e-4)
+    np.testing.assert_allclose(c, capture, rtol=1e-4)
+    np.testing.assert_allclose(gaze, 0.8 * e * c + 0.2 * blind, rtol=1e-5)
+    gone = field.unnormalized(jit(p_od), jit(p_o), jit(r), escaped=namespace("llvm").Bool(True))[0]
+    np.testing.assert_allclose(np.array(gone), np.exp(0.7) * blind, rtol=1e-4)
+
+
+def test_without_geometry_the_surface_makes_no_difference():
+    field = made(replace(SMALL, geometry="none", reach=1.5))
+    p_o, p_od, r = vectors()
+    near, far = (np.array(field.evaluate(jit(p), jit(p_o), jit(r), integral=1.0)[0]) for p in (p_od, p_o + 3 * (p_od - p_o)))
+    np.testing.assert_array_equal(near, far)
+    assert np.ptp(near) > 0
+
+
+def test_needs_its_integral():
+    p_o, p_od, r = (jit(v) for v in vectors())
+    with pytest.raises(ValueError, match="integral"):
+        made().evaluate(p_od, p_o, r)
+
+
+def test_gradients_are_finite_on_the_surface_itself():
+    field, p = made(), jit([[0.1, 0.2, 1.5]])
+    dr.enable_grad(p)
+    dr.backward(field.evaluate(p, jit([[0.1, 0.2, 1.5]]), jit([[0, 0, 1.0]]), integral=1.0)[0])
+    assert np.isfinite(np.array(dr.grad(p))).all()
+
+
+def test_table_of_a_known_density_integrates_to_one():
+    ns, kappa, mean = namespace("llvm"), 20.0, np.array([0.6, 0, 0.8])
+    truth = lambda d: np.exp(log_normaliser(kappa) + kappa * (d @ mean - 1))
+    fine = fibonacci_directions(20_000)
+    table = blind_table(truth(table_directions(64)), 64, ns, fine)
+    found = np.exp(np.array(look_up(ns.Float(table.ravel()), 64, jit(fine)), np.float64))
+    assert 4 * np.pi * found.mean() == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(found, truth(fine), atol=0.03 * truth(mean))
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_file(tmp_path, half):
+    ns, field = namespace("llvm"), made()
+    save_gaze(field, tmp_path / "gaze.safetensors", {"note": 1}, half)
+    again, meta = load_gaze(tmp_path / "gaze.safetensors", ns)
+    assert again.config == field.config and meta["output"] == {"activation": "log", "normalized": True}
+    for name, value in field.parameters().items():
+        np.testing.assert_allclose(again.parameters()[name].numpy(), value.numpy(), rtol=1e-3 if half else 0, atol=1e-6 if half else 0)
+
+
+@pytest.mark.parametrize("wrong", [{"mix": 1.0}, {"variant": "both"}, {"geometry": "flat"}, {"escaped": "never"}, {"prior": 1},
+                                   {"heads": ((0, 0), (1, 1))}])
+def test_settings_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError):
+        replace(SMALL, **wrong)
