@@ -16,6 +16,12 @@ Trained radiance field (:monosp:`nerf`)
    - A rotation, a uniform scale and a translation that place the field in the scene. Under a scale of :math:`s` the
      density becomes :math:`\sigma / s`, so that opacities do not change. (Default: none)
 
+ * - max_density
+   - |float|
+   - For Mitsuba's own media only, which need a bound: what ``eval_1`` returns at most, in 1 / scene unit. Times the
+     longest way through the box it should stay below 50: a path tracer's work grows with it, and more is opaque anyway.
+     :ref:`nerg <integrator-nerg>` knows nothing of it. (Default: 0, no bound, and no use in media)
+
  * - grid.table, density_net.0, ..., color_net.0, ...
    - |tensor|
    - Hash grid features and the weight matrices of both networks.
@@ -24,7 +30,7 @@ Trained radiance field (:monosp:`nerf`)
 Density and view-dependent colour of a place, as a multiresolution hash grid with two small networks. It is meant as the
 ``field`` of the integrator :ref:`nerg <integrator-nerg>`. As a plain volume it returns the density, in 1 / scene unit,
 through ``eval_1``: 0 outside of ``bbox()``, and in the cells that the checkpoint's occupancy grid calls empty, which are
-vacuum by definition: training has left them unsampled, and whatever the networks say there is skipped when marching. (A plain volume is not told the direction that its colour depends on.)
+vacuum by definition: training has left them unsampled, and whatever the networks say there is skipped when marching. With ``max_density`` it serves as ``sigma_t`` of a ``heterogeneous`` medium. (A plain volume is not told the direction that its colour depends on.)
 
 .. tabs::
     .. code-tab:: xml
@@ -44,11 +50,12 @@ vacuum by definition: training has left them unsampled, and whatever the network
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.properties import text
+from nerg_mi.properties import number, text
 from nerg_mi.registration import register
 from nerg_mi.transport.media import FieldMedium, Similarity
 
@@ -57,11 +64,15 @@ class NerfVolume(mi.Volume):
     __doc__ = __doc__
 
     def __init__(self, props):
+        filename = str(mi.file_resolver().resolve(text(props, "filename")))
+        similarity = Similarity(props.get("to_world", mi.ScalarTransform4f()).matrix)
+        field, metadata = load_radiance(filename, namespace(mi.variant()))
+        # Mitsuba's own media ask the base class, not bbox(): it makes its box from the unit cube.
+        lower, upper = similarity.bounds(field.box.lower, field.box.upper)
+        props["to_world"] = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         super().__init__(props)
-        self.filename = str(mi.file_resolver().resolve(text(props, "filename")))
-        to_world = props.get("to_world", mi.ScalarTransform4f())
-        self.field, self.metadata = load_radiance(self.filename, namespace(mi.variant()))
-        self._similarity = Similarity(to_world.matrix)
+        self.filename, self.field, self.metadata, self._similarity = filename, field, metadata, similarity
+        self.max_density = number(props, "max_density", 0, low=0)
 
     def medium(self) -> FieldMedium:
         """The field as the marcher sees it."""
@@ -75,7 +86,21 @@ class NerfVolume(mi.Volume):
         return 1
 
     def eval_1(self, it, active=True):
-        return self.medium().occupied_density(self._similarity.point_to_local(it.p), active)
+        sigma = self.medium().occupied_density(self._similarity.point_to_local(it.p), active)
+        return dr.minimum(sigma, self.max_density) if self.max_density else sigma
+
+    def eval(self, it, active=True):
+        # What media ask for; one density for all wavelengths.
+        return mi.UnpolarizedSpectrum(self.eval_1(it, active))
+
+    def max(self):
+        if not self.max_density:
+            raise ValueError(f'a medium needs a bound on the density of "{self.filename}": give the volume a "max_density"')
+        return self.max_density
+
+    def resolution(self):
+        cells = self.field.config.grid.finest
+        return mi.ScalarVector3i(cells, cells, cells)
 
     def traverse(self, cb):
         for name, value in self.field.parameters().items():
