@@ -407,6 +407,10 @@ class NergIntegrator(mi.SamplingIntegrator):
             p_o = viewpoint.center(self.observer)
             aligned = viewpoint.same_center(sensors, p_o)
 
+        if asked & _GAZE_AOVS and self.gaze.field.config.normalized:
+            observers = viewpoint.centers(sensors) if self.observer is None else [p_o]
+            self.gaze.face(observers, place, self.settings, self.depth_kind, self.surface_opacity)
+
         distance, r_o = towards(p_o, p_d)
         sight = Sight(p_d, distance, mi.Float(1), mi.Float(0))
         if self.occlusion and not aligned:

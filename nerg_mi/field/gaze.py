@@ -84,6 +84,8 @@ class GazeConfig:
             raise ValueError("a gaze field of the variant capture has no emit that semantic features could go to")
         if self.semantic_own and not self.semantic:
             raise ValueError("semantic_own adds a field's own features to semantic ones; say which those are")
+        if self.semantic and self.normalized:
+            raise ValueError("a gaze field with semantic features cannot be normalised over the sphere: their integral is not kept")
         if self.trunk not in TRUNKS:
             raise ValueError(f'the trunk of a gaze field must be one of {", ".join(TRUNKS)}, got "{self.trunk}"')
         if not 0 < self.emit_scale < float("inf"):

@@ -15,6 +15,7 @@ from ..attention.rays import Rays
 from ..attention.sphere import fibonacci_directions
 from ..field.box import Box
 from ..field.log_gaze import LogGazeConfig, blind_table, table_directions
+from ..transport.gaze_integral import nearest_depth
 from ..transport.media import Similarity
 from ..transport.trace import trace_depth
 from .gaze_semantics import semantic_features
@@ -127,17 +128,6 @@ def surfaces(medium, box: Box, positions, directions, kind: str = "median", fill
             met = ~escaped[p]
             depth[p, escaped[p]] = nearest_depth(directions[p, met], depth[p, met], directions[p, escaped[p]])
     return depth, escaped
-
-
-def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Depth in directions ``wanted`` (M, 3) from that of the up to eight nearest of ``known`` (N, 3): the mean of its
-    logarithm, weighted by the inverse square of the distance."""
-    from scipy.spatial import cKDTree
-
-    apart, which = cKDTree(known).query(wanted, k=np.arange(1, min(8, len(known)) + 1))
-    weight = 1 / (apart**2 + 1e-3)
-    log = np.log(np.maximum(depth, 1e-6))[which]
-    return np.exp((weight * log).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
 
 
 def box_exit(box: Box, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -254,18 +254,55 @@ class VolumeMedium:
 
 
 class GazeMedium:
-    """A gaze field placed in the scene. Densities over directions do not change with scale."""
+    """A gaze field placed in the scene. Densities over directions do not change with scale.
 
-    def __init__(self, field: GazeField, to_world: Similarity | None = None):
+    A normalised field must ``face`` an observer before it is evaluated for one.
+    """
+
+    def __init__(self, field, to_world: Similarity | None = None):
         self.field, self.to_world = field, to_world or Similarity()
+        self._integrals = []
 
     def parameters(self) -> list:
         """Arrays that gaze depends on, for derivatives."""
         return list(self.field.parameters().values())
 
+    def face(self, observers: list, place, settings, kind: str, surface_opacity: float) -> None:
+        """Integrate a normalised field over the spheres of ``observers`` (Point3f, one lane each) in ``place``.
+
+        ``settings``, ``kind``, ``surface_opacity``: of the observers' rays. Kept for as long as neither of them changes.
+        """
+        from .gaze_integral import GazeIntegral
+
+        how = place, settings, kind, surface_opacity
+        known = self._integrals
+        self._integrals = [next((k for k in known if k.serves(p_o, *how)), None) or GazeIntegral(self, place, p_o, *how[1:])
+                           for p_o in observers]
+
+    def unnormalized(self, p_od, p_o, r_o, active, escaped=False):
+        """``(emit, capture)`` of a normalised field, whose product is what is integrated."""
+        local = self.to_world
+        return self.field.unnormalized(
+            local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active, escaped=escaped
+        )
+
     def evaluate(self, p_od, p_o, r_o, active, semantic=None):
         """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``; ``semantic`` as the field wants it."""
         local = self.to_world
         return self.field.evaluate(
-            local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active, semantic
+            local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active, semantic,
+            self._integral(p_o),
         )
+
+    def _integral(self, p_o):
+        """Of the observer that is faced nearest to ``p_o``, lane by lane."""
+        if not self._integrals:
+            return None
+        best, apart = self._integrals[0].value(), None
+        for i, known in enumerate(self._integrals):
+            if len(self._integrals) == 1:
+                break
+            here = dr.detach(dr.squared_norm(p_o - known.center))
+            best = known.value() if i == 0 else dr.select(here < apart, known.value(), best)
+            apart = here if i == 0 else dr.minimum(here, apart)
+        return best

@@ -55,6 +55,11 @@ def same_center(sensors, p_o) -> bool:
     return len(centers) == count > 0 and all(bool(dr.all(dr.detach(c) == dr.detach(p_o))) for c in centers)
 
 
+def centers(sensors) -> list:
+    """Centre (Point3f) of each of ``sensors`` and of the members of batches."""
+    return [center(m) for s in sensors for m in _members(s)]
+
+
 def center_of_ray(sensors, ray):
     """Centre (Point3f) of the one of ``sensors`` that ``ray`` comes from.
 

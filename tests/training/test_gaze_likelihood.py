@@ -12,8 +12,9 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.training.gaze_likelihood import LikelihoodTrainer, _log_mean_exp
 from nerg_mi.training.gaze_recipes import gaze_recipe
 from nerg_mi.training.gaze_settings import GazeSettings
-from nerg_mi.training.gaze_supervision import Supervision, nearest_depth
+from nerg_mi.training.gaze_supervision import Supervision
 from nerg_mi.training.log_gaze_model import log_gaze, used_parameters
+from nerg_mi.transport.gaze_integral import nearest_depth
 from ..field.test_log_gaze import BOX, SMALL, jit, made, vectors
 
 FAST = GazeSettings(steps=150, loss="likelihood", integral=0.0, probes=4, directions=128, rays=64, learning_rate=1e-2,
