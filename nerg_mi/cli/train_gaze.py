@@ -12,39 +12,44 @@ def train_gaze(
     rays: Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet), as nerg rays import writes it.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Checkpoint to write (.safetensors).")],
     field: Annotated[Optional[Path], typer.Option(help="Radiance field in which people looked around.")] = None,
+    scene: Annotated[Optional[Path], typer.Option(help="Or: a Mitsuba scene, whose shapes they looked at.")] = None,
     geometry: Annotated[
-        Optional[str], typer.Option(help='Without photos: "hits" makes a place from the rays\' own hit points.')
+        Optional[str], typer.Option(help='Or: "hits" makes a place from the rays\' own hit points, "none" does without any.')
     ] = None,
-    voxel: Annotated[float, typer.Option(help="Edge of its voxels in metres.")] = 0.08,
+    recipe: Annotated[str, typer.Option(help="default (generalises best), small, or paper. Sets what is not set below.")] = "default",
+    voxel: Annotated[float, typer.Option(help="Edge of the voxels of --geometry hits in metres.")] = 0.08,
     align: Annotated[
-        Optional[Path], typer.Option(help="JSON file with the 4x4 similarity from the rays' frame to the field's. Default: none.")
+        Optional[Path], typer.Option(help="JSON file with the 4x4 similarity from the rays' frame to the place's. Default: none.")
     ] = None,
-    radius: Annotated[float, typer.Option(help="Radius R of a probe in metres.")] = 0.25,
-    probes: Annotated[int, typer.Option(help="Number of probes, at random ray origins.")] = 2048,
-    cap: Annotated[int, typer.Option(help="Rays in a probe at most, the nearest.")] = 1024,
-    min_rays: Annotated[int, typer.Option(help="Rays in a probe at least.")] = 64,
-    kappa_rule: Annotated[str, typer.Option(help="Concentration of a ray's kernel: fixed, silverman or loo.")] = "fixed",
-    kappa: Annotated[float, typer.Option(help="That of the rule fixed.")] = 50.0,
-    directions: Annotated[int, typer.Option(help="Directions of a probe.")] = 1024,
+    radius: Annotated[Optional[float], typer.Option(help="Radius R of a probe in metres.")] = None,
+    probes: Annotated[Optional[int], typer.Option(help="Number of probes at most.")] = None,
+    placement: Annotated[Optional[str], typer.Option(help="Of probes: data, grid, random or blue.")] = None,
+    cap: Annotated[Optional[int], typer.Option(help="Rays in a probe at most, the nearest.")] = None,
+    min_rays: Annotated[Optional[int], typer.Option(help="Rays in a probe at least.")] = None,
+    kappa_rule: Annotated[Optional[str], typer.Option(help="Concentration of a ray's kernel: fixed, silverman or loo.")] = None,
+    kappa: Annotated[Optional[float], typer.Option(help="That of the rule fixed.")] = None,
+    directions: Annotated[Optional[int], typer.Option(help="Directions of a probe.")] = None,
     gaze: Annotated[str, typer.Option("--variant", help="emit, capture or emit_capture.")] = "emit_capture",
-    activation: Annotated[str, typer.Option(help="Of the emit head: softplus, exp or linear.")] = "softplus",
-    size: Annotated[str, typer.Option(help="Size of the field: small or paper.")] = "small",
+    activation: Annotated[Optional[str], typer.Option(help="Of the emit head of small and paper: softplus, exp or linear.")] = None,
+    size: Annotated[Optional[str], typer.Option(help="Of the field of small and paper: small or paper.")] = None,
+    normalized: Annotated[bool, typer.Option("--normalized", help="Divide the field of small and paper by its integral over the sphere.")] = False,
     semantic: Annotated[
         str, typer.Option(help="Give emit the features of --field: accumulated along the ray, or snapshot at the surface.")
     ] = "",
     semantic_own: Annotated[bool, typer.Option("--semantic-own", help="Besides the gaze field's own, not in their place.")] = False,
     begin: Annotated[str, typer.Option(help="Weights of the trunk to begin with: random, or those of the radiance field (field).")] = "random",
     freeze: Annotated[bool, typer.Option("--freeze", help="Do not train the weights that --begin field gives.")] = False,
-    loss: Annotated[str, typer.Option(help="paper: KLD + (1 - CC) + MAE; code: MAE + 0.1 (1 - CC).")] = "paper",
+    loss: Annotated[Optional[str], typer.Option(help="Of small and paper. paper: KLD + (1 - CC) + MAE; code: MAE + 0.1 (1 - CC).")] = None,
     integral: Annotated[Optional[float], typer.Option(help="Weight of the error of the integral over the sphere.")] = None,
     minutes: Annotated[Optional[float], typer.Option(help="Train for this long, both fits together.")] = None,
-    steps: Annotated[Optional[int], typer.Option(help="Or: train for so many steps. Default: 600.")] = None,
+    steps: Annotated[Optional[int], typer.Option(help="Or: train for so many steps. Default: the recipe's.")] = None,
     learning_rate: Annotated[Optional[float], typer.Option(help="Learning rate at the start.")] = None,
     weight_decay: Annotated[Optional[float], typer.Option(help="Decoupled weight decay.")] = None,
     zones: Annotated[int, typer.Option(help="Zones of positions watched as validation; 0: none.")] = 3,
     refit: Annotated[bool, typer.Option(help="Train again on all rays once the best number of steps is known.")] = True,
     test_zones: Annotated[int, typer.Option(help="Zones of test positions that are left out of everything; 0: none.")] = 0,
     test_positions: Annotated[int, typer.Option(help="Test positions in them.")] = 64,
+    test_people: Annotated[float, typer.Option(help="Share of the people who are left out of everything besides.")] = 0.0,
     seed: Annotated[int, typer.Option(help="Seed of probes, directions, weights, batches and splits.")] = 0,
     threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store the weights in fp16.")] = False,
@@ -58,50 +63,54 @@ def train_gaze(
     from ..attention.rays import Rays
     from ..field.backend import namespace
     from ..formats.fields import save_gaze
+    from ..training.gaze_recipes import gaze_recipe
     from ..training.gaze_run import hold_out, train_gaze
-    from ..training.gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
+    from ..training.gaze_settings import GazeSettings, ProbeSettings
 
-    if (field is None) == (geometry is None):
-        raise ValueError("say where people looked around: either --field FILE or --geometry hits")
-    if geometry not in (None, "hits"):
-        raise ValueError(f'--geometry must be "hits", got "{geometry}"')
+    if sum(v is not None for v in (field, scene, geometry)) != 1:
+        raise ValueError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
+    if geometry not in (None, "hits", "none"):
+        raise ValueError(f'--geometry must be "hits" or "none", got "{geometry}"')
     if geometry is not None and align is not None:
-        raise ValueError("--align belongs to --field; a place made from hit points is in the rays' own frame")
+        raise ValueError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
+    if test_people and not test_zones:
+        raise ValueError("--test-people leaves people out at test positions: say where, with --test-zones")
     mi.set_variant(mode)
     if threads is not None:
         dr.set_thread_count(threads)
     _check_start(begin, freeze, semantic, field)
-    given = {"learning_rate": learning_rate, "weight_decay": weight_decay, "integral": integral}
-    settings = GazeSettings(
-        steps=600 if steps is None and minutes is None else steps, minutes=minutes, seed=seed, loss=loss, zones=zones,
-        refit=refit, frozen=freeze, **{k: v for k, v in given.items() if v is not None},
-    )  # fmt: skip
-    how = ProbeSettings(radius, probes, cap, min_rays, kappa_rule, kappa, directions)
+    chosen = gaze_recipe(recipe, gaze, activation, size)
+    if recipe == "default" and (semantic or begin == "field" or loss or normalized or integral is not None):
+        raise ValueError("--semantic, --begin field, --loss, --integral and --normalized belong to fields of the recipes small and paper; add --recipe small")
+    settings = GazeSettings(**chosen.settings | _given(
+        minutes=minutes, steps=steps, seed=seed, loss=loss, zones=zones, refit=refit,
+        frozen=freeze, learning_rate=learning_rate, weight_decay=weight_decay, integral=integral,
+    ) | ({"steps": None} if minutes is not None and steps is None else {}))  # fmt: skip
+    how = ProbeSettings(**chosen.probes | _given(
+        radius=radius, count=probes, placement=placement, cap=cap, min_rays=min_rays, kappa_rule=kappa_rule, kappa=kappa, directions=directions,
+    ))  # fmt: skip
     data, ns = Rays.load(rays), namespace(mode)
-    about = {"rays_file": {"file": rays.name, "sha256": file_sha256(rays), "persons": len(data.persons)}}
+    about = {"recipe": recipe, "rays_file": {"file": rays.name, "sha256": file_sha256(rays), "persons": len(data.persons)}}
     if test_zones:
-        data, about["test"] = hold_out(data, radius, test_zones, test_positions, seed, min_rays)
+        data, about["test"] = hold_out(data, how.radius, test_zones, test_positions, seed, max(64, how.min_rays), test_people)
         test = about["test"]
         typer.echo(f"{len(test['centres'])} test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays left")
-    if field is not None:
-        medium, box, about["field_file"] = _trained_place(field, ns, file_sha256)
+    place = _place(field, scene, geometry, data, output, voxel, ns)
+    about |= place.about
+    if recipe == "default":
+        config, initial = place.told(chosen.config), None
     else:
-        medium, box, about["geometry_file"] = _place_of_hits(data, output, voxel, file_sha256)
-    more, initial = {"semantic": semantic, "semantic_own": semantic_own}, None
-    if begin == "field":
-        from ..training.gaze_semantics import config_like, trunk_of
-
-        config = config_like(medium.field.config, gaze, activation, **more)
-        initial, about["begins_as"] = trunk_of(medium.field, config), field.name
-    else:
-        config = replace(sized_gaze_config(size, gaze, activation), **more)
-        if semantic:
-            config = replace(config, geometry=medium.feature_count)
+        config, initial = _begun(begin, place, chosen.config, {"semantic": semantic, "semantic_own": semantic_own, "normalized": normalized})
+        about |= {"begins_as": field.name} if initial else {}
     with _Bar() as bar:
-        trained, provenance = train_gaze(data, medium, box, config, settings, how, ns, _similarity(align), bar.update, initial)
+        trained, provenance = train_gaze(data, place.medium, place.box, config, settings, how, ns, _similarity(align), bar.update, initial)
     save_gaze(trained, output, {**about, **provenance}, half)
     _report(provenance)
     typer.echo(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
+
+
+def _given(**options) -> dict:
+    return {k: v for k, v in options.items() if v is not None}
 
 
 def _check_start(begin: str, freeze: bool, semantic: str, field: Path | None) -> None:
@@ -113,27 +122,33 @@ def _check_start(begin: str, freeze: bool, semantic: str, field: Path | None) ->
         raise ValueError(f'{"--semantic" if semantic else "--begin field"} needs a radiance field: give it with --field')
 
 
-def _trained_place(path: Path, ns, sha256):
-    from ..formats.fields import load_radiance
-    from ..transport.media import FieldMedium
+def _begun(begin: str, place, config, more: dict) -> tuple:
+    """Configuration, and the arrays to begin with (None: random ones), of a field of the recipes small and paper."""
+    config = place.told(config)
+    if begin == "field":
+        from ..training.gaze_semantics import config_like, trunk_of
 
-    field, _ = load_radiance(path, ns)
-    return FieldMedium(field), field.box, {"file": path.name, "sha256": sha256(path)}
+        config = config_like(place.medium.field.config, config.variant, config.activation, **more)
+        return config, trunk_of(place.medium.field, config)
+    if more["semantic"]:
+        more = {**more, "geometry": place.medium.feature_count}
+    return replace(config, **more), None
 
 
-def _place_of_hits(rays, output: Path, voxel: float, sha256):
-    import mitsuba as mi
+def _place(field, scene, geometry, rays, output: Path, voxel: float, ns):
+    from ..training import gaze_places as places
 
-    from ..training.hit_geometry import volume_dict, voxelise_hits, write_volume
-    from ..transport.media import VolumeMedium
-
-    density, box = voxelise_hits(rays, voxel)
+    if field is not None:
+        return places.place_of_field(field, ns)
+    if scene is not None:
+        return places.place_of_scene(scene)
+    if geometry == "none":
+        return places.place_of_nothing(rays)
     path = output.with_suffix(".vol")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    write_volume(path, density, box)
-    size = " x ".join(map(str, density.shape[::-1]))
-    typer.echo(f"wrote {path}: {size} voxels of {voxel:g} m, {100 * (density > 0).mean():.1f} % solid")
-    return VolumeMedium(mi.load_dict(volume_dict(path))), box, {"file": path.name, "sha256": sha256(path), "voxel": voxel}
+    place = places.place_of_hits(rays, path, voxel)
+    made = place.about["geometry_file"]
+    typer.echo(f"wrote {path}: {' x '.join(map(str, made['shape']))} voxels of {voxel:g} m, {100 * made['solid']:.1f} % solid")
+    return place
 
 
 def _similarity(path: Path | None):

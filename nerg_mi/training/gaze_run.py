@@ -9,7 +9,7 @@ from typing import Callable
 import numpy as np
 
 from ..attention.rays import Rays
-from ..attention.splits import split_by_position
+from ..attention.splits import purge, split_by_person, split_by_position
 from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
 from ..field.log_gaze import LogGazeConfig, LogGazeField
@@ -45,19 +45,28 @@ class _Fit:
     interrupted: bool
 
 
-def hold_out(rays: Rays, radius: float, zones: int, positions: int, seed: int = 0, min_rays: int = 64) -> tuple[Rays, dict]:
+def hold_out(rays: Rays, radius: float, zones: int, positions: int, seed: int = 0, min_rays: int = 64,
+             people: float = 0.0) -> tuple[Rays, dict]:
     """Rays to train on, when ``positions`` test positions in ``zones`` zones are held out; and an account of it (JSON).
 
     Every ray within 2 ``radius`` metres of a test position is left out (``attention.splits``), so that no probe of
-    training comes within ``radius`` of one. The account holds the test ``centres`` in the rays' frame.
+    training comes within ``radius`` of one. With a share of ``people`` these are left out everywhere, and the test positions
+    are theirs. The account holds the test ``centres`` in the rays' frame, and the names of the ``people`` left out.
     """
-    split = split_by_position(rays, radius, zones=zones, test_probes=positions, min_rays=min_rays, seed=seed)
+    known, names = np.ones(len(rays), bool), []
+    looked_at = rays
+    if people:
+        known, unseen = split_by_person(rays, test_share=people, seed=seed)
+        names = [rays.persons[i] for i in np.unique(rays.person[unseen])]
+        looked_at = rays.select(unseen)
+    split = split_by_position(looked_at, radius, zones=zones, test_probes=positions, min_rays=min_rays, seed=seed)
+    train = known & purge(rays, split.test_centres, 2 * radius)
     account = {
         "centres": split.test_centres.round(6).tolist(), "zone": split.zone.tolist(), "radius": radius,
-        "purged_within": 2 * radius, "seed": seed, "rays": len(rays), "rays_to_train": int(split.train.sum()),
-        "rays_near_tests": int(split.test.sum()),
+        "purged_within": 2 * radius, "seed": seed, "rays": len(rays), "rays_to_train": int(train.sum()),
+        "rays_near_tests": int(split.test.sum()), "people": names,
     }  # fmt: skip
-    return rays.select(split.train), account
+    return rays.select(train), account
 
 
 def train_gaze(
@@ -79,7 +88,7 @@ def train_gaze(
     learn, watched, held = rays, None, 0
     if settings.zones:
         split = split_by_position(rays, probes.radius, zones=settings.zones, test_probes=settings.watched,
-                                  min_rays=probes.min_rays, seed=settings.seed + 1)
+                                  min_rays=settings.watched_rays or probes.min_rays, seed=settings.seed + 1)
         learn, held = rays.select(split.train), int((~split.train).sum())
         # With all rays around them: what is scored is what people there really looked at.
         watched = supervise_rays(rays, medium, box, probes, align, split.test_centres, settings.seed + 2, config.semantic, config)

@@ -46,7 +46,7 @@ def uniform_scale(variant: str, activation: str) -> float:
 class ProbeSettings:
     """How rays become supervision; lengths in metres, in the rays' frame.
 
-    ``radius``, ``count`` (queries at distinct ray origins), ``cap``, ``min_rays``, ``kappa_rule``, ``kappa``: see
+    ``radius``, ``placement``, ``count``, ``spacing``, ``cap``, ``min_rays``, ``kappa_rule``, ``kappa``: see
     ``attention.probes.place_probes``. ``directions``: how many of equal area each probe has, turned at random, fixed for the
     whole training, so that depths are traced once. ``depth``: kind of depth that is the surface (``transport.depth``).
     """
@@ -59,6 +59,8 @@ class ProbeSettings:
     kappa: float = 50.0
     directions: int = 1024
     depth: str = "median"
+    placement: str = "data"
+    spacing: float | None = None
 
     def __post_init__(self):
         if self.directions < 16 or self.count < 1:
@@ -82,8 +84,9 @@ class GazeSettings:
     for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself; ``weight_decay``: decoupled
     (AdamW), a share of the weights a step a unit of learning rate; ``average``: decay a step of the averaged weights,
     which are the result. ``looks``: how often in a run the validation is looked at; ``patience``: looks without an
-    improvement after which the run ends (0: never). ``zones``, ``watched``: of the validation, groups of positions
-    and probes in them; no zones, no validation. ``refit``: train again on all rays, the validation's too, for as many
+    improvement after which the run ends (0: never). ``zones``, ``watched``, ``watched_rays``: of the validation, groups
+    of positions, probes in them, and rays that each has at least (default: as many as those of the training); no zones, no
+    validation. ``refit``: train again on all rays, the validation's too, for as many
     steps as were best. ``frozen``: weights that were given to begin with are not trained.
     """
 
@@ -104,6 +107,7 @@ class GazeSettings:
     patience: int = 6
     zones: int = 3
     watched: int = 60
+    watched_rays: int | None = None
     refit: bool = True
     frozen: bool = False
 

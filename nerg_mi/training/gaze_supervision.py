@@ -63,7 +63,7 @@ def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | 
               seed: int = 0, semantic: str = "", fill: bool = False) -> Supervision:
     """Directions, true densities and surfaces of ``probes``.
 
-    ``medium``: what depths are traced in (``FieldMedium`` or ``VolumeMedium``) and ``box``, where the gaze field will
+    ``medium``: what depths are traced in (see ``surfaces``) and ``box``, where the gaze field will
     live: both in the field's frame. ``count``: directions a probe, a Fibonacci set under a rotation of its own, so that
     together the probes see what one set leaves out. ``align``: similarity from the rays' frame to the field's.
     ``semantic``: which features of ``medium`` to keep (``field.gaze.SEMANTICS``); ``fill``: see ``surfaces``.
@@ -89,8 +89,8 @@ def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align:
     """Probes on ``rays``, at ``queries`` (P, 3) metres where given, and what ``supervise`` makes of them. ``config``: of
     the gaze field; a ``LogGazeConfig`` has the blind density made, and says what to do with directions that escape."""
     s, log = settings, isinstance(config, LogGazeConfig)
-    probes = place_probes(rays, s.radius, count=s.count, queries=queries, cap=s.cap, min_rays=min(s.min_rays, s.cap),
-                          kappa_rule=s.kappa_rule, kappa=s.kappa, seed=seed)
+    probes = place_probes(rays, s.radius, placement=s.placement, count=s.count, spacing=s.spacing, queries=queries, cap=s.cap,
+                          min_rays=min(s.min_rays, s.cap), kappa_rule=s.kappa_rule, kappa=s.kappa, seed=seed)
     out = supervise(probes, medium, box, s.directions, align, s.depth, seed, semantic,
                     log and config.escaped == "nearest")
     return replace(out, blind=blind_prior(rays, config.prior, align, seed)) if log else out

@@ -49,8 +49,12 @@ class Place:
     @property
     def diagonal(self) -> float:
         """Diagonal of the bounding box of all shapes, in scene units."""
+        return float(np.linalg.norm(np.subtract(*self.corners())))
+
+    def corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the bounding box of all shapes."""
         corners = [_corners(shape) for shape in self.scene.shapes()]
-        return float(np.linalg.norm(np.max([c[1] for c in corners], 0) - np.min([c[0] for c in corners], 0)))
+        return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
 
     def look(self, ray, active, settings, *, far=dr.inf, **options) -> View:
         """Look along ``ray`` (a Mitsuba ray; its ``maxt`` counts) up to the distance ``far``.

@@ -7,12 +7,15 @@ import numpy as np
 from ..field.backend import namespace
 from .depth import KINDS, surface_depth
 from .march import MarchSettings, march
+from .place import Place
 
 BATCH = 1 << 19
 
 
 def default_settings(medium) -> MarchSettings:
     """The march of the integrator ``nerg`` with nothing set: the medium's own step, or a 1024th of its diagonal."""
+    if isinstance(medium, Place):
+        return default_settings(medium.medium) if medium.medium is not None else MarchSettings(step=1)
     return MarchSettings(step=medium.step or medium.length_scale / 1024)
 
 
@@ -20,7 +23,7 @@ def trace_depth(medium, origins, directions, settings: MarchSettings | None = No
                 batch: int = BATCH):
     """Depth of the surface along rays through a medium, and the opacity that they meet: a density-only march.
 
-    ``medium``: a ``FieldMedium`` or ``VolumeMedium``. ``origins``, ``directions``: N rays in the scene's frame, directions
+    ``medium``: a ``FieldMedium`` or ``VolumeMedium``, or a ``Place`` (of shapes, whose rays are cast exactly, or of both). ``origins``, ``directions``: N rays in the scene's frame, directions
     unit, either as NumPy arrays (N, 3) or as Dr.Jit 3-arrays of N lanes. ``settings``: see ``default_settings``.
     ``kind``: ``median``, ``expected`` or ``refined`` (``transport.depth``). Returns ``(depth, opacity)`` of the kind that
     the rays came in (float32 (N,), or Dr.Jit Floats, evaluated): depth is the distance from the origin in scene units, 0
@@ -65,11 +68,17 @@ def _traced_jit(medium, origins, directions, settings, kind, batch):
 
 def _types(medium):
     """Namespace and 3-array of the backend that a medium's arrays belong to."""
+    if isinstance(medium, Place):
+        import mitsuba as mi
+
+        return namespace(mi.variant()), mi.Point3f
     ns = namespace(next(v for v in medium.parameters() if dr.is_array_v(v)))
     return ns, ns.Array3f
 
 
 def _trace(medium, o, d, settings, kind):
+    if isinstance(medium, Place):
+        return _looked(medium, o, d, settings, kind)
     with dr.suspend_grad():
         ray = medium.local(o, d)
         t0, t1 = dr.maximum(ray.t_near, 0), ray.t_far
@@ -78,5 +87,17 @@ def _trace(medium, o, d, settings, kind):
         depth = surface_depth(kind, result, medium, ray, t0, t1, active, settings)
         opacity = dr.select(active, result.opacity, 0)
         depth = dr.select(active, depth, 0)
+    dr.eval(depth, opacity)
+    return depth, opacity
+
+
+def _looked(place, o, d, settings, kind):
+    import mitsuba as mi
+
+    with dr.suspend_grad():
+        everywhere = dr.full(mi.Bool, True, max(dr.width(o), dr.width(d)))
+        view = place.look(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), everywhere, settings)
+        opacity = view.opacity + dr.zeros(mi.Float, dr.width(everywhere))
+        depth = view.depth(kind, opacity > 0)
     dr.eval(depth, opacity)
     return depth, opacity

@@ -237,5 +237,54 @@ def test_the_command_trains_on_hits(rays, tmp_path, monkeypatch, capsys):
     field, meta = load_gaze(out, namespace("llvm"))
     about = meta["provenance"]
     assert about["steps"] == 3 and len(about["rays_file"]["sha256"]) == 64 and len(about["geometry_file"]["sha256"]) == 64
-    with pytest.raises(ValueError, match="either --field FILE or --geometry hits"):
+    with pytest.raises(ValueError, match="one of --field FILE, --scene FILE"):
         app([str(tmp_path / "rays.npz"), "-o", str(out)], standalone_mode=False)
+    with pytest.raises(ValueError, match="add --recipe small"):
+        app([*arguments.split(), "--loss", "paper"], standalone_mode=False)
+
+
+@pytest.mark.parametrize("recipe", ["default", "small", "paper"])
+def test_recipes_in_a_scene_of_shapes(rgb, rays, tmp_path, recipe):
+    """The wall as a shape: its exact distance, and what looks past it escapes."""
+    import typer
+
+    from nerg_mi.cli.train_gaze import train_gaze
+    from nerg_mi.training.gaze_places import place_of_scene
+
+    (tmp_path / "scene.xml").write_text("""<scene version="3.0.0"><shape type="rectangle"><transform name="to_world">
+        <scale value="2"/><lookat origin="1.5, 0, 1.5" target="0, 0, 1.5" up="0, 0, 1"/></transform></shape></scene>""")
+    rays.save(tmp_path / "rays.npz")
+    app, out = typer.Typer(), tmp_path / "gaze.safetensors"
+    app.command()(train_gaze)
+    app(f"{tmp_path / 'rays.npz'} --scene {tmp_path / 'scene.xml'} --recipe {recipe} -o {out} --radius 0.5 --probes 6 --min-rays 8 "
+        f"--steps 2 --directions 64 --zones 0 {'--size small' if recipe == 'paper' else ''}".split(), standalone_mode=False)
+    field, meta = load_gaze(out, namespace("llvm"))
+    assert meta["provenance"]["recipe"] == recipe and 0.3 < meta["provenance"]["escaped_directions"] < 0.9
+    assert meta["output"] == {"activation": {"default": "log", "small": "softplus", "paper": "linear"}[recipe], "normalized": recipe == "default"}
+    place = place_of_scene(tmp_path / "scene.xml")
+    data = supervise_rays(rays, place.medium, place.box, PROBES)
+    hit = data.positions[:, None] + data.directions * data.distance[..., None]
+    np.testing.assert_allclose(hit[~data.escaped][:, 0], 1.5, atol=1e-5)
+
+
+def test_without_geometry(rays, tmp_path):
+    import typer
+
+    from nerg_mi.cli.train_gaze import train_gaze
+
+    rays.save(tmp_path / "rays.npz")
+    app, out = typer.Typer(), tmp_path / "gaze.safetensors"
+    app.command()(train_gaze)
+    arguments = f"{tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 2 --directions 64 --zones 0"
+    app(arguments.split(), standalone_mode=False)
+    field, meta = load_gaze(out, namespace("llvm"))
+    assert field.config.geometry == "none" and meta["provenance"]["geometry"] == "none" and meta["provenance"]["escaped_directions"] == 0
+    with pytest.raises(ValueError, match="needs surfaces"):
+        app([*arguments.split(), "--recipe", "small"], standalone_mode=False)
+
+
+def test_people_and_positions_are_held_out():
+    rays = looking_at((1.5, 0, 1.2), 4000, spread=6.0)
+    kept, account = gaze_run.hold_out(rays, 0.25, zones=2, positions=10, min_rays=8, people=0.5)
+    assert len(account["people"]) == 1 and set(np.unique(kept.person)) == {1 - rays.persons.index(account["people"][0])}
+    assert np.linalg.norm(kept.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.5

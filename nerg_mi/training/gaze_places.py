@@ -1,0 +1,95 @@
+"""Where people looked around: what a gaze field's depths are traced in, and what it is told where there is nothing."""
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..attention.collecting import file_sha256
+from ..attention.rays import Rays
+from ..field.box import Box
+from ..field.gaze import GazeConfig
+from ..field.log_gaze import LogGazeConfig
+from ..transport.media import FieldMedium, VolumeMedium
+from ..transport.place import Place
+from .hit_geometry import VOXEL, volume_dict, voxelise_hits, write_volume
+
+# How far people without any geometry are taken to look.
+_NOWHERE = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class GazePlace:
+    """``medium``: what ``transport.trace.trace_depth`` traces, None where nothing is known; ``box``: where a gaze field
+    lives; ``about``: for the provenance (JSON); ``kind``: ``field``, ``scene``, ``hits`` or ``none``."""
+
+    medium: object
+    box: Box
+    kind: str
+    about: dict = field(default_factory=dict)
+
+    def told(self, config: GazeConfig | LogGazeConfig) -> GazeConfig | LogGazeConfig:
+        """``config`` of a gaze field that knows what such a place is: one of hit points has holes, which were seen through by
+        nobody that it was made from; no place has no surfaces. Raises ``ValueError`` for a field that needs surfaces."""
+        if isinstance(config, LogGazeConfig):
+            return replace(config, escaped="nearest" if self.kind == "hits" else "constant",
+                           geometry="none" if self.kind == "none" else "surface")
+        if self.kind == "none":
+            raise ValueError("a gaze field of this recipe needs surfaces; without any geometry only the default recipe trains")
+        return config
+
+
+def place_of_field(path: Path, ns) -> GazePlace:
+    """A trained radiance field."""
+    from ..formats.fields import load_radiance
+
+    radiance, _ = load_radiance(path, ns)
+    return GazePlace(FieldMedium(radiance), radiance.box, "field", {"field_file": _file(path)})
+
+
+def place_of_scene(path: Path) -> GazePlace:
+    """The shapes of a Mitsuba scene, and the field or volume of its integrator where that is a ``nerg``."""
+    import mitsuba as mi
+
+    scene = mi.load_file(str(path))
+    place = Place(getattr(scene.integrator(), "medium", None), scene)
+    bounds = [] if place.medium is None else [place.medium.bounds()]
+    if place.scene is not None:
+        bounds.append(place.corners())
+    if not bounds:
+        raise ValueError(f'the scene "{path}" has neither shapes nor a field in which people could have looked around')
+    lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
+    # A plane has no thickness, and a field needs some.
+    pad = 0.01 * max(upper - lower)
+    return GazePlace(place, Box(tuple(lower - pad), tuple(upper + pad)), "scene", {"scene_file": _file(path)})
+
+
+def place_of_hits(rays: Rays, path: Path, voxel: float = VOXEL) -> GazePlace:
+    """A volume made of the rays' hit points, written to ``path`` (.vol)."""
+    density, box = voxelise_hits(rays, voxel)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_volume(path, density, box)
+    size = {"shape": list(density.shape[::-1]), "solid": round(float((density > 0).mean()), 4), "voxel": voxel}
+    return place_of_volume(path, size)
+
+
+def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
+    """A volume that ``place_of_hits`` has written."""
+    import mitsuba as mi
+
+    if not path.is_file():
+        raise FileNotFoundError(f'the place of hit points "{path}" does not exist; it is written beside the gaze field')
+    medium = VolumeMedium(mi.load_dict(volume_dict(path)))
+    lower, upper = medium.bounds()
+    return GazePlace(medium, Box(tuple(lower.tolist()), tuple(upper.tolist())), "hits", {"geometry_file": {**_file(path), **(about or {})}})
+
+
+def place_of_nothing(rays: Rays) -> GazePlace:
+    """No geometry: everything is two metres away from whoever looks."""
+    lower, upper = rays.origin.min(axis=0) - _NOWHERE, rays.origin.max(axis=0) + _NOWHERE
+    return GazePlace(None, Box(tuple(lower.tolist()), tuple(upper.tolist())), "none", {"geometry": "none"})
+
+
+def _file(path: Path) -> dict:
+    return {"file": path.name, "sha256": file_sha256(path)}
