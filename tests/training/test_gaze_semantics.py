@@ -123,7 +123,7 @@ def test05_the_command(rgb, place, rays, tmp_path, capsys):
     rays.save(tmp_path / "rays.npz")
     arguments = ["train", "gaze", str(tmp_path / "rays.npz"), "-o", str(tmp_path / "gaze.safetensors"), "--field", str(tmp_path / "field.safetensors"),
                  "--semantic", "snapshot", "--begin", "field", "--freeze", "--steps", "4", "--probes", "6", "--radius", "0.5", "--min-rays", "8",
-                 "--directions", "32", "--zones", "0"]
+                 "--directions", "32", "--zones", "0", "--recipe", "small"]
     with pytest.raises(SystemExit) as end:
         main(arguments)
     assert not end.value.code, capsys.readouterr().err
