@@ -67,6 +67,46 @@ def nss(density: np.ndarray, at_gaze: np.ndarray, weights: np.ndarray | None = N
     return np.where(deviation > 0, (at_gaze - mean) / np.where(deviation > 0, deviation, 1.0), 0.0)
 
 
+def auc_judd(
+    density: np.ndarray, at_gaze: np.ndarray, weights: np.ndarray | None = None, *, fixated: np.ndarray | None = None
+) -> np.ndarray:
+    """Area under the curve of hits against false alarms, thresholds at the gazes' own values (Judd et al. 2012); 0.5 is chance.
+
+    ``density`` (..., D); ``at_gaze`` (..., K), the map's values where people looked. Hits: the share of gazes at or above the
+    threshold; false alarms: the share of the map that is. ``fixated`` (..., D) bool leaves pixels out of the latter, as the
+    original does on a picture; rays are no pixels, and leave out nothing.
+    """
+    w = _shares(density, density, weights)
+    density, at_gaze = np.asarray(density, np.float64), np.asarray(at_gaze, np.float64)
+    shape = np.broadcast_shapes(density.shape[:-1], at_gaze.shape[:-1])
+    w = np.broadcast_to(w if fixated is None else w * ~np.asarray(fixated), (*shape, density.shape[-1]))
+    density = np.broadcast_to(density, w.shape).reshape(-1, w.shape[-1])
+    gazes = np.broadcast_to(at_gaze, (*shape, at_gaze.shape[-1])).reshape(len(density), -1)
+    out = np.empty(len(density))
+    for i, (row, share, gaze) in enumerate(zip(density, w.reshape(density.shape), gazes)):
+        # Equal values are one threshold: a map that is constant where people look is not to be blamed for it.
+        thresholds, last = np.unique(-gaze, return_counts=True)
+        thresholds, hits = -thresholds, np.cumsum(last) / len(gaze)
+        order = np.argsort(row)
+        below = np.concatenate([[0], np.cumsum(share[order])])
+        false = 1 - below[np.searchsorted(row[order], thresholds, "left")] / below[-1]
+        out[i] = np.trapezoid(np.concatenate([[0], hits, [1]]), np.concatenate([[0], false, [1]]))
+    return out.reshape(shape)
+
+
+def sauc(at_gaze: np.ndarray, at_others: np.ndarray) -> np.ndarray:
+    """Shuffled AUC: how often the map is higher where people looked, ``at_gaze`` (..., K), than where they looked from other
+    positions, ``at_others`` (..., M); ties count half. 0.5 is chance, which what does not depend on the position has."""
+    a, b = np.asarray(at_gaze, np.float64), np.asarray(at_others, np.float64)
+    shape = np.broadcast_shapes(a.shape[:-1], b.shape[:-1])
+    a, b = (np.broadcast_to(v, (*shape, v.shape[-1])).reshape(-1, v.shape[-1]) for v in (a, b))
+    out = []
+    for gaze, other in zip(a, np.sort(b, axis=-1)):
+        lower, upper = (np.searchsorted(other, gaze, side) for side in ("left", "right"))
+        out.append(np.mean(0.5 * (lower + upper)) / len(other))
+    return np.reshape(out, shape)
+
+
 def information_gain(
     at_gaze: np.ndarray, baseline_at_gaze: np.ndarray, *, eps: float = np.finfo(np.float64).eps
 ) -> np.ndarray:
