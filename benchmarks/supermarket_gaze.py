@@ -1,33 +1,28 @@
 """Gaze of real people in a VR supermarket, end to end: tracking files, rays, a place of hit points, a gaze field, scores.
 
-    python benchmarks/supermarket_gaze.py [--data FOLDER] [--kappa 20] [--folds 2] [--out out/benchmarks/supermarket_gaze.csv]
+    python benchmarks/supermarket_gaze.py [--data FOLDER] [--recipe default] [--folds 5] [--out out/benchmarks/supermarket_gaze]
 
-Runs `nerg rays import --preset vr_supermarket` and, for each fold, `nerg train gaze --geometry hits --test-zones 3`. In
-each fold the zones are others; every ray within 2R of a test position is left out of training, of the place and of the
-baselines. Truth at a test position is the kernel density (`--kappa`) of the rays within R of it, in 2,048 directions of
-equal area. `bits` is the information that the densities, normalised over the sphere, have about 128 of those rays
-themselves beyond the position-blind density (kappa 50), a ray, as seen from the test position.
-
-`split half` predicts one half of the people around a test position by the other half: a reference, not a bound, and scored
-against its own half (at positions where either half has 64 rays).
-KLD is of densities normalised over the sphere, with 1e-6 of the uniform density added to both; MAE and `integral` are of the
-densities as they are. Rows are means over folds of means over positions.
+Runs, as a user would, `nerg rays import --preset vr_supermarket` and for each fold `nerg train gaze --geometry hits --test-zones 3
+--test-people 0.5` and `nerg eval gaze` for each split. Half of the people train, and the other half are scored at 60 positions in
+three zones; every ray within 2R of a test position is left out of training, of the place and of the baselines. Splits: `both`,
+people and positions are new; `pos`, the training people at new positions; `people`, new people elsewhere. What the columns mean is in
+each fold's `gaze.md`. The recipe's settings were chosen by folds within the training people of these folds, and no score of the
+test people or positions. Rows are means over folds.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-
-DIRECTIONS = 2048
-RAYS = 128  # of each test position, for the information
 ROOT = Path(__file__).resolve().parents[1]
+SCORES = ("KLD", "CC", "SIM", "MAE", "NSS", "AUC", "sAUC", "bits", "loglik")
+OURS, BAR = "gaze field", "4,096 nearest rays"
 
 
 def nerg(*arguments) -> None:
@@ -36,118 +31,66 @@ def nerg(*arguments) -> None:
     subprocess.run([sys.executable, "-c", code, *map(str, arguments)], check=True, cwd=ROOT)
 
 
-def around(rays, centres, radius: float, kappa: float, cap: int = 1024):
-    """Probes at ``centres`` (all of them have rays), their densities and ray directions."""
-    from nerg_mi.attention.probes import place_probes
-
-    return place_probes(rays, radius, queries=centres, cap=cap, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query")
-
-
-def split_half(rays, centres, radius: float, kappa: float, directions) -> dict:
-    """Scores of one half of the people against the other, where both have 64 rays."""
-    from scipy.spatial import cKDTree
-
-    from nerg_mi.attention.splits import split_by_person
-    from nerg_mi.evaluation.gaze_scores import scores
-
-    halves = [rays.select(mask) for mask in split_by_person(rays, seed=0)]
-    enough = np.all([cKDTree(h.origin).query_ball_point(centres, radius, return_length=True) >= 64 for h in halves], axis=0)
-    if not enough.any():
-        return {}
-    density = [around(h, centres[enough], radius, kappa).density(directions) for h in halves]
-    return {"method": "split half", **scores(*density), "bits": np.nan}
-
-
-def information(tests, density, blind, positions, directions) -> float:
-    """Bits a ray of ``density`` beyond ``blind``, both normalised over ``directions``, at `RAYS` random rays of each test."""
-    rng = np.random.default_rng(0)
-    which = np.stack([rng.integers(a, b, RAYS) for a, b in zip(tests.offsets[:-1], tests.offsets[1:])])
-    at = tests.directions[which]
-    tiny = np.finfo(float).eps
-
-    def bits(method):
-        sphere = np.maximum(method(positions, directions).astype(float), 0).mean(axis=1)
-        return np.log2(np.maximum(method(positions, at).astype(float), 0) / (4 * np.pi * sphere[:, None]) + tiny)
-
-    return float(np.mean(bits(density) - bits(blind)))
-
-
-def run_fold(rays_file: Path, seed: int, args) -> list[dict]:
-    """Train and score one fold."""
-    import mitsuba as mi
-
-    from nerg_mi.attention.probes import place_probes
-    from nerg_mi.attention.rays import Rays
-    from nerg_mi.attention.sphere import fibonacci_directions
-    from nerg_mi.attention.splits import purge
-    from nerg_mi.evaluation import gaze_baselines as baselines
-    from nerg_mi.evaluation.gaze_scores import gaze_field, print_scores, scores
-    from nerg_mi.field.backend import namespace
-    from nerg_mi.formats.fields import load_gaze
-    from nerg_mi.training.hit_geometry import volume_dict
-    from nerg_mi.transport.media import VolumeMedium
-
-    file = args.out.parent / f"supermarket_{seed}.safetensors"
-    nerg("train", "gaze", rays_file, "--geometry", "hits", "-o", file, "--test-zones", 3, "--test-positions", 60,
-         "--kappa", args.kappa, "--seed", seed, "--steps", args.steps)  # fmt: skip
-    gaze, meta = load_gaze(file, namespace("llvm_ad_rgb"))
-    medium = VolumeMedium(mi.load_dict(volume_dict(file.with_suffix(".vol"))))
-    about, rays = meta["provenance"], Rays.load(rays_file)
-    centres, radius = np.array(about["test"]["centres"]), about["test"]["radius"]
-    train = rays.select(purge(rays, centres, about["test"]["purged_within"]))
-    directions = fibonacci_directions(DIRECTIONS)
-    probes = place_probes(train, radius, count=about["probes"]["count"], kappa_rule="fixed", kappa=args.kappa, seed=seed)
-    blind = baselines.position_blind(train, kappa=50)
-    methods = {
-        "gaze field": gaze_field(gaze, medium), "position-blind, kappa 50": blind,
-        f"position-blind, kappa {args.kappa:g}": baselines.position_blind(train, kappa=args.kappa),
-        "1 nearest probe": baselines.nearest_probes(probes, 1), "16 nearest probes": baselines.nearest_probes(probes, 16),
-        "4,096 nearest rays": baselines.nearest_rays(train, 4096, kappa=args.kappa),
-    }  # fmt: skip
-    tests = around(rays, centres, radius, args.kappa)
-    truth = tests.density(directions)
-    rows = [{"method": name, **scores(truth, density(centres, directions)),
-             "bits": information(tests, density, blind, centres, directions)} for name, density in methods.items()]  # fmt: skip
-    half = split_half(rays, centres, radius, args.kappa, directions)
-    rows += [half] if half else []
-    integral = 4 * np.pi * methods["gaze field"](centres, directions).mean(axis=1)
-    print_scores(rows, f"fold {seed}: {len(centres)} positions, {len(train):,} of {len(rays):,} rays trained on, kappa {args.kappa:g}")
-    print(f"integral of the gaze field over the sphere: mean {integral.mean():.3f}, {integral.min():.3f} to {integral.max():.3f}")
+def run_fold(rays: Path, seed: int, args) -> list[dict]:
+    """Train one fold, and score it in every split."""
+    file, rows = args.out / f"fold_{seed}.safetensors", []
+    threads = ["--threads", args.threads] if args.threads else []
+    nerg("train", "gaze", rays, "--geometry", "hits", "-o", file, "--recipe", args.recipe, "--test-zones", 3, "--test-positions", 60,
+         "--test-people", 0.5, "--seed", seed, *(["--steps", args.steps] if args.steps else []), *threads)  # fmt: skip
+    for split in args.splits.split(","):
+        folder = args.out / f"fold_{seed}_{split}"
+        nerg("eval", "gaze", file, rays, "--split", split, "-o", folder, "--kappa", args.kappa, "--seed", seed, *threads)
+        rows += [{"fold": seed, "split": split, **r} for r in json.loads((folder / "gaze.json").read_text())["methods"]]
     return rows
 
 
+def means(rows: list[dict], split: str) -> list[dict]:
+    """Each method's mean over folds."""
+    rows = [r for r in rows if r["split"] == split]
+    out = []
+    for name in dict.fromkeys(r["method"] for r in rows):
+        found = [r for r in rows if r["method"] == name]
+        out.append({"split": split, "method": name, **{k: sum(r[k] for r in found) / len(found) for k in SCORES}, "folds": len(found)})
+    return out
+
+
 def main(argv=None) -> None:
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.evaluation.gaze_scores import EPS, print_scores
-
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "vr_supermarket"
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "vr_supermarket"
     parser.add_argument("--data", type=Path, default=data)
-    parser.add_argument("--kappa", type=float, default=20.0, help="of the truth, the training and the baselines")
-    parser.add_argument("--folds", type=int, default=2)
-    parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/supermarket_gaze.csv"))
+    parser.add_argument("--recipe", default="default")
+    parser.add_argument("--kappa", type=float, default=20.0, help="of the truth and the baselines")
+    parser.add_argument("--folds", type=int, default=5)
+    parser.add_argument("--splits", default="both,pos,people")
+    parser.add_argument("--steps", type=int, help="Default: the recipe's.")
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/supermarket_gaze"))
     args = parser.parse_args(argv)
     args.out = args.out.resolve()
-    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.mkdir(parents=True, exist_ok=True)
     files = sorted(args.data.glob("*.csv.gz"))
     if not files:
         raise SystemExit(f'no recordings in "{args.data}"; set NERG_DATA to the folder that holds vr_supermarket')
-    rays_file = args.out.parent / "supermarket_rays.npz"
-    nerg("rays", "import", *files, "--preset", "vr_supermarket", "-o", rays_file)
-    folds = [run_fold(rays_file, seed, args) for seed in range(args.folds)]
-    found = [{r["method"]: r for r in rows} for rows in folds]
-    mean = [{"method": name, **{k: float(np.mean([f[name][k] for f in found if name in f])) for k in row if k != "method"}}
-            for name, row in found[0].items()]  # fmt: skip
-    print_scores(mean, f"mean of {len(folds)} folds")
-    print(f"KLD with eps {EPS:g} of the uniform density")
-    with open(args.out, "w", newline="") as file:
-        writer = csv.DictWriter(file, mean[0])
-        writer.writeheader()
-        writer.writerows(mean)
-    print(f"wrote {args.out}")
+    rays = args.out / "rays.npz"
+    nerg("rays", "import", *files, "--preset", "vr_supermarket", "-o", rays)
+    rows = [row for seed in range(args.folds) for row in run_fold(rays, seed, args)]
+    table = []
+    for split in args.splits.split(","):
+        table += means(rows, split)
+        print(f"\n{split}, mean of {args.folds} folds\n{'method':28s}" + "".join(f"{k:>9s}" for k in SCORES))
+        for r in table:
+            if r["split"] == split:
+                print(f"{r['method']:28s}" + "".join(f"{r[k]:9.4f}" if k == "MAE" else f"{r[k]:9.3f}" for k in SCORES))
+        print(f"fold by fold, {OURS} less {BAR}:")
+        for seed in range(args.folds):
+            ours, bar = (next(r for r in rows if (r["fold"], r["split"], r["method"]) == (seed, split, m)) for m in (OURS, BAR))
+            print(f"  {seed}: KLD {ours['KLD'] - bar['KLD']:+.3f}, CC {ours['CC'] - bar['CC']:+.3f}, bits {ours['bits'] - bar['bits']:+.3f}")
+    for name, content in (("folds.csv", rows), ("means.csv", table)):
+        with open(args.out / name, "w", newline="") as file:
+            writer = csv.DictWriter(file, list(dict.fromkeys(k for r in content for k in r)), restval="")
+            writer.writeheader()
+            writer.writerows(content)
+        print(f"wrote {args.out / name}")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ COMMANDS = {
     "render": "Render a scene file to an EXR or PNG file.",
     "rays": "Import tracking files as rays of attention, and look at what they hold.",
     "train": "Train a radiance field on posed photos, or a gaze field on rays.",
-    "eval": "Score a trained radiance field on held-out views.",
+    "eval": "Score a trained radiance field on held-out views, or a gaze field on held-out rays.",
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
     "export": "Write a radiance field as a mesh, points, grid volumes or a torch-ngp checkpoint.",
     "study": "Measure error against run time: a scene at many settings, compared with what is true.",

@@ -6,12 +6,17 @@ from typing import Annotated, Optional
 
 import typer
 
+from .eval_gaze import eval_gaze
+
 app = typer.Typer(no_args_is_help=True, help="Score trained fields.")
 
 
 @app.callback()
 def _fields() -> None:
     """Score trained fields."""
+
+
+app.command("gaze")(eval_gaze)
 
 
 @app.command("radiance")

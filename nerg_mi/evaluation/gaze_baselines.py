@@ -11,7 +11,7 @@ from typing import Callable
 import numpy as np
 
 from ..attention.kde import SphericalKde
-from ..attention.probes import Probes
+from ..attention.probes import Probes, place_probes
 from ..attention.rays import Rays
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -87,6 +87,20 @@ def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: obj
         return np.concatenate(out)
 
     return evaluate
+
+
+def standard_baselines(
+    rays: Rays, radius: float, kappa: float = 20.0, blind_kappa: float = 50.0, seed: int = 0, count: int = 2048
+) -> tuple[Baseline, dict[str, Baseline]]:
+    """``(blind, baselines)``: the density that information is counted from, and by name all that a gaze field is shown beside:
+    uniform, position-blind, nearest probes and nearest rays of the training ``rays``, with kernels of ``kappa``."""
+    probes = place_probes(rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed)
+    blind = position_blind(rays, kappa=blind_kappa)
+    return blind, {
+        "uniform": uniform(), "position-blind": position_blind(rays, kappa=kappa), f"position-blind, kappa {blind_kappa:g}": blind,
+        "nearest probe": nearest_probes(probes, 1), "16 nearest probes": nearest_probes(probes, 16),
+        "4,096 nearest rays": nearest_rays(rays, 4096, kappa=kappa),
+    }  # fmt: skip
 
 
 def _of(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: object) -> SphericalKde:
