@@ -21,7 +21,7 @@ def plot_errors(path: Path, rows: list[dict], title: str) -> None:
     """Four panels of error against seconds, a colour a factor, the front as a line, the paper's marching as crosses."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogFormatterSciNotation
+    from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 
     import matplotlib
 
@@ -49,8 +49,9 @@ def plot_errors(path: Path, rows: list[dict], title: str) -> None:
         axes.set_ylabel(label, fontsize=8)
         axes.tick_params(labelsize=7, which="both")
         for axis in (axes.xaxis, axes.yaxis):
-            # Where less than a decade is shown, matplotlib would label every minor tick, one upon the other.
-            axis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.5, 0.5)))
+            # Where hardly a decade is shown, matplotlib would label every minor tick, one upon the other.
+            axis.set_minor_locator(LogLocator(subs=(2, 5)))
+            axis.set_minor_formatter(LogFormatterSciNotation(minor_thresholds=(1.5, 1.5)))
         axes.grid(True, which="major", color="0.9", linewidth=0.6)
     figure.suptitle(title, fontsize=10)
     figure.legend(handles.values(), handles, loc="lower center", ncol=6, fontsize=7, frameon=False)

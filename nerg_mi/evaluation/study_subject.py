@@ -228,12 +228,14 @@ class ShapesSubject(FileSubject):
     def __init__(self, path: Path, loaded, width: int, height: int):
         self.corners = study_shapes.triangles(loaded)
         self._hits: dict = {}
+        self._color = None
         super().__init__(path, loaded, width, height)
         self.opaque = True
 
     def resize(self, width: int, height: int) -> None:
         super().resize(width, height)
         self._hits.clear()
+        self._color = None
 
     def first_hits(self, seed: int) -> np.ndarray:
         """Distances (N,) to the shapes along the rays of ``seed``; inf on a miss."""
@@ -242,8 +244,9 @@ class ShapesSubject(FileSubject):
         return self._hits[seed]
 
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
-        color = self.channels(self.integrator({"aovs": ""}), study_shapes.COLOR_SPP, seed + 1)["color"]
-        return study_shapes.truth(self, seed, visibility, color)
+        if self._color is None:
+            self._color = self.channels(self.integrator({"aovs": ""}), study_shapes.COLOR_SPP, seed + 1)["color"]
+        return study_shapes.truth(self, seed, visibility, self._color)
 
     def exact(self, seed: int):
         o, d = self.rays(seed)
