@@ -8,7 +8,7 @@ import numpy as np
 
 from nerg_mi.attention import vmf
 from nerg_mi.attention.kde import SphericalKde
-from nerg_mi.attention.sphere import direction_to_latlong, latlong_to_direction
+from nerg_mi.attention.sphere import direction_to_latlong, latlong_to_direction, logsumexp
 from nerg_mi.evaluation import metrics
 from nerg_mi.field.gaze import activate, softplus
 from nerg_mi.training.gaze_losses import gaze_loss, probe_cc, probe_kld
@@ -20,7 +20,7 @@ LONG = np.longdouble
 
 
 def tables(mi):
-    for title, cases in (("Directions and densities on the sphere", (concentrations, kernels, directions)),
+    for title, cases in (("Directions and densities on the sphere", (concentrations, kernels, log_sums, directions)),
                          ("Scores and losses", (scores, losses, activations))):
         yield title, HEAD, [row.cells() for case in cases for row in case(mi)]
 
@@ -99,6 +99,20 @@ def kernels(mi):
     yield Row("", "at the ray and opposite to it", "derivative with respect to the direction", said(*finite), "finite")
 
 
+def log_sums(mi):
+    """A von Mises-Fisher density of directions of equal area, with its logits moved by a constant."""
+    n = 4096
+    z = (np.arange(n) + 0.5) / n * 2 - 1
+    errors = []
+    for kappa in (0.0, 1.0, 100.0):
+        # ∫ exp(κ z) dω over bands of equal area, by their own sum in 80 bits.
+        exact = np.log(np.sum(np.exp(LONG(kappa) * (z.astype(LONG) - 1))) * 4 * LONG(np.pi) / n)
+        for logit in (-1e6, -1e3, 0.0, 1e3, 1e6):
+            got = logsumexp(kappa * (z - 1) + logit, 4 * np.pi / n)
+            errors.append(abs(float(LONG(got) - logit - exact)) / max(1.0, abs(logit)))
+    yield Row("log ∫ exp over the sphere", "logits -1e6 .. 1e6", "nats, of max(1, |logit|)", max(errors), "80-bit sum")
+
+
 def directions(mi):
     angle = np.concatenate([[0], np.geomspace(1e-12, 1, 60)])
     theta = np.concatenate([angle, np.pi - angle])
@@ -123,7 +137,9 @@ def scores(mi):
     yield Row("KLD, CC and SIM", "maps of zeros, one direction, constants, 1e±150", "all pairs", said(got), "finite")
     yield Row("", "any scale 1e-300 .. 1e300", "KLD of p with itself scaled (nats)",
               max(abs(metrics.kld(p, s * p)) for s in (1e-300, 1e-12, 1.0, 1e12, 1e300)), "0")  # fmt: skip
-    yield Row("", "any scale 1e-150 .. 1e150", "CC of p with itself scaled", max(abs(metrics.cc(p, s * p) - 1) for s in (1e-150, 1e-12, 1e12, 1e150)), "1")
+    scales = (1e-300, 1e-150, 1e-12, 1e12, 1e150, 1e300)
+    yield Row("", "any scale 1e-300 .. 1e300", "CC of p with itself scaled", max(abs(metrics.cc(p, s * p) - 1) for s in scales), "1")
+    yield Row("", "any scale 1e-300 .. 1e300", "NSS of p scaled", max(worst(metrics.nss(s * p, s * p), metrics.nss(p, p)) for s in scales), "NSS of p")
     yield Row("", "one direction against uniform", "KLD (nats)", abs(metrics.kld(one, flat) - math.log(512)), "log 512")
     yield Row("", "prediction zero where the truth is one", "KLD (nats)",
               abs(metrics.kld(one, 1 - one) - math.log(512 / metrics.EPS)), "log 512 / ε, ε = 1e-20")  # fmt: skip

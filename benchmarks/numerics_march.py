@@ -66,6 +66,17 @@ def share_slope(x):
     return np.where(x < 0.2, series, -1 / np.maximum(x, 0.2) ** 2 + 1 / (4 * np.sinh(safe / 2) ** 2))
 
 
+def half(x):
+    """-log((1 + exp(-x)) / 2) / x in float64, where half of a slab's opacity is reached, and its derivative."""
+    x = np.asarray(x, float)
+    safe = np.maximum(x, 0.05)
+    passed = np.exp(-safe)
+    value = -np.log1p(0.5 * np.expm1(-safe)) / safe
+    slope = (passed / (1 + passed) - value) / safe
+    return (np.where(x < 0.05, 0.5 - x / 8 + x**3 / 192 - x**5 / 2880, value),
+            np.where(x < 0.05, -1 / 8 + x**2 / 64 - x**4 / 576, slope))  # fmt: skip
+
+
 def smooth(tau, length=1.0, panels=2000):
     """``(opacity, expected depth)`` of a smooth optical depth ``tau(z)`` on [0, length], by Gauss-Legendre quadrature of
     ∫ (T(z) - T(length)) dz / opacity."""
@@ -127,54 +138,52 @@ def through(mi, medium, o, d, settings):
 SIGMAS = (1e-6, 1e-3, 0.1, 1.0, 10.0, 100.0, 1e3, 1e6, 1e9)
 
 
-def slab_errors(mi, kind: str, sigma: float, ahead: float, gradients: bool) -> dict[str, float]:
-    """Errors of opacity and depth of a unit slab whose face lies ``ahead`` of the ray's origin, and of their derivatives
-    with respect to the density."""
-    if kind == "constvolume":
-        volume = {"type": "constvolume", "value": float(sigma)}
+def slab_errors(mi, volume: str, sigma: float, ahead: float, kind: str) -> dict[str, float]:
+    """Errors of opacity and depth (of ``kind``) of a unit slab whose face lies ``ahead`` of the ray's origin, and of their
+    derivatives with respect to the density."""
+    if volume == "constvolume":
+        density = {"type": "constvolume", "value": float(sigma)}
     else:
-        volume = {"type": "gridvolume", "grid": mi.VolumeGrid(np.full((3, 3, 3), sigma, np.float32)), "raw": True}
+        density = {"type": "gridvolume", "grid": mi.VolumeGrid(np.full((3, 3, 3), sigma, np.float32)), "raw": True}
     # Mitsuba starts the rays of this sensor a hair in front of it.
     z = -ahead - float(mi.math.RayEpsilon)
     film = {"type": "hdrfilm", "width": 1, "height": 1, "component_format": "float32", "rfilter": {"type": "box"}}
     sensor = {"type": "radiancemeter", "origin": [0.5, 0.5, z], "direction": [0, 0, 1],
               "sampler": {"type": "independent", "sample_count": 1}, "film": film}  # fmt: skip
-    integrator = {"type": "nerg", "id": "integrator", "density": volume, "radiance": False, "aovs": "depth,opacity"}
+    integrator = {"type": "nerg", "id": "integrator", "density": density, "depth": kind, "radiance": False, "aovs": "depth,opacity"}
     scene = mi.load_dict({"type": "scene", "sensor": sensor, "integrator": integrator})
     depth, opacity = values(mi.render(scene, spp=1)).ravel()[3:]
     x = float(np.float32(sigma))
-    expected = {"opacity": -math.expm1(-x), "depth": ahead + float(share(x))}
-    out = {"opacity": worst(opacity, expected["opacity"]), "depth": worst(depth, expected["depth"])}
-    if gradients:
-        params = mi.traverse(scene)
-        key = next(k for k in params.keys() if k.endswith(("value.value", "density.data")))
-        slopes = {"depth": (3, float(share_slope(x))), "opacity": (4, math.exp(-x))}
-        for name, (channel, slope) in slopes.items():
-            value = type(params[key])(dr.detach(params[key]))
-            dr.enable_grad(value)
-            params[key] = value
-            params.update()
-            dr.backward(dr.gather(mi.Float, mi.render(scene, params, spp=1).array, channel))
-            got = float(values(dr.grad(value)).sum())
-            out[f"d {name}"] = worst(got, slope, relative=name == "depth" or slope > 1e-6)
+    inside, slope = (share(x), share_slope(x)) if kind == "expected" else half(x)
+    out = {"opacity": worst(opacity, -math.expm1(-x)), kind: worst(depth, ahead + float(inside))}
+    params = mi.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith(("value.value", "density.data")))
+    for name, channel, slope in ((kind, 3, float(slope)), ("opacity", 4, math.exp(-x))):
+        value = type(params[key])(dr.detach(params[key]))
+        dr.enable_grad(value)
+        params[key] = value
+        params.update()
+        dr.backward(dr.gather(mi.Float, mi.render(scene, params, spp=1).array, channel))
+        got = float(values(dr.grad(value)).sum())
+        out[f"∂ {name} / ∂σ"] = worst(got, slope, relative=name != "opacity" or slope > 1e-6)
     return out
 
 
 def slabs(mi):
-    head = ["σ", "opacity", "depth", "depth, face at the origin", "∂ opacity / ∂σ", "∂ depth / ∂σ"]
+    head = ["opacity", "expected", "expected, face at the origin", "median", "median, face at the origin", "∂ opacity / ∂σ", "∂ expected / ∂σ",
+            "∂ median / ∂σ"]  # fmt: skip
     rows = []
     for sigma in SIGMAS:
         errors: dict[str, float] = {}
-        for kind in ("constvolume", "gridvolume"):
+        for volume in ("constvolume", "gridvolume"):
             for ahead in (1.0, 0.0):
-                for name, e in slab_errors(mi, kind, sigma, ahead, True).items():
-                    name += ", face at the origin" if name == "depth" and ahead == 0 else ""
-                    errors[name] = max(errors.get(name, 0), e)
+                for kind in ("expected", "median"):
+                    for name, e in slab_errors(mi, volume, sigma, ahead, kind).items():
+                        name += ", face at the origin" if name == kind and ahead == 0 else ""
+                        errors[name] = max(errors.get(name, 0), e)
         note = "" if math.exp(-sigma) > 1e-6 else " (absolute)"
-        rows.append([f"{sigma:g}", f"{errors['opacity']:.1e}", f"{errors['depth']:.1e}",
-                     f"{errors['depth, face at the origin']:.1e}", f"{errors['d opacity']:.1e}{note}",
-                     f"{errors['d depth']:.1e}"])  # fmt: skip
-    return "Slab of length 1, nothing set: largest error of `constvolume` and `gridvolume`, closed form", head, rows
+        rows.append([f"{sigma:g}", *(f"{errors[n]:.1e}{note if n.startswith('∂ opacity') else ''}" for n in head)])
+    return "Slab of length 1: largest error of `constvolume` and `gridvolume`, closed form", ["σ", *head], rows
 
 
 # ----------------------------------------------------------------------------

@@ -173,7 +173,7 @@ def silhouettes(mi):
 def films(mi):
     to_world = mi.ScalarTransform4f().translate([0, 0, -3]).scale([0.5, 0.5, 1])
     sensor = lambda size, film=(): {**camera(mi, (0, 0, -3), (0, 0, 0), size, film=film), "type": "orthographic", "to_world": to_world}  # noqa: E731
-    plain = {"type": "nerg", "density": cube(mi, 1.0), "aovs": "depth,opacity", "step": 0.02}
+    plain = {"type": "nerg", "density": cube(mi, 1.0), "depth": "expected", "aovs": "depth,opacity", "step": 0.02}
 
     def strip(s):
         s = dict(s)
