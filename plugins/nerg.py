@@ -54,17 +54,20 @@ Neural radiance and gaze fields (:monosp:`nerg`)
      paper). ``transmittance``: the share of light that passes between observer and surface; ``falloff`` has no part in
      it. ``map``: as ``depth``, with depths and gaze around the observer computed once for all directions and kept until
      the observer, the field or a shape changes; right for many pixels or frames of one observer. Its depths carry no
-     derivatives; gaze is then looked up only while none of it are wanted either. (Default: ``depth``)
+     derivatives; gaze is then looked up only while none of it are wanted either. (Default: ``depth``; in the store
+     2.67 % of the pixels are wrong by it, 2.66 % by ``transmittance``, 3.0 % by ``map``: docs/error-and-time.md)
 
  * - map_height
    - |int|
-   - Rows of the ``map``; it has twice as many columns. (Default: 512)
+   - Rows of the ``map``; it has twice as many columns. (Default: 512; store: 3.0 % of the pixels are wrong, 3.5 % at 256,
+     2.83 % at 1,024 for 4 times the rays)
 
  * - depth
    - |string|
    - ``expected`` (mean distance of absorption), ``median`` (where half of the ray's own opacity is reached) or
      ``refined`` (the median, searched again inside the step that reaches it). The surface that gaze is evaluated on
-     lies at this depth. (Default: ``expected``)
+     lies at this depth. (Default: ``median``; store: 2.67 % of the pixels have a wrong visibility, 2.89 % with
+     ``expected``; ``refined`` takes 41 % more evaluations for 59 % less depth error)
 
  * - surface_opacity
    - |float|
@@ -86,35 +89,42 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - step
    - |float|
    - March step in scene units; 0 stands for the one that the field was trained with, or for a 1024th of the medium's
-     diagonal. (Default: 0)
+     diagonal. (Default: 0; store: depth is then 2.3 mm off its limit, which is 19 mm off the walls; sheets of 4e-3 in a unit
+     cube: 5e-4 off, a third of them lost at 256 steps)
 
  * - quadrature
    - |string|
    - ``constant``: density is constant over a step, sampled at its middle. ``linear``: linear between samples at the
      steps' ends. ``cells``: for an axis-aligned ``gridvolume`` as density, steps end at voxel boundaries only, where two
      samples integrate its interpolant exactly (opacity to rounding, depth to a hundredth of a voxel); a ``step`` that is
-     given bounds them, ``dt_gamma``, ``coarse`` and ``jitter`` do not apply. (Default: ``constant``)
+     given bounds them, ``dt_gamma``, ``coarse`` and ``jitter`` do not apply. (Default: ``constant``; store,
+     1,024 steps: depth 1.25 mm off, ``linear`` 2.33 mm)
 
  * - coarse
    - |float|
    - Steps in front of all matter are this many times longer; a first, density-only march finds where matter begins. What
-     is thinner than such a step may be missed. 1 does without. (Default: 1)
+     is thinner than such a step may be missed. 1 does without. (Default: 1; 4 saves 10 % of the store's
+     evaluations and loses 32 % of thin sheets)
 
  * - dt_gamma
    - |float|
-   - Steps are at least this share of the distance travelled. (Default: 0, i.e. uniform steps)
+   - Steps are at least this share of the distance travelled. (Default: 0, i.e. uniform steps; store: 1/128 saves 19 % of
+     the evaluations and errs 2.5 times more in depth)
 
  * - stop
    - |float|
-   - Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times that, in mean free paths. (Default: 1e-7)
+   - Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times that, in mean
+     free paths. (Default: 1e-7; store: 33.8 evaluations a pixel for 32.8 at 1e-4; fog: 1e-3 has 33 times its depth error)
 
  * - color_cutoff
    - |float|
-   - Samples that contribute less than this weight get no colour. (Default: 1e-4)
+   - Samples that contribute less than this weight get no colour. (Default: 1e-3; store: 3.6 colour evaluations a
+     pixel for 16.3 at 0, colour error unchanged)
 
  * - jitter
    - |bool|
-   - Shift the steps of each sample by a random share of a step. (Default: false)
+   - Shift the steps of each sample by a random share of a step. (Default: false; store: depth 2.31 mm off with
+     it, 2.30 mm without)
 
 This integrator marches a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that each ray
 meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper), with
