@@ -27,6 +27,7 @@ COMMANDS = {
     "eval": "Score a trained radiance field on held-out views, or a gaze field on held-out rays.",
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
     "export": "Write a radiance field as a mesh, points, grid volumes or a torch-ngp checkpoint.",
+    "ablate": "Train every variant of a gaze field alike, and compare them.",
     "study": "Measure error against run time: a scene at many settings, compared with what is true.",
 }
 """Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""

@@ -10,6 +10,7 @@ from ..attention.sphere import fibonacci_directions
 from ..field.backend import namespace
 from ..field.gaze import GazeField
 from ..field.log_gaze import LogGazeField
+from ..training.gaze_semantics import semantic_features
 from ..training.gaze_supervision import surfaces
 from ..transport.media import Similarity
 from . import metrics
@@ -69,7 +70,11 @@ def _densities(field, medium, positions, directions, kind, fill, ns) -> tuple[np
         p_o, r_o = (ns.Array3f(np.ascontiguousarray(v[part].T)) for v in (o, d))
         p_od = p_o + r_o * ns.Float(distance.ravel()[part])
         with dr.suspend_grad():
-            emit, capture = field.unnormalized(p_od, p_o, r_o, True, escaped=ns.Bool(escaped.ravel()[part]))
+            semantic = None
+            if field.config.semantic:
+                features = semantic_features(medium, o[part], d[part], distance.ravel()[part], field.config.semantic)
+                semantic = [ns.Float(np.ascontiguousarray(f, np.float32)) for f in features.T]
+            emit, capture = field.unnormalized(p_od, p_o, r_o, True, semantic, escaped=ns.Bool(escaped.ravel()[part]))
             # A constant variant returns one lane for all.
             out[part] = np.asarray(emit * capture + dr.zeros(ns.Float, dr.width(r_o)))
             if log:

@@ -26,7 +26,8 @@ class LikelihoodTrainer(GazeTrainer):
         low, high = supervision.positions.min(axis=0), supervision.positions.max(axis=0)
         config = replace(config, heads=(tuple(low.tolist()), tuple(np.maximum(high, low + 1e-3 * box.side).tolist())))
         super().__init__(supervision, box, config, settings, ns, schedule, initial)
-        self.constant["prior"] = self.initial.prior
+        trained = set(self.optimiser.keys())
+        self.constant = {k: v for k, v in self.initial.parameters().items() if k not in trained}
         self._escaped = ns.Bool(np.ascontiguousarray(supervision.escaped).ravel())
         # Inverse transform sampling: each probe's distribution function over its directions of equal area.
         self._steps = np.cumsum(supervision.truth, axis=1, dtype=np.float64)

@@ -1,0 +1,72 @@
+"""``nerg ablate``: which part of a gaze field does what."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+
+def command(
+    rays: Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet), as nerg rays import writes it.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for checkpoints, table and plot.")],
+    field: Annotated[Optional[Path], typer.Option(help="Radiance field in which people looked around.")] = None,
+    scene: Annotated[Optional[Path], typer.Option(help="Or: a Mitsuba scene, whose shapes they looked at.")] = None,
+    geometry: Annotated[Optional[str], typer.Option(help='Or: "hits" makes a place from the rays\' own hit points, "none" does without any.')] = None,
+    recipes: Annotated[str, typer.Option(help="Recipes to ablate, separated by commas.")] = "default,paper",
+    seeds: Annotated[int, typer.Option(help="Seeds of the default recipe; the others have one.")] = 3,
+    steps: Annotated[Optional[int], typer.Option(help="Steps of every recipe but the default one. Default: the recipe's.")] = None,
+    default_steps: Annotated[Optional[int], typer.Option(help="Steps of the default recipe. Default: its own.")] = None,
+    probes: Annotated[Optional[int], typer.Option(help="Probes of a training at most. Default: the recipe's.")] = None,
+    zones: Annotated[int, typer.Option(help="Zones of test positions.")] = 3,
+    positions: Annotated[int, typer.Option(help="Test positions.")] = 60,
+    people: Annotated[float, typer.Option(help="Share of the people who are held out besides.")] = 0.0,
+    radius: Annotated[float, typer.Option(help="Radius of the test's probes in metres.")] = 0.25,
+    kappa: Annotated[float, typer.Option(help="Concentration of the truth's kernel.")] = 20.0,
+    min_rays: Annotated[int, typer.Option(help="Rays at a test position at least.")] = 64,
+    cameras: Annotated[int, typer.Option(help="Cameras that a frame is timed over (the paper: 32); 0: none.")] = 4,
+    size: Annotated[str, typer.Option(help="Of a frame (the paper: 1280x720).")] = "320x180",
+    threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
+    mode: Annotated[str, typer.Option("-m", "--mode", help="Mitsuba variant.")] = "llvm_ad_rgb",
+) -> None:
+    """Train every variant of a gaze field alike; losses on training and held-out positions, and the time of a frame."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    from ..attention.rays import Rays
+    from ..evaluation.ablation import ablate, all_variants, frame_timer, write_ablation
+    from ..evaluation.gaze_evaluation import held_out_rays
+    from ..field.backend import namespace
+    from ..training.gaze_run import hold_out
+    from .train_gaze import _place
+
+    if sum(v is not None for v in (field, scene, geometry)) != 1:
+        raise ValueError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
+    if geometry not in (None, "hits", "none"):
+        raise ValueError(f'--geometry must be "hits" or "none", got "{geometry}"')
+    try:
+        width, height = (int(x) for x in size.lower().split("x"))
+    except ValueError as e:
+        raise ValueError(f'--size needs WIDTHxHEIGHT, got "{size}"') from e
+    mi.set_variant(mode)
+    if threads is not None:
+        dr.set_thread_count(threads)
+    ns, data = namespace(mode), Rays.load(rays)
+    _, account = hold_out(data, radius, zones, positions, 0, min_rays, people)
+    train, scored, centres = held_out_rays(data, account, "both" if people else "pos")
+    output.mkdir(parents=True, exist_ok=True)
+    place = _place(field, scene, geometry, train, output / "place", 0.08, ns)
+    names = tuple(recipes.split(","))
+    variants = all_variants(place.kind == "field", names)
+    render = frame_timer(place, np.asarray(centres), (field or output / "x").parent, cameras, width, height) if cameras else None
+    chosen = {n: steps for n in names if n != "default"} | {"default": default_steps}
+    rows = ablate(scored, train, centres, place, variants, output, ns, seeds, chosen, radius, kappa, min_rays, render, typer.echo, probes=probes)
+    without = f", {len(account['people'])} people held out" if people else ""
+    notes = (
+        f"{len(centres)} held-out positions in {zones} zones{without}; "
+        f"{len(train):,} of {len(data):,} rays trained on. Losses: KLD + (1 - CC) + MAE over 2,048 directions, truth with kappa {kappa:g}; "
+        f"relative to emit_capture of the same recipe; ± is the standard deviation over seeds. A frame: {width} x {height}, mean of {cameras} cameras."
+    )
+    for path in write_ablation(output, rows, notes):
+        typer.echo(f"wrote {path}")

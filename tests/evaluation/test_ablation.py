@@ -1,0 +1,65 @@
+"""The ablation: every variant, losses relative to the product, spreads over seeds, files."""
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from nerg_mi.evaluation.ablation import COLUMNS, all_variants, summarise, table, write_ablation
+
+from .test_gaze_evaluation import crowd
+
+
+def rows():
+    out = []
+    for recipe, variant, seed, loss in (("default", "emit", 0, 2.0), ("default", "emit_capture", 0, 1.0), ("default", "emit_capture", 1, 1.2),
+                                        ("paper", "emit_capture", 0, 3.0)):
+        out.append({"recipe": recipe, "variant": variant, "seed": seed, "steps": 5, "train_seconds": 1.0, "test_loss": loss, "train_loss": loss,
+                    "test_KLD": loss, "test_CC": 0.5, "test_MAE": 0.01, "test_relative": loss / 1.1, "train_relative": loss})
+    return out
+
+
+def test_variants():
+    names = [(v.recipe, v.name) for v in all_variants(True)]
+    assert [n for r, n in names if r == "default"] == ["emit", "capture", "emit_capture"]
+    paper = [n for r, n in names if r == "paper"]
+    assert len(paper) == 9 and sum("semantic" in n for n in paper) == 4 and "begins as the field, frozen" in paper
+    assert len(all_variants(False)) == 6 and len(all_variants(True, ("small",))) == 9
+
+
+def test_spreads_are_over_seeds():
+    emit, both, paper = summarise(rows())
+    assert both["test_loss"] == pytest.approx(1.1) and both["test_loss.spread"] == pytest.approx(np.std([1, 1.2], ddof=1))
+    assert "test_loss.spread" not in emit and both["seeds"] == 2 and paper["recipe"] == "paper"
+    assert "1.100 ± 0.141" in table([emit, both]) and len(table([emit, both]).splitlines()) == 4
+
+
+def test_files(tmp_path):
+    files = write_ablation(tmp_path, rows(), "notes")
+    assert all(f.stat().st_size > 50 for f in files)
+    with open(files[1]) as f:
+        assert list(csv.DictReader(f).fieldnames) == list(COLUMNS)
+    assert len(json.loads(files[2].read_text())["summary"]) == 3
+
+
+@pytest.mark.slow
+def test_the_command(rgb, tmp_path, capsys, monkeypatch):
+    """With two variants, for the time that compiling takes; the trainers know all of them."""
+    from nerg_mi.cli import main
+    from nerg_mi.evaluation import ablation
+
+    monkeypatch.setattr(ablation, "all_variants", lambda semantic, recipes: [v for v in all_variants(semantic, recipes) if v.gaze != "emit"])
+    crowd(3000).save(tmp_path / "rays.npz")
+    with pytest.raises(SystemExit) as end:
+        main([str(a) for a in ("ablate", tmp_path / "rays.npz", "-o", tmp_path / "out", "--geometry", "hits", "--recipes", "default", "--seeds", 2,
+                               "--default-steps", 2, "--zones", 2, "--positions", 6, "--min-rays", 8, "--radius", 0.5, "--cameras", 1,
+                               "--size", "16x8", "--probes", 12)])
+    assert not end.value.code, capsys.readouterr().err
+    found = json.loads((tmp_path / "out" / "ablation.json").read_text())
+    assert len(found["rows"]) == 4 and {r["seed"] for r in found["rows"]} == {0, 1}
+    whole = [r["test_relative"] for r in found["rows"] if r["variant"] == "emit_capture"]
+    assert np.mean(whole) == pytest.approx(1)
+    assert all(r["frame_seconds"] > 0 and np.isfinite(r["test_loss"]) for r in found["rows"])
+    assert (tmp_path / "out" / "default_capture_0.safetensors").exists()
