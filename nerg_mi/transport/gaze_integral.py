@@ -27,6 +27,8 @@ class GazeIntegral:
         import mitsuba as mi
 
         self.gaze, self.center = gaze, mi.Point3f(dr.detach(p_o))
+        # A position that is a constant of the kernel would be compiled anew for every observer.
+        dr.make_opaque(self.center)
         self._made = _traced_in(place), settings, kind, surface_opacity
         self._value, self._value_of = None, None
         with dr.suspend_grad():
