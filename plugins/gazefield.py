@@ -21,6 +21,12 @@ Trained gaze field (:monosp:`gazefield`)
    - Hash grid features and the weight matrices of the trunk and of the two heads.
    - |exposed|, |differentiable|
 
+ * - grid.table, emit_net.0, ..., capture_net.0, ..., escaped, prior
+   - |tensor|
+   - Of a log density: hash grid features, the weight matrices of its two networks, the logit where no surface is met, and the
+     table of the log of the density that does not depend on the position.
+   - |exposed|, |differentiable|
+
 How much surfaces attract an observer: equation 1 of the paper,
 :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o) \cdot \mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions
 around the observer. It is the ``gaze`` of the integrator :ref:`nerg <integrator-nerg>`; having two positions for an
@@ -86,7 +92,7 @@ class GazeFieldVolume(mi.Volume):
         c = self.field.config
         return (
             f"GazeFieldVolume[\n  filename = {self.filename},\n  variant = {c.variant},\n"
-            f"  activation = {c.activation},\n"
+            f"  activation = {c.activation},\n  normalized = {c.normalized},\n"
             f"  grid = {c.grid.levels} x {c.grid.features}, 2^{c.grid.log2_rows} rows, "
             f"{c.grid.base} to {c.grid.finest}\n]"
         )
