@@ -1,0 +1,61 @@
+"""Whether a normalised gaze field integrates to one: the integrator's integral against a finer one, at random positions.
+
+    python benchmarks/gaze_integrals.py GAZE PLACE.vol|FIELD.safetensors [--positions 1000] [--out out/benchmarks/gaze_integrals.csv]
+
+Positions are uniform in the box of the heads that the field was trained on. The finer integral has other directions, and half
+again as many. Prints the largest and the mean difference from one, and what an integral costs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from pathlib import Path
+
+import numpy as np
+
+
+def main(argv=None) -> None:
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.formats.fields import load_gaze
+    from nerg_mi.training.gaze_places import place_of_field, place_of_volume
+    from nerg_mi.transport.gaze_integral import COUNT, GazeIntegral
+    from nerg_mi.transport.media import GazeMedium
+    from nerg_mi.transport.place import Place
+    from nerg_mi.transport.trace import default_settings
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("gaze", type=Path)
+    parser.add_argument("place", type=Path)
+    parser.add_argument("--positions", type=int, default=1000)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/gaze_integrals.csv"))
+    args = parser.parse_args(argv)
+    ns = namespace("llvm_ad_rgb")
+    field, _ = load_gaze(args.gaze, ns)
+    medium = (place_of_volume(args.place) if args.place.suffix == ".vol" else place_of_field(args.place, ns)).medium
+    gaze, place, settings = GazeMedium(field), Place(medium), default_settings(medium)
+    low, high = np.array(field.config.heads)
+    rng, rows = np.random.default_rng(0), []
+    for p in rng.uniform(low, high, (args.positions, 3)).tolist():
+        started = time.perf_counter()
+        ours = float(GazeIntegral(gaze, place, mi.Point3f(*p), settings, "median", 0.5).value()[0])
+        seconds = time.perf_counter() - started
+        fine = float(GazeIntegral(gaze, place, mi.Point3f(*p), settings, "median", 0.5, count=COUNT * 3 // 2 + 13).value()[0])
+        rows.append({"x": p[0], "y": p[1], "z": p[2], "integral": fine / ours, "seconds": seconds})
+    off = np.abs([r["integral"] - 1 for r in rows])
+    print(f"{len(rows)} positions: off by {off.mean():.1e} in the mean, {np.quantile(off, 0.99):.1e} for 99 %, {off.max():.1e} at most; "
+          f"{np.median([r['seconds'] for r in rows]):.3f} s an integral of {COUNT:,} directions (median)")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    with open(args.out, "w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"wrote {args.out}")
+
+
+if __name__ == "__main__":
+    main()
