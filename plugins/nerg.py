@@ -45,8 +45,9 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - tolerance
    - |float|
    - How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands for two march
-     steps, or, without a field, for 1e-4 of the scene's diagonal. The point that the observer looks for lies this far, and one mean free path (at most a 64th of the depth),
-     in front of the camera's surface, so that no surface hides itself. (Default: 0)
+     steps, or, without a field, for 1e-4 of the scene's diagonal. The point that the observer looks for lies this far,
+     and as far as light goes into the surface (at most a 64th of the depth), in front of the camera's surface, so that
+     no surface hides itself. (Default: 0)
 
  * - visibility
    - |string|

@@ -89,9 +89,13 @@ class ObserverPass:
             known = self._map_from(place, p_o)
             if gaze is not None and not dr.grad_enabled(p_o, *gaze.parameters()):
                 known.keep(gaze)
-            met, seen, attended = known.look_up(
-                r_o, distance, falloff, tolerance, _PAST * in_front, active
-            )
+            else:
+                gaze = None
+            met, seen = known.look_up(r_o, distance, falloff, tolerance, active)
+            if gaze is not None:
+                # Of the surface itself: the point in front of it lies in another direction.
+                whole, r_d = towards(p_o, p_d)
+                attended = known.gaze_along(r_d, whole, falloff, _PAST * in_front, active)
             evals = type(distance)(0)
         else:
             towards_point = mi.Ray3f(p_o, r_o)

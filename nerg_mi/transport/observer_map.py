@@ -64,12 +64,32 @@ class ObserverMap:
         sin_phi, cos_phi = dr.sincos(phi)
         return self._vector(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
 
-    def look_up(self, r_o, distance, falloff, tolerance, slack, active):
-        """``(nearest depth, visibility, gaze)`` of points at ``distance`` along unit ``r_o``.
+    def look_up(self, r_o, distance, falloff, tolerance, active):
+        """``(nearest depth, visibility)`` of points at ``distance`` along unit ``r_o`` from the centre."""
+        Float = type(distance)
+        seen, nearest, best = Float(0), Float(dr.inf), Float(-1)
+        for entry, weight in self._entries(r_o, distance):
+            depth = dr.gather(Float, self.depth, entry, active)
+            seen += weight * visibility(distance, depth, falloff, tolerance)
+            closer = weight > best
+            nearest, best = dr.select(closer, depth, nearest), dr.select(closer, weight, best)
+        return nearest, seen
 
-        ``gaze``: None where none is kept, else a density, negative where the map does not know it: an entry that looks
-        past the point, by more than ``slack``, sees another surface.
-        """
+    def gaze_along(self, r_o, distance, falloff, slack, active):
+        """Density at the surface that is met along unit ``r_o`` for points at ``distance``, negative where the map does not
+        know it: an entry that looks past the point, by more than ``slack``, sees another surface."""
+        Float = type(distance)
+        total, share = Float(0), Float(0)
+        for entry, weight in self._entries(r_o, distance):
+            depth = dr.gather(Float, self.depth, entry, active)
+            weight *= visibility(distance, depth, falloff, slack)
+            weight = dr.select(depth < distance + slack, weight, 0)
+            total += weight * dr.gather(Float, self.gaze, entry, active)
+            share += weight
+        return dr.select(share > 0, total / dr.select(share > 0, share, 1), -1)
+
+    def _entries(self, r_o, distance):
+        """The four entries around the direction ``r_o``, and their bilinear weights."""
         Float, UInt32 = type(distance), self._uint
         r_o = dr.detach(r_o)
         theta = dr.atan2(dr.sqrt(r_o.x * r_o.x + r_o.y * r_o.y), r_o.z)
@@ -79,24 +99,10 @@ class ObserverMap:
         x = dr.select(x < 0, x + self.width, x)
         i, j = UInt32(x), dr.minimum(UInt32(y), self.height - 1)
         fx, fy = x - Float(i), y - Float(j)
-        seen, nearest, best = Float(0), Float(dr.inf), Float(-1)
-        total, share = Float(0), Float(0)
         for dj in (0, 1):
             for di in (0, 1):
                 row, column = dr.minimum(j + dj, self.height - 1), (i + di) % self.width
-                entry = column + self.width * row
-                depth = dr.gather(Float, self.depth, entry, active)
-                weight = (fx if di else 1 - fx) * (fy if dj else 1 - fy)
-                passes = weight * visibility(distance, depth, falloff, tolerance)
-                seen += passes
-                if self.gaze is not None:
-                    known = dr.select(depth < distance + slack, passes, 0)
-                    total += known * dr.gather(Float, self.gaze, entry, active)
-                    share += known
-                closer = weight > best
-                nearest, best = dr.select(closer, depth, nearest), dr.select(closer, weight, best)
-        gaze = None if self.gaze is None else dr.select(share > 0, total / dr.select(share > 0, share, 1), -1)
-        return nearest, seen, gaze
+                yield column + self.width * row, (fx if di else 1 - fx) * (fy if dj else 1 - fy)
 
 
 class _Fingerprint(list):
