@@ -12,7 +12,7 @@ import numpy as np
 
 from .observer_map import _fingerprint, _indices
 
-COUNT = 1 << 16
+COUNT = 1 << 17
 """Directions of an integral: enough for a thousandth at depths that jump from surface to surface."""
 
 
