@@ -6,7 +6,6 @@ Backends are tried in processes of their own, since a bad one may end its proces
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import json
 import platform
 import subprocess
@@ -18,10 +17,10 @@ from .errors import sentence
 
 EXTRAS = {
     "torch": 'fields as torch modules: pip install "nerg-mi[torch]"',
-    "skimage": 'meshes of radiance fields: pip install "nerg-mi[mesh]"',
+    "scikit-image": 'meshes of radiance fields: pip install "nerg-mi[mesh]"',
     "pyarrow": 'ray tables in Parquet: pip install "nerg-mi[parquet]"',
 }
-"""Optional packages, each with what it is for and how to get it."""
+"""Optional distributions, each with what it is for and how to get it."""
 
 CUDA_MINIMUM = (12, 8)
 """CUDA version of the oldest NVIDIA driver (R570) on which drjit.nn works."""
@@ -93,8 +92,8 @@ def examine() -> Diagnosis:
     """Try everything and report it; takes a few seconds."""
     diagnosis = Diagnosis()
     add = diagnosis.findings.append
-    python = f"Python {platform.python_version()}"
-    add(Finding("versions", ", ".join((f"nerg {__version__}", python, _version("mitsuba"), _version("drjit")))))
+    core = (f"{name} {_version(name) or 'not installed'}" for name in ("mitsuba", "drjit"))
+    add(Finding("versions", ", ".join((f"nerg {__version__}", f"Python {platform.python_version()}", *core))))
 
     library, trouble = llvm.current(), llvm.problem()
     add(Finding("libLLVM", str(library) if library else "none", trouble or ""))
@@ -126,8 +125,7 @@ def examine() -> Diagnosis:
     if threads:
         add(Finding("threads", str(threads)))
     for name, purpose in EXTRAS.items():
-        found = importlib.util.find_spec(name) is not None
-        add(Finding(name, importlib.metadata.version(name) if found else f"not installed ({purpose})"))
+        add(Finding(name, _version(name) or f"not installed ({purpose})"))
 
     diagnosis.usable = any(not v.startswith("scalar") for result in results.values() for v in result["variants"])
     if not diagnosis.usable:
@@ -138,11 +136,11 @@ def examine() -> Diagnosis:
     return diagnosis
 
 
-def _version(package: str) -> str:
+def _version(distribution: str) -> str | None:
     try:
-        return f"{package} {importlib.metadata.version(package)}"
+        return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
-        return f"no {package}"
+        return None
 
 
 def _one_line(text: str) -> str:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 from nerg_mi import diagnosis, llvm
 
@@ -17,7 +18,7 @@ def doctor(**environment):
 def test01_this_machine():
     done = doctor()
     assert done.returncode == 0, done.stdout + done.stderr
-    for word in ("libLLVM", "CUDA", "llvm_ad_rgb", "threads", "torch", "pyarrow", "ready to render"):
+    for word in ("libLLVM", "CUDA", "llvm_ad_rgb", "threads", *diagnosis.EXTRAS, "ready to render"):
         assert word in done.stdout
 
 
@@ -35,3 +36,8 @@ def test02_unusable_llvm(tmp_path):
 def test03_a_dying_backend_is_reported(monkeypatch):
     monkeypatch.setattr(diagnosis, "_TRIAL", "import os, sys; print('LLVM ERROR: no', file=sys.stderr, flush=True); os.abort()")
     assert diagnosis.try_backend("llvm") == {"variants": [], "failed": {"llvm": "LLVM ERROR: no"}}
+
+def test04_extras_by_their_names(monkeypatch):
+    """The names are those of distributions, as pyproject.toml has them: that of scikit-image is not that of its module."""
+    project = (Path(__file__).parents[2] / "pyproject.toml").read_text()
+    assert all(f'["{name}>=' in project for name in diagnosis.EXTRAS)
