@@ -335,7 +335,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         # ---------------------- The surface and its gaze ---------------------
         density_evals = mi.Float(0)
         if asked & (_GAZE_AOVS | _OBSERVER_AOVS | {"position", "features_at"}):
-            surface = some & (alpha >= self.surface_opacity)
+            surface = active & view.meets(self.surface_opacity)
             p_d = ray.o + ray.d * out["depth"]
             out["position"] = dr.select(surface, p_d, 0)
             if "features_at" in asked:

@@ -50,7 +50,7 @@ class GazeIntegral:
             return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
         everywhere = dr.full(mi.Bool, True, width)
         view = place.look(mi.Ray3f(self.center, self.directions), everywhere, settings)
-        met = everywhere & (view.opacity >= surface_opacity)
+        met = everywhere & view.meets(surface_opacity)
         depth = dr.select(met, view.depth(kind, met), self._beyond())
         if getattr(config, "escaped", None) == "nearest":
             known, d = np.array(met), np.array(self.directions).T

@@ -105,7 +105,7 @@ class ObserverPass:
                 seen = dr.select(between.hit, 0, 1 if between.march is None else dr.exp(-between.march.tau))
                 return Sight(p_d, distance, seen, _evals(between))
             view = place.look(towards_point, active, self.settings, count=count)
-            met = dr.select(active & (view.opacity >= self.surface_opacity), view.depth(self.depth, active), dr.inf)
+            met = dr.select(active & view.meets(self.surface_opacity), view.depth(self.depth, active), dr.inf)
             seen, evals = visibility(distance, met, falloff, tolerance), _evals(view)
         # An observer who meets nothing before the point sees the point itself.
         blocked = met < distance - tolerance

@@ -30,7 +30,7 @@ class ObserverMap:
             self.center = type(p_o)(dr.detach(p_o))
             everywhere = dr.full(mi.Bool, True, self.width * height)
             view = place.look(mi.Ray3f(self.center, self._directions()), everywhere, settings)
-            met = view.opacity >= surface_opacity
+            met = view.meets(surface_opacity)
             self.depth = dr.select(met, view.depth(kind, met), dr.inf)
             dr.eval(self.depth)
 

@@ -34,6 +34,10 @@ class View:
         """Depth of ``kind`` (``depth.KINDS``), 0 where nothing is met."""
         return self._depth(kind, active)
 
+    def meets(self, surface_opacity: float):
+        """Whether there is a surface: matter at all, and as much of it as ``surface_opacity``, which may be 0."""
+        return (self.opacity > 0) & (self.opacity >= surface_opacity)
+
     def fuzz(self, kind: str, depth):
         """How far light goes into the matter before the surface at ``depth``; 0 on a shape."""
         return 0 if self.march is None else way_out(kind, self.march, depth)

@@ -119,3 +119,14 @@ def test30_no_wall_hides_itself_from_an_oblique_observer(rgb, kind, sigma, angle
     }  # fmt: skip
     out = channels(rgb, integrator, camera(rgb, (0, 0.1, 0), (0, 0, 2), fov=20, size=12))
     assert out["visibility.Y"].min() > 0.999
+
+
+@pytest.mark.parametrize("kind", ["depth", "map"])
+def test31_an_observer_who_meets_nothing_is_not_blocked_by_it(rgb, kind):
+    """Also where any opacity counts as a surface: rays that pass a ball by a hair find the point in front of it in the open."""
+    integrator = {"type": "nerg", "aovs": "visibility,observer_depth,position", "surface_opacity": 0.0, "visibility": kind,
+                  "observer": observer_at(rgb, -2, 0.5, -2.5)}  # fmt: skip
+    out = channels(rgb, integrator, camera(rgb, (0.3, 0.2, -3), fov=12), ball={"type": "sphere", "radius": 0.8})
+    p = np.stack([out[f"position.{c}"] for c in "XYZ"], -1)
+    faces = (p * ((-2, 0.5, -2.5) - p)).sum(-1) > 0
+    assert faces.all() and (out["visibility.Y"] > 0.999).all() and (out["observer_depth.T"] > 2).all()
