@@ -29,6 +29,9 @@ def train_gaze(
     kappa_rule: Annotated[Optional[str], typer.Option(help="Concentration of a ray's kernel: fixed, silverman or loo.")] = None,
     kappa: Annotated[Optional[float], typer.Option(help="That of the rule fixed.")] = None,
     directions: Annotated[Optional[int], typer.Option(help="Directions of a probe.")] = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh-directions", help="Draw the directions anew for every epoch, not once a probe.")
+    ] = False,
     gaze: Annotated[str, typer.Option("--variant", help="emit, capture or emit_capture.")] = "emit_capture",
     activation: Annotated[Optional[str], typer.Option(help="Of the emit head of small and paper: softplus, exp or linear.")] = None,
     size: Annotated[Optional[str], typer.Option(help="Of the field of small and paper: small or paper.")] = None,
@@ -50,6 +53,8 @@ def train_gaze(
     test_zones: Annotated[int, typer.Option(help="Zones of test positions that are left out of everything; 0: none.")] = 0,
     test_positions: Annotated[int, typer.Option(help="Test positions in them.")] = 64,
     test_people: Annotated[float, typer.Option(help="Share of the people who are left out of everything besides.")] = 0.0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run of this output.")] = False,
+    save_every: Annotated[float, typer.Option(help="Seconds between two states for --resume; 0 keeps none.")] = 60.0,
     seed: Annotated[int, typer.Option(help="Seed of probes, directions, weights, batches and splits.")] = 0,
     threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store the weights in fp16.")] = False,
@@ -61,6 +66,7 @@ def train_gaze(
 
     from ..attention.collecting import file_sha256
     from ..attention.rays import Rays
+    from ..errors import NergError
     from ..field.backend import namespace
     from ..formats.fields import save_gaze
     from ..training.gaze_recipes import gaze_recipe
@@ -88,7 +94,11 @@ def train_gaze(
     ) | ({"steps": None} if minutes is not None and steps is None else {}))  # fmt: skip
     how = ProbeSettings(**chosen.probes | _given(
         radius=radius, count=probes, placement=placement, cap=cap, min_rays=min_rays, kappa_rule=kappa_rule, kappa=kappa, directions=directions,
+        fresh=fresh or None,
     ))  # fmt: skip
+    state = output.with_suffix(".run")
+    if resume and not state.is_file():
+        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
     data, ns = Rays.load(rays), namespace(mode)
     about = {"recipe": recipe, "rays_file": {"file": rays.name, "sha256": file_sha256(rays), "persons": len(data.persons)}}
     if test_zones:
@@ -103,9 +113,14 @@ def train_gaze(
         config, initial = _begun(begin, place, chosen.config, {"semantic": semantic, "semantic_own": semantic_own, "normalized": normalized})
         about |= {"begins_as": field.name} if initial else {}
     with _Bar() as bar:
-        trained, provenance = train_gaze(data, place.medium, place.box, config, settings, how, ns, _similarity(align), bar.update, initial)
+        trained, provenance = train_gaze(
+            data, place.medium, place.box, config, settings, how, ns, _similarity(align), bar.update, initial, about=dict(about),
+            state=state if save_every > 0 or resume else None, resume=resume, save_every=save_every or 60.0,
+        )  # fmt: skip
     save_gaze(trained, output, {**about, **provenance}, half)
     _report(provenance)
+    if provenance["interrupted"] and state.is_file():
+        typer.echo(f"interrupted; go on with --resume (state in {state})")
     typer.echo(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
 
 

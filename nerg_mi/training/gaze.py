@@ -42,7 +42,8 @@ class GazeTrainer:
                  schedule: int | None = None, initial: dict | None = None):
         self.config, self.settings, self.box, self.ns = config, settings, box, ns
         self.rng = np.random.default_rng(settings.seed)
-        self.data, self._schedule = _Samples(supervision, ns), schedule
+        self._schedule, self._supervision = schedule, supervision
+        self._learn_from(supervision, 0)
         self.initial = self._untrained()
         if initial:
             self.initial.set_parameters(initial)
@@ -56,7 +57,7 @@ class GazeTrainer:
 
     @property
     def seconds(self) -> float:
-        """Wall time since the run began."""
+        """Wall time of the run, without that between an interruption and its resumption."""
         return time.perf_counter() - self._started
 
     @property
@@ -64,6 +65,14 @@ class GazeTrainer:
         """Share of the schedule that is done, 0..1."""
         s, steps = self.settings, self._schedule or self.settings.steps
         return min(1.0, self.steps / steps if steps else self.seconds / (60 * s.minutes))
+
+    def restore(self, steps: int, seconds: float, random: dict) -> None:
+        """Go on from stored numbers; see ``gaze_state``."""
+        self.steps, self._started = steps, time.perf_counter() - seconds
+        self.rng.bit_generator.state = random
+
+    def _learn_from(self, supervision: Supervision, epoch: int) -> None:
+        self.data, self._epoch = _Samples(supervision, self.ns), epoch
 
     def _untrained(self) -> GazeField:
         return GazeField.random(self.config, self.box, self.ns, self.settings.seed)
@@ -77,6 +86,10 @@ class GazeTrainer:
 
     def step(self) -> None:
         """Draw probes and directions, and move the weights once."""
+        if self._supervision.renew is not None:
+            epoch = self.steps * min(self.settings.probes, self.data.probes) // self.data.probes
+            if epoch != self._epoch:
+                self._learn_from(self._supervision.renew(epoch), epoch)
         self._backward()
         self.optimiser.set_learning_rate(self.settings.rate(self.progress))
         self.optimiser.step()

@@ -28,7 +28,10 @@ class LikelihoodTrainer(GazeTrainer):
         super().__init__(supervision, box, config, settings, ns, schedule, initial)
         trained = set(self.optimiser.keys())
         self.constant = {k: v for k, v in self.initial.parameters().items() if k not in trained}
-        self._escaped = ns.Bool(np.ascontiguousarray(supervision.escaped).ravel())
+
+    def _learn_from(self, supervision: Supervision, epoch: int) -> None:
+        super()._learn_from(supervision, epoch)
+        self._escaped = self.ns.Bool(np.ascontiguousarray(supervision.escaped).ravel())
         # Inverse transform sampling: each probe's distribution function over its directions of equal area.
         self._steps = np.cumsum(supervision.truth, axis=1, dtype=np.float64)
 

@@ -2,7 +2,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import ModuleType
 from typing import Callable
 
@@ -17,7 +18,9 @@ from ..transport.media import Similarity
 from .gaze import GazeTrainer, Scores
 from .gaze_likelihood import LikelihoodTrainer
 from .gaze_settings import GazeSettings, ProbeSettings
+from .gaze_state import GazeRunFile, digest
 from .gaze_supervision import Supervision, supervise_rays
+from .run_state import Interruption
 
 
 @dataclass(frozen=True)
@@ -34,15 +37,28 @@ class GazeProgress:
 
 @dataclass
 class _Fit:
-    """What a fit came to: the best weights, after how many of how many scheduled steps, and how it went."""
+    """What a fit came to: the best weights, after how many of how many scheduled steps, and how it went. ``since``: looks
+    without an improvement; ``next_look``: which is due."""
 
-    trainer: GazeTrainer
-    weights: dict
-    best_step: int
-    schedule: int
-    scores: Scores | None
-    history: list
-    interrupted: bool
+    trainer: GazeTrainer | None
+    weights: dict = field(default_factory=dict)
+    best_step: int = 0
+    schedule: int = 0
+    scores: Scores | None = None
+    history: list = field(default_factory=list)
+    interrupted: bool = False
+    since: int = 0
+    next_look: int = 0
+
+    def found(self) -> dict:
+        """What a resumed run needs to know besides arrays (JSON)."""
+        scores = None if self.scores is None else [float(v) for v in self.scores]
+        return {**{k: getattr(self, k) for k in ("best_step", "schedule", "history", "since", "next_look")}, "scores": scores}
+
+    @staticmethod
+    def of(found: dict, trainer=None, weights: dict | None = None) -> _Fit:
+        scores = found.get("scores")
+        return _Fit(trainer, weights or {}, **{**found, "scores": None if scores is None else Scores(*scores)})
 
 
 def hold_out(rays: Rays, radius: float, zones: int, positions: int, seed: int = 0, min_rays: int = 64,
@@ -71,7 +87,8 @@ def hold_out(rays: Rays, radius: float, zones: int, positions: int, seed: int = 
 
 def train_gaze(
     rays: Rays, medium, box: Box, config: GazeConfig | LogGazeConfig, settings: GazeSettings, probes: ProbeSettings, ns: ModuleType,
-    align: Similarity | None = None, on_progress: Callable[[GazeProgress], None] | None = None, initial: dict | None = None,
+    align: Similarity | None = None, on_progress: Callable[[GazeProgress], None] | None = None, initial: dict | None = None, *,
+    state: Path | None = None, resume: bool = False, save_every: float = 60.0, about: dict | None = None,
 ) -> tuple[GazeField | LogGazeField, dict]:
     """Train a gaze field on ``rays`` in a place; returns it and its provenance (JSON).
 
@@ -81,27 +98,44 @@ def train_gaze(
     second fit then uses all rays for as many steps; the scores stay those of the first. Ctrl-C ends the run early with
     what it has come to. ``initial``: arrays to begin with (``gaze_semantics.trunk_of``). Raises ``ValueError`` when the
     rays make no probe.
+
+    ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
+    interrupted, removed when it is done; ``resume``: go on from there (probes and depths are made again). ``about``: what
+    else the run must agree on to be resumed (JSON), such as the files of the place.
     """
     say = on_progress or (lambda state: None)
     started = time.perf_counter()
+    same = {
+        **(about or {}), "rays": digest(rays), "settings": settings.to_dict(), "probes": probes.to_dict(), "architecture": config.to_dict(),
+        "box": box.to_dict(), "align": None if align is None else align.matrix.tolist(),
+    }  # fmt: skip
+    file = GazeRunFile(state, same, save_every, resume)
     say(GazeProgress("probes", 0.0, 0, 0.0, None))
     learn, watched, held = rays, None, 0
+    supervised = lambda rays, seed, queries=None: supervise_rays(rays, medium, box, probes, align, queries, seed, config.semantic, config)
     if settings.zones:
         split = split_by_position(rays, probes.radius, zones=settings.zones, test_probes=settings.watched,
                                   min_rays=settings.watched_rays or probes.min_rays, seed=settings.seed + 1)
         learn, held = rays.select(split.train), int((~split.train).sum())
         # With all rays around them: what is scored is what people there really looked at.
-        watched = supervise_rays(rays, medium, box, probes, align, split.test_centres, settings.seed + 2, config.semantic, config)
-    supervision = supervise_rays(learn, medium, box, probes, align, seed=settings.seed, semantic=config.semantic, config=config)
-    prepared = time.perf_counter() - started
-
+        watched = supervised(rays, settings.seed + 2, split.test_centres)
     refit = settings.refit and watched is not None
-    fit = _fit(supervision, watched, box, config, settings, ns, say, 0.5 if refit else 1.0, initial)
-    first, last, used = fit, fit, supervision
-    if refit and not fit.interrupted:
-        used = supervise_rays(rays, medium, box, probes, align, seed=settings.seed, semantic=config.semantic, config=config)
-        last = _refit(used, box, config, settings, ns, say, first, initial)
-    field = last.trainer.field(last.weights)
+    prepared, used = 0.0, None
+    if file.stage == "refit":
+        first = last = _Fit.of(file.found)
+    else:
+        used = supervised(learn, settings.seed)
+        prepared = time.perf_counter() - started
+        first = last = _fit(used, watched, box, config, settings, ns, say, 0.5 if refit else 1.0, initial, file)
+    if refit and not first.interrupted:
+        if file.stage != "refit":
+            file.keep("refit", None, first.found(), {}, now=True)
+        used = supervised(rays, settings.seed)
+        last = _refit(used, box, config, settings, ns, say, first, initial, file)
+    result = last.trainer.field(last.weights)
+    interrupted = first.interrupted or last.interrupted
+    if not interrupted:
+        file.remove()
     provenance = {
         "settings": settings.to_dict(),
         "probes": probes.to_dict(),
@@ -111,10 +145,10 @@ def train_gaze(
         "escaped_directions": round(used.escape_share, 6),
         "escaped_gaze": round(used.escaped_gaze, 6),
         "steps": last.trainer.steps,
-        "seconds": round(time.perf_counter() - started, 1),
+        "seconds": round(file.spent, 1),
         "seconds_preparing": round(prepared, 1),
         "refitted": last is not first,
-        "interrupted": first.interrupted or last.interrupted,
+        "interrupted": interrupted,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
     }
     if watched is not None:
@@ -122,7 +156,7 @@ def train_gaze(
             "zones": settings.zones, "probes": len(watched.truth), "rays_held_out": held, "best_step": first.best_step,
             **_rounded(first.scores), "history": first.history,
         }  # fmt: skip
-    return field, provenance
+    return result, provenance
 
 
 def trainer_of(config) -> type[GazeTrainer]:
@@ -130,28 +164,32 @@ def trainer_of(config) -> type[GazeTrainer]:
     return LikelihoodTrainer if isinstance(config, LogGazeConfig) else GazeTrainer
 
 
-def _fit(supervision: Supervision, watched: Supervision | None, box, config, settings, ns, say, share: float, initial) -> _Fit:
+def _fit(supervision: Supervision, watched: Supervision | None, box, config, settings, ns, say, share: float, initial, file: GazeRunFile) -> _Fit:
     """Train until the schedule ends, or validation has not improved for ``patience`` looks. ``share``: of the minutes."""
     timed = settings.minutes is not None
     if timed:
-        settings = _with(settings, minutes=settings.minutes * share)
+        settings = replace(settings, minutes=settings.minutes * share)
     trainer = trainer_of(config)(supervision, box, config, settings, ns, initial=initial)
-    out = _Fit(trainer, {}, 0, settings.steps or 0, None, [], False)
-    looks, since, recent = np.arange(1, settings.looks + 1) / settings.looks, 0, None
-    next_look = 0
+    out = _Fit.of(file.found, trainer, file.restore("fit", trainer))
+    out.schedule = settings.steps or 0
+    looks, recent = np.arange(1, settings.looks + 1) / settings.looks, out.scores
     try:
-        while trainer.progress < 1 and not (settings.patience and since >= settings.patience):
-            trainer.step()
-            if watched is not None and trainer.progress >= looks[next_look]:
-                next_look = min(int(np.searchsorted(looks, trainer.progress, "right")), len(looks) - 1)
-                recent = trainer.measure(watched)
-                out.history.append({"steps": trainer.steps, **_rounded(recent)})
-                since += 1
-                if out.scores is None or recent.loss < out.scores.loss:
-                    out.weights, out.best_step, out.scores, since = trainer.weights(), trainer.steps, recent, 0
-            say(GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, recent))
+        with Interruption() as stop:
+            while trainer.progress < 1 and not (settings.patience and out.since >= settings.patience):
+                trainer.step()
+                if watched is not None and trainer.progress >= looks[out.next_look]:
+                    out.next_look = min(int(np.searchsorted(looks, trainer.progress, "right")), len(looks) - 1)
+                    recent = trainer.measure(watched)
+                    out.history.append({"steps": trainer.steps, **_rounded(recent)})
+                    out.since += 1
+                    if out.scores is None or recent.loss < out.scores.loss:
+                        out.weights, out.best_step, out.scores, out.since = trainer.weights(), trainer.steps, recent, 0
+                file.keep("fit", trainer, out.found(), out.weights)
+                say(GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, recent))
+                stop.check()
     except KeyboardInterrupt:
         out.interrupted = True
+        file.keep("fit", trainer, out.found(), out.weights, now=True)
     if watched is not None and out.scores is None and trainer.steps:
         out.scores, out.best_step, out.weights = trainer.measure(watched), trainer.steps, trainer.weights()
     if not out.weights:
@@ -162,23 +200,22 @@ def _fit(supervision: Supervision, watched: Supervision | None, box, config, set
     return out
 
 
-def _refit(supervision: Supervision, box, config, settings, ns, say, first: _Fit, initial) -> _Fit:
+def _refit(supervision: Supervision, box, config, settings, ns, say, first: _Fit, initial, file: GazeRunFile) -> _Fit:
     """As many steps as were best, along the same schedule."""
-    trainer = trainer_of(config)(supervision, box, config, _with(settings, steps=first.best_step, minutes=None), ns, first.schedule, initial)
+    trainer = trainer_of(config)(supervision, box, config, replace(settings, steps=first.best_step, minutes=None), ns, first.schedule, initial)
+    file.restore("refit", trainer)
     interrupted = False
     try:
-        while trainer.steps < first.best_step:
-            trainer.step()
-            say(GazeProgress("refit", trainer.steps / first.best_step, trainer.steps, trainer.seconds, first.scores))
+        with Interruption() as stop:
+            while trainer.steps < first.best_step:
+                trainer.step()
+                file.keep("refit", trainer, first.found(), {})
+                say(GazeProgress("refit", trainer.steps / first.best_step, trainer.steps, trainer.seconds, first.scores))
+                stop.check()
     except KeyboardInterrupt:
         interrupted = True
+        file.keep("refit", trainer, first.found(), {}, now=True)
     return _Fit(trainer, trainer.weights(), trainer.steps, first.schedule, first.scores, [], interrupted)
-
-
-def _with(settings: GazeSettings, **values) -> GazeSettings:
-    from dataclasses import replace
-
-    return replace(settings, **values)
 
 
 def _rounded(scores: Scores) -> dict:

@@ -48,7 +48,8 @@ class ProbeSettings:
 
     ``radius``, ``placement``, ``count``, ``spacing``, ``cap``, ``min_rays``, ``kappa_rule``, ``kappa``: see
     ``attention.probes.place_probes``. ``directions``: how many of equal area each probe has, turned at random, fixed for the
-    whole training, so that depths are traced once. ``depth``: kind of depth that is the surface (``transport.depth``).
+    whole training, so that depths are traced once; ``fresh``: turned anew, and traced again, for every epoch (as many steps
+    as draw as many probes as there are). ``depth``: kind of depth that is the surface (``transport.depth``).
     """
 
     radius: float = 0.25
@@ -61,6 +62,7 @@ class ProbeSettings:
     depth: str = "median"
     placement: str = "data"
     spacing: float | None = None
+    fresh: bool = False
 
     def __post_init__(self):
         if self.directions < 16 or self.count < 1:

@@ -6,6 +6,7 @@ traced once, before the training.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Callable
 
 import numpy as np
 
@@ -37,7 +38,8 @@ class Supervision:
     ``positions`` (P, 3), the observers p_o; ``directions`` (P, D, 3), unit, r_o; ``truth`` (P, D), 1/sr; ``distance``
     (P, D), from p_o to p_od; ``escaped`` (P, D) bool: no surface was met, and p_od is where the box ends. ``semantic``
     (P, D, F), float16: features of a radiance field, for a gaze field that wants them. ``blind``: table of the log of the
-    rays' density whatever their position (``field.log_gaze``), for one that begins with it.
+    rays' density whatever their position (``field.log_gaze``), for one that begins with it. ``renew(epoch)``: the same probes
+    in other directions, where each epoch is to have its own.
     """
 
     positions: np.ndarray
@@ -47,6 +49,7 @@ class Supervision:
     escaped: np.ndarray
     semantic: np.ndarray | None = None
     blind: np.ndarray | None = None
+    renew: Callable[[int], Supervision] | None = None
 
     @property
     def escape_share(self) -> float:
@@ -60,7 +63,7 @@ class Supervision:
 
 
 def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | None = None, kind: str = "median",
-              seed: int = 0, semantic: str = "", fill: bool = False) -> Supervision:
+              seed: int | tuple = 0, semantic: str = "", fill: bool = False) -> Supervision:
     """Directions, true densities and surfaces of ``probes``.
 
     ``medium``: what depths are traced in (see ``surfaces``) and ``box``, where the gaze field will
@@ -87,12 +90,15 @@ def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align:
                    queries: np.ndarray | None = None, seed: int = 0, semantic: str = "",
                    config=None) -> Supervision:
     """Probes on ``rays``, at ``queries`` (P, 3) metres where given, and what ``supervise`` makes of them. ``config``: of
-    the gaze field; a ``LogGazeConfig`` has the blind density made, and says what to do with directions that escape."""
+    the gaze field; a ``LogGazeConfig`` has the blind density made, and says what to do with directions that escape. With
+    ``settings.fresh`` the result can ``renew`` its directions."""
     s, log = settings, isinstance(config, LogGazeConfig)
     probes = place_probes(rays, s.radius, placement=s.placement, count=s.count, spacing=s.spacing, queries=queries, cap=s.cap,
                           min_rays=min(s.min_rays, s.cap), kappa_rule=s.kappa_rule, kappa=s.kappa, seed=seed)
-    out = supervise(probes, medium, box, s.directions, align, s.depth, seed, semantic,
-                    log and config.escaped == "nearest")
+    turned = lambda seed: supervise(probes, medium, box, s.directions, align, s.depth, seed, semantic, log and config.escaped == "nearest")
+    out = turned(seed)
+    if s.fresh:
+        out = replace(out, renew=lambda epoch: turned((seed, epoch)))
     return replace(out, blind=blind_prior(rays, config.prior, align, seed)) if log else out
 
 

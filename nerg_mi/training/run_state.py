@@ -1,4 +1,4 @@
-"""The whole state of a radiance training in a file, so that an interrupted run goes on as if it had not been.
+"""The whole state of a training in a file, so that an interrupted run goes on as if it had not been.
 
 With one thread the weights then equal those of a run without interruption bit for bit; with more, sums over threads come in
 no fixed order in either.
@@ -6,6 +6,8 @@ no fixed order in either.
 from __future__ import annotations
 
 import json
+import signal
+import threading
 from pathlib import Path
 
 import drjit as dr
@@ -20,11 +22,7 @@ _GRID = ("value", "bits", "seen", "always")
 def save_run(trainer, path: str | Path, about: dict, history: list) -> None:
     """Write the state of ``trainer`` (`RadianceTrainer`) atomically. ``about``: what the run must agree on to be resumed
     (JSON); ``history``: of its held-out error so far."""
-    tensors, taken = {}, {}
-    for name, (value, _, _, (count, first, second, _)) in trainer.optimiser.state.items():
-        taken[name] = int(count.numpy()[0])
-        parts = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
-        tensors |= {f"{part}.{name}": x.numpy() for part, x in parts.items()}
+    tensors, taken = optimiser_state(trainer)
     for name in _GRID:
         tensors[f"grid.{name}"] = getattr(trainer.grid, name).numpy()
     tensors["hard"] = trainer.hard
@@ -42,23 +40,75 @@ def load_run(trainer, path: str | Path, about: dict) -> list:
     Raises `NergError` unless the state is one of a run with the same ``about``.
     """
     tensors, meta = read_checkpoint(path, KIND)
-    then, now = meta["about"], json.loads(json.dumps(about))
+    require_same(path, meta["about"], about)
+    restore_optimiser(trainer, tensors, meta["taken"])
+    trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], meta["turn"])
+    trainer.rng.bit_generator.state = meta["random"]
+    trainer.restore(meta["steps"], meta["rays"], meta["samples"], meta["seconds"], meta["settled"], tensors["hard"])
+    return meta["history"]
+
+
+def optimiser_state(trainer) -> tuple[dict, dict]:
+    """``(tensors, taken)``: weights, moments and averages of ``trainer`` by name, and the steps that each array has taken.
+
+    ``trainer``: has an ``optimiser`` (Adam or AdamW) and the dictionary ``averaged`` of its weights.
+    """
+    tensors, taken = {}, {}
+    for name, (value, _, _, (count, first, second, _)) in trainer.optimiser.state.items():
+        taken[name] = int(count.numpy()[0])
+        parts = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
+        tensors |= {f"{part}.{name}": x.numpy() for part, x in parts.items()}
+    return tensors, taken
+
+
+def restore_optimiser(trainer, tensors: dict, taken: dict) -> None:
+    """Set ``trainer`` to what ``optimiser_state`` gave."""
+    optimiser = trainer.optimiser
+    for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
+        old = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
+        new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
+        dr.enable_grad(new["weights"])
+        count = dr.opaque(type(count), taken[name])
+        optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
+        trainer.averaged[name] = new["averaged"]
+    dr.eval(optimiser.state, trainer.averaged)
+
+
+def require_same(path: str | Path, then: dict, now: dict) -> None:
+    """Raise `NergError` unless a run that was started as ``then`` says is the one that ``now`` says, entry by entry."""
+    now = json.loads(json.dumps(now))
     different = [k for k in now if then.get(k) != now[k]]
     if different:
         raise NergError(
             f'the run in "{path}" cannot go on: it was started with other {", ".join(different)}; give the options and the '
             "data set that it was started with, or start anew without --resume"
         )
-    optimiser = trainer.optimiser
-    for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
-        old = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
-        new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
-        dr.enable_grad(new["weights"])
-        count = dr.opaque(type(count), meta["taken"][name])
-        optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
-        trainer.averaged[name] = new["averaged"]
-    trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], meta["turn"])
-    trainer.rng.bit_generator.state = meta["random"]
-    trainer.restore(meta["steps"], meta["rays"], meta["samples"], meta["seconds"], meta["settled"], tensors["hard"])
-    dr.eval(optimiser.state, trainer.averaged)
-    return meta["history"]
+
+
+class Interruption:
+    """Ctrl-C between the steps of a run: a context in which it is noted, and raised by ``check``.
+
+    In the middle of a step it would leave weights and random numbers of different steps. The second one is raised at once.
+    """
+
+    def __enter__(self) -> Interruption:
+        self.asked = False
+        # Signals can only be dealt with in the main thread.
+        self._mine = threading.current_thread() is threading.main_thread()
+        if self._mine:
+            self._before = signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def _note(self, *_) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def check(self) -> None:
+        """Raise ``KeyboardInterrupt`` if there was one."""
+        if self.asked:
+            raise KeyboardInterrupt
+
+    def __exit__(self, *error) -> None:
+        if self._mine:
+            signal.signal(signal.SIGINT, self._before)

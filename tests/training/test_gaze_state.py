@@ -1,0 +1,157 @@
+"""A gaze training that is interrupted and resumed comes to what an uninterrupted one comes to."""
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.field.log_gaze import LogGazeConfig
+from nerg_mi.training.gaze_run import train_gaze
+from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings
+from .test_gaze import BOX, GRID, SMALL, looking_at, wall  # noqa: F401  (fixture)
+
+RAYS = looking_at((1.5, 0, 1.2), 3000, spread=6.0)
+PROBES = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
+LOG = LogGazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=2, finest=4), width=16, prior=16, mix=0.1)
+PRODUCT = GazeSettings(steps=16, looks=8, zones=2, watched=6, probes=4, directions=32)
+LIKELIHOOD = replace(PRODUCT, loss="likelihood", integral=0.0, rays=16)
+
+
+@pytest.fixture
+def threads():
+    """Sets the number of threads, which the end puts back."""
+    before = dr.thread_count()
+    yield dr.set_thread_count
+    dr.set_thread_count(before)
+
+
+def train(medium, settings, config, probes=PROBES, **options):
+    return train_gaze(RAYS, medium, BOX, config, settings, probes, namespace("llvm"), **options)
+
+
+def stopping(stage, step):
+    """Ctrl-C as soon as a stage has come to a step."""
+    seen = []
+
+    def watch(state):
+        seen.append((state.stage, state.steps))
+        if len([s for s in seen if s == (stage, step)]) == 1 and (state.stage, state.steps) == (stage, step):
+            raise KeyboardInterrupt
+
+    watch.seen = seen
+    return watch
+
+
+@pytest.mark.parametrize("settings, config, probes, count", [
+    (PRODUCT, SMALL, PROBES, 1), (LIKELIHOOD, LOG, replace(PROBES, fresh=True), 1), (LIKELIHOOD, LOG, PROBES, 2),
+], ids=["product", "fresh", "two threads"])  # fmt: skip
+def test_a_resumed_run_equals_an_uninterrupted_one(wall, settings, config, probes, count, threads, tmp_path):  # noqa: F811
+    """Bit for bit at one thread, to 1e-5 at two; interrupted in both of its fits, past validations and epochs."""
+    threads(count)
+    expected, whole = train(wall, settings, config, probes)
+    path = tmp_path / "a.run"
+    _, about = train(wall, settings, config, probes, state=path, on_progress=stopping("fit", 5))
+    assert about["interrupted"] and about["steps"] <= 5 and path.is_file()
+    assert whole["validation"]["best_step"] > 3
+    watch = stopping("refit", 3)
+    _, about = train(wall, settings, config, probes, state=path, resume=True, on_progress=watch)
+    assert about["interrupted"] and path.is_file() and ("fit", 5) not in watch.seen and ("fit", 6) in watch.seen
+    watch = stopping("", 0)
+    got, about = train(wall, settings, config, probes, state=path, resume=True, on_progress=watch)
+    assert not about["interrupted"] and not path.exists() and {s for s, _ in watch.seen} == {"probes", "refit"}
+    assert ("refit", 3) not in watch.seen and ("refit", 4) in watch.seen
+    for name, value in expected.parameters().items():
+        compare = np.testing.assert_array_equal if count == 1 else lambda a, b, err_msg: np.testing.assert_allclose(a, b, atol=1e-5, err_msg=err_msg)
+        compare(np.array(got.parameters()[name]), np.array(value), err_msg=name)
+    if count == 1:
+        assert about["validation"] == whole["validation"] and about["steps"] == whole["steps"]
+
+
+def test_another_run_is_not_resumed(wall, tmp_path):  # noqa: F811
+    path = tmp_path / "a.run"
+    train(wall, PRODUCT, SMALL, state=path, on_progress=stopping("fit", 1))
+    with pytest.raises(NergError, match="other settings;"):
+        train(wall, replace(PRODUCT, seed=3), SMALL, state=path, resume=True)
+    with pytest.raises(NergError, match="other place, probes;"):
+        train(wall, PRODUCT, SMALL, replace(PROBES, kappa=9.0), state=path, resume=True, about={"place": "elsewhere"})
+    with pytest.raises(NergError, match="nothing to resume"):
+        train(wall, PRODUCT, SMALL, state=tmp_path / "b.run", resume=True)
+
+
+def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):  # noqa: F811
+    """16 probes, 4 a step: an epoch is four steps. Without it there is one set of directions."""
+    from nerg_mi.training import gaze_supervision
+
+    drawn, sets = [], gaze_supervision.rotated_sets
+    monkeypatch.setattr(gaze_supervision, "rotated_sets", lambda *given: drawn.append(sets(*given)) or drawn[-1])
+    settings = replace(PRODUCT, zones=0, steps=9)
+    train(wall, settings, SMALL, replace(PROBES, fresh=True))
+    assert len(drawn) == 3 and np.abs(drawn[0] - drawn[1]).max() > 0.1 and np.abs(drawn[1] - drawn[2]).max() > 0.1
+    drawn.clear()
+    train(wall, settings, SMALL)
+    assert len(drawn) == 1
+
+
+def test_the_command_goes_on(rgb, tmp_path, monkeypatch, capsys):
+    import typer
+
+    from nerg_mi.cli import train_gaze as command
+    from nerg_mi.formats.fields import load_gaze
+
+    RAYS.save(tmp_path / "rays.npz")
+    out, app = tmp_path / "gaze.safetensors", typer.Typer()
+    app.command()(command.train_gaze)
+    arguments = f"{tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 8 --directions 64 --zones 0 --fresh-directions".split()
+    with pytest.raises(NergError, match="nothing to resume"):
+        app([*arguments, "--resume"], standalone_mode=False)
+    monkeypatch.setattr(command._Bar, "update", lambda self, state: stopping("fit", 5)(state))
+    app(arguments, standalone_mode=False)
+    assert "go on with --resume" in capsys.readouterr().out and out.with_suffix(".run").is_file()
+    app([*arguments, "--resume"], standalone_mode=False)
+    about = load_gaze(out, namespace("llvm"))[1]["provenance"]
+    assert about["steps"] == 8 and not about["interrupted"] and about["probes"]["fresh"] and not out.with_suffix(".run").exists()
+    assert "go on" not in capsys.readouterr().out
+
+
+_CHILD = """
+import sys
+import drjit as dr, mitsuba as mi
+from pathlib import Path
+import nerg_mi
+from tests.training.test_gaze_state import *
+mi.set_variant("llvm_ad_rgb")
+dr.set_thread_count(1)
+train(None, replace(LIKELIHOOD, steps=10**6, zones=0), replace(LOG, geometry="none"), state=Path(sys.argv[1]), save_every=0.0)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(rgb, how, threads, tmp_path):
+    """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
+    from nerg_mi.formats.checkpoint import read_checkpoint
+
+    threads(1)
+    path = tmp_path / "a.run"
+    child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
+    until = time.time() + 120
+    while not path.exists() and child.poll() is None and time.time() < until:
+        time.sleep(0.05)
+    time.sleep(0.05)
+    child.send_signal(how)
+    assert child.wait() == (0 if how == signal.SIGINT else -how)
+    tensors, meta = read_checkpoint(path, "gaze run")
+    same = tmp_path / "same.run"
+    settings = replace(LIKELIHOOD, steps=10**6, zones=0)
+    train(None, settings, replace(LOG, geometry="none"), state=same, on_progress=stopping("fit", meta["steps"]))
+    expected, _ = read_checkpoint(same, "gaze run")
+    assert meta["steps"] > 0 and set(tensors) == set(expected)
+    for name, value in expected.items():
+        np.testing.assert_array_equal(tensors[name], value, err_msg=name)
