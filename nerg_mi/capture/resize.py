@@ -9,9 +9,9 @@ def area_average(image: np.ndarray, width: int, height: int) -> np.ndarray:
     h, w, c = image.shape
     if c == 4:
         image = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], axis=2)
-    out = (_overlap(h, height) @ image.reshape(h, w * c)).reshape(height, w, c)
+    out = (overlap(h, height) @ image.reshape(h, w * c)).reshape(height, w, c)
     out = out.transpose(1, 0, 2).reshape(w, height * c)
-    out = (_overlap(w, width) @ out).reshape(width, height, c).transpose(1, 0, 2)
+    out = (overlap(w, width) @ out).reshape(width, height, c).transpose(1, 0, 2)
     if c == 4:
         alpha = out[..., 3:]
         color = np.where(alpha > 0, out[..., :3] / np.where(alpha > 0, alpha, 1), 0)
@@ -19,7 +19,7 @@ def area_average(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return np.ascontiguousarray(np.clip(out, 0, 1), np.float32)
 
 
-def _overlap(old: int, new: int):
+def overlap(old: int, new: int):
     """Sparse matrix (new, old): the share that each old pixel has in each new one."""
     from scipy.sparse import csr_array
 
