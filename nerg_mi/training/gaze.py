@@ -10,7 +10,7 @@ from drjit.opt import AdamW
 
 from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
-from .gaze_losses import gaze_loss
+from .gaze_losses import VANISHED, gaze_loss
 from .gaze_model import gaze_density, used_parameters
 from .gaze_settings import LOSSES, GazeSettings
 from .gaze_supervision import Supervision
@@ -115,7 +115,7 @@ class GazeTrainer:
         total = self.loss.total
         if s.integral:
             # Against the truth in the same directions, so that drawing few of them is no bias.
-            total += s.integral * dr.mean(dr.square(_integral(prediction - truth, D)))
+            total += s.integral * dr.mean(dr.square(_integral(prediction - truth, data.extent(probe))))
         dr.backward(total)
 
     def measure(self, supervision: Supervision, weights: dict | None = None) -> Scores:
@@ -129,7 +129,7 @@ class GazeTrainer:
                 prediction, truth = self._densities(data, {**self.constant, **(weights or self.averaged)}, probe,
                                                     np.broadcast_to(which, (len(probe), data.count)))
                 parts = gaze_loss(prediction, truth, data.count)
-                integral = _integral(prediction, data.count)
+                integral = _integral(prediction, data.extent(probe))
                 means = parts.kld, parts.cc, parts.mae, dr.mean(integral), dr.mean(dr.square(1 - integral))
                 rows.append((len(probe), *(float(v[0]) for v in means)))
         rows = np.array(rows)
@@ -156,9 +156,10 @@ class GazeTrainer:
         return out
 
 
-def _integral(density, directions: int):
-    """Integral over the sphere of each probe's density in ``directions`` directions of equal area."""
-    return dr.block_sum(density, directions) * (4 * np.pi / directions)
+def _integral(density, extent):
+    """Integral of each probe's density over its ``extent`` (sr, a lane a probe), of which the directions are equal parts."""
+    directions = dr.width(density) // dr.width(extent)
+    return dr.block_sum(density, directions) * (extent / directions)
 
 
 class _Samples:
@@ -169,6 +170,7 @@ class _Samples:
         if self.probes == 0:
             raise ValueError("there are no probes to train on")
         flat = lambda v: ns.Float(np.ascontiguousarray(v, np.float32).ravel())
+        self._extent = None if s.extent is None else np.asarray(s.extent, np.float32)
         self._positions, self._directions = flat(s.positions), flat(s.directions)
         self._truth, self._distance = flat(s.truth), flat(s.distance)
         self._features = 0 if s.semantic is None else s.semantic.shape[-1]
@@ -184,7 +186,24 @@ class _Samples:
             F = self._features
             semantic = [ns.Float(dr.gather(ns.Float16, self._semantic, index * F + k)) for k in range(F)]
         prediction = gaze_density(config, box, parameters, p_od, p_o, r_o, ns, semantic)
-        return prediction, self.truth(index)
+        truth = self.truth(index)
+        return self.given_view(prediction, probe, truth), truth
+
+    def extent(self, probe: np.ndarray):
+        """Solid angle (sr, a lane a probe) that the directions of the probes ``probe`` are equal parts of."""
+        return self.ns.Float(np.full(len(probe), 4 * np.pi, np.float32) if self._extent is None else self._extent[probe])
+
+    def given_view(self, density, probe: np.ndarray, truth=None):
+        """Densities of probes that are views, given the view: what else is looked at is not known there. Others stay. The
+        result has the integral that ``truth`` has in the same directions, else one."""
+        if self._extent is None:
+            return density
+        extent = self.extent(probe)
+        inside = _integral(dr.maximum(density, 0), extent)
+        # A density of zeros has no scale to be taken out.
+        scaled = (extent < 4 * np.pi * (1 - 1e-6)) & (inside > VANISHED)
+        factor = dr.select(scaled, (1 if truth is None else _integral(truth, extent)) / dr.select(scaled, inside, 1), 1)
+        return density * dr.repeat(factor, dr.width(density) // len(probe))
 
     def gather(self, probe: np.ndarray, which: np.ndarray) -> tuple:
         """``(p_od, p_o, r_o, index)`` of directions ``which`` (B, D) of the probes ``probe`` (B,); p_o has B lanes."""

@@ -54,7 +54,7 @@ class LikelihoodTrainer(GazeTrainer):
         run, lane = D + s.rays, lambda n: dr.arange(ns.UInt32, len(probe) * n)
         part = lambda n, first: dr.gather(ns.Float, logit, lane(n) // n * run + lane(n) % n + first)
         likelihood = dr.block_sum(part(s.rays, D), s.rays) / s.rays
-        total = dr.mean(_log_mean_exp(part(D, 0), D) - likelihood) + float(np.log(4 * np.pi))
+        total = dr.mean(_log_mean_exp(part(D, 0), D) - likelihood + dr.log(data.extent(probe)))
         self.loss = total
         dr.backward(total)
 
@@ -71,9 +71,10 @@ class LikelihoodTrainer(GazeTrainer):
         p_od, p_o, r_o, index = data.gather(probe, which)
         escaped = dr.gather(self.ns.Bool, self._measured, index)
         logit = log_gaze(self.config, self.box, parameters, p_od, p_o, r_o, escaped, self.ns)
-        density = dr.exp(logit - dr.repeat(_log_mean_exp(logit, D), D)) / (4 * np.pi)
+        density = dr.exp(logit - dr.repeat(_log_mean_exp(logit, D) + dr.log(data.extent(probe)), D))
         if m:
-            density = (1 - m) * density + m * dr.exp(self.initial.log_blind(r_o))
+            # Of a view the share m counts as on the sphere: the field's integral there is not known from within.
+            density = (1 - m) * density + m * data.given_view(dr.exp(self.initial.log_blind(r_o)), probe)
         return density, data.truth(index)
 
     def _loss(self, kld, cc, mae, off):

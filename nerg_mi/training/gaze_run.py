@@ -11,6 +11,7 @@ import numpy as np
 
 from ..attention.rays import Rays
 from ..attention.splits import purge, split_by_person, split_by_position
+from ..capture.salience import SalienceView
 from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
 from ..field.log_gaze import LogGazeConfig, LogGazeField
@@ -19,8 +20,9 @@ from .gaze import GazeTrainer, Scores
 from .gaze_likelihood import LikelihoodTrainer
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_state import GazeRunFile, digest
-from .gaze_supervision import Supervision, supervise_rays
+from .gaze_supervision import Supervision
 from .run_state import Interruption
+from .salience_supervision import digest_views, far_views, split_views, supervise_both
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,10 @@ def hold_out(rays: Rays, radius: float, zones: int, positions: int, seed: int = 
 
 
 def train_gaze(
-    rays: Rays, medium, box: Box, config: GazeConfig | LogGazeConfig, settings: GazeSettings, probes: ProbeSettings, ns: ModuleType,
+    rays: Rays | None, medium, box: Box, config: GazeConfig | LogGazeConfig, settings: GazeSettings, probes: ProbeSettings, ns: ModuleType,
     align: Similarity | None = None, on_progress: Callable[[GazeProgress], None] | None = None, initial: dict | None = None, *,
     state: Path | None = None, resume: bool = False, save_every: float = 60.0, about: dict | None = None,
+    views: list[SalienceView] | tuple = (),
 ) -> tuple[GazeField | LogGazeField, dict]:
     """Train a gaze field on ``rays`` in a place; returns it and its provenance (JSON).
 
@@ -102,35 +105,44 @@ def train_gaze(
     ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
     interrupted, removed when it is done; ``resume``: go on from there (probes and depths are made again). ``about``: what
     else the run must agree on to be resumed (JSON), such as the files of the place.
+
+    ``views``: salience images, in the field's frame, to learn from besides the rays, or without any (``rays`` None); zones of
+    views are watched then. No view within 2R of a position that is watched is learnt from in the first fit.
     """
     say = on_progress or (lambda state: None)
     started = time.perf_counter()
     same = {
-        **(about or {}), "rays": digest(rays), "settings": settings.to_dict(), "probes": probes.to_dict(), "architecture": config.to_dict(),
+        **(about or {}), "rays": None if rays is None else digest(rays), "views": digest_views(views),
+        "settings": settings.to_dict(), "probes": probes.to_dict(), "architecture": config.to_dict(),
         "box": box.to_dict(), "align": None if align is None else align.matrix.tolist(),
     }  # fmt: skip
     file = GazeRunFile(state, same, save_every, resume)
     say(GazeProgress("probes", 0.0, 0, 0.0, None))
-    learn, watched, held = rays, None, 0
-    supervised = lambda rays, seed, queries=None: supervise_rays(rays, medium, box, probes, align, queries, seed, config.semantic, config)
-    if settings.zones:
+    learn, seen, watched, held = rays, views, None, 0
+    supervised = lambda rays, views, seed, queries=None: supervise_both(
+        rays, views, medium, box, probes, align, queries, seed, config.semantic, config)  # fmt: skip
+    if settings.zones and rays is None:
+        seen, some = split_views(views, settings.zones, 2 * probes.radius, settings.seed + 1)
+        watched = supervised(None, some, settings.seed + 2)
+    elif settings.zones:
         split = split_by_position(rays, probes.radius, zones=settings.zones, test_probes=settings.watched,
                                   min_rays=settings.watched_rays or probes.min_rays, seed=settings.seed + 1)
         learn, held = rays.select(split.train), int((~split.train).sum())
         # With all rays around them: what is scored is what people there really looked at.
-        watched = supervised(rays, settings.seed + 2, split.test_centres)
+        watched = supervised(rays, (), settings.seed + 2, split.test_centres)
+        seen = far_views(views, split.test_centres, 2 * probes.radius, align)
     refit = settings.refit and watched is not None
     prepared, used = 0.0, None
     if file.stage == "refit":
         first = last = _Fit.of(file.found)
     else:
-        used = supervised(learn, settings.seed)
+        used = supervised(learn, seen, settings.seed)
         prepared = time.perf_counter() - started
         first = last = _fit(used, watched, box, config, settings, ns, say, 0.5 if refit else 1.0, initial, file)
     if refit and not first.interrupted:
         if file.stage != "refit":
             file.keep("refit", None, first.found(), {}, now=True)
-        used = supervised(rays, settings.seed)
+        used = supervised(rays, views, settings.seed)
         last = _refit(used, box, config, settings, ns, say, first, initial, file)
     result = last.trainer.field(last.weights)
     interrupted = first.interrupted or last.interrupted
@@ -140,7 +152,8 @@ def train_gaze(
         "settings": settings.to_dict(),
         "probes": probes.to_dict(),
         "align": None if align is None or align.identity else align.matrix.tolist(),
-        "rays": len(rays),
+        "rays": 0 if rays is None else len(rays),
+        "salience_views": len(views),
         "probes_made": len(used.truth),
         "escaped_directions": round(used.escape_share, 6),
         "escaped_gaze": round(used.escaped_gaze, 6),
@@ -153,7 +166,8 @@ def train_gaze(
     }
     if watched is not None:
         provenance["validation"] = {
-            "zones": settings.zones, "probes": len(watched.truth), "rays_held_out": held, "best_step": first.best_step,
+            "zones": settings.zones, "probes": len(watched.truth), "rays_held_out": held,
+            "views_held_out": len(views) - len(seen), "best_step": first.best_step,
             **_rounded(first.scores), "history": first.history,
         }  # fmt: skip
     return result, provenance

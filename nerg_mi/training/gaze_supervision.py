@@ -39,7 +39,8 @@ class Supervision:
     (P, D), from p_o to p_od; ``escaped`` (P, D) bool: no surface was met, and p_od is where the box ends. ``semantic``
     (P, D, F), float16: features of a radiance field, for a gaze field that wants them. ``blind``: table of the log of the
     rays' density whatever their position (``field.log_gaze``), for one that begins with it. ``renew(epoch)``: the same probes
-    in other directions, where each epoch is to have its own.
+    in other directions, where each epoch is to have its own. ``extent`` (P,): solid angle in sr of which the D directions are
+    equal parts and over which the truth integrates to one, where that is not the sphere (None) but a view.
     """
 
     positions: np.ndarray
@@ -50,6 +51,7 @@ class Supervision:
     semantic: np.ndarray | None = None
     blind: np.ndarray | None = None
     renew: Callable[[int], Supervision] | None = None
+    extent: np.ndarray | None = None
 
     @property
     def escape_share(self) -> float:
@@ -59,7 +61,8 @@ class Supervision:
     @property
     def escaped_gaze(self) -> float:
         """Share of the true gaze that goes where no surface is."""
-        return float((self.truth * self.escaped).sum() / self.truth.sum())
+        gaze = self.truth if self.extent is None else self.truth * self.extent[:, None]
+        return float((gaze * self.escaped).sum() / gaze.sum())
 
 
 def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | None = None, kind: str = "median",
@@ -76,14 +79,21 @@ def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | 
     truth = probes.density(directions)
     rotation = align.matrix[:3, :3] / align.scale
     positions = probes.positions @ align.matrix[:3, :3].T + align.matrix[:3, 3]
-    turned = directions @ rotation.T
-    distance, escaped = surfaces(medium, box, positions, turned, kind, fill)
+    return observe(positions, directions @ rotation.T, truth, medium, box, kind, semantic, fill)
+
+
+def observe(positions, directions, truth, medium, box: Box, kind: str = "median", semantic: str = "",
+            fill: bool = False) -> Supervision:
+    """Supervision by observers (P, 3) whose density in ``directions`` (P, D, 3) is ``truth`` (P, D), all in the field's frame,
+    with the surfaces that they see. The other arguments are those of ``supervise``."""
+    distance, escaped = surfaces(medium, box, positions, directions, kind, fill)
     features = None
     if semantic:
-        origins = np.repeat(positions, count, axis=0)
-        features = semantic_features(medium, origins, turned.reshape(-1, 3), distance.ravel(), semantic)
-        features = features.reshape(len(positions), count, -1)
-    return Supervision(positions.astype(np.float32), turned.astype(np.float32), truth, distance, escaped, features)
+        origins = np.repeat(positions, directions.shape[1], axis=0)
+        features = semantic_features(medium, origins, directions.reshape(-1, 3), distance.ravel(), semantic)
+        features = features.reshape(*directions.shape[:2], -1)
+    narrow = (v.astype(np.float32, copy=False) for v in (positions, directions, truth))
+    return Supervision(*narrow, distance, escaped, features)
 
 
 def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align: Similarity | None = None,
