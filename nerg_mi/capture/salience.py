@@ -99,19 +99,23 @@ class SalienceSet:
     about: dict = field(default_factory=dict)
 
 
-def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", align: np.ndarray | None = None) -> SalienceSet:
+def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", align: np.ndarray | None = None,
+                  trained: dict | None = None) -> SalienceSet:
     """The salience images of a posed image set ``dataset`` (as `sources.find_source` knows them).
 
     ``source``: a folder with one .png, .exr or .npy a frame, called as the photo is but for the suffix, or the name of a model
     (``MODELS``), which makes them from the photos. ``per``: what the images' values are proportional to: gaze a ``pixel``, as
     models have it that predict where in a picture is looked, or a ``steradian``, as a rendered density has it. ``align``:
-    (4, 4) similarity from the set's coordinates to those wanted. Masks of the frames hide what is not known.
+    (4, 4) similarity from the set's coordinates to those wanted; by default they stay, or become those of a radiance field that
+    was trained on this very file, of which ``trained`` is the provenance. Masks of the frames hide what is not known.
 
     Raises ``ValueError``, naming the file, for an image that is none, and when no frame has one.
     """
     if per not in PER:
         raise ValueError(f'salience is given per {" or per ".join(PER)}, not per "{per}"')
     posed = read_posed(find_source(dataset))
+    if align is None and trained and trained.get("sha256") == posed.sha256 and "to_file" in trained:
+        align = np.linalg.inv(trained["to_file"])
     if align is not None:
         posed = posed.moved(np.asarray(align, np.float64))
     model = MODELS.get(str(source))

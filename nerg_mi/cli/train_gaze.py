@@ -1,4 +1,4 @@
-"""``nerg train gaze``: a gaze field from rays of attention, in a trained place or in one made from hit points."""
+"""``nerg train gaze``: a gaze field from rays of attention or salience images, in a trained place or one of hit points."""
 from __future__ import annotations
 
 from dataclasses import replace
@@ -9,8 +9,18 @@ import typer
 
 
 def train_gaze(
-    rays: Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet), as nerg rays import writes it.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Checkpoint to write (.safetensors).")],
+    rays: Annotated[
+        Optional[Path], typer.Argument(help="Rays file (.npz or .parquet), as nerg rays import writes it. None: --views alone.")
+    ] = None,
+    views: Annotated[Optional[Path], typer.Option(help="Posed photos (folder or transforms file) with salience.")] = None,
+    salience: Annotated[
+        Optional[str], typer.Option(help="Folder of them, called as the photos are (.png, .exr, .npy), or spectral-residual.")
+    ] = None,
+    salience_per: Annotated[str, typer.Option(help="What they count gaze per: pixel or steradian.")] = "pixel",
+    align_views: Annotated[
+        Optional[Path], typer.Option(help="JSON file with the 4x4 similarity from the photos' frame to the place's.")
+    ] = None,
     field: Annotated[Optional[Path], typer.Option(help="Radiance field in which people looked around.")] = None,
     scene: Annotated[Optional[Path], typer.Option(help="Or: a Mitsuba scene, whose shapes they looked at.")] = None,
     geometry: Annotated[
@@ -63,6 +73,7 @@ def train_gaze(
     """Train a gaze field on rays of attention, and report its scores at positions that were held out."""
     import drjit as dr
     import mitsuba as mi
+    import numpy as np
 
     from ..attention.collecting import file_sha256
     from ..attention.rays import Rays
@@ -72,11 +83,17 @@ def train_gaze(
     from ..training.gaze_recipes import gaze_recipe
     from ..training.gaze_run import hold_out, train_gaze
     from ..training.gaze_settings import GazeSettings, ProbeSettings
+    from ..training.salience_supervision import far_views
 
     if sum(v is not None for v in (field, scene, geometry)) != 1:
         raise ValueError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
     if geometry not in (None, "hits", "none"):
         raise ValueError(f'--geometry must be "hits" or "none", got "{geometry}"')
+    if rays is None and views is None:
+        raise ValueError("say what to learn from: a rays file, or --views with --salience, or both")
+    if rays is None and (test_zones or geometry == "hits" or align or semantic):
+        raise ValueError("--test-zones, --geometry hits, --align and --semantic belong to rays; give a rays file besides --views "
+                         "(or hold views out by leaving their images out of the folder, and align them with --align-views)")
     if geometry is not None and align is not None:
         raise ValueError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
     if test_people and not test_zones:
@@ -99,23 +116,32 @@ def train_gaze(
     state = output.with_suffix(".run")
     if resume and not state.is_file():
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
-    data, ns = Rays.load(rays), namespace(mode)
-    about = {"recipe": recipe, "rays_file": {"file": rays.name, "sha256": file_sha256(rays), "persons": len(data.persons)}}
+    data, ns, about = None, namespace(mode), {"recipe": recipe}
+    if rays is not None:
+        data = Rays.load(rays)
+        about |= {"rays_file": {"file": rays.name, "sha256": file_sha256(rays), "persons": len(data.persons)}}
+    seen, found = _views(views, salience, salience_per, align_views, field)
+    about |= found
     if test_zones:
         data, about["test"] = hold_out(data, how.radius, test_zones, test_positions, seed, max(64, how.min_rays), test_people)
         test = about["test"]
         typer.echo(f"{len(test['centres'])} test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays left")
-    place = _place(field, scene, geometry, data, output, voxel, ns)
+        seen = far_views(seen, np.array(test["centres"]), 2 * how.radius, _similarity(align))
+    place = _place(field, scene, geometry, data, seen, output, voxel, ns)
     about |= place.about
     if recipe == "default":
         config, initial = place.told(chosen.config), None
     else:
-        config, initial = _begun(begin, place, chosen.config, {"semantic": semantic, "semantic_own": semantic_own, "normalized": normalized})
+        config, initial = _begun(begin, place, chosen.config, {
+            # Views alone do not say how much is looked altogether.
+            "semantic": semantic, "semantic_own": semantic_own, "normalized": normalized or rays is None,
+        })  # fmt: skip
         about |= {"begins_as": field.name} if initial else {}
     with _Bar() as bar:
         trained, provenance = train_gaze(
             data, place.medium, place.box, config, settings, how, ns, _similarity(align), bar.update, initial, about=dict(about),
             state=state if save_every > 0 or resume else None, resume=resume, save_every=save_every or 60.0,
+            views=seen,
         )  # fmt: skip
     save_gaze(trained, output, {**about, **provenance}, half)
     _report(provenance)
@@ -150,7 +176,28 @@ def _begun(begin: str, place, config, more: dict) -> tuple:
     return replace(config, **more), None
 
 
-def _place(field, scene, geometry, rays, output: Path, voxel: float, ns):
+def _views(views: Path | None, salience: str | None, per: str, align: Path | None, field: Path | None) -> tuple[list, dict]:
+    """Salience images, and what provenance says of them."""
+    if views is None or salience is None:
+        if views or salience or align:
+            raise ValueError("salience needs both: --views, the posed photos, and --salience, the images' folder or spectral-residual")
+        return [], {}
+    from ..capture.salience import open_salience
+    from ..formats.checkpoint import read_checkpoint
+
+    similarity = _similarity(align)
+    trained = None if field is None else read_checkpoint(field, "radiance")[1].get("provenance")
+    found = open_salience(views, salience, per, None if similarity is None else similarity.matrix, trained)
+    for said in found.unused:
+        typer.echo(said)
+    typer.echo(f"{len(found.views)} views with salience" + (f"; without: {', '.join(found.missing)}" if found.missing else "")
+               + (f"; images of no frame: {', '.join(found.stray)}" if found.stray else ""))
+    return found.views, {"salience": found.about, **({} if similarity is None else {"align_views": similarity.matrix.tolist()})}
+
+
+def _place(field, scene, geometry, rays, views, output: Path, voxel: float, ns):
+    import numpy as np
+
     from ..training import gaze_places as places
 
     if field is not None:
@@ -158,7 +205,8 @@ def _place(field, scene, geometry, rays, output: Path, voxel: float, ns):
     if scene is not None:
         return places.place_of_scene(scene)
     if geometry == "none":
-        return places.place_of_nothing(rays)
+        origins = [v.camera.center[None] for v in views] + ([] if rays is None else [rays.origin])
+        return places.place_of_nothing(np.concatenate(origins))
     path = output.with_suffix(".vol")
     place = places.place_of_hits(rays, path, voxel)
     made = place.about["geometry_file"]
@@ -181,7 +229,9 @@ def _similarity(path: Path | None):
 
 
 def _report(p: dict) -> None:
-    typer.echo(f"{p['probes_made']} probes; {100 * p['escaped_directions']:.2f} % of the directions meet no surface, "
+    views = p["salience_views"]
+    counts = f"{p['probes_made'] - views} probes" + (f" and {views} views" if views else "")
+    typer.echo(f"{counts}; {100 * p['escaped_directions']:.2f} % of the directions meet no surface, "
                f"and {100 * p['escaped_gaze']:.2f} % of the gaze")
     if "validation" in p:
         v = p["validation"]

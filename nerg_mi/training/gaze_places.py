@@ -85,9 +85,9 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
     return GazePlace(medium, Box(tuple(lower.tolist()), tuple(upper.tolist())), "hits", {"geometry_file": {**_file(path), **(about or {})}})
 
 
-def place_of_nothing(rays: Rays) -> GazePlace:
-    """No geometry: everything is two metres away from whoever looks."""
-    lower, upper = rays.origin.min(axis=0) - _NOWHERE, rays.origin.max(axis=0) + _NOWHERE
+def place_of_nothing(origins: np.ndarray) -> GazePlace:
+    """No geometry: everything is two metres away from whoever looks from one of ``origins`` (N, 3)."""
+    lower, upper = origins.min(axis=0) - _NOWHERE, origins.max(axis=0) + _NOWHERE
     return GazePlace(None, Box(tuple(lower.tolist()), tuple(upper.tolist())), "none", {"geometry": "none"})
 
 

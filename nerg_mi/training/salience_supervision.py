@@ -77,7 +77,7 @@ def together(a: Supervision, b: Supervision) -> Supervision:
 
 
 def blind_of_views(views: list[SalienceView], rows: int) -> np.ndarray:
-    """``field.log_gaze.blind_table`` of what is looked at wherever the camera stands, from ``views`` that each show a part of it.
+    """``field.log_gaze.blind_table`` of what is looked at wherever the camera stands, of which each of ``views`` shows a part.
 
     The density b of greatest likelihood when view v sees b given its part, found by Hunter's (2004) iteration for choices
     among a few: b = Σ_v p_v / Σ_v 1_v / b(v). One more view, of the whole sphere, is uniform: it settles what no other shows.
@@ -105,8 +105,8 @@ def blind_of_views(views: list[SalienceView], rows: int) -> np.ndarray:
 
 
 def split_views(views: list[SalienceView], zones: int, distance: float, seed: int = 0) -> tuple[list, list]:
-    """``(learn, watched)``: ``zones`` groups of neighbouring views, an eighth of all, are watched, and no other within ``distance``
-    of one is learnt from.
+    """``(learn, watched)``: ``zones`` groups of neighbouring views, an eighth of all, are watched, and no other within
+    ``distance`` of one is learnt from.
 
     Raises ``ValueError`` when too few are left.
     """
@@ -122,8 +122,8 @@ def split_views(views: list[SalienceView], zones: int, distance: float, seed: in
     watched = np.unique(np.argsort(near, axis=0, kind="stable")[:each])
     learn = far_views(views, centres[watched], distance)
     if len(learn) < max(2, len(views) // 4):
-        raise ValueError(f"{len(learn)} of {len(views)} views are left to train on, the others are watched or within {distance:g} "
-                         "of one that is; choose fewer --zones (0: none), or a smaller --radius")
+        raise ValueError(f"{len(learn)} of {len(views)} views are left to train on, the others are watched or within "
+                         f"{distance:g} of one that is; choose fewer --zones (0: none), or a smaller --radius")
     return learn, [views[k] for k in watched]
 
 

@@ -1,4 +1,4 @@
-"""Views as supervision: what they hold, likelihood and losses given a view, the blind density, a law learnt from views alone."""
+"""Views as supervision: what they hold, likelihood and losses given a view, the blind density, a law learnt from views."""
 from __future__ import annotations
 
 from dataclasses import replace
