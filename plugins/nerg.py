@@ -149,7 +149,8 @@ AOVs (0 where nothing is met):
 
 Colours are composited in the colour space that the field was trained in, then converted to linear:
 :math:`L = \alpha\,\mathrm{lin}(C / \alpha) + (1 - \alpha) L_{behind}`. Mono variants receive the luminance. The film's
-alpha is 1 wherever opacity > 0; use the ``opacity`` AOV for the fractional one.
+alpha is 1 wherever opacity > 0 or an environment emitter shows (not with ``hide_emitters``), as in other integrators; use the
+``opacity`` AOV for the fractional one.
 
 Use a box filter and ``component_format`` ``float32`` for AOVs: other filters blend depths across edges, and fp16 rounds
 them. With a box filter equal seeds give equal pictures to the bit.
@@ -354,9 +355,10 @@ class NergIntegrator(mi.SamplingIntegrator):
         # ---------------------- Colour ---------------------------------------
         L, nested = mi.Spectrum(0), [mi.Float(0)] * len(self.shading.aov_names())
         if self.radiance:
-            behind, nested = self.shading.radiance(
+            behind, nested, shown = self.shading.radiance(
                 scene, sampler, ray, view, self.background, self.hide_emitters, active
             )
+            some |= shown
             front, color = view.front, view.march.color if lit else None
             learnt = self.medium.background(ray.o, ray.d) if lit and scene.environment() is None else None
             if learnt is not None:

@@ -122,4 +122,19 @@ def _fingerprint(place):
 
     if place.scene is None:
         return _indices([])
-    return _indices([v for shape in place.scene.shapes() for v in dict(mi.traverse(shape)).values()])
+    shapes = [*place.scene.shapes(), *_groups(mi, place.scene)]
+    return _indices([v for shape in shapes for v in dict(mi.traverse(shape)).values()])
+
+
+def _groups(mi, scene) -> list:
+    """What instances repeat: no shapes of the scene itself."""
+    found = []
+
+    class Collect(mi.TraversalCallback):
+        def put(self, name, value, *rest):
+            if isinstance(value, mi.Shape) and value.class_name().startswith("ShapeGroup"):
+                found.append(value)
+
+    if any(shape.class_name() == "Instance" for shape in scene.shapes()):
+        scene.traverse(Collect())
+    return found

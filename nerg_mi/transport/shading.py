@@ -25,9 +25,10 @@ class Shading:
         self.nested, self._path = nested, None
 
     def radiance(self, scene, sampler, ray, view, background, hide_emitters, active):
-        """``(radiance, AOVs of the nested integrator)`` that arrive from behind the field, or from a place without one.
+        """``(radiance, AOVs of the nested integrator, shown)`` from behind the field, or from a place without one.
 
-        ``view``: ``place.View`` of ``ray``; ``background``: radiance where nothing is, if the scene has no environment.
+        ``view``: ``place.View`` of ``ray``; ``background``: radiance where nothing is, if the scene has no environment;
+        ``shown``: whether there is anything but that background, as a nested integrator says or an environment makes it.
         """
         import mitsuba as mi
 
@@ -38,10 +39,11 @@ class Shading:
             if environment is None:
                 # Directly seen emitters are shapes; where there is nothing at all, there is the background.
                 color = dr.select(view.hit | valid, color, background)
-            return color, aovs
+            return color, aovs, seen & valid
         behind = background if environment is None else environment.eval(_beyond(mi, ray), seen)
+        shown = active & (view.hit | (environment is not None))
         if view.cast is None:
-            return behind, []
+            return behind, [], shown
         hit = seen & view.hit
         if len(scene.emitters()) > 0:
             # Paths are not differentiated: Dr.Jit has no reverse mode through their loop.
@@ -51,7 +53,7 @@ class Shading:
         else:
             si = view.cast.compute_surface_interaction(mi.Ray3f(ray), mi.RayFlags.All, hit)
             shape = si.bsdf().eval_diffuse_reflectance(si, hit)
-        return dr.select(hit, shape, behind), []
+        return dr.select(hit, shape, behind), [], shown
 
     def aov_names(self) -> list:
         """Names of the AOVs that the nested integrator adds."""
