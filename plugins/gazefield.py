@@ -21,6 +21,11 @@ Trained gaze field (:monosp:`gazefield`)
    - Hash grid features and the weight matrices of the trunk and of the two heads.
    - |exposed|, |differentiable|
 
+ * - 0.grid.table, 1.grid.table, ...
+   - |tensor|
+   - Of an ensemble: the arrays of each member, by its number.
+   - |exposed|, |differentiable|
+
  * - grid.table, emit_net.0, ..., capture_net.0, ..., escaped, prior
    - |tensor|
    - Of a log density: hash grid features, the weight matrices of its two networks, the logit where no surface is met, and the
@@ -32,6 +37,10 @@ How much surfaces attract an observer: equation 1 of the paper,
 around the observer. It is the ``gaze`` of the integrator :ref:`nerg <integrator-nerg>`; having two positions for an
 argument, it cannot be evaluated as a plain volume. A field that was trained on a radiance field's features (``nerg train
 gaze --semantic``) needs that radiance field beside it, as the integrator's ``field``.
+
+Of an ensemble (``nerg train gaze --ensemble``) gaze is the mean of the members, each normalised by itself where it is
+normalised, and the integrator knows their standard deviation (its AOV ``gaze_std``). The checkpoint also says how many rays
+there were around a position (``support``).
 
 .. tabs::
     .. code-tab:: xml
@@ -57,6 +66,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.properties import text
 from nerg_mi.registration import register
+from nerg_mi.transport.gaze_ensemble import EnsembleMedium
 from nerg_mi.transport.media import GazeMedium, Similarity
 
 
@@ -70,9 +80,10 @@ class GazeFieldVolume(mi.Volume):
         self.field, self.metadata = load_gaze(self.filename, namespace(mi.variant()))
         self._similarity = Similarity(to_world.matrix)
 
-    def gaze_medium(self) -> GazeMedium:
+    def gaze_medium(self) -> GazeMedium | EnsembleMedium:
         """The gaze field as the integrator sees it."""
-        return GazeMedium(self.field, self._similarity)
+        kind = EnsembleMedium if hasattr(self.field, "members") else GazeMedium
+        return kind(self.field, self._similarity)
 
     def bbox(self):
         lower, upper = self._similarity.bounds(self.field.box.lower, self.field.box.upper)
@@ -91,7 +102,7 @@ class GazeFieldVolume(mi.Volume):
     def to_string(self):
         c = self.field.config
         return (
-            f"GazeFieldVolume[\n  filename = {self.filename},\n  variant = {c.variant},\n"
+            f"GazeFieldVolume[\n  filename = {self.filename},\n  members = {len(getattr(self.field, 'members', [0]))},\n  variant = {c.variant},\n"
             f"  activation = {c.activation},\n  normalized = {c.normalized},\n"
             f"  grid = {c.grid.levels} x {c.grid.features}, 2^{c.grid.log2_rows} rows, "
             f"{c.grid.base} to {c.grid.finest}\n]"

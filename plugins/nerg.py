@@ -141,6 +141,9 @@ AOVs (0 where nothing is met):
 - ``position`` (``.X .Y .Z``): the surface :math:`p_d`
 - ``gaze`` (``.Y``): density in 1/sr of the observer attending this surface, after occlusion
 - ``emit``, ``capture`` (``.Y``): the two factors after their activations; 1 for one that the variant lacks
+- ``gaze_std`` (``.Y``): standard deviation of ``gaze`` over the members of an ensemble, in 1/sr, after occlusion
+- ``support`` (``.Y``): how many training rays started around the observer, one at distance d counting 1 - d²/R²
+  (R of the training); one number an observer, shown where there is a surface
 - ``visibility`` (``.Y``): 1 visible to the observer .. 0 hidden
 - ``observer_depth`` (``.T``): :math:`d_o`; the distance to the surface where no occlusion is computed
 - ``features`` (``.0``, ``.1``, ...): the field's geometry features, accumulated like colour (not divided by opacity)
@@ -212,6 +215,7 @@ from nerg_mi.transport import viewpoint
 from nerg_mi.transport.color import composite_to_linear
 from nerg_mi.transport.depth import KINDS
 from nerg_mi.transport.features import Featured, accumulated, snapshot
+from nerg_mi.transport.gaze_ensemble import SupportView
 from nerg_mi.transport.march import MarchSettings
 from nerg_mi.transport.media import VolumeMedium
 from nerg_mi.transport.observer import KINDS as VISIBILITIES
@@ -222,12 +226,14 @@ from nerg_mi.transport.rules import rule
 from nerg_mi.transport.shading import Shading
 
 CHANNELS = {
-    "depth": "T", "opacity": "Y", "position": "XYZ", "gaze": "Y", "emit": "Y", "capture": "Y", "visibility": "Y",
-    "observer_depth": "T", "density_evals": "Y", "color_evals": "Y", "gaze_evals": "Y",
+    "depth": "T", "opacity": "Y", "position": "XYZ", "gaze": "Y", "emit": "Y", "capture": "Y", "gaze_std": "Y", "support": "Y",
+    "visibility": "Y", "observer_depth": "T", "density_evals": "Y", "color_evals": "Y", "gaze_evals": "Y",
 }
 _FEATURES = ("features", "features_at")
-_GAZE_AOVS = {"gaze", "emit", "capture", "gaze_evals"}
-_OBSERVER_AOVS = {"visibility", "observer_depth"}
+_GAZE_AOVS = {"gaze", "emit", "capture", "gaze_evals", "gaze_std"}
+# What else there is to know of an observer, from a view with ``face``, ``value`` and ``occluded``.
+_VIEWS = {"support"}
+_OBSERVER_AOVS = {"visibility", "observer_depth"} | _VIEWS
 
 
 class NergIntegrator(mi.SamplingIntegrator):
@@ -261,7 +267,8 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.radiance = boolean(props, "radiance", True)
         background = mi.Color3f(color(props, "background", 0.0))
         self.background = mi.Spectrum(mi.luminance(background) if mi.is_monochromatic else background)
-        self.aovs = _aovs(text(props, "aovs", "depth,opacity"), gaze is not None, field is not None)
+        self.aovs = _aovs(text(props, "aovs", "depth,opacity"), self.gaze, field)
+        self._views = {"support": SupportView(self.gaze.field.support, self.gaze.to_world)} if "support" in self.aovs else {}
         self.jitter = boolean(props, "jitter", False)
         step = number(props, "step", 0, low=0)
         self.settings = MarchSettings(
@@ -420,23 +427,27 @@ class NergIntegrator(mi.SamplingIntegrator):
             p_o = viewpoint.center(self.observer)
             aligned = viewpoint.same_center(sensors, p_o)
 
+        observers = viewpoint.centers(sensors) if self.observer is None else [p_o]
+        for view in self._views.values():
+            view.face(observers)
         if asked & _GAZE_AOVS and self.gaze.field.config.normalized:
-            observers = viewpoint.centers(sensors) if self.observer is None else [p_o]
             self.gaze.face(observers, place, self.settings, self.depth_kind, self.surface_opacity)
 
         distance, r_o = towards(p_o, p_d)
         sight = Sight(p_d, distance, mi.Float(1), mi.Float(0))
-        if self.occlusion and not aligned:
+        if self.occlusion and not aligned and asked & (_GAZE_AOVS | _OBSERVER_AOVS) - {n for n, v in self._views.items() if not v.occluded}:
             keeps = self.gaze is not None and not self.gaze.field.config.semantic and asked & _GAZE_AOVS <= {"gaze", "gaze_evals"}
             looked_up = self.gaze if keeps else None
             sight = self.observer_pass.look(place, ray, p_d, p_o, fuzz, surface, self.falloff, count, looked_up)
         out["visibility"] = dr.select(surface, sight.visibility, 0)
         out["observer_depth"] = dr.select(surface, sight.depth, 0)
+        for name, view in self._views.items():
+            out[name] = dr.select(surface, view.value(p_o, r_o) * (sight.visibility if view.occluded else 1), 0)
 
         if asked & _GAZE_AOVS:
             # Where the observer cannot see, gaze is 0 whatever the field says.
             attended = surface & (sight.visibility > 0)
-            networks = 2.0 if self.gaze.field.config.variant == "emit_capture" else 1.0
+            networks = mi.Float(self.gaze.networks)
             if sight.gaze is not None:
                 unknown = attended & (sight.gaze < 0)
                 gaze = dr.if_stmt(
@@ -445,14 +456,16 @@ class NergIntegrator(mi.SamplingIntegrator):
                     lambda unknown, gaze: gaze, label="gaze",
                 )
                 out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
-                out["gaze_evals"] = dr.select(unknown, networks, 0.0)
+                out["gaze_evals"] = dr.select(unknown, networks, 0)
                 return sight.density_evals
             needed = surface if asked & {"emit", "capture"} else attended
             semantic = self._semantic(place, sight.p_od, p_o, r_o, needed)
-            gaze, emit, capture = self.gaze.evaluate(sight.p_od, p_o, r_o, needed, semantic)
+            evaluate = self.gaze.spread if "gaze_std" in asked else self.gaze.evaluate
+            gaze, emit, capture, *spread = evaluate(sight.p_od, p_o, r_o, needed, semantic)
             out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
+            out["gaze_std"] = dr.select(attended, spread[0] * sight.visibility, 0) if spread else None
             out["emit"], out["capture"] = dr.select(surface, emit, 0), dr.select(surface, capture, 0)
-            out["gaze_evals"] = dr.select(surface, networks, 0.0)
+            out["gaze_evals"] = dr.select(surface, networks, 0)
         return sight.density_evals
 
 
@@ -509,15 +522,19 @@ def _nested(props):
     return found[0] if found else None
 
 
-def _aovs(value, has_gaze, has_field):
+def _aovs(value, gaze, field):
     names = [n.strip() for n in value.split(",") if n.strip()]
     for name in names:
         if name not in CHANNELS and name not in _FEATURES:
             raise ValueError(f'"aovs" does not know "{name}"; it knows {", ".join([*CHANNELS, *_FEATURES])}')
-        if name in _FEATURES and not has_field:
+        if name in _FEATURES and field is None:
             raise ValueError(f'"aovs" asks for "{name}", which needs a "field"')
-        if name in _GAZE_AOVS and not has_gaze:
+        if name in _GAZE_AOVS | {"support"} and gaze is None:
             raise ValueError(f'"aovs" asks for "{name}", which needs a "gaze" volume')
+        if name == "gaze_std" and not hasattr(gaze, "spread"):
+            raise ValueError('"aovs" asks for "gaze_std", which needs a "gaze" of several members; train it with --ensemble 5')
+        if name == "support" and getattr(gaze.field, "support", None) is None:
+            raise ValueError('"aovs" asks for "support", which the checkpoint of "gaze" does not hold; train it again')
     if len(set(names)) < len(names):
         raise ValueError(f'"aovs" names something twice: "{value}"')
     return names

@@ -9,6 +9,7 @@ import numpy as np
 from ..attention.sphere import fibonacci_directions
 from ..field.backend import namespace
 from ..field.gaze import GazeField
+from ..field.gaze_ensemble import GazeEnsemble
 from ..field.log_gaze import LogGazeField
 from ..training.gaze_semantics import semantic_features
 from ..training.gaze_supervision import surfaces
@@ -24,15 +25,18 @@ SPHERE = 2048
 """Directions of the integral that normalises a field."""
 
 
-def gaze_field(field: GazeField | LogGazeField, medium, align: Similarity | None = None, kind: str = "median",
+def gaze_field(field: GazeField | LogGazeField | GazeEnsemble, medium, align: Similarity | None = None, kind: str = "median",
                count: int = SPHERE) -> Baseline:
     """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr; normalised where the
     field says so, by its integral over ``count`` directions of equal area.
 
     ``medium``: what the observer's depth is traced in, in the field's frame (see ``training.gaze_supervision.surfaces``);
     ``align``: similarity from the frame of the positions to the field's; directions (D, 3) for all positions or (P, D, 3).
-    Where no surface is met the field is what it was trained to be there.
+    Where no surface is met the field is what it was trained to be there. Of an ensemble it is the members' mean.
     """
+    if isinstance(field, GazeEnsemble):
+        members = [gaze_field(m, medium, align, kind, count) for m in field.members]
+        return lambda positions, directions: np.mean([m(positions, directions) for m in members], axis=0)
     align = align or Similarity()
     ns, config = namespace(field.grid.table), field.config
     fill = getattr(config, "escaped", None) == "nearest"

@@ -135,6 +135,8 @@ class GazeField:
         self.config, self.box, self.grid = config, box, grid
         self.position_net, self.direction_net = position_net, direction_net
         self.emit_head, self.capture_head = emit_head, capture_head
+        # How many rays it learnt from around a position (``support.RaySupport``), where that is known.
+        self.support = None
         self.pack()
 
     @staticmethod

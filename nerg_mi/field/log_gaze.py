@@ -107,6 +107,8 @@ class LogGazeField:
                              f"got {tuple(prior.shape)} and {dr.width(escaped)}")
         self.config, self.box, self.grid = config, box, grid
         self.emit_net, self.capture_net, self.escaped, self.prior = emit_net, capture_net, escaped, prior
+        # How many rays it learnt from around a position (``support.RaySupport``), where that is known.
+        self.support = None
         self.pack()
 
     @staticmethod

@@ -15,11 +15,13 @@ from ..field.background import Background, BackgroundConfig
 from ..field.box import Box
 from ..field.cascades import CascadeGrid
 from ..field.gaze import GazeConfig, GazeField
+from ..field.gaze_ensemble import GazeEnsemble
 from ..field.hashgrid import HashGrid
 from ..field.log_gaze import LogGazeConfig, LogGazeField
 from ..field.mlp import MLP
 from ..field.occupancy import OccupancyGrid
 from ..field.radiance import RadianceConfig, RadianceField
+from ..field.support import RaySupport
 from .checkpoint import read_checkpoint, write_checkpoint
 
 
@@ -113,43 +115,57 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
     return field, meta
 
 
-def save_gaze(field: GazeField | LogGazeField, path: str | Path, provenance: dict, half: bool = False) -> None:
-    """Write ``field``; ``provenance`` (JSON) says what it was trained on and with."""
-    c = field.config
+def save_gaze(field: GazeField | LogGazeField | GazeEnsemble, path: str | Path, provenance: dict, half: bool = False) -> None:
+    """Write ``field``, with its support where it has one; ``provenance`` (JSON) says what it was trained on and with."""
+    c, tensors = field.config, _dump(field.parameters(), half)
+    members = [m.config.to_dict() for m in getattr(field, "members", ())]
     metadata = {
-        "architecture": c.to_dict(),
+        "architecture": {"kind": "ensemble", "members": members} if members else c.to_dict(),
         "output": {"activation": c.activation, "normalized": c.normalized},
         "box": field.box.to_dict(),
         "units": {"length": "scene unit", "gaze": "1 / steradian"},
         "provenance": provenance,
     }
-    write_checkpoint(path, "gaze", _dump(field.parameters(), half), metadata)
+    if field.support is not None:
+        # Counts and positions: never in fp16.
+        tensors["support.cells"], metadata["support"] = field.support.cells, {"radius": field.support.radius}
+    write_checkpoint(path, "gaze", tensors, metadata)
 
 
-def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField | LogGazeField, dict]:
-    """The gaze field in ``path`` on backend ``ns``, and its metadata."""
+def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField | LogGazeField | GazeEnsemble, dict]:
+    """The gaze field in ``path`` on backend ``ns``, with its support, and its metadata."""
     tensors, meta = read_checkpoint(path, "gaze")
     with _reading(path):
-        kind = meta["architecture"].get("kind", "product")
-        if kind == "log_density":
-            return _log_gaze(tensors, meta, ns), meta
-        if kind != "product":
-            raise ValueError(f'it is a gaze field of the kind "{kind}", which this version does not know')
-        config = GazeConfig.from_dict(meta["architecture"])
-        sizes = {
-            "position_net": config.position_sizes, "direction_net": config.direction_sizes,
-            "emit_head": [config.width, 1], "capture_head": [config.width, 1],
-        }
-        layernorm = lambda name: config.trunk == "layernorm" and not name.endswith("head")
-        nets = {name: _net(tensors, name, size, ns, layernorm(name)) for name, size in sizes.items()}
-        field = GazeField(config, Box(**meta["box"]), _grid(tensors, config.grid, ns), **nets)
+        about, box = meta["architecture"], Box(**meta["box"])
+        if about.get("kind") == "ensemble":
+            own = lambda i: {k.removeprefix(f"{i}."): v for k, v in tensors.items() if k.startswith(f"{i}.")}
+            field = GazeEnsemble([_gaze(own(i), member, box, ns) for i, member in enumerate(about["members"])])
+        else:
+            field = _gaze(tensors, about, box, ns)
+        if "support" in meta:
+            field.support = RaySupport(_finite(tensors, "support.cells"), meta["support"]["radius"])
     return field, meta
 
 
-def _log_gaze(tensors: dict, meta: dict, ns: ModuleType) -> LogGazeField:
-    config = LogGazeConfig.from_dict(meta["architecture"])
+def _gaze(tensors: dict, about: dict, box: Box, ns: ModuleType) -> GazeField | LogGazeField:
+    kind = about.get("kind", "product")
+    if kind == "log_density":
+        return _log_gaze(tensors, LogGazeConfig.from_dict(about), box, ns)
+    if kind != "product":
+        raise ValueError(f'it is a gaze field of the kind "{kind}", which this version does not know')
+    config = GazeConfig.from_dict(about)
+    sizes = {
+        "position_net": config.position_sizes, "direction_net": config.direction_sizes,
+        "emit_head": [config.width, 1], "capture_head": [config.width, 1],
+    }
+    layernorm = lambda name: config.trunk == "layernorm" and not name.endswith("head")
+    nets = {name: _net(tensors, name, size, ns, layernorm(name)) for name, size in sizes.items()}
+    return GazeField(config, box, _grid(tensors, config.grid, ns), **nets)
+
+
+def _log_gaze(tensors: dict, config: LogGazeConfig, box: Box, ns: ModuleType) -> LogGazeField:
     return LogGazeField(
-        config, Box(**meta["box"]), _grid(tensors, config.grid, ns), _net(tensors, "emit_net", config.emit_sizes, ns),
+        config, box, _grid(tensors, config.grid, ns), _net(tensors, "emit_net", config.emit_sizes, ns),
         _net(tensors, "capture_net", config.capture_sizes, ns), ns.Float(_finite(tensors, "escaped")),
         ns.TensorXf(_finite(tensors, "prior")),
     )

@@ -20,10 +20,10 @@ class GazeIntegral:
     """Of ``gaze`` (``media.GazeMedium``) at ``p_o`` (Point3f, one lane) in ``place``; see ``value``.
 
     ``settings``, ``kind``, ``surface_opacity``: of the observer's rays, as the integrator has them. The depths carry no
-    derivatives; the value has those of the field's parameters.
+    derivatives; the value has those of the field's parameters. ``depths``: an integral of such a field here, whose depths will do.
     """
 
-    def __init__(self, gaze, place, p_o, settings, kind: str, surface_opacity: float, count: int = COUNT):
+    def __init__(self, gaze, place, p_o, settings, kind: str, surface_opacity: float, count: int = COUNT, depths: GazeIntegral | None = None):
         import mitsuba as mi
 
         self.gaze, self.center = gaze, mi.Point3f(dr.detach(p_o))
@@ -31,6 +31,9 @@ class GazeIntegral:
         dr.make_opaque(self.center)
         self._made = _traced_in(place), settings, kind, surface_opacity
         self._value, self._value_of = None, None
+        if depths is not None:
+            self.directions, self.distance, self.escaped = depths.directions, depths.distance, depths.escaped
+            return
         with dr.suspend_grad():
             i = dr.arange(mi.Float, count)
             z = 1 - (2 * i + 1) / count

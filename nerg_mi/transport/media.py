@@ -263,21 +263,30 @@ class GazeMedium:
         self.field, self.to_world = field, to_world or Similarity()
         self._integrals = []
 
+    @property
+    def networks(self) -> int:
+        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
+        return 2 if self.field.config.variant == "emit_capture" else 1
+
     def parameters(self) -> list:
         """Arrays that gaze depends on, for derivatives."""
         return list(self.field.parameters().values())
 
-    def face(self, observers: list, place, settings, kind: str, surface_opacity: float) -> None:
+    def face(self, observers: list, place, settings, kind: str, surface_opacity: float, like: GazeMedium | None = None) -> None:
         """Integrate a normalised field over the spheres of ``observers`` (Point3f, one lane each) in ``place``.
 
         ``settings``, ``kind``, ``surface_opacity``: of the observers' rays. Kept for as long as neither of them changes.
+        ``like``: a medium of the same box, place and kind of field that faces the same observers, whose depths will do.
         """
         from .gaze_integral import GazeIntegral
 
         how = place, settings, kind, surface_opacity
         known = self._integrals
-        self._integrals = [next((k for k in known if k.serves(p_o, *how)), None) or GazeIntegral(self, place, p_o, *how[1:])
-                           for p_o in observers]
+        depths = [None] * len(observers) if like is None else like._integrals
+        self._integrals = [
+            next((k for k in known if k.serves(p_o, *how)), None) or GazeIntegral(self, place, p_o, *how[1:], depths=traced)
+            for p_o, traced in zip(observers, depths)
+        ]  # fmt: skip
 
     def unnormalized(self, p_od, p_o, r_o, active, escaped=False):
         """``(emit, capture)`` of a normalised field, whose product is what is integrated."""
@@ -296,13 +305,14 @@ class GazeMedium:
 
     def _integral(self, p_o):
         """Of the observer that is faced nearest to ``p_o``, lane by lane."""
-        if not self._integrals:
-            return None
-        best, apart = self._integrals[0].value(), None
-        for i, known in enumerate(self._integrals):
-            if len(self._integrals) == 1:
-                break
-            here = dr.detach(dr.squared_norm(p_o - known.center))
-            best = known.value() if i == 0 else dr.select(here < apart, known.value(), best)
-            apart = here if i == 0 else dr.minimum(here, apart)
-        return best
+        return at_nearest(self._integrals, p_o, lambda known: known.value()) if self._integrals else None
+
+
+def at_nearest(known: list, p_o, of):
+    """``of(k)`` of that one ``k`` of ``known``, each with a ``center``, which is nearest to ``p_o``, lane by lane."""
+    best, apart = of(known[0]), None
+    for k in known if len(known) > 1 else ():
+        here = dr.detach(dr.squared_norm(p_o - k.center))
+        best = best if apart is None else dr.select(here < apart, of(k), best)
+        apart = here if apart is None else dr.minimum(here, apart)
+    return best
