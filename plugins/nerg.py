@@ -216,6 +216,7 @@ from nerg_mi.transport.color import composite_to_linear
 from nerg_mi.transport.depth import KINDS
 from nerg_mi.transport.features import Featured, accumulated, snapshot
 from nerg_mi.transport.gaze_ensemble import SupportView
+from nerg_mi.transport.freezing import no_collection, recording
 from nerg_mi.transport.march import MarchSettings
 from nerg_mi.transport.media import VolumeMedium
 from nerg_mi.transport.observer import KINDS as VISIBILITIES
@@ -309,7 +310,8 @@ class NergIntegrator(mi.SamplingIntegrator):
             raise ValueError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
         try:
-            return super().render(scene, sensor, seed, spp, develop, evaluate)
+            with no_collection():
+                return super().render(scene, sensor, seed, spp, develop, evaluate)
         finally:
             self._sensors = None
 
@@ -389,6 +391,9 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.observer_pass.forget()
         if hasattr(self.medium, "refresh"):
             self.medium.refresh()
+        if recording():
+            # What is recorded is not looked at.
+            return
         self._check_observer()
         if not dr.all(self.falloff >= 0):
             raise ValueError(f'"falloff" must not be negative, got {self.falloff}')

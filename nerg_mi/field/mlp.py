@@ -32,7 +32,7 @@ class MLP:
     added to what it returns.
     """
 
-    DRJIT_STRUCT = {"weights": list, "norms": None}
+    DRJIT_STRUCT = {"weights": list, "norms": None, "_views": None, "buffer": None}
 
     def __init__(self, weights: list, norms: list | None = None):
         self.weights = list(weights)

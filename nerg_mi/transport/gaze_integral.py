@@ -38,8 +38,8 @@ class GazeIntegral:
             i = dr.arange(mi.Float, count)
             z = 1 - (2 * i + 1) / count
             # Turns of the golden angle, of which whole ones are dropped in double precision.
-            turns = np.arange(count) * (1.5 - 0.5 * math.sqrt(5)) % 1.0
-            sin, cos = dr.sincos(mi.Float((2 * np.pi * turns).astype(np.float32)))
+            turns = dr.arange(mi.Float64, count) * (1.5 - 0.5 * math.sqrt(5))
+            sin, cos = dr.sincos(mi.Float(dr.two_pi * (turns - dr.floor(turns))))
             r = dr.sqrt((1 - z) * (1 + z))
             self.directions = mi.Vector3f(r * cos, r * sin, z)
             self.distance, self.escaped = self._depths(place, settings, kind, surface_opacity)

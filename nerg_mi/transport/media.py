@@ -16,6 +16,7 @@ from ..field.backend import namespace
 from ..field.gaze import GazeField
 from ..field.radiance import RadianceField
 from .cells import bound, describe
+from .freezing import recording
 from .ray_box import intersect_box
 
 
@@ -171,6 +172,8 @@ class VolumeMedium:
     """
 
     color_space = "spectrum"
+    # What dr.freeze is to find: the volumes are known to it through the integrator.
+    DRJIT_STRUCT = {"_bound": None}
 
     def __init__(self, density, color=None):
         import mitsuba as mi
@@ -189,6 +192,10 @@ class VolumeMedium:
 
     def refresh(self) -> None:
         """Read the grid's voxels again; call after they have changed."""
+        if recording():
+            # A bound would be that of these voxels, and not of those of the replays.
+            self._bound = None
+            return
         described = describe(self._density)
         self.cells, self._bound, self.step = None, None, None
         if described is not None:
@@ -261,7 +268,7 @@ class GazeMedium:
 
     def __init__(self, field, to_world: Similarity | None = None):
         self.field, self.to_world = field, to_world or Similarity()
-        self._integrals = []
+        self._integrals, self._recorded = [], False
 
     @property
     def networks(self) -> int:
@@ -281,7 +288,9 @@ class GazeMedium:
         from .gaze_integral import GazeIntegral
 
         how = place, settings, kind, surface_opacity
-        known = self._integrals
+        # What was made while a function was recorded is the recording's.
+        known = [] if recording() or self._recorded else self._integrals
+        self._recorded = recording()
         depths = [None] * len(observers) if like is None else like._integrals
         self._integrals = [
             next((k for k in known if k.serves(p_o, *how)), None) or GazeIntegral(self, place, p_o, *how[1:], depths=traced)

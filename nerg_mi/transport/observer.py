@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
+from .freezing import recording
 from .march import MarchSettings
 from .observer_map import ObserverMap
 from .place import Place
@@ -122,6 +123,9 @@ class ObserverPass:
     def _map_from(self, place, p_o) -> ObserverMap:
         """The observer's map, marched anew only when the observer, the field or a shape has changed."""
         known = self._map
+        if recording():
+            # A recorded function decides nothing by what it reads: it marches its map whenever it is replayed.
+            return ObserverMap(place, p_o, self.map_height, self.settings, self.depth, self.surface_opacity)
         if known is None or not known.serves(place) or not dr.all(known.center == dr.detach(p_o), axis=None):
             self._map = ObserverMap(place, p_o, self.map_height, self.settings, self.depth, self.surface_opacity)
         return self._map

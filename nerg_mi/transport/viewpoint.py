@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import drjit as dr
 
+from .freezing import recording
+
 _CENTERED = {"PerspectiveCamera", "ThinLensCamera", "Panorama", "RadianceMeter"}
 
 
@@ -49,7 +51,12 @@ def require_center(sensor, role: str) -> None:
 
 
 def same_center(sensors, p_o) -> bool:
-    """Whether every sensor's centre is exactly ``p_o`` (which costs a look at both values)."""
+    """Whether every sensor's centre is exactly ``p_o`` (which costs a look at both values).
+
+    False while a function is recorded by ``dr.freeze``: it will be replayed wherever they stand then.
+    """
+    if recording():
+        return False
     centers = [center(m) for s in sensors for m in _members(s) if _kind(m) in _CENTERED]
     count = sum(len(_members(s)) for s in sensors)
     return len(centers) == count > 0 and all(bool(dr.all(dr.detach(c) == dr.detach(p_o))) for c in centers)
