@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -63,6 +64,9 @@ def train_gaze(
     test_zones: Annotated[int, typer.Option(help="Zones of test positions that are left out of everything; 0: none.")] = 0,
     test_positions: Annotated[int, typer.Option(help="Test positions in them.")] = 64,
     test_people: Annotated[float, typer.Option(help="Share of the people who are left out of everything besides.")] = 0.0,
+    ensemble: Annotated[
+        int, typer.Option(help="Train so many fields on resamples of the people; the mean is the gaze, their spread its uncertainty. 0: one field.")
+    ] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run of this output.")] = False,
     save_every: Annotated[float, typer.Option(help="Seconds between two states for --resume; 0 keeps none.")] = 60.0,
     seed: Annotated[int, typer.Option(help="Seed of probes, directions, weights, batches and splits.")] = 0,
@@ -80,6 +84,7 @@ def train_gaze(
     from ..errors import NergError
     from ..field.backend import namespace
     from ..formats.fields import save_gaze
+    from ..training.gaze_ensemble import train_ensemble
     from ..training.gaze_recipes import gaze_recipe
     from ..training.gaze_run import hold_out, train_gaze
     from ..training.gaze_settings import GazeSettings, ProbeSettings
@@ -114,7 +119,7 @@ def train_gaze(
         fresh=fresh or None,
     ))  # fmt: skip
     state = output.with_suffix(".run")
-    if resume and not state.is_file():
+    if resume and not ensemble and not state.is_file():
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
     data, ns, about = None, namespace(mode), {"recipe": recipe}
     if rays is not None:
@@ -137,8 +142,9 @@ def train_gaze(
             "semantic": semantic, "semantic_own": semantic_own, "normalized": normalized or rays is None,
         })  # fmt: skip
         about |= {"begins_as": field.name} if initial else {}
+    train = partial(train_ensemble, ensemble) if ensemble else train_gaze
     with _Bar() as bar:
-        trained, provenance = train_gaze(
+        trained, provenance = train(
             data, place.medium, place.box, config, settings, how, ns, _similarity(align), bar.update, initial, about=dict(about),
             state=state if save_every > 0 or resume else None, resume=resume, save_every=save_every or 60.0,
             views=seen,

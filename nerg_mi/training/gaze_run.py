@@ -15,6 +15,7 @@ from ..capture.salience import SalienceView
 from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
 from ..field.log_gaze import LogGazeConfig, LogGazeField
+from ..field.support import RaySupport
 from ..transport.media import Similarity
 from .gaze import GazeTrainer, Scores
 from .gaze_likelihood import LikelihoodTrainer
@@ -145,6 +146,8 @@ def train_gaze(
         used = supervised(rays, views, settings.seed)
         last = _refit(used, box, config, settings, ns, say, first, initial, file)
     result = last.trainer.field(last.weights)
+    if rays is not None:
+        result.support = support_of(learn if last is first else rays, probes.radius, align)
     interrupted = first.interrupted or last.interrupted
     if not interrupted:
         file.remove()
@@ -171,6 +174,12 @@ def train_gaze(
             **_rounded(first.scores), "history": first.history,
         }  # fmt: skip
     return result, provenance
+
+
+def support_of(rays: Rays, radius: float, align: Similarity | None = None) -> RaySupport:
+    """How many of ``rays`` there are around a position, in the field's frame, for probes of ``radius`` metres."""
+    align = align or Similarity()
+    return RaySupport.of(rays.origin @ align.matrix[:3, :3].T + align.matrix[:3, 3], radius * align.scale)
 
 
 def trainer_of(config) -> type[GazeTrainer]:
