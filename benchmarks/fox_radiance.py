@@ -25,17 +25,11 @@ def default_data() -> Path:
     return root / "fox"
 
 
-def open_split(path: Path, width: int, validate: bool):
-    """The data set, with the held-out photos; with ``validate`` these are dropped, and every 8th training photo replaces them."""
+def validation(data):
+    """The data set without its held-out photos: every 8th training photo replaces them."""
     from dataclasses import replace
 
-    from nerg_mi.capture.dataset import open_dataset
-
-    data = open_dataset(path, None, width)
-    if not validate:
-        return data
-    held = data.train[::8]
-    return replace(data, held_out=held, train=[v for k, v in enumerate(data.train) if k % 8])
+    return replace(data, held_out=data.train[::8], train=[v for k, v in enumerate(data.train) if k % 8])
 
 
 def parse_settings(pairs: list[str]) -> dict:
@@ -65,6 +59,7 @@ def main(argv=None) -> None:
 
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
+    from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.evaluation.radiance_scores import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
@@ -74,7 +69,8 @@ def main(argv=None) -> None:
     ns = namespace("llvm_ad_rgb")
     if not args.data.exists():
         raise SystemExit(f"{args.data} does not exist; give a posed image set with --data")
-    data = open_split(args.data, args.width, args.validate)
+    data = open_dataset(args.data, None, args.width)
+    data = validation(data) if args.validate else data
     stops = sorted(float(m) for m in args.minutes.split(","))
     settings = RadianceSettings(minutes=stops[-1], seed=args.seed, **parse_settings(args.set))
     args.out.mkdir(parents=True, exist_ok=True)

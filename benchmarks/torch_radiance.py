@@ -20,7 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import numpy as np  # noqa: E402
-from fox_radiance import default_data, open_split  # noqa: E402
+from fox_radiance import default_data, validation  # noqa: E402
 
 _PRIMES = (1, 2654435761, 805459861)
 
@@ -248,6 +248,7 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
     torch.set_num_threads(args.threads)
+    from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.evaluation.radiance_scores import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
@@ -255,10 +256,11 @@ def main(argv=None) -> None:
     from nerg_mi.training.settings import RadianceSettings, sized_config
 
     ns = namespace("llvm_ad_rgb")
-    data = open_split(args.data, args.width, args.validate)
+    data = open_dataset(args.data, None, args.width)
+    data = validation(data) if args.validate else data
     if any(v.has_alpha or v.mask is not None for v in data.train):
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
-    settings = RadianceSettings(minutes=args.minutes, settle=2.0, empty_weight=0.0)
+    settings = RadianceSettings(minutes=args.minutes, settle=2.0, empty_weight=0.0, thin_least=1.0)
     make = lambda: RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
     args.out.mkdir(parents=True, exist_ok=True)
     ours, judge = make(), make()

@@ -114,13 +114,31 @@ class HashGrid:
         Points outside of the cube give zeros. ``mode`` chooses how gradients are
         added to the table.
         """
-        inside = active & dr.all((p >= 0) & (p <= 1))
-        # A negative coordinate cast to an unsigned cell would extrapolate by 4e9.
-        p = dr.select(inside, p, 0)
+        p, inside = self._clamped(p, active)
         out = []
         for level in range(self.config.levels):
             out += self._level(level, p, inside, mode)
         return out
+
+    def by_level(self, p, active=True) -> list:
+        """The same features, evaluated one level after another: the rows of one level stay in the caches.
+
+        Worth it for many scattered points whose features are to be kept in memory anyhow.
+        """
+        p, inside = self._clamped(p, active)
+        dr.eval(p, inside)
+        out = []
+        for level in range(self.config.levels):
+            out += self._level(level, p, inside, dr.ReduceMode.Auto)
+            dr.eval(out)
+        return out
+
+    @staticmethod
+    def _clamped(p, active):
+        """``p`` with 0 for what lies outside of the cube, and the mask of what lies inside."""
+        inside = active & dr.all((p >= 0) & (p <= 1))
+        # A negative coordinate cast to an unsigned cell would extrapolate by 4e9.
+        return dr.select(inside, p, 0), inside
 
     def _level(self, level: int, p, active, mode) -> list:
         ns = namespace(p)

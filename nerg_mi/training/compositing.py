@@ -9,6 +9,8 @@ would add every sample of a ray to one address.
 """
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 
 from ..transport.quadrature import absorbed_share
@@ -66,25 +68,40 @@ class Segments:
         return dr.select(self.active, dr.float64_array_t(type(x))(x), 0)
 
 
-class _Weights(dr.CustomOp):
-    """w of τ; dw_i = T_i exp(-τ_i) dτ_i - w_i Σ_{j<i} dτ_j along one ray."""
+@dataclass
+class Thinned:
+    """What is known of samples that stand for others: one was kept with probability p, on the sum of all.
 
-    def eval(self, tau, segments):
+    ``copies``: 1 / p of each sample; ``before``: optical depth in front of it, of all samples; ``opacity``: of each ray,
+    of all samples.
+    """
+
+    copies: object
+    before: object
+    opacity: object
+
+
+class _Weights(dr.CustomOp):
+    """w of τ; dw_i = c_i T_i exp(-τ_i) dτ_i - w_i Σ_{j<i} c_j dτ_j along one ray, c the copies that a sample stands for."""
+
+    def eval(self, tau, segments, thinned):
         self.segments = segments
         Float = type(tau)
+        self.copies = 1 if thinned is None else thinned.copies
         capped = dr.minimum(tau, _MAX_TAU)
-        transmitted = dr.exp(-Float(segments.before(capped)))
-        self.weight = dr.select(segments.active, transmitted * absorbed_share(capped), 0)
-        self.passed = dr.select(segments.active, transmitted * dr.exp(-capped), 0)
+        before = Float(segments.before(capped)) if thinned is None else thinned.before
+        transmitted = dr.select(segments.active, self.copies * dr.exp(-before), 0)
+        self.weight = transmitted * absorbed_share(capped)
+        self.passed = transmitted * dr.exp(-capped)
         return Float(self.weight)
 
     def forward(self):
         g = self.grad_in("tau")
-        self.set_grad_out(self.passed * g - self.weight * type(g)(self.segments.before(g)))
+        self.set_grad_out(self.passed * g - self.weight * type(g)(self.segments.before(self.copies * g)))
 
     def backward(self):
         g = self.grad_out()
-        self.set_grad_in("tau", self.passed * g - type(g)(self.segments.after(g * self.weight)))
+        self.set_grad_in("tau", self.passed * g - self.copies * type(g)(self.segments.after(g * self.weight)))
 
     def name(self):
         return "volume rendering weights"
@@ -110,9 +127,13 @@ class _RaySum(dr.CustomOp):
         return "sum along rays"
 
 
-def weights(tau, segments: Segments):
-    """Weights of samples of optical depth ``tau`` >= 0 (Float); 0 for padding."""
-    return dr.custom(_Weights, tau, segments)
+def weights(tau, segments: Segments, thinned: Thinned | None = None):
+    """Weights of samples of optical depth ``tau`` >= 0 (Float); 0 for padding.
+
+    Of ``thinned`` samples each weight is that of all the samples it stands for: sums of them along a ray, and their
+    derivatives, are those over all samples on average.
+    """
+    return dr.custom(_Weights, tau, segments, thinned)
 
 
 def ray_sum(x, segments: Segments):

@@ -90,8 +90,17 @@ class _Spread(dr.CustomOp):
 
 
 def composite(sigma, rgb: list, samples: Samples):
-    """Weights, optical depths, colour (3 Floats) and opacity of every ray."""
-    s = samples.segments
+    """Weights, optical depths, colour (3 Floats) and opacity of every ray.
+
+    Of thinned samples the opacity is that of all, and the colour their mean times it: both without the noise of the sums of
+    weights. Derivatives are those of the plain sums, which are right on average.
+    """
+    s, thinned = samples.segments, samples.thinned
     tau = dr.select(s.active, sigma * samples.length, 0)
-    weight = weights(tau, s)
-    return weight, tau, [ray_sum(weight * c, s) for c in rgb], ray_sum(weight, s)
+    weight = weights(tau, s, thinned)
+    color, opacity = [ray_sum(weight * c, s) for c in rgb], ray_sum(weight, s)
+    if thinned is not None:
+        scale = dr.detach(thinned.opacity / dr.maximum(opacity, 1e-6))
+        color = [dr.replace_grad(c * scale, c) for c in color]
+        opacity = dr.replace_grad(thinned.opacity, opacity)
+    return weight, tau, color, opacity

@@ -1,8 +1,9 @@
 """Training a radiance field on posed pictures.
 
 instant-ngp's training (Müller et al. 2022) in Dr.Jit, arranged for the CPU backend: rays march a grid
-of occupied cells with true steps; a density-only pass drops what lies behind opaque surfaces; what remains
-is packed into batches of constant size, the number of rays adapting; networks run as tensor products.
+of occupied cells with true steps; a density-only pass drops what lies behind opaque surfaces, and lets one in many stand for
+samples that hardly absorb; what remains is packed into batches of constant size, the number of rays adapting; networks run
+as tensor products.
 """
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from .losses import color_loss, composite, depth_loss, distortion_loss
 from .model import density, density_color, density_of
 from .pixels import PixelBank
 from .preview import Preview, psnr, render_view
-from .sampling import StepTable, rays_in_box, visible_samples
+from .sampling import StepTable, Thinning, rays_in_box, visible_samples
 from .settings import RadianceSettings
 
 # The average is taken of every fourth step.
@@ -104,7 +105,7 @@ class RadianceTrainer:
     def _look(self, p, active):
         """Density at ``p`` for the choice of samples, and the grid's features, which need no second look-up."""
         now = {k: dr.detach(v) for k, v in self._parameters().items()}
-        features = HashGrid(self.config.grid, now["grid.table"])(self.box.to_unit(p), active)
+        features = HashGrid(self.config.grid, now["grid.table"]).by_level(self.box.to_unit(p), active)
         return density_of(self.config, now, features), features
 
     def _parameters(self) -> dict:
@@ -125,8 +126,9 @@ class RadianceTrainer:
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
         offset = ns.Float(self.rng.random(self.rays, np.float32))
         stride = 1 if self.carved else s.stride(self.steps)
+        thinning = Thinning(s.thin_sure, s.thin_least, self.rng.random()) if s.thin_least < 1 else None
         samples, covered = visible_samples(rays, self.table(stride), offset, self.grid.occupied, self._look,
-                                           s.stop, pad=s.batch)
+                                           s.stop, s.batch, thinning)
         self.steps += 1
         if samples is None:
             self._adapt(0)

@@ -12,7 +12,8 @@ import drjit as dr
 import numpy as np
 
 from ..field.box import Box
-from .compositing import Segments
+from ..transport.quadrature import absorbed_share
+from .compositing import Segments, Thinned
 
 
 class StepTable:
@@ -70,7 +71,7 @@ def rays_in_box(o, d, box: Box, near: float) -> Rays:
 class Samples:
     """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint
     (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding; ``features``: what the
-    density pass knew of them, or None."""
+    density pass knew of them, or None; ``thinned``: of samples that stand for others."""
 
     ray: object
     t: object
@@ -79,6 +80,17 @@ class Samples:
     segments: Segments
     count: int
     features: list | None = None
+    thinned: Thinned | None = None
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """Which samples to keep: those of a weight of ``sure`` or more all, others with a probability in proportion to their
+    weight, but ``least`` at least. ``offset``: of the systematic choice, a random number in [0, 1)."""
+
+    sure: float
+    least: float
+    offset: float
 
 
 def occupied_steps(rays: Rays, table: StepTable, offset, occupied) -> tuple | None:
@@ -114,19 +126,20 @@ def _step(rays: Rays, table: StepTable, offset, ray, k):
 
 
 def visible_samples(
-    rays: Rays, table: StepTable, offset, occupied, density, stop: float, pad: int | None = None
+    rays: Rays, table: StepTable, offset, occupied, density, stop: float, pad: int | None = None, thinning: Thinning | None = None
 ) -> tuple[Samples | None, int]:
     """Samples that may matter, and the number of leading rays that they cover completely.
 
     ``density``: function of points and a mask giving σ without a gradient, or σ and a list of Floats that the samples
-    are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make exactly so many samples, dropping the last rays
-    that do not fit. Returns (None, rays) when no ray meets anything.
+    are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make exactly so many samples,
+    dropping the last rays that do not fit. ``thinning``: let few samples stand for the many that hardly absorb.
+    Returns (None, rays) when no ray meets anything.
     """
     steps = occupied_steps(rays, table, offset, occupied)
     if steps is None:
         return None, rays.count
     ray, t, length, p = steps
-    Bool = dr.mask_t(t)
+    Bool, Float, UInt32 = dr.mask_t(t), type(t), type(ray)
     everywhere = dr.full(Bool, True, dr.width(t))
     segments = Segments(ray, everywhere, rays.count)
     sigma = density(p, everywhere)
@@ -134,15 +147,26 @@ def visible_samples(
     tau = dr.minimum(sigma * length, 60.0)
     # At once: each on its own would evaluate the field again.
     dr.eval(tau, features)
-    light = dr.exp(-type(t)(segments.before(tau)))
-    kept = dr.compress(light > stop)
+    before = Float(segments.before(tau))
+    light = dr.exp(-before)
+    chosen, thinned = light > stop, None
+    if thinning is not None:
+        weight = light * absorbed_share(tau)
+        share = dr.select(chosen, dr.clip(weight / thinning.sure, thinning.least, 1), 0)
+        # Systematic sampling: one sample for every unit of the running sum, so that neighbours replace one another.
+        running = dr.cumsum(dr.float64_array_t(Float)(share)) + dr.opaque(dr.float64_array_t(Float), thinning.offset)
+        chosen = dr.floor(running) > dr.floor(running - share)
+        thinned = Thinned(dr.rcp(share), before, absorbed_share(Float(segments.total(tau))))
+        dr.eval(chosen, thinned.copies, before, thinned.opacity)
+    kept = dr.compress(chosen)
     count, covered = dr.width(kept), rays.count
+    if count == 0:
+        return None, rays.count
     if pad is not None and count > pad:
         # The ray in which the limit falls is incomplete: it and all later ones wait for another batch.
-        covered = int(dr.gather(type(ray), ray, dr.gather(type(kept), kept, type(kept)(pad))).numpy()[0])
+        covered = int(dr.gather(UInt32, ray, dr.gather(UInt32, kept, UInt32(pad))).numpy()[0])
         if covered == 0:
             raise ValueError(f"a single ray has more than {pad} samples; enlarge the batch or the step")
-    UInt32 = type(ray)
     j = dr.arange(UInt32, pad if pad is not None else count)
     source = dr.gather(UInt32, kept, dr.minimum(j, dr.opaque(UInt32, count - 1)))
     ray = dr.gather(UInt32, ray, source)
@@ -150,5 +174,9 @@ def visible_samples(
     t, length, p = (dr.gather(type(v), v, source) for v in (t, length, p))
     if features is not None:
         features = [dr.gather(type(f), f, source) for f in features]
+    if thinned is not None:
+        thinned.copies, thinned.before = (dr.gather(Float, v, source) for v in (thinned.copies, thinned.before))
+        dr.eval(thinned.copies, thinned.before)
     dr.eval(ray, active, t, length, p, features)
-    return Samples(ray, t, length, p, Segments(ray, active, rays.count), min(count, pad or count), features), covered
+    segments = Segments(ray, active, rays.count)
+    return Samples(ray, t, length, p, segments, min(count, pad or count), features, thinned), covered

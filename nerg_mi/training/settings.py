@@ -35,7 +35,8 @@ class RadianceSettings:
     ``learning_rate``: held for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times
     itself. ``average``: decay a step of the averaged weights, which are the result.
     ``march_step``: shortest step (instant-ngp's √3/1024); ``growth``: steps are at least this share of their
-    distance; ``near``: where rays start; ``stop``: samples that less light reaches are left out.
+    distance; ``near``: where rays start; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on a sample is always kept, others
+    by chance in proportion to their weight, with ``thin_least`` at least (1: all are kept).
     ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells
     that fewer cameras see stay empty; ``settle``: share of the run after which all cells that rendering will visit
     are sampled. ``strides``: the first steps of the run march this many times coarser, ``stride_steps`` each, which
@@ -51,8 +52,8 @@ class RadianceSettings:
     minutes: float | None = None
     seed: int = 0
     # Not a power of two: arrays that many bytes apart share their place in the caches, which costs a factor of two.
-    batch: int = 2**15 + 240
-    learning_rate: float = 2.5e-2
+    batch: int = 2**14 + 240
+    learning_rate: float = 1.5e-2
     final_rate: float = 0.03
     hold: float = 0.4
     average: float = 0.99
@@ -60,6 +61,8 @@ class RadianceSettings:
     growth: float = 1 / 128
     near: float = 0.005
     stop: float = 2e-3
+    thin_sure: float = 1 / 16
+    thin_least: float = 1 / 32
     resolution: int = 128
     grid_every: int = 16
     min_views: int = 2
@@ -81,6 +84,8 @@ class RadianceSettings:
             raise ValueError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
         if self.depth_weight < 0 or self.distortion_weight < 0:
             raise ValueError(f"weights of losses must be 0 or more, got {self.depth_weight} and {self.distortion_weight}")
+        if not (self.thin_sure > 0 and 0 < self.thin_least <= 1):
+            raise ValueError(f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}")
         if self.resolution % 8:
             raise ValueError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
 

@@ -12,13 +12,14 @@ from nerg_mi.field.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.intrinsics import Intrinsics
+from nerg_mi.training.compositing import ray_sum
 from nerg_mi.training.losses import color_loss, composite, depth_loss
 from nerg_mi.training.model import density_color
 from nerg_mi.training.pixels import PixelBank
 from nerg_mi.training.preview import render_view
 from nerg_mi.training.radiance import RadianceTrainer
 from nerg_mi.training.radiance_run import save_trained, train_radiance
-from nerg_mi.training.sampling import StepTable, rays_in_box, visible_samples
+from nerg_mi.training.sampling import StepTable, Thinning, rays_in_box, visible_samples
 from nerg_mi.training.settings import RadianceSettings, sized_config
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
@@ -160,8 +161,37 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
     assert slope == pytest.approx((up - down) / (2 * h), rel=0.01)
 
 
+def test_thinned_samples_stand_for_all():
+    """Opacity is exact; colours and the gradient of linear sums are those of all samples on the mean over systematic choices."""
+    rng = np.random.default_rng(8)
+    o = ns.Array3f(np.tile([[0.0], [0.0], [-2.0]], 16).astype(np.float32))
+    d = dr.normalize(ns.Array3f(*[ns.Float(rng.normal(size=16).astype(np.float32) * 0.3) for _ in range(2)], ns.Float(np.ones(16))))
+    rays, table = rays_in_box(o, d, BOX, 0.01), StepTable(ns, 0.01, 4, 0.03, 0)
+    offset, per_ray = ns.Float(rng.random(16).astype(np.float32)), ns.Float(rng.normal(size=16).astype(np.float32))
+    density = lambda p, active=True: 0.3 + 20 * dr.exp(-40 * dr.square(p.z - 0.3 * p.x))
+
+    def render(thinning):
+        samples, _ = visible_samples(rays, table, offset, lambda p, a: a, density, 1e-9, thinning=thinning)
+        gain = ns.Float(1)
+        dr.enable_grad(gain)
+        rgb = [0.5 + 0.4 * dr.sin(4 * samples.p.z + k) for k in range(3)]
+        weight, _, color, opacity = composite(gain * density(samples.p), rgb, samples)
+        plain = sum(ray_sum(weight * c, samples.segments) for c in rgb)
+        dr.backward(dr.sum((plain + opacity) * per_ray))
+        return (samples.count, np.array([c.numpy() for c in color]), opacity.numpy(), dr.grad(gain).numpy()[0])
+
+    count, color, opacity, slope = render(None)
+    found = [render(Thinning(1 / 16, 1 / 32, (k + 0.5) / 400)) for k in range(400)]
+    assert max(f[0] for f in found) < 0.5 * count
+    for f in found[::40]:
+        assert np.allclose(f[2], opacity, atol=1e-6)
+    assert np.allclose(np.mean([f[1] for f in found], 0), color, atol=2e-3)
+    slopes = [f[3] for f in found]
+    assert abs(np.mean(slopes) - slope) < 4 * np.std(slopes) / 20 and np.std(slopes) > 0
+
+
 def test_settings_and_sizes_are_checked():
-    for wrong in ({}, {"steps": 5, "minutes": 1.0}, {"steps": 0}, {"steps": 5, "resolution": 100}):
+    for wrong in ({}, {"steps": 5, "minutes": 1.0}, {"steps": 0}, {"steps": 5, "resolution": 100}, {"steps": 5, "thin_least": 0}):
         with pytest.raises(ValueError):
             RadianceSettings(**wrong)
     with pytest.raises(ValueError, match="small, medium, paper"):
