@@ -88,7 +88,7 @@ def train_gaze(
     from ..training.gaze_recipes import gaze_recipe
     from ..training.gaze_run import hold_out, train_gaze
     from ..training.gaze_settings import GazeSettings, ProbeSettings
-    from ..training.salience_supervision import far_views
+    from ..training.salience_supervision import VIEWS_ALONE, far_views
 
     if sum(v is not None for v in (field, scene, geometry)) != 1:
         raise ValueError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
@@ -110,7 +110,7 @@ def train_gaze(
     chosen = gaze_recipe(recipe, gaze, activation, size)
     if recipe == "default" and (semantic or begin == "field" or loss or normalized or integral is not None):
         raise ValueError("--semantic, --begin field, --loss, --integral and --normalized belong to fields of the recipes small and paper; add --recipe small")
-    settings = GazeSettings(**chosen.settings | _given(
+    settings = GazeSettings(**chosen.settings | (VIEWS_ALONE if rays is None else {}) | _given(
         minutes=minutes, steps=steps, seed=seed, loss=loss, zones=zones, refit=refit,
         frozen=freeze, learning_rate=learning_rate, weight_decay=weight_decay, integral=integral,
     ) | ({"steps": None} if minutes is not None and steps is None else {}))  # fmt: skip

@@ -20,6 +20,8 @@ from ..transport.media import Similarity
 from .gaze_settings import ProbeSettings
 from .gaze_supervision import BLIND_KAPPA, Supervision, observe, supervise_rays
 
+# Of ``GazeSettings``, where there are no rays: what views share comes late, after a plateau at their blind density.
+VIEWS_ALONE = {"patience": 10}
 # Directions a pixel of a view, so that hardly any is left out.
 _PER_PIXEL = 4
 # Share of the views that validation watches.
@@ -80,9 +82,11 @@ def blind_of_views(views: list[SalienceView], rows: int) -> np.ndarray:
     """``field.log_gaze.blind_table`` of what is looked at wherever the camera stands, of which each of ``views`` shows a part.
 
     The density b of greatest likelihood when view v sees b given its part, found by Hunter's (2004) iteration for choices
-    among a few: b = Σ_v p_v / Σ_v 1_v / b(v). One more view, of the whole sphere, is uniform: it settles what no other shows.
-    Smoothed as that of rays is.
+    among a few: b = Σ_v p_v / Σ_v 1_v / b(v). One more view, of the whole sphere, is uniform: it links those that share nothing.
+    What no view shows is looked at as what lies next to it is. Smoothed as the density of rays is.
     """
+    from scipy.spatial import cKDTree
+
     directions = table_directions(rows)
     # Of the rows' bands, not of the texels' centres: they sum to 4π.
     edges = np.cos(np.arange(rows + 1) * np.pi / rows)
@@ -100,6 +104,9 @@ def blind_of_views(views: list[SalienceView], rows: int) -> np.ndarray:
         seen = known @ (blind * area)
         blind = target / (known.T @ (1 / np.maximum(seen, 1e-30) * (seen > 0)) + 1)
         blind /= blind @ area
+    shown = known.any(axis=0)
+    if shown.any():
+        blind = blind[np.flatnonzero(shown)[cKDTree(directions[shown]).query(directions)[1]]]
     kde = SphericalKde(directions, np.array([0, len(area)]), BLIND_KAPPA, blind * area)
     return blind_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(1 << 16))
 
