@@ -13,7 +13,7 @@ from .probes import Probes, place_probes
 from .rays import Rays
 
 METHODS = ("auto", "exact", "table")
-_WORTH = 4096  # directions from which on a table is quicker
+WORTH = 4096  # directions from which on a table is quicker
 
 
 def probe_at(rays: Rays, observer: np.ndarray, radius: float = 0.25, *, index: RayIndex | None = None, **options: object) -> Probes:
@@ -69,7 +69,7 @@ def kde_frame(
     kde = probe.kde(backend) if isinstance(probe, Probes) else probe
     if kde.count != 1:
         raise ValueError(f"a picture has one observer and needs one probe, got {kde.count}")
-    table = method == "table" or (method == "auto" and len(directions) >= _WORTH and SphericalKdeTable.fits(kde, len(directions)))
+    table = method == "table" or (method == "auto" and len(directions) >= WORTH and SphericalKdeTable.fits(kde, len(directions)))
     density = SphericalKdeTable(kde, used=directions).evaluate(directions) if table else kde.evaluate(directions)[0]
     density = density.reshape(shape)
     for shown in (there, mask):
