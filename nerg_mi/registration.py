@@ -18,6 +18,7 @@ PLUGINS = (
     ("panorama", "sensor"),
     ("nerf", "volume"),
     ("gazefield", "volume"),
+    ("gazekde", "volume"),
     ("nerg", "integrator"),
 )
 """Name and kind of each plugin; the module `nerg_mi.plugins.<name>` registers it. Order: a plugin follows those it uses."""

@@ -25,6 +25,10 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - Lights the shapes of the scene; its AOVs follow ours. Without one it is ``path`` where the scene has emitters, and
      shapes show their plain albedo where it has none.
 
+ * - kde
+   - :paramtype:`volume`
+   - Tracked rays (:ref:`gazekde <volume-gazekde>`), whose density the AOV ``kde`` shows.
+
  * - observer
    - :paramtype:`sensor`
    - Whose gaze it is; only its position counts. Without it the observer is the centre of the rendering camera, and an
@@ -144,6 +148,7 @@ AOVs (0 where nothing is met):
 - ``gaze_std`` (``.Y``): standard deviation of ``gaze`` over the members of an ensemble, in 1/sr, after occlusion
 - ``support`` (``.Y``): how many training rays started around the observer, one at distance d counting 1 - d²/R²
   (R of the training); one number an observer, shown where there is a surface
+- ``kde`` (``.Y``): density in 1/sr of the tracked rays nearest to the observer, towards this surface, after occlusion
 - ``visibility`` (``.Y``): 1 visible to the observer .. 0 hidden
 - ``observer_depth`` (``.T``): :math:`d_o`; the distance to the surface where no occlusion is computed
 - ``features`` (``.0``, ``.1``, ...): the field's geometry features, accumulated like colour (not divided by opacity)
@@ -228,13 +233,15 @@ from nerg_mi.transport.shading import Shading
 
 CHANNELS = {
     "depth": "T", "opacity": "Y", "position": "XYZ", "gaze": "Y", "emit": "Y", "capture": "Y", "gaze_std": "Y", "support": "Y",
-    "visibility": "Y", "observer_depth": "T", "density_evals": "Y", "color_evals": "Y", "gaze_evals": "Y",
+    "kde": "Y", "visibility": "Y", "observer_depth": "T", "density_evals": "Y", "color_evals": "Y", "gaze_evals": "Y",
 }
 _FEATURES = ("features", "features_at")
 _GAZE_AOVS = {"gaze", "emit", "capture", "gaze_evals", "gaze_std"}
 # What else there is to know of an observer, from a view with ``face``, ``value`` and ``occluded``.
-_VIEWS = {"support"}
+_VIEWS = {"support", "kde"}
 _OBSERVER_AOVS = {"visibility", "observer_depth"} | _VIEWS
+# What needs to know what the observer sees.
+_HIDDEN_AOVS = (_GAZE_AOVS | _OBSERVER_AOVS) - {"support"}
 
 
 class NergIntegrator(mi.SamplingIntegrator):
@@ -248,13 +255,15 @@ class NergIntegrator(mi.SamplingIntegrator):
                 'call mi.set_variant("llvm_ad_rgb")'
             )
         field, density, paint = (props.get(k, None) for k in ("field", "density", "color"))
-        gaze, observer = props.get("gaze", None), props.get("observer", None)
+        gaze, kde, observer = (props.get(k, None) for k in ("gaze", "kde", "observer"))
         self.medium = _medium(field, density, paint)
         if gaze is not None and not hasattr(gaze, "gaze_medium"):
             raise ValueError('"gaze" must be a volume of type "gazefield"')
+        if kde is not None and not hasattr(kde, "kde_view"):
+            raise ValueError('"kde" must be a volume of type "gazekde"')
         if observer is not None and not isinstance(observer, mi.Sensor):
             raise ValueError('"observer" must be a sensor; its to_world places the observer')
-        self._children = {"field": field, "density": density, "color": paint, "gaze": gaze, "observer": observer}
+        self._children = {"field": field, "density": density, "color": paint, "gaze": gaze, "kde": kde, "observer": observer}
         self.gaze = None if gaze is None else gaze.gaze_medium()
         _check_semantics(self.gaze, field, self.medium)
         self.observer = observer
@@ -268,8 +277,10 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.radiance = boolean(props, "radiance", True)
         background = mi.Color3f(color(props, "background", 0.0))
         self.background = mi.Spectrum(mi.luminance(background) if mi.is_monochromatic else background)
-        self.aovs = _aovs(text(props, "aovs", "depth,opacity"), self.gaze, field)
-        self._views = {"support": SupportView(self.gaze.field.support, self.gaze.to_world)} if "support" in self.aovs else {}
+        self.aovs = _aovs(text(props, "aovs", "depth,opacity"), self.gaze, field, kde)
+        self._views = {"kde": kde.kde_view()} if "kde" in self.aovs else {}
+        if "support" in self.aovs:
+            self._views["support"] = SupportView(self.gaze.field.support, self.gaze.to_world)
         self.jitter = boolean(props, "jitter", False)
         step = number(props, "step", 0, low=0)
         self.settings = MarchSettings(
@@ -440,8 +451,9 @@ class NergIntegrator(mi.SamplingIntegrator):
 
         distance, r_o = towards(p_o, p_d)
         sight = Sight(p_d, distance, mi.Float(1), mi.Float(0))
-        if self.occlusion and not aligned and asked & (_GAZE_AOVS | _OBSERVER_AOVS) - {n for n, v in self._views.items() if not v.occluded}:
-            keeps = self.gaze is not None and not self.gaze.field.config.semantic and asked & _GAZE_AOVS <= {"gaze", "gaze_evals"}
+        if self.occlusion and not aligned and asked & _HIDDEN_AOVS:
+            of_gaze = asked & _GAZE_AOVS
+            keeps = of_gaze and not self.gaze.field.config.semantic and of_gaze <= {"gaze", "gaze_evals"}
             looked_up = self.gaze if keeps else None
             sight = self.observer_pass.look(place, ray, p_d, p_o, fuzz, surface, self.falloff, count, looked_up)
         out["visibility"] = dr.select(surface, sight.visibility, 0)
@@ -527,7 +539,7 @@ def _nested(props):
     return found[0] if found else None
 
 
-def _aovs(value, gaze, field):
+def _aovs(value, gaze, field, kde):
     names = [n.strip() for n in value.split(",") if n.strip()]
     for name in names:
         if name not in CHANNELS and name not in _FEATURES:
@@ -536,6 +548,8 @@ def _aovs(value, gaze, field):
             raise ValueError(f'"aovs" asks for "{name}", which needs a "field"')
         if name in _GAZE_AOVS | {"support"} and gaze is None:
             raise ValueError(f'"aovs" asks for "{name}", which needs a "gaze" volume')
+        if name == "kde" and kde is None:
+            raise ValueError('"aovs" asks for "kde", which needs a "kde" volume of type "gazekde"')
         if name == "gaze_std" and not hasattr(gaze, "spread"):
             raise ValueError('"aovs" asks for "gaze_std", which needs a "gaze" of several members; train it with --ensemble 5')
         if name == "support" and getattr(gaze.field, "support", None) is None:

@@ -80,7 +80,7 @@ def test05b_scalar_variants_are_warned_of_and_forgotten():
         "except RuntimeError as e: print(e)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert '"nerf", "gazefield", "nerg") needs a variant that compiles its kernels' in done.stdout + done.stderr
+    assert '"nerf", "gazefield", "gazekde", "nerg") needs a variant that compiles its kernels' in done.stdout + done.stderr
     assert '"nowhere" does not exist' in done.stdout.replace(str(Path.cwd()) + "/", "")
 
 

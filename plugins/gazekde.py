@@ -1,0 +1,91 @@
+r"""
+.. _volume-gazekde:
+
+Kernel density of tracked rays (:monosp:`gazekde`)
+--------------------------------------------------
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - Rays file (``.npz`` or ``.parquet``) as ``nerg rays import`` writes it. Relative names are looked up beside the scene file.
+
+ * - count
+   - |int|
+   - How many of the rays that started nearest to the observer count. (Default: 4096)
+
+ * - kappa
+   - |float|
+   - Concentration of the von Mises-Fisher kernel of each ray. (Default: 20, that of the truth in ``nerg eval gaze``)
+
+ * - to_world
+   - |transform|
+   - A rotation, a uniform scale and a translation from the rays' frame to the scene's. For rays that a gaze field was trained
+     on: the field's own ``to_world`` after the similarity of ``nerg train gaze --align``. (Default: none)
+
+Where people around the observer really looked, as a density in 1/sr: the ground truth beside a gaze field (NeRG, Section 5.3).
+It is the ``kde`` of the integrator :ref:`nerg <integrator-nerg>`, whose AOV ``kde`` shows it on the surfaces that the camera
+sees; it cannot be evaluated as a plain volume. Rays are gathered once an observer. Pictures of 4,096 pixels or more look
+the density up in a table (within 1e-4 of the highest density of one ray's kernel), smaller ones sum all rays at each pixel.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: gazekde-volume
+
+        <integrator type="nerg">
+            <volume type="gazekde" name="kde">
+                <string name="filename" value="day.npz"/>
+            </volume>
+            <string name="aovs" value="kde"/>
+        </integrator>
+
+    .. code-tab:: python
+
+        'kde': {
+            'type': 'gazekde',
+            'filename': 'day.npz'
+        }
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from nerg_mi.attention.kde_view import KdeView
+from nerg_mi.attention.rays import Rays
+from nerg_mi.field.backend import namespace
+from nerg_mi.properties import integer, number, text
+from nerg_mi.registration import register
+from nerg_mi.transport.media import Similarity
+
+
+class GazeKdeVolume(mi.Volume):
+    __doc__ = __doc__
+
+    def __init__(self, props):
+        super().__init__(props)
+        self.filename = str(mi.file_resolver().resolve(text(props, "filename")))
+        count, kappa = integer(props, "count", 4096, low=1, high=1 << 24), number(props, "kappa", 20.0, low=0, high=1e8)
+        to_world = Similarity(props.get("to_world", mi.ScalarTransform4f()).matrix)
+        rays = Rays.load(self.filename)
+        self.rays = len(rays)
+        self._view = KdeView(rays, count, kappa, to_world, namespace(mi.variant()))
+        self._bounds = to_world.bounds(rays.origin.min(axis=0), rays.origin.max(axis=0))
+
+    def kde_view(self) -> KdeView:
+        """The density as the integrator sees it."""
+        return self._view
+
+    def bbox(self):
+        lower, upper = self._bounds
+        return mi.ScalarBoundingBox3f(lower.tolist(), upper.tolist())
+
+    def channel_count(self):
+        return 1
+
+    def to_string(self):
+        v = self._view
+        return f"GazeKdeVolume[\n  filename = {self.filename},\n  rays = {self.rays},\n  count = {v.count},\n  kappa = {v.kappa}\n]"
+
+
+register("volume", "gazekde", GazeKdeVolume)

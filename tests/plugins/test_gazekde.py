@@ -1,0 +1,142 @@
+"""The density of tracked rays in the integrator: against the sum over the rays in float64."""
+import numpy as np
+import pytest
+
+from nerg_mi.attention.rays import Rays
+from nerg_mi.attention.vmf import log_normaliser
+from tests.reference import kde as reference
+
+from .scenes import camera, channels, named, observer_at, wall
+from .test_nerg_leaves_out import operations
+from .test_nerg_normalized import room
+
+KAPPA = 20.0
+# What the table may be off: a ten-thousandth of the highest density of one ray.
+TABLE = 1e-4 * float(np.exp(log_normaliser(KAPPA)))
+
+
+def tracked(n=600, seed=0):
+    """People about the middle of the room who look at two places of its walls."""
+    rng = np.random.default_rng(seed)
+    origin = rng.normal(0, 0.3, (n, 3)).clip(-0.7, 0.7)
+    target = np.where(np.arange(n)[:, None] % 3, (0.9, 0.3, 0.1), (0.2, 0.9, -0.3)) + rng.normal(0, 0.2, (n, 3))
+    d = target - origin
+    return Rays(np.arange(n), np.arange(n) % 4, tuple("abcd"), origin, d / np.linalg.norm(d, axis=1, keepdims=True), np.ones(n))
+
+
+@pytest.fixture(scope="module")
+def rays(tmp_path_factory):
+    path = tmp_path_factory.mktemp("rays") / "rays.npz"
+    tracked().save(path)
+    return str(path)
+
+
+def shown(rays, aovs="kde,position", count=4096, **more):
+    return {"type": "nerg", "aovs": aovs, "radiance": False, "kde": {"type": "gazekde", "filename": rays, "count": count, "kappa": KAPPA}, **more}
+
+
+def expected(eye, out, count=4096):
+    """Float64 density of the ``count`` rays nearest to ``eye`` towards what the pixels show."""
+    data = tracked()
+    near = np.argsort(np.linalg.norm(data.origin - eye, axis=1))[:count]
+    p = np.stack([out[f"position.{c}"] for c in "XYZ"], axis=-1).astype(np.float64)
+    d = p - eye
+    d /= np.linalg.norm(d, axis=-1, keepdims=True)
+    chosen = data.direction[near]
+    return reference.kde(d.reshape(-1, 3), chosen, np.array([0, len(chosen)]), np.array([KAPPA])).reshape(d.shape[:-1])
+
+
+@pytest.mark.parametrize("count", [4096, 50])
+@pytest.mark.parametrize("size, error", [(12, 1e-5), (70, TABLE)], ids=["exact", "table"])
+def test01_the_density_is_that_of_the_rays(rgb, rays, count, size, error):
+    """Small pictures sum all rays at each pixel, large ones look a table up."""
+    eye = (0.1, -0.2, 0.3)
+    out = channels(rgb, shown(rays, count=count), camera(rgb, eye, (0.5, 0.4, 0), size=size, fov=90), **room(rgb))
+    truth = expected(eye, out, count)
+    assert truth.max() > 0.3 and truth.min() < 0.05
+    assert np.abs(out["kde.Y"] - truth).max() < error * (1 if error == TABLE else truth.max()) + 2e-6
+
+
+def test02_another_observer_and_what_is_hidden(rgb, rays):
+    """No gaze field is needed; what the observer does not see is 0, the rest is the observer's density."""
+    eye = (0, 0, -0.9)
+    sensor = camera(rgb, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
+    how = {"density": wall(rgb), "step": 0.01, "falloff": 0.0, "observer": observer_at(rgb, *eye)}
+    out = channels(rgb, shown(rays, "kde,position,visibility", **how), sensor)
+    hidden, seen = out["visibility.Y"] == 0, out["visibility.Y"] == 1
+    assert hidden.sum() > 20 and seen.sum() > 5 and not out["kde.Y"][hidden].any()
+    np.testing.assert_allclose(out["kde.Y"][seen], expected(eye, out)[seen], rtol=1e-3, atol=1e-5)
+    open_ = channels(rgb, shown(rays, occlusion=False, **how), sensor)["kde.Y"]
+    assert (open_[hidden] > 0).all()
+
+
+def test03_rays_are_gathered_once_an_observer(rgb, rays):
+    integrator = shown(rays, observer=observer_at(rgb, 0.2, 0.1, 0), falloff=0.0)
+    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0), size=70), **room(rgb)})
+    view = scene.integrator()._views["kde"]
+    first = np.array(rgb.render(scene, spp=1))
+    made, table = view._known[0], view._known[0]._table
+    np.testing.assert_array_equal(np.array(rgb.render(scene, spp=1)), first)
+    assert view._known[0] is made and made._table is table is not None
+    params = rgb.traverse(scene)
+    params["integrator.observer.to_world"] = rgb.Transform4f().translate([-0.3, 0.1, 0.1])
+    params.update()
+    moved = named(rgb, np.array(rgb.render(scene, spp=1)), integrator)
+    assert view._known[0] is not made
+    seen = moved["kde.Y"] > 0
+    assert np.abs(moved["kde.Y"] - expected((-0.3, 0.1, 0.1), moved))[seen].max() < TABLE + 1e-5
+
+
+def test04_each_camera_of_a_batch_has_its_own(rgb, rays):
+    integrator, eyes = shown(rays, count=100), [(0.3, 0.1, 0), (-0.5, 0.4, 0.2)]
+    film = {"type": "hdrfilm", "width": 24, "height": 12, "component_format": "float32", "rfilter": {"type": "box"}}
+    batch = {"type": "batch", "film": film, **{f"s{i}": camera(rgb, eye, (0, 0.5, 0.9)) for i, eye in enumerate(eyes)}}
+    both = channels(rgb, integrator, batch, **room(rgb))
+    for i, eye in enumerate(eyes):
+        half = {k: v[:, 12 * i : 12 * i + 12] for k, v in both.items()}
+        np.testing.assert_allclose(half["kde.Y"], expected(eye, half, 100), rtol=1e-3, atol=1e-5)
+
+
+def test05_rays_of_another_frame(rgb, rays):
+    """The rays' frame turned, twice as large and moved: everything in the scene goes with it, densities stay."""
+    eye, matrix = np.array((0.1, -0.2, 0.3)), rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 0, 1], 90).scale(2)
+    place = lambda p: (np.array(matrix.matrix) @ [*p, 1])[:3]
+    shapes = {k: {**v, "to_world": matrix @ v["to_world"]} for k, v in room(rgb).items()}
+    integrator = shown(rays)
+    integrator["kde"]["to_world"] = matrix
+    plain = channels(rgb, shown(rays), camera(rgb, eye, (0.5, 0.4, 0), fov=60), **room(rgb))["kde.Y"]
+    sensor = {**camera(rgb, eye, (0.5, 0.4, 0), fov=60)}
+    up = np.array(matrix.matrix)[:3, :3] @ [0, 1, 0] / 2
+    sensor["to_world"] = rgb.ScalarTransform4f().look_at(place(eye).tolist(), place((0.5, 0.4, 0)).tolist(), up.tolist())
+    np.testing.assert_allclose(channels(rgb, integrator, sensor, **shapes)["kde.Y"], plain, rtol=2e-3, atol=1e-4)
+
+
+def test06_what_is_not_asked_for_is_not_traced(rgb, rays):
+    without = {k: v for k, v in shown(rays, "depth").items() if k != "kde"}
+    sensor = camera(rgb)
+    assert operations(rgb, {**without, "density": {"type": "constvolume"}}, sensor) == operations(rgb, shown(rays, "depth", density={"type": "constvolume"}), sensor)
+    assert rgb.load_dict(shown(rays, "depth"))._views == {}
+
+
+def test07_what_is_needed_is_said(rgb, rays, tmp_path):
+    for integrator, said in (
+        ({"type": "nerg", "aovs": "kde"}, '"kde" volume of type "gazekde"'),
+        ({"type": "nerg", "kde": {"type": "constvolume"}}, 'must be a volume of type "gazekde"'),
+        (shown(str(tmp_path / "no.npz")), "no.npz"), (shown(rays, count=0), '"count"'),
+    ):  # fmt: skip
+        with pytest.raises(RuntimeError, match=said):
+            rgb.load_dict(integrator)
+    assert "count = 600" in str(rgb.load_dict(shown(rays)["kde"]))
+
+
+def test08_a_frozen_function_is_refused_in_a_sentence(rgb, rays):
+    import drjit as dr
+
+    scene = rgb.load_dict({"type": "scene", "integrator": shown(rays), "sensor": camera(rgb, (0, 0, 0), (1, 0, 0)), **room(rgb)})
+    frozen = dr.freeze(lambda scene, seed: rgb.render(scene, spp=1, seed=seed))
+    with pytest.raises(Exception) as said:
+        frozen(scene, rgb.UInt32(0))
+    error = said.value
+    while error is not None and "leave them out" not in str(error):
+        error = error.__cause__ or error.__context__
+    assert error is not None
