@@ -126,7 +126,7 @@ class RadianceTrainer:
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
         offset = ns.Float(self.rng.random(self.rays, np.float32))
         stride = 1 if self.carved else s.stride(self.steps)
-        thinning = Thinning(s.thin_sure, s.thin_least, self.rng.random()) if s.thin_least < 1 else None
+        thinning = Thinning(s.thin_sure, s.thin_least, int(self.rng.integers(2**63))) if s.thin_least < 1 else None
         samples, covered = visible_samples(rays, self.table(stride), offset, self.grid.occupied, self._look,
                                            s.stop, s.batch, thinning)
         self.steps += 1

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from ..field.backend import namespace
 from ..field.box import Box
 from ..transport.quadrature import absorbed_share
 from .compositing import Segments, Thinned
@@ -86,11 +87,12 @@ class Samples:
 @dataclass(frozen=True)
 class Thinning:
     """Which samples to keep: those of a weight of ``sure`` or more all, others with a probability in proportion to their
-    weight, but ``least`` at least. ``offset``: of the systematic choice, a random number in [0, 1)."""
+    weight, but ``least`` at least. ``seed``: of the choices. They are independent of one another, because derivatives hold
+    products of two samples, whose average is right only if so."""
 
     sure: float
     least: float
-    offset: float
+    seed: int
 
 
 def occupied_steps(rays: Rays, table: StepTable, offset, occupied) -> tuple | None:
@@ -152,10 +154,9 @@ def visible_samples(
     chosen, thinned = light > stop, None
     if thinning is not None:
         weight = light * absorbed_share(tau)
-        share = dr.select(chosen, dr.clip(weight / thinning.sure, thinning.least, 1), 0)
-        # Systematic sampling: one sample for every unit of the running sum, so that neighbours replace one another.
-        running = dr.cumsum(dr.float64_array_t(Float)(share)) + dr.opaque(dr.float64_array_t(Float), thinning.offset)
-        chosen = dr.floor(running) > dr.floor(running - share)
+        share = dr.clip(weight / thinning.sure, thinning.least, 1)
+        random = namespace(t).PCG32(dr.width(t), dr.opaque(dr.uint64_array_t(Float), thinning.seed)).next_float32()
+        chosen &= random < share
         thinned = Thinned(dr.rcp(share), before, absorbed_share(Float(segments.total(tau))))
         dr.eval(chosen, thinned.copies, before, thinned.opacity)
     kept = dr.compress(chosen)

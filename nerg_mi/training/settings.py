@@ -61,7 +61,7 @@ class RadianceSettings:
     growth: float = 1 / 128
     near: float = 0.005
     stop: float = 2e-3
-    thin_sure: float = 1 / 16
+    thin_sure: float = 1 / 32
     thin_least: float = 1 / 32
     resolution: int = 128
     grid_every: int = 16

@@ -162,7 +162,7 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
 
 
 def test_thinned_samples_stand_for_all():
-    """Opacity is exact; colours and the gradient of linear sums are those of all samples on the mean over systematic choices."""
+    """Opacity is exact, colours (a ratio) nearly and derivatives wholly those of all samples on the mean over many choices."""
     rng = np.random.default_rng(8)
     o = ns.Array3f(np.tile([[0.0], [0.0], [-2.0]], 16).astype(np.float32))
     d = dr.normalize(ns.Array3f(*[ns.Float(rng.normal(size=16).astype(np.float32) * 0.3) for _ in range(2)], ns.Float(np.ones(16))))
@@ -181,11 +181,11 @@ def test_thinned_samples_stand_for_all():
         return (samples.count, np.array([c.numpy() for c in color]), opacity.numpy(), dr.grad(gain).numpy()[0])
 
     count, color, opacity, slope = render(None)
-    found = [render(Thinning(1 / 16, 1 / 32, (k + 0.5) / 400)) for k in range(400)]
+    found = [render(Thinning(1 / 16, 1 / 32, k)) for k in range(400)]
     assert max(f[0] for f in found) < 0.5 * count
     for f in found[::40]:
         assert np.allclose(f[2], opacity, atol=1e-6)
-    assert np.allclose(np.mean([f[1] for f in found], 0), color, atol=2e-3)
+    assert np.allclose(np.mean([f[1] for f in found], 0), color, atol=0.03)
     slopes = [f[3] for f in found]
     assert abs(np.mean(slopes) - slope) < 4 * np.std(slopes) / 20 and np.std(slopes) > 0
 
