@@ -223,7 +223,7 @@ from nerg_mi.transport.features import Featured, accumulated, snapshot
 from nerg_mi.transport.gaze_ensemble import SupportView
 from nerg_mi.transport.freezing import no_collection, recording
 from nerg_mi.transport.march import MarchSettings
-from nerg_mi.transport.media import VolumeMedium
+from nerg_mi.transport.media import KnownEmpty, VolumeMedium
 from nerg_mi.transport.observer import KINDS as VISIBILITIES
 from nerg_mi.transport.observer import ObserverPass, Sight, towards
 from nerg_mi.transport.place import Place
@@ -257,6 +257,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         field, density, paint = (props.get(k, None) for k in ("field", "density", "color"))
         gaze, kde, observer = (props.get(k, None) for k in ("gaze", "kde", "observer"))
         self.medium = _medium(field, density, paint)
+        self._known_empty = None if density is None else KnownEmpty(self.medium)
         if gaze is not None and not hasattr(gaze, "gaze_medium"):
             raise ValueError('"gaze" must be a volume of type "gazefield"')
         if kde is not None and not hasattr(kde, "kde_view"):

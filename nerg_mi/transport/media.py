@@ -172,8 +172,6 @@ class VolumeMedium:
     """
 
     color_space = "spectrum"
-    # What dr.freeze is to find: the volumes are known to it through the integrator.
-    DRJIT_STRUCT = {"_bound": None}
 
     def __init__(self, density, color=None):
         import mitsuba as mi
@@ -258,6 +256,24 @@ class VolumeMedium:
 
     def background(self, o, d):
         return None
+
+
+class KnownEmpty:
+    """What a ``VolumeMedium`` skips, as dr.freeze finds it among an integrator's attributes. (The medium itself is handed to
+    custom operations, which would have to make another one of its kind.)"""
+
+    DRJIT_STRUCT = {"bound": None}
+
+    def __init__(self, medium: VolumeMedium):
+        self.medium = medium
+
+    @property
+    def bound(self):
+        return self.medium._bound
+
+    @bound.setter
+    def bound(self, value):
+        self.medium._bound = value
 
 
 class GazeMedium:
