@@ -25,7 +25,7 @@ Kernel density of tracked rays (:monosp:`gazekde`)
 
 Where people around the observer really looked, as a density in 1/sr: the ground truth beside a gaze field (NeRG, Section 5.3).
 It is the ``kde`` of the integrator :ref:`nerg <integrator-nerg>`, whose AOV ``kde`` shows it on the surfaces that the camera
-sees; it cannot be evaluated as a plain volume. Rays are gathered once an observer. Pictures of 4,096 pixels or more look
+sees; it cannot be evaluated as a plain volume. Rays are gathered once an observer. Pictures of 4,096 pixels or more (and of 165 kappa or more) look
 the density up in a table (within 1e-4 of the highest density of one ray's kernel), smaller ones sum all rays at each pixel.
 
 .. tabs::

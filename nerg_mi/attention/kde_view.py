@@ -44,7 +44,7 @@ class KdeView:
     def value(self, p_o, r_o):
         """Density (1/sr) in direction ``r_o``, unit, of the observer that is faced nearest to ``p_o``, lane by lane; without derivatives.
 
-        Directions from ``kde_frame.WORTH`` on are looked up in a table, where it is no finer than they are; fewer are summed exactly.
+        ``kde_frame.WORTH`` directions or more are looked up in a table, where that costs less; fewer are summed exactly.
         """
         d = self.to_world.direction_to_local(dr.detach(r_o))
         return at_nearest(self._known, p_o, lambda known: known.density(d))
@@ -63,7 +63,8 @@ class _Density:
         ns, lanes = self.kde.ns, dr.width(d)
         d = ns.Array3f(d.x, d.y, d.z)
         with dr.suspend_grad():
-            if lanes < WORTH or not SphericalKdeTable.fits(self.kde, lanes):
+            # All of a table is made, whatever is seen of it; a texel costs a fifth of a lane.
+            if lanes < WORTH or not SphericalKdeTable.fits(self.kde, lanes // 4):
                 return self.kde.density(dr.zeros(ns.UInt32, lanes), d)
             if self._table is None:
                 self._table = SphericalKdeTable(self.kde)
