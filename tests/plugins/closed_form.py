@@ -83,5 +83,6 @@ def nerg(mi, sigma, color, eye, lower=(-1, -1, -1), upper=(1, 1, 1), depth="expe
         out["density"] = {"type": "constvolume", "value": sigma, "to_world": box}
         out["color"] = {"type": "constvolume", "value": {"type": "rgb", "value": list(color)}}
     if eye is not None:
-        out["observer"] = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(list(eye), [0.1, 0.2, 0.3], [0, 1, 0])}
+        to_world = mi.ScalarTransform4f().look_at(list(eye), [0.1, 0.2, 0.3], [0, 1, 0])
+        out["observer"] = {"type": "perspective", "to_world": to_world}
     return out

@@ -18,7 +18,8 @@ def film(**kwargs):
 
 def furniture(mi):
     """A ball inside of the unit box's field, half a board behind it, and a board that casts a shadow from ``EYE``."""
-    return {"ball": sphere(mi, 0.5, 0, 0.2, radius=0.4), "back": square(mi, 1.4, 0.8, x=-0.4), "lid": square(mi, -0.2, 0.25, x=-0.6)}
+    return {"ball": sphere(mi, 0.5, 0, 0.2, radius=0.4), "back": square(mi, 1.4, 0.8, x=-0.4),
+            "lid": square(mi, -0.2, 0.25, x=-0.6)}  # fmt: skip
 
 
 def sensors(mi):
@@ -28,8 +29,10 @@ def sensors(mi):
         "perspective": camera(mi), "crop": camera(mi, film=crop),
         "thinlens": camera(mi, kind="thinlens", fov=35, aperture_radius=0.15, focus_distance=3.0),
         "orthographic": {**camera(mi, kind="orthographic"), "to_world": ortho},
-        "batch": {"type": "batch", "film": film(height=6), **{f"c{i}": camera(mi, o, size=6) for i, o in enumerate([(0.5, 0.4, -3), (-2.5, 0.2, -1)])}},
-        "panorama": {"type": "panorama", "to_world": mi.ScalarTransform4f().translate([0, 0.1, -1.6]), "film": film(width=16, height=9)},
+        "batch": {"type": "batch", "film": film(height=6),
+                  **{f"c{i}": camera(mi, o, size=6) for i, o in enumerate([(0.5, 0.4, -3), (-2.5, 0.2, -1)])}},
+        "panorama": {"type": "panorama", "to_world": mi.ScalarTransform4f().translate([0, 0.1, -1.6]),
+                     "film": film(width=16, height=9)},
         "sample border": camera(mi, rfilter="gaussian", film=dict(sample_border=True)),
         "crop with a border": camera(mi, rfilter="gaussian", film=dict(sample_border=True, **crop)),
     }  # fmt: skip
@@ -70,12 +73,14 @@ def test03_without_an_observer_it_is_the_camera(rgb, kind):
     assert np.allclose(a, b, atol=2e-4)
     out = channels(rgb, nerg(rgb, 1.0, COLOR, None) | {"aovs": "position,observer_depth"}, sensor, **furniture(rgb))
     p = np.stack([out[f"position.{c}"] for c in "XYZ"], -1)
-    centers = [(0, 0.1, -1.6)] if kind == "panorama" else [(0.5, 0.4, -3), (-2.5, 0.2, -1)] if kind == "batch" else [(0.5, 0.4, -3)]
+    first = (0.5, 0.4, -3)
+    centers = {"panorama": [(0, 0.1, -1.6)], "batch": [first, (-2.5, 0.2, -1)], "thinlens": [first]}[kind]
     width = p.shape[1] // len(centers)
     for i, c in enumerate(centers):
         part = np.s_[:, i * width : (i + 1) * width]
         met = p[part].any(-1)
-        assert met.any() and np.allclose(out["observer_depth.T"][part][met], np.linalg.norm(p[part] - c, axis=-1)[met], rtol=1e-4)
+        distance = np.linalg.norm(p[part] - c, axis=-1)
+        assert met.any() and np.allclose(out["observer_depth.T"][part][met], distance[met], rtol=1e-4)
 
 
 @pytest.mark.parametrize("light", ["path", "direct"])
@@ -97,9 +102,11 @@ def boxes(mi):
 @pytest.mark.parametrize("kind", ["depth", "map"])
 def test05_instances_are_what_they_stand_for(rgb, kind):
     group = {"type": "shapegroup", "a": {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(0.25)}}
-    instances = {f"i{i}": {"type": "instance", "to_world": t, "g": {"type": "ref", "id": "group"}} for i, t in enumerate(boxes(rgb))}
+    instances = {f"i{i}": {"type": "instance", "to_world": t, "g": {"type": "ref", "id": "group"}}
+                 for i, t in enumerate(boxes(rgb))}  # fmt: skip
     plain = {f"c{i}": {"type": "cube", "to_world": t @ rgb.ScalarTransform4f().scale(0.25)} for i, t in enumerate(boxes(rgb))}
-    integrator = constant(0.3, aovs="depth,opacity,position,visibility", visibility=kind, map_height=64, falloff=0.0, observer=observer_at(rgb, *EYE))
+    integrator = constant(0.3, aovs="depth,opacity,position,visibility", visibility=kind, map_height=64, falloff=0.0,
+                          observer=observer_at(rgb, *EYE))  # fmt: skip
     a = render(rgb, integrator, group=group, **instances, back=square(rgb, 1.4, 1.5))
     b = render(rgb, integrator, **plain, back=square(rgb, 1.4, 1.5))
     assert np.mean(np.abs(a - b) > 1e-4) < 0.005 and 0.1 < named(rgb, b, integrator)["visibility.Y"].mean() < 0.95
@@ -109,7 +116,8 @@ def mover(mi, name):
     """A shape, the key that moves it, the value to move it to, and the shape as it then is."""
     t = mi.ScalarTransform4f().translate([-0.4, 0.2, 0.1]).rotate([0, 1, 0], 20).scale(0.35)
     group = {"type": "shapegroup", "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.5)}}
-    instance = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0]), "g": {"type": "ref", "id": "group"}}
+    instance = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0]),
+                "g": {"type": "ref", "id": "group"}}  # fmt: skip
     if name == "instance":
         return {"group": group, "it": instance}, "it.to_world", {"group": group, "it": {**instance, "to_world": t}}
     if name == "group":
@@ -148,7 +156,8 @@ def test07_textures(rgb):
     texture["to_uv"] = rgb.ScalarTransform4f().scale([3, 2, 1])
     things = {"board": {**board, "to_world": rgb.ScalarTransform4f().rotate([0.5, 1, 0], 160),
                         "bsdf": {"type": "twosided", "b": {"type": "principled", "base_color": texture}}},
-              "ball": {**sphere(rgb, 0.7, 0, -0.7, radius=0.4), "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}}  # fmt: skip
+              "ball": {**sphere(rgb, 0.7, 0, -0.7, radius=0.4),
+                       "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}}  # fmt: skip
     albedo = render(rgb, {"type": "aov", "aovs": "a:albedo"}, **things)
     image = render(rgb, {"type": "nerg", "aovs": ""}, **things)
     assert np.allclose(image[..., :3], albedo[..., -3:], atol=1e-5) and np.ptp(image[..., 0]) > 0.5
@@ -191,11 +200,14 @@ def test10_alpha_is_that_of_other_integrators(rgb, sky, hide):
     """The film's alpha: the share of samples that meet anything, or an environment that shows."""
     more = {"sky": {"type": "constant"}} if sky else {}
     sensor = camera(rgb, film={"pixel_format": "rgba"})
+    path = {"type": "path", "hide_emitters": hide}
+    more["ball"] = sphere(rgb, 0, 0, 0)
     for nested in ({}, {"lit": {"type": "direct", "hide_emitters": hide}}):
-        known = render(rgb, nested.get("lit", {"type": "path", "hide_emitters": hide}), sensor, spp=4, ball=sphere(rgb, 0, 0, 0), **more)[..., 3]
-        ours = render(rgb, {"type": "nerg", "aovs": "opacity", "hide_emitters": hide, **nested}, sensor, spp=4, ball=sphere(rgb, 0, 0, 0), **more)
+        known = render(rgb, nested.get("lit", path), sensor, spp=4, **more)[..., 3]
+        ours = render(rgb, {"type": "nerg", "aovs": "opacity", "hide_emitters": hide, **nested}, sensor, spp=4, **more)
         assert np.array_equal(ours[..., 3], known)
         assert 0 < ours[..., 4].mean() < 0.5
+    del more["ball"]
     thin = render(rgb, constant(0.2, aovs="opacity", hide_emitters=hide), sensor, **more)
     met = thin[..., 4] > 0
     assert np.array_equal(thin[..., 3], np.where(met | (sky and not hide), 1, 0)) and thin[..., 4].max() < 0.5

@@ -47,18 +47,20 @@ def rgb_of(*value):
     return {"type": "rgb", "value": list(value)}
 
 
-def things(mi, shift=0.0):
+def things(mi):
     """A ball and a turned box on a floor."""
     T = mi.ScalarTransform4f
     return {
-        "ball": {"type": "sphere", "center": [-0.4 + shift, 0, 0], "radius": 0.5, "b": {"type": "diffuse", "reflectance": rgb_of(0.7, 0.3, 0.2)}},
+        "ball": {"type": "sphere", "center": [-0.4, 0, 0], "radius": 0.5,
+                 "b": {"type": "diffuse", "reflectance": rgb_of(0.7, 0.3, 0.2)}},
         "box": {"type": "cube", "to_world": T().translate([0.7, -0.2, 0.3]).rotate([0, 1, 0], 30).scale(0.3)},
         "floor": {"type": "rectangle", "to_world": T().translate([0, -0.5, 0]).rotate([1, 0, 0], -90).scale(2)},
     }  # fmt: skip
 
 
 def slab(mi, folder, change=1.0):
-    integrator = constant(0.8 * change, aovs="depth,opacity", background=0.2, color={"type": "constvolume", "value": rgb_of(0.9, 0.5, 0.1)})
+    integrator = constant(0.8 * change, aovs="depth,opacity", background=0.2,
+                          color={"type": "constvolume", "value": rgb_of(0.9, 0.5, 0.1)})  # fmt: skip
     return integrator, {}, ("depth.T", "opacity.Y", "R"), camera(mi, (1.8, 1.2, -1.5), (0.5, 0.5, 0.5), size=SIZE)
 
 
@@ -90,7 +92,8 @@ def both(mi, folder, change=1.0):
 
 def observer(mi, folder, change=1.0):
     """Who stands elsewhere sees through a long fall-off."""
-    integrator = neural(folder, aovs="gaze,visibility,observer_depth", observer=observer_at(mi, -3, 0.5, 0.5), falloff=1.0 * change, radiance=False)
+    integrator = neural(folder, aovs="gaze,visibility,observer_depth", observer=observer_at(mi, -3, 0.5, 0.5),
+                        falloff=1.0 * change, radiance=False)  # fmt: skip
     return integrator, {}, ("gaze.Y", "visibility.Y", "observer_depth.T"), camera(mi, size=SIZE)
 
 
@@ -99,8 +102,9 @@ def panorama(mi, folder, change=1.0):
     data = np.random.default_rng(0).uniform(0, 2, (5, 5, 5)).astype(np.float32)
     box = mi.ScalarTransform4f().translate([-1.5, -1.5, -1.5]).scale(3)
     density = {"type": "gridvolume", "grid": mi.VolumeGrid(data * np.float32(change)), "to_world": box}
-    integrator = {"type": "nerg", "density": density, "quadrature": "cells", "depth": "expected", "aovs": "depth,opacity,visibility", "radiance": False,
-                  "visibility": "transmittance", "observer": observer_at(mi, 0.9, 0.2, -0.9), "surface_opacity": 0.0}  # fmt: skip
+    integrator = {"type": "nerg", "density": density, "quadrature": "cells", "depth": "expected", "radiance": False,
+                  "aovs": "depth,opacity,visibility", "visibility": "transmittance", "surface_opacity": 0.0,
+                  "observer": observer_at(mi, 0.9, 0.2, -0.9)}  # fmt: skip
     sensor = {"type": "panorama", "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0.4]),
               "film": camera(mi)["film"] | {"width": 32, "height": 16}}  # fmt: skip
     return integrator, {"ball": things(mi)["ball"]}, ("depth.T", "opacity.Y", "visibility.Y"), sensor
