@@ -395,7 +395,9 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def traverse(self, cb):
         for name, child in (self._children | {"integrator": self.shading.nested}).items():
-            if child is not None:
+            if name == "observer" and child is not None:
+                child.traverse(_Pose(cb, "observer."))
+            elif child is not None:
                 cb.put(name, child, mi.ParamFlags.Differentiable)
         cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
 
@@ -403,6 +405,8 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.observer_pass.forget()
         if hasattr(self.medium, "refresh"):
             self.medium.refresh()
+        if self.observer is not None and (not keys or "to_world" in keys):
+            self.observer.parameters_changed(["to_world"])
         if recording():
             # What is recorded is not looked at.
             return
@@ -495,6 +499,18 @@ class NergIntegrator(mi.SamplingIntegrator):
         if kind == "accumulated":
             return accumulated(place, mi.Ray3f(p_o, r_o), active, self.settings)
         return None
+
+
+class _Pose(mi.TraversalCallback):
+    """Shows the pose of a sensor as what it is to us. Mitsuba calls it not differentiable, as silhouettes are not."""
+
+    def __init__(self, cb, prefix):
+        super().__init__()
+        self.cb, self.prefix = cb, prefix
+
+    def put(self, name, value, flags, *kind):
+        if name == "to_world":
+            self.cb.put(self.prefix + name, value, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous, *kind)
 
 
 # ----------------------------------------------------------------------------
