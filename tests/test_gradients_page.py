@@ -1,0 +1,34 @@
+"""The blocks of docs/gradients.md run as they stand there, one after the other, only smaller and on untrained fields."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.view import demo
+from tests.view.standins import write_standins
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "gradients.md"
+
+
+def test01_blocks(rgb, tmp_path, monkeypatch):
+    store = tmp_path / "scenes" / "store"
+    store.mkdir(parents=True)
+    shutil.copy(demo.store_scene(), store)
+    write_standins(store)
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.M | re.S)
+    names = {}
+    for text in blocks:
+        small = text.replace("width=480, height=320", "width=12, height=8")
+        exec(compile(small, PAGE.name, "exec"), names)
+    assert np.isfinite(np.array(names["change"])).all() and np.any(np.array(names["change"]) != 0)
+    losses = [loss.numpy().item() for loss in names["losses"]]
+    assert len(losses) == 14 and np.isfinite(losses).all()
+
+
+def test02_what_it_names_is_there():
+    root = PAGE.parents[1]
+    for path in re.findall(r"`((?:tests|benchmarks|nerg_mi)/[\w/.]+\.py)`", PAGE.read_text(encoding="utf-8")):
+        assert (root / path).is_file(), path
