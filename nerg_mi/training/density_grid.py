@@ -25,11 +25,11 @@ class DensityGrid:
     """
 
     def __init__(self, ns, box: Box, resolution: int, step: float, cameras: list[Camera], min_views: int,
-                 threshold: float = 0.01):
+                 threshold: float = 0.01, near: float = 0.0):
         self.ns, self.box, self.resolution, self.step, self.threshold = ns, box, resolution, step, threshold
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
-        self._allow(self._seen(cameras, min_views))
+        self._allow(self._seen(cameras, min_views, near))
         if self.seen_count == 0:
             raise ValueError(
                 f"not one cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
@@ -54,7 +54,7 @@ class DensityGrid:
     def _to_world(self, u):
         return (u - 0.5) * self.box.side + self.ns.Array3f(*self.box.center)
 
-    def _seen(self, cameras: list[Camera], min_views: int):
+    def _seen(self, cameras: list[Camera], min_views: int, near: float):
         """Cells whose centre lies within the box and in at least ``min_views`` pictures.
 
         Occlusion is not considered, and pictures are taken to be 10 % wider than their borders' rays.
@@ -77,7 +77,8 @@ class DensityGrid:
             left, right, up, down = (e * 1.1 for e in edge)
             sees = (z < 0) & (x > left * z) & (x < -right * z) & (-y > up * z) & (-y < -down * z)
             count += dr.select(sees, UInt32(1), 0)
-            dr.eval(count)
+            inside &= d[0] * d[0] + d[1] * d[1] + d[2] * d[2] > near * near
+            dr.eval(count, inside)
         return inside & (count >= min(min_views, len(cameras)))
 
     def carve(self, points) -> None:

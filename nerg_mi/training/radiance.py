@@ -56,7 +56,7 @@ class RadianceTrainer:
         self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.live.parameters().items()}
         self.march_step = settings.march_step * box.side
         self.grid = DensityGrid(ns, box, settings.resolution, self.march_step, [v.camera for v in views],
-                                settings.min_views)
+                                settings.min_views, near=settings.near * box.side)
         # With exact depth everywhere the free space is known from the start, and there is no fog to clear.
         self.carved = self.use_depth and self.pixels.depth_everywhere
         if self.carved:
@@ -125,7 +125,7 @@ class RadianceTrainer:
         pixels = self.pixels.batch(ns.UInt32(index))
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
         offset = ns.Float(self.rng.random(self.rays, np.float32))
-        stride = 1 if self.carved else s.stride(self.steps)
+        stride = 1 if self.carved else s.stride(self.progress)
         thinning = Thinning(s.thin_sure, s.thin_least, int(self.rng.integers(2**63))) if s.thin_least < 1 else None
         samples, covered = visible_samples(rays, self.table(stride), offset, self.grid.occupied, self._look,
                                            s.stop, s.batch, thinning)
@@ -159,6 +159,10 @@ class RadianceTrainer:
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
         parameters = self._parameters()
         sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns, samples.features)
+        if s.reach > 0:
+            # What is near a camera is sampled by many of its rays, and would turn to fog before far surfaces are found.
+            share = dr.minimum(dr.square(samples.t / (s.reach * self.box.side)), 1)
+            sigma, *rgb = (dr.replace_grad(x, x * share) for x in (sigma, *rgb))
         # Now: each sum along the rays would evaluate the networks again.
         dr.eval(sigma, rgb)
         weight, tau, color, opacity = composite(sigma, rgb, samples)

@@ -35,12 +35,14 @@ class RadianceSettings:
     ``learning_rate``: held for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times
     itself. ``average``: decay a step of the averaged weights, which are the result.
     ``march_step``: shortest step (instant-ngp's √3/1024); ``growth``: steps are at least this share of their
-    distance; ``near``: where rays start; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on a sample is always kept, others
-    by chance in proportion to their weight, with ``thin_least`` at least (1: all are kept).
+    distance; ``near``: where rays start, and distance to every camera within which nothing is; ``reach``: the derivatives of
+    samples nearer than this are scaled by the square of their share of it (Philip and Deschaintre 2023, "Floaters No More"),
+    0: none are; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on a sample is always
+    kept, others by chance in proportion to their weight, with ``thin_least`` at least (1: all are kept).
     ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells
     that fewer cameras see stay empty; ``settle``: share of the run after which all cells that rendering will visit
-    are sampled. ``strides``: the first steps of the run march this many times coarser, ``stride_steps`` each, which
-    clears early fog cheaply.
+    are sampled. ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like
+    part of it, which clears early fog cheaply.
     ``huber``: error at which the colour loss turns linear; ``empty_weight``: weight of the penalty on density in
     cells that are not sampled; ``depth_weight``: of the depth terms where depth is known, falling to
     ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in march steps, within which a
@@ -59,7 +61,8 @@ class RadianceSettings:
     average: float = 0.99
     march_step: float = 3**0.5 / 1024
     growth: float = 1 / 128
-    near: float = 0.005
+    near: float = 0.02
+    reach: float = 0.4
     stop: float = 2e-3
     thin_sure: float = 1 / 32
     thin_least: float = 1 / 32
@@ -67,8 +70,8 @@ class RadianceSettings:
     grid_every: int = 16
     min_views: int = 2
     settle: float = 0.85
-    strides: tuple[int, ...] = field(default=(8, 4, 2))
-    stride_steps: int = 96
+    strides: tuple[int, ...] = field(default=(16, 8, 4, 2))
+    stride_share: float = 0.33
     huber: float = 0.1
     empty_weight: float = 0.003
     depth_weight: float = 0.02
@@ -94,9 +97,9 @@ class RadianceSettings:
         late = max(0.0, progress - self.hold) / (1 - self.hold)
         return self.learning_rate * self.final_rate ** min(late, 1.0)
 
-    def stride(self, step: int) -> int:
-        """How many times coarser than ``march_step`` step number ``step`` marches."""
-        stage = step // self.stride_steps
+    def stride(self, progress: float) -> int:
+        """How many times coarser than ``march_step`` the run marches at ``progress`` in 0..1."""
+        stage = int(progress / self.stride_share * len(self.strides)) if self.stride_share > 0 else len(self.strides)
         return self.strides[stage] if stage < len(self.strides) else 1
 
     def to_dict(self) -> dict:

@@ -61,7 +61,7 @@ def dataset():
 
 
 def settings(**changes):
-    given = {"steps": 300, "batch": 2**12, "resolution": 32, "march_step": 1 / 64, "stride_steps": 16, "seed": 1,
+    given = {"steps": 300, "batch": 2**12, "resolution": 32, "march_step": 1 / 64, "stride_share": 0.2, "seed": 1,
              "depth_weight": 2e-3, **changes}
     return RadianceSettings(**given)
 
