@@ -264,7 +264,7 @@ class NergIntegrator(mi.SamplingIntegrator):
             raise ValueError('"kde" must be a volume of type "gazekde"')
         if observer is not None and not isinstance(observer, mi.Sensor):
             raise ValueError('"observer" must be a sensor; its to_world places the observer')
-        self._children = {"field": field, "density": density, "color": paint, "gaze": gaze, "kde": kde, "observer": observer}
+        self._given = {"field": field, "density": density, "color": paint, "gaze": gaze, "kde": kde, "observer": observer}
         self.gaze = None if gaze is None else gaze.gaze_medium()
         _check_semantics(self.gaze, field, self.medium)
         self.observer = observer
@@ -393,11 +393,17 @@ class NergIntegrator(mi.SamplingIntegrator):
         aovs = [c for name in self.aovs for c in (out[name] if name in several else [out[name]])]
         return dr.select(active, L, 0), some, aovs + nested
 
+    @property
+    def children(self):
+        """The volumes, the observer and the nested integrator, by their names as parameters."""
+        given = self._given | {"integrator": self.shading.nested}
+        return {name: child for name, child in given.items() if child is not None}
+
     def traverse(self, cb):
-        for name, child in (self._children | {"integrator": self.shading.nested}).items():
-            if name == "observer" and child is not None:
+        for name, child in self.children.items():
+            if name == "observer":
                 child.traverse(_Pose(cb, "observer."))
-            elif child is not None:
+            else:
                 cb.put(name, child, mi.ParamFlags.Differentiable)
         cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
 
@@ -422,7 +428,7 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def to_string(self):
         s = self.settings
-        body = {k: str(v).replace("\n", "\n  ") for k, v in self._children.items() if v is not None and k != "observer"}
+        body = {k: str(v).replace("\n", "\n  ") for k, v in self.children.items() if k not in ("observer", "integrator")}
         if self.observer is not None:
             body["observer"] = viewpoint.center(self.observer)
         body |= {

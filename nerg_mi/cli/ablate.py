@@ -56,7 +56,7 @@ def command(
     _, account = hold_out(data, radius, zones, positions, 0, min_rays, people)
     train, scored, centres = held_out_rays(data, account, "both" if people else "pos")
     output.mkdir(parents=True, exist_ok=True)
-    place = _place(field, scene, geometry, train, output / "place", 0.08, ns)
+    place = _place(field, scene, geometry, train, [], output / "place", 0.08, ns)
     names = tuple(recipes.split(","))
     variants = all_variants(place.kind == "field", names)
     render = frame_timer(place, np.asarray(centres), (field or output / "x").parent, cameras, width, height) if cameras else None

@@ -179,7 +179,7 @@ class FileSubject(Subject):
         integrator, sensor = loaded.integrator(), loaded.sensors()[0]
         self.name, self.twin = path.stem if path.stem != "scene" else path.resolve().parent.name, path.parent / "twin.xml"
         self.opaque = self.twin.is_file()
-        children = _children(integrator)
+        children = integrator.children
         self.has_gaze = "gaze" in children
         self._set_up(loaded, sensor, {**children, **parameters(integrator), "aovs": self.aovs()})
         self.resize(width, height)
@@ -286,18 +286,3 @@ def parameters(integrator) -> dict:
         "falloff": float(integrator.falloff[0]), "depth": integrator.depth_kind, "visibility": observer.kind,
         "map_height": observer.map_height, "background": np.array(integrator.background, float).ravel().tolist(),
     }  # fmt: skip
-
-
-def _children(integrator) -> dict:
-    """The volumes and the observer of a loaded integrator, by the names of its parameters."""
-    import mitsuba as mi
-
-    found = {}
-
-    class Collect(mi.TraversalCallback):
-        def put(self, name, value, *rest):
-            if isinstance(value, (mi.Volume, mi.Sensor, mi.Integrator)):
-                found[name] = value
-
-    integrator.traverse(Collect())
-    return found
