@@ -11,7 +11,6 @@ a longer run has come to, not what a run of that length ends with: give a single
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import time
 from pathlib import Path
@@ -40,6 +39,8 @@ def parse_settings(pairs: list[str]) -> dict:
 
 
 def main(argv=None) -> None:
+    from output import write_rows
+
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=default_data())
     parser.add_argument("--minutes", default="1,2,4,7,10")
@@ -97,11 +98,8 @@ def main(argv=None) -> None:
         print(f"{row['minutes']:8g} {row['steps']:7d} {row['ms_a_step']:8.1f} {row['psnr']:8.2f} {row['ssim']:7.4f} "
               f"{row['psnr_train']:12.2f}", flush=True)
     table = args.out / f"fox_radiance_{args.width}.csv"
-    with open(table, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    print(f"whole benchmark {time.perf_counter() - begin:.0f} s; wrote {table}")
+    write_rows(table, rows)
+    print(f"whole benchmark {time.perf_counter() - begin:.0f} s")
 
 
 if __name__ == "__main__":

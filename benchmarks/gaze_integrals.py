@@ -9,7 +9,6 @@ again as many. Prints the largest and the mean difference from one, and what an 
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
 
@@ -17,6 +16,8 @@ import numpy as np
 
 
 def main(argv=None) -> None:
+    from output import write_rows
+
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -49,12 +50,7 @@ def main(argv=None) -> None:
     off = np.abs([r["integral"] - 1 for r in rows])
     print(f"{len(rows)} positions: off by {off.mean():.1e} in the mean, {np.quantile(off, 0.99):.1e} for 99 %, {off.max():.1e} at most; "
           f"{np.median([r['seconds'] for r in rows]):.3f} s an integral of {COUNT:,} directions (median)")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    with open(args.out, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    print(f"wrote {args.out}")
+    write_rows(args.out, rows)
 
 
 if __name__ == "__main__":

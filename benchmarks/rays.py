@@ -12,7 +12,6 @@ besides, the second says more. Peak memory is that of the whole process.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import resource
 import time
@@ -50,6 +49,8 @@ def picture(width: int = 1280, height: int = 720, degrees: float = 70.0):
 
 
 def main() -> None:
+    from output import write_rows
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rays", type=int, default=2_600_000)
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")))
@@ -111,12 +112,8 @@ def main() -> None:
             frames[method] = timed(name, lambda: kde_frame(probe, directions, method=method), 4)
         off = np.abs(frames["table"] - frames["exact"]).max() / frames["exact"].max()
         print(f"  table against exact: {off:.1e} of the largest density")
-    with open(options.out, "w", newline="") as out:
-        writer = csv.DictWriter(out, list(table[0]))
-        writer.writeheader()
-        writer.writerows(table)
+    write_rows(options.out, table)
     raw.unlink()
-    print(f"wrote {options.out}")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ over the places themselves, the best of that kind.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import tempfile
 import time
@@ -83,6 +82,8 @@ def draw_rays(law, positions: np.ndarray, count: int, rng):
 
 
 def main(argv=None) -> list[dict]:
+    from output import write_rows
+
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -145,12 +146,7 @@ def main(argv=None) -> list[dict]:
         methods[label] = gaze_field(field, place.medium)
     rows = score_rows(truth, tests, directions, methods)
     print_scores(rows, f"{len(tests)} held-out positions against the law, over the sphere ({len(stood)} places trained on)")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    with open(args.out, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    print(f"wrote {args.out}")
+    write_rows(args.out, rows)
     return rows
 
 

@@ -16,7 +16,6 @@ position, as many as a probe holds: what a probe of perfect data would score.
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +36,8 @@ def fresh_draws(law, count: int, kappa: float):
 
 
 def main(argv=None) -> None:
+    from output import write_rows
+
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -88,12 +89,7 @@ def main(argv=None) -> None:
     integral = 4 * np.pi * methods["gaze field"](positions, directions).mean(axis=1)
     print(f"integral of the gaze field over the sphere: mean {integral.mean():.3f}, "
           f"{integral.min():.3f} to {integral.max():.3f}; KLD with eps {EPS:g} of the uniform density")
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    with open(args.out, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    print(f"wrote {args.out}")
+    write_rows(args.out, rows)
 
 
 if __name__ == "__main__":

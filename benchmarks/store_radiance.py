@@ -9,7 +9,6 @@ ray casts to the twin. ``--validate`` leaves the held-out views alone: every 8th
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import time
 from pathlib import Path
@@ -21,6 +20,8 @@ VIEWS = Path(__file__).resolve().parents[1] / "scenes" / "store" / "build"
 
 
 def main(argv=None) -> None:
+    from output import write_rows
+
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--views", type=Path, default=VIEWS)
     parser.add_argument("--minutes", type=float, default=10)
@@ -78,11 +79,7 @@ def main(argv=None) -> None:
               f"{100 * depth['median']:10.2f} {100 * depth['mean']:8.2f} {depth['off']:7.2%} {depth['opacity']:8.4f} "
               f"{depth['translucent']:6.2%} {load:5.1f}", flush=True)
     table = args.out / "store_radiance.csv"
-    with open(table, "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-    print(f"wrote {table}")
+    write_rows(table, rows)
 
 
 if __name__ == "__main__":

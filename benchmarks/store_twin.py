@@ -19,7 +19,6 @@ observer to the field's surface. Boxes 3 cm smaller decide what must be dark, bo
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from pathlib import Path
 
@@ -200,6 +199,8 @@ def picture(folder: Path, path: Path, width: int, spp: int, files: dict) -> None
 
 
 def main(argv=None) -> None:
+    from output import write_rows
+
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--field", type=Path, help="checkpoint (default: that of the store)")
     parser.add_argument("--gaze", type=Path, help="checkpoint of the gaze field (default: the store's)")
@@ -232,12 +233,7 @@ def main(argv=None) -> None:
         rows.append(measure(folder, pair, args.width, files, args.color_spp))
         print("; ".join(v if isinstance(v, str) else f"{k} {v:.4g}" for k, v in rows[-1].items()), flush=True)
     print("; ".join(["mean", *(f"{k} {np.mean([r[k] for r in rows]):.4g}" for k in rows[0] if k != "pair")]))
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    with args.out.open("w", newline="") as f:
-        writer = csv.DictWriter(f, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    print(f"wrote {args.out}")
+    write_rows(args.out, rows)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ all pixels with a surface, `p90 cm away` over those away from silhouettes.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from pathlib import Path
 
@@ -125,6 +124,8 @@ def table(rows: list[dict]) -> None:
 
 
 def main(argv=None) -> None:
+    from output import write_rows
+
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--field", type=Path, help="checkpoint (default: that of the store)")
     parser.add_argument("--gaze", type=Path, help="checkpoint of the scene's gaze field (default: the store's; not evaluated)")
@@ -150,12 +151,7 @@ def main(argv=None) -> None:
         for pair in args.pair or PAIRS
     ]
     table(rows)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    with args.out.open("w", newline="") as f:
-        writer = csv.DictWriter(f, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    print(f"wrote {args.out}")
+    write_rows(args.out, rows)
 
 
 if __name__ == "__main__":

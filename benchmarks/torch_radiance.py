@@ -4,13 +4,13 @@
 
 Same grid, networks, initial weights, rays, step table, occupancy grid, density pass, losses, optimiser and schedule, on the same
 machine in the same run, one after the other; the peer is eager PyTorch, gathers and sums, autograd. Before they start, both
-evaluate the same random points, and the program stops if they differ. Without our trainer's extras: cleared cells, and the settling
-of the grid, which are switched off in both. Both fields are scored by the integrator, under the occupancy found in the same way.
+evaluate the same random points, and the program stops if they differ. Without our trainer's extras: thinned samples, damped
+derivatives near cameras, cleared cells, and the settling of the grid, which are switched off in both. Both fields are scored by
+the integrator, under the occupancy found in the same way.
 """
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import sys
 import time
@@ -175,7 +175,7 @@ class TorchTrainer:
             self.update()
         index = torch.randint(len(self.o), (self.rays,), generator=self.generator)
         o, d, truth = self.o[index], self.d[index], self.c[index]
-        ray, _, length, p = self.samples(o, d, s.stride(self.steps))
+        ray, _, length, p = self.samples(o, d, s.stride(self.progress))
         self.steps += 1
         covered = self.rays
         if len(ray) > s.batch:
@@ -231,6 +231,8 @@ def same_model(trainer, peer) -> float:
 
 
 def main(argv=None) -> None:
+    from output import write_rows
+
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=default_data())
     parser.add_argument("--minutes", type=float, default=2.0)
@@ -287,10 +289,7 @@ def main(argv=None) -> None:
                      "psnr": round(scores["psnr_mean"], 2), "ssim": round(scores["ssim_mean"], 4), "load_before": round(load, 1)})
         print(rows[-1], flush=True)
     print(f"steps a second: {rows[0]['steps_per_s'] / rows[1]['steps_per_s']:.1f} times PyTorch's")
-    with open(args.out / "torch_radiance.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    write_rows(args.out / "torch_radiance.csv", rows)
 
 
 if __name__ == "__main__":

@@ -53,7 +53,8 @@ def depth_loss(weight, tau, samples: Samples, pixels: PixelBatch, margin: float,
 def distortion_loss(weight, samples: Samples, scale: float):
     """Loss a ray that draws its weight together: Σ_ij w_i w_j |m_i - m_j| + Σ_i w_i² δ_i / 3 with midpoints m and lengths
     δ of the samples, in units of ``scale`` (Barron et al. 2022, mip-NeRF 360, eq. 15; summed in O(n) as samples are
-    in order). The samples' places have no derivative."""
+    in order). The samples' places have no derivative. Samples that stand for others count as one: the second term is then too
+    large by 1/p of each."""
     length = samples.length / scale
     return ray_sum(dr.custom(_Spread, weight, samples.t / scale + 0.5 * length, length, samples.segments), samples.segments)
 
