@@ -1,6 +1,6 @@
-"""Derivatives of pictures against central differences, for every quantity and parameter, and the memory that they take.
+"""Derivatives of pictures against central differences, for every quantity and parameter.
 
-    python benchmarks/gradients.py [--only errors,memory] [--depth median] [--case NAME] [--update docs/gradients.md]
+    python benchmarks/gradients.py [--depth median] [--case NAME] [--update docs/gradients.md]
 
 One number moves each parameter along a fixed line (``gradients_cases.py``). Forward: derivatives of all pixels at once, as
 ``mi.render`` gives them. Reverse: derivative of one weighted sum of the pixels of one quantity. Both against central differences
@@ -11,7 +11,6 @@ is the dot-product test and holds to rounding. Prints markdown; nothing passes o
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -126,22 +125,8 @@ def summary(found: dict) -> list[str]:
     return [*cells, f"{max(e.dot for e in known):.0e}", f"{max(e.doubt for e in known):.0e}", f"{1 - min(e.share for e in known):.0%}"]
 
 
-def memory(mi):
-    """Of one backward pass, each in a process of its own."""
-    rows = []
-    for samples in (16, 64, 256, 1024):
-        row = [f"{samples:,}"]
-        for how in ("ours", "plain"):
-            command = [sys.executable, str(Path(__file__).with_name("gradients_memory.py")), how, str(samples)]
-            row += [subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()]
-            print(row, file=sys.stderr, flush=True)
-        rows.append(row)
-    yield "Memory of a backward pass", ["samples a ray", "nerg, MB", "plain reverse mode over stored samples, MB"], rows
-
-
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="errors,memory", help="comma-separated parts")
     parser.add_argument("--case", default="", help="only cases whose name contains this")
     parser.add_argument("--depth", default="median", help="median, expected or refined")
     parser.add_argument("--update", type=Path, help="a document whose tables are replaced, heading by heading")
@@ -153,15 +138,11 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     # A sensor's pose counts as not differentiable in Mitsuba, which says so on each of its updates.
     mi.set_log_level(mi.LogLevel.Error)
-    parts = {"errors": lambda: errors(mi, args.case, args.depth), "memory": lambda: memory(mi)}
-    for part in args.only.split(","):
-        if part not in parts:
-            parser.error(f'there is no part "{part}"; there are {", ".join(parts)}')
-        for title, head, rows in parts[part]():
-            text = table(head, rows)
-            print(f"### {title}\n\n{text}\n", flush=True)
-            if args.update:
-                args.update.write_text(replaced(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")
+    for title, head, rows in errors(mi, args.case, args.depth):
+        text = table(head, rows)
+        print(f"### {title}\n\n{text}\n", flush=True)
+        if args.update:
+            args.update.write_text(replaced(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")
 
 
 if __name__ == "__main__":
