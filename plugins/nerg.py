@@ -327,6 +327,19 @@ class NergIntegrator(mi.SamplingIntegrator):
         finally:
             self._sensors = None
 
+    def render_forward(self, scene, params, sensor, seed=0, spp=0):
+        # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a table
+        # of all sensors, the observer among them.
+        if viewpoint.is_batch(sensor) and any(dr.grad_enabled(c) for c in self._eyes(sensor)):
+            raise ValueError(
+                'a "batch" of cameras has no forward derivatives with respect to the pose of an observer or a camera; '
+                "render its cameras one by one, or use reverse mode (dr.backward)"
+            )
+        return super().render_forward(scene, params, sensor, seed, spp)
+
+    def _eyes(self, sensor):
+        return viewpoint.centers([sensor]) + ([] if self.observer is None else [viewpoint.center(self.observer)])
+
     def sample(self, scene, sampler, ray, medium=None, active=True):
         active = mi.Bool(active)
         offset = sampler.next_1d(active) if self.jitter else None

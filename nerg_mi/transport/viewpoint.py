@@ -18,9 +18,14 @@ def center(sensor):
     return sensor.world_transform() @ mi.Point3f(0)
 
 
+def is_batch(sensor) -> bool:
+    """Whether ``sensor`` consists of several."""
+    return _kind(sensor) == "BatchSensor"
+
+
 def _members(sensor) -> list:
     """The sensors that ``sensor`` consists of: itself, or those of a batch."""
-    if _kind(sensor) != "BatchSensor":
+    if not is_batch(sensor):
         return [sensor]
     import mitsuba as mi
 

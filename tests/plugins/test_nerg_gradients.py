@@ -219,3 +219,32 @@ def test11_forward_mode(rgb, files):
     expected = (ends[0] - ends[1]) / 0.004
     assert np.abs(expected).max() > 0.01
     assert np.allclose(got[..., :5], expected[..., :5], atol=0.03 * np.abs(expected[..., :5]).max())
+
+
+@pytest.mark.parametrize("whose", ["integrator.observer.to_world", "sensor.b.to_world"])
+def test12_poses_in_front_of_a_batch_go_backward_only(rgb, whose):
+    """Forward mode is refused where Mitsuba would end the process."""
+    sensor = {"type": "batch", "film": {**camera(rgb)["film"], "width": 2 * SIZE},
+              **{n: camera(rgb, (x, 0.4, -3)) for n, x in (("a", 0.5), ("b", -0.5))}}  # fmt: skip
+    integrator = {"type": "nerg", "aovs": "observer_depth", "occlusion": False,
+                  "observer": {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate([2, 0.1, -3])}}  # fmt: skip
+    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, "s": {"type": "sphere"}})
+    params = rgb.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith(whose.split(".", 1)[1]))
+    pose = rgb.Transform4f(params[key])
+
+    def total(x):
+        params[key] = rgb.Transform4f().translate([x, 0, 0]) @ pose
+        params.update()
+        return dr.sum(rgb.render(scene, params=params, spp=1)[..., 3], axis=None)
+
+    for mode in (dr.forward, dr.backward):
+        x = rgb.Float(0)
+        dr.enable_grad(x)
+        value = total(x)
+        if mode is dr.forward:
+            with pytest.raises(ValueError, match="one by one"):
+                dr.forward(x)
+        else:
+            dr.backward(value)
+            assert np.isfinite(dr.grad(x).numpy().item()) and dr.grad(x).numpy().item() != 0
