@@ -49,7 +49,8 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - tolerance
    - |float|
    - How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands for two march
-     steps, or, without a field, for 1e-4 of the scene's diagonal. The point that the observer looks for lies this far,
+     steps, or, without a field, for 1e-4 of the scene's diagonal (or of four times the larger distance of surface and
+     observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The point that the observer looks for lies this far,
      and as far as light goes into the surface (at most a 64th of the depth), in front of the camera's surface, so that
      no surface hides itself. (Default: 0)
 
@@ -316,8 +317,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
-        if self.medium is None and len(scene.shapes()) == 0:
-            raise ValueError('there is nothing to render: give "nerg" a "field" or a "density", or the scene shapes')
+        self._check_place(scene)
         if 0 in sensor.film().crop_size():
             raise ValueError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
@@ -341,6 +341,8 @@ class NergIntegrator(mi.SamplingIntegrator):
         return viewpoint.centers([sensor]) + ([] if self.observer is None else [viewpoint.center(self.observer)])
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
+        if self._sensors is None:
+            self._check_place(scene)
         active = mi.Bool(active)
         offset = sampler.next_1d(active) if self.jitter else None
         asked = set(self.aovs)
@@ -390,7 +392,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         L, nested = mi.Spectrum(0), [mi.Float(0)] * len(self.shading.aov_names())
         if self.radiance:
             behind, nested, shown = self.shading.radiance(
-                scene, sampler, ray, view, self.background, self.hide_emitters, active
+                scene, sampler, ray, medium, view, self.background, self.hide_emitters, active
             )
             some |= shown
             front, color = view.front, view.march.color if lit else None
@@ -432,6 +434,10 @@ class NergIntegrator(mi.SamplingIntegrator):
         self._check_observer()
         if not dr.all(self.falloff >= 0):
             raise ValueError(f'"falloff" must not be negative, got {self.falloff}')
+
+    def _check_place(self, scene):
+        if self.medium is None and len(scene.shapes()) == 0:
+            raise ValueError('there is nothing to render: give "nerg" a "field" or a "density", or the scene shapes')
 
     def _check_observer(self):
         if self.observer is not None:

@@ -19,8 +19,9 @@ KINDS = ("depth", "transmittance", "map")
 
 # An entry of a map sees the same surface as a point if it lies at most this many times the point's lift behind it.
 _PAST = 4
-# Ray casts agree on a shape to this share of the scene's diagonal.
-EXACT = 1e-4
+# Ray casts agree on a shape to this share of the scene's diagonal, or of the coordinates there, four times taken: what is far
+# away takes no part in how exactly a near one is met, but for the size of its triangles.
+EXACT, _FAR = 1e-4, 1e-6
 
 
 @dataclass
@@ -51,7 +52,7 @@ class ObserverPass:
     """Looks from an observer at points of a place.
 
     ``kind``: one of ``KINDS``; ``depth``: kind of d_o; ``surface_opacity``: opacity from which a ray meets a
-    surface; ``tolerance``: in scene units, 0 for two steps (without a medium, ``EXACT`` of the scene's diagonal);
+    surface; ``tolerance``: in scene units, 0 for two steps (without a medium, see ``EXACT``);
     ``map_height``: rows of the map.
     """
 
@@ -76,7 +77,7 @@ class ObserverPass:
         """
         import mitsuba as mi
 
-        tolerance = self._tolerance(place, ray, p_d)
+        tolerance = self._tolerance(place, ray, p_d, p_o)
         in_front = tolerance + fuzz
         if self.kind == "map":
             # Entries of a map are this far apart where the ray ends, and depths on slopes as much.
@@ -113,11 +114,12 @@ class ObserverPass:
         d_o = dr.select(dr.isfinite(met), met, distance)
         return Sight(dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals, attended)
 
-    def _tolerance(self, place, ray, p_d):
+    def _tolerance(self, place, ray, p_d, p_o):
         if self.tolerance:
             return self.tolerance
         if place.medium is None:
-            return EXACT * place.diagonal
+            near = 4 * dr.maximum(dr.norm(dr.detach(p_d)), dr.norm(dr.detach(p_o)))
+            return EXACT * dr.minimum(place.diagonal, near) + _FAR * place.diagonal
         return 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o))
 
     def _map_from(self, place, p_o) -> ObserverMap:

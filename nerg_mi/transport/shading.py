@@ -24,18 +24,18 @@ class Shading:
             )
         self.nested, self._path = nested, None
 
-    def radiance(self, scene, sampler, ray, view, background, hide_emitters, active):
+    def radiance(self, scene, sampler, ray, medium, view, background, hide_emitters, active):
         """``(radiance, AOVs of the nested integrator, shown)`` from behind the field, or from a place without one.
 
-        ``view``: ``place.View`` of ``ray``; ``background``: radiance where nothing is, if the scene has no environment;
-        ``shown``: whether there is anything but that background, as a nested integrator says or an environment makes it.
+        ``medium``: Mitsuba's, that the camera stands in (or None); ``view``: ``place.View`` of ``ray``; ``background``:
+        radiance where nothing is, if the scene has no environment; ``shown``: whether there is anything but that background, as a nested integrator says or an environment makes it.
         """
         import mitsuba as mi
 
         seen = active & (view.front < 1)
         environment = None if hide_emitters else scene.environment()
         if self.nested is not None:
-            color, valid, aovs = self.nested.sample(scene, sampler, ray, None, seen)
+            color, valid, aovs = self.nested.sample(scene, sampler, ray, medium, seen)
             if environment is None:
                 # Directly seen emitters are shapes; where there is nothing at all, there is the background.
                 color = dr.select(view.hit | valid, color, background)

@@ -220,3 +220,39 @@ def test11_hidden_emitters_are_hidden_from_the_picture_only(rgb):
     assert np.allclose(image[..., 3], render(rgb, {"type": "depth"}, **things)[..., 0], atol=1e-5)
     assert np.allclose(image[..., :3], render(rgb, {"type": "path", "hide_emitters": True}, **things), atol=1e-5)
     assert image[..., :3].max() < 1.9
+
+
+def test12_what_is_far_away_does_not_blunt_shadows(rgb):
+    """A lid 20 cm before a wall hides it by a hard edge, also under a dome of a kilometre (1e-4 of its diagonal are 35 cm)."""
+    integrator = {"type": "nerg", "aovs": "visibility,position", "falloff": 0.0, "observer": observer_at(rgb, 0, 0, -1)}
+    sensor = camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24)
+    things = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.8, 0.5)}
+    for dome in ({}, {"dome": {"type": "sphere", "radius": 1000.0, "bsdf": {"type": "twosided", "b": {"type": "diffuse"}}}}):
+        out = channels(rgb, integrator, sensor, **things, **dome)
+        reach = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
+        on_wall = np.abs(out["position.Z"] - 1) < 1e-3
+        hidden, seen = on_wall & (reach < 0.55), on_wall & (reach > 0.56) & (reach < 2.9)
+        assert hidden.sum() > 10 and seen.sum() > 100
+        assert (out["visibility.Y"][hidden] == 0).all() and (out["visibility.Y"][seen] == 1).all()
+
+
+def test13_media_of_mitsuba_light_shapes_through_a_nested_volpath(rgb):
+    """Around shapes, and around the camera itself: the same paths as those of `volpath`."""
+    fog = {"type": "homogeneous", "sigma_t": 0.4, "albedo": 0.5}
+    things = {"back": square(rgb, 1.4, 1.5), "lamp": {"type": "point", "position": [1, 1, -1], "intensity": 9.0}}
+    cloud = {"cloud": {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(0.6), "bsdf": {"type": "null"}, "interior": fog}}
+    for sensor, more in ((camera(rgb), cloud), ({**camera(rgb), "medium": fog}, {})):
+        known = render(rgb, {"type": "volpath"}, sensor, spp=2, seed=2, **things, **more)
+        ours = render(rgb, {"type": "nerg", "aovs": "depth", "lit": {"type": "volpath"}}, sensor, spp=2, seed=2, **things, **more)
+        assert np.allclose(ours[..., :3], known, atol=1e-5) and np.ptp(known) > 0.05
+
+
+@pytest.mark.parametrize("around", ["aov", "moment"])
+def test14_nothing_to_render_is_said_inside_of_other_integrators_too(rgb, around):
+    outer = {"type": around, "in": {"type": "nerg"}, **({"aovs": "z:depth"} if around == "aov" else {})}
+    with pytest.raises(Exception) as error:
+        render(rgb, outer)
+    said, e = "", error.value
+    while e is not None:
+        said, e = said + str(e), e.__cause__ or e.__context__
+    assert "there is nothing to render" in said
