@@ -159,9 +159,10 @@ class RadianceTrainer:
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
         parameters = self._parameters()
         sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns, samples.features)
-        if s.reach > 0:
+        reach = s.reach * self.box.side * max(0.0, 1 - self.progress / s.reach_share)
+        if reach > 0:
             # What is near a camera is sampled by many of its rays, and would turn to fog before far surfaces are found.
-            share = dr.minimum(dr.square(samples.t / (s.reach * self.box.side)), 1)
+            share = dr.minimum(dr.square(samples.t / dr.opaque(ns.Float, reach)), 1)
             sigma, *rgb = (dr.replace_grad(x, x * share) for x in (sigma, *rgb))
         # Now: each sum along the rays would evaluate the networks again.
         dr.eval(sigma, rgb)

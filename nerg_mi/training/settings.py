@@ -8,10 +8,10 @@ from ..field.hashgrid import HashGridConfig
 from ..field.radiance import RadianceConfig
 
 # (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's sizes;
-# "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16.
+# "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16; "medium" holds the texture of a room, in 8 MB.
 _SIZES = {
     "small": (8, 16, 32, 512, 32, 1),
-    "medium": (12, 18, 16, 2048, 32, 2),
+    "medium": (8, 18, 32, 512, 32, 1),
     "paper": (16, 19, 16, 2048, 64, 2),
 }
 
@@ -31,23 +31,22 @@ def sized_config(size: str, box: Box) -> RadianceConfig:
 class RadianceSettings:
     """Controls of a training run; lengths are shares of the scene box's side.
 
-    ``steps`` or ``minutes``: how long, exactly one of them. ``batch``: samples a step.
-    ``learning_rate``: held for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times
-    itself. ``average``: decay a step of the averaged weights, which are the result.
-    ``march_step``: shortest step (instant-ngp's √3/1024); ``growth``: steps are at least this share of their
-    distance; ``near``: where rays start, and distance to every camera within which nothing is; ``reach``: the derivatives of
-    samples nearer than this are scaled by the square of their share of it (Philip and Deschaintre 2023, "Floaters No More"),
-    0: none are; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on a sample is always
-    kept, others by chance in proportion to their weight, with ``thin_least`` at least (1: all are kept).
-    ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells
-    that fewer cameras see stay empty; ``settle``: share of the run after which all cells that rendering will visit
-    are sampled. ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like
-    part of it, which clears early fog cheaply.
-    ``huber``: error at which the colour loss turns linear; ``empty_weight``: weight of the penalty on density in
-    cells that are not sampled; ``depth_weight``: of the depth terms where depth is known, falling to
-    ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in march steps, within which a
-    ray's weight should lie; ``replay``: share of the rays drawn from those whose depth was wrong; ``distortion_weight``: of
-    the loss that draws a ray's weight together (0: none).
+    ``steps`` or ``minutes``: how long, exactly one of them. ``batch``: samples a step. ``learning_rate``: held for the
+    share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself. ``average``: decay a step of the
+    averaged weights, which are the result. ``march_step``: shortest step (instant-ngp's √3/1024); ``growth``: steps are at
+    least this share of their distance; ``near``: where rays start, and distance to every camera within which nothing is;
+    ``reach``: the derivatives of samples nearer than this are scaled by the square of their share of it (Philip and
+    Deschaintre 2023, "Floaters No More"), 0: none are; it falls to 0 over ``reach_share`` of the run, as surfaces come to
+    stand where fog was; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on a
+    sample is always kept, others by chance in proportion to their weight, with ``thin_least`` at least (1: all are kept).
+    ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells that fewer
+    cameras see stay empty; ``settle``: share of the run after which all cells that rendering will visit are sampled.
+    ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like part of it, which
+    clears early fog cheaply. ``huber``: error at which the colour loss turns linear (colours are in 0..1);
+    ``empty_weight``: weight of the penalty on density in cells that are not sampled; ``depth_weight``: of the depth terms
+    where depth is known, falling to ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in
+    march steps, within which a ray's weight should lie; ``replay``: share of the rays drawn from those whose depth was
+    wrong; ``distortion_weight``: of the loss that draws a ray's weight together (0: none).
     """
 
     steps: int | None = None
@@ -63,6 +62,7 @@ class RadianceSettings:
     growth: float = 1 / 128
     near: float = 0.02
     reach: float = 0.4
+    reach_share: float = 0.5
     stop: float = 2e-3
     thin_sure: float = 1 / 32
     thin_least: float = 1 / 32
@@ -72,7 +72,7 @@ class RadianceSettings:
     settle: float = 0.85
     strides: tuple[int, ...] = field(default=(16, 8, 4, 2))
     stride_share: float = 0.33
-    huber: float = 0.1
+    huber: float = 1.0
     empty_weight: float = 0.003
     depth_weight: float = 0.02
     final_depth: float = 0.25
@@ -89,6 +89,8 @@ class RadianceSettings:
             raise ValueError(f"weights of losses must be 0 or more, got {self.depth_weight} and {self.distortion_weight}")
         if not (self.thin_sure > 0 and 0 < self.thin_least <= 1):
             raise ValueError(f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}")
+        if not (self.stride_share >= 0 and self.reach_share > 0):
+            raise ValueError(f"stride_share must be 0 or more and reach_share above 0, got {self.stride_share} and {self.reach_share}")
         if self.resolution % 8:
             raise ValueError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
 
