@@ -49,7 +49,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - tolerance
    - |float|
    - How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands for two march
-     steps, or, without a field, for 1e-4 of the scene's diagonal (or of four times the larger distance of surface and
+     steps, or, without a field, for 1e-4 of the scene's diagonal (or of twice the larger distance of surface and
      observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The point that the observer looks for lies this far,
      and as far as light goes into the surface (at most a 64th of the depth), in front of the camera's surface, so that
      no surface hides itself. (Default: 0)
@@ -169,7 +169,8 @@ refused when it is loaded; weights set later are not looked at).
 
 Derivatives reach field and gaze weights, volumes, ``falloff``, camera and observer positions, in forward and in reverse
 mode, with memory that does not grow with the number of steps. They do not see the edges of visibility, nor where
-marching stops. Empty voxels of a ``gridvolume`` are skipped: change its data through the scene's or the integrator's
+marching stops. In a ``batch`` of cameras, those of poses exist in reverse mode only. Empty voxels of a ``gridvolume`` are
+skipped: change its data through the scene's or the integrator's
 parameters (``mi.traverse``), whose ``update()`` refreshes what is known to be empty.
 
 Shapes of the scene hide the field behind them, from the camera and from the observer, and the field in front of them

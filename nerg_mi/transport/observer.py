@@ -19,9 +19,9 @@ KINDS = ("depth", "transmittance", "map")
 
 # An entry of a map sees the same surface as a point if it lies at most this many times the point's lift behind it.
 _PAST = 4
-# Ray casts agree on a shape to this share of the scene's diagonal, or of the coordinates there, four times taken: what is far
+# Ray casts agree on a shape to this share of the scene's diagonal, or of twice the coordinates there: what is far
 # away takes no part in how exactly a near one is met, but for the size of its triangles.
-EXACT, _FAR = 1e-4, 1e-6
+EXACT, _FAR = 1e-4, 3e-7
 
 
 @dataclass
@@ -118,7 +118,7 @@ class ObserverPass:
         if self.tolerance:
             return self.tolerance
         if place.medium is None:
-            near = 4 * dr.maximum(dr.norm(dr.detach(p_d)), dr.norm(dr.detach(p_o)))
+            near = 2 * dr.maximum(dr.norm(dr.detach(p_d)), dr.norm(dr.detach(p_o)))
             return EXACT * dr.minimum(place.diagonal, near) + _FAR * place.diagonal
         return 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o))
 
