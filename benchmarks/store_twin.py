@@ -14,6 +14,8 @@ the integrator.
 Second table: `scenes/store/display.xml` against the same scene with the display moved out of the room. What must be
 hidden is computed by float64 intersections with the display's boxes: by the camera's rays, and by the segments from the
 observer to the field's surface. Boxes 3 cm smaller decide what must be dark, boxes 3 cm larger what must not change.
+Then the same with the display in the store of shapes (`-D place=shapes.xml`), with a fall-off of 0, against `shapes.xml`: there
+boxes are 2 mm smaller and larger, and what is hidden lies 2 mm behind the display or more.
 """
 
 from __future__ import annotations
@@ -31,10 +33,11 @@ from benchmarks.store_visibility import PAIRS, near_edges  # noqa: E402
 AOVS = "opacity,position,visibility,gaze"
 BOXES = np.array([[(4.40, 4.65, 0.00), (4.90, 5.00, 0.95)], [(4.40, 4.96, 0.95), (4.90, 5.00, 1.45)]])
 """The display of display.xml, lower and upper corners in metres."""
-EYE = "4.4, 2.8, 1.6"
-# How far a surface must lie behind the display to be dark: fall-off, tolerance, and what light goes into it.
-BEHIND = 0.15
-MARGIN = 0.03
+EYE, CAMERA, TARGET = "4.4, 2.8, 1.6", "5.75, 4.2, 2.1", "4.7, 4.95, 0.8"
+# How far a surface must lie behind the display to be dark (fall-off, tolerance, and what light goes into it), and by how much
+# boxes are smaller and larger; for shapes without a fall-off only the tolerance of 1 mm counts.
+BEHIND, MARGIN = 0.15, 0.03
+SHARP = 0.002
 
 
 def vector(text: str) -> np.ndarray:
@@ -138,29 +141,38 @@ def move_away(scene) -> None:
     params.update()
 
 
-def measure_display(folder: Path, width: int, files: dict) -> dict:
-    """What the display hides: counts of pixels and the shares of them that are as they must be."""
+def measure_display(folder: Path, width: int, files: dict, shapes: bool = False) -> dict:
+    """What the display hides: counts of pixels and the shares of them that are as they must be. ``shapes``: of the store
+    without a field."""
     from nerg_mi.scenes.store import twin
 
-    scene = load(folder / "display.xml", width, radiance="false", **files)
+    place, behind, margin = "scene.xml", BEHIND, MARGIN
+    if shapes:
+        place, behind, margin = "shapes.xml", SHARP, SHARP
+        files = {k: v for k, v in files.items() if k != "field"} | {"falloff": "0"}
+    scene = load(folder / "display.xml", width, radiance="false", place=place, **files)
     camera = np.ravel(np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)[:3, 3])
     there = look(scene)
-    move_away(scene)
-    bare = look(scene)
-    plain = look(load(folder / "scene.xml", width, radiance="false", eye=EYE, camera=str(camera.tolist())[1:-1],
-                      target="4.7, 4.95, 0.8", **files))  # fmt: skip
+    if not shapes:
+        move_away(scene)
+        bare = look(scene)
+    plain = look(load(folder / place, width, radiance="false", eye=EYE, camera=CAMERA,
+                      target=TARGET, **files))  # fmt: skip
+    if shapes:
+        # A display a kilometre away would make the scene, and with it the tolerance, larger.
+        bare = plain
 
     met = bare["surface"]
     z = np.linalg.norm(bare["p"] - camera, axis=-1)
     d = (bare["p"] - camera) / z[..., None]
     entry = box_entry(camera, d)
-    on, off = met & (entry < z - 0.05), met & ~np.isfinite(entry)
+    on, off = met & (entry < z - (SHARP if shapes else 0.05)), met & ~np.isfinite(entry)
     depth = np.linalg.norm(there["p"] - camera, axis=-1)
 
     eye = vector(EYE)
     was_seen = off & (bare["visibility"] > 0)
-    dark = was_seen & shadowed(eye, bare["p"], -MARGIN, BEHIND)
-    free = off & ~shadowed(eye, bare["p"], MARGIN, -MARGIN)
+    dark = was_seen & shadowed(eye, bare["p"], -margin, behind)
+    free = off & ~shadowed(eye, bare["p"], margin, -margin)
     same = np.all([there[k] == bare[k] for k in ("opacity", "visibility", "gaze")], axis=0) & (there["p"] == bare["p"]).all(-1)
 
     # On the display itself: what of it the observer sees, by the boxes and by the rest of the store.
@@ -168,7 +180,7 @@ def measure_display(folder: Path, width: int, files: dict) -> dict:
     seen = ~shadowed(eye, q, 0.0, 1e-4) & twin.visible(eye, q)
     shown = there["visibility"][on] > 0.5
     # Faces turned away from the observer fade over the tolerance and the fall-off from their edge on.
-    faded = ~seen & ~shadowed(eye, q, 0.0, 0.1) & twin.visible(eye, q)
+    faded = ~seen & ~shadowed(eye, q, 0.0, SHARP if shapes else 0.1) & twin.visible(eye, q)
     return {
         "on": on.sum(), "display_depth_cm": 100 * np.abs(depth - entry)[on].max(),
         "display_depth_right": (np.abs(depth - entry)[on] < 1e-3).mean(), "display_faded": faded.mean(),
@@ -209,6 +221,7 @@ def main(argv=None) -> None:
                         help="paths a pixel for the colours of the shapes, at half the width; 0: no colours")  # fmt: skip
     parser.add_argument("--pair", action="append", choices=list(PAIRS), help="only this one; may be given several times")
     parser.add_argument("--no-display", action="store_true", help="the first table only")
+    parser.add_argument("--display-only", action="store_true", help="the second table only")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/store_twin.csv"), help="CSV file to write")
     parser.add_argument("--picture", type=Path, help="PNG file to write: the display, gaze without it, gaze with it")
     args = parser.parse_args(argv)
@@ -222,12 +235,15 @@ def main(argv=None) -> None:
     folder = store_scene().parent
     files = {k: str(v.resolve()) for k, v in (("field", args.field), ("gaze", args.gaze)) if v is not None}
     if not args.no_display:
-        print("A display in the field:")
-        for key, value in measure_display(folder, args.width, files).items():
-            print(f"  {key:22} {value:.6g}", flush=True)
+        for shapes in (False, True):
+            print(f"A display in the {'store of shapes' if shapes else 'field'}:")
+            for key, value in measure_display(folder, args.width, files, shapes).items():
+                print(f"  {key:22} {value:.6g}", flush=True)
     if args.picture:
         picture(folder, args.picture, 240, 8, files)
         print(f"wrote {args.picture}", flush=True)
+    if args.display_only:
+        return
     rows = []
     for pair in args.pair or PAIRS:
         rows.append(measure(folder, pair, args.width, files, args.color_spp))

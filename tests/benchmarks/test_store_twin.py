@@ -40,3 +40,10 @@ def test03_a_display_elsewhere_is_noticed(files, monkeypatch):
     monkeypatch.setattr(store_twin, "BOXES", store_twin.BOXES + np.array([0.4, 0, 0]))
     got = store_twin.measure_display(store_scene().parent, 48, files)
     assert got["display_depth_right"] < 0.9 and got["dark_gaze_0"] < 0.8 and got["free_same"] < 0.99
+
+
+def test04_a_display_in_the_store_of_shapes_hides_exactly(files):
+    got = store_twin.measure_display(store_scene().parent, 32, files, shapes=True)
+    assert got["on"] > 20 and got["display_depth_cm"] < 0.01 and got["display_visibility"] > 0.97
+    assert got["dark"] > 20 and got["dark_gaze_0"] == 1 and got["dark_gaze_before"] > 0
+    assert got["free"] > 300 and got["free_same"] == 1 and got["undecided"] < 20
