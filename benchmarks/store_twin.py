@@ -176,7 +176,8 @@ def measure_display(folder: Path, width: int, files: dict, shapes: bool = False)
     same = np.all([there[k] == bare[k] for k in ("opacity", "visibility", "gaze")], axis=0) & (there["p"] == bare["p"]).all(-1)
 
     # On the display itself: what of it the observer sees, by the boxes and by the rest of the store.
-    q = camera + entry[on, None] * d[on] - 2e-3 * d[on]
+    # The point lies in front of it, as far as the tolerance of shapes is, or by a little more than rounding.
+    q = camera + entry[on, None] * d[on] - (1e-3 if shapes else 2e-3) * d[on]
     seen = ~shadowed(eye, q, 0.0, 1e-4) & twin.visible(eye, q)
     shown = there["visibility"][on] > 0.5
     # Faces turned away from the observer fade over the tolerance and the fall-off from their edge on.
