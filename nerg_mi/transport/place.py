@@ -44,11 +44,17 @@ class View:
 
 
 class Place:
-    """``medium``: a ``media`` medium or None; ``scene``: the Mitsuba scene whose shapes are met, or None."""
+    """``medium``: a ``media`` medium or None; ``scene``: the Mitsuba scene whose shapes are met, or None. Raises ``ValueError`` for
+    meshes that have no faces."""
 
     def __init__(self, medium, scene=None):
         self.medium = medium
-        self.scene = scene if scene is not None and len(scene.shapes()) > 0 else None
+        shapes = [] if scene is None else scene.shapes()
+        self.scene = scene if len(shapes) > 0 else None
+        for shape in shapes:
+            if shape.is_mesh() and shape.face_count() == 0:
+                # Mitsuba 3.9.1 builds a scene of it, but cannot shade what it does not meet.
+                raise ValueError(f'the mesh "{shape.id()}" has no faces; take it out of the scene')
 
     @property
     def diagonal(self) -> float:

@@ -247,12 +247,24 @@ def test13_media_of_mitsuba_light_shapes_through_a_nested_volpath(rgb):
         assert np.allclose(ours[..., :3], known, atol=1e-5) and np.ptp(known) > 0.05
 
 
+def said(error) -> str:
+    """The messages of an error and of all that it comes from: ``mi.render`` puts one of its own around."""
+    text = ""
+    while error is not None:
+        text, error = text + str(error), error.__cause__ or error.__context__
+    return text
+
+
 @pytest.mark.parametrize("around", ["aov", "moment"])
 def test14_nothing_to_render_is_said_inside_of_other_integrators_too(rgb, around):
     outer = {"type": around, "in": {"type": "nerg"}, **({"aovs": "z:depth"} if around == "aov" else {})}
     with pytest.raises(Exception) as error:
         render(rgb, outer)
-    said, e = "", error.value
-    while e is not None:
-        said, e = said + str(e), e.__cause__ or e.__context__
-    assert "there is nothing to render" in said
+    assert "there is nothing to render" in said(error.value)
+
+
+def test15_a_mesh_without_faces_is_named(rgb):
+    integrator = {"type": "nerg", "aovs": "visibility", "observer": observer_at(rgb, *EYE)}
+    with pytest.raises(Exception) as error:
+        render(rgb, integrator, ball=sphere(rgb, 0, 0, 0), leftover=rgb.Mesh("leftover", 0, 0))
+    assert 'the mesh "leftover" has no faces' in said(error.value)
