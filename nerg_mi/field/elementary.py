@@ -1,4 +1,4 @@
-"""1 - exp(-x) and log(1 + x) without cancellation, which Dr.Jit lacks."""
+"""1 - exp(-x) and log(1 + x) without cancellation, quotients of tiny numbers: what Dr.Jit lacks."""
 from __future__ import annotations
 
 import drjit as dr
@@ -15,3 +15,9 @@ def one_minus_exp(x):
 def log1p(x):
     """log(1 + x) for -1 < x <= 1, to full relative precision also for tiny x."""
     return 2 * dr.atanh(x / (2 + x))
+
+
+def quotient(a, b):
+    """a / b for b != 0. Its first derivatives do not square b, which would overflow below 1e-19."""
+    value = dr.detach(a) / dr.detach(b)
+    return dr.replace_grad(value, (a - value * b) * (1 / dr.detach(b)))

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
+from ..field.elementary import quotient
 from .quadrature import absorbed_share
 from .rules import rule
 
@@ -85,7 +86,7 @@ class MarchResult:
         """Mean distance of absorption, 0 where nothing absorbs."""
         alpha = self.opacity
         some = alpha > 0
-        return dr.select(some, self.origin + self.moment / dr.select(some, alpha, 1), 0)
+        return dr.select(some, self.origin + quotient(self.moment, dr.select(some, alpha, 1)), 0)
 
 
 def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, color=None,

@@ -15,6 +15,7 @@ from typing import Callable
 
 import drjit as dr
 
+from ..field.elementary import quotient
 from .quadrature import linear_crossing, linear_share, mean_depth_share
 
 KINDS = ("constant", "linear", "cells")
@@ -70,7 +71,7 @@ class Constant:
         def paint(lit):
             return color(medium.color(features, p, ray.w, lit))
 
-        return Step(dtau, mean_depth_share(dtau), lambda missing: delta * missing / dr.select(dtau > 0, dtau, 1),
+        return Step(dtau, mean_depth_share(dtau), lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
                     paint, None, dr.select(active, 1.0, 0.0))
 
 
