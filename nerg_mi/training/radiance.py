@@ -28,8 +28,7 @@ from .settings import RadianceSettings
 
 # The average is taken of every fourth step.
 _AVERAGE_EVERY = 4
-# More rays cost time in proportion and teach no more: steps count.
-_MAX_RAYS = 2**12
+_MAX_RAYS = 2**14
 # Training rays that decide, at the end, which cells matter.
 _LOOKS, _LOOK_RAYS = 64, 2**12
 # Rays whose depth loss exceeds this are drawn again; so many are kept.
