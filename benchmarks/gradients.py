@@ -23,7 +23,8 @@ from numerics import replaced, table
 QUANTITIES = {
     "colour": "RGB", "depth": ["depth.T"], "opacity": ["opacity.Y"], "position": ["position.X", "position.Y", "position.Z"],
     "gaze": ["gaze.Y"], "emit": ["emit.Y"], "capture": ["capture.Y"], "visibility": ["visibility.Y"],
-    "observer depth": ["observer_depth.T"],
+    "observer depth": ["observer_depth.T"], "features": ["features.0", "features.1"],
+    "features at": ["features_at.0", "features_at.1"], "spread of gaze": ["gaze_std.Y"],
 }  # fmt: skip
 
 
@@ -41,7 +42,7 @@ class Entry:
 
 
 def measure(mi, scene, case, quantities=QUANTITIES) -> dict:
-    """``Entry`` of each quantity, or None where it does not depend on the parameter."""
+    """``Entry`` of each quantity that the scene has, or None where it does not depend on the parameter."""
     import drjit as dr
 
     params = mi.traverse(scene)
@@ -70,6 +71,8 @@ def measure(mi, scene, case, quantities=QUANTITIES) -> dict:
     bend, bend_near = np.abs(ends[1] + ends[-1] - 2 * middle) / h, np.abs(ends[0.5] + ends[-0.5] - 2 * middle) * 2 / h
     result = {}
     for name, channels in quantities.items():
+        if channels != "RGB" and not set(channels) <= set(names):
+            continue
         where = [0, 1, 2] if channels == "RGB" else [3 + names.index(c) for c in channels]
         fd, ad, span = difference[..., where], tangent[..., where], np.abs(middle[..., where]).max()
         scale = np.sqrt(np.mean(fd**2))
@@ -120,7 +123,8 @@ def errors(mi, only: str, depth: str):
 
 
 def summary(found: dict) -> list[str]:
-    cells = [f"{e.forward:.0e} / {e.reverse:.0e}" if (e := found[quantity]) else "none" for quantity in QUANTITIES]
+    text = lambda e: f"{e.forward:.0e} / {e.reverse:.0e}" if e else "none"
+    cells = [text(found[quantity]) if quantity in found else "" for quantity in QUANTITIES]
     known = [e for e in found.values() if e]
     return [*cells, f"{max(e.dot for e in known):.0e}", f"{max(e.doubt for e in known):.0e}", f"{1 - min(e.share for e in known):.0%}"]
 

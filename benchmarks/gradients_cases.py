@@ -15,6 +15,7 @@ import numpy as np
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.box import Box
 from nerg_mi.field.gaze import GazeConfig, GazeField
+from nerg_mi.field.gaze_ensemble import GazeEnsemble
 from nerg_mi.field.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
@@ -38,7 +39,7 @@ class Case:
 
 
 def write_fields(mi, folder: Path) -> None:
-    """A radiance field over the cube of side 2 and a gaze field over a larger one.
+    """A radiance field over the cube of side 2, a gaze field over a larger one, and an ensemble of that one with another.
 
     Features are positive, and each neuron's weights have one sign: some ReLUs pass and some block, and none changes over while a
     parameter moves, so that differences are those of a smooth function.
@@ -47,8 +48,8 @@ def write_fields(mi, folder: Path) -> None:
     rng = np.random.default_rng(0)
     config = RadianceConfig(GRID, width=16, geometry=7, sh_degree=2, density_scale=0.4)
     radiance = RadianceField.random(config, BOX, ns, 0, march_step=0.1)
-    gaze = GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2), AROUND, ns, 1)
-    for one in (radiance, gaze):
+    gaze, other = (GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2), AROUND, ns, seed) for seed in (1, 2))
+    for one in (radiance, gaze, other):
         values = {"grid.table": ns.Float(rng.uniform(0.2, 1.8, len(one.grid.table)).astype(np.float32))}
         for name, w in one.parameters().items():
             if name == "grid.table":
@@ -68,6 +69,7 @@ def write_fields(mi, folder: Path) -> None:
         one.set_parameters(values)
     save_radiance(radiance, folder / "field.safetensors", {})
     save_gaze(gaze, folder / "gaze.safetensors", {})
+    save_gaze(GazeEnsemble([gaze, other]), folder / "ensemble.safetensors", {})
 
 
 # ----------------------------------------------------------------------------
@@ -96,8 +98,11 @@ def integrator(mi, folder, observer=(-2, 0.5, 2), **more):
 
 
 def field_scene(mi, folder, **more):
+    """With the AOVs that only a field and an ensemble of gaze fields have."""
     field = {"type": "nerf", "filename": str(folder / "field.safetensors")}
-    return {"integrator": integrator(mi, folder, field=field, **more), "sensor": camera(mi)}
+    gaze = {"type": "gazefield", "filename": str(folder / "ensemble.safetensors")}
+    about = {"aovs": f"{AOVS},features,features_at,gaze_std", "field": field, "gaze": gaze, **more}
+    return {"integrator": integrator(mi, folder, **about), "sensor": camera(mi)}
 
 
 def constant_scene(mi, folder, **more):
@@ -199,13 +204,16 @@ def nets(prefix, *names):
 
 def cases() -> list[Case]:
     density, paint = nets("field", "density_net.0", "density_net.1"), nets("field", "color_net.0", "color_net.1", "color_net.2")
-    gaze = nets("gaze", "position_net.0", "position_net.1", "direction_net.0", "direction_net.1", "emit_head.0", "capture_head.0")
+    heads = "position_net.0", "position_net.1", "direction_net.0", "direction_net.1", "emit_head.0", "capture_head.0"
+    both = lambda *names: [key for member in (0, 1) for key in nets(f"gaze.{member}", *names)]
     return [
         Case("field: hash table", "field", nets("field", "grid.table"), along(1), 2e-2),
         Case("field: density network", "field", density, along(1), 2e-3),
         Case("field: colour network", "field", paint, along(1), 2e-3),
-        Case("gaze: hash table", "field", nets("gaze", "grid.table"), along(1), 2e-2),
-        Case("gaze: networks", "field", gaze, along(1), 1e-3),
+        Case("gaze: hash table", "constant", nets("gaze", "grid.table"), along(1), 2e-2),
+        Case("gaze: networks", "constant", nets("gaze", *heads), along(1), 1e-3),
+        Case("ensemble of gaze: hash tables", "field", both("grid.table"), along(1), 2e-2),
+        Case("ensemble of gaze: networks", "field", both(*heads), along(1), 1e-3),
         Case("constvolume: density", "constant", ["integrator.density.value.value"], number(), 2e-2),
         Case("constvolume: colour", "constant", ["integrator.color.value.value"], color, 2e-2),
         Case("gridvolume: density", "grid", ["integrator.density.data"], along(1), 4e-3),

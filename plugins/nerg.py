@@ -50,9 +50,9 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - |float|
    - How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands for two march
      steps, or, without a field, for 1e-4 of the scene's diagonal (or of twice the larger distance of surface and
-     observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The point that the observer looks for lies this far,
-     and as far as light goes into the surface (at most a 64th of the depth), in front of the camera's surface, so that
-     no surface hides itself. (Default: 0)
+     observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The point that the observer
+     looks for lies this far, and as far as light goes into the surface (at most a 64th of the depth), in front of the
+     camera's surface, so that no surface hides itself. (Default: 0)
 
  * - visibility
    - |string|

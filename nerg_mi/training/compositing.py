@@ -139,3 +139,13 @@ def weights(tau, segments: Segments, thinned: Thinned | None = None):
 def ray_sum(x, segments: Segments):
     """Sum of ``x`` (a Float, one entry a sample) along each ray: a Float, one entry a ray."""
     return dr.custom(_RaySum, x, segments)
+
+
+def damp_near(values: list, t, reach) -> list:
+    """``values`` of samples at distance ``t``, with derivatives scaled by (t / reach)² where they are nearer than ``reach``.
+
+    What is near a camera is sampled by many of its rays, and would turn to fog before far surfaces are found (Philip and
+    Deschaintre 2023, "Floaters No More").
+    """
+    share = dr.minimum(dr.square(t / reach), 1)
+    return [dr.replace_grad(x, x * share) for x in values]

@@ -17,7 +17,7 @@ from ..capture.images import View
 from ..field.box import Box
 from ..field.hashgrid import HashGrid
 from ..field.radiance import RadianceConfig, RadianceField
-from .compositing import weights
+from .compositing import damp_near, weights
 from .density_grid import DensityGrid
 from .losses import color_loss, composite, depth_loss, distortion_loss
 from .model import density, density_color, density_of
@@ -159,11 +159,9 @@ class RadianceTrainer:
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
         parameters = self._parameters()
         sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns, samples.features)
-        reach = s.reach * self.box.side * max(0.0, 1 - self.progress / s.reach_share)
+        reach = s.damped_within(self.progress) * self.box.side
         if reach > 0:
-            # What is near a camera is sampled by many of its rays, and would turn to fog before far surfaces are found.
-            share = dr.minimum(dr.square(samples.t / dr.opaque(ns.Float, reach)), 1)
-            sigma, *rgb = (dr.replace_grad(x, x * share) for x in (sigma, *rgb))
+            sigma, *rgb = damp_near([sigma, *rgb], samples.t, dr.opaque(ns.Float, reach))
         # Now: each sum along the rays would evaluate the networks again.
         dr.eval(sigma, rgb)
         weight, tau, color, opacity = composite(sigma, rgb, samples)

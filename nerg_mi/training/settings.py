@@ -90,7 +90,8 @@ class RadianceSettings:
         if not (self.thin_sure > 0 and 0 < self.thin_least <= 1):
             raise ValueError(f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}")
         if not (self.stride_share >= 0 and self.reach_share > 0):
-            raise ValueError(f"stride_share must be 0 or more and reach_share above 0, got {self.stride_share} and {self.reach_share}")
+            shares = f"{self.stride_share} and {self.reach_share}"
+            raise ValueError(f"stride_share must be 0 or more and reach_share above 0, got {shares}")
         if self.resolution % 8:
             raise ValueError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
 
@@ -98,6 +99,10 @@ class RadianceSettings:
         """Learning rate at ``progress`` in 0..1 of the run."""
         late = max(0.0, progress - self.hold) / (1 - self.hold)
         return self.learning_rate * self.final_rate ** min(late, 1.0)
+
+    def damped_within(self, progress: float) -> float:
+        """Distance within which derivatives are damped at ``progress`` in 0..1 of the run, a share of the side."""
+        return self.reach * max(0.0, 1 - progress / self.reach_share)
 
     def stride(self, progress: float) -> int:
         """How many times coarser than ``march_step`` the run marches at ``progress`` in 0..1."""

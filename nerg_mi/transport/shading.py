@@ -28,7 +28,8 @@ class Shading:
         """``(radiance, AOVs of the nested integrator, shown)`` from behind the field, or from a place without one.
 
         ``medium``: Mitsuba's, that the camera stands in (or None); ``view``: ``place.View`` of ``ray``; ``background``:
-        radiance where nothing is, if the scene has no environment; ``shown``: whether there is anything but that background, as a nested integrator says or an environment makes it.
+        radiance where nothing is, if the scene has no environment; ``shown``: whether there is anything but that
+        background, as a nested integrator says or an environment makes it.
         """
         import mitsuba as mi
 

@@ -12,7 +12,7 @@ from nerg_mi.field.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.intrinsics import Intrinsics
-from nerg_mi.training.compositing import ray_sum
+from nerg_mi.training.compositing import damp_near, ray_sum
 from nerg_mi.training.losses import color_loss, composite, depth_loss
 from nerg_mi.training.model import density_color
 from nerg_mi.training.pixels import PixelBank
@@ -191,12 +191,35 @@ def test_thinned_samples_stand_for_all():
 
 
 def test_settings_and_sizes_are_checked():
-    for wrong in ({}, {"steps": 5, "minutes": 1.0}, {"steps": 0}, {"steps": 5, "resolution": 100}, {"steps": 5, "thin_least": 0}):
+    for wrong in ({}, {"steps": 5, "minutes": 1.0}, {"steps": 0}, {"steps": 5, "resolution": 100}, {"steps": 5, "thin_least": 0},
+                  {"steps": 5, "reach_share": 0}):
         with pytest.raises(ValueError):
             RadianceSettings(**wrong)
     with pytest.raises(ValueError, match="small, medium, paper"):
         sized_config("huge", BOX)
     assert sized_config("paper", BOX).grid.log2_rows == 19
+
+
+def test_damping_near_cameras_ends_when_surfaces_stand():
+    s = RadianceSettings(steps=5, reach=0.4, reach_share=0.5)
+    assert [s.damped_within(p) for p in (0, 0.25, 0.5, 1)] == pytest.approx([0.4, 0.2, 0, 0])
+
+
+def test_damping_near_cameras(dataset):
+    """Derivatives nearer than the reach fall with the square of the distance, values stay; a trainer's step follows."""
+    t, x = ns.Float([0.1, 0.2, 0.4, 3]), ns.Float([1, 2, 3, 4])
+    dr.enable_grad(x)
+    y, = damp_near([x], t, 0.4)
+    dr.backward(dr.sum(2 * y))
+    assert np.array_equal(y.numpy(), x.numpy()) and np.allclose(dr.grad(x).numpy(), [2 / 16, 2 / 4, 2, 2])
+
+    def first_step(reach):
+        # All samples are nearer than a reach of a thousand sides: nothing of the pictures reaches the weights.
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(reach=reach, empty_weight=0.0), ns, depth=False)
+        trainer.step()
+        return max(np.abs(state[3][1].numpy()).max() for state in trainer.optimiser.state.values())
+
+    assert first_step(1000.0) < 1e-4 * first_step(0.0)
 
 
 def test_a_box_that_no_camera_sees_is_refused(dataset):
