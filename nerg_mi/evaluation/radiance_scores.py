@@ -13,16 +13,11 @@ import numpy as np
 from ..capture.cameras import Camera, pixel_directions, sensor_dict
 from ..capture.images import View
 from ..capture.undistort import pinhole, through_lens
+from ..training.preview import psnr
 from ..view.tonemap import srgb, write_png
 
 # Wang et al. 2004: window of 11 x 11 pixels, a Gaussian of 1.5; constants for values in 0..1.
 _RADIUS, _SIGMA, _C1, _C2 = 5, 1.5, 0.01**2, 0.03**2
-
-
-def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of values in 0..1, (h, w, c), over the pixels of ``mask`` (h, w)."""
-    error = (np.clip(picture, 0, 1).astype(np.float64) - truth) ** 2
-    return float(-10 * np.log10(max(np.mean(error if mask is None else error[mask]), 1e-12)))
 
 
 def ssim(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:

@@ -222,12 +222,12 @@ class RadianceTrainer:
         self.rays = int(np.clip(rays, 64, _MAX_RAYS))
 
     def measure(self, views: list[View], every: int = 1, field: RadianceField | None = None) -> list[float]:
-        """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel.
+        """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel of those that their masks leave in.
 
         Of ``field``, by its own occupancy; without one, of the averaged weights so far.
         """
-        field = field or self.field(bound=False)
-        return [psnr(self.render(v, every, field).color, v.over(0)[every // 2::every, every // 2::every]) for v in views]
+        field, part = field or self.field(bound=False), (slice(every // 2, None, every),) * 2
+        return [psnr(self.render(v, every, field).color, v.over(0)[part], None if v.mask is None else v.mask[part]) for v in views]
 
     def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
         """``view`` by the trainer's own marcher; ``every`` and ``field`` as `measure` has them."""

@@ -65,7 +65,7 @@ def train_radiance(
             trainer.step()
             if looks and trainer.progress >= looks[0]:
                 looks = [x for x in looks if x > trainer.progress]
-                last = float(np.mean(trainer.measure(watched, _LOOK_EVERY)))
+                last = float(np.nanmean(trainer.measure(watched, _LOOK_EVERY)))
                 history.append({"steps": trainer.steps, "seconds": round(trainer.seconds, 1), "psnr": round(last, 2)})
                 if preview is not None:
                     _write_preview(trainer, watched[0], preview)
