@@ -24,6 +24,8 @@ def command(
     radius: Annotated[float, typer.Option(help="Radius of the test's probes in metres.")] = 0.25,
     kappa: Annotated[float, typer.Option(help="Concentration of the truth's kernel.")] = 20.0,
     min_rays: Annotated[int, typer.Option(help="Rays at a test position at least.")] = 64,
+    law: Annotated[Optional[str], typer.Option(help='Truth in closed form, where it is known: "MODULE:CLASS", whose instances have density(positions, directions) in 1/sr.')] = None,
+    refit: Annotated[bool, typer.Option(help="Train again on all rays, those that validated too, for as many steps as were best.")] = True,
     cameras: Annotated[int, typer.Option(help="Cameras that a frame is timed over (the paper: 32); 0: none.")] = 4,
     size: Annotated[str, typer.Option(help="Of a frame (the paper: 1280x720).")] = "320x180",
     threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
@@ -60,13 +62,26 @@ def command(
     names = tuple(recipes.split(","))
     variants = all_variants(place.kind == "field", names)
     render = frame_timer(place, np.asarray(centres), (field or output / "x").parent, cameras, width, height) if cameras else None
+    truth = _known_law(law).density if law else None
     chosen = {n: steps for n in names if n != "default"} | {"default": default_steps}
-    rows = ablate(scored, train, centres, place, variants, output, ns, seeds, chosen, radius, kappa, min_rays, render, typer.echo, probes=probes)
+    rows = ablate(scored, train, centres, place, variants, output, ns, seeds, chosen, radius, kappa, min_rays, render, typer.echo, truth=truth, probes=probes, refit=refit)
     without = f", {len(account['people'])} people held out" if people else ""
+    source = f"that of {law}" if law else f"with kappa {kappa:g}"
     notes = (
         f"{len(centres)} held-out positions in {zones} zones{without}; "
-        f"{len(train):,} of {len(data):,} rays trained on. Losses: KLD + (1 - CC) + MAE over 2,048 directions, truth with kappa {kappa:g}; "
+        f"{len(train):,} of {len(data):,} rays trained on. Losses: KLD + (1 - CC) + MAE over 2,048 directions, truth {source}; "
         f"relative to emit_capture of the same recipe; ± is the standard deviation over seeds. A frame: {width} x {height}, mean of {cameras} cameras."
     )
     for path in write_ablation(output, rows, notes):
         typer.echo(f"wrote {path}")
+
+
+def _known_law(name: str):
+    """An instance of the class that ``MODULE:CLASS`` names."""
+    import importlib
+
+    module, _, kind = name.partition(":")
+    try:
+        return getattr(importlib.import_module(module), kind)()
+    except (ImportError, AttributeError, ValueError) as e:
+        raise ValueError(f'--law needs MODULE:CLASS that can be imported, such as nerg_mi.scenes.store.attention_law:AttentionLaw, got "{name}"') from e

@@ -7,6 +7,7 @@ by the integrator, observer and camera in one place.
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import time
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from ..training.gaze_recipes import gaze_recipe
 from ..training.gaze_run import train_gaze
 from ..training.gaze_semantics import config_like, trunk_of
 from ..training.gaze_settings import GazeSettings, ProbeSettings
+from ..training.gaze_state import digest
 from .gaze_evaluation import GazeTest, make_test, map_scores
 from .gaze_scores import gaze_field
 
@@ -57,12 +59,13 @@ def all_variants(semantic: bool, recipes: tuple = ("default", "paper")) -> list[
 
 def ablate(rays: Rays, train: Rays, centres: np.ndarray, place: GazePlace, variants: list[Variant], folder: Path, ns, seeds: int = 3,
            steps: dict | None = None, radius: float = 0.25, kappa: float = 20.0, min_rays: int = 64, render: Callable | None = None,
-           say: Callable = print, align=None, truth: Callable | None = None, probes: int | None = None) -> list[dict]:
+           say: Callable = print, align=None, truth: Callable | None = None, probes: int | None = None, refit: bool = True) -> list[dict]:
     """Train and score ``variants``; one row each, seed by seed (recipe ``default``: ``seeds`` of them, others one), with ``COLUMNS``.
 
     ``rays``: whose density at ``centres`` is the truth of the test; ``train``: what is trained on; ``truth(positions, directions)``:
     the true density in place of theirs, where it is known. ``steps``: by recipe, in place of its own. ``render(checkpoint)``:
-    seconds a frame. ``probes``: of a training at most. Checkpoints go to ``folder``.
+    seconds a frame. ``probes``: of a training at most; ``refit``: as ``GazeSettings`` has it. Checkpoints go to ``folder``, each with its row: what
+    an earlier run with the same rays, place, tests and settings has left there is not trained again.
     """
     seen = train.origin[np.random.default_rng(0).permutation(len(train))[: len(centres)]]
     sets = {"train": make_test(train, seen, radius, kappa, min_rays=min(min_rays, 16)), "test": make_test(rays, centres, radius, kappa, min_rays=min_rays)}
@@ -71,7 +74,7 @@ def ablate(rays: Rays, train: Rays, centres: np.ndarray, place: GazePlace, varia
     rows = []
     for v in variants:
         for seed in range(seeds if v.recipe == "default" else 1):
-            row = _run(v, seed, train, sets, place, folder, ns, (steps or {}).get(v.recipe), probes, min_rays, render, align)
+            row = _run(v, seed, train, sets, place, folder, ns, (steps or {}).get(v.recipe), probes, min_rays, render, align, refit)
             say(f"{v.recipe:8s} {v.name:28s} seed {seed}: test KLD {row['test_KLD']:.3f}, CC {row['test_CC']:.3f}; {row['train_seconds']:.0f} s")
             rows.append(row)
     for recipe in {v.recipe for v in variants}:
@@ -84,7 +87,7 @@ def ablate(rays: Rays, train: Rays, centres: np.ndarray, place: GazePlace, varia
     return rows
 
 
-def _run(v: Variant, seed: int, train: Rays, sets: dict[str, GazeTest], place: GazePlace, folder: Path, ns, steps, probes, min_rays, render, align) -> dict:
+def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: GazePlace, folder: Path, ns, steps, probes, min_rays, render, align, refit) -> dict:
     recipe, initial = gaze_recipe(v.recipe, v.gaze), None
     config, more = place.told(recipe.config), dict(v.more)
     if v.begin:
@@ -92,22 +95,36 @@ def _run(v: Variant, seed: int, train: Rays, sets: dict[str, GazeTest], place: G
         initial = trunk_of(place.medium.field, config)
     elif more:
         config = replace(config, **more, geometry=place.medium.feature_count)
-    settings = GazeSettings(**recipe.settings | {"seed": seed, "frozen": v.frozen} | ({"steps": steps} if steps else {}))
+    settings = GazeSettings(**recipe.settings | {"seed": seed, "frozen": v.frozen, "refit": refit} | ({"steps": steps} if steps else {}))
     how = ProbeSettings(**recipe.probes | ({"count": probes} if probes else {}))
     # Positions that validate are to be had wherever there are some that test.
     settings = replace(settings, watched_rays=min(settings.watched_rays or how.min_rays, min_rays))
+    path = folder / f"{v.recipe}_{v.name.replace(', ', '_').replace(' ', '_')}_{seed}.safetensors"
+    same = {"architecture": config.to_dict(), "settings": settings.to_dict(), "probes": how.to_dict(), "rays": digest(train),
+            "tests": {k: hashlib.sha256(t.truth.tobytes()).hexdigest() for k, t in tests.items()}, "begin": v.begin, **place.about}
+    kept = path.with_suffix(".json")
+    if path.exists() and kept.exists() and (found := json.loads(kept.read_text()))["same"] == json.loads(json.dumps(same)):
+        row = found["row"]
+    else:
+        made = {"recipe": v.recipe, "variant": v.name, "seed": seed}
+        row = made | _train(train, tests, place, config, settings, how, ns, align, initial, made, path)
+        kept.write_text(json.dumps({"row": row, "same": same}, indent=1) + "\n")
+    if render is not None:
+        row["frame_seconds"] = render(path)
+    return row
+
+
+def _train(train, tests, place: GazePlace, config, settings, how, ns, align, initial, made: dict, path: Path) -> dict:
+    """Train, write the checkpoint (``made``: what it is), score on ``tests``."""
     started = time.perf_counter()
     field, about = train_gaze(train, place.medium, place.box, config, settings, how, ns, align, initial=initial)
-    row = {"recipe": v.recipe, "variant": v.name, "seed": seed, "steps": about["steps"], "train_seconds": time.perf_counter() - started}
-    path = folder / f"{v.recipe}_{v.name.replace(', ', '_').replace(' ', '_')}_{seed}.safetensors"
-    save_gaze(field, path, {**place.about, **about, "recipe": v.recipe})
+    row = {"steps": about["steps"], "train_seconds": time.perf_counter() - started}
+    save_gaze(field, path, {**place.about, **about, **made})
     density = gaze_field(field, place.medium, align, how.depth)
-    for side, test in sets.items():
+    for side, test in tests.items():
         scores = map_scores(test.truth, density(test.centres, test.directions))
         row |= {f"{side}_{k}": scores[k] for k in ("KLD", "CC", "MAE")}
         row[f"{side}_loss"] = scores["KLD"] + 1 - scores["CC"] + scores["MAE"]
-    if render is not None:
-        row["frame_seconds"] = render(path)
     return row
 
 

@@ -52,10 +52,11 @@ def test_the_command(rgb, tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(ablation, "all_variants", lambda semantic, recipes: [v for v in all_variants(semantic, recipes) if v.gaze != "emit"])
     crowd(3000).save(tmp_path / "rays.npz")
+    command = [str(a) for a in ("ablate", tmp_path / "rays.npz", "-o", tmp_path / "out", "--geometry", "hits", "--recipes", "default", "--seeds", 2,
+                                "--default-steps", 2, "--zones", 2, "--positions", 6, "--min-rays", 8, "--radius", 0.5, "--cameras", 1,
+                                "--size", "16x8", "--probes", 12)]
     with pytest.raises(SystemExit) as end:
-        main([str(a) for a in ("ablate", tmp_path / "rays.npz", "-o", tmp_path / "out", "--geometry", "hits", "--recipes", "default", "--seeds", 2,
-                               "--default-steps", 2, "--zones", 2, "--positions", 6, "--min-rays", 8, "--radius", 0.5, "--cameras", 1,
-                               "--size", "16x8", "--probes", 12)])
+        main(command)
     assert not end.value.code, capsys.readouterr().err
     found = json.loads((tmp_path / "out" / "ablation.json").read_text())
     assert len(found["rows"]) == 4 and {r["seed"] for r in found["rows"]} == {0, 1}
@@ -63,3 +64,21 @@ def test_the_command(rgb, tmp_path, capsys, monkeypatch):
     assert np.mean(whole) == pytest.approx(1)
     assert all(r["frame_seconds"] > 0 and np.isfinite(r["test_loss"]) for r in found["rows"])
     assert (tmp_path / "out" / "default_capture_0.safetensors").exists()
+    # What is there already is not trained again; what would be another training is.
+    trained = []
+    monkeypatch.setattr(ablation, "_train", lambda *given: trained.append(given[-1].stem) or found["rows"][0])
+    for more in ([], ["--law", "tests.evaluation.test_ablation:Uniform", "--seeds", "1"]):
+        with pytest.raises(SystemExit) as end:
+            main(command + more)
+        assert not end.value.code, capsys.readouterr().err
+        assert trained == (["default_capture_0", "default_emit_capture_0"] if more else [])
+    with pytest.raises(SystemExit) as end:
+        main([*command, "--law", "nowhere"])
+    assert end.value.code and "MODULE:CLASS" in capsys.readouterr().err
+
+
+class Uniform:
+    """A law under which people look anywhere."""
+
+    def density(self, positions, directions):
+        return np.full((len(positions), len(directions)), 1 / (4 * np.pi))
