@@ -17,7 +17,7 @@ from .placement import PLACEMENTS, place_queries
 from .rays import Rays
 
 KAPPA_RULES = ("silverman", "loo", "fixed")
-WEIGHTS = ("equal", "distance")
+WEIGHTS = ("equal", "distance", "person")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +100,9 @@ def place_probes(
     ``kappa_shared``: one κ for all probes (:mod:`nerg_mi.attention.bandwidth`).
     ``widen``: κ of the law of the eyes about the heads, see :meth:`Probes.widened`.
 
-    ``weights``: of a probe's rays, ``equal`` or ``distance`` (1 - d/R, as an option of the
-    published code has it with the farthest ray's distance for R). ``ray_weights`` (N,):
+    ``weights``: of a probe's rays, ``equal``, ``distance`` (1 - d/R, as an option of the
+    published code has it with the farthest ray's distance for R), or ``person``: each person
+    counts as much in a probe, however long they stayed. ``ray_weights`` (N,):
     non-negative factors besides, such as those of :func:`person_weights`; rays of weight zero are left out.
 
     ``centre``: where the density is said to hold. ``mean``, the (weighted) mean of the
@@ -151,6 +152,10 @@ def place_probes(
     if weights == "distance":
         # Never quite zero: a probe may hold nothing but rays at its rim.
         w = np.maximum(1.0 - distances / radius, 1e-6) * (1.0 if w is None else w)
+    elif weights == "person":
+        probe = np.repeat(np.arange(len(counts)), counts)
+        _, whose, times = np.unique(probe * (1 + rays.person.max()) + rays.person[indices], return_inverse=True, return_counts=True)
+        w = (1.0 if w is None else w) / times[whose]
     share = (1.0 / counts if w is None else 1.0 / np.add.reduceat(w, offsets[:-1]))[:, None]
     means = np.add.reduceat(rays.origin[indices] * (1.0 if w is None else w[:, None]), offsets[:-1]) * share
     if kappa_rule == "fixed":

@@ -39,6 +39,7 @@ def train_gaze(
     min_rays: Annotated[Optional[int], typer.Option(help="Rays in a probe at least.")] = None,
     kappa_rule: Annotated[Optional[str], typer.Option(help="Concentration of a ray's kernel: fixed, silverman or loo.")] = None,
     kappa: Annotated[Optional[float], typer.Option(help="That of the rule fixed.")] = None,
+    weights: Annotated[Optional[str], typer.Option(help="Of a probe's rays: equal, distance (1 - d/R), or person (all people of a probe count alike).")] = None,
     directions: Annotated[Optional[int], typer.Option(help="Directions of a probe.")] = None,
     fresh: Annotated[
         bool, typer.Option("--fresh-directions", help="Draw the directions anew for every epoch, not once a probe.")
@@ -115,7 +116,7 @@ def train_gaze(
         frozen=freeze, learning_rate=learning_rate, weight_decay=weight_decay, integral=integral,
     ) | ({"steps": None} if minutes is not None and steps is None else {}))  # fmt: skip
     how = ProbeSettings(**chosen.probes | _given(
-        radius=radius, count=probes, placement=placement, cap=cap, min_rays=min_rays, kappa_rule=kappa_rule, kappa=kappa, directions=directions,
+        radius=radius, count=probes, placement=placement, cap=cap, min_rays=min_rays, kappa_rule=kappa_rule, kappa=kappa, weights=weights, directions=directions,
         fresh=fresh or None,
     ))  # fmt: skip
     state = output.with_suffix(".run")

@@ -42,11 +42,20 @@ def blocks_of(rays: Rays) -> tuple[np.ndarray, str]:
 
 
 def resample(rays: Rays, seed) -> Rays:
-    """As many blocks as ``rays`` has, drawn with replacement: a block that is drawn twice counts twice (Efron 1979)."""
-    block, _ = blocks_of(rays)
+    """As many blocks as ``rays`` has, drawn with replacement: a block that is drawn twice counts twice (Efron 1979).
+
+    A person who is drawn twice is two people then, so that weights by person count both.
+    """
+    block, kind = blocks_of(rays)
     count = block.max() + 1
-    times = np.bincount(np.random.default_rng(seed).integers(0, count, count), minlength=count)
-    return rays.select(np.repeat(np.arange(len(rays)), times[block]))
+    times = np.bincount(np.random.default_rng(seed).integers(0, count, count), minlength=count)[block]
+    index = np.repeat(np.arange(len(rays)), times)
+    drawn = rays.select(index)
+    if kind != "people":
+        return drawn
+    again, known = np.arange(len(index)) - np.repeat(np.cumsum(times) - times, times), len(rays.persons)
+    names = [*rays.persons, *(f"{name} ({k + 2})" for k in range(again.max()) for name in rays.persons)]
+    return replace(drawn, person=drawn.person + known * again, persons=tuple(names))
 
 
 def train_ensemble(

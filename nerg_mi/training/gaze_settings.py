@@ -46,7 +46,7 @@ def uniform_scale(variant: str, activation: str) -> float:
 class ProbeSettings:
     """How rays become supervision; lengths in metres, in the rays' frame.
 
-    ``radius``, ``placement``, ``count``, ``spacing``, ``cap``, ``min_rays``, ``kappa_rule``, ``kappa``: see
+    ``radius``, ``placement``, ``count``, ``spacing``, ``cap``, ``min_rays``, ``kappa_rule``, ``kappa``, ``weights``: see
     ``attention.probes.place_probes``. ``directions``: how many of equal area each probe has, turned at random, fixed for the
     whole training, so that depths are traced once; ``fresh``: turned anew, and traced again, for every epoch (as many steps
     as draw as many probes as there are). ``depth``: kind of depth that is the surface (``transport.depth``).
@@ -63,6 +63,7 @@ class ProbeSettings:
     placement: str = "data"
     spacing: float | None = None
     fresh: bool = False
+    weights: str = "equal"
 
     def __post_init__(self):
         if self.directions < 16 or self.count < 1:

@@ -104,7 +104,7 @@ def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align:
     ``settings.fresh`` the result can ``renew`` its directions."""
     s, log = settings, isinstance(config, LogGazeConfig)
     probes = place_probes(rays, s.radius, placement=s.placement, count=s.count, spacing=s.spacing, queries=queries, cap=s.cap,
-                          min_rays=min(s.min_rays, s.cap), kappa_rule=s.kappa_rule, kappa=s.kappa, seed=seed)
+                          min_rays=min(s.min_rays, s.cap), kappa_rule=s.kappa_rule, kappa=s.kappa, weights=s.weights, seed=seed)
     turned = lambda seed: supervise(probes, medium, box, s.directions, align, s.depth, seed, semantic, log and config.escaped == "nearest")
     out = turned(seed)
     if s.fresh:

@@ -79,3 +79,17 @@ def test_refusals(rays):
         place_probes(rays, 0.001, count=10)
     with pytest.raises(ValueError, match="min_rays"):
         place_probes(rays, 0.25, cap=10, min_rays=20)
+
+
+def test_people_of_a_probe_can_count_alike():
+    """One who stayed a hundred times as long weighs as much as the other; times the rays' own weights, within a person."""
+    toward = np.array([[1.0, 0, 0]] * 100 + [[0, 1.0, 0]])
+    rays = Rays(np.arange(101.0), np.array([0] * 100 + [1]), ("stays", "passes"), np.zeros((101, 3)), toward, np.ones(101))
+    both = np.array([[[1.0, 0, 0], [0, 1.0, 0]]])
+    about = dict(queries=np.zeros((1, 3)), min_rays=1, kappa_rule="fixed", kappa=50.0)
+    stays, passes = place_probes(rays, 0.2, weights="person", **about).density(both)[0]
+    assert stays == pytest.approx(passes, rel=1e-5)
+    assert np.divide(*place_probes(rays, 0.2, **about).density(both)[0]) == pytest.approx(100, rel=1e-3)
+    some = np.array([1.0] * 50 + [0.0] * 50 + [1.0])
+    stays, passes = place_probes(rays, 0.2, weights="person", ray_weights=some, **about).density(both)[0]
+    assert stays == pytest.approx(passes, rel=1e-5)

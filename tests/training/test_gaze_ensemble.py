@@ -50,7 +50,11 @@ def test_people_are_blocks_and_else_stretches_of_their_time():
 def test_a_resample_holds_whole_people_as_often_as_they_were_drawn():
     rays, times = crowd(), []
     for seed in range(300):
-        counts = np.bincount(resample(rays, seed).person, minlength=6) / 200
+        drawn = resample(rays, seed)
+        # One who is drawn twice is two people, of 200 rays each, who are told apart by their names.
+        each = np.bincount(drawn.person, minlength=len(drawn.persons))
+        assert set(each) <= {0, 200} and drawn.persons[:6] == rays.persons
+        counts = np.bincount(drawn.person % 6, minlength=6) / 200
         assert np.array_equal(counts, counts.round()) and counts.sum() == 6
         times.append(counts)
     # Multinomial with six trials and probabilities of a sixth: mean 1, variance 5/6, and one in three is left out.
