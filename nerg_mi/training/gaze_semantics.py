@@ -37,6 +37,8 @@ def semantic_features(medium, origins, directions, distance, kind: str) -> np.nd
                 found = snapshot(medium, o + d * t, mi.Bool(True))
             else:
                 found = accumulated(Place(medium), mi.Ray3f(o, d), mi.Bool(True), default_settings(medium))
+            # At once: each by itself would march, or evaluate the network, again.
+            dr.eval(found)
             out[part] = np.stack([np.array(f) for f in found], axis=-1)
     return out
 
