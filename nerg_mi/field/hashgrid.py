@@ -148,17 +148,8 @@ class HashGrid:
         cell = [ns.UInt32(c) for c in pos]
         w = [c - ns.Float(i) for c, i in zip(pos, cell)]
         lo, hi = self._corner_indices(level, cell)
-        offset = self._offsets[level]
-
-        def blend(axis: int, index: tuple):
-            # Lerps from the last axis inwards: seven a feature instead of eight weights and eight products.
-            if axis < 0:
-                row = self._combine(level, index) + offset
-                return dr.gather(packet, self.table, row, active, mode=mode)
-            low, high = (blend(axis - 1, (i[axis], *index)) for i in (lo, hi))
-            return dr.lerp(low, high, w[axis])
-
-        return list(dr.select(active, blend(self.config.dimensions - 1, ()), 0))
+        read = lambda index: dr.gather(packet, self.table, self._combine(level, index) + self._offsets[level], active, mode=mode)  # noqa: E731
+        return list(dr.select(active, _blend(read, lo, hi, w, self.config.dimensions - 1, ()), 0))
 
     def _corner_indices(self, level: int, cell):
         """Per-axis parts of the vertex index, for the lower and the upper corner."""
@@ -178,3 +169,14 @@ class HashGrid:
             h = h ^ i
         rows = self._rows[level]
         return h & (rows - 1) if rows & (rows - 1) == 0 else h % rows
+
+
+def _blend(read, lo: list, hi: list, w: list, axis: int, index: tuple):
+    """Lerps from the last axis inwards: seven a feature instead of eight weights and eight products.
+
+    Not a closure: one that calls itself is a cycle, and keeps its arrays until Python looks for those.
+    """
+    if axis < 0:
+        return read(index)
+    low, high = (_blend(read, lo, hi, w, axis - 1, (i[axis], *index)) for i in (lo, hi))
+    return dr.lerp(low, high, w[axis])

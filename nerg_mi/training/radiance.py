@@ -29,8 +29,6 @@ from .settings import RadianceSettings
 # The average is taken of every fourth step.
 _AVERAGE_EVERY = 4
 _MAX_RAYS = 2**14
-# Steps after which unused memory goes back.
-_FLUSH_EVERY = 256
 # Training rays that decide, at the end, which cells matter.
 _LOOKS, _LOOK_RAYS = 64, 2**12
 # Rays whose depth loss exceeds this are drawn again; so many are kept.
@@ -123,9 +121,6 @@ class RadianceTrainer:
                     self.grid.settle(self.density, self.rng, self._lit)
                 self.settled = True
             self.grid.update(self.density, self.rng)
-        if self.steps % _FLUSH_EVERY == 0:
-            # Freed arrays wait to be used again by others of their size, which is a new one in every step.
-            dr.flush_malloc_cache()
         index = self._draw()
         pixels = self.pixels.batch(ns.UInt32(index))
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)

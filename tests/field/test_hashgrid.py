@@ -1,4 +1,6 @@
 """The hash grid against a restatement of torch-ngp's kernel, its published sizes, and central differences."""
+import gc
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
@@ -157,3 +159,16 @@ def test11_wrong_sizes_are_named(wrong, words):
 def test12_a_table_of_the_wrong_length_is_refused():
     with pytest.raises(ValueError, match="has 10 entries"):
         HashGrid(SMALL, dr.zeros(ns.Float, 10))
+
+
+def test13_an_evaluation_leaves_no_cycles():
+    """Arrays in a reference cycle stay until Python looks for cycles, which it hardly ever does for so few objects."""
+    _, grid = random_grid(SMALL)
+    evaluate(grid, np.zeros((4, 3)))
+    gc.collect()
+    gc.disable()
+    try:
+        evaluate(grid, np.zeros((4, 3)))
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
