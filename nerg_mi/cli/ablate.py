@@ -14,6 +14,7 @@ def command(
     scene: Annotated[Optional[Path], typer.Option(help="Or: a Mitsuba scene, whose shapes they looked at.")] = None,
     geometry: Annotated[Optional[str], typer.Option(help='Or: "hits" makes a place from the rays\' own hit points, "none" does without any.')] = None,
     recipes: Annotated[str, typer.Option(help="Recipes to ablate, separated by commas.")] = "default,paper",
+    variant: Annotated[Optional[list[str]], typer.Option(help='Only this one, such as emit_capture or "semantic snapshot"; may be given several times.')] = None,
     seeds: Annotated[int, typer.Option(help="Seeds of the default recipe; the others have one.")] = 3,
     steps: Annotated[Optional[int], typer.Option(help="Steps of every recipe but the default one. Default: the recipe's.")] = None,
     default_steps: Annotated[Optional[int], typer.Option(help="Steps of the default recipe. Default: its own.")] = None,
@@ -60,7 +61,7 @@ def command(
     output.mkdir(parents=True, exist_ok=True)
     place = _place(field, scene, geometry, train, [], output / "place", 0.08, ns)
     names = tuple(recipes.split(","))
-    variants = all_variants(place.kind == "field", names)
+    variants = _chosen(all_variants(place.kind == "field", names), variant)
     render = frame_timer(place, np.asarray(centres), (field or output / "x").parent, cameras, width, height) if cameras else None
     truth = _known_law(law).density if law else None
     chosen = {n: steps for n in names if n != "default"} | {"default": default_steps}
@@ -74,6 +75,14 @@ def command(
     )
     for path in write_ablation(output, rows, notes):
         typer.echo(f"wrote {path}")
+
+
+def _chosen(variants: list, names: list[str] | None) -> list:
+    """Those of ``variants`` that are called one of ``names``; all without any."""
+    known = list(dict.fromkeys(v.name for v in variants))
+    if unknown := set(names or ()) - set(known):
+        raise ValueError(f'--variant must be one of {", ".join(known)} here, got "{sorted(unknown)[0]}"')
+    return [v for v in variants if not names or v.name in names]
 
 
 def _known_law(name: str):

@@ -67,14 +67,16 @@ def test_the_command(rgb, tmp_path, capsys, monkeypatch):
     # What is there already is not trained again; what would be another training is.
     trained = []
     monkeypatch.setattr(ablation, "_train", lambda *given: trained.append(given[-1].stem) or found["rows"][0])
-    for more in ([], ["--law", "tests.evaluation.test_ablation:Uniform", "--seeds", "1"]):
+    other = ["--law", "tests.evaluation.test_ablation:Uniform", "--seeds", "1", "--variant", "capture"]
+    for more in ([], other):
         with pytest.raises(SystemExit) as end:
             main(command + more)
         assert not end.value.code, capsys.readouterr().err
-        assert trained == (["default_capture_0", "default_emit_capture_0"] if more else [])
-    with pytest.raises(SystemExit) as end:
-        main([*command, "--law", "nowhere"])
-    assert end.value.code and "MODULE:CLASS" in capsys.readouterr().err
+        assert trained == (["default_capture_0"] if more else [])
+    for more, words in ((["--law", "nowhere"], "MODULE:CLASS"), (["--variant", "emitt"], 'emit_capture here, got "emitt"')):
+        with pytest.raises(SystemExit) as end:
+            main([*command, *more])
+        assert end.value.code and words in " ".join(capsys.readouterr().err.split())
 
 
 class Uniform:
