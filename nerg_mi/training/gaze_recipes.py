@@ -33,7 +33,7 @@ def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation
             raise ValueError("the default recipe has an activation and sizes of its own; choose --recipe small or paper to set them")
         return Recipe(
             LogGazeConfig(variant=variant, mix=0.15),
-            {"steps": 200, "loss": "likelihood", "integral": 0.0, "probes": 12, "directions": 192, "rays": 64, "learning_rate": 3e-3,
+            {"steps": 200, "loss": "likelihood", "integral": 0.0, "probes": 24, "directions": 512, "rays": 64, "learning_rate": 3e-3,
              "final_rate": 0.1, "hold": 0.5, "weight_decay": 1.0, "average": 0.95, "watched_rays": 64},
             # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
             {"placement": "blue", "spacing": 0.08, "count": 1024, "min_rays": 1, "kappa": 20.0, "directions": 2048,
