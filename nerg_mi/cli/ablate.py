@@ -26,7 +26,7 @@ def command(
     kappa: Annotated[float, typer.Option(help="Concentration of the truth's kernel.")] = 20.0,
     min_rays: Annotated[int, typer.Option(help="Rays at a test position at least.")] = 64,
     law: Annotated[Optional[str], typer.Option(help='Truth in closed form, where it is known: "MODULE:CLASS", whose instances have density(positions, directions) in 1/sr.')] = None,
-    refit: Annotated[bool, typer.Option(help="Train again on all rays, those that validated too, for as many steps as were best.")] = True,
+    refit: Annotated[bool, typer.Option(help="Train every recipe but the default one, which always does, again on all rays for as many steps as were best on some.")] = True,
     cameras: Annotated[int, typer.Option(help="Cameras that a frame is timed over (the paper: 32); 0: none.")] = 4,
     size: Annotated[str, typer.Option(help="Of a frame (the paper: 1280x720).")] = "320x180",
     threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,

@@ -64,7 +64,7 @@ def ablate(rays: Rays, train: Rays, centres: np.ndarray, place: GazePlace, varia
 
     ``rays``: whose density at ``centres`` is the truth of the test; ``train``: what is trained on; ``truth(positions, directions)``:
     the true density in place of theirs, where it is known. ``steps``: by recipe, in place of its own. ``render(checkpoint)``:
-    seconds a frame. ``probes``: of a training at most; ``refit``: as ``GazeSettings`` has it. Checkpoints go to ``folder``, each with its row: what
+    seconds a frame. ``probes``: of a training at most; ``refit``: as ``GazeSettings`` has it, of every recipe but the default one, which does. Checkpoints go to ``folder``, each with its row: what
     an earlier run with the same rays, place, tests and settings has left there is not trained again.
     """
     seen = train.origin[np.random.default_rng(0).permutation(len(train))[: len(centres)]]
@@ -95,7 +95,7 @@ def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: 
         initial = trunk_of(place.medium.field, config)
     elif more:
         config = replace(config, **more, geometry=place.medium.feature_count)
-    settings = GazeSettings(**recipe.settings | {"seed": seed, "frozen": v.frozen, "refit": refit} | ({"steps": steps} if steps else {}))
+    settings = GazeSettings(**recipe.settings | {"seed": seed, "frozen": v.frozen, "refit": refit or v.recipe == "default"} | ({"steps": steps} if steps else {}))
     how = ProbeSettings(**recipe.probes | ({"count": probes} if probes else {}))
     # Positions that validate are to be had wherever there are some that test.
     settings = replace(settings, watched_rays=min(settings.watched_rays or how.min_rays, min_rays))
