@@ -59,13 +59,15 @@ def all_variants(semantic: bool, recipes: tuple = ("default", "paper")) -> list[
 
 def ablate(rays: Rays, train: Rays, centres: np.ndarray, place: GazePlace, variants: list[Variant], folder: Path, ns, seeds: int = 3,
            steps: dict | None = None, radius: float = 0.25, kappa: float = 20.0, min_rays: int = 64, render: Callable | None = None,
-           say: Callable = print, align=None, truth: Callable | None = None, probes: int | None = None, refit: bool = True) -> list[dict]:
+           say: Callable = print, align=None, truth: Callable | None = None, probes: int | None = None,
+           refit: bool = True) -> list[dict]:
     """Train and score ``variants``; one row each, seed by seed (recipe ``default``: ``seeds`` of them, others one), with ``COLUMNS``.
 
     ``rays``: whose density at ``centres`` is the truth of the test; ``train``: what is trained on; ``truth(positions, directions)``:
     the true density in place of theirs, where it is known. ``steps``: by recipe, in place of its own. ``render(checkpoint)``:
-    seconds a frame. ``probes``: of a training at most; ``refit``: as ``GazeSettings`` has it, of every recipe but the default one, which does. Checkpoints go to ``folder``, each with its row: what
-    an earlier run with the same rays, place, tests and settings has left there is not trained again.
+    seconds a frame. ``probes``: of a training at most; ``refit``: as ``GazeSettings`` has it, of every recipe but the default one,
+    which does. Checkpoints go to ``folder``, each with its row: what an earlier run with the same rays, place, tests and
+    settings has left there is not trained again.
     """
     seen = train.origin[np.random.default_rng(0).permutation(len(train))[: len(centres)]]
     sets = {"train": make_test(train, seen, radius, kappa, min_rays=min(min_rays, 16)), "test": make_test(rays, centres, radius, kappa, min_rays=min_rays)}
@@ -87,7 +89,8 @@ def ablate(rays: Rays, train: Rays, centres: np.ndarray, place: GazePlace, varia
     return rows
 
 
-def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: GazePlace, folder: Path, ns, steps, probes, min_rays, render, align, refit) -> dict:
+def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: GazePlace, folder: Path, ns, steps, probes,
+         min_rays, render, align, refit) -> dict:
     recipe, initial = gaze_recipe(v.recipe, v.gaze), None
     config, more = place.told(recipe.config), dict(v.more)
     if v.begin:
@@ -95,7 +98,8 @@ def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: 
         initial = trunk_of(place.medium.field, config)
     elif more:
         config = replace(config, **more, geometry=place.medium.feature_count)
-    settings = GazeSettings(**recipe.settings | {"seed": seed, "frozen": v.frozen, "refit": refit or v.recipe == "default"} | ({"steps": steps} if steps else {}))
+    fixed = {"seed": seed, "frozen": v.frozen, "refit": refit or v.recipe == "default"}
+    settings = GazeSettings(**recipe.settings | fixed | ({"steps": steps} if steps else {}))
     how = ProbeSettings(**recipe.probes | ({"count": probes} if probes else {}))
     # Positions that validate are to be had wherever there are some that test.
     settings = replace(settings, watched_rays=min(settings.watched_rays or how.min_rays, min_rays))
@@ -108,7 +112,10 @@ def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: 
     else:
         made = {"recipe": v.recipe, "variant": v.name, "seed": seed}
         row = made | _train(train, tests, place, config, settings, how, ns, align, initial, made, path)
-        kept.write_text(json.dumps({"row": row, "same": same}, indent=1) + "\n")
+        # Under another name first: a process that is killed leaves no half of it.
+        part = path.with_suffix(".part")
+        part.write_text(json.dumps({"row": row, "same": same}, indent=1) + "\n")
+        part.replace(kept)
     if render is not None:
         row["frame_seconds"] = render(path)
     return row
