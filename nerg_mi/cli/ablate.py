@@ -71,7 +71,8 @@ def command(
     notes = (
         f"{len(centres)} held-out positions in {zones} zones{without}; "
         f"{len(train):,} of {len(data):,} rays trained on. Losses: KLD + (1 - CC) + MAE over 2,048 directions, truth {source}; "
-        f"relative to emit_capture of the same recipe; ± is the standard deviation over seeds. A frame: {width} x {height}, mean of {cameras} cameras."
+        f"relative to emit_capture of the same recipe; ± is the standard deviation over seeds."
+        + f" A frame: {width} x {height}, mean of {cameras} cameras." * bool(render)
     )
     for path in write_ablation(output, rows, notes):
         typer.echo(f"wrote {path}")

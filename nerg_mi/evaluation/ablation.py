@@ -230,10 +230,12 @@ def _plot(summary: list[dict], path: Path) -> None:
     x = np.arange(len(summary))
     for side, shift, colour in (("train", -0.2, "#9db7d5"), ("test", 0.2, "#2f5f93")):
         bars = [r.get(f"{side}_relative", np.nan) for r in summary]
-        axis.bar(x + shift, bars, 0.4, yerr=[r.get(f"{side}_relative.spread", 0) for r in summary], label=f"{side} probes", color=colour, capsize=3)
+        # One seed has no spread, which is not one of zero.
+        spread = [r.get(f"{side}_relative.spread", np.nan) for r in summary]
+        axis.bar(x + shift, bars, 0.4, yerr=spread, label=f"{side} probes", color=colour, capsize=3)
     axis.axhline(1, color="0.5", lw=0.8)
     axis.set_xticks(x, [f"{r['variant']}\n({r['recipe']})" for r in summary], fontsize=8, rotation=30, ha="right")
     axis.set_ylabel("KLD + (1 - CC) + MAE, emit_capture = 1")
-    axis.legend()
+    figure.legend(loc="outside upper right", ncols=2)
     figure.savefig(path, dpi=120)
     plt.close(figure)
