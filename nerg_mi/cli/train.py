@@ -19,7 +19,7 @@ def train_radiance(
     holdout: Annotated[
         Optional[int], typer.Option(help="Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.")
     ] = None,
-    size: Annotated[str, typer.Option(help="Size of the field: small, medium, large or paper.")] = "small",
+    size: Annotated[str, typer.Option(help="Size of the field: small, medium or paper.")] = "small",
     width: Annotated[Optional[int], typer.Option(help="Width of the pictures in pixels.")] = None,
     downscale: Annotated[Optional[float], typer.Option(help="Or: divide their size by this.")] = None,
     minutes: Annotated[Optional[float], typer.Option(help="Train for this long. Default: 5.")] = None,

@@ -8,12 +8,10 @@ from ..field.hashgrid import HashGridConfig
 from ..field.radiance import RadianceConfig
 
 # (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's sizes;
-# "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16; "medium" and "large" hold more of a room's texture,
-# in 7 and 13 MB, and take longer.
+# "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16; "medium" holds the texture of a room, in 7 MB.
 _SIZES = {
     "small": (8, 16, 32, 512, 32, 1),
     "medium": (8, 18, 32, 512, 32, 1),
-    "large": (8, 19, 32, 1024, 32, 1),
     "paper": (16, 19, 16, 2048, 64, 2),
 }
 
