@@ -34,9 +34,7 @@ def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation
         return Recipe(
             LogGazeConfig(variant=variant, mix=0.15),
             {"steps": 200, "loss": "likelihood", "integral": 0.0, "probes": 24, "directions": 512, "rays": 64, "learning_rate": 3e-3,
-             "final_rate": 0.1, "hold": 0.5, "weight_decay": 1.0, "average": 0.95, "watched_rays": 64,
-             # A few zones are a noisy judge, and what they like best of the first, large steps is not what generalises.
-             "judge_from": 0.5},
+             "final_rate": 0.1, "hold": 0.5, "weight_decay": 1.0, "average": 0.95, "watched_rays": 64},
             # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
             {"placement": "blue", "spacing": 0.08, "count": 1024, "min_rays": 1, "kappa": 20.0, "directions": 2048,
              # Not by time: whoever stays long at a place says little of others.

@@ -204,10 +204,9 @@ def _fit(supervision: Supervision, watched: Supervision | None, box, config, set
                     out.next_look = min(int(np.searchsorted(looks, trainer.progress, "right")), len(looks) - 1)
                     recent = trainer.measure(watched)
                     out.history.append({"steps": trainer.steps, **_rounded(recent)})
-                    if trainer.progress >= settings.judge_from:
-                        out.since += 1
-                        if out.scores is None or np.isnan(out.scores.loss) or recent.loss < out.scores.loss:
-                            out.weights, out.best_step, out.scores, out.since = trainer.weights(), trainer.steps, recent, 0
+                    out.since += 1
+                    if out.scores is None or recent.loss < out.scores.loss:
+                        out.weights, out.best_step, out.scores, out.since = trainer.weights(), trainer.steps, recent, 0
                 file.keep("fit", trainer, out.found(), out.weights)
                 say(GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, recent))
                 stop.check()

@@ -87,7 +87,7 @@ class GazeSettings:
     for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself; ``weight_decay``: decoupled
     (AdamW), a share of the weights a step a unit of learning rate; ``average``: decay a step of the averaged weights,
     which are the result. ``looks``: how often in a run the validation is looked at; ``patience``: looks without an
-    improvement after which the run ends (0: never); ``judge_from``: share of the run before which no look counts. ``zones``, ``watched``, ``watched_rays``: of the validation, groups
+    improvement after which the run ends (0: never). ``zones``, ``watched``, ``watched_rays``: of the validation, groups
     of positions, probes in them, and rays that each has at least (default: as many as those of the training); no zones, no
     validation. ``refit``: train again on all rays, the validation's too, for as many
     steps as were best. ``frozen``: weights that were given to begin with are not trained.
@@ -108,7 +108,6 @@ class GazeSettings:
     average: float = 0.98
     looks: int = 20
     patience: int = 6
-    judge_from: float = 0.0
     zones: int = 3
     watched: int = 60
     watched_rays: int | None = None
@@ -122,8 +121,6 @@ class GazeSettings:
             raise ValueError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
         if self.loss not in LOSSES:
             raise ValueError(f'the loss must be one of {", ".join(LOSSES)}, got "{self.loss}"')
-        if not 0 <= self.judge_from < 1:
-            raise ValueError(f"judge_from must be a share of the run in [0, 1), got {self.judge_from}")
         if min(self.probes, self.directions, self.rays, self.looks) < 1 or min(self.weight_decay, self.integral) < 0 or min(self.zones, self.patience) < 0:
             raise ValueError(f"a training needs probes, directions and looks, and nothing negative, got {self}")
 

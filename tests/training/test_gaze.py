@@ -176,13 +176,6 @@ def test_validation_stops_and_the_best_is_fitted_again(rgb):
     assert {s.stage for s in states} == {"probes", "fit", "refit"} and states[-1].done == 1
     assert 0 < v["rays_held_out"] < len(rays) and json.loads(json.dumps(about, allow_nan=False)) == about
     assert field.config == SMALL
-    # Under a large learning rate the first looks end a run too early, unless they do not count.
-    astray = replace(settings, learning_rate=0.3, final_rate=1.0, patience=1, refit=False)
-    best = [gaze_run.train_gaze(rays, medium, box, SMALL, replace(astray, judge_from=share), PROBES, namespace("llvm"))[1]["validation"]
-            for share in (0, 0.9)]
-    assert best[0]["best_step"] < 12 == best[1]["best_step"] and best[0]["loss"] > best[1]["loss"]
-    with pytest.raises(ValueError, match="judge_from"):
-        replace(settings, judge_from=1.0)
 
 
 def test_a_place_made_of_hits(rgb, rays, tmp_path):
