@@ -205,7 +205,7 @@ def _fit(supervision: Supervision, watched: Supervision | None, box, config, set
                     recent = trainer.measure(watched)
                     out.history.append({"steps": trainer.steps, **_rounded(recent)})
                     out.since += 1
-                    if out.scores is None or recent.loss < out.scores.loss:
+                    if out.scores is None or np.isnan(out.scores.loss) or recent.loss < out.scores.loss:
                         out.weights, out.best_step, out.scores, out.since = trainer.weights(), trainer.steps, recent, 0
                 file.keep("fit", trainer, out.found(), out.weights)
                 say(GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, recent))
