@@ -70,9 +70,7 @@ def make_test(rays: Rays, centres: np.ndarray, radius: float, kappa: float = 20.
     """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, with a kernel of ``kappa``.
 
     Raises ``ValueError`` where none has."""
-    from scipy.spatial import cKDTree
-
-    enough = cKDTree(rays.origin).query_ball_point(centres, radius, return_length=True) >= min_rays
+    enough = _enough(rays, centres, radius, min_rays)
     if not enough.any():
         raise ValueError(f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; lower min_rays")
     probes = place_probes(rays, radius, queries=centres[enough], cap=cap, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query")
@@ -98,6 +96,13 @@ def make_test(rays: Rays, centres: np.ndarray, radius: float, kappa: float = 20.
     truth = np.einsum("pn,pnd->pd", counts / counts.sum(axis=1, keepdims=True), parts)
     names = tuple(rays.persons[i] for i in present)
     return GazeTest(centres[enough], d, truth, parts, counts, names, at, np.searchsorted(present, person[which]), others)
+
+
+def _enough(rays: Rays, centres: np.ndarray, radius: float, min_rays: int) -> np.ndarray:
+    """Which of ``centres`` (P,) have ``min_rays`` rays within ``radius`` metres."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(rays.origin).query_ball_point(centres, radius, return_length=True) >= min_rays
 
 
 def evaluate_gaze(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, resamples: int = 200, seed: int = 0) -> list[dict]:
@@ -166,12 +171,10 @@ def split_half(test_side: Rays, centres: np.ndarray, radius: float, kappa: float
     if len(np.unique(test_side.person)) < 2:
         return None
     halves = [test_side.select(mask) for mask in split_by_person(test_side, seed=seed)]
-    try:
-        first = make_test(halves[0], centres, radius, kappa, min_rays=min_rays)
-        second = make_test(halves[1], first.centres, radius, kappa, min_rays=min_rays)
-        first = make_test(halves[0], second.centres, radius, kappa, min_rays=min_rays)
-    except ValueError:
+    both = np.logical_and(*(_enough(half, centres, radius, min_rays) for half in halves))
+    if not both.any():
         return None
+    first = make_test(halves[0], centres[both], radius, kappa, min_rays=min_rays)
     probes = place_probes(halves[1], radius, queries=first.centres, cap=1024, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query")
     predicted = lambda positions, directions: probes.density(directions)
     row = evaluate_gaze(first, {"split half": predicted}, blind, resamples=0)[0]

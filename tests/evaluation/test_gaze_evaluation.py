@@ -127,3 +127,15 @@ def test_the_command(rgb, rays, tmp_path, capsys):
     crowd(seed=1).save(tmp_path / "others.npz")
     code, said = nerg("eval", "gaze", gaze, tmp_path / "others.npz")
     assert code == 1 and "trained on other rays" in said
+
+
+def test_halves_of_the_people_are_compared_where_both_were(rays, test_set):
+    row = evaluation.split_half(rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, uniform(), min_rays=20)
+    assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
+    nobody = np.array([[40.0, 0, 0]])
+    assert evaluation.split_half(rays, nobody, 0.6, 20.0, uniform(), min_rays=20) is None
+    alone = rays.select(rays.person == 0)
+    assert evaluation.split_half(alone, test_set.centres, 0.6, 20.0, uniform(), min_rays=20) is None
+    with pytest.raises(ValueError, match="kappa is negative"):
+        # What is wrong is said, and not taken for "nobody was there".
+        evaluation.split_half(rays, test_set.centres, 0.6, -1.0, uniform(), min_rays=20)
