@@ -15,6 +15,10 @@ from .observer_map import _fingerprint, _indices
 COUNT = 1 << 17
 """Directions of an integral: enough for a thousandth at depths that jump from surface to surface."""
 
+_FILL = 1 << 14
+"""Directions whose depths fill those that escape. Always the same: filled from its own directions, an integral of more of them
+would be another one, by up to some per cent where half of them escape."""
+
 
 class GazeIntegral:
     """Of ``gaze`` (``media.GazeMedium``) at ``p_o`` (Point3f, one lane) in ``place``; see ``value``.
@@ -35,13 +39,7 @@ class GazeIntegral:
             self.directions, self.distance, self.escaped = depths.directions, depths.distance, depths.escaped
             return
         with dr.suspend_grad():
-            i = dr.arange(mi.Float, count)
-            z = 1 - (2 * i + 1) / count
-            # Turns of the golden angle, of which whole ones are dropped in double precision.
-            turns = dr.arange(mi.Float64, count) * (1.5 - 0.5 * math.sqrt(5))
-            sin, cos = dr.sincos(mi.Float(dr.two_pi * (turns - dr.floor(turns))))
-            r = dr.sqrt((1 - z) * (1 + z))
-            self.directions = mi.Vector3f(r * cos, r * sin, z)
+            self.directions = spiral(count)
             self.distance, self.escaped = self._depths(place, settings, kind, surface_opacity)
             dr.eval(self.directions, self.distance, self.escaped)
 
@@ -51,24 +49,29 @@ class GazeIntegral:
         config, width = self.gaze.field.config, dr.width(self.directions)
         if getattr(config, "geometry", None) == "none":
             return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
-        everywhere = dr.full(mi.Bool, True, width)
-        view = place.look(mi.Ray3f(self.center, self.directions), everywhere, settings)
-        met = everywhere & view.meets(surface_opacity)
-        depth = dr.select(met, view.depth(kind, met), self._beyond())
+
+        def trace(directions):
+            everywhere = dr.full(mi.Bool, True, dr.width(directions))
+            view = place.look(mi.Ray3f(self.center, directions), everywhere, settings)
+            met = everywhere & view.meets(surface_opacity)
+            return met, dr.select(met, view.depth(kind, met), self._beyond(directions))
+
+        met, depth = trace(self.directions)
         if getattr(config, "escaped", None) == "nearest":
-            known, d = np.array(met), np.array(self.directions).T
-            depth = np.array(depth)
-            if known.any() and not known.all():
-                depth[~known] = nearest_depth(d[known], depth[known], d[~known])
+            escaped, depth, few = ~np.array(met), np.array(depth), spiral(_FILL)
+            known, distance = (np.array(v) for v in trace(few))
+            if escaped.any() and known.any():
+                seen, wanted = np.array(few).T[known], np.array(self.directions).T[escaped]
+                depth[escaped] = nearest_depth(seen, distance[known], wanted)
             depth = mi.Float(depth)
         return depth, ~met
 
-    def _beyond(self):
+    def _beyond(self, directions):
         """Where a ray that meets nothing ends: on the gaze field's box, or its diagonal away."""
         from .ray_box import intersect_box
 
         box, local = self.gaze.field.box, self.gaze.to_world
-        near, far = intersect_box(local.point_to_local(self.center), local.vector_to_local(self.directions), box.lower, box.upper)
+        near, far = intersect_box(local.point_to_local(self.center), local.vector_to_local(directions), box.lower, box.upper)
         return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * local.scale)
 
     def serves(self, p_o, place, settings, kind, surface_opacity) -> bool:
@@ -91,6 +94,19 @@ class GazeIntegral:
         o = self.center + dr.zeros(type(self.center), dr.width(self.directions))
         emit, capture = self.gaze.unnormalized(o + self.directions * self.distance, o, self.directions, True, self.escaped)
         return dr.mean(emit * capture + dr.zeros(type(self.distance), dr.width(self.distance))) * (4 * dr.pi)
+
+
+def spiral(count: int):
+    """``count`` directions of equal area (Vector3f) on a golden-angle spiral: ``attention.sphere``'s, made on the device."""
+    import mitsuba as mi
+
+    i = dr.arange(mi.Float, count)
+    z = 1 - (2 * i + 1) / count
+    # Turns of the golden angle, of which whole ones are dropped in double precision.
+    turns = dr.arange(mi.Float64, count) * (1.5 - 0.5 * math.sqrt(5))
+    sin, cos = dr.sincos(mi.Float(dr.two_pi * (turns - dr.floor(turns))))
+    r = dr.sqrt((1 - z) * (1 + z))
+    return mi.Vector3f(r * cos, r * sin, z)
 
 
 def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
