@@ -262,7 +262,7 @@ def main(argv=None) -> None:
     data = validation(data) if args.validate else data
     if any(v.has_alpha or v.mask is not None for v in data.train):
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
-    settings = RadianceSettings(minutes=args.minutes, settle=2.0, empty_weight=0.0, thin_least=1.0, reach=0.0)
+    settings = RadianceSettings(minutes=args.minutes, settle=2.0, empty_weight=0.0, grid_decay=0.0, thin_least=1.0, reach=0.0)
     make = lambda: RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
     args.out.mkdir(parents=True, exist_ok=True)
     ours, judge = make(), make()

@@ -50,6 +50,15 @@ def depth_loss(weight, tau, samples: Samples, pixels: PixelBatch, margin: float,
     return dr.select(pixels.depth > 0, loss, 0)
 
 
+def feature_decay(features):
+    """Mean square (Float) of a grid's ``features``.
+
+    What many rays see outweighs it, as each feature has one share in millions. Features that few rays have shaped, or chance
+    alone, it takes back to 0: Adam moves all alike, however small their derivatives are.
+    """
+    return dr.mean(dr.square(features))
+
+
 def distortion_loss(weight, samples: Samples, scale: float):
     """Loss a ray that draws its weight together: Σ_ij w_i w_j |m_i - m_j| + Σ_i w_i² δ_i / 3 with midpoints m and lengths
     δ of the samples, in units of ``scale`` (Barron et al. 2022, mip-NeRF 360, eq. 15; summed in O(n) as samples are

@@ -19,7 +19,7 @@ from ..field.hashgrid import HashGrid
 from ..field.radiance import RadianceConfig, RadianceField
 from .compositing import damp_near, weights
 from .density_grid import DensityGrid
-from .losses import color_loss, composite, depth_loss, distortion_loss
+from .losses import color_loss, composite, depth_loss, distortion_loss, feature_decay
 from .model import density, density_color, density_of
 from .pixels import PixelBank
 from .preview import Preview, psnr, render_view
@@ -176,7 +176,7 @@ class RadianceTrainer:
             loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
         loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
-        dr.backward(loss + self._clear(parameters))
+        dr.backward(loss + self._clear(parameters) + s.grid_decay * feature_decay(parameters["grid.table"]))
         self.optimiser.set_learning_rate(s.rate(self.progress))
         self.optimiser.step()
         self.loss, self.samples = loss, samples.count

@@ -43,7 +43,9 @@ class RadianceSettings:
     cameras see stay empty; ``settle``: share of the run after which all cells that rendering will visit are sampled.
     ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like part of it, which
     clears early fog cheaply. ``huber``: error at which the colour loss turns linear (colours are in 0..1);
-    ``empty_weight``: weight of the penalty on density in cells that are not sampled; ``depth_weight``: of the depth terms
+    ``empty_weight``: weight of the penalty on density in cells that are not sampled; ``grid_decay``: of the mean square of
+    the grid's features, which lets go of what few rays have shaped (Barron et al. 2023, Zip-NeRF, there level by level);
+    ``depth_weight``: of the depth terms
     where depth is known, falling to ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in
     march steps, within which a ray's weight should lie; ``replay``: share of the rays drawn from those whose depth was
     wrong; ``distortion_weight``: of the loss that draws a ray's weight together (0: none).
@@ -74,6 +76,7 @@ class RadianceSettings:
     stride_share: float = 0.33
     huber: float = 1.0
     empty_weight: float = 0.003
+    grid_decay: float = 0.1
     depth_weight: float = 0.02
     final_depth: float = 0.25
     depth_margin: float = 1.5
@@ -85,8 +88,9 @@ class RadianceSettings:
             raise ValueError("give the length of the training either in steps or in minutes")
         if (self.steps if self.steps is not None else self.minutes) <= 0:
             raise ValueError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
-        if self.depth_weight < 0 or self.distortion_weight < 0:
-            raise ValueError(f"weights of losses must be 0 or more, got {self.depth_weight} and {self.distortion_weight}")
+        given = self.depth_weight, self.distortion_weight, self.grid_decay
+        if min(given) < 0:
+            raise ValueError(f"weights of losses must be 0 or more, got {', '.join(map(str, given))}")
         if not (self.thin_sure > 0 and 0 < self.thin_least <= 1):
             raise ValueError(f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}")
         if not (self.stride_share >= 0 and self.reach_share > 0):

@@ -15,7 +15,7 @@ from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.intrinsics import Intrinsics
 from nerg_mi.training.compositing import damp_near, ray_sum
-from nerg_mi.training.losses import color_loss, composite, depth_loss
+from nerg_mi.training.losses import color_loss, composite, depth_loss, feature_decay
 from nerg_mi.training.model import density_color
 from nerg_mi.training.pixels import PixelBank
 from nerg_mi.training.preview import render_view
@@ -64,7 +64,7 @@ def dataset():
 
 def settings(**changes):
     given = {"steps": 300, "batch": 2**12, "resolution": 32, "march_step": 1 / 64, "stride_share": 0.2, "seed": 1,
-             "depth_weight": 2e-3, **changes}
+             "depth_weight": 2e-3, "grid_decay": 1e-3, **changes}
     return RadianceSettings(**given)
 
 
@@ -238,3 +238,23 @@ def test_what_a_mask_hides_does_not_count_in_the_progress(dataset):
 def test_a_box_that_no_camera_sees_is_refused(dataset):
     with pytest.raises(ValueError, match="--aabb"):
         RadianceTrainer(dataset.train, Box((50, 50, 50), (51, 51, 51)), TINY, settings(), ns)
+
+
+def test_features_that_no_ray_shapes_are_let_go(dataset):
+    x = ns.Float([1, -2, 0, 4])
+    dr.enable_grad(x)
+    y = feature_decay(x)
+    dr.backward(y)
+    assert float(y[0]) == pytest.approx(21 / 4) and np.allclose(dr.grad(x).numpy(), [0.5, -1, 0, 2])
+
+    def left(weight):
+        # Nearer than a reach of a thousand sides: nothing of the pictures reaches the features.
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(reach=1000.0, empty_weight=0.0, grid_decay=weight), ns, depth=False)
+        trainer.optimiser["grid.table"] = dr.full(ns.Float, 0.5, len(trainer.live.parameters()["grid.table"]))
+        for _ in range(10):
+            trainer.step()
+        return float(dr.mean(dr.abs(trainer.optimiser["grid.table"]))[0])
+
+    assert left(0.1) < 0.4 < left(0.0)
+    with pytest.raises(ValueError, match="must be 0 or more"):
+        settings(grid_decay=-1.0)
