@@ -142,7 +142,7 @@ def main(argv=None) -> list[dict]:
         controls = settings if r is not None else replace(settings, **VIEWS_ALONE)
         field, about = train_gaze(r, place.medium, place.box, config, controls, how, ns, views=v)
         spent[label] = time.process_time() - started
-        print(f"{label}: best after {about['validation']['best_step']} steps, {spent[label]:.0f} s of CPU")
+        print(f"{label}: {about['steps']} steps, {spent[label]:.0f} s of CPU")
         methods[label] = gaze_field(field, place.medium)
     rows = score_rows(truth, tests, directions, methods)
     print_scores(rows, f"{len(tests)} held-out positions against the law, over the sphere ({len(stood)} places trained on)")

@@ -60,7 +60,7 @@ def train_gaze(
     steps: Annotated[Optional[int], typer.Option(help="Or: train for so many steps. Default: the recipe's.")] = None,
     learning_rate: Annotated[Optional[float], typer.Option(help="Learning rate at the start.")] = None,
     weight_decay: Annotated[Optional[float], typer.Option(help="Decoupled weight decay.")] = None,
-    zones: Annotated[int, typer.Option(help="Zones of positions watched as validation; 0: none.")] = 3,
+    zones: Annotated[int | None, typer.Option(help="Zones of positions watched as validation, whose best weights count; 0: none. Default: the recipe's.")] = None,
     refit: Annotated[bool, typer.Option(help="Train again on all rays once the best number of steps is known.")] = True,
     test_zones: Annotated[int, typer.Option(help="Zones of test positions that are left out of everything; 0: none.")] = 0,
     test_positions: Annotated[int, typer.Option(help="Test positions in them.")] = 64,

@@ -11,7 +11,7 @@ from typing import Callable
 import numpy as np
 
 from ..attention.kde import SphericalKde
-from ..attention.probes import Probes, place_probes
+from ..attention.probes import Probes, person_weights, place_probes
 from ..attention.rays import Rays
 from ..attention.sphere import fibonacci_directions
 from ..field.box import Box
@@ -22,8 +22,9 @@ from ..transport.trace import trace_depth
 from .gaze_semantics import semantic_features
 from .gaze_settings import ProbeSettings
 
-# Concentration of the blind density's kernels, and of how many rays it is made at most.
-BLIND_KAPPA = 50.0
+# Concentration of the blind density's kernels, and of how many rays it is made at most. Wide, because the field learns what it lacks
+# from many probes, but nothing takes back the peaks of a few people, which others do not share.
+_BLIND_KAPPA = 10.0
 _BLIND_RAYS = 1 << 16
 # How far everything is where no geometry is known, in the field's units.
 NOWHERE = 2.0
@@ -109,15 +110,17 @@ def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align:
     out = turned(seed)
     if s.fresh:
         out = replace(out, renew=lambda epoch: turned((seed, epoch)))
-    return replace(out, blind=blind_prior(rays, config.prior, align, seed)) if log else out
+    return replace(out, blind=blind_prior(rays, config.prior, align, seed, s.weights)) if log else out
 
 
-def blind_prior(rays: Rays, rows: int, align: Similarity | None = None, seed: int = 0) -> np.ndarray:
-    """``field.log_gaze.blind_table`` of what people look at wherever they stand, in the field's frame."""
+def blind_prior(rays: Rays, rows: int, align: Similarity | None = None, seed: int = 0, weights: str = "equal") -> np.ndarray:
+    """``field.log_gaze.blind_table`` of what people look at wherever they stand, in the field's frame. ``weights``: with
+    ``person`` all people count alike, however many rays are theirs."""
     align = align or Similarity()
     which = np.random.default_rng(seed).permutation(len(rays))[:_BLIND_RAYS]
     # The table's directions in the rays' frame: its inverse is a rotation's transpose.
-    kde = SphericalKde(rays.direction[which], np.array([0, len(which)]), BLIND_KAPPA)
+    each = person_weights(rays)[which] if weights == "person" else None
+    kde = SphericalKde(rays.direction[which], np.array([0, len(which)]), _BLIND_KAPPA, each)
     density = kde.evaluate(table_directions(rows) @ (align.matrix[:3, :3] / align.scale))[0]
     return blind_table(density, rows, kde.ns, fibonacci_directions(1 << 16))
 

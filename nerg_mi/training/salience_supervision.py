@@ -18,15 +18,17 @@ from ..field.box import Box
 from ..field.log_gaze import LogGazeConfig, blind_table, table_directions
 from ..transport.media import Similarity
 from .gaze_settings import ProbeSettings
-from .gaze_supervision import BLIND_KAPPA, Supervision, observe, supervise_rays
+from .gaze_supervision import Supervision, observe, supervise_rays
 
 # Of ``GazeSettings``, where there are no rays: what views share comes late, after a plateau at their blind density.
-VIEWS_ALONE = {"patience": 10}
+VIEWS_ALONE = {"steps": 200, "zones": 3, "patience": 10}
 # Directions a pixel of a view, so that hardly any is left out.
 _PER_PIXEL = 4
 # Share of the views that validation watches.
 _WATCHED = 0.12
 _ROUNDS = 100
+# Concentration of the kernels that smooth the views' blind density.
+_BLIND_KAPPA = 50.0
 
 
 def supervise_views(views: list[SalienceView], medium, box: Box, settings: ProbeSettings, seed: int = 0, semantic: str = "",
@@ -83,7 +85,7 @@ def blind_of_views(views: list[SalienceView], rows: int) -> np.ndarray:
 
     The density b of greatest likelihood when view v sees b given its part, found by Hunter's (2004) iteration for choices
     among a few: b = Σ_v p_v / Σ_v 1_v / b(v). One more view, of the whole sphere, is uniform: it links those that share nothing.
-    What no view shows is looked at as what lies next to it is. Smoothed as the density of rays is.
+    What no view shows is looked at as what lies next to it is.
     """
     from scipy.spatial import cKDTree
 
@@ -107,7 +109,7 @@ def blind_of_views(views: list[SalienceView], rows: int) -> np.ndarray:
     shown = known.any(axis=0)
     if shown.any():
         blind = blind[np.flatnonzero(shown)[cKDTree(directions[shown]).query(directions)[1]]]
-    kde = SphericalKde(directions, np.array([0, len(area)]), BLIND_KAPPA, blind * area)
+    kde = SphericalKde(directions, np.array([0, len(area)]), _BLIND_KAPPA, blind * area)
     return blind_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(1 << 16))
 
 

@@ -7,12 +7,14 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.attention.rays import Rays
 from nerg_mi.attention.sphere import fibonacci_directions
 from nerg_mi.field.backend import namespace
+from nerg_mi.field.log_gaze import table_directions
 from nerg_mi.training.gaze_likelihood import LikelihoodTrainer, _log_mean_exp
 from nerg_mi.training.gaze_recipes import gaze_recipe
 from nerg_mi.training.gaze_settings import GazeSettings
-from nerg_mi.training.gaze_supervision import Supervision
+from nerg_mi.training.gaze_supervision import Supervision, blind_prior
 from nerg_mi.training.log_gaze_model import log_gaze, used_parameters
 from nerg_mi.transport.gaze_integral import nearest_depth
 from ..field.test_log_gaze import BOX, SMALL, jit, made, vectors
@@ -118,9 +120,22 @@ def test_holes_take_the_depth_around_them():
 
 
 def test_recipes():
+    assert gaze_recipe().settings["zones"] == 0 and GazeSettings(**gaze_recipe("small").settings).zones == 3
     assert gaze_recipe().config.normalized and gaze_recipe("paper").config.activation == "linear"
     assert gaze_recipe("small", "emit").config.variant == "emit"
     with pytest.raises(ValueError, match="default, small, paper"):
         gaze_recipe("best")
     with pytest.raises(ValueError, match="of its own"):
         gaze_recipe("default", activation="exp")
+
+
+def test_the_blind_density_counts_people_or_rays():
+    """Nine rays of one person, one of another, elsewhere: the ratio of the kernels' peaks."""
+    direction = np.array(9 * [[1.0, 0, 0]] + [[0, 1.0, 0]])
+    rays = Rays(np.arange(10.0), np.array(9 * [0] + [1]), ("a", "b"), np.zeros((10, 3)), direction, np.ones(10))
+    for weights, ratio in (("equal", 9), ("person", 1)):
+        table = np.exp(blind_prior(rays, 64, weights=weights).astype(np.float64).ravel())
+        at = lambda d: table[np.argmax(table_directions(64) @ d)]
+        tail = np.exp(-10.0)  # of the other kernel, at a right angle
+        expected = (ratio + tail) / (1 + ratio * tail)
+        assert at((1, 0, 0)) / at((0, 1, 0)) == pytest.approx(expected, rel=0.02), weights
