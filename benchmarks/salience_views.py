@@ -99,7 +99,7 @@ def main(argv=None) -> list[dict]:
     from nerg_mi.training.gaze_recipes import gaze_recipe
     from nerg_mi.training.gaze_run import train_gaze
     from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings
-    from nerg_mi.training.salience_supervision import VIEWS_ALONE, blind_of_views
+    from nerg_mi.training.salience_supervision import blind_of_views
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--places", type=int, default=150)
@@ -135,11 +135,11 @@ def main(argv=None) -> list[dict]:
     recipe = gaze_recipe(args.recipe)
     # As the command does where there are no rays; and the scores of the others then compare.
     config = place.told(recipe.config if args.recipe == "default" else replace(recipe.config, normalized=True))
-    settings = GazeSettings(**recipe.settings | {"seed": args.seed} | ({"steps": args.steps} if args.steps else {}))
+    given = {"seed": args.seed} | ({"steps": args.steps} if args.steps else {})
     how, spent = ProbeSettings(**recipe.probes | {"radius": RADIUS}), {}
     for label, r, v in ((f"rays, {len(rays):,}", rays, ()), (f"views, {len(views)}", None, views), ("both", rays, views)):
         started = time.process_time()
-        controls = settings if r is not None else replace(settings, **VIEWS_ALONE)
+        controls = GazeSettings(**recipe.settings | (recipe.views_alone if r is None else {}) | given)
         field, about = train_gaze(r, place.medium, place.box, config, controls, how, ns, views=v)
         spent[label] = time.process_time() - started
         print(f"{label}: {about['steps']} steps, {spent[label]:.0f} s of CPU")

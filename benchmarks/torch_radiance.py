@@ -284,7 +284,7 @@ def main(argv=None) -> None:
             judge.averaged = {k: type(v)(peer.averaged[k].numpy()) for k, v in judge.averaged.items()}
         path = args.out / f"{name}.safetensors"
         save_radiance((judge if trainer is peer else ours).field(), path, {"trainer": name})
-        scores = score_views(path, data.held_out)
+        scores = score_views(path, data.held_out, 4)
         rows.append({"trainer": name, "minutes": args.minutes, "steps": steps, "steps_per_s": round(steps / seconds, 2),
                      "psnr": round(scores["psnr_mean"], 2), "ssim": round(scores["ssim_mean"], 4), "load_before": round(load, 1)})
         print(rows[-1], flush=True)

@@ -30,7 +30,7 @@ def eval_radiance(
     width: Annotated[Optional[int], typer.Option(help="Width of the pictures. Default: as it was trained.")] = None,
     scale: Annotated[float, typer.Option(help="As it was trained with.")] = 1.0,
     coordinates: Annotated[str, typer.Option(help="As it was trained with.")] = "file",
-    spp: Annotated[int, typer.Option(min=1, help="Rays a pixel: of 4, their scatter costs a tenth of a decibel at 28.")] = 16,
+    spp: Annotated[int, typer.Option(min=1, help="Rays a pixel. The scatter of few is part of the score.")] = 16,
     output: Annotated[
         Optional[Path], typer.Option("-o", "--output", help="Folder for the pictures. Default: FIELD.eval")
     ] = None,

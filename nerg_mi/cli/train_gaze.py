@@ -60,7 +60,7 @@ def train_gaze(
     steps: Annotated[Optional[int], typer.Option(help="Or: train for so many steps. Default: the recipe's.")] = None,
     learning_rate: Annotated[Optional[float], typer.Option(help="Learning rate at the start.")] = None,
     weight_decay: Annotated[Optional[float], typer.Option(help="Decoupled weight decay.")] = None,
-    zones: Annotated[int | None, typer.Option(help="Zones of positions watched as validation, whose best weights count; 0: none. Default: the recipe's.")] = None,
+    zones: Annotated[Optional[int], typer.Option(help="Zones of positions watched as validation, whose best weights count; 0: none. Default: the recipe's.")] = None,
     refit: Annotated[bool, typer.Option(help="Train again on all rays once the best number of steps is known.")] = True,
     test_zones: Annotated[int, typer.Option(help="Zones of test positions that are left out of everything; 0: none.")] = 0,
     test_positions: Annotated[int, typer.Option(help="Test positions in them.")] = 64,
@@ -89,7 +89,7 @@ def train_gaze(
     from ..training.gaze_recipes import gaze_recipe
     from ..training.gaze_run import hold_out, train_gaze
     from ..training.gaze_settings import GazeSettings, ProbeSettings
-    from ..training.salience_supervision import VIEWS_ALONE, far_views
+    from ..training.salience_supervision import far_views
 
     if sum(v is not None for v in (field, scene, geometry)) != 1:
         raise ValueError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
@@ -111,7 +111,7 @@ def train_gaze(
     chosen = gaze_recipe(recipe, gaze, activation, size)
     if recipe == "default" and (semantic or begin == "field" or loss or normalized or integral is not None):
         raise ValueError("--semantic, --begin field, --loss, --integral and --normalized belong to fields of the recipes small and paper; add --recipe small")
-    settings = GazeSettings(**chosen.settings | (VIEWS_ALONE if rays is None else {}) | _given(
+    settings = GazeSettings(**chosen.settings | (chosen.views_alone if rays is None else {}) | _given(
         minutes=minutes, steps=steps, seed=seed, loss=loss, zones=zones, refit=refit,
         frozen=freeze, learning_rate=learning_rate, weight_decay=weight_decay, integral=integral,
     ) | ({"steps": None} if minutes is not None and steps is None else {}))  # fmt: skip

@@ -83,7 +83,7 @@ class Rendered:
 class Renderer:
     """Renders the field in a checkpoint as the cameras of a data set see it. Needs a Mitsuba variant."""
 
-    def __init__(self, field: str | Path, spp: int = 4):
+    def __init__(self, field: str | Path, spp: int = 16):
         import mitsuba as mi
 
         self.spp = spp
@@ -122,7 +122,7 @@ class Renderer:
         return Rendered(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
 
 
-def score_views(field: str | Path, views: list[View], spp: int = 4, pictures: Path | None = None, on_view=None) -> dict:
+def score_views(field: str | Path, views: list[View], spp: int = 16, pictures: Path | None = None, on_view=None) -> dict:
     """Scores (JSON) of the field in a checkpoint on ``views``; writes each picture beside its truth into ``pictures``.
 
     ``psnr``, ``ssim``: a list with one entry a view, in the order of ``views`` (names); ``*_mean``: their means;

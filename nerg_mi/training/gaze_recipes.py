@@ -1,7 +1,7 @@
 """Ready-made ways to train a gaze field, by one word."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ..field.gaze import GazeConfig
 from ..field.log_gaze import LogGazeConfig
@@ -12,11 +12,14 @@ RECIPES = ("default", "small", "paper")
 
 @dataclass(frozen=True)
 class Recipe:
-    """``config``: of the field; ``settings``, ``probes``: keywords of ``GazeSettings`` and ``ProbeSettings`` (steps too)."""
+    """``config``: of the field; ``settings``, ``probes``: keywords of ``GazeSettings`` and ``ProbeSettings`` (steps too);
+    ``views_alone``: those of ``settings`` that differ where salience images are all there is."""
 
     config: GazeConfig | LogGazeConfig
     settings: dict
     probes: dict
+    # What views share comes late, after a plateau at their blind density.
+    views_alone: dict = field(default_factory=lambda: {"patience": 10})
 
 
 def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation: str | None = None, size: str | None = None) -> Recipe:
@@ -33,14 +36,15 @@ def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation
             raise ValueError("the default recipe has an activation and sizes of its own; choose --recipe small or paper to set them")
         return Recipe(
             LogGazeConfig(variant=variant, mix=0.15),
-            # No zones: fits without the zones that a validation takes, and all around them, have a third of the probes, and are at their
-            # best too early for all of them. The schedule ends where longer ones only follow the people at hand.
+            # No zones: fits without those that a validation takes, and all around them, lack most of the probes, and are at their best
+            # too early for all of them. The schedule ends where longer ones only follow the people at hand.
             {"steps": 120, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 24, "directions": 512, "rays": 64, "learning_rate": 3e-3,
              "final_rate": 0.1, "hold": 0.5, "weight_decay": 1.0, "average": 0.95, "watched_rays": 64},
             # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
             {"placement": "blue", "spacing": 0.08, "count": 1024, "min_rays": 1, "kappa": 20.0, "directions": 2048,
              # Not by time: whoever stays long at a place says little of others.
              "weights": "person"},
+            {"steps": 200, "zones": 3, "patience": 10},
         )
     if name == "small":
         return Recipe(sized_gaze_config(size or "small", variant, activation or "softplus"), {"steps": 600}, {})

@@ -20,15 +20,13 @@ from ..transport.media import Similarity
 from .gaze_settings import ProbeSettings
 from .gaze_supervision import Supervision, observe, supervise_rays
 
-# Of ``GazeSettings``, where there are no rays: what views share comes late, after a plateau at their blind density.
-VIEWS_ALONE = {"steps": 200, "zones": 3, "patience": 10}
 # Directions a pixel of a view, so that hardly any is left out.
 _PER_PIXEL = 4
 # Share of the views that validation watches.
 _WATCHED = 0.12
 _ROUNDS = 100
 # Concentration of the kernels that smooth the views' blind density.
-_BLIND_KAPPA = 50.0
+_SMOOTHING = 50.0
 
 
 def supervise_views(views: list[SalienceView], medium, box: Box, settings: ProbeSettings, seed: int = 0, semantic: str = "",
@@ -109,7 +107,7 @@ def blind_of_views(views: list[SalienceView], rows: int) -> np.ndarray:
     shown = known.any(axis=0)
     if shown.any():
         blind = blind[np.flatnonzero(shown)[cKDTree(directions[shown]).query(directions)[1]]]
-    kde = SphericalKde(directions, np.array([0, len(area)]), _BLIND_KAPPA, blind * area)
+    kde = SphericalKde(directions, np.array([0, len(area)]), _SMOOTHING, blind * area)
     return blind_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(1 << 16))
 
 

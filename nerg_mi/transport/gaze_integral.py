@@ -39,7 +39,7 @@ class GazeIntegral:
             self.directions, self.distance, self.escaped = depths.directions, depths.distance, depths.escaped
             return
         with dr.suspend_grad():
-            self.directions = spiral(count)
+            self.directions = _spiral(count)
             self.distance, self.escaped = self._depths(place, settings, kind, surface_opacity)
             dr.eval(self.directions, self.distance, self.escaped)
 
@@ -58,12 +58,14 @@ class GazeIntegral:
 
         met, depth = trace(self.directions)
         if getattr(config, "escaped", None) == "nearest":
-            escaped, depth, few = ~np.array(met), np.array(depth), spiral(_FILL)
-            known, distance = (np.array(v) for v in trace(few))
-            if escaped.any() and known.any():
-                seen, wanted = np.array(few).T[known], np.array(self.directions).T[escaped]
-                depth[escaped] = nearest_depth(seen, distance[known], wanted)
-            depth = mi.Float(depth)
+            escaped = ~np.array(met)
+            if escaped.any():
+                few = _spiral(_FILL)
+                known, distance = (np.array(v) for v in trace(few))
+                if known.any():
+                    depth = np.array(depth)
+                    depth[escaped] = nearest_depth(np.array(few).T[known], distance[known], np.array(self.directions).T[escaped])
+                    depth = mi.Float(depth)
         return depth, ~met
 
     def _beyond(self, directions):
@@ -96,7 +98,7 @@ class GazeIntegral:
         return dr.mean(emit * capture + dr.zeros(type(self.distance), dr.width(self.distance))) * (4 * dr.pi)
 
 
-def spiral(count: int):
+def _spiral(count: int):
     """``count`` directions of equal area (Vector3f) on a golden-angle spiral: ``attention.sphere``'s, made on the device."""
     import mitsuba as mi
 

@@ -121,6 +121,9 @@ def test_holes_take_the_depth_around_them():
 
 def test_recipes():
     assert gaze_recipe().settings["zones"] == 0 and GazeSettings(**gaze_recipe("small").settings).zones == 3
+    # The one has to be told to look longer where there are views alone; the others' lengths stay their own.
+    assert gaze_recipe().views_alone["steps"] > gaze_recipe().settings["steps"] and gaze_recipe().views_alone["zones"] == 3
+    assert all("steps" not in gaze_recipe(name).views_alone for name in ("small", "paper"))
     assert gaze_recipe().config.normalized and gaze_recipe("paper").config.activation == "linear"
     assert gaze_recipe("small", "emit").config.variant == "emit"
     with pytest.raises(ValueError, match="default, small, paper"):
