@@ -4,6 +4,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ..field.gaze import GazeConfig
+from ..field.hashgrid import HashGridConfig
 from ..field.log_gaze import LogGazeConfig
 from .gaze_settings import SIZES, sized_gaze_config
 
@@ -35,13 +36,13 @@ def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation
         if activation or size:
             raise ValueError("the default recipe has an activation and sizes of its own; choose --recipe small or paper to set them")
         return Recipe(
-            LogGazeConfig(variant=variant, mix=0.15),
+            LogGazeConfig(grid=HashGridConfig(levels=5, log2_rows=14, base=2, finest=32), variant=variant, sh_degree=3, mix=0.05),
             # No zones: fits without those that a validation takes, and all around them, lack most of the probes, and are at their best
             # too early for all of them. The schedule ends where longer ones only follow the people at hand.
-            {"steps": 120, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 24, "directions": 512, "rays": 64, "learning_rate": 3e-3,
-             "final_rate": 0.1, "hold": 0.5, "weight_decay": 1.0, "average": 0.95, "watched_rays": 64},
+            {"steps": 160, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 24, "directions": 512, "rays": 64, "learning_rate": 3e-3,
+             "final_rate": 0.1, "hold": 0.5, "weight_decay": 4.0, "average": 0.95, "watched_rays": 64},
             # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
-            {"placement": "blue", "spacing": 0.08, "count": 1024, "min_rays": 1, "kappa": 20.0, "directions": 2048,
+            {"placement": "blue", "spacing": 0.08, "count": 1024, "min_rays": 1, "kappa": 30.0, "directions": 2048,
              # Not by time: whoever stays long at a place says little of others.
              "weights": "person"},
             {"steps": 200, "zones": 3, "patience": 10},
