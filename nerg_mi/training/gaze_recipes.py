@@ -37,8 +37,8 @@ def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation
             raise ValueError("the default recipe has an activation and sizes of its own; choose --recipe small or paper to set them")
         return Recipe(
             LogGazeConfig(grid=HashGridConfig(levels=5, log2_rows=14, base=2, finest=32), variant=variant, sh_degree=3, mix=0.05),
-            # No zones: fits without those that a validation takes, and all around them, lack most of the probes, and are at their best
-            # too early for all of them. The schedule ends where longer ones only follow the people at hand.
+            # No zones: fits without those that a validation takes, and all around them, lack most of the probes. The decay and the few
+            # harmonics keep longer trainings from following the people at hand: two or three times the steps end alike.
             {"steps": 160, "zones": 0, "loss": "likelihood", "integral": 0.0, "probes": 24, "directions": 512, "rays": 64, "learning_rate": 3e-3,
              "final_rate": 0.1, "hold": 0.5, "weight_decay": 4.0, "average": 0.95, "watched_rays": 64},
             # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
