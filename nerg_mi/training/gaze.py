@@ -99,6 +99,8 @@ class GazeTrainer:
         for k, old in self.averaged.items():
             self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * dr.opaque(self.ns.Float, 1 - decay)
         dr.eval(self.averaged)
+        # Steps are only queued otherwise: their time would count as none, and a run of minutes would go on long after them.
+        dr.sync_thread()
 
     def _backward(self) -> None:
         """Draw a batch, and leave the gradients of its loss in the weights."""
