@@ -6,11 +6,11 @@ architecture, units, bounding box, colour space and provenance.
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
+
+from .atomic import write_bytes
 
 FORMAT = 1
 
@@ -22,26 +22,9 @@ def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray]
     """
     from safetensors.numpy import save
 
-    path = Path(path)
     header = {"nerg": json.dumps({"format": FORMAT, "kind": kind, **metadata}, allow_nan=False)}
     data = save({k: np.ascontiguousarray(v) for k, v in tensors.items()}, metadata=header)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "wb") as f:
-            f.write(data)
-        # mkstemp makes private files; a checkpoint is as readable as any other output.
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    write_bytes(path, data)
 
 
 def _parse(raw: str, path: Path) -> dict:

@@ -16,13 +16,13 @@ from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
 from ..field.log_gaze import LogGazeConfig, LogGazeField
 from ..field.support import RaySupport
+from ..interruption import Interruption
 from ..transport.media import Similarity
 from .gaze import GazeTrainer, Scores
 from .gaze_likelihood import LikelihoodTrainer
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_state import GazeRunFile, digest
 from .gaze_supervision import Supervision
-from .run_state import Interruption
 from .salience_supervision import digest_views, far_views, split_views, supervise_both
 
 

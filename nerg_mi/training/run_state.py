@@ -6,8 +6,6 @@ no fixed order in either.
 from __future__ import annotations
 
 import json
-import signal
-import threading
 from pathlib import Path
 
 import drjit as dr
@@ -83,32 +81,3 @@ def require_same(path: str | Path, then: dict, now: dict) -> None:
             f'the run in "{path}" cannot go on: it was started with other {", ".join(different)}; give the options and the '
             "data set that it was started with, or start anew without --resume"
         )
-
-
-class Interruption:
-    """Ctrl-C between the steps of a run: a context in which it is noted, and raised by ``check``.
-
-    In the middle of a step it would leave weights and random numbers of different steps. The second one is raised at once.
-    """
-
-    def __enter__(self) -> Interruption:
-        self.asked = False
-        # Signals can only be dealt with in the main thread.
-        self._mine = threading.current_thread() is threading.main_thread()
-        if self._mine:
-            self._before = signal.signal(signal.SIGINT, self._note)
-        return self
-
-    def _note(self, *_) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True
-
-    def check(self) -> None:
-        """Raise ``KeyboardInterrupt`` if there was one."""
-        if self.asked:
-            raise KeyboardInterrupt
-
-    def __exit__(self, *error) -> None:
-        if self._mine:
-            signal.signal(signal.SIGINT, self._before)

@@ -36,7 +36,7 @@ def test02_files_are_as_readable_as_others(tmp_path):
     assert stat.S_IMODE(path.stat().st_mode) == stat.S_IMODE(other.stat().st_mode)
 
 
-@pytest.mark.parametrize("fail", ["replace", "metadata", "fdopen"])
+@pytest.mark.parametrize("fail", ["replace", "metadata", "fsync"])
 def test03_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch, fail):
     path = tmp_path / "f.safetensors"
     write_checkpoint(path, "radiance", TENSORS, {"n": 1})

@@ -1,0 +1,36 @@
+"""Ctrl-C between the steps of long work, so that what is being computed stays consistent."""
+
+from __future__ import annotations
+
+import signal
+import threading
+
+
+class Interruption:
+    """A context in which Ctrl-C is noted, and raised by ``check``.
+
+    In the middle of a step it would leave weights and random numbers of different steps, and Mitsuba and Dr.Jit would carry
+    on with what they have begun. Whoever works inside calls ``check`` after every step. The second Ctrl-C is raised at once.
+    """
+
+    def __enter__(self) -> Interruption:
+        self.asked = False
+        # Signals can only be dealt with in the main thread.
+        self._mine = threading.current_thread() is threading.main_thread()
+        if self._mine:
+            self._before = signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def _note(self, *_) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+
+    def check(self) -> None:
+        """Raise ``KeyboardInterrupt`` if there was one."""
+        if self.asked:
+            raise KeyboardInterrupt
+
+    def __exit__(self, *error) -> None:
+        if self._mine:
+            signal.signal(signal.SIGINT, self._before)

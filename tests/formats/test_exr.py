@@ -1,0 +1,54 @@
+"""EXR files hold the channels that they were given, also where Dr.Jit has one thread."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from nerg_mi.formats.exr import write_bitmap_exr, write_exr
+
+
+def test_channels_come_back_in_another_reader(tmp_path, rgb):
+    random = np.random.default_rng(1)
+    names = ("R", "G", "B", "depth.T", "position.X", "position.Y", "position.Z", "n.R", "n.G", "n.B", "gaze.Y")
+    channels = {name: random.normal(size=(7, 5)).astype(np.float32) for name in names}
+    channels["depth.T"][2, 3] = np.inf
+    write_exr(tmp_path / "a.exr", channels, {"seed": "3"})
+    bitmap = rgb.Bitmap(str(tmp_path / "a.exr"))
+    read = dict(zip([f.name for f in bitmap.struct_()], np.moveaxis(np.array(bitmap), 2, 0)))
+    assert read.keys() == channels.keys()
+    assert all(np.array_equal(read[name], channels[name]) for name in names)
+    assert bitmap.metadata()["seed"] == "3"
+
+
+def test_a_bitmap_is_written_as_mitsuba_writes_it(tmp_path, rgb):
+    pixels = np.random.default_rng(2).random((6, 4, 3)).astype(np.float32)
+    rgb.Bitmap(pixels).write(str(tmp_path / "theirs.exr"))
+    write_bitmap_exr(tmp_path / "ours.exr", rgb.Bitmap(pixels))
+    theirs, ours = (rgb.Bitmap(str(tmp_path / f"{name}.exr")) for name in ("theirs", "ours"))
+    assert np.array_equal(np.array(theirs), np.array(ours))
+    assert ours.pixel_format() == theirs.pixel_format() == rgb.Bitmap.PixelFormat.RGB
+
+
+def test_an_attribute_of_the_format_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="dataWindow"):
+        write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 2), np.float32)}, {"dataWindow": "x"})
+
+
+_ONE_THREAD = """
+import sys
+import nerg_mi, mitsuba as mi, drjit as dr, numpy as np
+mi.set_variant("llvm_ad_rgb")
+dr.set_thread_count(1)
+from nerg_mi.formats.exr import write_bitmap_exr
+write_bitmap_exr(sys.argv[1], mi.Bitmap(np.ones((64, 64, 3), np.float32)))
+"""
+
+
+def test_one_thread_is_enough(tmp_path):
+    # Mitsuba's writer never returns here.
+    subprocess.run([sys.executable, "-c", _ONE_THREAD, str(tmp_path / "a.exr")], check=True, timeout=120)
+    assert (tmp_path / "a.exr").stat().st_size > 0
