@@ -1,0 +1,41 @@
+"""Tables of the documentation that commands print: put in place of the one that stands there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table; a bar within a cell is escaped."""
+    cells = [[str(c).replace("|", "\\|").replace("\n", " ") for c in row] for row in rows]
+    lines = [list(map(str, head)), ["---"] * len(head), *cells]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def replace_table(document: str, title: str, text: str) -> str:
+    """``document`` with the first table below the heading ``## title`` exchanged for ``text``, or ``text`` added there.
+
+    Raises ``ValueError`` where there is no such heading.
+    """
+    lines = document.split("\n")
+    if f"## {title}" not in lines:
+        raise ValueError(f'the document has no heading "## {title}" to put a table under; add it')
+    start = lines.index(f"## {title}") + 1
+    stop = next((k for k in range(start, len(lines)) if lines[k].startswith("## ")), len(lines))
+    first = next((k for k in range(start, stop) if lines[k].startswith("|")), None)
+    if first is None:
+        last = stop
+        while last > start and not lines[last - 1].strip():
+            last -= 1
+        return "\n".join([*lines[:last], "", *text.split("\n"), "", *lines[stop:]]).rstrip("\n") + "\n"
+    end = next((k for k in range(first, stop) if not lines[k].startswith("|")), stop)
+    return "\n".join([*lines[:first], *text.split("\n"), *lines[end:]])
+
+
+def update(path: str | Path | None, title: str, text: str) -> None:
+    """Print ``text``, and put it into the page ``path`` (None: only print)."""
+    print(text)
+    if path is not None:
+        path = Path(path)
+        path.write_text(replace_table(path.read_text(encoding="utf-8"), title, text), encoding="utf-8")
