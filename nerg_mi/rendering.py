@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from .errors import NergError, UnusableLLVM, sentence
+from .formats.atomic import replacing
+from .formats.exr import write_bitmap_exr
 
 _FORMATS = (".exr", ".png")
 _PREFERRED = ("cuda_ad_rgb", "llvm_ad_rgb")
@@ -91,7 +93,6 @@ def render_file(
     except RuntimeError as error:
         raise NergError(sentence(error)) from error
 
-    output.parent.mkdir(parents=True, exist_ok=True)
     _write(mi, bitmap, output)
     width, height = bitmap.size()
     seconds = time.perf_counter() - start
@@ -101,9 +102,10 @@ def render_file(
 def _write(mi, bitmap, output: Path) -> None:
     if output.suffix.lower() == ".exr":
         # float32 whatever the component_format of the film, which counts only where the film writes itself
-        bitmap.write(str(output))
+        write_bitmap_exr(output, bitmap)
         return
     # With AOVs the bitmap has many channels, of which the colour is the layer without a name.
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = dict(bitmap.split())["<root>"]
-    mi.util.write_bitmap(str(output), bitmap, write_async=False)
+    with replacing(output) as temporary:
+        mi.util.write_bitmap(str(temporary), bitmap, write_async=False)

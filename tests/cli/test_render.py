@@ -1,5 +1,8 @@
 """`nerg render` on a small scene of stock plugins."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -22,6 +25,9 @@ SCENE = """
     </sensor>
 </scene>
 """
+
+NERG = [sys.executable, "-c", "import nerg_command; nerg_command.main()"]
+"""The command in a process of its own."""
 
 
 @pytest.fixture
@@ -96,3 +102,30 @@ def test05_one_sentence(scene, tmp_path, monkeypatch, capsys, options, said):
 def test06_missing_scene(tmp_path, capsys):
     assert nerg("render", tmp_path / "nowhere.xml", "-o", tmp_path / "out.exr") == 1
     assert "there is no scene file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test07_one_thread_is_enough(rgb, scene, tmp_path, name):
+    # Mitsuba's EXR writer never returns where Dr.Jit has one thread.
+    out = tmp_path / name
+    subprocess.run([*NERG, "render", scene, "-o", out, "-m", "llvm_ad_rgb", "-t", "1"], check=True, timeout=180)
+    assert tuple(rgb.Bitmap(str(out)).size()) == (16, 8)
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test08_a_picture_takes_the_place_of_another_whole(rgb, scene, tmp_path, monkeypatch, name):
+    from nerg_mi.formats import atomic
+
+    out = tmp_path / name
+    out.write_bytes(b"what was there")
+    before = set(tmp_path.iterdir())
+
+    def full(path):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(atomic, "_flush", full)
+        assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb") == 1
+    assert out.read_bytes() == b"what was there" and set(tmp_path.iterdir()) == before
+    assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb") == 0
+    assert tuple(rgb.Bitmap(str(out)).size()) == (16, 8)
