@@ -12,6 +12,7 @@ import argparse
 import time
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
 
 

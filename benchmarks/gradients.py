@@ -16,6 +16,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
 
 from numerics import replaced, table
@@ -136,7 +137,6 @@ def main(argv=None) -> None:
     parser.add_argument("--update", type=Path, help="a document whose tables are replaced, heading by heading")
     args = parser.parse_args(argv)
 
-    import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before mitsuba)
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")

@@ -14,6 +14,8 @@ import importlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
 GROUPS = ("march", "rays", "pictures", "gaze")
 
 
@@ -61,7 +63,6 @@ def main() -> None:
         if name not in GROUPS:
             parser.error(f'there is no group "{name}"; there are {", ".join(GROUPS)}')
 
-    import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before mitsuba)
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")

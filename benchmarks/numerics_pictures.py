@@ -5,6 +5,7 @@ import math
 import tempfile
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import drjit as dr
 import numpy as np
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import math
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import drjit as dr
 import numpy as np
 

@@ -13,6 +13,7 @@ import statistics
 import time
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import mitsuba as mi
 
 import nerg_mi.scenes.store

@@ -17,6 +17,8 @@ import resource
 import time
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -57,7 +59,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "benchmarks" / "rays.csv")
     options = parser.parse_args()
 
-    import nerg_mi  # noqa: F401  chooses the libLLVM
     import mitsuba as mi
     import numpy as np
 

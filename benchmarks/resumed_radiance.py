@@ -19,13 +19,14 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np  # noqa: E402
 from fox_radiance import default_data  # noqa: E402
 
 _RUN = """
 import sys
 from pathlib import Path
-import drjit as dr, mitsuba as mi
+import nerg_mi, drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.capture.dataset import open_dataset
 from nerg_mi.field.backend import namespace

@@ -13,6 +13,8 @@ import os
 import time
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
 # BLAS threads wait in a busy loop, in the way of the others.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -24,6 +24,7 @@ import argparse
 import sys
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -227,7 +228,6 @@ def main(argv=None) -> None:
     parser.add_argument("--picture", type=Path, help="PNG file to write: the display, gaze without it, gaze with it")
     args = parser.parse_args(argv)
 
-    import nerg_mi  # noqa: F401  chooses the libLLVM, so it comes before mitsuba
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")

@@ -21,6 +21,7 @@ import argparse
 import time
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
 
 # name: (camera, target, eye). Cameras see over or around shelves; eyes are a shopper's.
@@ -137,7 +138,6 @@ def main(argv=None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/store_visibility.csv"), help="CSV file to write")
     args = parser.parse_args(argv)
 
-    import nerg_mi  # noqa: F401  chooses the libLLVM, so it comes before mitsuba
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")

@@ -16,6 +16,7 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
 
 SIZE = (0.24, 0.12, 0.25)  # along, into and above the shelf, metres
@@ -254,7 +255,6 @@ def figure(attention: Attention, sweep, paths, checks, settings: Settings):
 
 
 def main(argv=None) -> dict:
-    import nerg_mi  # noqa: F401  (chooses the libLLVM)
     import mitsuba as mi
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

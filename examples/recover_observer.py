@@ -18,6 +18,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
 
 OBSERVER = "integrator.observer.to_world"
@@ -244,7 +245,6 @@ def figure(shown, truths, searches):
 
 
 def main(argv=None) -> dict:
-    import nerg_mi  # noqa: F401  (chooses the libLLVM)
     import mitsuba as mi
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

@@ -221,7 +221,7 @@ from nerg_mi.registration import register
 from nerg_mi.transport import viewpoint
 from nerg_mi.transport.color import composite_to_linear
 from nerg_mi.transport.depth import KINDS
-from nerg_mi.transport.features import Featured, accumulated, snapshot
+from nerg_mi.transport.features import Featured, snapshot, what_gaze_wants
 from nerg_mi.transport.gaze_ensemble import SupportView
 from nerg_mi.transport.freezing import no_collection, recording
 from nerg_mi.transport.march import MarchSettings
@@ -477,7 +477,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         observers = viewpoint.centers(sensors) if self.observer is None else [p_o]
         for view in self._views.values():
             view.face(observers)
-        if asked & _GAZE_AOVS and self.gaze.field.config.normalized:
+        if asked & _GAZE_AOVS:
             self.gaze.face(observers, place, self.settings, self.depth_kind, self.surface_opacity)
 
         distance, r_o = towards(p_o, p_d)
@@ -507,7 +507,7 @@ class NergIntegrator(mi.SamplingIntegrator):
                 out["gaze_evals"] = dr.select(unknown, networks, 0)
                 return sight.density_evals
             needed = surface if asked & {"emit", "capture"} else attended
-            semantic = self._semantic(place, sight.p_od, p_o, r_o, needed)
+            semantic = what_gaze_wants(self.gaze.field.config.semantic, place, sight.p_od, p_o, r_o, needed, self.settings)
             evaluate = self.gaze.spread if "gaze_std" in asked else self.gaze.evaluate
             gaze, emit, capture, *spread = evaluate(sight.p_od, p_o, r_o, needed, semantic)
             out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
@@ -515,16 +515,6 @@ class NergIntegrator(mi.SamplingIntegrator):
             out["emit"], out["capture"] = dr.select(surface, emit, 0), dr.select(surface, capture, 0)
             out["gaze_evals"] = dr.select(surface, networks, 0)
         return sight.density_evals
-
-
-    def _semantic(self, place, p_od, p_o, r_o, active):
-        """The radiance field's features of what the observer sees, for a gaze field that wants them."""
-        kind = self.gaze.field.config.semantic
-        if kind == "snapshot":
-            return snapshot(self.medium, p_od, active)
-        if kind == "accumulated":
-            return accumulated(place, mi.Ray3f(p_o, r_o), active, self.settings)
-        return None
 
 
 class _Pose(mi.TraversalCallback):

@@ -12,6 +12,7 @@ defined: maps that are constant or zero give a number, not NaN.
 from __future__ import annotations
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 # Of a map's mean: far below any density that matters, far above underflow.
 EPS = 1e-20
@@ -90,7 +91,7 @@ def auc_judd(
         order = np.argsort(row)
         below = np.concatenate([[0], np.cumsum(share[order])])
         false = 1 - below[np.searchsorted(row[order], thresholds, "left")] / below[-1]
-        out[i] = np.trapezoid(np.concatenate([[0], hits, [1]]), np.concatenate([[0], false, [1]]))
+        out[i] = trapezoid(np.concatenate([[0], hits, [1]]), np.concatenate([[0], false, [1]]))
     return out.reshape(shape)
 
 

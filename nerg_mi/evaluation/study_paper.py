@@ -7,7 +7,8 @@ w = αT; a cell of the occupancy grid that is empty is left in multiples of dt; 
 ray towards p_d is marched likewise, and its depth compared with the distance.
 
 Not taken over, because they would only make it worse here: fp16 networks, the near distance of 0.2, cascades, a comparison
-tolerance of 1e-5 (ours is the study's), gaze without a surface, and a sign of the shadow that shows what is hidden.
+tolerance of 1e-5 (ours is the study's), gaze without a surface, and a sign of the shadow that shows what is hidden. A
+normalised gaze field is divided by the integral that ``nerg`` finds: the paper has none.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ import drjit as dr
 
 from ..transport import viewpoint
 from ..transport.color import composite_to_linear
+from ..transport.features import what_gaze_wants
+from ..transport.place import Place
 from ..transport.visibility import visibility
 
 STEPS = 1024
@@ -86,9 +89,12 @@ def _integrator_class(variant: str):
             seen = dr.select(surface, visibility(distance, d_o, like.falloff, self._tolerance), 0)
             out["visibility"] = seen
             if gaze:
-                attended = surface & (seen > 0)
-                out["gaze"] = dr.select(attended, like.gaze.evaluate(p_o + r_o * d_o, p_o, r_o, attended)[0] * seen, 0)
-                out["gaze_evals"] = dr.select(surface, 2.0 if like.gaze.field.config.variant == "emit_capture" else 1.0, 0.0)
+                place, attended = Place(like.medium), surface & (seen > 0)
+                like.gaze.face([p_o], place, like.settings, like.depth_kind, like.surface_opacity)
+                p_od = p_o + r_o * d_o
+                semantic = what_gaze_wants(like.gaze.field.config.semantic, place, p_od, p_o, r_o, attended, like.settings)
+                out["gaze"] = dr.select(attended, like.gaze.evaluate(p_od, p_o, r_o, attended, semantic)[0] * seen, 0)
+                out["gaze_evals"] = dr.select(surface, mi.Float(like.gaze.networks), 0.0)
             return n
 
     return PaperIntegrator

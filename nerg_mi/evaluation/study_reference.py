@@ -171,7 +171,8 @@ def truth(scene: AnalyticScene, gaze, o, d, *, depth: str, visibility: str, fall
           surface_opacity: float) -> Truth:
     """The reference of ``nerg``'s channels for rays (N, 3), as its manual page defines them.
 
-    ``gaze``: what ``evaluate(p_od, p_o, r_o, True)`` asks (a single-precision network, evaluated at float64 positions), or None.
+    ``gaze``: what ``evaluate(p_od, p_o, r_o, True)`` asks (a single-precision network, evaluated at float64 positions), or None;
+    a normalised one faces the observer already.
     """
     seen = look(scene, o, d)
     t = seen.depth(depth)
@@ -207,7 +208,8 @@ def towards(p_o, p):
 
 
 def evaluate_gaze(gaze, p_od, p_o, r_o) -> np.ndarray:
-    """Gaze density (N,) in 1/sr of the medium ``gaze`` at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``."""
+    """Gaze density (N,) in 1/sr of the medium ``gaze`` at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, which a
+    normalised one faces already."""
     import mitsuba as mi
 
     def points(kind, v):

@@ -47,6 +47,18 @@ def snapshot(medium, p, active) -> list:
     return [dr.select(active, f, 0) for f in features]
 
 
+def what_gaze_wants(kind: str, place, p_od, p_o, r_o, active, settings) -> list | None:
+    """Features (Floats) of what an observer sees at ``p_od`` along unit ``r_o`` from ``p_o``, for a gaze field that wants such
+    of ``kind`` (``field.gaze.SEMANTICS``); None for one that wants none. ``settings``: of the march."""
+    import mitsuba as mi
+
+    if kind == "snapshot":
+        return snapshot(place.medium, p_od, active)
+    if kind == "accumulated":
+        return accumulated(place, mi.Ray3f(p_o, r_o), active, settings)
+    return None
+
+
 def accumulated(place, ray, active, settings) -> list:
     """Features (Floats) accumulated along a Mitsuba ``ray`` through ``place`` (``place.Place`` with a field)."""
     featured = Featured(place.medium, False)

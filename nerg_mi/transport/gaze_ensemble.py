@@ -29,7 +29,7 @@ class EnsembleMedium:
         """``GazeMedium.face`` of every member; depths around an observer are traced once for all of them."""
         first, *others = self.members
         first.face(observers, *place)
-        for member in others:
+        for member in others if self.field.config.normalized else ():
             member.face(observers, *place, like=first)
 
     def evaluate(self, p_od, p_o, r_o, active, semantic=None):

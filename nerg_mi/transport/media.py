@@ -296,13 +296,16 @@ class GazeMedium:
         return list(self.field.parameters().values())
 
     def face(self, observers: list, place, settings, kind: str, surface_opacity: float, like: GazeMedium | None = None) -> None:
-        """Integrate a normalised field over the spheres of ``observers`` (Point3f, one lane each) in ``place``.
+        """Integrate a normalised field over the spheres of ``observers`` (Point3f, one lane each) in ``place``; of another one
+        nothing needs to be known.
 
         ``settings``, ``kind``, ``surface_opacity``: of the observers' rays. Kept for as long as neither of them changes.
         ``like``: a medium of the same box, place and kind of field that faces the same observers, whose depths will do.
         """
         from .gaze_integral import GazeIntegral
 
+        if not self.field.config.normalized:
+            return
         how = place, settings, kind, surface_opacity
         # What was made while a function was recorded is the recording's.
         known = [] if recording() or self._recorded else self._integrals

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from nerg_mi.attention import vmf
 from nerg_mi.attention.sphere import fibonacci_directions, latlong_grid
@@ -123,7 +124,7 @@ def test_auc_judd_of_a_picture():
     for k, threshold in enumerate(at):
         hits.append((k + 1) / len(at))
         false.append(((MODEL >= threshold).sum() - k - 1) / (1600 - len(at)))
-    expected = np.trapezoid([*hits, 1.0], [*false, 1.0])
+    expected = trapezoid([*hits, 1.0], [*false, 1.0])
     assert metrics.auc_judd(MODEL, at, fixated=fixated) == pytest.approx(expected)
 
 

@@ -1,0 +1,40 @@
+"""Small gaze fields of every kind in files, for tests that render them and evaluate them otherwise."""
+
+from __future__ import annotations
+
+import drjit.llvm.ad as ns
+import numpy as np
+
+from nerg_mi.field.box import Box
+from nerg_mi.field.gaze import GazeConfig, GazeField
+from nerg_mi.field.gaze_ensemble import GazeEnsemble
+from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.field.log_gaze import LogGazeConfig, LogGazeField
+from nerg_mi.formats.fields import save_gaze
+
+KINDS = ("linear", "normalised", "default recipe", "ensemble")
+GRID = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
+
+
+def made(kind: str, box: Box, seed: int = 4, **more):
+    """A field of ``kind``: far from constant, so that what is evaluated elsewhere is another value."""
+    if kind == "ensemble":
+        return GazeEnsemble([made("default recipe", box, s, **more) for s in (seed, seed + 1)])
+    rng = np.random.default_rng(seed)
+    if kind == "default recipe":
+        config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=(box.lower, box.upper), mix=0.2, **more)
+        field = LogGazeField.random(config, box, ns, seed, 0.5 * rng.normal(size=(16, 32)) - 2.5)
+        steep = {k: 8 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")} | {"escaped": ns.Float(0.4)}
+    else:
+        field = GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=kind == "normalised", **more), box, ns, seed)
+        steep = {}
+    table = 2 * rng.normal(size=len(field.grid.table)).astype(np.float32)
+    field.set_parameters({"grid.table": ns.Float(table), **steep})
+    return field
+
+
+def saved(path, kind: str, box: Box, seed: int = 4, **more):
+    """The field of ``kind`` that is written to ``path``."""
+    field = made(kind, box, seed, **more)
+    save_gaze(field, path, {})
+    return field
