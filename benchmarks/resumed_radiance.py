@@ -35,9 +35,9 @@ from nerg_mi.training.settings import RadianceSettings, sized_config
 data, width, steps, threads, out, resume = sys.argv[1:]
 dr.set_thread_count(int(threads))
 data = open_dataset(data, None, int(width))
-field, about = train_radiance(data, sized_config("small", data.box), RadianceSettings(steps=int(steps)), namespace("llvm_ad_rgb"),
-                              state=Path(out).with_suffix(".run"), resume=resume == "1", save_every=2.0)
-save_trained(field, about, out)
+train_radiance(data, sized_config("small", data.box), RadianceSettings(steps=int(steps)), namespace("llvm_ad_rgb"),
+               state=Path(out).with_suffix(".run"), resume=resume == "1", save_every=2.0,
+               write=lambda field, about: save_trained(field, about, out))
 """
 
 

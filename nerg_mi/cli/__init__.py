@@ -37,7 +37,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line `arguments` (default: that of the process) and end the process.
 
     Exit codes: 0 done; 1 an expected error, told in one sentence (with --traceback or NERG_TRACEBACK=1 in full);
-    2 a wrong command line; 130 interrupted.
+    2 a wrong command line; 130 interrupted. A command that ends early on Ctrl-C leaves its outputs whole or absent and raises
+    `KeyboardInterrupt`, whose message, where it has one, says how to go on.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     full = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0") or "--traceback" in arguments
@@ -45,14 +46,24 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = [a for a in arguments if a != "--traceback"]
     try:
         _app(next((a for a in arguments if not a.startswith("-")), None))(arguments, prog_name="nerg")
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
+    except (KeyboardInterrupt, SystemExit) as end:
+        interrupt = _interrupt(end)
+        if interrupt is None:
+            raise
+        print(str(interrupt) or "Interrupted.", file=sys.stderr)
         sys.exit(130)
     except (ValueError, OSError, ImportError) as error:  # NergError is a ValueError
         if full:
             raise
         print(f"nerg: {sentence(error)}", file=sys.stderr)
         sys.exit(1)
+
+
+def _interrupt(end: BaseException | None) -> KeyboardInterrupt | None:
+    """The Ctrl-C that ended the command. Typer makes of it an exit with code 130, which has it as its cause."""
+    while end is not None and not isinstance(end, KeyboardInterrupt):
+        end = end.__cause__ or end.__context__
+    return end
 
 
 def _app(asked: str | None) -> typer.Typer:

@@ -40,7 +40,7 @@ def train_radiance(
         float, typer.Option(help="Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.")
     ] = 0.0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run of this output.")] = False,
-    save_every: Annotated[float, typer.Option(help="Seconds between two states for --resume; 0 keeps none.")] = 60.0,
+    save_every: Annotated[float, typer.Option(help="Seconds between two states for --resume; 0: only one, when it ends early.")] = 60.0,
     variant: Annotated[str, typer.Option(help="Mitsuba variant.")] = "llvm_ad_rgb",
 ) -> None:
     """Train a radiance field on posed pictures, and report the error on those held out."""
@@ -75,16 +75,17 @@ def train_radiance(
     typer.echo(f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
                f"{data.source['width']} x {data.source['height']} pixels")
     with _Bar() as bar:
-        field, provenance = train_radiance(data, config, settings, namespace(variant), depth, bar.update,
-                                           state=state if save_every > 0 or resume else None, resume=resume,
-                                           save_every=save_every or 60.0, preview=output.with_suffix(".preview.png"))
-    save_trained(field, provenance, output, half)
-    if provenance["interrupted"] and state.is_file():
-        typer.echo(f"interrupted; go on with --resume (state in {state})")
+        _, provenance = train_radiance(
+            data, config, settings, namespace(variant), depth, bar.update, state=state, resume=resume,
+            save_every=save_every or float("inf"), preview=output.with_suffix(".preview.png"),
+            write=lambda field, provenance: save_trained(field, provenance, output, half),
+        )  # fmt: skip
     typer.echo(f"{provenance['steps']} steps in {provenance['seconds']:.0f} s")
     if data.held_out:
         typer.echo(f"held-out PSNR: {provenance['psnr_held_out']['mean']:.2f} dB")
     typer.echo(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
+    if provenance["interrupted"]:
+        raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")
 
 
 def _numbers(text: str | None) -> tuple | None:

@@ -69,7 +69,7 @@ def train_gaze(
         int, typer.Option(help="Train so many fields on resamples of the people; the mean is the gaze, their spread its uncertainty. 0: one field.")
     ] = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the interrupted run of this output.")] = False,
-    save_every: Annotated[float, typer.Option(help="Seconds between two states for --resume; 0 keeps none.")] = 60.0,
+    save_every: Annotated[float, typer.Option(help="Seconds between two states for --resume; 0: only one, when it ends early.")] = 60.0,
     seed: Annotated[int, typer.Option(help="Seed of probes, directions, weights, batches and splits.")] = 0,
     threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store the weights in fp16.")] = False,
@@ -145,16 +145,15 @@ def train_gaze(
         about |= {"begins_as": field.name} if initial else {}
     train = partial(train_ensemble, ensemble) if ensemble else train_gaze
     with _Bar() as bar:
-        trained, provenance = train(
+        _, provenance = train(
             data, place.medium, place.box, config, settings, how, ns, _similarity(align), bar.update, initial, about=dict(about),
-            state=state if save_every > 0 or resume else None, resume=resume, save_every=save_every or 60.0,
-            views=seen,
+            state=state, resume=resume, save_every=save_every or float("inf"), views=seen,
+            write=lambda trained, provenance: save_gaze(trained, output, {**about, **provenance}, half),
         )  # fmt: skip
-    save_gaze(trained, output, {**about, **provenance}, half)
     _report(provenance)
-    if provenance["interrupted"] and state.is_file():
-        typer.echo(f"interrupted; go on with --resume (state in {state})")
     typer.echo(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
+    if provenance["interrupted"]:
+        raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")
 
 
 def _given(**options) -> dict:

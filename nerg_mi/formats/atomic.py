@@ -9,6 +9,8 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,9 +43,18 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if os.path.exists(path) and not os.path.isfile(path):
+            # A pipe or a device, such as /dev/stdout, has nothing to be kept, and must not become a file.
+            with tempfile.TemporaryDirectory() as folder:
+                temporary = Path(folder, target.name)
+                temporary.touch()
+                yield temporary
+                with temporary.open("rb") as made, open(path, "wb") as out:
+                    shutil.copyfileobj(made, out)
+            return
         target.parent.mkdir(parents=True, exist_ok=True)
         # In the same folder, since only there a move is one step; hidden, since it is nobody's result.
-        temporary = target.with_name(f".{target.stem[:64]}.{os.getpid()}-{secrets.token_hex(4)}.part{target.suffix}")
+        temporary = target.with_name(f".{target.stem[:32]}.{os.getpid()}-{secrets.token_hex(4)}.part{target.suffix}")
         # Opened here and not by the writer, so that the permissions are those that the umask gives any other file.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         try:
@@ -69,6 +80,27 @@ def write_text(path: str | os.PathLike, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
+def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
+    """Raise `NergError` where it is plain that no file can be written to ``path``: to be asked before long work.
+
+    A folder in its place, a file in place of a parent, no permission, a suffix that is none of ``suffixes`` (where there are
+    any). Nothing is made. A disk that fills meanwhile, or permissions that change, are found by `replacing`.
+    """
+    if suffixes and Path(path).suffix.lower() not in suffixes:
+        raise NergError(f'"{path}" has no format that is written here; give it a name that ends in {" or ".join(suffixes)}.')
+    with writing(path):
+        target = Path(os.path.realpath(path))
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        _check_parents(target)
+
+
+def check_folder(path: str | os.PathLike) -> None:
+    """Raise `NergError` where it is plain that no files can be written into the folder ``path``, which need not be there yet."""
+    with writing(path):
+        _check_parents(Path(os.path.realpath(path)) / "file")
+
+
 def make_folder(path: str | os.PathLike) -> Path:
     """Make the folder ``path`` with its parents, if it is not there; raises `NergError` where that cannot be done."""
     with writing(path):
@@ -84,6 +116,20 @@ def writing(path: str | os.PathLike) -> Iterator[None]:
     except OSError as error:
         remedy = _REMEDIES.get(error.errno, "choose another folder")
         raise NergError(f'"{path}" could not be written ({error.strerror or error}): {remedy}.') from error
+
+
+def _check_parents(target: Path) -> None:
+    """Raise `OSError` unless ``target``, or first its missing parents, can be made."""
+    try:
+        os.lstat(target)  # finds a name that is too long, a parent that is a file, or one that may not be entered
+    except FileNotFoundError:
+        pass
+    there = next(p for p in target.parents if p.exists())
+    if not there.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(there))
+    if not os.access(there, os.W_OK | os.X_OK):
+        why = errno.EROFS if os.statvfs(there).f_flag & os.ST_RDONLY else errno.EACCES
+        raise OSError(why, os.strerror(why), str(there))
 
 
 def _flush(path: Path) -> None:

@@ -10,6 +10,7 @@ from types import ModuleType
 
 import numpy as np
 
+from ..errors import NergError
 from ..field.backend import aligned
 from ..field.background import Background, BackgroundConfig
 from ..field.box import Box
@@ -32,8 +33,9 @@ def _dump(parameters: dict, half: bool) -> dict[str, np.ndarray]:
         with np.errstate(over="ignore"):  # what exceeds fp16 is refused below, by name
             stored = value.astype(np.float16 if half else np.float32)
         if not np.all(np.isfinite(stored)):
-            why = "exceeds what fp16 can hold; store it in fp32" if np.all(np.isfinite(value)) else "is not finite"
-            raise ValueError(f'the weight array "{name}" {why}')
+            if np.all(np.isfinite(value)):
+                raise NergError(f'the weight array "{name}" exceeds what fp16 can hold; leave out --half')
+            raise ValueError(f'the weight array "{name}" is not finite')
         out[name] = stored
     return out
 

@@ -6,6 +6,7 @@ of each person (block bootstrap, Künsch 1989). Single rays of one second say th
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +15,12 @@ import numpy as np
 from ..attention.rays import Rays
 from ..errors import NergError
 from ..field.gaze_ensemble import GazeEnsemble
+from ..formats.checkpoint import read_checkpoint
 from ..formats.fields import load_gaze, save_gaze
 from .gaze_run import GazeProgress, support_of, train_gaze
 from .gaze_settings import GazeSettings, ProbeSettings
-from .run_state import require_same
+from .gaze_state import KIND as RUN
+from .run_state import kept_unless, require_same
 
 FEW = 5
 """Blocks that a resample needs at least; people are the blocks where there are as many of them."""
@@ -61,12 +64,13 @@ def resample(rays: Rays, seed) -> Rays:
 def train_ensemble(
     members: int, rays: Rays | None, medium, box, config, settings: GazeSettings, probes: ProbeSettings, ns, align=None, on_progress=None,
     initial: dict | None = None, *, state: Path | None = None, resume: bool = False, save_every: float = 60.0, about: dict | None = None,
-    views: list | tuple = (),
+    views: list | tuple = (), write: Callable[[GazeEnsemble, dict], None] | None = None,
 ) -> tuple[GazeEnsemble, dict]:
     """Train ``members`` gaze fields, each on a resample and with a seed of its own; returns them and their provenance (JSON).
 
     The other arguments are those of ``gaze_run.train_gaze``; minutes are those of all members together. With ``state``, what
-    is done is kept beside it, one file a member, and removed at the end. Raises `NergError` where it is interrupted.
+    is done is kept beside it, one file a member, and removed once ``write`` has put the ensemble into a file; without it the
+    members stay. Raises `KeyboardInterrupt`, whose message says how to go on, where it is interrupted.
     """
     if members < 2:
         raise ValueError(f"an ensemble needs at least two members, got {members}")
@@ -89,20 +93,37 @@ def train_ensemble(
             done = meta["provenance"]
             require_same(part, done["about"], {**same, "settings": mine.to_dict(), "probes": probes.to_dict()})
             done = done["trained"]
+            if state.is_file() and read_checkpoint(state, RUN)[1]["about"].get("member") == same["member"]:
+                # Killed between the writing of the member and the removal of its state.
+                state.unlink()
         else:
+            about_part = {**same, "settings": mine.to_dict(), "probes": probes.to_dict()}
+            keep = None if part is None else _keeper(part, about_part)
             field, done = train_gaze(resample(rays, (settings.seed, k)), medium, box, config, mine, probes, ns, align, say, initial, state=state,
-                                     resume=resume and state.is_file(), save_every=save_every, about=same)
+                                     resume=resume and state.is_file(), save_every=save_every, about=same, write=keep)
             if done["interrupted"]:
-                kept = "go on with --resume" if state is not None else "nothing was kept, since --save-every is 0"
-                raise NergError(f"interrupted while training member {k + 1} of {members}; {kept}")
-            if part is not None:
-                save_gaze(field, part, {"trained": done, "about": {**same, "settings": mine.to_dict(), "probes": probes.to_dict()}})
+                kept = f"go on with --resume (state in {state})" if state is not None else "nothing was kept"
+                raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {kept}")
         fields.append(field)
         each.append(done)
-    for part in parts:
-        if part is not None:
-            part.unlink(missing_ok=True)
-    return GazeEnsemble(fields, support_of(rays, probes.radius, align)), _together(each, settings, rays, kind)
+    ensemble, provenance = GazeEnsemble(fields, support_of(rays, probes.radius, align)), _together(each, settings, rays, kind)
+    if write is not None:
+        # Every member is in its file by now: there is nothing more to keep if this fails.
+        with kept_unless(state, lambda: None, done=False):
+            write(ensemble, provenance)
+        for part in parts:
+            if part is not None:
+                part.unlink(missing_ok=True)
+    return ensemble, provenance
+
+
+def _keeper(part: Path, about: dict):
+    """Writes a member into ``part``; one that was interrupted has its state, and is none yet."""
+    def keep(field, done: dict) -> None:
+        if not done["interrupted"]:
+            save_gaze(field, part, {"trained": done, "about": about})
+
+    return keep
 
 
 def _together(each: list[dict], settings: GazeSettings, rays: Rays, kind: str) -> dict:

@@ -23,6 +23,7 @@ from .gaze_likelihood import LikelihoodTrainer
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_state import GazeRunFile, digest
 from .gaze_supervision import Supervision
+from .run_state import kept_unless
 from .salience_supervision import digest_views, far_views, split_views, supervise_both
 
 
@@ -92,20 +93,21 @@ def train_gaze(
     rays: Rays | None, medium, box: Box, config: GazeConfig | LogGazeConfig, settings: GazeSettings, probes: ProbeSettings, ns: ModuleType,
     align: Similarity | None = None, on_progress: Callable[[GazeProgress], None] | None = None, initial: dict | None = None, *,
     state: Path | None = None, resume: bool = False, save_every: float = 60.0, about: dict | None = None,
-    views: list[SalienceView] | tuple = (),
+    views: list[SalienceView] | tuple = (), write: Callable[[GazeField | LogGazeField, dict], None] | None = None,
 ) -> tuple[GazeField | LogGazeField, dict]:
     """Train a gaze field on ``rays`` in a place; returns it and its provenance (JSON).
 
     ``medium``: what depths are traced in; ``box``: where the gaze field lives; both in the field's frame, into which the
     similarity ``align`` takes the rays. Some zones of positions are held out, purged by 2R, and watched: the weights that
     score best there count (the loss that is trained), and the run ends when they get no better. With ``settings.refit`` a
-    second fit then uses all rays for as many steps; the scores stay those of the first. Ctrl-C ends the run early with
-    what it has come to. ``initial``: arrays to begin with (``gaze_semantics.trunk_of``). Raises ``ValueError`` when the
+    second fit then uses all rays for as many steps; the scores stay those of the first. Ctrl-C ends the run after the step
+    at hand, with what it has come to. ``initial``: arrays to begin with (``gaze_semantics.trunk_of``). Raises ``ValueError`` when the
     rays make no probe.
 
     ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
-    interrupted, removed when it is done; ``resume``: go on from there (probes and depths are made again). ``about``: what
-    else the run must agree on to be resumed (JSON), such as the files of the place.
+    interrupted; ``resume``: go on from there (probes and depths are made again). ``about``: what else the run must agree on to
+    be resumed (JSON), such as the files of the place. ``write``: given the result, which it puts into a file. Once it has done
+    so, the state of a run that is done is removed; if it raises, the state is that of the end. Without it the state stays.
 
     ``views``: salience images, in the field's frame, to learn from besides the rays, or without any (``rays`` None); zones of
     views are watched then. No view within 2R of a position that is watched is learnt from in the first fit.
@@ -149,8 +151,6 @@ def train_gaze(
     if rays is not None:
         result.support = support_of(learn if last is first else rays, probes.radius, align)
     interrupted = first.interrupted or last.interrupted
-    if not interrupted:
-        file.remove()
     provenance = {
         "settings": settings.to_dict(),
         "probes": probes.to_dict(),
@@ -173,6 +173,11 @@ def train_gaze(
             "views_held_out": len(views) - len(seen), "best_step": first.best_step,
             **_rounded(first.scores), "history": first.history,
         }  # fmt: skip
+    if write is not None:
+        stage, weights = ("fit", last.weights) if last is first else ("refit", {})
+        keep = lambda: file.keep(stage, last.trainer, first.found(), weights, now=True)
+        with kept_unless(state, keep, done=not interrupted):
+            write(result, provenance)
     return result, provenance
 
 
@@ -196,22 +201,19 @@ def _fit(supervision: Supervision, watched: Supervision | None, box, config, set
     out = _Fit.of(file.found, trainer, file.restore("fit", trainer))
     out.schedule = settings.steps or 0
     looks, recent = np.arange(1, settings.looks + 1) / settings.looks, out.scores
-    try:
-        with Interruption() as stop:
-            while trainer.progress < 1 and not (settings.patience and out.since >= settings.patience):
-                trainer.step()
-                if watched is not None and trainer.progress >= looks[out.next_look]:
-                    out.next_look = min(int(np.searchsorted(looks, trainer.progress, "right")), len(looks) - 1)
-                    recent = trainer.measure(watched)
-                    out.history.append({"steps": trainer.steps, **_rounded(recent)})
-                    out.since += 1
-                    if out.scores is None or np.isnan(out.scores.loss) or recent.loss < out.scores.loss:
-                        out.weights, out.best_step, out.scores, out.since = trainer.weights(), trainer.steps, recent, 0
-                file.keep("fit", trainer, out.found(), out.weights)
-                say(GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, recent))
-                stop.check()
-    except KeyboardInterrupt:
-        out.interrupted = True
+    with Interruption() as stop:
+        while trainer.progress < 1 and not out.interrupted and not (settings.patience and out.since >= settings.patience):
+            trainer.step()
+            if watched is not None and trainer.progress >= looks[out.next_look]:
+                out.next_look = min(int(np.searchsorted(looks, trainer.progress, "right")), len(looks) - 1)
+                recent = trainer.measure(watched)
+                out.history.append({"steps": trainer.steps, **_rounded(recent)})
+                out.since += 1
+                if out.scores is None or np.isnan(out.scores.loss) or recent.loss < out.scores.loss:
+                    out.weights, out.best_step, out.scores, out.since = trainer.weights(), trainer.steps, recent, 0
+            file.keep("fit", trainer, out.found(), out.weights)
+            out.interrupted = _stopped(stop, say, GazeProgress("fit", trainer.progress, trainer.steps, trainer.seconds, recent))
+    if out.interrupted:
         file.keep("fit", trainer, out.found(), out.weights, now=True)
     if watched is not None and out.scores is None and trainer.steps:
         out.scores, out.best_step, out.weights = trainer.measure(watched), trainer.steps, trainer.weights()
@@ -228,17 +230,24 @@ def _refit(supervision: Supervision, box, config, settings, ns, say, first: _Fit
     trainer = trainer_of(config)(supervision, box, config, replace(settings, steps=first.best_step, minutes=None), ns, first.schedule, initial)
     file.restore("refit", trainer)
     interrupted = False
-    try:
-        with Interruption() as stop:
-            while trainer.steps < first.best_step:
-                trainer.step()
-                file.keep("refit", trainer, first.found(), {})
-                say(GazeProgress("refit", trainer.steps / first.best_step, trainer.steps, trainer.seconds, first.scores))
-                stop.check()
-    except KeyboardInterrupt:
-        interrupted = True
+    with Interruption() as stop:
+        while trainer.steps < first.best_step and not interrupted:
+            trainer.step()
+            file.keep("refit", trainer, first.found(), {})
+            interrupted = _stopped(stop, say, GazeProgress("refit", trainer.steps / first.best_step, trainer.steps, trainer.seconds, first.scores))
+    if interrupted:
         file.keep("refit", trainer, first.found(), {}, now=True)
     return _Fit(trainer, trainer.weights(), trainer.steps, first.schedule, first.scores, [], interrupted)
+
+
+def _stopped(stop: Interruption, say: Callable, progress: GazeProgress) -> bool:
+    """Tell ``progress``; whether there was a Ctrl-C. Heard only here: within a step, weights and random numbers are of different steps."""
+    try:
+        say(progress)
+        stop.check()
+    except KeyboardInterrupt:
+        return True
+    return False
 
 
 def _rounded(scores: Scores) -> dict:

@@ -61,11 +61,6 @@ class GazeRunFile:
         write_checkpoint(self.path, KIND, tensors, {"about": self.about, "stage": stage, "found": found, "spent": self.spent, **meta})
         self._kept = time.perf_counter()
 
-    def remove(self) -> None:
-        """The run is done."""
-        if self.path is not None:
-            self.path.unlink(missing_ok=True)
-
 
 def digest(rays: Rays) -> str:
     """SHA-256 of what a training takes from ``rays``."""

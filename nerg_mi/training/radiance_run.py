@@ -13,8 +13,10 @@ from ..capture.dataset import Dataset
 from ..capture.images import View
 from ..field.radiance import RadianceConfig, RadianceField
 from ..formats.fields import save_radiance
+from ..formats.png import write_png
+from ..interruption import Interruption
 from .radiance import RadianceTrainer
-from .run_state import load_run, save_run
+from .run_state import kept_unless, load_run, save_run
 from .settings import RadianceSettings
 
 # Shares of the run at which the held-out error is looked at.
@@ -38,15 +40,16 @@ class Progress:
 def train_radiance(
     dataset: Dataset, config: RadianceConfig, settings: RadianceSettings, ns: ModuleType, depth: bool = True,
     on_progress: Callable[[Progress], None] | None = None, *, state: Path | None = None, resume: bool = False,
-    save_every: float = 60.0, preview: Path | None = None,
+    save_every: float = 60.0, preview: Path | None = None, write: Callable[[RadianceField, dict], None] | None = None,
 ) -> tuple[RadianceField, dict]:
     """Train a field on ``dataset``; returns it, with its occupancy, and its provenance (JSON).
 
     The held-out views are looked at and never learnt from: a few of them, coarsely, at some shares of the run, and
-    all of them, fully, at the end. Ctrl-C ends the run early with what it has come to.
+    all of them, fully, at the end. Ctrl-C ends the run after the step at hand, with what it has come to.
 
     ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
-    interrupted, removed when it is done; ``resume``: go on from there. ``preview``: PNG of the first watched view,
+    interrupted; ``resume``: go on from there. ``write``: given the result, which it puts into a file. Once it has done so, the
+    state of a run that is done is removed; if it raises, the state is that of the end. Without it the state stays. ``preview``: PNG of the first watched view,
     its picture beside what is true, rewritten at every look.
     """
     trainer = RadianceTrainer(dataset.train, dataset.box, config, settings, ns, depth)
@@ -60,8 +63,8 @@ def train_radiance(
     last = history[-1]["psnr"] if history else None
     looks = [x for x in _LOOKS if x > trainer.progress] if watched else []
     saved, interrupted = trainer.seconds, False
-    try:
-        while trainer.progress < 1:
+    with Interruption() as stop:
+        while trainer.progress < 1 and not interrupted:
             trainer.step()
             if looks and trainer.progress >= looks[0]:
                 looks = [x for x in looks if x > trainer.progress]
@@ -72,17 +75,31 @@ def train_radiance(
             if state is not None and trainer.seconds - saved > save_every:
                 save_run(trainer, state, about, history)
                 saved = trainer.seconds
-            if on_progress is not None:
-                on_progress(Progress(trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last))
-    except KeyboardInterrupt:
-        interrupted = True
-    if state is not None and interrupted:
-        save_run(trainer, state, about, history)
+            try:
+                if on_progress is not None:
+                    on_progress(Progress(trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last))
+                stop.check()
+            except KeyboardInterrupt:
+                # Only here, between two steps: elsewhere there would be weights and random numbers of different steps.
+                interrupted = True
     seconds = trainer.seconds
+    keep = lambda: save_run(trainer, state, about, history)
+    if state is not None and interrupted:
+        keep()
+    with kept_unless(state, keep, done=write is not None and not interrupted):
+        field, provenance = _result(trainer, dataset, watched, history, seconds, interrupted)
+        if write is not None:
+            write(field, provenance)
+    return field, provenance
+
+
+def _result(trainer: RadianceTrainer, dataset: Dataset, watched: list[View], history: list, seconds: float,
+            interrupted: bool) -> tuple[RadianceField, dict]:
+    """The field that the run has come to, and its provenance with the error on all held-out views."""
     field = trainer.field()
     provenance = {
         **dataset.source,
-        "settings": settings.to_dict(),
+        "settings": trainer.settings.to_dict(),
         "depth_supervision": trainer.use_depth,
         "steps": trainer.steps,
         "seconds": round(seconds, 1),
@@ -96,8 +113,6 @@ def train_radiance(
             "mean": round(float(np.mean(psnr)), 3),
             "views": {v.name: round(p, 3) for v, p in zip(dataset.held_out, psnr)},
         }
-    if state is not None and not interrupted:
-        state.unlink(missing_ok=True)
     return field, provenance
 
 
@@ -106,7 +121,7 @@ def _write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
 
     seen = trainer.render(view)
     both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)], axis=1)
-    mi.Bitmap((255 * both + 0.5).astype(np.uint8)).write(str(path))
+    write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)))
 
 
 def save_trained(field: RadianceField, provenance: dict, output: str | Path, half: bool = False) -> None:

@@ -6,6 +6,8 @@ no fixed order in either.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import drjit as dr
@@ -44,6 +46,31 @@ def load_run(trainer, path: str | Path, about: dict) -> list:
     trainer.rng.bit_generator.state = meta["random"]
     trainer.restore(meta["steps"], meta["rays"], meta["samples"], meta["seconds"], meta["settled"], tensors["hard"])
     return meta["history"]
+
+
+@contextmanager
+def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iterator[None]:
+    """A block that measures and writes what a training has come to; only when it has ended is the state in ``path`` removed.
+
+    ``path``: None where no state is kept; ``keep``: brings it up to date, called if the block raises, so that no step is lost
+    to a full disk or to Ctrl-C; ``done``: whether the state goes. A `NergError` of the block then says how to go on.
+    """
+    try:
+        yield
+    except BaseException as error:
+        if path is None:
+            raise
+        try:
+            keep()
+        except NergError:
+            # The same full disk: an older state stays, and what could not be written first is what is told.
+            raise error from None
+        if isinstance(error, NergError):
+            said = str(error).rstrip(".")
+            raise NergError(f"{said}; the training is kept: once that is mended, --resume writes it") from error
+        raise
+    if path is not None and done:
+        path.unlink(missing_ok=True)
 
 
 def optimiser_state(trainer) -> tuple[dict, dict]:

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.atomic import make_folder, replacing, write_bytes, write_text
+from nerg_mi.formats.atomic import check_folder, check_writable, make_folder, replacing, write_bytes, write_text
 
 
 def test_parents_are_made_and_nothing_else_is_left(tmp_path):
@@ -60,6 +60,38 @@ def test_what_cannot_be_written_is_told_with_its_remedy(tmp_path):
         make_folder(tmp_path / "file" / "x")
     with pytest.raises(NergError, match="name is too long"):
         write_bytes(tmp_path / ("x" * 300), b"")
+
+
+def test_a_pipe_is_written_to_and_stays_one(tmp_path):
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    write_bytes(path, b"through")
+    assert os.read(reader, 100) == b"through" and path.is_fifo() and os.listdir(tmp_path) == ["pipe"]
+    os.close(reader)
+
+
+def test_what_cannot_be_written_is_found_before_and_nothing_is_made(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"")
+    check_writable(tmp_path / "file")
+    check_writable(tmp_path / "a" / "b.NPZ", ".npz", ".parquet")
+    check_folder(tmp_path)
+    check_folder(tmp_path / "a" / "b")
+    with pytest.raises(NergError, match="ends in .npz or .parquet"):
+        check_writable(tmp_path / "b.txt", ".npz", ".parquet")
+    for path, said in ((tmp_path, "is a folder"), (tmp_path / "file" / "x" / "y", "parents is a file"), (tmp_path / ("x" * 300), "too long")):
+        with pytest.raises(NergError, match=said):
+            check_writable(path)
+    with pytest.raises(NergError, match="parents is a file"):
+        check_folder(tmp_path / "file")
+    with pytest.raises(NergError, match="parents is a file"):
+        check_folder(tmp_path / "file" / "x")
+    assert os.listdir(tmp_path) == ["file"]
+    # A superuser may write everywhere: what the system says of others.
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    for check in (check_writable, check_folder):
+        with pytest.raises(NergError, match="you may not write there"):
+            check(tmp_path / "new")
 
 
 _LIMITED = """

@@ -8,7 +8,8 @@ import pytest
 
 from nerg_mi.attention.rays import Rays
 from nerg_mi.errors import NergError
-from nerg_mi.formats.fields import load_gaze
+from nerg_mi.formats.checkpoint import write_checkpoint
+from nerg_mi.formats.fields import _dump, load_gaze
 from nerg_mi.training.gaze_ensemble import blocks_of, resample, train_ensemble
 from nerg_mi.training.gaze_run import train_gaze
 from .test_gaze import BOX, looking_at
@@ -86,18 +87,33 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):  # noqa: F811
         if state.stage == "2/3 fit" and state.steps == 2:
             raise KeyboardInterrupt
 
-    with pytest.raises(NergError, match="interrupted while training member 2 of 3; go on with --resume"):
+    with pytest.raises(KeyboardInterrupt, match="interrupted while training member 2 of 3; go on with --resume"):
         together(state=path, on_progress=stop)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.member0.safetensors", "a.run"]
     with pytest.raises(NergError, match="started with other probes"):
         together(state=path, resume=True, probes=replace(PROBES, kappa=9.0))
     seen.clear()
-    got, about = together(state=path, resume=True, on_progress=lambda s: seen.append(s.stage))
+    written = []
+    got, about = together(state=path, resume=True, on_progress=lambda s: seen.append(s.stage),
+                          write=lambda *_: written.append(sorted(p.name for p in tmp_path.iterdir())))
     assert set(seen) == {"2/3 probes", "2/3 fit", "3/3 probes", "3/3 fit"} and seen.count("2/3 fit") == 2
-    assert not list(tmp_path.iterdir()) and about["steps"] == 12
+    assert written == [[f"a.member{k}.safetensors" for k in range(3)]] and not list(tmp_path.iterdir()) and about["steps"] == 12
     expected = arrays(together()[0])
     for name, value in arrays(got).items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
+
+
+def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):  # noqa: F811
+    """Refused at the end: the next start trains no member again; nor does one that was killed before it removed a state."""
+    threads(1)
+    path, stages = tmp_path / "a.run", []
+    with pytest.raises(NergError, match="fp16.*--resume writes it"):
+        together(state=path, write=lambda field, about: _dump({"grid": ns.Float(1e6)}, True))
+    members = sorted(p.name for p in tmp_path.iterdir())
+    assert members == [f"a.member{k}.safetensors" for k in range(3)]
+    write_checkpoint(path, "gaze run", {"x": np.zeros(1)}, {"about": {"member": [1, 3]}})
+    _, about = together(state=path, resume=True, on_progress=lambda s: stages.append(s.stage), write=lambda *_: None)
+    assert not stages and about["steps"] == 12 and not list(tmp_path.iterdir())
 
 
 def test_what_cannot_be_resampled_is_refused():

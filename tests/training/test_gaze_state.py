@@ -65,8 +65,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(wall, settings, config, probe
     _, about = train(wall, settings, config, probes, state=path, resume=True, on_progress=watch)
     assert about["interrupted"] and path.is_file() and ("fit", 5) not in watch.seen and ("fit", 6) in watch.seen
     watch = stopping("", 0)
-    got, about = train(wall, settings, config, probes, state=path, resume=True, on_progress=watch)
-    assert not about["interrupted"] and not path.exists() and {s for s, _ in watch.seen} == {"probes", "refit"}
+    there = []
+    got, about = train(wall, settings, config, probes, state=path, resume=True, on_progress=watch, write=lambda *_: there.append(path.is_file()))
+    assert not about["interrupted"] and there == [True] and not path.exists() and {s for s, _ in watch.seen} == {"probes", "refit"}
     assert ("refit", 3) not in watch.seen and ("refit", 4) in watch.seen
     for name, value in expected.parameters().items():
         compare = np.testing.assert_array_equal if count == 1 else lambda a, b, err_msg: np.testing.assert_allclose(a, b, atol=1e-5, err_msg=err_msg)
@@ -100,25 +101,51 @@ def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):  # noqa: F811
     assert len(drawn) == 1
 
 
-def test_the_command_goes_on(rgb, tmp_path, monkeypatch, capsys):
-    import typer
+@pytest.mark.parametrize("refit", [True, False])
+def test_a_result_that_cannot_be_written_is_kept(wall, refit, threads, tmp_path):  # noqa: F811
+    """A full disk at the end, once: nothing is trained again."""
+    threads(1)
+    path, seen, written = tmp_path / "a.run", [], []
 
+    def refuse(field, about):
+        raise NergError("the disk is full.")
+
+    settings = replace(PRODUCT, refit=refit)
+    how = {"state": path, "save_every": 1e9}
+    with pytest.raises(NergError, match="the disk is full; .* --resume writes it"):
+        train(wall, settings, SMALL, write=refuse, **how)
+    assert path.is_file()
+    watch = stopping("", 0)
+    field, _ = train(wall, settings, SMALL, resume=True, on_progress=watch, write=lambda *given: written.append(given), **how)
+    assert {s for s, _ in watch.seen} == {"probes"} and written[0][0] is field and not path.exists()
+    expected = train(wall, settings, SMALL)[0].parameters()
+    for name, value in field.parameters().items():
+        np.testing.assert_array_equal(np.array(value), np.array(expected[name]), err_msg=name)
+
+
+def test_the_command_goes_on(rgb, tmp_path, monkeypatch, capsys):
+    from nerg_mi.cli import main
     from nerg_mi.cli import train_gaze as command
     from nerg_mi.formats.fields import load_gaze
 
+    def nerg(*more):
+        with pytest.raises(SystemExit) as end:
+            main([*arguments, *more])
+        return end.value.code, capsys.readouterr().err
+
     RAYS.save(tmp_path / "rays.npz")
-    out, app = tmp_path / "gaze.safetensors", typer.Typer()
-    app.command()(command.train_gaze)
-    arguments = f"{tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 8 --directions 64 --zones 0 --fresh-directions".split()
-    with pytest.raises(NergError, match="nothing to resume"):
-        app([*arguments, "--resume"], standalone_mode=False)
-    monkeypatch.setattr(command._Bar, "update", lambda self, state: stopping("fit", 5)(state))
-    app(arguments, standalone_mode=False)
-    assert "go on with --resume" in capsys.readouterr().out and out.with_suffix(".run").is_file()
-    app([*arguments, "--resume"], standalone_mode=False)
+    out = tmp_path / "gaze.safetensors"
+    arguments = f"train gaze {tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 8 --directions 64 --zones 0 --fresh-directions".split()
+    code, said = nerg("--resume")
+    assert code == 1 and "nothing to resume" in said
+    with monkeypatch.context() as change:
+        change.setattr(command._Bar, "update", lambda self, state: stopping("fit", 5)(state))
+        code, said = nerg()
+    assert code == 130 and "go on with --resume" in said and out.is_file() and out.with_suffix(".run").is_file()
+    code, said = nerg("--resume")
     about = load_gaze(out, namespace("llvm"))[1]["provenance"]
     assert about["steps"] == 8 and not about["interrupted"] and about["probes"]["fresh"] and not out.with_suffix(".run").exists()
-    assert "go on" not in capsys.readouterr().out
+    assert code == 0 and "go on" not in said
 
 
 _CHILD = """

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.training.radiance import RadianceTrainer
-from nerg_mi.training.radiance_run import train_radiance
+from nerg_mi.training.radiance_run import save_trained, train_radiance
 from nerg_mi.training.run_state import load_run, save_run
 from .test_radiance import BOX, TINY, dataset, settings  # noqa: F401  (fixture)
 
@@ -61,20 +62,55 @@ def test_another_run_is_not_resumed(dataset, tmp_path):  # noqa: F811
         load_run(t, tmp_path / "a.run", {"sha": 1, "width": 48})
 
 
-def test_ctrl_c_keeps_the_state_and_the_end_removes_it(dataset, tmp_path):  # noqa: F811
-    path, seen = tmp_path / "a.run", []
+def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):  # noqa: F811
+    path, seen, written = tmp_path / "a.run", [], []
 
     def stop(progress):
         seen.append(progress)
         if progress.steps == 5 and len(seen) == 5:
             raise KeyboardInterrupt
 
-    how = {"state": path, "preview": tmp_path / "a.png"}
-    _, about = train_radiance(dataset, TINY, settings(steps=12), ns, on_progress=stop, **how)
-    assert about["interrupted"] and about["steps"] == 5 and path.is_file()
-    _, about = train_radiance(dataset, TINY, settings(steps=12), ns, on_progress=stop, resume=True, **how)
-    assert not about["interrupted"] and about["steps"] == 12 and seen[5].steps == 6
-    assert not path.exists() and (tmp_path / "a.png").stat().st_size > 100
+    how = {"state": path, "preview": tmp_path / "a.png", "on_progress": stop,
+           "write": lambda field, about: written.append((about["steps"], path.is_file()))}  # fmt: skip
+    _, about = train_radiance(dataset, TINY, settings(steps=12), ns, **how)
+    assert about["interrupted"] and path.is_file()
+    _, about = train_radiance(dataset, TINY, settings(steps=12), ns, resume=True, **how)
+    assert not about["interrupted"] and seen[5].steps == 6 and (tmp_path / "a.png").stat().st_size > 100
+    assert written == [(5, True), (12, True)] and not path.exists()
+
+
+def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):  # noqa: F811
+    """Weights beyond fp16, and then without --half: no step is trained again."""
+    path, seen = tmp_path / "a.run", []
+
+    def refuse(field, about):
+        parameters = field.parameters()
+        field.set_parameters(parameters | {"grid.table": parameters["grid.table"] * 0 + 1e6})
+        save_trained(field, about, tmp_path / "a.safetensors", half=True)
+
+    how = {"state": path, "save_every": 1e9, "on_progress": seen.append}
+    with pytest.raises(NergError, match="fp16.*leave out --half.*--resume writes it"):
+        train_radiance(dataset, TINY, settings(steps=6), ns, write=refuse, **how)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.run"]
+    seen.clear()
+    _, about = train_radiance(dataset, TINY, settings(steps=6), ns, resume=True, write=lambda f, a: save_trained(f, a, tmp_path / "a.safetensors"), **how)
+    assert about["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
+
+
+def test_a_second_ctrl_c_leaves_the_state_before_the_step(dataset, one_thread, monkeypatch, tmp_path):  # noqa: F811
+    """Raised in the middle of a step, when weights and random numbers are of different steps: that state is not kept."""
+    path, descend = tmp_path / "a.run", RadianceTrainer._descend
+
+    def twice(self, *given):
+        if self.steps == 5:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        descend(self, *given)
+
+    monkeypatch.setattr(RadianceTrainer, "_descend", twice)
+    with pytest.raises(KeyboardInterrupt):
+        train_radiance(dataset, TINY, settings(steps=12), ns, state=path, save_every=0.0)
+    assert read_checkpoint(path, "radiance run")[1]["steps"] == 4
 
 
 _CHILD = """
@@ -92,15 +128,17 @@ radiance_run.train_radiance(data, TINY, settings(steps=10**6), ns, state=Path(sy
 """
 
 
-def test_a_killed_run_leaves_a_whole_state(dataset, one_thread, tmp_path):  # noqa: F811
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thread, how, tmp_path):  # noqa: F811
+    """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
     path = tmp_path / "a.run"
     child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
     until = time.time() + 120
     while not path.exists() and child.poll() is None and time.time() < until:
         time.sleep(0.05)
     time.sleep(0.3)
-    child.send_signal(signal.SIGKILL)
-    child.wait()
+    child.send_signal(how)
+    assert child.wait(120) == (0 if how == signal.SIGINT else -how)
     about = {k: None for k in ("sha256", "training_frames", "width", "height")}
     killed = trainer(dataset, steps=10**6)
     load_run(killed, path, about)
