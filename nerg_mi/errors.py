@@ -12,6 +12,10 @@ class NergError(ValueError):
     """
 
 
+class MissingFile(NergError, FileNotFoundError):
+    """A file that is not there; the message names it."""
+
+
 class UnusableLLVM(ImportError):
     """The libLLVM that Dr.Jit would load cannot run its kernels. The message names the version and the remedy."""
 
