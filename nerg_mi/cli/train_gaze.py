@@ -28,7 +28,9 @@ def train_gaze(
         Optional[str], typer.Option(help='Or: "hits" makes a place from the rays\' own hit points, "none" does without any.')
     ] = None,
     recipe: Annotated[str, typer.Option(help="default (generalises best), small, or paper. Sets what is not set below.")] = "default",
-    voxel: Annotated[float, typer.Option(help="Edge of the voxels of --geometry hits in metres.")] = 0.08,
+    voxel: Annotated[
+        Optional[float], typer.Option(help="Edge of the voxels of --geometry hits in metres.  [default: 0.08, more in very large places]")
+    ] = None,
     align: Annotated[
         Optional[Path], typer.Option(help="JSON file with the 4x4 similarity from the rays' frame to the place's. Default: none.")
     ] = None,
@@ -201,7 +203,7 @@ def _views(views: Path | None, salience: str | None, per: str, align: Path | Non
     return found.views, {"salience": found.about, **({} if similarity is None else {"align_views": similarity.matrix.tolist()})}
 
 
-def _place(field, scene, geometry, rays, views, output: Path, voxel: float, ns):
+def _place(field, scene, geometry, rays, views, output: Path, voxel: float | None, ns):
     import numpy as np
 
     from ..training import gaze_places as places
@@ -216,7 +218,10 @@ def _place(field, scene, geometry, rays, views, output: Path, voxel: float, ns):
     path = output.with_suffix(".vol")
     place = places.place_of_hits(rays, path, voxel)
     made = place.about["geometry_file"]
-    typer.echo(f"wrote {path}: {' x '.join(map(str, made['shape']))} voxels of {voxel:g} m, {100 * made['solid']:.1f} % solid")
+    typer.echo(f"wrote {path}: {' x '.join(map(str, made['shape']))} voxels of {made['voxel']:.3g} m, {100 * made['solid']:.1f} % solid")
+    if made["beyond"]:
+        typer.echo(f"{100 * made['beyond']:.1f} % of the hit points lie beyond this box and stand on its shell, in their true directions "
+                   "but too near")
     return place
 
 

@@ -13,7 +13,8 @@ from ..field.gaze import GazeConfig
 from ..field.log_gaze import LogGazeConfig
 from ..transport.media import FieldMedium, VolumeMedium
 from ..transport.place import Place
-from .hit_geometry import VOXEL, volume_dict, voxelise_hits, write_volume
+from .hit_extent import hit_extent
+from .hit_geometry import volume_dict, voxelise_hits, write_volume
 
 # How far people without any geometry are taken to look.
 _NOWHERE = 2.0
@@ -65,12 +66,17 @@ def place_of_scene(path: Path) -> GazePlace:
     return GazePlace(place, Box(tuple(lower - pad), tuple(upper + pad)), "scene", {"scene_file": _file(path)})
 
 
-def place_of_hits(rays: Rays, path: Path, voxel: float = VOXEL) -> GazePlace:
-    """A volume made of the rays' hit points, written to ``path`` (.vol)."""
-    density, box = voxelise_hits(rays, voxel)
+def place_of_hits(rays: Rays, path: Path, voxel: float | None = None) -> GazePlace:
+    """A volume made of the rays' hit points, written to ``path`` (.vol); ``voxel``: edge of its voxels in metres, by default
+    what `hit_extent` chooses."""
+    extent = hit_extent(rays, voxel)
+    density, box = voxelise_hits(rays, extent=extent)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_volume(path, density, box)
-    size = {"shape": list(density.shape[::-1]), "solid": round(float((density > 0).mean()), 4), "voxel": voxel}
+    size = {
+        "shape": list(extent.shape), "solid": round(float((density > 0).mean()), 4), "voxel": extent.voxel,
+        "beyond": round(extent.beyond, 4),
+    }  # fmt: skip
     return place_of_volume(path, size)
 
 

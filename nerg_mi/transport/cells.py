@@ -10,6 +10,8 @@ from ..field.occupancy import OccupancyGrid
 
 # Share of a voxel by which a point on a boundary counts as beyond it; far below what a sample can tell.
 _NUDGE = 1e-4
+# Voxels whose values are asked for at a time.
+_ASKED = 1 << 20
 
 
 class VoxelCells:
@@ -58,21 +60,28 @@ def describe(volume) -> tuple[VoxelCells, np.ndarray] | None:
     box = volume.bbox()
     lower, upper = np.array(box.min, float), np.array(box.max, float)
     resolution = data.shape[::-1]
-    # Every voxel is asked for: few of them tell a grid that is mostly empty from its mirror image.
-    index = np.indices(data.shape).reshape(3, -1)[::-1]
     size = (upper - lower) / resolution
-
-    def ask(cell):
-        it = dr.zeros(mi.Interaction3f)
-        it.p = mi.Point3f((lower[:, None] + cell * size[:, None]).astype(np.float32))
-        return np.array(volume.eval_1(it))
-
-    values = data[index[2], index[1], index[0]]
     scale = max(float(np.abs(data).max()), 1e-30)
-    if not np.allclose(ask(index + 0.5), values, atol=1e-3 * scale):
+
+    def matches(shift, tolerance):
+        """Whether the volume has the grid's values at ``shift`` of a voxel from every voxel's lower corner."""
+        # Every voxel is asked for: few of them tell a grid that is mostly empty from its mirror image. Some layers at a time:
+        # positions take thirty times the memory of values.
+        layers = max(1, _ASKED // (data.shape[1] * data.shape[2]))
+        for first in range(0, data.shape[0], layers):
+            part = data[first : first + layers]
+            z, y, x = np.indices(part.shape, np.float32).reshape(3, -1)
+            cell = np.stack([x, y, z + first]) + shift
+            it = dr.zeros(mi.Interaction3f)
+            it.p = mi.Point3f((lower[:, None] + cell * size[:, None]).astype(np.float32))
+            if not np.allclose(np.array(volume.eval_1(it)), part.ravel(), atol=tolerance * scale):
+                return False
+        return True
+
+    if not matches(0.5, 1e-3):
         return None
     # A quarter voxel off the centre, nearest neighbours still return the centre's value.
-    nearest = np.allclose(ask(index + 0.25), values, atol=1e-6 * scale)
+    nearest = matches(0.25, 1e-6)
     if nearest and not np.allclose(data, data.flat[0]):
         return VoxelCells(lower, upper, resolution, 0.0), data
     return VoxelCells(lower, upper, resolution, 0.5), data
