@@ -92,3 +92,14 @@ def test_one_ray_a_fixation():
         fixation_rays(rays, np.full(20, -1))
     with pytest.raises(ValueError, match="velocity must be positive"):
         ivt(rays, velocity=0)
+
+
+@pytest.mark.parametrize("find", [ivt, idt])
+@pytest.mark.parametrize("gap", [0.02, -0.1, 0.0, -1000.0])
+def test_two_people_are_never_one_fixation(find, gap):
+    """Somebody's first ray may come any time after, or before, another one's last, in the very same direction."""
+    t = np.arange(20) * 0.02
+    still = gaze([0] * 40, person=np.r_[np.zeros(20), np.ones(20)], t=np.r_[t, t + t[-1] + gap])
+    assert find(still).tolist() == [0] * 20 + [1] * 20
+    # Each stay is too short by itself; together they would not be.
+    assert (find(still, least=0.5) == -1).all()

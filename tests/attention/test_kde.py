@@ -76,3 +76,16 @@ def test_refusals():
         SphericalKde(rays, [0, len(rays)], 1.0, np.zeros(len(rays)), "llvm")
     with pytest.raises(ValueError, match="expected"):
         SphericalKde(rays, offsets, kappa, backend="llvm").evaluate(np.zeros((2, 5, 3)))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_part_is_the_same_densities(weighted):
+    rays, offsets, kappa, rng = ragged()
+    # Some rays of each probe weigh much more than others: equal weights would be off by a large share of the peak.
+    weights = rng.random(len(rays)) ** 4 if weighted else None
+    kde, x = SphericalKde(rays, offsets, kappa, weights, "llvm"), fibonacci_directions(200)
+    whole = kde.evaluate(x)
+    for first, last in [(0, 2), (1, 3), (2, 4), (3, 4), (0, 4)]:
+        part = kde.part(first, last)
+        assert part.count == last - first
+        assert np.allclose(part.evaluate(x), whole[first:last], rtol=1e-5, atol=1e-7)

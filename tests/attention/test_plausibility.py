@@ -65,3 +65,17 @@ def test_times_and_steep_gaze():
     assert "a ray comes every 20 s" in said(replace(rays, t=rays.t * 1000))
     down = np.tile([0.1, 0.1, -1.0], (len(rays), 1)) / np.linalg.norm([0.1, 0.1, -1.0])
     assert "degrees down" in said(replace(rays, direction=down))
+
+
+@pytest.mark.parametrize("units", ["m", "cm", "mm"])
+@pytest.mark.parametrize("up", ["y", "x", "-y"])
+def test_axes_are_told_in_the_frame_of_the_file(units, up):
+    """In its own axes, which a cyclic change of them, unlike a swap, tells from those of the rays; whatever its unit."""
+    rays = walk(hit=False, frame={"up": up, "units": units})
+    agreement, file_up = walking_agreement(rays), "xyz".index(up[-1])
+    assert agreement[file_up] == 0 and (np.delete(agreement, file_up) > 0.5).all()
+    # Heads that stand along another axis of the file than the one that was declared.
+    turn = to_rays_frame(up=up)[:3, :3]
+    for standing in {"x", "y", "z"} - {up[-1]}:
+        file = rays.origin[:, {"x": [2, 0, 1], "y": [1, 2, 0], "z": [0, 1, 2]}[standing]]
+        assert f"(--up {standing})" in said(replace(rays, origin=file @ turn.T))

@@ -3,7 +3,7 @@ import pytest
 
 from nerg_mi.attention import vmf
 from nerg_mi.attention.bandwidth import leave_one_out_kappa
-from nerg_mi.attention.probes import place_probes
+from nerg_mi.attention.probes import person_weights, place_probes
 from nerg_mi.attention.rays import Rays
 from nerg_mi.attention.sphere import fibonacci_directions
 
@@ -93,3 +93,29 @@ def test_people_of_a_probe_can_count_alike():
     some = np.array([1.0] * 50 + [0.0] * 50 + [1.0])
     stays, passes = place_probes(rays, 0.2, weights="person", ray_weights=some, **about).density(both)[0]
     assert stays == pytest.approx(passes, rel=1e-5)
+
+
+def test_distance_and_the_rays_own_weights_multiply():
+    """Of rays at 0, R/2 and the very rim; the last keeps a trace of weight, so that a probe of rims alone is one."""
+    x = np.array([0.0, 0.1, 0.2])
+    rays = Rays(np.arange(3.0), np.zeros(3), ("a",), x[:, None] * [1.0, 0, 0], np.eye(3), np.ones(3))
+    about = dict(queries=np.zeros((1, 3)), min_rays=1, kappa_rule="fixed", kappa=200.0)
+    alone = place_probes(rays, 0.2, weights="distance", **about)
+    assert alone.weights == pytest.approx([1.0, 0.5, 1e-6], rel=1e-9)
+    own = np.array([0.25, 3.0, 1.0])
+    both = place_probes(rays, 0.2, weights="distance", ray_weights=own, **about)
+    assert both.weights == pytest.approx([0.25, 1.5, 1e-6], rel=1e-9)
+    assert both.positions[0, 0] == pytest.approx((0.25 * 0 + 1.5 * 0.1) / 1.75, rel=1e-5)
+    peaks = both.density(np.eye(3)[None])[0]
+    assert peaks[1] / peaks[0] == pytest.approx(6, rel=1e-4)
+    rim = place_probes(rays.select([2]), 0.2, weights="distance", **about)
+    assert rim.density(np.eye(3)[None])[0, 2] > 10
+
+
+def test_person_weights_of_people_without_rays():
+    """Names without rays do not count as people: the mean stays one, and everybody who is there has the same sum."""
+    person = np.array([0] * 6 + [3] * 2)
+    rays = Rays(np.arange(8.0), person, tuple("abcd"), np.zeros((8, 3)), np.tile([1.0, 0, 0], (8, 1)), np.ones(8))
+    weights = person_weights(rays)
+    assert weights == pytest.approx([8 / 2 / 6] * 6 + [8 / 2 / 2] * 2)
+    assert weights.mean() == pytest.approx(1)

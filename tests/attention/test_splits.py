@@ -36,6 +36,8 @@ def test_train_and_test_probes_share_no_ray(rays):
     # And training probes keep their distance: no training ray within 2R.
     apart = np.linalg.norm(rays.origin[split.train][:, None] - split.test_centres[None], axis=2)
     assert apart.min() > 2 * R
+    within = np.linalg.norm(rays.origin[:, None] - split.test_centres[None], axis=2).min(axis=1)
+    assert np.array_equal(split.test, within <= R) and np.array_equal(split.purged, (within > R) & (within <= 2 * R))
     assert not (split.train & split.test).any() and (split.train | split.test | split.purged).all()
 
 
@@ -121,3 +123,10 @@ def test_both_refuses_what_leaves_nothing(rays):
         both((nobody, ~nobody))
     with pytest.raises(ValueError, match="how to split"):
         both()
+
+
+@pytest.mark.parametrize("count, each", [(10, [4, 3, 3]), (11, [4, 4, 3]), (12, [4, 4, 4]), (2, [1, 1, 0])])
+def test_every_test_position_that_was_asked_for(rays, count, each):
+    """What does not divide by the zones goes to the first of them."""
+    split = split_by_position(rays, R, zones=3, zone_radius=0.4, test_probes=count, min_rays=8)
+    assert len(split.test_centres) == count and np.bincount(split.zone, minlength=3).tolist() == each
