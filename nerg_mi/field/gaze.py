@@ -206,8 +206,8 @@ class GazeField:
         emit = one if self.config.variant == "capture" else self.emit(p_od, r_o, active, semantic)
         return emit, one if self.config.variant == "emit" else self.capture(p_o, r_o, active)
 
-    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None):
-        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``.
+    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``; ``escaped`` makes no difference.
 
         ``semantic``: see ``emit``. ``integral``: of a normalised field over the sphere at ``p_o``
         (``transport.gaze_integral``), by which ``emit`` is divided; ``ValueError`` without it.

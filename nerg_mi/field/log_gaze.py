@@ -180,15 +180,16 @@ class LogGazeField:
             logit += emit if c.escaped == "nearest" else dr.select(escaped, self.escaped, emit)
         return dr.exp(dr.minimum(logit, _HIGHEST)), one if c.variant == "emit" else self.capture(p_o, r_o, active)
 
-    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None):
-        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr.
+    def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``escaped`` as for
+        ``unnormalized``.
 
         ``integral``: Z(p_o) (``transport.gaze_integral``); ``emit`` is divided by it and includes the blind density, so that
         gaze = (1 - m) emit * capture + m blind. Raises ``ValueError`` without it.
         """
         if integral is None:
             raise ValueError("this gaze field is normalised over the observer's sphere: evaluating it needs its integral there")
-        emit, capture = self.unnormalized(p_od, p_o, r_o, active)
+        emit, capture = self.unnormalized(p_od, p_o, r_o, active, escaped=escaped)
         emit = emit / integral
         gaze = emit * capture
         if self.config.mix:

@@ -32,13 +32,22 @@ class EnsembleMedium:
         for member in others if self.field.config.normalized else ():
             member.face(observers, *place, like=first)
 
-    def evaluate(self, p_od, p_o, r_o, active, semantic=None):
-        """Means of the members' ``(gaze, emit, capture)``; that of the product is not the product of the means."""
-        return self.spread(p_od, p_o, r_o, active, semantic)[:3]
+    def known(self) -> list:
+        """``GazeMedium.known`` of every member."""
+        return [m.known() for m in self.members]
 
-    def spread(self, p_od, p_o, r_o, active, semantic=None):
+    def recall(self, known: list) -> None:
+        """``GazeMedium.recall`` of every member."""
+        for member, own in zip(self.members, known):
+            member.recall(own)
+
+    def evaluate(self, p_od, p_o, r_o, active, semantic=None, escaped=False):
+        """Means of the members' ``(gaze, emit, capture)``; that of the product is not the product of the means."""
+        return self.spread(p_od, p_o, r_o, active, semantic, escaped)[:3]
+
+    def spread(self, p_od, p_o, r_o, active, semantic=None, escaped=False):
         """``evaluate``, and the standard deviation of the members' gaze (1/sr, of N - 1 degrees of freedom)."""
-        found = [m.evaluate(p_od, p_o, r_o, active, semantic) for m in self.members]
+        found = [m.evaluate(p_od, p_o, r_o, active, semantic, escaped) for m in self.members]
         gaze, emit, capture = (sum(parts[1:], parts[0]) / len(found) for parts in zip(*found))
         variance = sum(dr.square(g - gaze) for g, _, _ in found) / (len(found) - 1)
         # Where members agree, the root's derivative would not be finite.

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import math
 
+from dataclasses import dataclass
+
 import drjit as dr
 import numpy as np
 
+from .features import what_gaze_wants
 from .observer_map import _fingerprint, _indices
 
 COUNT = 1 << 17
@@ -34,47 +37,15 @@ class GazeIntegral:
         # A position that is a constant of the kernel would be compiled anew for every observer.
         dr.make_opaque(self.center)
         self._made = _traced_in(place), settings, kind, surface_opacity
+        self._surroundings = Surroundings(gaze, place, self.center, settings, kind, surface_opacity)
         self._value, self._value_of = None, None
         if depths is not None:
             self.directions, self.distance, self.escaped = depths.directions, depths.distance, depths.escaped
             return
         with dr.suspend_grad():
             self.directions = _spiral(count)
-            self.distance, self.escaped = self._depths(place, settings, kind, surface_opacity)
+            self.distance, self.escaped = self._surroundings.along(self.directions)
             dr.eval(self.directions, self.distance, self.escaped)
-
-    def _depths(self, place, settings, kind, surface_opacity):
-        import mitsuba as mi
-
-        config, width = self.gaze.field.config, dr.width(self.directions)
-        if getattr(config, "geometry", None) == "none":
-            return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
-
-        def trace(directions):
-            everywhere = dr.full(mi.Bool, True, dr.width(directions))
-            view = place.look(mi.Ray3f(self.center, directions), everywhere, settings)
-            met = everywhere & view.meets(surface_opacity)
-            return met, dr.select(met, view.depth(kind, met), self._beyond(directions))
-
-        met, depth = trace(self.directions)
-        if getattr(config, "escaped", None) == "nearest":
-            escaped = ~np.array(met)
-            if escaped.any():
-                few = _spiral(_FILL)
-                known, distance = (np.array(v) for v in trace(few))
-                if known.any():
-                    depth = np.array(depth)
-                    depth[escaped] = nearest_depth(np.array(few).T[known], distance[known], np.array(self.directions).T[escaped])
-                    depth = mi.Float(depth)
-        return depth, ~met
-
-    def _beyond(self, directions):
-        """Where a ray that meets nothing ends: on the gaze field's box, or its diagonal away."""
-        from .ray_box import intersect_box
-
-        box, local = self.gaze.field.box, self.gaze.to_world
-        near, far = intersect_box(local.point_to_local(self.center), local.vector_to_local(directions), box.lower, box.upper)
-        return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * local.scale)
 
     def serves(self, p_o, place, settings, kind, surface_opacity) -> bool:
         """Whether the depths are those of such an observer in such a place."""
@@ -96,6 +67,86 @@ class GazeIntegral:
         o = self.center + dr.zeros(type(self.center), dr.width(self.directions))
         emit, capture = self.gaze.unnormalized(o + self.directions * self.distance, o, self.directions, True, self.escaped)
         return dr.mean(emit * capture + dr.zeros(type(self.distance), dr.width(self.distance))) * (4 * dr.pi)
+
+
+class Surroundings:
+    """What an observer at ``center`` (Point3f, one lane) meets in every direction, as the field of ``gaze`` is to be evaluated
+    there: also where there is no surface. The other arguments are those of ``GazeIntegral``."""
+
+    def __init__(self, gaze, place, center, settings, kind: str, surface_opacity: float):
+        self.field, self.to_world, self.place, self.center = gaze.field, gaze.to_world, place, center
+        self.settings, self.kind, self.surface_opacity = settings, kind, surface_opacity
+
+    def along(self, directions):
+        """Distance (Float, scene units) along unit ``directions`` (Vector3f), and whether no surface is met there (Bool).
+
+        What escapes ends on the field's box, or at the depth of the nearest directions that do not, as the field wants it."""
+        import mitsuba as mi
+
+        config, width = self.field.config, dr.width(directions)
+        if getattr(config, "geometry", None) == "none":
+            return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
+        met, depth = self._trace(directions)
+        if getattr(config, "escaped", None) == "nearest":
+            escaped = ~np.array(met)
+            if escaped.any():
+                few = _spiral(_FILL)
+                known, distance = (np.array(v) for v in self._trace(few))
+                if known.any():
+                    depth = np.array(depth)
+                    depth[escaped] = nearest_depth(np.array(few).T[known], distance[known], np.array(directions).T[escaped])
+                    depth = mi.Float(depth)
+        return depth, ~met
+
+    def _trace(self, directions):
+        import mitsuba as mi
+
+        everywhere = dr.full(mi.Bool, True, dr.width(directions))
+        view = self.place.look(mi.Ray3f(self.center, directions), everywhere, self.settings)
+        met = everywhere & view.meets(self.surface_opacity)
+        return met, dr.select(met, view.depth(self.kind, met), self._beyond(directions))
+
+    def _beyond(self, directions):
+        """Where a ray that meets nothing ends: on the gaze field's box, or its diagonal away."""
+        from .ray_box import intersect_box
+
+        box, local = self.field.box, self.to_world
+        near, far = intersect_box(local.point_to_local(self.center), local.vector_to_local(directions), box.lower, box.upper)
+        return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * local.scale)
+
+
+@dataclass(frozen=True)
+class KnownIntegral:
+    """An integral of which nothing but the number is kept: ``number`` (Float, one lane) of the observer at ``center``."""
+
+    center: object
+    number: object
+
+    def value(self):
+        return self.number
+
+    def serves(self, *how) -> bool:
+        """Never: what it was made of is not known."""
+        return False
+
+
+def gaze_around(gaze, place, p_o, r_o, settings, kind: str, surface_opacity: float):
+    """Density (Float, 1/sr) of the observer at ``p_o`` (Point3f, one lane) in directions ``r_o`` (unit Vector3f), carrying no
+    derivatives: on surfaces what the integrator shows there, and elsewhere what the field was trained to be.
+
+    ``gaze`` (``media.GazeMedium`` or ``gaze_ensemble.EnsembleMedium``) must ``face`` the observer; the others as there.
+    """
+    import mitsuba as mi
+
+    with dr.suspend_grad():
+        center = mi.Point3f(dr.detach(p_o))
+        dr.make_opaque(center)
+        distance, escaped = Surroundings(gaze, place, center, settings, kind, surface_opacity).along(r_o)
+        o = center + dr.zeros(mi.Point3f, dr.width(r_o))
+        p_od, everywhere = o + r_o * distance, dr.full(mi.Bool, True, dr.width(r_o))
+        semantic = what_gaze_wants(gaze.field.config.semantic, place, p_od, o, r_o, everywhere, settings)
+        # A constant variant returns one lane for all.
+        return gaze.evaluate(p_od, o, r_o, everywhere, semantic, escaped)[0] + dr.zeros(mi.Float, dr.width(r_o))
 
 
 def _spiral(count: int):

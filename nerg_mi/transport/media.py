@@ -316,6 +316,16 @@ class GazeMedium:
             for p_o, traced in zip(observers, depths)
         ]  # fmt: skip
 
+    def known(self) -> list:
+        """Of the observers that are faced, the integrals as numbers, for ``recall``: without the directions that they are over."""
+        from .gaze_integral import KnownIntegral
+
+        return [KnownIntegral(k.center, k.value()) for k in self._integrals]
+
+    def recall(self, known: list) -> None:
+        """Face the observers of ``known`` again. Only for as long as neither the field nor its place has changed."""
+        self._integrals = list(known)
+
     def unnormalized(self, p_od, p_o, r_o, active, escaped=False):
         """``(emit, capture)`` of a normalised field, whose product is what is integrated."""
         local = self.to_world
@@ -323,12 +333,13 @@ class GazeMedium:
             local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active, escaped=escaped
         )
 
-    def evaluate(self, p_od, p_o, r_o, active, semantic=None):
-        """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``; ``semantic`` as the field wants it."""
+    def evaluate(self, p_od, p_o, r_o, active, semantic=None, escaped=False):
+        """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``; ``semantic`` as the field wants it;
+        ``escaped``: directions in which no surface is met."""
         local = self.to_world
         return self.field.evaluate(
             local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active, semantic,
-            self._integral(p_o),
+            self._integral(p_o), escaped,
         )
 
     def _integral(self, p_o):

@@ -141,7 +141,7 @@ def test_a_law_is_learnt_from_views_alone_and_holds_around():
     rng, d = np.random.default_rng(5), fibonacci_directions(1024)
     positions = rng.uniform((-0.9, -0.9, 1.45), (0.9, 0.9, 1.75), (8, 3))
     truth = np.stack([lobe(p, d) for p in positions])
-    found = gaze_field(field, None, count=1024)(positions, d)
+    found = gaze_field(field, None)(positions, d)
     np.testing.assert_allclose(4 * np.pi * found.mean(axis=1), 1, atol=1e-3)
     kld = lambda q: np.mean(truth * np.log(truth / q)) * 4 * np.pi
     cc = np.mean([np.corrcoef(a, b)[0, 1] for a, b in zip(truth, found)])
