@@ -41,6 +41,7 @@ def command(
     from ..evaluation.ablation import ablate, all_variants, frame_timer, write_ablation
     from ..evaluation.gaze_evaluation import held_out_rays
     from ..field.backend import namespace
+    from ..formats.atomic import check_folder
     from ..training.gaze_run import hold_out
     from .train_gaze import _place
 
@@ -52,13 +53,13 @@ def command(
         width, height = (int(x) for x in size.lower().split("x"))
     except ValueError as e:
         raise ValueError(f'--size needs WIDTHxHEIGHT, got "{size}"') from e
+    check_folder(output)
     mi.set_variant(mode)
     if threads is not None:
         dr.set_thread_count(threads)
     ns, data = namespace(mode), Rays.load(rays)
     _, account = hold_out(data, radius, zones, positions, 0, min_rays, people)
     train, scored, centres = held_out_rays(data, account, "both" if people else "pos")
-    output.mkdir(parents=True, exist_ok=True)
     place = _place(field, scene, geometry, train, [], output / "place", 0.08, ns)
     names = tuple(recipes.split(","))
     variants = _chosen(all_variants(place.kind == "field", names), variant)

@@ -39,15 +39,19 @@ def eval_radiance(
     variant: Annotated[str, typer.Option(help="Mitsuba variant.")] = "llvm_ad_rgb",
 ) -> None:
     """PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the integrator."""
-    import json
-
     import drjit as dr
     import mitsuba as mi
 
     from ..capture.dataset import open_dataset
     from ..evaluation.radiance_scores import score_views
+    from ..formats.atomic import check_folder, check_writable
     from ..formats.checkpoint import read_checkpoint
+    from ..formats.tables import write_json
 
+    output = output or field.with_suffix(".eval")
+    check_folder(output)
+    if json_file is not None:
+        check_writable(json_file)
     mi.set_variant(variant)
     if threads is not None:
         dr.set_thread_count(threads)
@@ -62,7 +66,6 @@ def eval_radiance(
     views = data.train if train else data.held_out
     typer.echo(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")
     show = lambda name, psnr, ssim: typer.echo(f"{name[-32:]:32s} {psnr:8.2f} {ssim:7.4f}")
-    output = output or field.with_suffix(".eval")
     scores = score_views(field, views, spp, output, show)
     show("mean", scores["psnr_mean"], scores["ssim_mean"])
     if "depth" in scores:
@@ -71,6 +74,5 @@ def eval_radiance(
                    f"opacity {d['opacity']:.3f}, {d['translucent']:.1%} of the pixels below 0.9")
     typer.echo(f"wrote {len(views)} pictures to {output}")
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps({"field": field.name, "dataset": data.source["dataset"], **scores}, indent=1) + "\n")
+        write_json(json_file, {"field": field.name, "dataset": data.source["dataset"], **scores})
         typer.echo(f"wrote {json_file}")

@@ -38,9 +38,12 @@ def eval_gaze(
     from ..evaluation.gaze_report import side_by_side, write_report
     from ..evaluation.gaze_scores import EPS, gaze_field
     from ..field.backend import namespace
+    from ..formats.atomic import check_folder
     from ..formats.fields import load_gaze
     from ..transport.media import Similarity
 
+    output = output or gaze.with_suffix(".eval")
+    check_folder(output)
     mi.set_variant(mode)
     if threads is not None:
         dr.set_thread_count(threads)
@@ -63,7 +66,6 @@ def eval_gaze(
     half = evaluation.split_half(scored, test.centres, account["radius"], kappa, blind, min_rays, seed)
     rows += [half] if half else []
     persons = evaluation.person_rows(test, {k: methods[k] for k in ("gaze field", "4,096 nearest rays")}, blind, min_rays)
-    output = output or gaze.with_suffix(".eval")
     notes = (
         f"# {gaze.name}: {split}\n\n{len(test.centres)} positions, {len(test.persons)} persons; {len(train):,} of {len(data):,} rays "
         f"trained on. Truth: rays within {account['radius']:g} m, kappa {kappa:g}, {directions} directions of equal area; KLD in nats with "

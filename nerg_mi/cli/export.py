@@ -68,12 +68,12 @@ def export_volume(
     resolution: _Resolution = 256, variant: _Variant = "llvm_ad_rgb",
 ) -> None:  # fmt: skip
     """Density, and colour, as Mitsuba grid volumes (.vol)."""
-    from ..errors import NergError
+    from ..formats.atomic import check_writable
     from ..formats.volumes import density_and_color, write_volume
 
     for path in (output, color):
-        if path is not None and path.suffix != ".vol":
-            raise NergError(f'"{path}" is no grid volume: let its name end in .vol.')
+        if path is not None:
+            check_writable(path, ".vol")
     start = time.perf_counter()
     sigma, paint, lower, upper = density_and_color(_load(field, variant), resolution, color is not None)
     write_volume(output, sigma, lower, upper)
@@ -88,8 +88,10 @@ def export_volume(
 @app.command("torch-ngp")
 def export_torch_ngp(field: _Field, output: _Output, variant: _Variant = "llvm_ad_rgb") -> None:
     """A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes."""
+    from ..formats.atomic import check_writable
     from ..formats.torch_ngp import write_torch_ngp
 
+    check_writable(output, ".pth")
     start = time.perf_counter()
     write_torch_ngp(_load(field, variant), output)
     _wrote(output, start)
@@ -105,15 +107,15 @@ def _load(path: Path, variant: str):
 
 def _writer(output: Path, up: str):
     from ..errors import NergError
+    from ..formats.atomic import check_writable
     from ..formats.surfaces import write_glb, write_ply
 
     if up not in ("y", "z"):
         raise NergError(f'--up must be z or y, not "{up}".')
+    check_writable(output, ".ply", ".glb")
     if output.suffix.lower() == ".ply":
         return write_ply
-    if output.suffix.lower() == ".glb":
-        return lambda surface, path: write_glb(surface, path, up)
-    raise NergError(f'"{output}" has no known format: let its name end in .ply or .glb.')
+    return lambda surface, path: write_glb(surface, path, up)
 
 
 def _by(shape) -> str:

@@ -26,6 +26,7 @@ def command(
     """Convert a checkpoint to the fields of the volumes `nerf` and `gazefield`. Nothing in the file is run."""
     from ..errors import NergError
     from ..field.backend import namespace
+    from ..formats.atomic import check_writable
     from ..formats.fields import save_gaze, save_radiance
     from ..formats.nerg_checkpoint import is_nerg, read_nerg
     from ..formats.torch_ngp import Given, open_checkpoint, read_torch_ngp
@@ -33,6 +34,9 @@ def command(
 
     if output is None and gaze is None:
         raise NergError("nothing is asked for: give -o FIELD.safetensors, --gaze GAZE.safetensors, or both.")
+    for path in (output, gaze):
+        if path is not None:
+            check_writable(path, ".safetensors")
     given = Given(color_space, finest, bg_radius)
     ns = namespace(activate(variant))
     if is_nerg(open_checkpoint(file)[1]):

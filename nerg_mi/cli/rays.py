@@ -50,6 +50,7 @@ def import_rays(
     from ..attention import presets
     from ..attention.tables import rays_from_table
 
+    _check(output)
     if (preset is None) == (columns is None):
         raise ValueError("say what the files are: either --preset NAME or --map COLUMNS")
     given = {
@@ -111,6 +112,7 @@ def filter_rays(
     from ..attention import filters, fixations as fix
     from ..attention.rays import Rays
 
+    _check(output)
     if fixations not in (None, "ivt", "idt"):
         raise ValueError(f'--fixations is "{fixations}"; it is ivt or idt')
     if one_ray and fixations is None:
@@ -167,6 +169,8 @@ def split_rays(
     from ..attention import splits
     from ..attention.rays import Rays
 
+    outputs = {side: output.with_name(f"{output.stem}-{side}{output.suffix}") for side in ("train", "test")}
+    _check(*outputs.values())
     data = Rays.load(rays)
     parts, about = [], {}
     if zones:
@@ -187,9 +191,8 @@ def split_rays(
     train, test = splits.both(*parts)
     typer.echo(f"{train.sum():,} training rays, {test.sum():,} test rays, {(~(train | test)).sum():,} purged of {len(data):,}")
     for side, mask in (("train", train), ("test", test)):
-        path = output.with_name(f"{output.stem}-{side}{output.suffix}")
-        data.select(mask).noting(step="split", side=side, seed=seed, kept=int(mask.sum()), of=len(data), by=about).save(path)
-        typer.echo(f"wrote {path}")
+        data.select(mask).noting(step="split", side=side, seed=seed, kept=int(mask.sum()), of=len(data), by=about).save(outputs[side])
+        typer.echo(f"wrote {outputs[side]}")
 
 
 @app.command("plot")
@@ -204,13 +207,13 @@ def plot_rays(
 ) -> None:
     """The floor plan: where people stood and how densely, or the layout."""
     from ..attention.rays import Rays
+    from ..formats.atomic import check_writable
     from ..view import ray_figures
     from ..view.figures import save
 
     if kind not in ("density", "layout"):
         raise ValueError(f'--kind is "{kind}"; it is density or layout')
-    if output.suffix.lower() != ".png":
-        raise ValueError(f"{output}: plots are written as PNG; choose a name that ends in .png")
+    check_writable(output, ".png")
     if kind == "density":
         if test is not None:
             raise ValueError("--test is drawn in the layout; add --kind layout")
@@ -222,6 +225,15 @@ def plot_rays(
         figure = ray_figures.layout_figure(Rays.load(rays), held, where.get("test_centres"), where.get("radius"))
     save(figure, output)
     typer.echo(f"wrote {output}")
+
+
+def _check(*outputs: Path) -> None:
+    """Raise `NergError` where rays cannot be written to one of ``outputs``: before minutes of reading."""
+    from ..formats.atomic import check_writable
+    from ..formats.rays_file import SUFFIXES
+
+    for path in outputs:
+        check_writable(path, *SUFFIXES)
 
 
 def _step(data, mask, step: str, what: dict):

@@ -50,9 +50,14 @@ def train_radiance(
     from ..capture.dataset import open_dataset
     from ..errors import NergError
     from ..field.backend import namespace
+    from ..formats.atomic import check_writable
     from ..training.radiance_run import save_trained, train_radiance
     from ..training.settings import RadianceSettings, sized_config
 
+    state, preview = output.with_suffix(".run"), output.with_suffix(".preview.png")
+    check_writable(output, ".safetensors")
+    check_writable(state)
+    check_writable(preview)
     mi.set_variant(variant)
     if threads is not None:
         dr.set_thread_count(threads)
@@ -62,7 +67,6 @@ def train_radiance(
     if depth_weight is not None:
         weights["depth_weight"] = depth_weight
     settings = RadianceSettings(steps=steps, minutes=minutes, seed=seed, **weights)
-    state = output.with_suffix(".run")
     if resume and not state.is_file():
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
     data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth, scale, coordinates)
@@ -77,7 +81,7 @@ def train_radiance(
     with _Bar() as bar:
         _, provenance = train_radiance(
             data, config, settings, namespace(variant), depth, bar.update, state=state, resume=resume,
-            save_every=save_every or float("inf"), preview=output.with_suffix(".preview.png"),
+            save_every=save_every or float("inf"), preview=preview,
             write=lambda field, provenance: save_trained(field, provenance, output, half),
         )  # fmt: skip
     typer.echo(f"{provenance['steps']} steps in {provenance['seconds']:.0f} s")

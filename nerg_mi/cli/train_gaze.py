@@ -86,6 +86,7 @@ def train_gaze(
     from ..attention.rays import Rays
     from ..errors import NergError
     from ..field.backend import namespace
+    from ..formats.atomic import check_writable
     from ..formats.fields import save_gaze
     from ..training.gaze_ensemble import train_ensemble
     from ..training.gaze_recipes import gaze_recipe
@@ -106,6 +107,11 @@ def train_gaze(
         raise ValueError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
     if test_people and not test_zones:
         raise ValueError("--test-people leaves people out at test positions: say where, with --test-zones")
+    state = output.with_suffix(".run")
+    check_writable(output, ".safetensors")
+    check_writable(state)
+    if geometry == "hits":
+        check_writable(output.with_suffix(".vol"))
     mi.set_variant(mode)
     if threads is not None:
         dr.set_thread_count(threads)
@@ -121,7 +127,6 @@ def train_gaze(
         radius=radius, count=probes, placement=placement, cap=cap, min_rays=min_rays, kappa_rule=kappa_rule, kappa=kappa, weights=weights, directions=directions,
         fresh=fresh or None,
     ))  # fmt: skip
-    state = output.with_suffix(".run")
     if resume and not ensemble and not state.is_file():
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
     data, ns, about = None, namespace(mode), {"recipe": recipe}

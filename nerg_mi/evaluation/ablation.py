@@ -6,7 +6,6 @@ by the integrator, observer and camera in one place.
 """
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import time
@@ -17,7 +16,10 @@ from typing import Callable
 import numpy as np
 
 from ..attention.rays import Rays
+from ..formats.atomic import write_text
 from ..formats.fields import save_gaze
+from ..formats.png import write_figure
+from ..formats.tables import write_csv, write_json
 from ..training.gaze_places import GazePlace
 from ..training.gaze_recipes import gaze_recipe
 from ..training.gaze_run import train_gaze
@@ -112,10 +114,7 @@ def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: 
     else:
         made = {"recipe": v.recipe, "variant": v.name, "seed": seed}
         row = made | _train(train, tests, place, config, settings, how, ns, align, initial, made, path)
-        # Under another name first: a process that is killed leaves no half of it.
-        part = path.with_suffix(".part")
-        part.write_text(json.dumps({"row": row, "same": same}, indent=1) + "\n")
-        part.replace(kept)
+        write_json(kept, {"row": row, "same": same})
     if render is not None:
         row["frame_seconds"] = render(path)
     return row
@@ -210,12 +209,9 @@ def table(summary: list[dict]) -> str:
 def write_ablation(folder: Path, rows: list[dict], notes: str) -> list[Path]:
     """``ablation.md``, ``.csv``, ``.json`` and the plot ``ablation.png``; returns their paths."""
     summary, files = summarise(rows), [folder / f"ablation.{e}" for e in ("md", "csv", "json", "png")]
-    files[0].write_text(f"{notes}\n\n{table(summary)}")
-    with open(files[1], "w", newline="") as out:
-        writer = csv.DictWriter(out, COLUMNS, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
-    files[2].write_text(json.dumps({"rows": rows, "summary": summary}, indent=1) + "\n")
+    write_text(files[0], f"{notes}\n\n{table(summary)}")
+    write_csv(files[1], rows, COLUMNS)
+    write_json(files[2], {"rows": rows, "summary": summary})
     _plot(summary, files[3])
     return files
 
@@ -237,5 +233,5 @@ def _plot(summary: list[dict], path: Path) -> None:
     axis.set_xticks(x, [f"{r['variant']}\n({r['recipe']})" for r in summary], fontsize=8, rotation=30, ha="right")
     axis.set_ylabel("KLD + (1 - CC) + MAE, emit_capture = 1")
     figure.legend(loc="outside upper right", ncols=2)
-    figure.savefig(path, dpi=120)
+    write_figure(path, figure, dpi=120)
     plt.close(figure)

@@ -1,14 +1,15 @@
 """What an evaluation of gaze writes: tables as Markdown, CSV and JSON, and pictures of truth and prediction."""
 from __future__ import annotations
 
-import csv
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 
 from ..attention.sphere import Z_UP, latlong_grid
+from ..formats.atomic import write_text
+from ..formats.png import write_figure
+from ..formats.tables import write_csv, write_json
 from .gaze_evaluation import SCORES, GazeTest
 
 _DIGITS = {"MAE": 4}
@@ -38,19 +39,15 @@ def _cell(row: dict, column: str) -> str:
 
 def write_report(folder: Path, rows: list[dict], persons: list[dict], about: dict, notes: str) -> list[Path]:
     """``gaze.md``, ``gaze.csv``, ``persons.csv`` and ``gaze.json`` in ``folder``; returns their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
     files = [folder / name for name in ("gaze.md", "gaze.csv", "persons.csv", "gaze.json")]
     ours, bar = rows[0], next(r["method"] for r in reversed(rows) if r["method"] != "split half")
     less = [{"method": f"{ours['method']} less {bar}"} | {k.replace(".less", ""): v for k, v in ours.items() if ".less" in k}]
-    files[0].write_text(f"{notes}\n\n{markdown(rows)}\n{markdown(less)}\n## Each person\n\n"
-                        + markdown(persons, ("method", "person", "rays", "KLD", "CC", "NSS", "AUC", "bits", "loglik")))
+    each = markdown(persons, ("method", "person", "rays", "KLD", "CC", "NSS", "AUC", "bits", "loglik"))
+    write_text(files[0], f"{notes}\n\n{markdown(rows)}\n{markdown(less)}\n## Each person\n\n{each}")
     for path, table in zip(files[1:3], (rows, persons)):
-        with open(path, "w", newline="") as out:
-            writer = csv.DictWriter(out, list(dict.fromkeys(k for r in table for k in r)), restval="")
-            writer.writeheader()
-            writer.writerows(table)
+        write_csv(path, table)
     clean = lambda table: [{k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()} for r in table]
-    files[3].write_text(json.dumps({**about, "methods": clean(rows), "persons": clean(persons)}, indent=1, allow_nan=False) + "\n")
+    write_json(files[3], {**about, "methods": clean(rows), "persons": clean(persons)}, allow_nan=False)
     return files
 
 
@@ -75,5 +72,5 @@ def side_by_side(test: GazeTest, methods: dict, path: Path, count: int = 4, heig
                 axis.set_title(name, fontsize=10)
         row[0].set_ylabel(", ".join(f"{x:.1f}" for x in test.centres[which[i]]) + " m", fontsize=8)
         figure.colorbar(image, ax=row.tolist(), shrink=0.9).set_label("1/sr", fontsize=8)
-    figure.savefig(path, dpi=110)
+    write_figure(path, figure, dpi=110)
     plt.close(figure)

@@ -13,6 +13,7 @@ import numpy as np
 from ..capture.cameras import Camera, pixel_directions, sensor_dict
 from ..capture.images import View
 from ..capture.undistort import pinhole, through_lens
+from ..formats.atomic import make_folder
 from ..training.preview import psnr
 from ..view.tonemap import srgb, write_png
 
@@ -132,7 +133,7 @@ def score_views(field: str | Path, views: list[View], spp: int = 16, pictures: P
         raise ValueError("there are no views to score; the data set holds none out, so give --holdout 8 or --train")
     render, rows, depths = Renderer(field, spp), [], []
     if pictures is not None:
-        pictures.mkdir(parents=True, exist_ok=True)
+        make_folder(pictures)
     for k, view in enumerate(views):
         seen, truth = render(view.camera, k), view.over(0)
         mask = seen.mask if view.mask is None else seen.mask & view.mask

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from .. import __version__
 from ..errors import NergError
+from ..formats.atomic import check_folder
 from ..rendering import activate
 from . import study_errors, study_measure, study_plots, study_tables
 from .study_settings import settings
@@ -44,6 +45,8 @@ def run_study(
         wanted = re.compile(only)
     except re.error as error:
         raise NergError(f'"{only}" is no regular expression ({error}): name settings as in "depth|paper".') from error
+    out = Path(out)
+    check_folder(out)
     active = activate(variant)
     import drjit as dr
     import mitsuba as mi
@@ -77,8 +80,6 @@ def run_study(
         "versions": {"nerg_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__, "python": platform.python_version()},
         "against_paper": study_tables.against_paper(table), "rows": table, "scaling": scaling,
     }  # fmt: skip
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
     files = study_tables.write_tables(out, report)
     title = f"{subject.name}, {width} x {height}, {active}"
     study_plots.plot_errors(out / "errors.png", table, f"Error against time: {title}")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..formats.png import write_figure
 from .study_settings import PAPER
 from .study_tables import comparable
 
@@ -56,7 +57,7 @@ def plot_errors(path: Path, rows: list[dict], title: str) -> None:
     figure.suptitle(title, fontsize=10)
     figure.legend(handles.values(), handles, loc="lower center", ncol=6, fontsize=7, frameon=False)
     figure.tight_layout(rect=(0, 0.06, 1, 1))
-    figure.savefig(path, metadata={"Software": None}, pil_kwargs={"optimize": True})
+    write_figure(path, figure, metadata={"Software": None}, pil_kwargs={"optimize": True})
 
 
 def plot_scaling(path: Path, rows: list[dict], title: str) -> None:
@@ -79,7 +80,7 @@ def plot_scaling(path: Path, rows: list[dict], title: str) -> None:
         axes.grid(True, which="major", color="0.9", linewidth=0.6)
     figure.suptitle(title, fontsize=10)
     figure.tight_layout()
-    figure.savefig(path, metadata={"Software": None}, pil_kwargs={"optimize": True})
+    write_figure(path, figure, metadata={"Software": None}, pil_kwargs={"optimize": True})
 
 
 def exponent(x, y) -> float:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import math
 from pathlib import Path
 
+from ..formats.atomic import write_text
+from ..formats.tables import write_csv, write_json
 from .study_measure import COLUMNS
 from .study_settings import PAPER
 
@@ -73,12 +73,9 @@ def write_tables(out: Path, report: dict) -> list[Path]:
     ``report``); returns their paths."""
     paths = [out / "study.csv", out / "study.md", out / "scaling.csv", out / "study.json"]
     for path, rows, columns in ((paths[0], report["rows"], COLUMNS), (paths[2], report["scaling"], None)):
-        with path.open("w", newline="") as f:
-            writer = csv.DictWriter(f, columns or list(rows[0]), restval="")
-            writer.writeheader()
-            writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows)
-    paths[1].write_text(markdown(report))
-    paths[3].write_text(json.dumps(report, indent=1) + "\n")
+        write_csv(path, ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows), columns or list(rows[0]))
+    write_text(paths[1], markdown(report))
+    write_json(paths[3], report)
     return paths
 
 

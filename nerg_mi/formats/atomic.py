@@ -69,10 +69,11 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         _flush(target.parent)
 
 
-def write_bytes(path: str | os.PathLike, data: bytes | memoryview) -> None:
-    """Write ``data`` to ``path``, whole or not at all; see `replacing`."""
-    with replacing(path) as temporary:
-        temporary.write_bytes(data)
+def write_bytes(path: str | os.PathLike, *parts: bytes | memoryview) -> None:
+    """Write ``parts``, one after the other, to ``path``, whole or not at all; see `replacing`."""
+    with replacing(path) as temporary, temporary.open("wb") as out:
+        for part in parts:
+            out.write(part)
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
@@ -87,7 +88,7 @@ def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
     any). Nothing is made. A disk that fills meanwhile, or permissions that change, are found by `replacing`.
     """
     if suffixes and Path(path).suffix.lower() not in suffixes:
-        raise NergError(f'"{path}" has no format that is written here; give it a name that ends in {" or ".join(suffixes)}.')
+        raise NergError(f'"{path}" has no format that is written here: let its name end in {" or ".join(suffixes)}.')
     with writing(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():

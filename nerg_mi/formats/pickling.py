@@ -2,12 +2,13 @@
 from __future__ import annotations
 
 import io
-import os
 import struct
 import zipfile
 from pathlib import Path
 
 import numpy as np
+
+from .atomic import replacing
 
 _STORAGE = {"<f4": "FloatStorage", "<f2": "HalfStorage", "<i4": "IntStorage", "<i8": "LongStorage", "|u1": "ByteStorage"}
 
@@ -77,22 +78,14 @@ class _Writer:
 
 def write_torch(path: str | Path, value: dict) -> None:
     """Write ``value`` (dictionaries, lists, numbers, strings and NumPy arrays) to ``path``, whole or not at all."""
-    path = Path(path)
     writer = _Writer()
     writer.out.write(b"\x80\x02")
     writer.put(value)
     writer.out.write(b".")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    folder = path.stem
-    try:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-            archive.writestr(f"{folder}/data.pkl", writer.out.getvalue())
-            archive.writestr(f"{folder}/byteorder", "little")
-            for key, array in enumerate(writer.storages):
-                archive.writestr(f"{folder}/data/{key}", array.tobytes())
-            archive.writestr(f"{folder}/version", "3\n")
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    folder = Path(path).stem
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(f"{folder}/data.pkl", writer.out.getvalue())
+        archive.writestr(f"{folder}/byteorder", "little")
+        for key, array in enumerate(writer.storages):
+            archive.writestr(f"{folder}/data/{key}", array.tobytes())
+        archive.writestr(f"{folder}/version", "3\n")

@@ -14,7 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from .atomic import replacing
+
 VERSION = 1
+SUFFIXES = (".npz", ".parquet")
 _REQUIRED = ("t", "person", "origin", "direction", "confidence")
 _OPTIONAL = ("hit", "cohort")
 _VECTORS = ("origin", "direction", "hit")
@@ -22,7 +25,7 @@ _VECTORS = ("origin", "direction", "hit")
 
 def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], metadata: dict[str, Any]) -> None:
     """Write columns of N rows (``t``, ``person``, ``origin``, ``direction``,
-    ``confidence``, optionally ``hit`` and ``cohort``) and JSON-serialisable metadata.
+    ``confidence``, optionally ``hit`` and ``cohort``) and JSON-serialisable metadata, whole or not at all.
 
     Raises ``ValueError`` for another suffix, and ``ImportError`` with the
     remedy where Parquet is asked for without pyarrow.
@@ -30,7 +33,7 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
     document = json.dumps({"version": VERSION, **metadata})
     if _suffix(path) == ".npz":
         # What savez_compressed writes, with a faster level of zlib: millions of rays in seconds.
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, value in {"metadata": np.array(document), **columns}.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as out:
                     np.lib.format.write_array(out, value, allow_pickle=False)
@@ -42,7 +45,8 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
             table.update({f"{name}_{axis}": value[:, i] for i, axis in enumerate("xyz")})
         else:
             table[name] = value
-    pq.write_table(pa.table(table).replace_schema_metadata({"nerg_mi": document}), path, compression="zstd")
+    with replacing(path) as temporary:
+        pq.write_table(pa.table(table).replace_schema_metadata({"nerg_mi": document}), temporary, compression="zstd")
 
 
 def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -81,7 +85,7 @@ def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict
 
 def _suffix(path: str | os.PathLike) -> str:
     suffix = Path(path).suffix.lower()
-    if suffix not in (".npz", ".parquet"):
+    if suffix not in SUFFIXES:
         raise ValueError(f"{path}: rays are kept as .npz or .parquet; choose a name with one of these endings")
     return suffix
 

@@ -12,10 +12,13 @@ import io
 import itertools
 import operator
 import os
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Iterator, NamedTuple, Sequence
 
 import numpy as np
+
+from .atomic import replacing
 
 KEYPOINTS = 22
 VALUES = 3 * KEYPOINTS
@@ -66,7 +69,7 @@ def write_skeleton(
 
     form = ", ".join([f"%.{decimals}f"] * VALUES)
     flat = keypoints.reshape(n, VALUES)
-    with _open(path, "w") as out:
+    with replacing(path) as temporary, _written(temporary, Path(path).name) as out:
         for name, time, values in zip(ids, times, flat):
             out.write(f"{name}|{int(time)}|[{form % tuple(values)}]\n")
 
@@ -85,7 +88,7 @@ def iterate_skeleton(
     times: list[int] = []
     texts: list[str] = []
     lines: list[int] = []
-    with _open(path, "r") as source:
+    with _read(path) as source:
         for number, line in enumerate(source, start=1):
             line = line.strip()
             if not line:
@@ -157,10 +160,20 @@ def _rows(
     )
 
 
-def _open(path: str | os.PathLike, mode: str) -> IO[str]:
-    if not str(path).endswith(".gz"):
-        return open(path, mode + "t", encoding="utf-8", newline="\n" if mode == "w" else None)
-    if mode == "r":
+def _read(path: str | os.PathLike) -> IO[str]:
+    if str(path).endswith(".gz"):
         return gzip.open(path, "rt", encoding="utf-8")
-    # mtime=0: equal poses give equal bytes, whenever they are written.
-    return io.TextIOWrapper(gzip.GzipFile(Path(path), "wb", mtime=0), encoding="utf-8", newline="\n")
+    return open(path, encoding="utf-8")
+
+
+@contextmanager
+def _written(path: Path, name: str) -> Iterator[IO[str]]:
+    """A text file to write, compressed where ``name``, that which it will have, ends in ``.gz``."""
+    with path.open("wb") as raw:
+        if not name.endswith(".gz"):
+            with io.TextIOWrapper(raw, encoding="utf-8", newline="\n") as out:
+                yield out
+            return
+        # With its later name in it and no time: equal poses give equal bytes, whenever they are written.
+        with io.TextIOWrapper(gzip.GzipFile(name, "wb", fileobj=raw, mtime=0), encoding="utf-8", newline="\n") as out:
+            yield out

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..field.extraction import Lattice, Sampler, crossings, opacity, surface_density
 from ..field.radiance import RadianceField
+from .atomic import write_bytes
 
 
 @dataclass
@@ -176,9 +177,7 @@ def write_ply(surface: Surface, path: str | Path) -> None:
         f["n"], f["v"] = 3, surface.faces
         header += [f"element face {len(f)}", "property list uchar int vertex_indices"]
         data += f.tobytes()
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes("\n".join([*header, "end_header", ""]).encode() + data)
+    write_bytes(path, "\n".join([*header, "end_header", ""]).encode(), data)
 
 
 def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
@@ -218,9 +217,5 @@ def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(
-        struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(data)) + struct.pack("<II", len(text), 0x4E4F534A) + text
-        + struct.pack("<II", len(data), 0x004E4942) + data
-    )
+    head = struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(data))
+    write_bytes(path, head, struct.pack("<II", len(text), 0x4E4F534A), text, struct.pack("<II", len(data), 0x004E4942), data)

@@ -9,20 +9,22 @@ import numpy as np
 
 from ..field.extraction import Lattice, Sampler, surface_density
 from ..field.radiance import RadianceField
+from .atomic import write_bytes
 
 # Optical depth of a voxel at most, and the opacity from which on it has a colour.
 _DEEPEST, _FAINT = 5.0, 1e-3
 
 
 def write_volume(path: str | Path, data: np.ndarray, lower, upper) -> None:
-    """Mitsuba's .vol format, version 3: ``data`` (z, y, x) or (z, y, x, channels) as float32, and the box it fills."""
+    """Mitsuba's .vol format, version 3: ``data`` (z, y, x) or (z, y, x, channels) as float32, and the box it fills.
+
+    A ``gridvolume`` with ``use_grid_bbox`` set to true reads it, and fills that box.
+    """
     data = np.asarray(data, "<f4")
     data = data[..., None] if data.ndim == 3 else data
     nz, ny, nx, channels = data.shape
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     head = struct.pack("<3sBiiiii6f", b"VOL", 3, 1, nx, ny, nz, channels, *map(float, lower), *map(float, upper))
-    path.write_bytes(head + np.ascontiguousarray(data).tobytes())
+    write_bytes(path, head, np.ascontiguousarray(data).data)
 
 
 def density_and_color(field: RadianceField, resolution: int = 256, color: bool = True, samples: int = 2):

@@ -11,10 +11,11 @@ from ..attention.rays import Rays
 from ..field.box import Box
 from ..field.gaze import GazeConfig
 from ..field.log_gaze import LogGazeConfig
+from ..formats.volumes import write_volume
 from ..transport.media import FieldMedium, VolumeMedium
 from ..transport.place import Place
 from .hit_extent import hit_extent
-from .hit_geometry import volume_dict, voxelise_hits, write_volume
+from .hit_geometry import volume_dict, voxelise_hits
 
 # How far people without any geometry are taken to look.
 _NOWHERE = 2.0
@@ -71,8 +72,7 @@ def place_of_hits(rays: Rays, path: Path, voxel: float | None = None) -> GazePla
     what `hit_extent` chooses."""
     extent = hit_extent(rays, voxel)
     density, box = voxelise_hits(rays, extent=extent)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_volume(path, density, box)
+    write_volume(path, density, box.lower, box.upper)
     size = {
         "shape": list(extent.shape), "solid": round(float((density > 0).mean()), 4), "voxel": extent.voxel,
         "beyond": round(extent.beyond, 4),

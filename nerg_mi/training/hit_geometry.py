@@ -86,21 +86,8 @@ def _passed(origins: np.ndarray, hits: np.ndarray, extent: HitExtent) -> np.ndar
     return out
 
 
-def write_volume(path: str | Path, density: np.ndarray, box: Box) -> None:
-    """Write ``density`` (z, y, x) as a Mitsuba ``.vol`` file that knows its ``box``.
-
-    It is read by a ``gridvolume`` with ``use_grid_bbox`` set to true and ``filter_type`` ``nearest`` (file format: Mitsuba's ``VolumeGrid``, version 3).
-    """
-    z, y, x = density.shape
-    with open(path, "wb") as out:
-        out.write(b"VOL\x03")
-        out.write(np.array([1, x, y, z, 1], "<i4").tobytes())
-        out.write(np.array([*box.lower, *box.upper], "<f4").tobytes())
-        out.write(np.ascontiguousarray(density, "<f4").tobytes())
-
-
 def volume_dict(path: str | Path) -> dict:
-    """The Mitsuba plugin, as a dict, that shows what ``write_volume`` wrote.
+    """The Mitsuba plugin, as a dict, that shows what ``formats.volumes.write_volume`` wrote of hit points.
 
     Without interpolation, which would bring every surface nearer by most of a voxel.
     """

@@ -8,7 +8,6 @@ observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field, an
 from __future__ import annotations
 
 import hashlib
-import json
 import platform
 import shutil
 import sys
@@ -21,6 +20,9 @@ import numpy as np
 
 from .. import __version__, llvm
 from ..errors import NergError, sentence
+from ..formats.atomic import check_folder
+from ..formats.exr import write_bitmap_exr
+from ..formats.tables import write_json
 from ..rendering import activate
 from . import figures
 from .overlay import Heat, top_of
@@ -71,6 +73,8 @@ def run_demo(
     """
     if width < 12 or spp < 1:
         raise NergError(f"the demo needs pictures of at least 12 pixels and 1 sample a pixel, got {width} and {spp}.")
+    out = Path(out)
+    check_folder(out)
     scene = store_scene() if scene is None else Path(scene)
     inputs = _inputs(scene, defaults or {})
     active = activate(variant)
@@ -96,8 +100,6 @@ def run_demo(
     without = _render(mi, unhidden, CAMERA, spp, seed)
 
     clock.start("pictures")
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
     versions = _versions(active)
     header = {"Software": f"nerg_mi {__version__}", "Comment": f"seed {seed}, {spp} samples a pixel, {active}"}
     # One scale for all pictures of gaze, so that a colour means the same in each of them.
@@ -108,7 +110,7 @@ def run_demo(
     marker = _pixel_of_observer(mi, seen)
     files = _write_pictures(out, camera, own, sphere, without, heat, marker, header)
     camera.bitmap.metadata()["seed"] = seed
-    camera.bitmap.write(str(out / "scene.exr"))
+    write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
     clock.stop()
 
@@ -118,7 +120,7 @@ def run_demo(
         "seconds": {k: round(v, 2) for k, v in clock.seconds.items()},
         "inputs": {p.name: checksum(p) for p in inputs}, "outputs": {p.name: checksum(p) for p in files},
     }  # fmt: skip
-    (out / "run.json").write_text(json.dumps(report, indent=1) + "\n")
+    write_json(out / "run.json", report)
     return DemoResult([*files, out / "run.json"], clock.seconds, report)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..formats.png import write_figure
 from .overlay import Heat, overlay, scale_strip
 from .tonemap import LUMINANCE, srgb
 
@@ -21,7 +22,7 @@ _BAR, _GAP, _LABELS, _HEAD, _FOOT = 14, 10, 66, 26, 10  # pixels
 
 def save(figure, path, text: dict[str, str] | None = None) -> None:
     """Write a figure as PNG. ``text``: what its header says; no time, no program version, so equal figures are equal files."""
-    figure.savefig(path, dpi=DPI, facecolor=PAPER, metadata={"Software": None, **(text or {})}, pil_kwargs={"optimize": True})
+    write_figure(path, figure, dpi=DPI, facecolor=PAPER, metadata={"Software": None, **(text or {})}, pil_kwargs={"optimize": True})
 
 
 def depth_figure(depth, mask, title: str = "Depth", unit: str = "m"):

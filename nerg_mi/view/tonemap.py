@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..formats import png
+
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Weights of linear sRGB for the luminance (Rec. 709)."""
 
@@ -30,4 +32,4 @@ def write_png(path, display, text: dict[str, str] | None = None) -> None:
     bitmap = mi.Bitmap(to_bytes(display))
     for key, value in (text or {}).items():
         bitmap.metadata()[key] = value
-    bitmap.write(str(path))
+    png.write_png(path, bitmap)

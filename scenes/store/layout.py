@@ -10,11 +10,12 @@ pictures, and what exact ray casts answer without ambiguity.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+
+from nerg_mi.formats.tables import write_json
 
 ROOM = (8.0, 6.0, 3.0)  # metres
 SOUTH, NORTH, WEST, EAST = (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)
@@ -232,5 +233,5 @@ def write_regions(layout: Layout, path) -> Path:
         "aabb": layout.aabb.tolist(),
         "regions": [r.as_json() for r in layout.regions],
     }
-    path.write_text(json.dumps(content, indent=1) + "\n")
+    write_json(path, content)
     return path

@@ -130,9 +130,12 @@ def main(argv=None) -> None:
 
     import mitsuba as mi
 
+    from nerg_mi.formats.atomic import check_folder
+
     mi.set_variant(args.variant)
     job = Job(args.seed)
-    job.build.mkdir(parents=True, exist_ok=True)
+    check_folder(job.store)
+    check_folder(job.build)
     for name, stage in STAGES.items():
         if args.stage and name not in args.stage:
             continue

@@ -196,7 +196,6 @@ def write_shoppers(layout: Layout, path, *, say=print, **options) -> Path:
 
     ids, times, origins, directions = simulate(layout, **options)
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     # 0.1 mm turns a head by less than 1 mrad, far below the law's jitter
     write_skeleton(path, ids, times, keypoints_from_head(origins, directions), decimals=4)
     nearest = floor_clearance(layout, origins[:, :2]).min()

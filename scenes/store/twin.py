@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.formats.atomic import write_bytes, write_text
+
 HERE = Path(__file__).resolve().parent
 TWIN_XML = HERE / "twin.xml"
 
@@ -90,17 +92,16 @@ def _write_ply(path: Path, quads: np.ndarray, colors: np.ndarray | None) -> None
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     # Mitsuba groups the face properties color_0..2 into the attribute face_color
     header += [f"property float color_{k}" for k in range(3)] if colors is not None else []
-    path.write_bytes(("\n".join([*header, "end_header", ""])).encode() + vertices.astype("<f4").tobytes() + faces.tobytes())
+    write_bytes(path, "\n".join([*header, "end_header", ""]).encode(), vertices.astype("<f4").tobytes(), faces.tobytes())
 
 
 def write_twin(layout, folder=HERE) -> list[Path]:
     """Write twin.xml, twin.ply and twin_lights.ply of a `Layout` into a folder; returns their paths."""
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     _write_ply(folder / "twin.ply", layout.quads, np.clip(layout.colors, *ALBEDO_RANGE))
     _write_ply(folder / "twin_lights.ply", layout.lights, None)
     tint = PANEL_RADIANCE * np.array([1.0, 0.97, 0.92])
-    (folder / "twin.xml").write_text(XML.format(r=tint[0], g=tint[1], b=tint[2]))
+    write_text(folder / "twin.xml", XML.format(r=tint[0], g=tint[1], b=tint[2]))
     return [folder / n for n in ("twin.xml", "twin.ply", "twin_lights.ply")]
 
 

@@ -8,12 +8,14 @@ store's own metric frame with z up. ``aabb`` are the bounds of the store.
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.formats.atomic import replacing
+from nerg_mi.formats.png import write_png
+from nerg_mi.formats.tables import write_json
 from nerg_mi.scenes.store import cameras, twin
 from nerg_mi.scenes.store.layout import Layout
 
@@ -76,12 +78,12 @@ class Photographer:
         return np.where(np.isfinite(t), t, 0.0).astype(np.float32).reshape(self.camera.height, self.camera.width)
 
 
-def write_png(path: Path, picture: np.ndarray) -> None:
+def write_picture(path: Path, picture: np.ndarray) -> None:
     """Write linear radiance (h, w, 3) as 8-bit sRGB; what is brighter than white is clipped."""
     import mitsuba as mi
 
     bitmap = mi.Bitmap(np.ascontiguousarray(picture, np.float32))
-    bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True).write(str(path))
+    write_png(path, bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True))
 
 
 def transforms(camera: cameras.Pinhole, layout: Layout, frames: list) -> dict:
@@ -115,7 +117,6 @@ def write_views(
     camera = camera or cameras.Pinhole()
     folder = Path(folder)
     for name in ("images", "depth"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
         # an earlier, larger set would leave pictures behind that no file lists
         for old in (folder / name).glob("t*_???.*"):
             old.unlink()
@@ -133,15 +134,16 @@ def write_views(
         for k, pose in enumerate(poses):
             stem = f"{kind}_{k:03d}"
             picture = photographer.picture(pose, seed * 10_000 + done, spp if kind == "train" else 4 * spp)
-            write_png(folder / "images" / f"{stem}.png", picture)
-            np.save(folder / "depth" / f"{stem}.npy", photographer.depth(pose))
+            write_picture(folder / "images" / f"{stem}.png", picture)
+            with replacing(folder / "depth" / f"{stem}.npy") as temporary:
+                np.save(temporary, photographer.depth(pose))
             files = {"file_path": f"images/{stem}.png", "depth_file_path": f"depth/{stem}.npy"}
             frames.append(files | {"transform_matrix": pose.tolist()})
             done += 1
             if done % 30 == 0:
                 say(f"  {done} of {train + test} views, {time.perf_counter() - start:.0f} s")
         name = "transforms.json" if kind == "train" else "transforms_test.json"
-        (folder / name).write_text(json.dumps(transforms(camera, layout, frames), indent=1) + "\n")
-    (folder / "coverage.json").write_text(json.dumps(figures, indent=1) + "\n")
+        write_json(folder / name, transforms(camera, layout, frames))
+    write_json(folder / "coverage.json", figures)
     say(f"rendered {done} views in {time.perf_counter() - start:.0f} s")
     return figures

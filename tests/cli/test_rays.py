@@ -102,7 +102,7 @@ def test_split_shares_no_ray(walk, tmp_path, how):
 def test_split_and_plot_refuse(walk, tmp_path):
     for arguments, message in [
         (["split", walk, "-o", tmp_path / "s.npz"], "say how to split"),
-        (["plot", walk, "-o", tmp_path / "p.jpg"], "ends in .png"),
+        (["plot", walk, "-o", tmp_path / "p.jpg"], "end in .png"),
         (["plot", walk, "-o", tmp_path / "p.png", "--kind", "map"], "density or layout"),
         (["plot", walk, "-o", tmp_path / "p.png", "--test", walk], "add --kind layout"),
     ]:

@@ -77,7 +77,7 @@ def test_what_cannot_be_written_is_found_before_and_nothing_is_made(tmp_path, mo
     check_writable(tmp_path / "a" / "b.NPZ", ".npz", ".parquet")
     check_folder(tmp_path)
     check_folder(tmp_path / "a" / "b")
-    with pytest.raises(NergError, match="ends in .npz or .parquet"):
+    with pytest.raises(NergError, match="end in .npz or .parquet"):
         check_writable(tmp_path / "b.txt", ".npz", ".parquet")
     for path, said in ((tmp_path, "is a folder"), (tmp_path / "file" / "x" / "y", "parents is a file"), (tmp_path / ("x" * 300), "too long")):
         with pytest.raises(NergError, match=said):

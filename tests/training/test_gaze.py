@@ -20,7 +20,8 @@ from nerg_mi.training.gaze import GazeTrainer
 from nerg_mi.training.gaze_model import gaze_density, used_parameters
 from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
 from nerg_mi.training.gaze_supervision import box_exit, rotated_sets, supervise, supervise_rays
-from nerg_mi.training.hit_geometry import volume_dict, voxelise_hits, write_volume
+from nerg_mi.formats.volumes import write_volume
+from nerg_mi.training.hit_geometry import volume_dict, voxelise_hits
 from nerg_mi.transport.media import Similarity, VolumeMedium
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
@@ -181,7 +182,7 @@ def test_validation_stops_and_the_best_is_fitted_again(rgb):
 def test_a_place_made_of_hits(rgb, rays, tmp_path):
     density, box = voxelise_hits(rays, 0.1)
     assert density.dtype == np.float32 and (density > 0).any()
-    write_volume(tmp_path / "place.vol", density, box)
+    write_volume(tmp_path / "place.vol", density, box.lower, box.upper)
     medium = VolumeMedium(rgb.load_dict(volume_dict(tmp_path / "place.vol")))
     np.testing.assert_allclose(medium.bounds(), [box.lower, box.upper], atol=1e-5)
     from nerg_mi.transport.trace import trace_depth

@@ -7,11 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from nerg_mi.field.box import Box
 from nerg_mi.field.log_gaze import LogGazeField
 from nerg_mi.field.backend import namespace
 from nerg_mi.training.gaze_places import place_of_volume
-from nerg_mi.training.hit_geometry import write_volume
+from nerg_mi.formats.volumes import write_volume
 from nerg_mi.transport.gaze_integral import GazeIntegral
 from nerg_mi.transport.media import GazeMedium
 from nerg_mi.transport.place import Place
@@ -27,7 +26,7 @@ def speckled(tmp_path_factory):
     density = 1e4 * (rng.random((24, 32, 32)) < 0.003)
     density[8:16, 12:20, 12:20] = 0
     path = tmp_path_factory.mktemp("place") / "hits.vol"
-    write_volume(path, density, Box(BOX.lower, BOX.upper))
+    write_volume(path, density, BOX.lower, BOX.upper)
     return place_of_volume(path).medium
 
 
