@@ -94,6 +94,49 @@ def test_table_of_a_known_density_integrates_to_one():
     np.testing.assert_allclose(found, truth(fine), atol=0.03 * truth(mean))
 
 
+def test_the_table_is_interpolated_all_around():
+    """Against bilinear interpolation in NumPy whose columns go around and around; most azimuths beside 0 and pi."""
+    ns, rows, rng = namespace("llvm"), 6, np.random.default_rng(4)
+    table, step = rng.normal(size=(rows, 2 * rows)), np.pi / rows
+    seams = np.concatenate([c + step * np.linspace(-1.3, 1.3, 27) for c in (0, np.pi, -np.pi, 2 * np.pi)])
+    phi = np.concatenate([seams, rng.uniform(-np.pi, np.pi, 300)])
+    theta = np.concatenate([rng.uniform(0.3, np.pi - 0.3, len(phi) - 6), [1e-3, 0.1, 0.3, np.pi - 0.3, np.pi - 0.1, np.pi - 1e-3]])
+    d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
+    x, y = (phi / step - 0.5) % (2 * rows), np.clip(theta / step - 0.5, 0, rows - 1)
+    i, j = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), rows - 2)
+    at = lambda column, row: table[row, column % (2 * rows)]
+    above, below = ((1 - (x - i)) * at(i, row) + (x - i) * at(i + 1, row) for row in (j, j + 1))
+    found = np.array(look_up(ns.Float(table.astype(np.float32).ravel()), rows, jit(d)))
+    np.testing.assert_allclose(found, (1 - (y - j)) * above + (y - j) * below, atol=2e-4)
+
+
+def test_a_lobe_on_the_seam_is_as_one_beside_it():
+    """Turned by whole texels the table is the same: at azimuth pi, at 0 and elsewhere, far out on the lobe too."""
+    ns, rows, kappa = namespace("llvm"), 64, 20.0
+    fine = fibonacci_directions(20_000)
+    offsets = np.random.default_rng(0).normal(0, 0.4, (200, 3))
+    found = []
+    for turn in (0, 21, 64, 65, 127):  # texels of azimuth, of 128
+        c, s = np.cos(turn * np.pi / 64), np.sin(turn * np.pi / 64)
+        rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        mean = rotation @ [0.8, 0, 0.6]
+        table = blind_table(np.exp(log_normaliser(kappa) + kappa * (table_directions(rows) @ mean - 1)), rows, ns, fine)
+        d = np.array([0.8, 0, 0.6]) + offsets
+        d = d / np.linalg.norm(d, axis=1, keepdims=True) @ rotation.T
+        found.append(np.array(look_up(ns.Float(table.ravel()), rows, jit(d))))
+    np.testing.assert_allclose(found[1:], np.broadcast_to(found[0], (4, 200)), atol=1e-3)
+
+
+def test_densities_leave_no_float_whatever_the_weights_are():
+    """Weights of any size: the logit is held below where its exponential would overflow, and stays below where it is not."""
+    field = made(replace(SMALL, variant="emit"))
+    p_o, p_od, r = (jit(v) for v in vectors())
+    before = np.array(field.unnormalized(p_od, p_o, r)[0])
+    field.set_parameters({"prior": field.prior * 0 + 1000})
+    after = np.array(field.unnormalized(p_od, p_o, r)[0])
+    assert np.isfinite(after).all() and (after > 1e12).all() and (before < 1e12).all()
+
+
 @pytest.mark.parametrize("half", [False, True])
 def test_file(tmp_path, half):
     ns, field = namespace("llvm"), made()

@@ -98,6 +98,23 @@ def test_one_probe_is_learnt(rays, wall):
     assert after.kld < 0.05 and after.cc > 0.97 and abs(after.integral - 1) < 0.15
 
 
+@pytest.mark.parametrize("average", [0.0, 0.3, 0.999])
+def test_what_is_kept_is_the_average_of_the_weights_so_far(rays, wall, average):
+    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) after k steps, of ``average`` later."""
+    probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
+    settings = GazeSettings(steps=5, learning_rate=1e-2, zones=0, average=average)
+    trainer = GazeTrainer(supervise(probes, wall, BOX, 64), BOX, SMALL, settings, namespace("llvm"))
+    expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
+    for k in range(1, 6):
+        trainer.step()
+        memory = min(average, (k + 1) / (k + 10))
+        for name, value in trainer.optimiser.items():
+            expected[name] = memory * expected[name] + (1 - memory) * value.numpy()
+    for name, value in trainer.weights().items():
+        np.testing.assert_allclose(value.numpy(), expected[name], atol=1e-6)
+    assert average == 0 or np.abs(expected["emit_head.0"] - trainer.optimiser["emit_head.0"].numpy()).max() > 1e-4
+
+
 def test_equal_seeds_train_equal_fields(rays, wall):
     settings = GazeSettings(steps=6, zones=0, probes=2, directions=32, refit=False)
     train = lambda s: gaze_run.train_gaze(rays, wall, BOX, SMALL, s, PROBES, namespace("llvm"))[0].parameters()

@@ -10,8 +10,10 @@ import pytest
 from nerg_mi.attention.rays import Rays
 from nerg_mi.attention.sphere import fibonacci_directions
 from nerg_mi.field.backend import namespace
-from nerg_mi.field.log_gaze import table_directions
+from nerg_mi.evaluation import metrics
+from nerg_mi.field.log_gaze import blind_table, table_directions
 from nerg_mi.training.gaze_likelihood import LikelihoodTrainer, _log_mean_exp
+from nerg_mi.training.gaze_losses import KLD_EPS
 from nerg_mi.training.gaze_recipes import gaze_recipe
 from nerg_mi.training.gaze_settings import GazeSettings
 from nerg_mi.training.gaze_supervision import Supervision, blind_prior
@@ -80,6 +82,24 @@ def test_the_loss_is_the_cross_entropy():
     entropy = -(4 * np.pi * data.truth * np.log(data.truth + 1e-30)).mean()
     assert drawn == pytest.approx(scores.kld + entropy, abs=0.01)
     assert scores.integral == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("mix", [0.0, 0.3])
+def test_a_validation_sees_the_density_that_the_field_has(mix):
+    """With its share of the blind density, and its integral, taken over the same directions."""
+    data, ns = supervision(2), namespace("llvm")
+    rows = np.random.default_rng(3).normal(size=(SMALL.prior, 2 * SMALL.prior))
+    data = replace(data, blind=blind_table(np.exp(rows).ravel(), SMALL.prior, ns, data.directions[0].astype(float)))
+    trainer = LikelihoodTrainer(data, BOX, replace(SMALL, mix=mix), replace(FAST, probes=2), ns)
+    scores = trainer.measure(data)
+    assert scores.integral == pytest.approx(1, abs=1e-4)
+    field, kld = trainer.field(), []
+    for p_o, d, t, gone, truth in zip(data.positions, data.directions, data.distance, data.escaped, data.truth):
+        args = jit(p_o + d * t[:, None]), jit(np.broadcast_to(p_o, d.shape)), jit(d)
+        product = np.multiply(*(np.array(v, np.float64) for v in field.unnormalized(*args, escaped=ns.Bool(gone))))
+        density = (1 - mix) * product / (4 * np.pi * product.mean()) + mix * np.exp(np.array(field.log_blind(args[2])))
+        kld.append(metrics.kld(truth[None], density[None], eps=KLD_EPS)[0])
+    assert scores.kld == pytest.approx(np.mean(kld), rel=1e-4)
 
 
 def test_a_law_is_learnt_and_holds_elsewhere():

@@ -69,6 +69,22 @@ def test_constants_give_numbers(densities, value, Float):
         assert got.cc[0] == 0
 
 
+@pytest.mark.parametrize("Float", [ns.Float32, ns.Float64])
+def test_negative_predictions_count_as_zero_in_the_divergence(densities, Float):
+    """A linear activation predicts both signs: the divergence is that of the clamped prediction, and moves only what is positive."""
+    truth, guess = densities
+    guess = guess - 0.4
+    assert (guess < 0).any(axis=1).all() and (guess > 0).any(axis=1)[:3].all()
+    x = Float(guess.ravel())
+    dr.enable_grad(x)
+    got = gaze_loss(x, Float(truth.ravel()), D, Float(W), kld=1, cc=0, mae=0)
+    dr.backward(got.total)
+    clamped = np.maximum(guess, 0)
+    assert np.isclose(got.kld[0], metrics.kld(truth, clamped, W, eps=KLD_EPS).mean(), rtol=1e-5)
+    slope = np.array(x.grad).reshape(P, D)
+    assert np.isfinite(slope).all() and not slope[guess < 0].any() and slope[0][guess[0] > 0].all()
+
+
 def test_float32_is_good_enough(densities):
     truth, guess = densities
     assert np.isclose(loss(ns.Float32, guess, truth).total[0], loss(ns.Float64, guess, truth).total[0], rtol=1e-5)

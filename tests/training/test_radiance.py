@@ -99,6 +99,22 @@ def test_equal_seeds_give_equal_fields_to_rounding(dataset):
     assert not np.allclose(weights(3), weights(4), atol=1e-2)
 
 
+@pytest.mark.parametrize("average", [0.0, 0.5, 0.999])
+def test_what_is_kept_is_the_average_of_every_fourth_steps_weights(dataset, average):
+    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) a step after k steps, of ``average`` later."""
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(average=average), ns)
+    expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
+    for k in range(1, 13):
+        trainer.step()
+        memory = min(average, (k + 1) / (k + 10)) ** 4
+        if k % 4 == 0:
+            for name, value in trainer.optimiser.items():
+                expected[name] = memory * expected[name] + (1 - memory) * value.numpy()
+    for name, value in trainer.averaged.items():
+        assert np.allclose(value.numpy(), expected[name], atol=1e-6)
+    assert average == 0 or np.abs(expected["density_net.0"] - trainer.optimiser["density_net.0"].numpy()).max() > 1e-4
+
+
 @pytest.mark.slow
 def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
     """Held-out views through the occupied cells and through the whole box; free space is empty."""

@@ -8,6 +8,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.transport.march import MarchSettings, march
 from nerg_mi.transport.media import LocalRay, VolumeMedium
 from nerg_mi.transport.rules import KINDS, linear_crossing, linear_share, rule
@@ -174,12 +175,34 @@ def test11_cells_step_from_wall_to_wall_of_voxels(rgb, gain):
     assert short.density_evals.numpy()[0] > 2 * 80 and abs(short.expected_depth.numpy()[0] - expected) < 2e-4 / 8
 
 
+@pytest.mark.parametrize("offset", [None, 0.4])
+def test12_a_leap_forgets_the_density_before_it(offset):
+    # Matter everywhere, and growing; the steps whose middle lies in an empty cell are left out, the others are trapezia.
+    rise = lambda z, x: 1 + 6 * z * z  # noqa: E731
+    medium, n, occupied = Colored(rise, lambda z: z, ns.Float(1)), 32, np.array([1, 0, 1, 1, 0, 0, 0, 1], bool)
+    bits = np.broadcast_to(occupied[:, None, None], (8, 2, 2))
+    medium.occupancy, medium.to_unit, medium.vector_to_unit = OccupancyGrid(bits, ns, 0), lambda p: p, lambda d: d
+    z, t0, t1 = ns.Array3f(0, 0, 1), dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 1)
+    ray = LocalRay(ns.Array3f(0.3, 0.3, 0), z, z, t0, t1)
+    share = None if offset is None else ns.Float(offset)
+    got = march(medium, ray, t0, t1, True, MarchSettings(1 / n, stop=0, quadrature="linear"), offset=share, count=True)
+    first = 1 if offset is None else offset
+    borders = np.minimum(np.concatenate([[0], (first + np.arange(n + 1)) / n]), 1)
+    a, b = borders[:-1], borders[1:]
+    kept = (b > a) & occupied[np.minimum((4 * (a + b)).astype(int), 7)]
+    ends = 1 + 6 * np.stack([a, b]) ** 2
+    assert np.isclose(got.tau[0], (ends.mean(0) * (b - a))[kept].sum(), rtol=1e-5)
+    # An end that two steps share is evaluated once.
+    assert got.density_evals[0] == kept.sum() + np.count_nonzero(kept & ~np.concatenate([[False], kept[:-1]]))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test07_every_march_ends(kind):
     # Far away the voxels are as small as the spacing of floats. In a process of its own, which can be ended.
     code = f"""
 import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
+from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.transport.march import MarchSettings, march
 from nerg_mi.transport.media import LocalRay, VolumeMedium
 data = np.full((64, 64, 64), 1.5, np.float32)
