@@ -132,9 +132,9 @@ def test_optical_depth_of_a_cell_is_bounded():
 
 @pytest.mark.parametrize("thick", [0.001, 0.01, 3.0])
 def test_while_the_field_is_thin_half_of_its_mean_counts(thick):
-    """Slabs of x of optical depth 1, 0.3, 0.1 and 0 times ``thick``: cells above half of the mean count, and all above the threshold."""
+    """Slabs of x of optical depth 1, 0.3, 0.05 and 0 times ``thick``: cells above half of the mean count, and all above the threshold."""
     grid = DensityGrid(ns, BOX, R, 1.0, above(), 1, threshold=0.3)
-    shares = np.array([1, 0.3, 0.1, 0])
+    shares = np.array([1, 0.3, 0.05, 0])
 
     def density(p, active):
         k = dr.minimum(ns.UInt32((p.x + 1) * 2), 3)
