@@ -5,6 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import NergError
+from ..formats.bounded import plain, reading
+from ..formats.exr import read_exr
+from ..formats.image_header import check_image
+from ..formats.npy import read_npy
 from ..formats.posed import DepthFile, MaskFile
 
 
@@ -12,11 +17,11 @@ def read_image(path: str | Path) -> np.ndarray:
     """The image (h, w, 3 or 4), sRGB with straight alpha: uint8 or uint16 as stored, else float32 in 0..1.
 
     EXR is linear, with premultiplied alpha where it has any: it is made straight and converted, and what is
-    brighter than white is clipped. Raises ``ValueError``, naming the file, for what cannot be read.
+    brighter than white is clipped. Raises `NergError`, naming the file, for what cannot be read.
     """
     import mitsuba as mi
 
-    bitmap = _open(path, "image")
+    bitmap = open_bitmap(path, "image")
     formats, kinds = mi.Bitmap.PixelFormat, mi.Struct.Type
     kind, pixels = bitmap.component_format(), bitmap.pixel_format()
     if kind in (kinds.UInt8, kinds.UInt16) and bitmap.srgb_gamma():
@@ -38,18 +43,38 @@ def read_image(path: str | Path) -> np.ndarray:
         # Without any light and without opacity a colour is 0 over 0.
         out[..., :3][out[..., 3] == 0] = 0
     if not np.all(np.isfinite(out)):
-        raise ValueError(f'the image "{path}" holds values that are not finite')
+        raise NergError(f'the image "{path}" holds values that are not finite; make it again')
     out[..., :3] = _to_srgb(np.clip(out[..., :3], 0, 1))
     return np.clip(out, 0, 1)
 
 
-def _open(path: str | Path, what: str):
+def open_bitmap(path: str | Path, what: str):
+    """The picture ``path`` as a Mitsuba bitmap, as Mitsuba itself opens it; `NergError` for one that is damaged or too large.
+
+    The size is checked in the header first. EXR is read by the OpenEXR library.
+    """
     import mitsuba as mi
 
-    try:
+    if check_image(path, what).kind == "exr":
+        return _exr_bitmap(read_exr(path, what))
+    # Mitsuba says so of whatever it finds wrong.
+    with reading(path, what, also=(RuntimeError,)):
         return mi.Bitmap(str(path))
-    except RuntimeError as e:
-        raise ValueError(f'the {what} "{path}" cannot be read: {str(e).strip().splitlines()[-1]}') from e
+
+
+def _exr_bitmap(channels: dict[str, np.ndarray]):
+    import mitsuba as mi
+
+    names, kinds = list(channels), {c.dtype for c in channels.values()}
+    values = np.stack(list(channels.values()), axis=-1)
+    if len(kinds) > 1:
+        values = values.astype(np.float32)
+    found = "".join(n.rpartition(".")[2].lower() for n in names)
+    known = {"rgb": "RGB", "rgba": "RGBA", "y": "Y", "ya": "YA", "xyz": "XYZ", "xyza": "XYZA"}
+    format = getattr(mi.Bitmap.PixelFormat, known.get(found, "MultiChannel") if len(found) == len(names) else "MultiChannel")
+    bitmap = mi.Bitmap(values, format, names)
+    bitmap.set_premultiplied_alpha(True)
+    return bitmap
 
 
 def _layer(bitmap, path):
@@ -58,7 +83,8 @@ def _layer(bitmap, path):
     for name in ("<root>", "rgba", "color"):
         if name in layers:
             return layers[name]
-    raise ValueError(f'the image "{path}" has no channels R, G and B, only the layers {", ".join(sorted(layers))}')
+    raise NergError(f'the image "{path}" has no channels R, G and B, only the layers {plain(", ".join(sorted(layers)))}; '
+                    "save it with these")
 
 
 def _to_srgb(x: np.ndarray) -> np.ndarray:
@@ -69,32 +95,32 @@ def read_depth(source: DepthFile) -> np.ndarray:
     """The values (h, w) of ``.npy``, ``.exr`` (first channel) or 16-bit ``.png`` in scene units, float32; 0: unknown."""
     path, suffix = source.path, source.path.suffix.lower()
     if suffix == ".npy":
-        try:
-            out = np.load(path, allow_pickle=False)
-        except (OSError, EOFError, ValueError) as e:
-            raise ValueError(f'the depth file "{path}" cannot be read: {e}') from e
+        out = read_npy(path, "depth file")
     elif suffix in (".exr", ".png"):
-        out = np.array(_open(path, "depth file"))
+        out = np.array(open_bitmap(path, "depth file"))
         if suffix == ".png" and out.dtype != np.uint16:
-            raise ValueError(f'the depth file "{path}" must be a 16-bit PNG, but has {out.dtype.itemsize * 8} bits')
+            raise NergError(f'the depth file "{path}" must be a 16-bit PNG, but has {out.dtype.itemsize * 8} bits')
         if out.ndim == 3 and (suffix == ".exr" or out.shape[2] == 1):
             out = out[..., 0]
     else:
-        raise ValueError(f'the depth file "{path}" must be .npy, .exr or a 16-bit .png')
+        raise NergError(f'the depth file "{path}" must be .npy, .exr or a 16-bit .png')
     if out.ndim == 3 and out.shape[2] == 1:
         out = out[..., 0]
     if out.ndim != 2 or not np.issubdtype(out.dtype, np.number):
-        raise ValueError(f'the depth file "{path}" must hold one number a pixel, got shape {out.shape}')
-    out = out.astype(np.float32)
+        raise NergError(f'the depth file "{path}" must hold one number a pixel, got shape {out.shape}')
+    if np.iscomplexobj(out):
+        raise NergError(f'the depth file "{path}" holds complex numbers; save it as float32')
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is unknown
+        out = out.astype(np.float32)
     return np.where(np.isfinite(out) & (out > 0), out * np.float32(source.unit), 0).astype(np.float32)
 
 
 def read_mask(source: MaskFile, shape: tuple[int, int]) -> np.ndarray:
     """Which pixels (h, w) are used, bool. The mask must have the image's ``shape``."""
-    out = np.array(_open(source.path, "mask"))
+    out = np.array(open_bitmap(source.path, "mask"))
     out = out[..., None] if out.ndim == 2 else out
     if out.shape[:2] != shape:
-        raise ValueError(f'the mask "{source.path}" has {out.shape[1]} x {out.shape[0]} pixels, but its image '
+        raise NergError(f'the mask "{source.path}" has {out.shape[1]} x {out.shape[0]} pixels, but its image '
                          f"{shape[1]} x {shape[0]}")
     # An alpha channel says nothing here; as in nerfstudio and instant-ngp, whatever is not black is white.
     white = np.any((out[..., :1] if out.shape[2] <= 2 else out[..., :3]) != 0, axis=2)

@@ -9,6 +9,7 @@ import numpy as np
 from .occupancy import OccupancyGrid
 
 _MOST_PARTS = 64
+_MOST_CELLS = 1 << 24
 
 
 class CascadeGrid:
@@ -37,6 +38,11 @@ class CascadeGrid:
         # Cells of the common grid along a cell of each level.
         self._ratios = [int(h * parts[0]) for h in self._halves]
         self.cells = (r * self._ratios[-1],) * 3
+        if self.cells[0] > _MOST_CELLS:
+            raise ValueError(
+                f"cascades of {r} cells to a bound of {bound} need {self.cells[0]} equal cells along an edge, and float32 "
+                f"tells at most {_MOST_CELLS} apart"
+            )
         self.distance = ns.UInt8(np.stack(self._distances()).ravel())
 
     @property

@@ -10,9 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import MissingFile, NergError
 from .atomic import write_bytes
+from .bounded import parse_json, plain, reading, size_of
 
 FORMAT = 1
+
+HEADER_BYTES = 16 << 20
+"""The header, which names every array and holds the metadata, may have so many bytes."""
 
 
 def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray], metadata: dict) -> None:
@@ -27,39 +32,58 @@ def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray]
     write_bytes(path, data)
 
 
-def _parse(raw: str, path: Path) -> dict:
-    try:
-        metadata = json.loads(raw)
-    except json.JSONDecodeError as e:
-        raise ValueError(f'the metadata of "{path}" are damaged: {e}') from e
-    if not isinstance(metadata, dict):
-        raise ValueError(f'the metadata of "{path}" are damaged: a JSON object is needed')
-    return metadata
-
-
 def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
     """Tensors and metadata of a checkpoint of ``kind``.
 
-    Raises ``FileNotFoundError`` when there is no such file and ``ValueError`` when it is not
-    such a checkpoint.
+    Raises `MissingFile` when there is no such file and `NergError` when it is not such a checkpoint.
     """
     from safetensors import SafetensorError, safe_open
 
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f'the checkpoint "{path}" does not exist: correct its name, or make one with "nerg train"')
-    try:
-        with safe_open(path, framework="numpy") as f:
-            raw = (f.metadata() or {}).get("nerg")
-            if raw is None:
-                raise ValueError(f'"{path}" is a safetensors file but not a nerg_mi checkpoint (no "nerg" metadata)')
-            metadata = _parse(raw, path)
-            if metadata.get("kind") != kind:
-                raise ValueError(f'"{path}" holds a {metadata.get("kind")} field where a {kind} field is needed')
-            if metadata.get("format") != FORMAT:
-                raise ValueError(
-                    f'"{path}" has checkpoint format {metadata.get("format")}; this version reads format {FORMAT}'
-                )
-            return {k: f.get_tensor(k) for k in f.keys()}, metadata
-    except SafetensorError as e:
-        raise ValueError(f'"{path}" is not a readable safetensors file: {e}') from e
+        raise MissingFile(f'the checkpoint "{path}" does not exist: correct its name, or make one with "nerg train"')
+    _check_header(path)
+    # The library asks NumPy for types that it has not (bfloat16), which is the file's doing.
+    with reading(path, "checkpoint", also=(TypeError, AttributeError)):
+        try:
+            with safe_open(path, framework="numpy") as f:
+                return _contents(f, path, kind)
+        except SafetensorError as e:
+            raise NergError(
+                f'"{path}" is not a readable safetensors file: {plain(e)}; copy it again, or make it anew'
+            ) from e
+
+
+def _check_header(path: Path) -> None:
+    size = size_of(path, "checkpoint")
+    with reading(path, "checkpoint"), open(path, "rb") as file:
+        header = int.from_bytes(file.read(8), "little")
+    if size < 8 or header > size - 8:
+        raise NergError(
+            f'"{path}" is not a readable safetensors file: its header claims {header:,} bytes and the file has {size:,}; '
+            "copy it again, or make it anew"
+        )
+    if header > HEADER_BYTES:
+        raise NergError(f'the header of "{path}" has {header:,} bytes, more than the {HEADER_BYTES:,} that are read')
+
+
+def _contents(f, path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
+    raw = (f.metadata() or {}).get("nerg")
+    if raw is None:
+        raise NergError(
+            f'"{path}" is a safetensors file but not a nerg_mi checkpoint (no "nerg" metadata); name one that is'
+        )
+    metadata = parse_json(raw, path, "checkpoint, in its metadata")
+    if not isinstance(metadata, dict):
+        raise NergError(f'the metadata of "{path}" are damaged: a JSON object is needed; copy it again')
+    if metadata.get("kind") != kind:
+        raise NergError(
+            f'"{path}" holds a {plain(metadata.get("kind"), 40)} field where a {kind} field is needed; name one of those'
+        )
+    if metadata.get("format") != FORMAT:
+        raise NergError(
+            f'"{path}" has checkpoint format {plain(metadata.get("format"), 40)}; this version reads format {FORMAT}'
+        )
+    if not isinstance(metadata.get("provenance", {}), dict):
+        raise NergError(f'the metadata of "{path}" are damaged: "provenance" must be a JSON object; copy it again')
+    return {k: f.get_tensor(k) for k in f.keys()}, metadata

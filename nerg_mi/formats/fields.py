@@ -4,7 +4,6 @@ Weights may be stored in fp16 (half the size); they are fp32 once loaded.
 """
 from __future__ import annotations
 
-from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -23,6 +22,8 @@ from ..field.mlp import MLP
 from ..field.occupancy import OccupancyGrid
 from ..field.radiance import RadianceConfig, RadianceField
 from ..field.support import RaySupport
+from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
+from .bounded import plain
 from .checkpoint import read_checkpoint, write_checkpoint
 
 
@@ -40,36 +41,36 @@ def _dump(parameters: dict, half: bool) -> dict[str, np.ndarray]:
     return out
 
 
-@contextmanager
-def _reading(path):
-    """Name the file in whatever is found wrong with what it holds."""
-    try:
-        yield
-    except KeyError as e:
-        raise ValueError(f'the checkpoint "{path}" lacks {e}, which its kind of field needs') from e
-    except (TypeError, ValueError) as e:
-        raise ValueError(f'the checkpoint "{path}" holds no usable field: {e}') from e
-
-
-def _finite(tensors: dict, name: str) -> np.ndarray:
-    value = aligned(tensors[name])
+def _finite(tensors: dict, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """The array ``name``, aligned. Raises ``ValueError`` where it has not the ``shape`` (None: of any length)."""
+    found = tensors[name].shape
+    if len(found) != len(shape) or any(want not in (None, have) for want, have in zip(shape, found)):
+        said = " x ".join("any" if n is None else str(n) for n in shape)
+        raise ValueError(f'the weight array "{name}" has the shape {found} where its configuration needs {said}')
+    with np.errstate(over="ignore"):  # what fp32 cannot hold is not finite
+        value = aligned(tensors[name])
     if not np.all(np.isfinite(value)):
         raise ValueError(f'the weight array "{name}" is not finite')
     return value
 
 
 def _net(tensors: dict, name: str, sizes: list[int], ns: ModuleType, normalized: bool = False) -> MLP:
-    array = lambda key: ns.TensorXf(_finite(tensors, f"{name}.{key}"))
-    layers = range(len(sizes) - 1)
-    norms = [{part: array(f"{i}.{part}") for part in ("gain", "shift", "bias")} for i in layers] if normalized else None
-    return MLP([array(i) for i in layers], norms)
+    array = lambda key, *shape: ns.TensorXf(_finite(tensors, f"{name}.{key}", shape))
+    layers, norms = list(enumerate(zip(sizes, sizes[1:]))), None
+    if normalized:
+        norms = [
+            {"gain": array(f"{i}.gain", n), "shift": array(f"{i}.shift", n), "bias": array(f"{i}.bias", m)}
+            for i, (n, m) in layers
+        ]
+    return MLP([array(i, m, n) for i, (n, m) in layers], norms)
 
 
 def _grid(tensors: dict, config, ns: ModuleType, name: str = "grid") -> HashGrid:
-    return HashGrid(config, ns.Float(_finite(tensors, f"{name}.table")))
+    return HashGrid(config, ns.Float(_finite(tensors, f"{name}.table", (config.offsets()[-1] * config.features,))))
 
 
 def _occupancy(tensors: dict, about: dict, ns: ModuleType) -> OccupancyGrid | CascadeGrid:
+    check_occupancy(about)
     bits, resolution, threshold = tensors["occupancy.bits"], about["resolution"], about["threshold"]
     if "bound" in about:
         return CascadeGrid.from_packed(bits, resolution, about["bound"], ns, threshold)
@@ -100,19 +101,22 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
 def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict]:
     """The field in ``path`` on backend ``ns`` (see ``field.backend.namespace``), and its metadata."""
     tensors, meta = read_checkpoint(path, "radiance")
-    with _reading(path):
-        config, occupancy, background = RadianceConfig.from_dict(meta["architecture"]), None, None
+    with building(path):
+        config, occupancy, background = RadianceConfig.from_dict(check_sizes(meta["architecture"])), None, None
+        step = meta["march_step"]
+        if step is not None and not 0 < number(meta, "march_step", "metadata"):
+            raise ValueError(f'its "march_step" must be positive, not {step}')
         if "occupancy" in meta:
             occupancy = _occupancy(tensors, meta["occupancy"], ns)
         if "background" in meta:
-            behind = BackgroundConfig.from_dict(meta["background"])
+            behind = BackgroundConfig.from_dict(check_sizes(meta["background"], "background"))
             background = Background(
                 behind, _grid(tensors, behind.grid, ns, "background_grid"), _net(tensors, "background_net", behind.sizes, ns)
             )
         field = RadianceField(
             config, Box(**meta["box"]), _grid(tensors, config.grid, ns),
             _net(tensors, "density_net", config.density_sizes, ns), _net(tensors, "color_net", config.color_sizes, ns),
-            occupancy, meta["color_space"], meta["march_step"], background,
+            occupancy, meta["color_space"], step, background,
         )
     return field, meta
 
@@ -137,24 +141,26 @@ def save_gaze(field: GazeField | LogGazeField | GazeEnsemble, path: str | Path, 
 def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField | LogGazeField | GazeEnsemble, dict]:
     """The gaze field in ``path`` on backend ``ns``, with its support, and its metadata."""
     tensors, meta = read_checkpoint(path, "gaze")
-    with _reading(path):
+    with building(path):
         about, box = meta["architecture"], Box(**meta["box"])
         if about.get("kind") == "ensemble":
+            if len(about["members"]) > MEMBERS:
+                raise ValueError(f"it has {len(about['members'])} members, and at most {MEMBERS} are read")
             own = lambda i: {k.removeprefix(f"{i}."): v for k, v in tensors.items() if k.startswith(f"{i}.")}
             field = GazeEnsemble([_gaze(own(i), member, box, ns) for i, member in enumerate(about["members"])])
         else:
             field = _gaze(tensors, about, box, ns)
         if "support" in meta:
-            field.support = RaySupport(_finite(tensors, "support.cells"), meta["support"]["radius"])
+            field.support = RaySupport(_finite(tensors, "support.cells", (None, 5)), meta["support"]["radius"])
     return field, meta
 
 
 def _gaze(tensors: dict, about: dict, box: Box, ns: ModuleType) -> GazeField | LogGazeField:
-    kind = about.get("kind", "product")
+    kind = check_sizes(about).get("kind", "product")
     if kind == "log_density":
         return _log_gaze(tensors, LogGazeConfig.from_dict(about), box, ns)
     if kind != "product":
-        raise ValueError(f'it is a gaze field of the kind "{kind}", which this version does not know')
+        raise ValueError(f'it is a gaze field of the kind "{plain(kind, 40)}", which this version does not know')
     config = GazeConfig.from_dict(about)
     sizes = {
         "position_net": config.position_sizes, "direction_net": config.direction_sizes,
@@ -168,6 +174,6 @@ def _gaze(tensors: dict, about: dict, box: Box, ns: ModuleType) -> GazeField | L
 def _log_gaze(tensors: dict, config: LogGazeConfig, box: Box, ns: ModuleType) -> LogGazeField:
     return LogGazeField(
         config, box, _grid(tensors, config.grid, ns), _net(tensors, "emit_net", config.emit_sizes, ns),
-        _net(tensors, "capture_net", config.capture_sizes, ns), ns.Float(_finite(tensors, "escaped")),
-        ns.TensorXf(_finite(tensors, "prior")),
+        _net(tensors, "capture_net", config.capture_sizes, ns), ns.Float(_finite(tensors, "escaped", (1,))),
+        ns.TensorXf(_finite(tensors, "prior", (config.prior, 2 * config.prior))),
     )

@@ -6,10 +6,13 @@ from types import ModuleType
 
 import numpy as np
 
+from ..errors import NergError
 from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
 from ..field.mlp import MLP
 from ..field.radiance import RadianceField
+from .architecture import building, check_sizes
+from .bounded import plain
 from .torch_ngp import Given, StateDict, decimals, grid, grid_config, open_checkpoint, origin, radiance_field, sh_degree
 from .unpickling import NamedValue
 
@@ -27,18 +30,19 @@ def read_nerg(
 ) -> tuple[RadianceField | None, GazeField, dict]:
     """Radiance field (None where the file holds none), gaze field and origin (JSON) of a NeRG checkpoint.
 
-    The gaze field's finest resolution is 256 x bound, whatever ``given`` says of the NeRF's. Raises ``ValueError``
+    The gaze field's finest resolution is 256 x bound, whatever ``given`` says of the NeRF's. Raises `NergError`
     for the variants that read other features than the gaze field's own.
     """
     whole, model = open_checkpoint(path)
     if ema is False and whole.get("ema"):
-        raise ValueError(f'"{path}" keeps its moving averages as its weights and nothing else: import it without --no-ema')
+        raise NergError(f'"{path}" keeps its moving averages as its weights and nothing else: import it without --no-ema')
     if ema and not whole.get("ema"):
-        raise ValueError(f'"{path}" holds no moving averages: import its weights with --no-ema')
+        raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
     state = StateDict(Path(path), model)
-    gaze = gaze_field(state, _variant(state, whole.get("variant")), ns)
-    nerf = state.below("model_nerf.")
-    field = radiance_field(nerf, ns, given) if nerf.names() else None
+    with building(path):
+        gaze = gaze_field(state, _variant(state, whole.get("variant")), ns)
+        nerf = state.below("model_nerf.")
+        field = radiance_field(nerf, ns, given) if nerf.names() else None
     return field, gaze, origin(path, whole, "NeRG", bool(whole.get("ema")))
 
 
@@ -47,15 +51,15 @@ def _variant(state: StateDict, stored) -> str:
     name = stored.value if isinstance(stored, NamedValue) else stored
     if name is None:
         name = {(True, True): "EmitCapture", (True, False): "Emit", (False, True): "Capture"}.get((emit, capture))
-    if name not in _VARIANTS or any(n.startswith("attend_head.") for n in state.names()):
-        raise ValueError(
-            f'"{state.path}" is of the variant {name}; {", ".join(_VARIANTS)} are read, '
+    if not isinstance(name, str) or name not in _VARIANTS or any(n.startswith("attend_head.") for n in state.names()):
+        raise NergError(
+            f'"{state.path}" is of the variant {plain(name, 40) if isinstance(name, str) else "unknown"}; {", ".join(_VARIANTS)} are read, '
             "the others need the NeRF's features along the ray or an attention block"
         )
     if any(n.startswith("capture_head.") and n != "capture_head.weight" for n in state.names()):
-        raise ValueError(f'"{state.path}" captures gaze by a mixture of von Mises-Fisher lobes; only a linear head is read')
+        raise NergError(f'"{state.path}" captures gaze by a mixture of von Mises-Fisher lobes; only a linear head is read')
     if ("Emit" in name and not emit) or ("Capture" in name and not capture):
-        raise ValueError(f'"{state.path}" is of the variant {name} and lacks one of its heads')
+        raise NergError(f'"{state.path}" is of the variant {name} and lacks one of its heads')
     return _VARIANTS[name]
 
 
@@ -67,11 +71,12 @@ def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
     position, direction = read(state, "net1", ns), read(state, "net2", ns)
     width, geometry = direction.outputs, position.outputs
     if position.weights[0].shape[0] != width or direction.weights[0].shape[0] != width:
-        raise ValueError(f'the networks of "{state.path}" are not all {width} wide')
+        raise NergError(f'the networks of "{state.path}" are not all {width} wide')
     config = GazeConfig(
         grid_config(state, "encoder", 256 * bound), variant, "linear", width, geometry,
         sh_degree(state, direction.inputs - geometry), trunk="layernorm" if normalized else "linear",
     )
+    check_sizes(config.to_dict(), "networks")
     heads = [_head(state, names, width, ns) for names in _HEADS.values()]
     box, table = Box((-bound,) * 3, (bound,) * 3, bound), grid(state, "encoder", config.grid, ns)
     return GazeField(config, box, table, position, direction, *heads)

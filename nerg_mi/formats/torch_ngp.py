@@ -12,6 +12,7 @@ from types import ModuleType
 
 import numpy as np
 
+from ..errors import NergError
 from ..field.background import Background, BackgroundConfig
 from ..field.box import Box
 from ..field.cascades import CascadeGrid, levels_of
@@ -19,12 +20,15 @@ from ..field.hashgrid import HashGrid, HashGridConfig
 from ..field.mlp import MLP
 from ..field.occupancy import OccupancyGrid
 from ..field.radiance import RadianceConfig, RadianceField
+from .architecture import building, check_sizes
 from .unpickling import StoredTensor, read_torch
 
 MARCH_STEP = 2 * math.sqrt(3) / 1024
 """torch-ngp's shortest step, at its default of 1,024 steps."""
 
 _CELLS = 128
+# More of either than any network has that is trained.
+_LEVELS, _LAYERS = 64, 64
 
 
 @dataclass(frozen=True)
@@ -57,17 +61,21 @@ class StateDict:
         return list(self._tensors)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        try:
-            tensor = self._averaged.get(name, self._tensors[name])
-        except KeyError:
-            raise ValueError(f'"{self.path}" lacks "{self.prefix}{name}", which its kind of checkpoint holds') from None
-        return tensor.numpy()
+        self.shape(name)
+        return self._averaged.get(name, self._tensors[name]).numpy()
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """The shape of ``self[name]``, which is not read."""
+        if name not in self._tensors:
+            raise NergError(f'"{self.path}" lacks "{self.prefix}{name}", which its kind of checkpoint holds; copy it again')
+        return self._tensors[name].shape
 
     def weights(self, name: str) -> np.ndarray:
-        """``self[name]`` in fp32. Raises ``ValueError`` when it is not finite."""
-        value = self[name].astype(np.float32)
+        """``self[name]`` in fp32. Raises `NergError` when it is not finite."""
+        with np.errstate(over="ignore"):  # what fp32 cannot hold is not finite
+            value = self[name].astype(np.float32)
         if not np.all(np.isfinite(value)):
-            raise ValueError(f'"{self.prefix}{name}" in "{self.path}" is not finite: its training has diverged')
+            raise NergError(f'"{self.prefix}{name}" in "{self.path}" is not finite: its training has diverged')
         return value
 
     def below(self, prefix: str) -> StateDict:
@@ -78,10 +86,10 @@ def open_checkpoint(path: str | Path) -> tuple[dict, dict]:
     """``(whole file, state dictionary)`` of a checkpoint, or of a bare state dictionary."""
     whole = read_torch(path)
     if not isinstance(whole, dict):
-        raise ValueError(f'"{path}" holds a {type(whole).__name__}, not a checkpoint')
+        raise NergError(f'"{path}" holds a {type(whole).__name__}, not a checkpoint')
     model = whole.get("model", whole)
     if not isinstance(model, dict) or not any(isinstance(v, StoredTensor) for v in model.values()):
-        raise ValueError(f'"{path}" holds no weights: neither a state dictionary nor one under "model"')
+        raise NergError(f'"{path}" holds no weights: neither a state dictionary nor one under "model"')
     return whole, model
 
 
@@ -94,12 +102,12 @@ def averaged_weights(path: str | Path, whole: dict, model: dict, wanted: bool | 
     shadow = (whole.get("ema") or {}).get("shadow_params") or []
     if not wanted and wanted is not None or not shadow:
         if wanted and not shadow:
-            raise ValueError(f'"{path}" holds no moving averages: import its weights with --no-ema')
+            raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
         return {}
     # Buffers are not averaged; parameters come in the order of the state dictionary.
     names = [k for k in model if k.endswith((".embeddings", ".weight", ".bias"))]
     if [tuple(model[k].shape) for k in names] != [tuple(v.shape) for v in shadow]:
-        raise ValueError(
+        raise NergError(
             f'the {len(shadow)} moving averages of "{path}" do not fit its {len(names)} weights: import these with --no-ema'
         )
     return dict(zip(names, shadow))
@@ -115,8 +123,9 @@ def read_torch_ngp(
 ) -> tuple[RadianceField, dict]:
     """The radiance field in a torch-ngp checkpoint on backend ``ns``, and what to say about its origin (JSON)."""
     whole, model = open_checkpoint(path)
-    averaged = averaged_weights(path, whole, model, ema)
-    field = radiance_field(StateDict(Path(path), model, averaged=averaged), ns, given, whole.get("mean_density"))
+    with building(path):
+        averaged = averaged_weights(path, whole, model, ema)
+        field = radiance_field(StateDict(Path(path), model, averaged=averaged), ns, given, whole.get("mean_density"))
     return field, origin(path, whole, "torch-ngp", bool(averaged))
 
 
@@ -129,7 +138,7 @@ def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density:
     """The field that a torch-ngp state dictionary describes."""
     for name in state.names():
         if name in ("encoder.params", "sigma_net.params", "color_net.params"):
-            raise ValueError(f'"{state.path}" was trained with --tcnn or --ff, whose layout is not read: retrain without')
+            raise NergError(f'"{state.path}" was trained with --tcnn or --ff, whose layout is not read: retrain without')
     box, bound = _box(state)
     density, color = layers(state, "sigma_net", ns), layers(state, "color_net", ns)
     width, geometry = density.weights[0].shape[0], density.outputs - 1
@@ -137,6 +146,7 @@ def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density:
         grid_config(state, "encoder", given.finest or 2048 * bound), width, len(density.weights) - 1, len(color.weights) - 1,
         geometry, sh_degree(state, color.inputs - geometry),
     )
+    check_sizes(config.to_dict(), "networks")
     return RadianceField(
         config, box, grid(state, "encoder", config.grid, ns), density, color, _occupancy(state, bound, ns, mean_density),
         given.color_space, MARCH_STEP, _background(state, ns, given, config.sh_degree),
@@ -148,7 +158,7 @@ def _box(state: StateDict) -> tuple[Box, float]:
     aabb = decimals(state["aabb_infer"]) if "aabb_infer" in state else train
     bound = float(np.abs(train).max())
     if train.shape != (6,) or aabb.shape != (6,) or not bound >= 1:
-        raise ValueError(f'the boxes of "{state.path}", {train} and {aabb}, are not those of a bound of at least 1')
+        raise NergError(f'the boxes of "{state.path}", {train} and {aabb}, are not those of a bound of at least 1')
     return Box(aabb[:3], aabb[3:], bound), bound
 
 
@@ -164,21 +174,23 @@ def whole(value: float) -> int | float:
 def sh_degree(state: StateDict, inputs: int) -> int:
     degree = math.isqrt(max(inputs, 0))
     if degree < 1 or degree**2 != inputs:
-        raise ValueError(f'the direction encoding of "{state.path}" has {inputs} numbers, so it is not spherical harmonics')
+        raise NergError(f'the direction encoding of "{state.path}" has {inputs} numbers, so it is not spherical harmonics')
     return degree
 
 
 def grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3) -> HashGridConfig:
     """Configuration of the hash grid ``name``, whose level sizes are compared with those stored."""
-    offsets, table = state[f"{name}.offsets"].astype(int).tolist(), state._tensors[f"{name}.embeddings"]
+    offsets, table = state[f"{name}.offsets"].astype(int).ravel()[: _LEVELS + 2].tolist(), state.shape(f"{name}.embeddings")
     levels, largest = len(offsets) - 1, max(np.diff(offsets), default=0)
-    if levels < 1 or largest < 8 or len(table.shape) != 2:
-        raise ValueError(f'the hash grid "{state.prefix}{name}" of "{state.path}" has no levels')
+    if not 1 <= levels <= _LEVELS or largest < 8 or len(table) != 2:
+        raise NergError(
+            f'the hash grid "{state.prefix}{name}" of "{state.path}" has no levels, or more than {_LEVELS}; copy it again'
+        )
     config = HashGridConfig(
-        levels, table.shape[1], max(int(largest) - 1, 1).bit_length(), finest=whole(finest), dimensions=dimensions
+        levels, table[1], max(int(largest) - 1, 1).bit_length(), finest=whole(finest), dimensions=dimensions
     )
     if config.offsets() != offsets:
-        raise ValueError(
+        raise NergError(
             f'the levels of "{state.prefix}{name}" in "{state.path}" begin at rows {offsets}, which is not a grid from 16 to '
             f"{finest:g}: give its finest resolution with --finest"
         )
@@ -194,7 +206,9 @@ def layers(state: StateDict, name: str, ns: ModuleType) -> MLP:
     found = [k for k in state.names() if k.startswith(f"{name}.")]
     names = [f"{name}.{i}.weight" for i in range(max(len(found), 1))]
     if found and set(found) != set(names):
-        raise ValueError(f'"{name}" in "{state.path}" has {", ".join(found)}, where layers without biases are expected')
+        raise NergError(f'"{name}" in "{state.path}" has {", ".join(found)}, where layers without biases are expected')
+    if len(names) > _LAYERS:
+        raise NergError(f'"{name}" in "{state.path}" has {len(names)} layers, and at most {_LAYERS} are read')
     return MLP([ns.TensorXf(state.weights(k)) for k in names])
 
 
@@ -202,7 +216,7 @@ def _background(state: StateDict, ns: ModuleType, given: Given, degree: int) -> 
     if "bg_net.0.weight" not in state:
         return None
     if given.background_radius is None:
-        raise ValueError(
+        raise NergError(
             f'"{state.path}" has a background network, and torch-ngp does not store its radius: '
             "give what it was trained with, --bg-radius 32 (say), or --bg-radius 0 to leave it out"
         )
@@ -228,13 +242,15 @@ def _occupancy(state: StateDict, bound: float, ns: ModuleType, mean_density) -> 
     else:
         return None
     if bits.size != levels * _CELLS**3:
-        raise ValueError(f'"{state.path}" has {bits.size} density bits where a bound of {bound:g} has {levels} x 128^3')
+        raise NergError(f'"{state.path}" has {bits.size} density bits where a bound of {bound:g} has {levels} x 128^3')
     bits = bits.reshape(levels, -1)
     if density is not None and not bits.all():
         # The largest density that the grid calls empty: cells never seen hold -1.
         threshold = max(float(density[~bits].max()), 0.0)
     else:
         threshold = min(float(mean_density or 0.0), 10.0)
+    if not np.isfinite(threshold):
+        raise NergError(f'the densities of "{state.path}" are not finite: its training has diverged')
     ordered = bits[:, morton_order()].reshape(levels, _CELLS, _CELLS, _CELLS)
     return OccupancyGrid(ordered[0], ns, threshold) if levels == 1 else CascadeGrid(ordered, bound, ns, threshold)
 
@@ -255,7 +271,7 @@ def morton_order(cells: int = _CELLS) -> np.ndarray:
 def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     """State dictionary with which torch-ngp's ``NeRFNetwork(bound)`` renders ``field``.
 
-    Raises ``ValueError`` naming what does not fit: torch-ngp fixes the sizes of its networks and grid by the bound.
+    Raises `NergError` naming what does not fit: torch-ngp fixes the sizes of its networks and grid by the bound.
     """
     c, box = field.config, field.box
     bound = box.side / 2
@@ -272,7 +288,7 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
         (c.density_scale == 1, f"its density scale must be 1, not {c.density_scale:g}"),
     ) if not fits]  # fmt: skip
     if wrong:
-        raise ValueError(f"this field has no torch-ngp form: {'; '.join(wrong)}")
+        raise NergError(f"this field has no torch-ngp form: {'; '.join(wrong)}")
     cube = np.float32([-bound] * 3 + [bound] * 3)
     state = {"aabb_train": cube, "aabb_infer": np.float32([*box.lower, *box.upper]),
              "density_bitfield": _bitfield(field.occupancy, bound), "step_counter": np.zeros((16, 2), np.int32)}  # fmt: skip
@@ -304,7 +320,7 @@ def _bitfield(occupancy, bound: float) -> np.ndarray:
     elif isinstance(occupancy, OccupancyGrid):
         bits = np.stack([_overlapped(occupancy.bits, min(2.0**k, bound) / bound) for k in range(levels)])
     else:
-        raise ValueError(f"cascades of {occupancy.resolution}^3 cells to a bound of {occupancy.bound:g} have no torch-ngp form")
+        raise NergError(f"cascades of {occupancy.resolution}^3 cells to a bound of {occupancy.bound:g} have no torch-ngp form")
     packed = np.zeros((levels, _CELLS**3), bool)
     packed[:, morton_order()] = bits.reshape(levels, -1)
     return np.packbits(packed.ravel(), bitorder="little")

@@ -9,10 +9,13 @@ import numpy as np
 
 from ..attention.rays import Rays
 from ..errors import NergError
+from ..formats.architecture import number
+from ..formats.bounded import plain
 from ..formats.checkpoint import read_checkpoint, write_checkpoint
-from .run_state import optimiser_state, require_same, restore_optimiser
+from .run_state import optimiser_state, require_same, require_shape, restore_optimiser, restoring
 
 KIND = "gaze run"
+STAGES = ("fit", "refit")
 
 
 class GazeRunFile:
@@ -31,8 +34,12 @@ class GazeRunFile:
             if path is None or not path.is_file():
                 raise NergError(f'there is nothing to resume: "{path}" does not exist; leave out --resume to start')
             self._tensors, self._meta = read_checkpoint(path, KIND)
-            require_same(path, self._meta["about"], about)
-            self.stage, self.found, self.seconds = self._meta["stage"], self._meta["found"], self._meta["spent"]
+            with restoring(path):
+                require_same(path, self._meta["about"], about)
+                self.stage, self.found = self._meta["stage"], self._meta["found"]
+                self.seconds = number(self._meta, "spent", "state")
+                if self.stage not in STAGES or not isinstance(self.found, dict):
+                    raise ValueError(f'its "stage" is {plain(self.stage, 40)} and not one of {", ".join(STAGES)}')
 
     @property
     def spent(self) -> float:
@@ -43,10 +50,14 @@ class GazeRunFile:
         """Set ``trainer`` to the state of ``stage``, where that is what was read; returns the weights that ``keep`` was given."""
         if stage != self.stage or "random" not in self._meta:
             return {}
-        restore_optimiser(trainer, self._tensors, self._meta["taken"])
-        trainer.restore(self._meta["steps"], self._meta["seconds"], self._meta["random"])
-        kind = {k: type(v) for k, v in trainer.averaged.items()}
-        return {k: kind[k](self._tensors[f"best.{k}"]) for k in kind if f"best.{k}" in self._tensors}
+        with restoring(self.path):
+            restore_optimiser(trainer, self._tensors, self._meta["taken"])
+            counts = [number(self._meta, name, "state") for name in ("steps", "seconds")]
+            trainer.restore(*counts, self._meta["random"])
+            best = {k: v for k, v in trainer.averaged.items() if f"best.{k}" in self._tensors}
+            for k, v in best.items():
+                require_shape(self._tensors, f"best.{k}", v)
+            return {k: type(v)(self._tensors[f"best.{k}"]) for k, v in best.items()}
 
     def keep(self, stage: str, trainer, found: dict, weights: dict, now: bool = False) -> None:
         """Write the state, atomically, when it is time (or ``now``). ``trainer``: None between two fits; ``found``: what

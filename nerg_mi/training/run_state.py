@@ -13,6 +13,8 @@ from pathlib import Path
 import drjit as dr
 
 from ..errors import NergError
+from ..formats.architecture import number
+from ..formats.bounded import reading
 from ..formats.checkpoint import read_checkpoint, write_checkpoint
 
 KIND = "radiance run"
@@ -40,12 +42,29 @@ def load_run(trainer, path: str | Path, about: dict) -> list:
     Raises `NergError` unless the state is one of a run with the same ``about``.
     """
     tensors, meta = read_checkpoint(path, KIND)
-    require_same(path, meta["about"], about)
-    restore_optimiser(trainer, tensors, meta["taken"])
-    trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], meta["turn"])
-    trainer.rng.bit_generator.state = meta["random"]
-    trainer.restore(meta["steps"], meta["rays"], meta["samples"], meta["seconds"], meta["settled"], tensors["hard"])
-    return meta["history"]
+    with restoring(path):
+        require_same(path, meta["about"], about)
+        counts = [number(meta, name, "state") for name in ("steps", "rays", "samples", "seconds")]
+        for name in _GRID:
+            require_shape(tensors, f"grid.{name}", getattr(trainer.grid, name))
+        restore_optimiser(trainer, tensors, meta["taken"])
+        trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], int(number(meta, "turn", "state")))
+        trainer.rng.bit_generator.state = meta["random"]
+        trainer.restore(*counts, bool(meta["settled"]), tensors["hard"])
+        return list(meta["history"])
+
+
+@contextmanager
+def restoring(path: str | Path) -> Iterator[None]:
+    """What a damaged state makes the block raise, as a `NergError` that names ``path``."""
+    with reading(path, "state of a run", "start anew without --resume", also=(TypeError, AttributeError)):
+        yield
+
+
+def require_shape(tensors: dict, name: str, like) -> None:
+    """Raise ``ValueError`` unless the stored array ``name`` has the shape of the Dr.Jit array ``like``."""
+    if tuple(tensors[name].shape) != tuple(dr.shape(like)):
+        raise ValueError(f'its array "{name}" has the shape {tensors[name].shape} and not {tuple(dr.shape(like))}')
 
 
 @contextmanager
@@ -87,13 +106,15 @@ def optimiser_state(trainer) -> tuple[dict, dict]:
 
 
 def restore_optimiser(trainer, tensors: dict, taken: dict) -> None:
-    """Set ``trainer`` to what ``optimiser_state`` gave."""
+    """Set ``trainer`` to what ``optimiser_state`` gave. Raises ``ValueError`` or `KeyError` where that does not fit it."""
     optimiser = trainer.optimiser
     for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
         old = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}
+        for part, x in old.items():
+            require_shape(tensors, f"{part}.{name}", x)
         new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
         dr.enable_grad(new["weights"])
-        count = dr.opaque(type(count), taken[name])
+        count = dr.opaque(type(count), int(number(taken, name, "state")))
         optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
         trainer.averaged[name] = new["averaged"]
     dr.eval(optimiser.state, trainer.averaged)
@@ -101,6 +122,8 @@ def restore_optimiser(trainer, tensors: dict, taken: dict) -> None:
 
 def require_same(path: str | Path, then: dict, now: dict) -> None:
     """Raise `NergError` unless a run that was started as ``then`` says is the one that ``now`` says, entry by entry."""
+    if not isinstance(then, dict):
+        raise NergError(f'the run in "{path}" cannot go on: its state is damaged; start anew without --resume')
     now = json.loads(json.dumps(now))
     different = [k for k in now if then.get(k) != now[k]]
     if different:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
+from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import FORMAT, read_checkpoint, write_checkpoint
 
 TENSORS = {
@@ -114,3 +115,28 @@ def test10_torch_is_not_imported(tmp_path):
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("raw", [
+    b"", b"\1\2", (10**12).to_bytes(8, "little") + b"{}", (2).to_bytes(8, "little") + b"[]", (1 << 63).to_bytes(8, "little"),
+    (200).to_bytes(8, "little") + b'{"x":{"dtype":"F32","shape":[1152921504606846976],"data_offsets":[0,0]}}'.ljust(200),
+])  # fmt: skip
+def test_headers_are_bounded(tmp_path, raw):
+    (tmp_path / "f.safetensors").write_bytes(raw)
+    with pytest.raises(NergError, match="f.safetensors"):
+        read_checkpoint(tmp_path / "f.safetensors", "radiance")
+
+
+def test_a_header_of_many_megabytes_is_not_read(tmp_path):
+    (tmp_path / "f.safetensors").write_bytes((17 << 20).to_bytes(8, "little") + b" " * (17 << 20))
+    with pytest.raises(NergError, match="more than the 16,777,216 that are read"):
+        read_checkpoint(tmp_path / "f.safetensors", "radiance")
+
+
+def test_metadata_nested_deep_are_refused(tmp_path):
+    from safetensors.numpy import save_file
+
+    deep = '{"kind": "radiance", "format": 1, "deep": ' + "[" * 100_000 + "]" * 100_000 + "}"
+    save_file({"x": np.zeros(1, np.float32)}, tmp_path / "f.safetensors", metadata={"nerg": deep})
+    with pytest.raises(NergError, match="f.safetensors.*nested"):
+        read_checkpoint(tmp_path / "f.safetensors", "radiance")

@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from nerg_mi.formats.exr import write_bitmap_exr, write_exr
+from nerg_mi.errors import NergError
+from nerg_mi.formats.exr import read_exr, write_bitmap_exr, write_exr
 
 
 def test_channels_come_back_in_another_reader(tmp_path, rgb):
@@ -52,3 +53,34 @@ def test_one_thread_is_enough(tmp_path):
     # Mitsuba's writer never returns here.
     subprocess.run([sys.executable, "-c", _ONE_THREAD, str(tmp_path / "a.exr")], check=True, timeout=120)
     assert (tmp_path / "a.exr").stat().st_size > 0
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16])
+@pytest.mark.parametrize("names", [
+    "R G B", "R G B A", "Y", "Y A", "Z", "depth.T", "R G B depth.T", "A B C", "rgba.R rgba.G rgba.B rgba.A", "r g b",
+    "albedo.R albedo.G albedo.B nn.X nn.Y nn.Z", "X Y Z", "Z Y X A B", "Blue Aqua Cat", "left.R right.R left.G B",
+])  # fmt: skip
+def test_pictures_are_read_as_mitsuba_reads_them(rgb, tmp_path, names, kind):
+    from nerg_mi.capture.reading import open_bitmap
+
+    values = np.random.default_rng(0).random((len(names.split()), 4, 3)).astype(kind)
+    write_exr(tmp_path / "a.exr", dict(zip(names.split(), values)))
+    mine, theirs = open_bitmap(tmp_path / "a.exr", "image"), rgb.Bitmap(str(tmp_path / "a.exr"))
+    assert mine.pixel_format() == theirs.pixel_format() and mine.component_format() == theirs.component_format()
+    if mine.pixel_format() == rgb.Bitmap.PixelFormat.MultiChannel:
+        assert [f.name for f in mine.struct_()] == [f.name for f in theirs.struct_()]
+    assert np.array_equal(np.array(mine), np.array(theirs)) and np.array(mine).shape == np.array(theirs).shape
+    for ask in ("premultiplied_alpha", "srgb_gamma", "has_alpha"):
+        assert getattr(mine, ask)() == getattr(theirs, ask)(), ask
+
+
+def test_damaged_exr_files_are_told_with_their_name(tmp_path):
+    write_exr(tmp_path / "a.exr", {c: np.random.default_rng(0).random((8, 8)).astype(np.float32) for c in "RGB"})
+    raw = (tmp_path / "a.exr").read_bytes()
+    for cut in (0, 3, 20, 200, len(raw) - 5):
+        (tmp_path / "b.exr").write_bytes(raw[:cut])
+        with pytest.raises(NergError, match="b.exr"):
+            read_exr(tmp_path / "b.exr")
+    write_exr(tmp_path / "c.exr", {c: np.zeros((2, 2), np.float32) for c in ("Y", "RY", "BY")})
+    with pytest.raises(NergError, match="c.exr.*luminance"):
+        read_exr(tmp_path / "c.exr")

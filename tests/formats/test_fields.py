@@ -7,6 +7,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from nerg_mi.errors import NergError
 from nerg_mi.field.box import Box
 from nerg_mi.field.gaze import GazeConfig, GazeField
 from nerg_mi.field.hashgrid import HashGridConfig
@@ -142,3 +143,40 @@ def test10_weights_that_are_not_finite_are_refused(tmp_path):
     field.set_parameters({"color_net.1": field.color_net.weights[1] * 1e6})
     with pytest.raises(ValueError, match="color_net.1"):
         save_radiance(field, tmp_path / "f", {}, half=True)
+
+
+@pytest.mark.parametrize("path, value", [
+    (("architecture", "grid", "levels"), 10**9), (("architecture", "width"), 10**9), (("architecture", "color_hidden"), 10**9),
+    (("architecture", "grid", "log2_rows"), 60), (("architecture", "grid", "finest"), 1e300), (("architecture", "sh_degree"), 2.5),
+    (("architecture", "grid", "base"), True), (("architecture", "geometry"), "15"), (("architecture", "grid"), [1]),
+    (("architecture",), 3), (("box", "lower"), "here"), (("box",), None), (("occupancy", "resolution"), 10**6),
+    (("occupancy", "resolution"), -1), (("occupancy", "bound"), 1e300), (("march_step",), 0), (("march_step",), "x"),
+    (("march_step",), float("nan")), (("provenance",), [1]), (("color_space",), {}),
+])  # fmt: skip
+def test_sizes_are_checked_before_anything_is_built(tmp_path, path, value):
+    save_radiance(radiance(), tmp_path / "f", {})
+
+    def change(tensors, meta):
+        *way, last = path
+        for key in way:
+            meta = meta[key]
+        meta[last] = value
+
+    rewrite(tmp_path / "f", change)
+    with pytest.raises(NergError, match='"[^"]*/f"'):
+        load_radiance(tmp_path / "f", ns)
+
+
+@pytest.mark.parametrize("name, shape", [("grid.table", (4,)), ("density_net.0", (3, 5)), ("color_net.0", (7,)), ("color_net.1", ())])
+def test_arrays_must_have_the_shapes_of_the_architecture(tmp_path, name, shape):
+    save_radiance(radiance(), tmp_path / "f", {})
+    rewrite(tmp_path / "f", lambda tensors, meta: tensors.update({name: np.zeros(shape, np.float32)}))
+    with pytest.raises(NergError, match=f'"{name}" has the shape'):
+        load_radiance(tmp_path / "f", ns)
+
+
+def test_cascades_that_float32_cannot_address_are_refused():
+    from nerg_mi.field.cascades import CascadeGrid
+
+    with pytest.raises(ValueError, match="cells along an edge"):
+        CascadeGrid(np.zeros((25, 2, 2, 2), bool), 2.0**24, ns, 0.0)

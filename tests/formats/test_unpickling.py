@@ -7,6 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.formats.pickling import write_torch
 from nerg_mi.formats.unpickling import StoredTensor, read_torch
 
@@ -122,3 +123,69 @@ def test07_damaged_archives(tmp_path):
             read_torch(archive(tmp_path / "d.pth", broken))
     with pytest.raises(ValueError, match='lacks its record "data/0"'):
         read_torch(archive(tmp_path / "d.pth", tensor((2,), (1,)))).numpy()
+
+
+ONE = np.arange(4, dtype="<f4").tobytes()
+
+
+def test_a_huge_memo_index_makes_no_room(tmp_path):
+    for put in (b"r\xff\xff\xff\xff", b"r\xff\xff\xff\x7f"):
+        assert read_torch(archive(tmp_path / "m.pth", b"\x80\x02K\x01" + put + b".")) == 1
+
+
+@pytest.mark.parametrize("shape, stride", [((10**9,), (0,)), ((10**5, 10**5), (0, 0)), ((1 << 21,), (0,)), ((1,) * 40, (0,) * 40)])
+def test_repeated_numbers_are_bounded(tmp_path, shape, stride):
+    with pytest.raises(NergError, match="t.pth"):
+        read_torch(archive(tmp_path / "t.pth", tensor(shape, stride), **{"0": ONE})).numpy()
+    assert np.array_equal(read_torch(archive(tmp_path / "s.pth", tensor((3, 2), (0, 1)), **{"0": ONE})).numpy(), [[0, 1]] * 3)
+    far = tensor((1, 2), (2**61, 1))
+    assert np.array_equal(read_torch(archive(tmp_path / "s.pth", far, **{"0": ONE})).numpy(), [[0, 1]])
+
+
+def test_keys_that_share_their_parts_are_not_hashed(tmp_path):
+    """A tuple of two that are one, fifty times over, has 2^50 leaves to hash."""
+    with pytest.raises(NergError, match="key"):
+        read_torch(archive(tmp_path / "k.pth", b"\x80\x02}K\x01" + b"2\x86" * 50 + b"Ns."))
+
+
+def test_texts_are_not_copied_over_and_over(tmp_path):
+    text = b"X" + (1 << 20).to_bytes(4, "little") + b"x" * (1 << 20) + b"q\x00"
+    again = b"c_codecs\nencode\nq\x01" + b"h\x01h\x00\x85R" * 1000
+    with pytest.raises(NergError, match="encoded text"):
+        read_torch(archive(tmp_path / "e.pth", b"\x80\x02" + text + again + b"."))
+
+
+@pytest.mark.parametrize("pickled, words", [
+    (b"\x80\x02" + b"N" * 1_000_001 + b".", "operations"), (b"\x80\x02h\x07.", "recalls"), (b"\x80\x02t.", ""),
+    (b"\x80\x02(i\nos\nsystem\n.", ""), (b"\x80\x04\x96\xff\xff\xff\xff\xff\xff\xff\x7f.", ""), (b"\x80\x02\x82\x01.", "EXT1"),
+    (b"\x80\x02X\xff\xff\xff\x7f.", ""), (b"\x80\x02N", ""), (b"\x80\x02.", ""),
+])  # fmt: skip
+def test_pickles_that_no_checkpoint_has(tmp_path, pickled, words):
+    with pytest.raises(NergError, match=f"p.pth.*{words}"):
+        read_torch(archive(tmp_path / "p.pth", pickled))
+
+
+def test_nothing_of_a_pickle_leads_to_the_archive(tmp_path):
+    """Not even while it is read: what a persistent id stands for is a key and a number type."""
+    from nerg_mi.formats import unpickling
+
+    machine = unpickling._Machine()
+    out = machine.run(tensor((2, 2), (2, 1)))
+    assert out._archive is None and machine.tensors == [out]
+    stored = unpickling._stored(("storage", unpickling._Global("torch", "FloatStorage"), "0", "cpu", 4))
+    assert vars(stored) == {"key": "0", "dtype": "<f4"}
+    for pid in ("storage", ("storage",), ("storage", "FloatStorage", "0"), ("module", *[unpickling._Global("torch", "x")] * 2),
+                ("storage", unpickling._Global("torch", "FloatStorage"), "../0")):  # fmt: skip
+        with pytest.raises(ValueError, match="stored array"):
+            unpickling._stored(pid)
+
+
+def test_archives_that_inflate_are_refused(tmp_path, monkeypatch):
+    from nerg_mi.formats import inflating
+
+    monkeypatch.setattr(inflating, "FREE", 1 << 20)
+    with zipfile.ZipFile(tmp_path / "z.pth", "w", zipfile.ZIP_DEFLATED) as z:
+        z.writestr("a/data.pkl", tensor((2,), (1,)))
+        z.writestr("a/data/0", bytes(30 << 20))
+    with pytest.raises(NergError, match="z.pth.*inflates"):
+        read_torch(tmp_path / "z.pth")

@@ -147,3 +147,21 @@ def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thre
         same.step()
     for name, value in state(same).items():
         assert np.array_equal(value, state(killed)[name]), name
+
+
+@pytest.mark.parametrize("change", [
+    lambda tensors, meta: meta.pop("taken"), lambda tensors, meta: meta.update(about=[]), lambda tensors, meta: meta.update(steps="7"),
+    lambda tensors, meta: meta.update(random={"bit_generator": "PCG64", "state": 3}), lambda tensors, meta: meta.update(seconds=None),
+    lambda tensors, meta: tensors.pop("hard"), lambda tensors, meta: tensors.update({"grid.bits": np.zeros(3, np.uint8)}),
+    lambda tensors, meta: tensors.update({"weights.grid.table": np.zeros(5, np.float32)}), lambda tensors, meta: meta.update(history=3),
+])  # fmt: skip
+def test_a_damaged_state_is_told_with_its_name(dataset, tmp_path, change):  # noqa: F811
+    from nerg_mi.formats.checkpoint import write_checkpoint
+
+    t = trainer(dataset)
+    save_run(t, tmp_path / "a.run", {"sha": 1}, [])
+    tensors, meta = read_checkpoint(tmp_path / "a.run", "radiance run")
+    change(tensors, meta)
+    write_checkpoint(tmp_path / "b.run", "radiance run", tensors, {k: v for k, v in meta.items() if k not in ("kind", "format")})
+    with pytest.raises(NergError, match="b.run"):
+        load_run(t, tmp_path / "b.run", {"sha": 1})
