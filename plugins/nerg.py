@@ -424,9 +424,11 @@ class NergIntegrator(mi.SamplingIntegrator):
         cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
-        self.observer_pass.forget()
+        # A map knows by itself of which observer it is, and the fall-off has no part in it.
+        if not keys or set(keys) - {"falloff", "to_world"}:
+            self.observer_pass.forget()
         if hasattr(self.medium, "refresh"):
-            self.medium.refresh()
+            self.medium.refresh(anyway=not keys or "density" in keys)
         if self.observer is not None and (not keys or "to_world" in keys):
             self.observer.parameters_changed(["to_world"])
         if recording():

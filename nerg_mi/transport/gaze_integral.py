@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 
 from .features import what_gaze_wants
-from .observer_map import _fingerprint, _indices
+from .fingerprint import Fingerprint, of_shapes
 
 COUNT = 1 << 17
 """Directions of an integral: enough for a thousandth at depths that jump from surface to surface."""
@@ -55,11 +55,11 @@ class GazeIntegral:
         """The integral (Float of one lane), with derivatives where parameters of the field have any."""
         parameters = self.gaze.parameters()
         if not dr.grad_enabled(parameters):
-            if self._value_of is None or self._value_of != _indices(parameters):
+            if self._value_of is None or self._value_of != Fingerprint(parameters):
                 with dr.suspend_grad():
                     self._value = self._integral()
                     dr.eval(self._value)
-                self._value_of = _indices(parameters)
+                self._value_of = Fingerprint(parameters)
             return self._value
         return self._integral()
 
@@ -175,4 +175,4 @@ def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> n
 
 def _traced_in(place) -> list:
     values = [] if place.medium is None else [v for v in place.medium.parameters() if dr.is_array_v(v)]
-    return [_fingerprint(place), _indices(values)]
+    return [of_shapes(place), Fingerprint(values)]

@@ -16,6 +16,7 @@ from ..field.backend import namespace
 from ..field.gaze import GazeField
 from ..field.radiance import RadianceField
 from .cells import bound, describe
+from .fingerprint import Fingerprint
 from .freezing import recording
 from .ray_box import intersect_box
 
@@ -186,13 +187,19 @@ class VolumeMedium:
                 f'the volume "density" has no finite extent (its bounding box is {self._lower} to {self._upper}); '
                 "give it a to_world that places it in the scene"
             )
+        self._read: Fingerprint | None = None
         self.refresh()
 
-    def refresh(self) -> None:
-        """Read the grid's voxels again; call after they have changed."""
+    def refresh(self, anyway: bool = False) -> None:
+        """Read the grid's voxels again if they are other arrays than before, or ``anyway``; call after they may have changed."""
         if recording():
             # A bound would be that of these voxels, and not of those of the replays.
-            self._bound = None
+            self._bound = self._read = None
+            return
+        import mitsuba as mi
+
+        arrays = Fingerprint(v for v in dict(mi.traverse(self._density)).values() if dr.is_array_v(v))
+        if arrays == self._read and not anyway:
             return
         described = describe(self._density)
         self.cells, self._bound, self.step = None, None, None
@@ -201,6 +208,8 @@ class VolumeMedium:
             # A step that is longer than a voxel can pass over a sheet.
             self.step = min(self.length_scale / 1024, 0.5 * self.cells.edge)
             self._bound = bound(data, namespace(self._variant))
+        # At the end: what was refused is looked at again.
+        self._read = arrays
 
     @property
     def occupancy(self):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import drjit as dr
 
+from .fingerprint import Fingerprint, of_shapes
 from .place import Place
 from .visibility import visibility
 
@@ -24,7 +25,7 @@ class ObserverMap:
 
         self.height, self.width = height, 2 * height
         self._uint, self._vector = mi.UInt32, mi.Vector3f
-        self._shapes = _fingerprint(place)
+        self._shapes = of_shapes(place)
         self.gaze, self._gaze_of = None, None
         with dr.suspend_grad():
             self.center = type(p_o)(dr.detach(p_o))
@@ -36,11 +37,11 @@ class ObserverMap:
 
     def serves(self, place: Place) -> bool:
         """Whether the shapes are still those that were cast at."""
-        return self._shapes == _fingerprint(place)
+        return self._shapes == of_shapes(place)
 
     def keep(self, gaze) -> None:
         """Have ``look_up`` know the density of ``gaze`` (``media.GazeMedium``) where the observer meets a surface."""
-        if self._gaze_of is not None and self._gaze_of == _indices(gaze.parameters()):
+        if self._gaze_of is not None and self._gaze_of == Fingerprint(gaze.parameters()):
             return
         with dr.suspend_grad():
             r_o = self._directions()
@@ -48,7 +49,7 @@ class ObserverMap:
             p_od = self.center + r_o * dr.select(met, self.depth, 0)
             self.gaze = dr.select(met, gaze.evaluate(p_od, self.center, r_o, met)[0], 0)
             dr.eval(self.gaze)
-        self._gaze_of = _indices(gaze.parameters())
+        self._gaze_of = Fingerprint(gaze.parameters())
 
     @property
     def spacing(self) -> float:
@@ -103,38 +104,3 @@ class ObserverMap:
             for di in (0, 1):
                 row, column = dr.minimum(j + dj, self.height - 1), (i + di) % self.width
                 yield column + self.width * row, (fx if di else 1 - fx) * (fy if dj else 1 - fy)
-
-
-class _Fingerprint(list):
-    """Values by identity. They are held, so that no later variable can take the place of one."""
-
-    def __init__(self, values):
-        super().__init__(i for v in values for i in dr.detail.collect_indices(v))
-        self._held = list(values)
-
-
-def _indices(values) -> list:
-    return _Fingerprint(values)
-
-
-def _fingerprint(place):
-    import mitsuba as mi
-
-    if place.scene is None:
-        return _indices([])
-    shapes = [*place.scene.shapes(), *_groups(mi, place.scene)]
-    return _indices([v for shape in shapes for v in dict(mi.traverse(shape)).values()])
-
-
-def _groups(mi, scene) -> list:
-    """What instances repeat: no shapes of the scene itself."""
-    found = []
-
-    class Collect(mi.TraversalCallback):
-        def put(self, name, value, *rest):
-            if isinstance(value, mi.Shape) and value.class_name().startswith("ShapeGroup"):
-                found.append(value)
-
-    if any(shape.class_name() == "Instance" for shape in scene.shapes()):
-        scene.traverse(Collect())
-    return found

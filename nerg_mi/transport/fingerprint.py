@@ -1,0 +1,43 @@
+"""Whether arrays are still those that something was made of: told by identity, without reading them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import drjit as dr
+
+
+class Fingerprint(list):
+    """Of ``values`` (Dr.Jit arrays, or anything that holds some): equal as long as these are.
+
+    Copies are held, so that no later variable can take the place of one: the objects that ``mi.traverse`` gives are assigned to,
+    and hold other variables then."""
+
+    def __init__(self, values: Iterable):
+        held = [dr.copy(v) for v in values]
+        super().__init__(i for v in held for i in dr.detail.collect_indices(v))
+        self._held = held
+
+
+def of_shapes(place) -> Fingerprint:
+    """Of all shapes of a ``place.Place``, those that instances repeat among them."""
+    import mitsuba as mi
+
+    if place.scene is None:
+        return Fingerprint([])
+    shapes = [*place.scene.shapes(), *_groups(mi, place.scene)]
+    return Fingerprint(v for shape in shapes for v in dict(mi.traverse(shape)).values())
+
+
+def _groups(mi, scene) -> list:
+    """What instances repeat: no shapes of the scene itself."""
+    found = []
+
+    class Collect(mi.TraversalCallback):
+        def put(self, name, value, *rest):
+            if isinstance(value, mi.Shape) and value.class_name().startswith("ShapeGroup"):
+                found.append(value)
+
+    if any(shape.class_name() == "Instance" for shape in scene.shapes()):
+        scene.traverse(Collect())
+    return found
