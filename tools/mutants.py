@@ -214,7 +214,7 @@ def chosen_by(place: str, tree: Path) -> list[Mutant]:
 
 def run(packages: list[str], results: dict[str, dict], arguments) -> None:
     with Bench() as bench:
-        reach = Reach(bench)
+        reach = Reach(bench, tuple(arguments.tests or ["tests/"]))
         if arguments.only:
             mutants = [m for place in arguments.only for m in chosen_by(place, bench.tree)]
         else:
@@ -240,6 +240,7 @@ def main() -> int:
     parser.add_argument("--survivors", action="store_true", help="print the survivors of the sample, run nothing")
     parser.add_argument("--update", metavar="PAGE", help="put the table on this page, run nothing")
     parser.add_argument("--again", action="store_true", help="judge also what is known")
+    parser.add_argument("--tests", action="append", metavar="PREFIX", help="judge by the files of tests that begin so (default: all)")
     parser.add_argument("--bound", type=float, default=45.0, help="seconds of tests at most for a mutant (default: 45)")
     arguments = parser.parse_args()
     packages = arguments.package or list(QUOTAS)

@@ -29,10 +29,10 @@ def test_files(tree: Path) -> list[str]:
 class Reach:
     """`tests`: outcome and seconds of each test without any mistake; `of(mutant)`: which of them reach it."""
 
-    def __init__(self, bench: Bench):
+    def __init__(self, bench: Bench, prefixes: tuple[str, ...] = ("tests/",)):
         self.bench, self.records = bench, {}
         self._moves: dict[tuple[str, str], dict[int, int]] = {}
-        for file in test_files(bench.tree):
+        for file in (f for f in test_files(bench.tree) if f.startswith(prefixes)):
             path = _FOLDER / (file.replace("/", "-") + ".json")
             stamp = digest(bench.source(file))
             if not path.exists() or json.loads(path.read_text())["stamp"] != stamp:

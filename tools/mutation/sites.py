@@ -31,8 +31,11 @@ _TWINS = {
 }
 _TWINS |= {b: a for a, b in _TWINS.items()}
 _MATHS = {"dr", "np", "math", "mi", "numpy"}
-# A call of these is no function of its first argument that could be left out.
+# What only decides when and where something is computed: without it values are the same.
+_SCHEDULING = {"eval", "schedule", "sync_thread", "make_opaque", "flush_malloc_cache"}
+# A call of these is no function of its first argument that could be left out, or only converts it.
 _MAKERS = {
+    "asarray", "array", "ascontiguousarray", "opaque",
     "zeros", "ones", "full", "empty", "arange", "linspace", "eye", "width", "shape", "ndim", "array_t", "uint32_array_t",
     "load_file", "load_dict", "traverse", "Log", "set_variant", "custom", "while_loop", "if_stmt", "scoped_set_flag",
     "make_opaque", "eval", "sync_thread", "schedule", "enable_grad", "hint", "errstate", "random", "load", "save",
@@ -130,7 +133,8 @@ class _Finder:
         if isinstance(s, ast.Expr) and isinstance(s.value, ast.Call):
             if self.is_message(s.value):
                 return
-            self.put("removed statement", s, "pass")
+            if getattr(s.value.func, "attr", "") not in _SCHEDULING:
+                self.put("removed statement", s, "pass")
         if isinstance(s, ast.AugAssign):
             self.put("removed statement", s, "pass")
             if isinstance(s.op, (ast.Add, ast.Sub)):
