@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import NergError
 from ..field.box import Box
 from .cameras import Camera, project
 
@@ -49,7 +50,7 @@ def scene_box(cameras: list[Camera], object_only: bool = False, points: np.ndarr
     lower, upper = centers.min(axis=0), centers.max(axis=0)
     margin = 0.5 * float(np.max(upper - lower))
     if margin == 0:
-        raise ValueError("all cameras stand at one point, so that no scene box can be guessed; give one with --aabb")
+        raise NergError("all cameras stand at one point, so that no scene box can be guessed; give one with --aabb")
     return Box(tuple(lower - margin), tuple(upper + margin)), "around the cameras"
 
 

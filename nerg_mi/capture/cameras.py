@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import NergError
 from ..formats.intrinsics import Intrinsics
 from . import lens
 
@@ -77,19 +78,19 @@ def project(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]
 def sensor_dict(camera: Camera) -> dict:
     """A Mitsuba ``perspective`` sensor (dict for ``mi.load_dict``) that takes this camera's picture.
 
-    Box filter, float32 RGB, one ray through each pixel's footprint. Raises ``ValueError`` for what
+    Box filter, float32 RGB, one ray through each pixel's footprint. Raises `NergError` for what
     that sensor cannot express: distortion, and pixels that are not square to 0.1 %.
     """
     import mitsuba as mi
 
     i = camera.intrinsics
     if i.is_distorted:
-        raise ValueError(
+        raise NergError(
             "Mitsuba's perspective sensor has no lens distortion, but this camera has "
             f"{'a fisheye lens' if i.fisheye else f'k1, k2, p1, p2 = {i.distortion[:4]}'}; undistort the images first"
         )
     if abs(i.fx / i.fy - 1) > 1e-3:
-        raise ValueError(f"Mitsuba's perspective sensor has square pixels, but this camera has fx={i.fx:g}, fy={i.fy:g}")
+        raise NergError(f"Mitsuba's perspective sensor has square pixels, but this camera has fx={i.fx:g}, fy={i.fy:g}")
     return {
         "type": "perspective",
         "to_world": mi.ScalarTransform4f((camera.to_world @ _OPENGL_FROM_MITSUBA).tolist()),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import NergError
 from ..field.box import Box
 from ..formats.posed import PosedImages, Unused
 from .bounds import lonely, scene_box
@@ -46,18 +47,18 @@ def open_dataset(
     of the file, else a guess from points on surfaces (COLMAP's, or from depth) or from the cameras. ``depth``: read
     the depth files that the frames name.
 
-    Frames that cannot be used are left out and listed; ``ValueError``, naming file and frame, when none can.
+    Frames that cannot be used are left out and listed; `NergError`, naming file and frame, when none can.
     """
     split = read_split(path, holdout, coordinates, scale)
     train, bad = load_usable(split.posed.frames, width, downscale, depth)
     if not train:
-        raise ValueError(f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '
+        raise NergError(f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '
                          f'"{bad[0].name}": {bad[0].reason}')
     held_out, bad_held = load_usable(split.held_out, width, downscale, depth)
     box, box_from = _box(split.posed, train, aabb)
     alone = lonely([v.camera for v in train], box) if len(train) > 1 else []
     if len(alone) == len(train):
-        raise ValueError(
+        raise NergError(
             f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") look at the '
             f"same place within the box {_corners(box)}; check the poses, or give a box that holds what they show with --aabb"
         )
@@ -83,7 +84,7 @@ def open_dataset(
 def _box(posed: PosedImages, views: list[View], aabb) -> tuple[Box, str]:
     if aabb is not None:
         if len(aabb) != 6:
-            raise ValueError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
+            raise NergError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
         given, how = np.reshape(np.asarray(aabb, float), (2, 3)), "as given"
     elif posed.aabb is not None:
         given, how = posed.aabb, f'"aabb" of {posed.path.name}'

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import NergError
 from ..formats.posed import Frame, Unused
 from . import lens
 from .cameras import Camera, pixel_directions, pixel_grid, view_tangents
@@ -56,13 +57,13 @@ def split_holdout(frames: list[Frame], every: int) -> tuple[list[Frame], list[Fr
     """Training and held-out frames: every ``every``-th of ``frames`` (sorted by file name), the first
     included, is held out; 0 holds none out."""
     if every < 0 or every == 1:
-        raise ValueError(f"holdout must be 0 (none) or at least 2 (every so many frames), got {every}")
+        raise NergError(f"holdout must be 0 (none) or at least 2 (every so many frames), got {every}")
     if every == 0:
         return list(frames), []
     held = frames[::every]
     train = [f for i, f in enumerate(frames) if i % every]
     if not train:
-        raise ValueError(f"holding out every {every}th of {len(frames)} frames leaves none to train on; use holdout 0")
+        raise NergError(f"holding out every {every}th of {len(frames)} frames leaves none to train on; use holdout 0")
     return train, held
 
 
@@ -81,13 +82,13 @@ def load_usable(
 
 
 def check_size(width: int | None, downscale: float | None) -> None:
-    """``ValueError`` for sizes that no picture can have."""
+    """`NergError` for sizes that no picture can have."""
     if width is not None and downscale is not None:
-        raise ValueError("give either width or downscale, not both")
+        raise NergError("give either width or downscale, not both")
     if width is not None and width < 1:
-        raise ValueError(f"width must be at least 1 pixel, got {width}")
+        raise NergError(f"width must be at least 1 pixel, got {width}")
     if downscale is not None and not downscale >= 1:
-        raise ValueError(f"downscale must be at least 1, got {downscale}")
+        raise NergError(f"downscale must be at least 1, got {downscale}")
 
 
 def load_view(frame: Frame, width: int | None = None, downscale: float | None = None, depth: bool = False) -> View:
@@ -95,7 +96,7 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
 
     Pictures are averaged over the area of the new pixels, on their stored (sRGB) values, as other
     trainers do; depth takes the value nearest to each new pixel's centre; a pixel counts where all that it covers is
-    on in the mask. ``depth``: read depth files. ``ValueError`` names the file that cannot be used.
+    on in the mask. ``depth``: read depth files. `NergError` names the file that cannot be used.
     """
     check_size(width, downscale)
     pixels = read_image(frame.image)
@@ -103,7 +104,7 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
     stated = frame.intrinsics(w, h)
     factor = w / width if width is not None else downscale or 1.0
     if factor < 1:
-        raise ValueError(f'the image "{frame.image}" is only {w} pixels wide; choose a width of at most {w}')
+        raise NergError(f'the image "{frame.image}" is only {w} pixels wide; choose a width of at most {w}')
     size = max(1, round(w / factor)), max(1, round(h / factor))
     intrinsics = stated.resized(*size)
     # Every pixel must have a ray; lenses fold over at the borders first.
@@ -113,7 +114,7 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
         shown = np.linalg.norm(pixel_grid(intrinsics), axis=-1) < lens.fisheye_limit(intrinsics)[1]
         mask = mask if shown.all() else shown if mask is None else mask & shown
     if mask is not None and not mask.any():
-        raise ValueError("its mask leaves out every pixel")
+        raise NergError("its mask leaves out every pixel")
     distance = _distances(frame, (h, w), intrinsics) if depth and frame.depth is not None else None
     if size != (w, h):
         pixels = area_average(View(frame.name, None, pixels).color, *size)
@@ -127,7 +128,7 @@ def _distances(frame: Frame, shape: tuple[int, int], intrinsics) -> np.ndarray:
     """Distances along the rays of the resized picture; depth cameras may have fewer pixels than the photo."""
     out, (h, w) = read_depth(frame.depth), shape
     if abs(out.shape[1] * h - out.shape[0] * w) > 0.01 * w * out.shape[0]:
-        raise ValueError(f'the depth file "{frame.depth.path}" has {out.shape[1]} x {out.shape[0]} pixels, which is not the '
+        raise NergError(f'the depth file "{frame.depth.path}" has {out.shape[1]} x {out.shape[0]} pixels, which is not the '
                          f"shape of its image, {w} x {h}")
     out = nearest(out, intrinsics.width, intrinsics.height)
     if frame.depth.along_axis:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import NergError
 from ..formats.intrinsics import Intrinsics
 
 _NEWTON = 20
@@ -30,7 +31,7 @@ def distort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
 def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
     """The inverse of `distort`, by Newton's iteration.
 
-    Raises ``ValueError`` where the model folds over inside the image, so that no inverse exists.
+    Raises `NergError` where the model folds over inside the image, so that no inverse exists.
     """
     goal = np.asarray(xy, np.float64)
     if not any(lens.distortion):
@@ -53,7 +54,7 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
     if not good:
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         said = ", ".join(f"{k}={v:g}" for k, v in zip(names, lens.distortion) if v)
-        raise ValueError(f"the distortion {said} cannot be inverted over the whole image; undistort the images beforehand, "
+        raise NergError(f"the distortion {said} cannot be inverted over the whole image; undistort the images beforehand, "
                          "or crop them")
     return u
 
@@ -108,7 +109,7 @@ def fisheye_limit(lens: Intrinsics) -> tuple[float, float]:
 def rays(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
     """Unit directions (..., 3) that image coordinates ``xy`` (..., 2) show; a fisheye's last one beyond its limit.
 
-    Raises ``ValueError`` as `undistort` does.
+    Raises `NergError` as `undistort` does.
     """
     if not lens.fisheye:
         u = undistort(xy, lens)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import MissingFile, NergError
 from ..formats.intrinsics import Intrinsics
 from ..formats.posed import Frame
 from . import lens
@@ -109,10 +110,10 @@ def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", a
     (4, 4) similarity from the set's coordinates to those wanted; by default they stay, or become those of a radiance field that
     was trained on this very file, of which ``trained`` is the provenance. Masks of the frames hide what is not known.
 
-    Raises ``ValueError``, naming the file, for an image that is none, and when no frame has one.
+    Raises `NergError`, naming the file, for an image that is none, and when no frame has one.
     """
     if per not in PER:
-        raise ValueError(f'salience is given per {" or per ".join(PER)}, not per "{per}"')
+        raise NergError(f'salience is given per {" or per ".join(PER)}, not per "{per}"')
     posed = read_posed(find_source(dataset))
     if align is None and trained and trained.get("sha256") == posed.sha256 and "to_file" in trained:
         align = np.linalg.inv(trained["to_file"])
@@ -126,7 +127,7 @@ def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", a
     views = [_view(f, files[f.name], model, per) for f in posed.frames if f.name in files]
     missing = [f.name for f in posed.frames if f.name not in files]
     if not views:
-        raise ValueError(f'no image in "{source}" is called as one of the {len(posed.frames)} frames of "{posed.path}" is; '
+        raise NergError(f'no image in "{source}" is called as one of the {len(posed.frames)} frames of "{posed.path}" is; '
                          f'the first of these would be "{Path(posed.frames[0].name).stem}" with {", ".join(SUFFIXES)}')
     about = {
         "views": posed.path.name, "sha256": posed.sha256, "salience": str(source) if model else Path(source).resolve().name,
@@ -138,31 +139,31 @@ def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", a
 def read_salience(path: str | Path) -> np.ndarray:
     """The image (h, w), float64, not negative and not all zero: PNG of 8 or 16 bits as stored (no gamma), EXR, NPY.
 
-    Raises ``ValueError``, naming the file, for what is none: NaN, negative values, colours, transparency.
+    Raises `NergError`, naming the file, for what is none: NaN, negative values, colours, transparency.
     """
     path = Path(path)
     try:
         out = np.load(path, allow_pickle=False) if path.suffix.lower() == ".npy" else _stored(path)
     except (OSError, EOFError, ValueError, RuntimeError) as e:
-        raise ValueError(f'the salience image "{path}" cannot be read: {str(e).strip().splitlines()[-1]}') from e
+        raise NergError(f'the salience image "{path}" cannot be read: {str(e).strip().splitlines()[-1]}') from e
     if out.ndim == 3 and out.shape[2] in (2, 4):
         if np.ptp(out[..., -1].astype(np.float64)) > 0:
-            raise ValueError(f'the salience image "{path}" is partly transparent; leave out its alpha channel')
+            raise NergError(f'the salience image "{path}" is partly transparent; leave out its alpha channel')
         out = out[..., :-1]
     if out.ndim == 3 and out.shape[2] in (1, 3):
         if not all(np.array_equal(out[..., 0], out[..., k], equal_nan=True) for k in range(1, out.shape[2])):
-            raise ValueError(f'the salience image "{path}" is in colours; give the grey map itself, not a picture of it')
+            raise NergError(f'the salience image "{path}" is in colours; give the grey map itself, not a picture of it')
         out = out[..., 0]
     if out.ndim != 2 or not out.size or not (np.issubdtype(out.dtype, np.number) or out.dtype == bool) or np.iscomplexobj(out):
-        raise ValueError(f'the salience image "{path}" must hold one number a pixel, got shape {out.shape} of {out.dtype}')
+        raise NergError(f'the salience image "{path}" must hold one number a pixel, got shape {out.shape} of {out.dtype}')
     out = out.astype(np.float64)
     if not np.all(np.isfinite(out)):
-        raise ValueError(f'the salience image "{path}" holds {np.sum(~np.isfinite(out))} values that are not finite; '
+        raise NergError(f'the salience image "{path}" holds {np.sum(~np.isfinite(out))} values that are not finite; '
                          "leave it out, or make it again")
     if (out < 0).any():
-        raise ValueError(f'the salience image "{path}" holds negative values; of log densities give the exponential')
+        raise NergError(f'the salience image "{path}" holds negative values; of log densities give the exponential')
     if not out.any():
-        raise ValueError(f'the salience image "{path}" is zero everywhere; leave it out, or make it again')
+        raise NergError(f'the salience image "{path}" is zero everywhere; leave it out, or make it again')
     return out
 
 
@@ -171,19 +172,19 @@ def _stored(path: Path) -> np.ndarray:
 
     bitmap = mi.Bitmap(str(path))
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel and bitmap.channel_count() != 1:
-        raise ValueError(f"it has {bitmap.channel_count()} channels and not one")
+        raise NergError(f"it has {bitmap.channel_count()} channels and not one")
     return np.array(bitmap)
 
 
 def _files(folder: Path, frames: list[Frame]) -> tuple[dict[str, Path], list[str]]:
     """The file of each frame that has one, and names of the others."""
     if not folder.is_dir():
-        raise FileNotFoundError(f'there is no folder "{folder}" of salience images; '
+        raise MissingFile(f'there is no folder "{folder}" of salience images; '
                                 f'give one, or a model: {", ".join(MODELS)}')
     found: dict[str, Path] = {}
     for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES):
         if path.stem in found:
-            raise ValueError(f'"{found[path.stem].name}" and "{path.name}" in "{folder}" are of the same frame; keep one')
+            raise NergError(f'"{found[path.stem].name}" and "{path.name}" in "{folder}" are of the same frame; keep one')
         found[path.stem] = path
     out, owner = {}, {}
     for frame in frames:
@@ -191,7 +192,7 @@ def _files(folder: Path, frames: list[Frame]) -> tuple[dict[str, Path], list[str
         if stem not in found:
             continue
         if stem in owner:
-            raise ValueError(f'the salience image "{found[stem]}" could be of "{owner[stem]}" or of "{frame.name}"; '
+            raise NergError(f'the salience image "{found[stem]}" could be of "{owner[stem]}" or of "{frame.name}"; '
                              "give the photos different names")
         out[frame.name], owner[stem] = found[stem], frame.name
     return out, [p.name for stem, p in found.items() if stem not in owner]
@@ -204,14 +205,14 @@ def _view(frame: Frame, path: Path | None, model, per: str) -> SalienceView:
         try:
             values = model(_opaque(photo))
         except ValueError as e:
-            raise ValueError(f'the photo "{frame.image}" has no salience: {e}') from e
+            raise NergError(f'the photo "{frame.image}" has no salience: {e}') from e
         what = f'the photo "{frame.image}"'
     else:
         values, size, what = read_salience(path), _photo_size(frame), f'the salience image "{path}"'
     h, w = values.shape
     # A map may be a pixel off where its size was rounded.
     if abs(h - w * size[1] / size[0]) > max(1.0, _SHAPE * h):
-        raise ValueError(f"{what} has {w} x {h} pixels, which is not the shape of its photo, {size[0]} x {size[1]}; "
+        raise NergError(f"{what} has {w} x {h} pixels, which is not the shape of its photo, {size[0]} x {size[1]}; "
                          "bring it to that shape")
     intrinsics = frame.intrinsics(*size).resized(w, h)
     solid = pixel_solid_angles(intrinsics)
@@ -219,7 +220,7 @@ def _view(frame: Frame, path: Path | None, model, per: str) -> SalienceView:
         solid = np.where(_unmasked(frame, size, intrinsics), solid, 0)
     share = np.where(solid > 0, values, 0) if per == "pixel" else values * solid
     if not share.sum() > 0:
-        raise ValueError(f"{what} is zero wherever the lens and the mask of its frame show anything; "
+        raise NergError(f"{what} is zero wherever the lens and the mask of its frame show anything; "
                          "leave it out, or correct the mask")
     view = SalienceView(frame.name, Camera(intrinsics, frame.to_world), share / share.sum(), solid).reduced(_KEPT)
     return SalienceView(view.name, view.camera, view.share.astype(np.float32), view.solid_angle.astype(np.float32))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import MissingFile, NergError
 from ..formats.colmap import model_files, read_colmap
 from ..formats.posed import Frame, PosedImages, Unused
 from ..formats.transforms import read_dataparser, read_transforms
@@ -36,7 +37,7 @@ def find_source(dataset: str | Path) -> Path:
     for name in _MODELS:
         if model_files(dataset / name) is not None:
             return dataset / name
-    raise FileNotFoundError(
+    raise MissingFile(
         f'"{dataset}" holds neither transforms.json nor transforms_train.json nor a COLMAP model (sparse/0/cameras.bin); '
         "name the folder of a posed image set"
     )
@@ -49,7 +50,7 @@ def read_posed(source: Path) -> PosedImages:
     folders = [source, *list(source.resolve().parents)[:3]]
     images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
     if images is None:
-        raise FileNotFoundError(f'there is no folder "images" beside or above the COLMAP model "{source}"; '
+        raise MissingFile(f'there is no folder "images" beside or above the COLMAP model "{source}"; '
                                 "put the photos there")
     masks = images.with_name("masks")
     return read_colmap(source, images, masks if masks.is_dir() else None)
@@ -78,7 +79,7 @@ def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str
         both = [f for f in posed.frames if f.image.resolve() in hidden]
         train = [f for f in posed.frames if f.image.resolve() not in hidden]
         if not train:
-            raise ValueError(f'all frames of "{posed.path}" are also in "{other.name}", which holds them out; use holdout 0')
+            raise NergError(f'all frames of "{posed.path}" are also in "{other.name}", which holds them out; use holdout 0')
         unused = [*posed.unused, *(Unused(f.name, f"it is held out by {other.name}") for f in both), *test.unused]
         posed = replace(posed, frames=train, unused=unused, notes=[*posed.notes, *test.notes])
         return Split(posed, test.frames, other.name)
@@ -86,7 +87,7 @@ def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str
         names = set(posed.held_out)
         train = [f for f in posed.frames if f.name not in names]
         if not train:
-            raise ValueError(f'"{posed.path}" holds out all of its frames; use holdout 0')
+            raise NergError(f'"{posed.path}" holds out all of its frames; use holdout 0')
         return Split(replace(posed, frames=train), [f for f in posed.frames if f.name in names],
                      f"listed in {posed.path.name}")
     every = 8 if holdout is None else holdout
@@ -107,18 +108,18 @@ def _test_file(source: Path) -> Path | None:
 def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarray:
     """From the file's coordinates to those asked for."""
     if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"scale must be a positive number, got {scale}")
+        raise NergError(f"scale must be a positive number, got {scale}")
     original = np.eye(4) if posed.original is None else posed.original
     if coordinates == "file":
         to = np.eye(4)
     elif coordinates == "original":
         if posed.original is None:
-            raise ValueError(f'"{posed.path}" has no "applied_transform", so that its original coordinates are not known; '
+            raise NergError(f'"{posed.path}" has no "applied_transform", so that its original coordinates are not known; '
                              'use the coordinates "file"')
         to = original
     elif coordinates.endswith(".json"):
         to = read_dataparser(coordinates) @ original
     else:
-        raise ValueError(f'coordinates must be {", ".join(COORDINATES)} or the path of a dataparser_transforms.json, '
+        raise NergError(f'coordinates must be {", ".join(COORDINATES)} or the path of a dataparser_transforms.json, '
                          f'got "{coordinates}"')
     return np.diag([scale, scale, scale, 1.0]) @ to

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import NergError
 from .resize import area_average
 
 # The authors' scale of attention, and their blur in pixels at that width.
@@ -20,7 +21,7 @@ def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
     """Salience (h, w), float64, at most 1, of ``photo`` (H, W, 3) in 0..1, sRGB; computed and returned ``width`` pixels wide.
 
     As the authors' own script has it: grey, 3 x 3 mean of the log amplitude with repeated edges, Gaussian of 2.5 pixels. Raises
-    ``ValueError`` for a photo of one colour, which has no salience.
+    `NergError` for a photo of one colour, which has no salience.
     """
     from scipy.fft import fft2, ifft2
     from scipy.ndimage import gaussian_filter, uniform_filter
@@ -30,7 +31,7 @@ def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
     grey = np.asarray(photo, np.float32) @ np.float32([0.299, 0.587, 0.114])
     grey = area_average(grey[..., None], w, max(1, round(H * w / W)))[..., 0].astype(np.float64)
     if not np.ptp(grey) > 1e-6:
-        raise ValueError("it has one colour everywhere, and no spectrum to find salience in")
+        raise NergError("it has one colour everywhere, and no spectrum to find salience in")
     spectrum = fft2(grey)
     # The logarithm of an amplitude of zero is none; rounding decides about smaller ones anyway.
     amplitude = np.log(np.maximum(np.abs(spectrum), 1e-9 * np.abs(spectrum).max()))

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import MissingFile, NergError
 from .posed import Frame, MaskFile, PosedImages, Unused, drop_repeated, none_usable
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
@@ -42,11 +43,11 @@ class _Camera:
     def lens(self) -> dict:
         names = _PARAMETERS.get(self.model)
         if names is None:
-            raise ValueError(f'its camera model "{self.model}" is not supported; run "colmap image_undistorter" and train on '
+            raise NergError(f'its camera model "{self.model}" is not supported; run "colmap image_undistorter" and train on '
                              f"its result, or use one of {', '.join(_PARAMETERS)}")
         names = names.split()
         if len(names) != len(self.parameters) or not np.all(np.isfinite(self.parameters)):
-            raise ValueError(f"its camera needs {len(names)} finite parameters for {self.model}, not {self.parameters}")
+            raise NergError(f"its camera needs {len(names)} finite parameters for {self.model}, not {self.parameters}")
         lens = dict(zip(names, map(float, self.parameters)))
         if "f" in lens:
             lens["fl_x"] = lens["fl_y"] = lens.pop("f")
@@ -67,13 +68,13 @@ def model_files(folder: str | Path) -> dict[str, Path] | None:
 def read_colmap(folder: str | Path, images: str | Path, masks: str | Path | None = None) -> PosedImages:
     """Read the model in ``folder``; its image names are relative to ``images``, its masks' to ``masks`` (``NAME.png``).
 
-    In COLMAP's own world. Frames that cannot be used are listed; ``ValueError`` names file and record for
+    In COLMAP's own world. Frames that cannot be used are listed; `NergError` names file and record for
     what cannot be parsed, and when no frame can be used.
     """
     folder, images = Path(folder), Path(images)
     files = model_files(folder)
     if files is None:
-        raise FileNotFoundError(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
+        raise MissingFile(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
     binary = files["cameras"].suffix == ".bin"
     cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"])
     poses = (_images_bin if binary else _images_txt)(files["images"])
@@ -95,15 +96,15 @@ def read_colmap(folder: str | Path, images: str | Path, masks: str | Path | None
 
 def _frame(name: str, camera: _Camera | None, number: int, q, t, images: Path, masks) -> Frame:
     if camera is None:
-        raise ValueError(f"the model has no camera {number}")
+        raise NergError(f"the model has no camera {number}")
     if not (images / name).is_file():
-        raise ValueError(f'its image "{images / name}" does not exist')
+        raise NergError(f'its image "{images / name}" does not exist')
     lens, mask = camera.lens(), None
     if masks is not None:
         # COLMAP appends the suffix; others replace it.
         found = [p for p in (Path(masks) / f"{name}.png", (Path(masks) / name).with_suffix(".png")) if p.is_file()]
         if not found:
-            raise ValueError(f'its mask "{Path(masks) / name}.png" does not exist')
+            raise NergError(f'its mask "{Path(masks) / name}.png" does not exist')
         mask = MaskFile(found[0])
     return Frame(name, images / name, _to_world(q, t), lens, mask=mask)
 
@@ -112,7 +113,7 @@ def _to_world(q, t) -> np.ndarray:
     w, x, y, z = q
     norm = float(np.linalg.norm(q))
     if not (np.isfinite(norm) and norm > 1e-6 and np.all(np.isfinite(t))):
-        raise ValueError("its pose is not finite, or its quaternion is zero")
+        raise NergError("its pose is not finite, or its quaternion is zero")
     w, x, y, z = (v / norm for v in (w, x, y, z))
     m = np.eye(4)
     m[:3, :3] = [
@@ -141,7 +142,7 @@ class _Reader:
 
     def need(self, size: int, what: str) -> None:
         if self.at + size > len(self.data):
-            raise ValueError(f'"{self.path}" ends in the middle of {what} (byte {self.at} of {len(self.data)}); copy it again')
+            raise NergError(f'"{self.path}" ends in the middle of {what} (byte {self.at} of {len(self.data)}); copy it again')
 
     def skip(self, size: int, what: str) -> None:
         self.need(size, what)
@@ -150,7 +151,7 @@ class _Reader:
     def name(self, what: str) -> str:
         end = self.data.find(b"\0", self.at)
         if end < 0:
-            raise ValueError(f'"{self.path}" ends in the middle of the name of {what}; copy it again')
+            raise NergError(f'"{self.path}" ends in the middle of the name of {what}; copy it again')
         out, self.at = self.data[self.at:end], end + 1
         return out.decode("utf-8", errors="surrogateescape")
 
@@ -160,7 +161,7 @@ def _cameras_bin(path: Path) -> dict[int, _Camera]:
     for k in range(r.take("Q", "its header")[0]):
         number, model, width, height = r.take("iiQQ", f"camera record {k + 1}")
         if model not in _MODELS:
-            raise ValueError(f'camera {number} of "{path}" has the unknown model number {model}, so that the file cannot be '
+            raise NergError(f'camera {number} of "{path}" has the unknown model number {model}, so that the file cannot be '
                              'read on; convert it with "colmap model_converter --output_type TXT"')
         name, count = _MODELS[model]
         out[number] = _Camera(name, width, height, r.take(f"{count}d", f"camera record {k + 1}"))
@@ -202,7 +203,7 @@ def _cameras_txt(path: Path) -> dict[int, _Camera]:
         try:
             out[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         except (ValueError, IndexError) as e:
-            raise ValueError(f'line {number} of "{path}" is not "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"') from e
+            raise NergError(f'line {number} of "{path}" is not "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"') from e
     return out
 
 
@@ -221,7 +222,7 @@ def _images_txt(path: Path) -> list[tuple]:
             if len(q) != 4 or len(t) != 3 or not words[9:]:
                 raise ValueError
         except (ValueError, IndexError) as e:
-            raise ValueError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
+            raise NergError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
         observations = True
     return out
 
@@ -232,7 +233,7 @@ def _points_txt(path: Path) -> np.ndarray:
         try:
             out.append((*map(float, words[1:4]), float(words[7]), (len(words) - 8) // 2))
         except (ValueError, IndexError) as e:
-            raise ValueError(f'line {number} of "{path}" is not "POINT3D_ID X Y Z R G B ERROR TRACK"') from e
+            raise NergError(f'line {number} of "{path}" is not "POINT3D_ID X Y Z R G B ERROR TRACK"') from e
     return _trusted(out, path)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import NergError
 from .intrinsics import Intrinsics
 
 # Keys of `Frame.lens`, all floats; "fisheye" is 1 for fisheye lenses.
@@ -51,12 +52,12 @@ class Frame:
         """Intrinsics for this frame's image, whose file has ``width`` x ``height`` pixels.
 
         Focal lengths in pixels (``fl_x``) are preferred to angles, which some writers round.
-        Raises ``ValueError`` when the file gives neither, or another shape than the image's.
+        Raises `NergError` when the file gives neither, or another shape than the image's.
         """
         lens = self.lens
         w, h = lens.get("w", width), lens.get("h", height)
         if not (w > 0 and h > 0) or abs(w * height - h * width) > 0.01 * h * width:
-            raise ValueError(
+            raise NergError(
                 f'the image "{self.image}" has {width} x {height} pixels but its camera says {w:g} x {h:g}; '
                 'correct width and height ("w" and "h"), or the image'
             )
@@ -68,7 +69,7 @@ class Frame:
         # One focal length means square pixels.
         fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
         if fx is None or not (np.isfinite(fx) and fx > 0 and np.isfinite(fy) and fy > 0):
-            raise ValueError(
+            raise NergError(
                 f'frame "{self.name}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in radians'
             )
         stated = Intrinsics(
@@ -132,11 +133,11 @@ class PosedImages:
 
 
 def _parts(similarity: np.ndarray) -> tuple[float, np.ndarray]:
-    """Scale and rotation of a similarity; ``ValueError`` for anything else."""
+    """Scale and rotation of a similarity; `NergError` for anything else."""
     m = np.asarray(similarity, np.float64)
     scale = np.cbrt(np.linalg.det(m[:3, :3])) if m.shape == (4, 4) and np.all(np.isfinite(m)) else 0.0
     if not scale > 0 or np.abs(m[:3, :3] @ m[:3, :3].T / scale**2 - np.eye(3)).max() > 1e-3:
-        raise ValueError("a change of coordinates must be a uniform scale, a rotation and a translation, without mirroring")
+        raise NergError("a change of coordinates must be a uniform scale, a rotation and a translation, without mirroring")
     return float(scale), m[:3, :3] / scale
 
 
@@ -150,21 +151,21 @@ def _moved_box(box: np.ndarray | None, m: np.ndarray) -> np.ndarray | None:
 
 
 def rigid_pose(matrix: object) -> np.ndarray:
-    """The (4, 4) pose that ``matrix`` means: a scale is taken out, and rounding. ``ValueError`` for what is no pose."""
+    """The (4, 4) pose that ``matrix`` means: a scale is taken out, and rounding. `NergError` for what is no pose."""
     try:
         pose = np.asarray(matrix, np.float64)
     except (TypeError, ValueError) as e:
-        raise ValueError("its pose must be a matrix of 4 x 4 numbers") from e
+        raise NergError("its pose must be a matrix of 4 x 4 numbers") from e
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
     if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
-        raise ValueError("its pose must be a matrix of 4 x 4 finite numbers")
+        raise NergError("its pose must be a matrix of 4 x 4 finite numbers")
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise ValueError("the last row of its pose is not 0, 0, 0, 1 (is the matrix transposed?)")
+        raise NergError("the last row of its pose is not 0, 0, 0, 1 (is the matrix transposed?)")
     rotation = pose[:3, :3]
     scale = np.cbrt(np.linalg.det(rotation))
     if scale <= 0 or np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() > 1e-2:
-        raise ValueError("its pose is not a rotation and a translation (mirrored, sheared or singular)")
+        raise NergError("its pose is not a rotation and a translation (mirrored, sheared or singular)")
     # Some writers leave a scale in the rotation, or round it: the nearest rotation is what they meant.
     u, _, vt = np.linalg.svd(rotation)
     pose = pose.copy()
@@ -188,9 +189,9 @@ def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
     return kept, unused
 
 
-def none_usable(path: Path, unused: list[Unused]) -> ValueError:
+def none_usable(path: Path, unused: list[Unused]) -> NergError:
     """The error of a set without a single usable frame."""
     if not unused:
-        return ValueError(f'"{path}" lists no frames')
-    return ValueError(f'none of the {len(unused)} frames of "{path}" can be used; the first, "{unused[0].name}": '
+        return NergError(f'"{path}" lists no frames')
+    return NergError(f'none of the {len(unused)} frames of "{path}" can be used; the first, "{unused[0].name}": '
                       f"{unused[0].reason}")

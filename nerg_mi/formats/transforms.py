@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import NergError
 from .posed import LENS_KEYS, DepthFile, Frame, MaskFile, PosedImages, Unused, drop_repeated, none_usable, rigid_pose
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
@@ -28,13 +29,13 @@ _MILLIMETRE = 1e-3
 def read_transforms(path: str | Path) -> PosedImages:
     """Read a transforms file. Frames that cannot be used are listed, not fatal.
 
-    Raises ``ValueError``, naming file and frame, for malformed JSON and when not a single frame can be used.
+    Raises `NergError`, naming file and frame, for malformed JSON and when not a single frame can be used.
     """
     path = Path(path)
     raw = path.read_bytes()
     data = _json(path, raw)
     if not isinstance(data.get("frames"), list):
-        raise ValueError(f'"{path}" is not a transforms file: it has no list "frames"')
+        raise NergError(f'"{path}" is not a transforms file: it has no list "frames"')
     original = _original(data, path)
     # Millimetres are of the original coordinates.
     metre = 1.0 if original is None else 1 / float(np.cbrt(np.linalg.det(original[:3, :3])))
@@ -65,9 +66,9 @@ def read_dataparser(path: str | Path) -> np.ndarray:
     try:
         m, scale = np.asarray(data["transform"], np.float64), float(data["scale"])
     except (KeyError, TypeError, ValueError) as e:
-        raise ValueError(f'"{path}" needs "transform", 3 x 4 numbers, and "scale"') from e
+        raise NergError(f'"{path}" needs "transform", 3 x 4 numbers, and "scale"') from e
     if m.shape not in ((3, 4), (4, 4)) or not (np.all(np.isfinite(m)) and np.isfinite(scale) and scale > 0):
-        raise ValueError(f'"{path}" needs "transform", 3 x 4 finite numbers, and a positive "scale"')
+        raise NergError(f'"{path}" needs "transform", 3 x 4 finite numbers, and a positive "scale"')
     return np.vstack([scale * m[:3], [0, 0, 0, 1]])
 
 
@@ -75,9 +76,9 @@ def _json(path: Path, raw: bytes) -> dict:
     try:
         data = json.loads(raw)
     except ValueError as e:
-        raise ValueError(f'"{path}" is not valid JSON: {e}') from e
+        raise NergError(f'"{path}" is not valid JSON: {e}') from e
     if not isinstance(data, dict):
-        raise ValueError(f'"{path}" is not a transforms file: it holds no JSON object')
+        raise NergError(f'"{path}" is not a transforms file: it holds no JSON object')
     return data
 
 
@@ -85,9 +86,9 @@ def _frame(data: dict, entry: dict, folder: Path, name: str, metre: float, notes
     """One frame; ``data``: its keys over those of the file."""
     image = _image_file(folder / name)
     if image is None:
-        raise ValueError("its image does not exist")
+        raise NergError("its image does not exist")
     if "transform_matrix" not in entry:
-        raise ValueError('it has no "transform_matrix"')
+        raise NergError('it has no "transform_matrix"')
     pose, lens, mask = rigid_pose(entry["transform_matrix"]), _lens(data), _mask(entry, folder, image)
     depth = _depth(data, entry, folder, metre)
     if depth is not None and not depth.path.is_file():
@@ -108,7 +109,7 @@ def _mask(entry: dict, folder: Path, image: Path) -> MaskFile | None:
     if entry.get("mask_path") is not None:
         mask = folder / _path(entry, "mask_path")
         if not mask.is_file():
-            raise ValueError(f'its mask "{entry["mask_path"]}" does not exist; restore it, or remove its "mask_path"')
+            raise NergError(f'its mask "{entry["mask_path"]}" does not exist; restore it, or remove its "mask_path"')
         return MaskFile(mask)
     dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
     return MaskFile(dynamic, hides=True) if dynamic.is_file() else None
@@ -126,7 +127,7 @@ def _depth(data: dict, entry: dict, folder: Path, metre: float) -> DepthFile | N
     elif counted and data.get("integer_depth_scale") is not None:
         unit = _number(data, "integer_depth_scale")
     if not unit > 0:
-        raise ValueError("the unit of its depth file is not positive")
+        raise NergError("the unit of its depth file is not positive")
     if data.get("is_euclidean_depth") is not None:
         axis = not data["is_euclidean_depth"]
     return DepthFile(path, unit, axis)
@@ -134,7 +135,7 @@ def _depth(data: dict, entry: dict, folder: Path, metre: float) -> DepthFile | N
 
 def _path(entry: dict, key: str) -> str:
     if not isinstance(entry[key], str):
-        raise ValueError(f'its "{key}" is not the path of a file')
+        raise NergError(f'its "{key}" is not the path of a file')
     return entry[key]
 
 
@@ -142,20 +143,20 @@ def _number(data: dict, key: str) -> float:
     try:
         return float(data[key])
     except (TypeError, ValueError) as e:
-        raise ValueError(f'its "{key}" is not a number') from e
+        raise NergError(f'its "{key}" is not a number') from e
 
 
 def _lens(data: dict) -> dict:
     model = data.get("camera_model", "OPENCV")
     fisheye = bool(data.get("is_fisheye")) or model in _FISHEYE
     if model not in _PINHOLE + _FISHEYE or data.get("is_equirectangular") or any(str(k).startswith("ftheta") for k in data):
-        raise ValueError(f'its lens model "{model}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, p2, '
+        raise NergError(f'its lens model "{model}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, p2, '
                          'to "OPENCV_FISHEYE" with k1 to k4, or to "PINHOLE"')
     lens = {k: _number(data, k) for k in LENS_KEYS if k != "fisheye" and data.get(k) is not None}
     if not all(np.isfinite(v) for v in lens.values()):
-        raise ValueError("its intrinsics are not finite")
+        raise NergError("its intrinsics are not finite")
     if not fisheye and model != "FULL_OPENCV" and any(lens.get(k) for k in ("k4", "k5", "k6")):
-        raise ValueError('its k4, k5, k6 mean different things to different programs; name "camera_model": "FULL_OPENCV" if '
+        raise NergError('its k4, k5, k6 mean different things to different programs; name "camera_model": "FULL_OPENCV" if '
                          "they are OpenCV's rational model, or undistort the images")
     return {**lens, "fisheye": 1.0} if fisheye else lens
 
@@ -173,7 +174,7 @@ def _original(data: dict, path: Path) -> np.ndarray | None:
     except (TypeError, ValueError):
         rigid, scale = False, 0.0
     if not rigid or not scale > 0:
-        raise ValueError(f'"applied_transform" of "{path}" must be a rotation and a translation, 3 x 4 numbers, and '
+        raise NergError(f'"applied_transform" of "{path}" must be a rotation and a translation, 3 x 4 numbers, and '
                          '"applied_scale" positive')
     return np.linalg.inv(applied)
 
@@ -201,5 +202,5 @@ def _aabb(data: dict, path: Path) -> np.ndarray | None:
         box = np.zeros(0)
     box = box.reshape(2, 3) if box.size == 6 else box
     if box.shape != (2, 3) or not np.all(np.isfinite(box)) or not np.all(box[1] > box[0]):
-        raise ValueError(f'"aabb" in "{path}" must be two corners of 3 numbers, the second above the first')
+        raise NergError(f'"aabb" in "{path}" must be two corners of 3 numbers, the second above the first')
     return box

@@ -1,0 +1,54 @@
+"""Cases of all readers, the same in every run."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+from hypothesis import HealthCheck, Phase, given, seed, settings
+
+from tests.fuzz.describe import Reader
+from tests.fuzz.mutations import mutated
+from tests.fuzz.watch import Case
+
+
+def make_inputs(readers: list[Reader], folder: Path) -> Path:
+    """The valid inputs of ``readers``, each in a folder of its name below ``folder``."""
+    for reader in readers:
+        (folder / reader.name).mkdir(parents=True)
+        reader.make(folder / reader.name)
+    return folder
+
+
+def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) -> list[Case]:
+    """``count`` cases, as many for each reader and each of its targets; ``start``: another gives others."""
+    targets = [(r, t, kinds) for r in readers for t, kinds in r.targets.items()]
+    out = []
+    for k, (reader, target, kinds) in enumerate(targets):
+        share = count * (k + 1) // len(targets) - count * k // len(targets)
+        data = (inputs / reader.name / target).read_bytes()
+        drawn = _drawn(data, kinds, share, f"{start} {reader.name} {target}")
+        out += [Case(reader.name, target, d) for d in drawn]
+    return out
+
+
+def _drawn(data: bytes, kinds: tuple[str, ...], count: int, name: str) -> list[bytes]:
+    found: list[bytes] = []
+
+    @seed(name)
+    @settings(
+        max_examples=count,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(mutated(data, kinds))
+    def collect(changed: bytes) -> None:
+        if len(found) < count:
+            found.append(changed)
+
+    state = random.getstate()
+    collect()
+    random.setstate(state)
+    return found

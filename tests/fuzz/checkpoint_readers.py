@@ -1,0 +1,238 @@
+"""Readers of fields and of the states of trainings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from tests.fuzz.describe import Reader
+
+_ABOUT = {"sha": 1, "width": 24}
+
+
+def _parts():
+    from drjit.llvm import ad as ns
+
+    from nerg_mi.field.box import Box
+    from nerg_mi.field.hashgrid import HashGridConfig
+
+    return ns, Box((-1, 0, 2), (3, 2, 4)), HashGridConfig(levels=2, log2_rows=3, base=2, finest=4)
+
+
+def _make_radiance(folder: Path) -> None:
+    from nerg_mi.field.background import Background, BackgroundConfig
+    from nerg_mi.field.hashgrid import HashGridConfig
+    from nerg_mi.field.occupancy import OccupancyGrid
+    from nerg_mi.field.radiance import RadianceConfig, RadianceField
+    from nerg_mi.formats.fields import save_radiance
+
+    ns, box, grid = _parts()
+    config = RadianceConfig(grid, width=4, color_hidden=1, geometry=3, sh_degree=2)
+    behind = BackgroundConfig(8.0, HashGridConfig(levels=1, log2_rows=3, base=2, finest=4, dimensions=2), 4, 1, 2)
+    field = RadianceField.random(
+        config,
+        box,
+        ns,
+        1,
+        occupancy=OccupancyGrid(np.eye(4, dtype=bool)[None].repeat(4, 0), ns, 0.25),
+        march_step=0.01,
+        background=Background.random(behind, ns),
+    )
+    save_radiance(field, folder / "field.safetensors", {"dataset": "here", "width": 8, "to_file": np.eye(4).tolist()})
+
+
+def _read_radiance(folder: Path) -> object:
+    from nerg_mi.formats.fields import load_radiance
+
+    return load_radiance(folder / "field.safetensors", _parts()[0])
+
+
+def _gaze(kind: str):
+    from nerg_mi.field.gaze import GazeConfig, GazeField
+    from nerg_mi.field.gaze_ensemble import GazeEnsemble
+    from nerg_mi.field.log_gaze import LogGazeConfig, LogGazeField
+    from nerg_mi.field.support import RaySupport
+
+    ns, box, grid = _parts()
+    if kind == "product":
+        return GazeField.random(GazeConfig(grid, width=4, geometry=3, sh_degree=2, trunk="layernorm"), box, ns, 2)
+    one = lambda seed: LogGazeField.random(LogGazeConfig(grid, width=4, layers=1, sh_degree=2, prior=2), box, ns, seed)
+    field = one(1) if kind == "log" else GazeEnsemble([one(1), one(2)])
+    field.support = RaySupport.of(np.random.default_rng(0).random((9, 3)), 0.5)
+    return field
+
+
+def _make_gaze(kind: str):
+    def make(folder: Path) -> None:
+        from nerg_mi.formats.fields import save_gaze
+
+        save_gaze(_gaze(kind), folder / "gaze.safetensors", {})
+
+    return make
+
+
+def _read_gaze(folder: Path) -> object:
+    from nerg_mi.formats.fields import load_gaze
+
+    return load_gaze(folder / "gaze.safetensors", _parts()[0])
+
+
+# --- states of trainings ----------------------------------------------------------------------------------------------
+
+
+class _Grid:
+    def __init__(self, ns):
+        self.value, self.bits, self.seen, self.always = (
+            ns.Float([0.0] * 8),
+            ns.UInt8([1] * 8),
+            ns.Bool([True] * 8),
+            ns.Bool([False] * 8),
+        )
+        self.turn = 3
+
+    def restore(self, value, bits, seen, always, turn: int) -> None:
+        assert len(value) == len(bits) == len(seen) == len(always) == 8 and isinstance(turn, int)
+
+
+def _trainer():
+    """What of a trainer its state consists of."""
+    import mitsuba as mi
+
+    ns = _parts()[0]
+    optimiser = mi.ad.Adam(lr=0.1)
+    optimiser["grid.table"] = ns.Float([1.0] * 6)
+    optimiser["net.0"] = ns.TensorXf(np.ones((2, 3), np.float32))
+    averaged = {k: type(v)(v) for k, v in optimiser.items()}
+    return SimpleNamespace(
+        optimiser=optimiser,
+        averaged=averaged,
+        grid=_Grid(ns),
+        hard=np.zeros(4, np.float32),
+        rng=np.random.default_rng(1),
+        steps=7,
+        rays=100,
+        samples=1000,
+        seconds=2.5,
+        settled=False,
+        restore=lambda *numbers: None,
+    )
+
+
+def _make_radiance_run(folder: Path) -> None:
+    from nerg_mi.training.run_state import save_run
+
+    save_run(_trainer(), folder / "field.run", _ABOUT, [{"psnr": 20.0}])
+
+
+def _read_radiance_run(folder: Path) -> object:
+    from nerg_mi.training.run_state import load_run
+
+    return load_run(_trainer(), folder / "field.run", _ABOUT)
+
+
+def _make_gaze_run(folder: Path) -> None:
+    from nerg_mi.training.gaze_state import GazeRunFile
+
+    trainer = _trainer()
+    GazeRunFile(folder / "gaze.run", _ABOUT).keep("fit", trainer, {"best": 1.5}, trainer.averaged, now=True)
+
+
+def _read_gaze_run(folder: Path) -> object:
+    from nerg_mi.training.gaze_state import GazeRunFile
+
+    file = GazeRunFile(folder / "gaze.run", _ABOUT, resume=True)
+    return file.restore("fit", _trainer())
+
+
+# --- torch's ----------------------------------------------------------------------------------------------------------
+
+
+def _table(levels: int) -> dict:
+    rng = np.random.default_rng(0)
+    return {
+        "encoder.embeddings": rng.random((8 * levels, 2)).astype(np.float32),
+        "encoder.offsets": np.arange(0, 8 * levels + 1, 8, dtype=np.int32),
+    }
+
+
+def _weights(*shapes) -> list[np.ndarray]:
+    return [np.random.default_rng(k).random(s).astype(np.float32) for k, s in enumerate(shapes)]
+
+
+def _radiance_state() -> dict:
+    names = ("sigma_net.0.weight", "sigma_net.1.weight", "color_net.0.weight", "color_net.1.weight")
+    cube = np.float32([-1, -1, -1, 1, 1, 1])
+    return {
+        "aabb_train": cube,
+        "aabb_infer": cube,
+        **_table(2),
+        **dict(zip(names, _weights((4, 4), (3, 4), (4, 6), (3, 4)))),
+    }
+
+
+def _make_ngp(folder: Path) -> None:
+    from nerg_mi.formats.pickling import write_torch
+
+    state = _radiance_state()
+    shadow = [v for k, v in state.items() if k.endswith((".embeddings", ".weight"))]
+    write_torch(
+        folder / "ngp.pth",
+        {
+            "epoch": 7,
+            "global_step": 99,
+            "stats": {"loss": [0.5]},
+            "mean_density": 0.1,
+            "model": state,
+            "ema": {"decay": 0.95, "shadow_params": shadow},
+        },
+    )
+
+
+def _read_ngp(folder: Path) -> object:
+    from nerg_mi.formats.torch_ngp import Given, read_torch_ngp
+
+    return read_torch_ngp(folder / "ngp.pth", _parts()[0], given=Given(finest=32))
+
+
+def _make_nerg(folder: Path) -> None:
+    from nerg_mi.formats.pickling import write_torch
+
+    names = (
+        "net1.0.weight",
+        "net1.3.weight",
+        "net2.0.weight",
+        "net2.3.weight",
+        "emit_head.weight",
+        "capture_head.weight",
+    )
+    nets = dict(zip(names, _weights((4, 4), (3, 4), (4, 7), (4, 4), (1, 4), (1, 4))))
+    nerf = {f"model_nerf.{k}": v for k, v in _radiance_state().items()}
+    write_torch(
+        folder / "nerg.pth",
+        {
+            "epoch": 2,
+            "variant": "EmitCapture",
+            "model": {"aabb_train": np.float32([-1, -1, -1, 1, 1, 1]), **_table(2), **nets, **nerf},
+        },
+    )
+
+
+def _read_nerg(folder: Path) -> object:
+    from nerg_mi.formats.nerg_checkpoint import read_nerg
+    from nerg_mi.formats.torch_ngp import Given
+
+    return read_nerg(folder / "nerg.pth", _parts()[0], given=Given(finest=32))
+
+
+CHECKPOINTS = [
+    Reader("radiance checkpoint", _make_radiance, {"field.safetensors": ("safetensors",)}, _read_radiance),
+    Reader("gaze checkpoint", _make_gaze("product"), {"gaze.safetensors": ("safetensors",)}, _read_gaze),
+    Reader("log gaze checkpoint", _make_gaze("log"), {"gaze.safetensors": ("safetensors",)}, _read_gaze),
+    Reader("gaze ensemble", _make_gaze("ensemble"), {"gaze.safetensors": ("safetensors",)}, _read_gaze),
+    Reader("radiance run", _make_radiance_run, {"field.run": ("safetensors",)}, _read_radiance_run),
+    Reader("gaze run", _make_gaze_run, {"gaze.run": ("safetensors",)}, _read_gaze_run),
+    Reader("torch-ngp checkpoint", _make_ngp, {"ngp.pth": ("zip",)}, _read_ngp),
+    Reader("NeRG checkpoint", _make_nerg, {"nerg.pth": ("zip",)}, _read_nerg),
+]

@@ -1,0 +1,154 @@
+"""The process in which damaged files are read: started by `watch`, one line of JSON in for a case, one out for its
+outcome.
+
+Each case is watched by an audit hook: nothing may be run, opened for writing, removed, or sent.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import resource
+import shutil
+import sys
+import time
+import warnings
+from pathlib import Path
+
+ROOM = 1 << 30
+"""So much more memory may a case take, in bytes."""
+
+SECONDS = 5.0
+"""So much time of the processor."""
+
+_FORBIDDEN = (
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.spawn",
+    "os.fork",
+    "os.forkpty",
+    "subprocess.Popen",
+    "pty.spawn",
+    "pickle.find_class",
+    "shutil.",
+    "os.remove",
+    "os.rename",
+    "os.mkdir",
+    "os.rmdir",
+    "os.link",
+    "os.symlink",
+    "os.chmod",
+    "os.chown",
+    "os.truncate",
+    "os.putenv",
+    "socket.",
+    "ctypes.dlopen",
+    "code.__new__",
+    "marshal.",
+    "webbrowser.",
+    "urllib.",
+    "ftplib.",
+    "smtplib.",
+    "signal.pthread_kill",
+    "os.kill",
+    "tempfile.",
+)
+
+watched = False
+violations: list[str] = []
+
+
+def audit(event: str, arguments: tuple) -> None:
+    """Note what no reader does, and keep it from happening."""
+    if not watched:
+        return
+    bad = event.startswith(_FORBIDDEN)
+    if event == "open":
+        _, mode, flags = arguments
+        writes = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+        bad = (isinstance(mode, str) and any(c in mode for c in "wax+")) or (
+            isinstance(flags, int) and bool(flags & writes)
+        )
+    elif event == "exec":
+        name = getattr(arguments[0], "co_filename", "<unknown>")
+        # Modules that are imported late are run too, from files; the frozen ones are Python's own, dataclasses among
+        # what is not.
+        bad = name.startswith("<") and not name.startswith("<frozen")
+    if bad:
+        violations.append(f"{event} {str(arguments)[:200]}")
+        raise RuntimeError(f"a damaged file led to {event}")
+
+
+def _memory(name: str) -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(name + ":"):
+            return int(line.split()[1]) << 10
+    return 0
+
+
+def _files(folder: Path) -> set:
+    return {(str(p.relative_to(folder)), p.stat().st_size) for p in folder.rglob("*")}
+
+
+def attempt(reader, folder: Path) -> dict:
+    """What comes of reading ``folder``: ``outcome`` is result, refusal, or one of the breaches of the contract."""
+    global watched
+    from nerg_mi.errors import NergError
+
+    violations.clear()
+    before = _files(folder)
+    Path("/proc/self/clear_refs").write_text("5")
+    memory, start, outcome, said = _memory("VmRSS"), time.thread_time(), "result", ""
+    watched = True
+    try:
+        reader.read(folder)
+    except NergError as error:
+        outcome, said = "refusal", str(error)
+    except BaseException as error:
+        outcome, said = "other exception", f"{type(error).__name__}: {error}"
+    finally:
+        watched = False
+    seconds, taken = time.thread_time() - start, _memory("VmHWM") - memory
+    if violations:
+        outcome, said = "executed", "; ".join(violations)
+    elif _files(folder) != before:
+        outcome, said = "left a file", str(_files(folder) ^ before)
+    elif taken > ROOM or "needs more memory than there is" in said:
+        outcome, said = "memory", f"{taken >> 20} MB; {said}"
+    elif seconds > SECONDS:
+        outcome, said = "slow", f"{seconds:.1f} s; {said}"
+    elif outcome == "refusal" and not (said.isprintable() and 10 < len(said) < 1500):
+        outcome = "no sentence"
+    return {"outcome": outcome, "said": said[:600], "seconds": seconds, "memory": taken}
+
+
+def main() -> None:
+    out = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    warnings.simplefilter("ignore")
+    from tests.fuzz.readers import READERS
+
+    readers, home, room = {r.name: r for r in READERS}, Path(sys.argv[1]), Path(sys.argv[2])
+    sys.addaudithook(audit)
+    for name in sys.argv[3:]:
+        shutil.copytree(home / name, room / name)
+        # Once whole, so that all is imported, and to see that the input is valid.
+        readers[name].read(room / name)
+    limit = _memory("VmSize") + 2 * ROOM
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    print(json.dumps({"ready": True}), file=out)
+    for line in sys.stdin:
+        case = json.loads(line)
+        folder = room / case["reader"]
+        file = folder / case["target"]
+        whole = file.read_bytes()
+        file.write_bytes(base64.b64decode(case["data"]))
+        report = attempt(readers[case["reader"]], folder)
+        file.write_bytes(whole)
+        print(json.dumps(report), file=out)
+
+
+if __name__ == "__main__":
+    main()

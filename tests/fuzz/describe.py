@@ -1,0 +1,22 @@
+"""What a reader is to the fuzzer: how a valid input is made, which of its files are damaged, and how it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Reader:
+    """``make`` writes a small valid input into an empty folder; ``read`` reads that folder and uses what it gets.
+
+    ``targets``: the files in it that are damaged, by name, each with the kinds of structure that damage may keep, of
+    "json", "text", "zip", "gzip", "npy", "safetensors"; bytes are damaged in any case. Both functions import what they
+    need themselves.
+    """
+
+    name: str
+    make: Callable[[Path], None]
+    targets: dict[str, tuple[str, ...]]
+    read: Callable[[Path], object]

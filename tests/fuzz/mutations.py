@@ -1,0 +1,274 @@
+"""Damage to files, drawn by hypothesis: to their bytes, and to the structure that they have."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import re
+import struct
+import zipfile
+
+from hypothesis import strategies as st
+
+EXTREMES = (
+    0,
+    1,
+    -1,
+    2,
+    127,
+    255,
+    256,
+    32767,
+    65535,
+    65536,
+    10**6,
+    10**9,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**60,
+    2**63 - 1,
+    2**64 - 1,
+)
+_VALUES = (
+    None,
+    True,
+    False,
+    0,
+    -1,
+    1,
+    0.5,
+    1e-300,
+    1e308,
+    float("nan"),
+    float("inf"),
+    2**31,
+    10**9,
+    2**60,
+    10**40,
+    "",
+    "a",
+    "\0",
+    "../../../etc/passwd",
+    "x" * 300,
+    [],
+    {},
+    [[]],
+    [1, 2, 3],
+    [[1e308] * 4] * 4,
+    {"a": {"b": []}},
+)
+_WORDS = (
+    "nan",
+    "inf",
+    "-1",
+    "0",
+    "1e999",
+    "99999999999999999999",
+    "2147483648",
+    "-0.0",
+    "",
+    "a",
+    "\0",
+    "é",
+    '"',
+    ",",
+    "\t",
+    "1" * 400,
+)
+
+
+def mutated(data: bytes, kinds: tuple[str, ...]) -> st.SearchStrategy[bytes]:
+    """``data`` damaged: one to three times in its bytes, or, as often for each of ``kinds``, in its structure."""
+    ways = [_bytes, *(_STRUCTURES[k] for k in kinds for _ in range(2))]
+    return st.sampled_from(ways).flatmap(lambda way: way(data))
+
+
+@st.composite
+def _bytes(draw, data: bytes) -> bytes:
+    for _ in range(draw(st.integers(1, 3))):
+        data = draw(st.sampled_from([_flipped, _truncated, _inserted, _overwritten, _moved]))(draw, data)
+    return data
+
+
+def _at(draw, data: bytes) -> int:
+    """A place in ``data``: often near its start, where headers are, or its end, where archives list what they hold."""
+    most = len(data)
+    near = st.integers(0, min(most, 200))
+    return draw(st.one_of(near, near.map(lambda n: most - n), st.integers(0, most)))
+
+
+def _flipped(draw, data: bytes) -> bytes:
+    out = bytearray(data)
+    for _ in range(draw(st.integers(1, 8))):
+        if out:
+            out[min(_at(draw, data), len(out) - 1)] ^= 1 << draw(st.integers(0, 7))
+    return bytes(out)
+
+
+def _truncated(draw, data: bytes) -> bytes:
+    return data[: _at(draw, data)]
+
+
+def _inserted(draw, data: bytes) -> bytes:
+    at = _at(draw, data)
+    more = draw(st.binary(min_size=1, max_size=8)) * draw(st.sampled_from([1, 1, 1, 10, 1000]))
+    return data[:at] + more + data[at:]
+
+
+def _overwritten(draw, data: bytes) -> bytes:
+    """An integer of one to eight bytes is given an extreme value, where one might stand."""
+    at, size, order = _at(draw, data), draw(st.sampled_from([1, 2, 4, 8])), draw(st.sampled_from(["little", "big"]))
+    value = draw(st.sampled_from(EXTREMES)) % (1 << 8 * size)
+    return data[:at] + value.to_bytes(size, order) + data[at + size :]
+
+
+def _moved(draw, data: bytes) -> bytes:
+    """A piece is left out, or stands twice."""
+    a, b = sorted((_at(draw, data), _at(draw, data)))
+    return data[:a] + data[b:] if draw(st.booleans()) else data[:b] + data[a:]
+
+
+# --- structures -------------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def _json(draw, data: bytes) -> bytes:
+    return _changed_json(draw, json.loads(data))
+
+
+def _changed_json(draw, value) -> bytes:
+    deep = draw(st.integers(0, 30))
+    if deep == 0:
+        count = draw(st.sampled_from([100, 5000, 200_000]))
+        return draw(st.sampled_from([b"[" * count, b"[" * count + b"]" * count, b'{"a":' * count]))
+    for _ in range(draw(st.integers(1, 3))):
+        value = _changed(draw, value)
+    text = json.dumps(value)
+    return text.encode()
+
+
+def _changed(draw, value):
+    """``value`` with one of its parts exchanged, left out, or named otherwise."""
+    if isinstance(value, dict) and value and draw(st.integers(0, 7)):
+        key = draw(st.sampled_from(sorted(value)))
+        what, rest = draw(st.integers(0, 9)), {k: v for k, v in value.items() if k != key}
+        if what == 0:
+            return rest
+        if what == 1:
+            return {**rest, key + "x": value[key]}
+        return {**rest, key: _changed(draw, value[key])}
+    if isinstance(value, list) and value and draw(st.integers(0, 7)):
+        k = draw(st.integers(0, len(value) - 1))
+        what = draw(st.integers(0, 9))
+        if what == 0:
+            return value[:k] + value[k + 1 :]
+        if what == 1:
+            return value[:k] + [value[k]] * 2 + value[k:]
+        return [*value[:k], _changed(draw, value[k]), *value[k + 1 :]]
+    return draw(st.sampled_from(_VALUES))
+
+
+@st.composite
+def _text(draw, data: bytes) -> bytes:
+    text = data.decode("utf-8", "surrogateescape")
+    for _ in range(draw(st.integers(1, 3))):
+        spots = [m.span() for m in re.finditer(r"[-+.\w]+", text)]
+        if not spots:
+            break
+        a, b = draw(st.sampled_from(spots))
+        word = draw(st.sampled_from([*_WORDS, *map(str, EXTREMES)]))
+        what = draw(st.integers(0, 5))
+        text = text[:a] + (text[a:b] + " " + word if what == 0 else "" if what == 1 else word) + text[b:]
+    return text.encode("utf-8", "surrogateescape")
+
+
+@st.composite
+def _npy(draw, data: bytes) -> bytes:
+    """The header of an array says something else."""
+    size = struct.unpack_from("<H", data, 8)[0]
+    head = data[10 : 10 + size].decode("latin1")
+    number, values = (
+        str(draw(st.sampled_from(EXTREMES))),
+        ("'|O'", "'<U0'", "'<f8'", "'<i1'", "'|V100000'", "[('a', '<f4')]", "1", "''"),
+    )
+    ways = [
+        lambda: re.sub(r"\d+", number, head, count=draw(st.integers(1, 3))),
+        lambda: re.sub(r"'descr': '[^']*'", f"'descr': {draw(st.sampled_from(values))}", head),
+        lambda: re.sub(
+            r"\(.*\)", draw(st.sampled_from(["()", "(-1,)", f"({number}, {number})", "(1,) * 9", "(" * 90])), head
+        ),
+        lambda: head.replace("False", draw(st.sampled_from(["True", "None", "1", "__import__('os')"]))),
+        lambda: draw(
+            st.sampled_from(
+                [head.replace("'shape'", "'form'"), "{" * 100 + "\n", head + " " * 20_000, "-" * 3000 + "1"]
+            )
+        ),
+    ]
+    head = draw(st.sampled_from(ways))()
+    return data[:8] + struct.pack("<H", len(head) % 65536) + head.encode("latin1") + data[10 + size :]
+
+
+@st.composite
+def _gzip(draw, data: bytes) -> bytes:
+    inner = gzip.decompress(data)
+    if draw(st.integers(0, 20)) == 0:
+        inner += b"0" * draw(st.sampled_from([10**6, 30 * 10**6]))
+    return gzip.compress(draw(st.sampled_from([_text, _bytes]).flatmap(lambda way: way(inner))), 1, mtime=0)
+
+
+@st.composite
+def _zip(draw, data: bytes) -> bytes:
+    """A member is damaged, renamed, left out, or grown; or the list of members says something else."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {n: archive.read(n) for n in archive.namelist()}
+    names = sorted(members)
+    # What describes the others is the more rewarding.
+    likely = [n for n in names if n.endswith((".pkl", ".json")) for _ in range(2 * len(names))]
+    name, what = draw(st.sampled_from([*names, *likely])), draw(st.integers(0, 11))
+    if what == 0:
+        members.pop(name)
+    elif what == 1:
+        members[draw(st.sampled_from(["x", "../x", "/x", "data.pkl", "a/data.pkl", "x.npy", "é" * 40]))] = members.pop(
+            name
+        )
+    elif what == 2:
+        members[name] += bytes(draw(st.sampled_from([1000, 10**6, 30 * 10**6])))
+    elif members[name].startswith(b"\x93NUMPY") and what < 9:
+        members[name] = draw(_npy(members[name]))
+    else:
+        members[name] = draw(_bytes(members[name]))
+    out = io.BytesIO()
+    with zipfile.ZipFile(
+        out, "w", draw(st.sampled_from([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])), compresslevel=1
+    ) as archive:
+        for key in sorted(members):
+            archive.writestr(zipfile.ZipInfo(key), members[key], archive.compression)
+    data = out.getvalue()
+    if what in (10, 11):
+        at = data.rindex(b"PK\1\2") + draw(st.sampled_from([8, 10, 16, 20, 24, 28, 42]))
+        data = (
+            data[:at]
+            + draw(st.sampled_from([b"\xff\xff", b"\xff\xff\xff\x7f", b"\0\0", b"\0\0\0\x40", b"\1\0"]))
+            + data[at:]
+        )
+        data = data[:at] + data[at + (len(data) - len(out.getvalue())) :] if draw(st.booleans()) else data
+    return data
+
+
+@st.composite
+def _safetensors(draw, data: bytes) -> bytes:
+    """The header, or the metadata within, says something else."""
+    size = struct.unpack_from("<Q", data)[0]
+    header = json.loads(data[8 : 8 + size])
+    if "__metadata__" in header and draw(st.integers(0, 4)):
+        about = header["__metadata__"]
+        header["__metadata__"] = {**about, "nerg": _changed_json(draw, json.loads(about["nerg"])).decode()}
+        raw = json.dumps(header).encode()
+    else:
+        raw = _changed_json(draw, header)
+    return struct.pack("<Q", len(raw)) + raw + data[8 + size :]
+
+
+_STRUCTURES = {"json": _json, "text": _text, "npy": _npy, "gzip": _gzip, "zip": _zip, "safetensors": _safetensors}

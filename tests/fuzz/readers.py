@@ -1,0 +1,6 @@
+"""Every reader of the package, as the fuzzer sees it: one entry each, see `describe.Reader`."""
+
+from tests.fuzz.capture_readers import CAPTURES
+from tests.fuzz.checkpoint_readers import CHECKPOINTS
+
+READERS = [*CHECKPOINTS, *CAPTURES]

@@ -1,0 +1,109 @@
+"""Runs cases in a warm child process, and sees it crash or hang."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import select
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+BREACHES = ("other exception", "crash", "hang", "executed", "left a file", "memory", "slow", "no sentence")
+# A case has 5 s of the processor's time; the machine may be busy, and a hang is a hang.
+_PATIENCE = 120.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """``data``: the bytes of the file ``target`` of the reader ``reader``."""
+
+    reader: str
+    target: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Report:
+    """``outcome``: result, refusal, or one of `BREACHES`; ``said``: the sentence, or what went wrong; ``seconds``: of
+    the processor; ``memory``: bytes more at the peak than before."""
+
+    outcome: str
+    said: str = ""
+    seconds: float = 0.0
+    memory: int = 0
+
+
+class Child:
+    """One process; ``inputs``: folder of the valid inputs by reader; ``names``: of the readers that it will be asked
+    for.
+    """
+
+    def __init__(self, inputs: Path, names: list[str]):
+        self._room = tempfile.TemporaryDirectory(prefix="nerg-fuzz-")
+        self._errors = tempfile.TemporaryFile()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tests.fuzz.child", str(inputs), self._room.name, *names],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+        first = self._line()
+        if first is None or not json.loads(first).get("ready"):
+            self.close()
+            raise RuntimeError(f"the child did not start: {self.last_words()}")
+
+    def _line(self) -> bytes | None:
+        """The next line; None when none comes, "" when the process has ended."""
+        if not select.select([self._process.stdout], [], [], _PATIENCE)[0]:
+            return None
+        return self._process.stdout.readline()
+
+    def last_words(self) -> str:
+        self._errors.seek(0)
+        return self._errors.read().decode(errors="replace")[-2000:]
+
+    def run(self, case: Case) -> Report:
+        """The outcome of ``case``; after a crash or a hang the child is of no more use."""
+        document = {"reader": case.reader, "target": case.target, "data": base64.b64encode(case.data).decode()}
+        try:
+            self._process.stdin.write(json.dumps(document).encode() + b"\n")
+            self._process.stdin.flush()
+            line = self._line()
+        except BrokenPipeError:
+            line = b""
+        if line is None:
+            return Report("hang", f"no answer in {_PATIENCE:.0f} s")
+        if not line:
+            return Report("crash", f"the process ended with {self._process.wait()}: {self.last_words()[-300:]}")
+        return Report(**json.loads(line))
+
+    def close(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._room.cleanup()
+
+
+def run_cases(cases: Iterable[Case], inputs: Path, names: list[str]) -> Iterator[tuple[Case, Report]]:
+    """Each case with its report."""
+    child = None
+    try:
+        for case in cases:
+            child = child or Child(inputs, names)
+            report = child.run(case)
+            yield case, report
+            if report.outcome in ("crash", "hang"):
+                child.close()
+                child = None
+    finally:
+        if child is not None:
+            child.close()
