@@ -288,11 +288,11 @@ class NergIntegrator(mi.SamplingIntegrator):
         step = number(props, "step", 0, low=0)
         self.settings = MarchSettings(
             step=step or (1 if self.medium is None else self.medium.step or self.medium.length_scale / 1024),
-            dt_gamma=number(props, "dt_gamma", 0, low=0, high=1),
-            stop=number(props, "stop", 1e-7, low=0, high=1),
-            color_cutoff=number(props, "color_cutoff", 1e-3, low=0, high=1),
-            quadrature=choice(props, "quadrature", "constant", QUADRATURES),
-            coarse=number(props, "coarse", 1, low=1),
+            dt_gamma=number(props, "dt_gamma", MarchSettings.dt_gamma, low=0, high=1),
+            stop=number(props, "stop", MarchSettings.stop, low=0, high=1),
+            color_cutoff=number(props, "color_cutoff", MarchSettings.color_cutoff, low=0, high=1),
+            quadrature=choice(props, "quadrature", MarchSettings.quadrature, QUADRATURES),
+            coarse=number(props, "coarse", MarchSettings.coarse, low=1),
             cell_step=step or math.inf,
         )
         if self.medium is not None:

@@ -6,9 +6,12 @@ give either it or the snapshot at the surface to the gaze field.
 """
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 
 from ..field.backend import namespace
+from .march import MarchSettings
 from .place import Place
 
 
@@ -60,7 +63,10 @@ def what_gaze_wants(kind: str, place, p_od, p_o, r_o, active, settings) -> list 
 
 
 def accumulated(place, ray, active, settings) -> list:
-    """Features (Floats) accumulated along a Mitsuba ``ray`` through ``place`` (``place.Place`` with a field)."""
+    """Features (Floats) accumulated along a Mitsuba ``ray`` through ``place`` (``place.Place`` with a field).
+
+    What gathers them is always the default's, in training as in every picture: ``color_cutoff`` chooses how exact colours are."""
+    settings = replace(settings, color_cutoff=MarchSettings.color_cutoff)
     featured = Featured(place.medium, False)
     march = Place(featured, place.scene).look(ray, active, settings, color=featured.blank).march
     return [dr.select(active, f, 0) for f in march.color]

@@ -26,7 +26,7 @@ _TRACE = 1e-3
 
 @dataclass(frozen=True)
 class MarchSettings:
-    """Controls of a march; lengths in scene units.
+    """Controls of a march; lengths in scene units. The defaults are those of the integrator ``nerg``.
 
     ``step``: step length; ``dt_gamma``: steps are at least this share of the distance
     travelled (instant-ngp's cone stepping; 0: uniform); ``stop``: transmittance below which
@@ -41,7 +41,7 @@ class MarchSettings:
     step: float
     dt_gamma: float = 0.0
     stop: float = 1e-7
-    color_cutoff: float = 1e-4
+    color_cutoff: float = 1e-3
     quadrature: str = "constant"
     coarse: float = 1.0
     cell_step: float = math.inf

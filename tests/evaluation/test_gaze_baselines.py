@@ -74,3 +74,19 @@ def test_own_directions_of_nearest_rays(rays):
     at, own = rays.origin[:70], uniform_directions(70 * 8, rng).reshape(70, 8, 3)
     f = baselines.nearest_rays(rays, 100, backend="llvm")
     assert np.allclose(f(at, own)[66], f(at[66:67], own[66])[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("weights", ["distance", "person"])
+def test_probes_keep_their_weights(rays, weights):
+    """What a probe weighs its rays by is part of its density, for one probe and for several."""
+    one = lambda w: np.concatenate([np.zeros(8000), np.arange(1, 1001) % 7]).astype(int) if w else np.zeros(9000, int)
+    people = Rays(rays.t, one(True), tuple("abcdefg"), rays.origin, rays.direction, np.ones(9000))
+    probes = place_probes(people, 0.4, count=50, kappa_rule="fixed", kappa=20.0, weights=weights)
+    assert probes.weights is not None and np.ptp(probes.weights) > 0
+    density = probes.density(X, "llvm")
+    plain = place_probes(people, 0.4, count=50, kappa_rule="fixed", kappa=20.0).density(X, "llvm")
+    assert np.abs(density - plain).max() > 0.02
+    at = probes.positions[:4]
+    assert np.allclose(baselines.nearest_probes(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5)
+    near = np.argsort(np.linalg.norm(probes.positions - at[0], axis=1))[:3]
+    assert np.allclose(baselines.nearest_probes(probes, 3, backend="llvm")(at[:1], X)[0], density[near].mean(axis=0), rtol=1e-4, atol=1e-5)

@@ -13,13 +13,14 @@ from nerg_mi.field.box import Box
 from nerg_mi.field.gaze import GazeField
 from nerg_mi.field.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.formats.fields import load_gaze, save_radiance
+from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
 from nerg_mi.training.gaze import GazeTrainer
 from nerg_mi.training.gaze_model import gaze_density
 from nerg_mi.training.gaze_semantics import config_like, semantic_features, trunk_of
 from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings
 from nerg_mi.training.gaze_supervision import supervise_rays
 from nerg_mi.transport.media import FieldMedium
+from nerg_mi.transport.trace import default_settings
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
 PROBES = ProbeSettings(radius=0.5, count=12, cap=64, min_rays=8, kappa=20.0, directions=64)
@@ -134,3 +135,35 @@ def test05_the_command(rgb, place, rays, tmp_path, capsys):
         with pytest.raises(SystemExit) as end:
             main([a for a in arguments if a not in ("--freeze", "--begin", "field")] + wrong)
         assert end.value.code == 1 and said in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("cutoff", [None, 0.0, 0.05])
+@pytest.mark.parametrize("kind", ["snapshot", "accumulated"])
+def test_features_of_training_are_those_of_rendering(rgb, place, tmp_path, monkeypatch, kind, cutoff):
+    """Whatever the picture's colours are cut off at: a field must be shown what it was trained on."""
+    save_radiance(place, tmp_path / "field.safetensors", {})
+    config = config_like(place.config, "emit", "softplus", semantic=kind)
+    save_gaze(GazeField.random(config, BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
+    integrator = {"type": "nerg", "aovs": "opacity,position,gaze", "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
+                  "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")}}  # fmt: skip
+    if cutoff is not None:
+        integrator["color_cutoff"] = cutoff
+    eye = np.array([0.1, -1.9, 1.6])
+    sensor = {"type": "perspective", "to_world": rgb.ScalarTransform4f().look_at(eye.tolist(), [0, 0, 1.4], [0, 0, 1]), "near_clip": 1e-4,
+              "film": {"type": "hdrfilm", "width": 8, "height": 8, "component_format": "float32", "rfilter": {"type": "box"}}}  # fmt: skip
+    scene, given = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor}), []
+    made = scene.integrator()
+    if cutoff is None:
+        assert made.settings == default_settings(made.medium)
+    evaluate = made.gaze.evaluate
+    # Kept as the render hands them over, and evaluated with the picture.
+    monkeypatch.setattr(made.gaze, "evaluate", lambda *a: (given.append([rgb.Float(f) for f in a[4]]), evaluate(*a))[1])
+    picture = np.array(rgb.render(scene, spp=1)).reshape(64, -1)[:, -5:]
+    rendered = np.stack([np.array(f) for f in given[0]], axis=-1)
+    met = picture[:, 0] >= 0.5
+    way = picture[:, 1:4] - eye
+    distance = np.linalg.norm(way, axis=1)
+    trained = semantic_features(made.medium, np.broadcast_to(eye, way.shape)[met], (way / distance[:, None])[met], distance[met], kind)
+    assert met.sum() > 30 and np.ptp(rendered[met]) > 0.1
+    # Half precision, and directions that were read back from positions.
+    np.testing.assert_allclose(rendered[met], trained, atol=2e-3 * np.abs(trained).max())

@@ -11,7 +11,7 @@ from nerg_mi.field.log_gaze import LogGazeField
 from nerg_mi.field.backend import namespace
 from nerg_mi.training.gaze_places import place_of_volume
 from nerg_mi.formats.volumes import write_volume
-from nerg_mi.transport.gaze_integral import GazeIntegral
+from nerg_mi.transport.gaze_integral import GazeIntegral, nearest_depth
 from nerg_mi.transport.media import GazeMedium
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
@@ -41,3 +41,20 @@ def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
     integral = lambda count, p: float(GazeIntegral(GazeMedium(field), place, mi.Point3f(*p), settings, "median", 0.5, count).value()[0])
     for p in ((0, 0, 1.5), (0.3, -0.2, 1.6)):
         assert integral(1 << 17, p) == pytest.approx(integral(1 << 19, p), rel=3e-4), p
+
+
+@pytest.mark.parametrize("count", [1, 5, 8, 40])
+def test_depths_of_what_escapes_are_those_of_its_neighbours(count):
+    """By hand: the weighted mean of the logarithm over the eight nearest, or all where there are fewer."""
+    rng = np.random.default_rng(count)
+    unit = lambda n: (lambda v: v / np.linalg.norm(v, axis=1, keepdims=True))(rng.normal(size=(n, 3)))
+    known, wanted, depth = unit(count), unit(30), rng.uniform(0.2, 9.0, count)
+    expected = []
+    for w in wanted:
+        apart = np.linalg.norm(known - w, axis=1)
+        near = np.argsort(apart)[:8]
+        weight = 1 / (apart[near] ** 2 + 1e-3)
+        expected.append(np.exp(np.sum(weight * np.log(depth[near])) / weight.sum()))
+    np.testing.assert_allclose(nearest_depth(known, depth, wanted), expected, rtol=1e-5)
+    # A depth of zero has a logarithm too.
+    assert nearest_depth(known, np.zeros(count), wanted) == pytest.approx(1e-6)
