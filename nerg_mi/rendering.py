@@ -7,8 +7,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from .errors import NergError, UnusableLLVM, sentence
-from .formats.atomic import replacing
+from .formats.atomic import check_writable
 from .formats.exr import write_bitmap_exr
+from .formats.png import write_png
 
 _FORMATS = (".exr", ".png")
 _PREFERRED = ("cuda_ad_rgb", "llvm_ad_rgb")
@@ -68,8 +69,7 @@ def render_file(
     samples a pixel, 0 for those of the scene's sampler. `threads`: 0 for one a core. Raises NergError for what the user can mend.
     """
     scene, output = Path(scene), Path(output)
-    if output.suffix.lower() not in _FORMATS:
-        raise NergError(f'"{output}" has no known picture format: let its name end in .exr or .png.')
+    check_writable(output, *_FORMATS)
     if not scene.is_file():
         raise NergError(f'there is no scene file "{scene}".')
     active = activate(variant)
@@ -107,5 +107,4 @@ def _write(mi, bitmap, output: Path) -> None:
     # With AOVs the bitmap has many channels, of which the colour is the layer without a name.
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         bitmap = dict(bitmap.split())["<root>"]
-    with replacing(output) as temporary:
-        mi.util.write_bitmap(str(temporary), bitmap, write_async=False)
+    write_png(output, mi.util.convert_to_bitmap(bitmap))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -33,14 +34,47 @@ def write_exr(path: str | os.PathLike, channels: Mapping[str, np.ndarray], attri
         raise ValueError(f"the attributes {', '.join(sorted(taken))} belong to the format; give them other names")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **{k: str(v) for k, v in (attributes or {}).items()}}
     data = {name: np.ascontiguousarray(value) for name, value in channels.items()}
+    rows = len(next(iter(data.values())))
     with replacing(path) as temporary:
         try:
             with OpenEXR.File(header, data) as file:
                 file.write(str(temporary))
         except RuntimeError as error:
-            if os.strerror(errno.ENOSPC) in str(error):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from error
+            _raise_if_full(temporary)
             raise NergError(f'"{path}" could not be written ({str(error).strip()}); choose another name or folder.') from error
+        if not _whole(temporary, rows):
+            # The library does not look at what becomes of the last kilobytes, which leave its buffer as the file is closed.
+            _raise_if_full(temporary)
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
+
+
+def _whole(path: Path, rows: int) -> bool:
+    """Whether the last block of a scanline file of so many rows, compressed 16 at a time, ends where the file does."""
+    try:
+        with path.open("rb") as file:
+            file.seek(8)  # magic number and version
+            while _name(file):
+                _name(file)  # the type of the attribute
+                file.seek(struct.unpack("<i", file.read(4))[0], os.SEEK_CUR)
+            blocks = -(-rows // 16)
+            last = max(struct.unpack(f"<{blocks}Q", file.read(8 * blocks)))
+            file.seek(last + 4)  # the block's first row
+            return last > 0 and last + 8 + struct.unpack("<i", file.read(4))[0] == path.stat().st_size
+    except struct.error:
+        return False
+
+
+def _name(file) -> bytes:
+    """The bytes before the next zero."""
+    return b"".join(iter(lambda: file.read(1) or b"\0", b"\0"))
+
+
+def _raise_if_full(path: Path) -> None:
+    """Raise the `OSError` for which nothing more fits into ``path``, if there is one: OpenEXR gives no number of it."""
+    with path.open("ab") as file:
+        file.write(bytes(1 << 16))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def read_exr(path: str | os.PathLike, what: str = "image") -> dict[str, np.ndarray]:

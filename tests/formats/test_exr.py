@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 
@@ -37,6 +38,29 @@ def test_a_bitmap_is_written_as_mitsuba_writes_it(tmp_path, rgb):
 def test_an_attribute_of_the_format_is_refused(tmp_path):
     with pytest.raises(ValueError, match="dataWindow"):
         write_exr(tmp_path / "a.exr", {"R": np.zeros((2, 2), np.float32)}, {"dataWindow": "x"})
+
+
+@pytest.mark.parametrize("shape", [(1, 3), (16, 5), (50, 40)])
+def test_a_file_that_is_cut_off_is_not_taken_for_a_picture(tmp_path, shape):
+    """OpenEXR says nothing where the end does not fit, which is all of a small picture."""
+    random = np.random.default_rng(3)
+    channels = {"R": random.random(shape, np.float32), "A": random.random(shape).astype(np.float16)}
+    path = tmp_path / "a.exr"
+    write_exr(path, channels, {"seed": "3"})
+    whole = path.stat().st_size
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    for size in (0, 7, whole // 2, whole - 1, whole):
+        path.write_bytes(b"old")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            if size < whole:
+                with pytest.raises(NergError, match="largest size"):
+                    write_exr(path, channels, {"seed": "3"})
+            else:
+                write_exr(path, channels, {"seed": "3"})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+        assert path.stat().st_size == (3 if size < whole else whole) and [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
 _ONE_THREAD = """

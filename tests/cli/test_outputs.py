@@ -1,0 +1,168 @@
+"""Every output of every command: parents are made, what stands in the way is told before work, and a full disk loses nothing."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import resource
+from contextlib import contextmanager
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import pytest
+
+import nerg_mi.cli
+
+from .outputs import CASES, INPUTS, READS_ONLY, make_inputs
+
+
+def nerg(capsys, *arguments) -> tuple[int, str]:
+    """Exit code of a command, and what it said on stderr."""
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(list(map(str, arguments)))
+    return end.value.code or 0, capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    folder = make_inputs(tmp_path_factory.mktemp("inputs"))
+    arguments = ["train", "gaze", folder / "rays.npz", "-o", folder / "gaze.safetensors", "--geometry", "hits", "--radius", 0.5, "--probes", 8,
+                 "--steps", 2, "--directions", 64, "--zones", 0, "--min-rays", 8, "--test-zones", 1, "--test-positions", 3]  # fmt: skip
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(list(map(str, arguments)))
+    assert not end.value.code
+    return folder
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@contextmanager
+def largest_file(size: int):
+    """As if the disk were full: no file of this process may grow beyond ``size`` bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def told_in_a_sentence(code: int, said: str) -> bool:
+    last = said.strip().splitlines()[-1:] or [""]
+    return code == 1 and last[0].startswith("nerg: ") and "Traceback" not in said
+
+
+def remember(monkeypatch, name: str) -> None:
+    """A function is called once, and later gives what it gave then: what a command computes is not the matter here."""
+    found = []
+    original = pkgutil.resolve_name(name)
+    monkeypatch.setattr(name, lambda *given, **more: found[0] if found else found.append(original(*given, **more)) or found[0])
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name} {Path(c.files[0]).suffix}")
+def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb):
+    if case.name == "export mesh":
+        pytest.importorskip("skimage")
+    if case.files[0].endswith(".parquet"):
+        pytest.importorskip("pyarrow")
+
+    for name in case.once:
+        remember(monkeypatch, f"nerg_mi.{name}")
+
+    # A parent that is missing is made, and nothing is left beside what was asked for.
+    out = tmp_path / "new" / "deeper"
+    code, said = nerg(capsys, *case.arguments(inputs, out))
+    made = files(out)
+    assert code == 0 and set(made) == set(case.files), said
+    assert all(made.values())
+
+    # What stands in the way is found before any work: nothing is written.
+    for k, name in enumerate(case.targets):
+        out = tmp_path / f"blocked{k}"
+        if Path(name).suffix:
+            (out / name).mkdir(parents=True)
+            reason = "it is a folder"
+        else:
+            out.mkdir()
+            (out / name).write_bytes(b"old")
+            reason = "one of its parents is a file"
+        before = files(out)
+        code, said = nerg(capsys, *case.arguments(inputs, out))
+        assert told_in_a_sentence(code, said) and reason in said and str(out / name) in " ".join(said.split()), said
+        assert files(out) == before
+    (tmp_path / "file").write_bytes(b"old")
+    code, said = nerg(capsys, *case.arguments(inputs, tmp_path / "file" / "below"))
+    assert told_in_a_sentence(code, said) and "one of its parents is a file" in said
+
+    # Where there is no room each file is the old one or the new one, and there is no other.
+    for share in (0.5,) if case.once else (0, 0.5):
+        limit = int(share * max(map(len, made.values())))
+        out = tmp_path / f"full{share}"
+        for name in case.files:
+            (out / name).parent.mkdir(parents=True, exist_ok=True)
+            (out / name).write_bytes(b"old")
+        with largest_file(limit):
+            code, said = nerg(capsys, *case.arguments(inputs, out))
+        assert told_in_a_sentence(code, said) and "largest size" in said, said
+        found = files(out)
+        assert set(found) == set(case.files), "a leftover, or a loss"
+        assert all(content == b"old" or limit >= len(content) > 3 for content in found.values())
+        assert any(content == b"old" for content in found.values())
+
+
+def test_filtering_in_place_keeps_its_input_where_there_is_no_room(inputs, tmp_path, capsys):
+    for name in ("rays.npz", "rays.parquet"):
+        if name.endswith(".parquet"):
+            pytest.importorskip("pyarrow")
+        from nerg_mi.attention.rays import Rays
+
+        Rays.load(inputs / "rays.npz").save(tmp_path / name)
+        before = (tmp_path / name).read_bytes()
+        with largest_file(1000):
+            code, said = nerg(capsys, "rays", "filter", tmp_path / name, "-o", tmp_path / name, "--person", "a")
+        assert told_in_a_sentence(code, said) and (tmp_path / name).read_bytes() == before
+        assert name in os.listdir(tmp_path)
+        code, _ = nerg(capsys, "rays", "filter", tmp_path / name, "-o", tmp_path / name, "--person", "a")
+        assert code == 0 and set(Rays.load(tmp_path / name).person) == {0}
+
+
+def commands() -> dict:
+    """Every command of `nerg`, a function, by its whole name."""
+    out = {}
+    for name in nerg_mi.cli.COMMANDS:
+        module = importlib.import_module(f"nerg_mi.cli.{name}")
+        if hasattr(module, "app"):
+            out |= {f"{name} {c.name}": c.callback for c in module.app.registered_commands}
+        else:
+            out[name] = module.command
+    return out
+
+
+def path_options(command) -> dict[str, tuple]:
+    """Parameters of a command that are paths, and the options by which they are given."""
+    out = {}
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        kind, *more = get_args(hint) or (hint,)
+        if Path in (kind, *get_args(kind)):
+            given = [d for info in more for d in (getattr(info, "default", None), *(getattr(info, "param_decls", None) or ()))]
+            out[name] = tuple(d for d in given if isinstance(d, str) and d.startswith("-")) or ("--" + name.replace("_", "-"),)
+    return out
+
+
+def test_every_command_and_every_output_is_tried(tmp_path):
+    """A new command, or a new option that takes a path, belongs into `outputs.CASES`, or among what is read only."""
+    (tmp_path / "demo.json").write_text("{}")
+    found = commands()
+    assert set(found) == {c.name for c in CASES} | READS_ONLY
+    for name, command in found.items():
+        given = [c.arguments(tmp_path, tmp_path) for c in CASES if c.name == name]
+        options = path_options(command)
+        assert INPUTS.get(name, set()) <= set(options), f"{name} has no such parameter"
+        for parameter in set(options) - INPUTS.get(name, set()):
+            assert any(option in line for line in given for option in options[parameter]), f"{name}: {options[parameter]}"
