@@ -17,12 +17,19 @@ import drjit as dr
 import numpy as np
 import torch
 
+from ..errors import NergError
 from ..field.backend import is_cuda, namespace
 from ..field.background import Background
 from ..field.gaze import GazeField
+from ..field.gaze_ensemble import GazeEnsemble
 from ..field.hashgrid import HashGrid
+from ..field.log_gaze import LogGazeField
 from ..field.mlp import MLP
 from ..field.radiance import RadianceField
+
+
+_FIXED = ("prior",)
+"""Arrays that no training changes: parameters without gradients."""
 
 
 class _FieldModule(torch.nn.Module):
@@ -34,7 +41,7 @@ class _FieldModule(torch.nn.Module):
         self.device_type = "cuda" if is_cuda(self._ns) else "cpu"
         for name, value in field.parameters().items():
             tensor = torch.tensor(value.numpy(), device=self.device_type)
-            self.register_parameter(name.replace(".", "__"), torch.nn.Parameter(tensor))
+            self.register_parameter(name.replace(".", "__"), torch.nn.Parameter(tensor, requires_grad=name not in _FIXED))
 
     def _values(self) -> dict:
         return {name: self.get_parameter(name.replace(".", "__")) for name in self._field.parameters()}
@@ -46,7 +53,7 @@ class _FieldModule(torch.nn.Module):
         return out
 
     def _array(self, name: str, value: np.ndarray):
-        return self._ns.Float(value) if name.endswith("table") else self._ns.TensorXf(value)
+        return self._ns.Float(value.ravel()) if _is_flat(name) else self._ns.TensorXf(value)
 
     def _rows(self, **tensors) -> list:
         """Inputs (N, 3), checked."""
@@ -66,7 +73,7 @@ class _FieldModule(torch.nn.Module):
 
         @dr.wrap(source="torch", target="drjit")
         def evaluate(values, *points):
-            arrays = {k: ns.Float(v.array) if k.endswith("table") else ns.TensorXf(v) for k, v in values.items()}
+            arrays = {k: ns.Float(v.array) if _is_flat(k) else ns.TensorXf(v) for k, v in values.items()}
             here = _with(field, arrays)
             columns = [_columns(ns, p) for p in points]
             out = function(here, *columns)
@@ -103,14 +110,57 @@ class RadianceModule(_FieldModule):
 
 
 class GazeModule(_FieldModule):
-    """The gaze density of a gaze field."""
+    """The gaze density of a gaze field, be it normalised over the observer's sphere or not.
 
-    def __init__(self, field: GazeField):
+        around = GazeIntegral(GazeMedium(field), place, p_o, settings, "median", 0.5)      # directions, their depths, what escapes
+        Z = module.integral(p_od, p_o, r_o, escaped)                                       # at all of its directions
+        gaze = module(p_od, p_o, r_o, Z)
+
+    Raises `NergError` for an ensemble, whose members are modules each.
+    """
+
+    def __init__(self, field: GazeField | LogGazeField):
+        if isinstance(field, GazeEnsemble):
+            raise NergError(f"an ensemble of {len(field.members)} gaze fields is no module: make one of each of its members, and average what they return")
         super().__init__(field)
 
-    def forward(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor) -> torch.Tensor:
-        """Gaze (N,) in 1/sr of observers ``p_o`` (N, 3) who see ``p_od`` (N, 3) along unit ``r_o`` (N, 3)."""
-        return self._evaluate(lambda field, *q: [field.evaluate(*q)[0]], *self._rows(p_od=p_od, p_o=p_o, r_o=r_o))[0]
+    def forward(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, integral: torch.Tensor | float | None = None,
+                escaped: torch.Tensor | None = None) -> torch.Tensor:
+        """Gaze (N,) in 1/sr of observers ``p_o`` (N, 3) who see ``p_od`` (N, 3) along unit ``r_o`` (N, 3).
+
+        ``integral``: of a normalised field over the sphere around each observer, (N,) or one number for all (see ``integral``);
+        ``escaped`` (N,) bool: where no surface is met (default: nowhere). Raises ``ValueError`` for a normalised field without
+        its integral, and for tensors that do not fit.
+        """
+        if self._field.config.normalized and integral is None:
+            raise ValueError('this gaze field is normalised over the observer\'s sphere: give its "integral" there, which the method integral finds')
+        extra = self._extra(len(p_od), 1.0 if integral is None else integral, escaped)
+        evaluate = lambda field, p, o, r, e: [field.evaluate(p, o, r, integral=e.x, escaped=e.y > 0.5)[0]]
+        return self._evaluate(evaluate, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), extra)[0]
+
+    def unnormalized(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None) -> torch.Tensor:
+        """Emit times capture (N,) before any division: what the integral is one of. Arguments as for ``forward``."""
+
+        def product(field, p, o, r, e):
+            emit, capture = field.unnormalized(p, o, r, escaped=e.y > 0.5)
+            return [emit * capture + dr.zeros(type(e.x), dr.width(e))]
+
+        return self._evaluate(product, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), self._extra(len(p_od), 1.0, escaped))[0]
+
+    def integral(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None) -> torch.Tensor:
+        """The integral over the sphere (one number) of one observer, who is ``p_o`` in every row, from N directions ``r_o`` of
+        equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's (``transport.gaze_integral``)."""
+        return 4 * torch.pi * self.unnormalized(p_od, p_o, r_o, escaped).mean()
+
+    def _extra(self, count: int, integral, escaped) -> torch.Tensor:
+        """Integrals and what escapes as rows (N, 3)."""
+        number = torch.as_tensor(integral, dtype=torch.float32, device=self.device_type)
+        gone = torch.zeros(count, dtype=torch.float32, device=self.device_type) if escaped is None else escaped.to(torch.float32)
+        for name, t in (("integral", number), ("escaped", gone)):
+            if t.numel() != 1 and tuple(t.shape) != (count,):
+                raise ValueError(f"{name} must be one number or a tensor of {count}, one for each row, got {tuple(t.shape)}")
+        columns = [number.reshape(-1).expand(count), gone.reshape(-1).expand(count)]
+        return torch.stack([*columns, torch.zeros_like(columns[0])], 1).contiguous()
 
 
 class _Table(HashGrid):
@@ -118,6 +168,11 @@ class _Table(HashGrid):
 
     def __call__(self, p, active=True, mode: dr.ReduceMode = dr.ReduceMode.Expand) -> list:
         return super().__call__(p, active, mode)
+
+
+def _is_flat(name: str) -> bool:
+    """Whether a field keeps the array of that name as a Float, and not as a tensor."""
+    return name.endswith("table") or name == "escaped"
 
 
 def _columns(ns, p):
@@ -138,6 +193,8 @@ def _with(field, values: dict):
         elif isinstance(part, Background):
             grid, net = _grid(part.grid, values.get("background_grid.table")), _net(part.net, "background_net", values)
             setattr(out, name, Background(part.config, grid, net))
+        elif name in values:
+            setattr(out, name, values[name])
     out.pack()
     return out
 
