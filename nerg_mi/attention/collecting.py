@@ -8,13 +8,20 @@ from typing import Any, Sequence
 
 import numpy as np
 
+from ..errors import NergError
+from ..formats.bounded import reading, size_of
+from ..formats.line_blocks import OnBadLine
 from .rays import FRAME, Rays
+
+BAD_LINES = 0.01
+"""Share of a file's lines that may be left out since they cannot be read."""
 
 
 def file_sha256(path: str | os.PathLike) -> str:
-    """Hex digest of a file's bytes."""
+    """Hex digest of a file's bytes. Raises `NergError` for what is no ordinary file, or cannot be read."""
     digest = hashlib.sha256()
-    with open(path, "rb") as source:
+    size_of(path)
+    with reading(path), open(path, "rb") as source:
         while block := source.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
@@ -36,10 +43,14 @@ class RaysBuilder:
     """Collects rays source by source, drops what cannot be used, and keeps the
     account: how many rows of which source were dropped, and why.
 
-    ``about`` goes into the metadata as it is (preset, tick, column map, ...).
+    ``about`` goes into the metadata as it is (preset, tick, column map, ...). ``skip_bad_lines``: leave out lines that
+    cannot be read, with an account of them too, as long as they are at most `BAD_LINES` of a file's, or one.
     """
 
-    def __init__(self, *, transform: np.ndarray | None = None, **about: Any) -> None:
+    def __init__(self, *, transform: np.ndarray | None = None, skip_bad_lines: bool = False, **about: Any) -> None:
+        tick = about.get("tick", 1.0)
+        if not (0 < tick < 1e12):
+            raise NergError(f"a unit of the file's time is a positive number of seconds, got {tick} (--tick)")
         self._transform = np.eye(4) if transform is None else np.asarray(transform, dtype=np.float64)
         self._about = about
         self._parts: list[dict[str, np.ndarray]] = []
@@ -48,9 +59,40 @@ class RaysBuilder:
         self._sources: list[dict[str, Any]] = []
         self._dropped: list[dict[str, Any]] = []
         self._rows_read = 0
+        self._skips, self._lines, self._bad, self._first_bad = skip_bad_lines, 0, [], ""
+
+    @property
+    def on_bad(self) -> OnBadLine | None:
+        """What readers tell of lines that cannot be read; None where such a line ends the import."""
+        return self._bad_line if self._skips else None
+
+    def _bad_line(self, line: int, why: str) -> None:
+        self._first_bad = self._first_bad or f"line {line}{why}"
+        self._bad.append(line)
+        # Files of another format altogether: their lines need not all be counted.
+        if len(self._bad) > 10_000 + BAD_LINES * self._lines:
+            self._end_source()
+
+    def count_lines(self, n: int) -> None:
+        """Count lines of the present source that were read and give no rays."""
+        self._lines += n
+
+    def _end_source(self) -> None:
+        """Account for the bad lines of the present source. Raises `NergError` if they are too many."""
+        bad, lines = len(self._bad), self._lines + len(self._bad)
+        if bad > max(1, BAD_LINES * lines):
+            raise NergError(
+                f"{self._sources[-1]['file']}: {bad:,} of {lines:,} lines cannot be read, more than the {100 * BAD_LINES:g} % that "
+                f"--skip-bad-lines leaves out (the first is {self._first_bad})"
+            )
+        if bad:
+            self._drop("the line is cut off or holds a cell that is no number", np.array(self._bad))
+            self._rows_read += bad
+        self._lines, self._bad, self._first_bad = 0, [], ""
 
     def source(self, path: Path, name: str | None = None) -> None:
         """Begin a file; only its name (or another one, where files share theirs) is recorded, with its checksum."""
+        self._end_source()
         self._sources.append({"file": name or path.name, "sha256": file_sha256(path)})
 
     def add(
@@ -93,6 +135,7 @@ class RaysBuilder:
                 self._drop(reason, np.asarray(rows)[gone])
                 keep &= ~mask
         self._rows_read += n
+        self._lines += n
         R, shift = self._transform[:3, :3], self._transform[:3, 3]
         scale = np.cbrt(abs(np.linalg.det(R)))
         part = {
@@ -119,10 +162,11 @@ class RaysBuilder:
         self._dropped.append({"reason": reason, "file": name, "count": int(rows.size), "rows": _ranges(rows)})
 
     def build(self) -> Rays:
-        """The rays collected. Raises ``ValueError`` when none is left."""
+        """The rays collected. Raises `NergError` when none is left."""
+        self._end_source()
         if not sum(self._kept):
             why = "; ".join(f"{d['count']} rows: {d['reason']}" for d in self._dropped[:4]) or "the files hold no rows"
-            raise ValueError(f"no ray is left of {self._rows_read} rows ({why}); check the column map and the preset")
+            raise NergError(f"no ray is left of {self._rows_read} rows ({why}); check the column map and the preset")
         metadata = {
             "frame": dict(FRAME),
             "transform": self._transform.tolist(),

@@ -5,6 +5,7 @@ from typing import Sequence
 
 import numpy as np
 
+from ..errors import NergError
 from .rays import Rays
 
 
@@ -23,7 +24,7 @@ def select_mask(
 
     ``time``: from (inclusive) and to (exclusive), seconds, either may be ``None``. ``persons``, ``without_persons``,
     ``cohorts``: names. ``box``: x0, x1, y0, y1, z0, z1 in metres that hold the origin. ``min_confidence``: at least this.
-    ``with_hit``: a hit point is known. Raises ``ValueError`` for an unknown name or a box that is none.
+    ``with_hit``: a hit point is known. Raises `NergError` for an unknown name or a box that is none.
     """
     keep = np.ones(len(rays), bool)
     if time is not None:
@@ -35,12 +36,12 @@ def select_mask(
         keep &= ~np.isin(rays.person, _codes(without_persons, rays.persons, "person"))
     if cohorts is not None:
         if rays.cohort is None:
-            raise ValueError("these rays have no cohorts; import them with a cohort column (--map cohort=...)")
+            raise NergError("these rays have no cohorts; import them with a cohort column (--map cohort=...)")
         keep &= np.isin(rays.cohort, _codes(cohorts, rays.cohorts, "cohort"))
     if box is not None:
         box = np.asarray(box, dtype=np.float64)
         if box.shape != (6,) or not (box[0::2] < box[1::2]).all():
-            raise ValueError(f"a box is x0, x1, y0, y1, z0, z1 in metres with each first below its second, got {box.tolist()}")
+            raise NergError(f"a box is x0, x1, y0, y1, z0, z1 in metres with each first below its second, got {box.tolist()}")
         keep &= ((rays.origin >= box[0::2]) & (rays.origin <= box[1::2])).all(axis=1)
     if min_confidence is not None:
         keep &= rays.confidence >= min_confidence
@@ -52,8 +53,14 @@ def select_mask(
 def _codes(names: Sequence[str], known: tuple[str, ...], what: str) -> list[int]:
     unknown = [n for n in names if n not in known]
     if unknown:
-        raise ValueError(f"no {what} is called {', '.join(map(repr, unknown))}; there are {', '.join(known)}")
+        raise NergError(f"no {what} is called {', '.join(map(repr, unknown))}; there are {', '.join(known)}")
     return [known.index(n) for n in names]
+
+
+def time_order(rays: Rays) -> np.ndarray | None:
+    """The rays' order by person and time (N,); None where they are in that order already."""
+    earlier = (rays.person[1:] < rays.person[:-1]) | ((rays.person[1:] == rays.person[:-1]) & (rays.t[1:] < rays.t[:-1]))
+    return np.lexsort((rays.t, rays.person)) if earlier.any() else None
 
 
 def person_order(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
@@ -99,7 +106,7 @@ def thin_mask(rays: Rays, seconds: float = 2.0, distance: float = 0.1, gap: floa
     they looked at keeps its shares. Walking is left as it is.
     """
     if not (seconds > 0 and distance > 0):
-        raise ValueError(f"seconds {seconds} and distance {distance} must be positive")
+        raise NergError(f"seconds {seconds} and distance {distance} must be positive")
     label = stays(rays, distance, gap)
     order = np.lexsort((rays.t, label))
     counts = np.bincount(label)

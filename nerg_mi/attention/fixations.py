@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..errors import NergError
 from . import vmf
 from .filters import person_order
 from .rays import Rays
@@ -68,11 +69,11 @@ def fixation_rays(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
     """One ray a fixation, and how long each lasted (F,), seconds.
 
     Time of the middle, mean origin, mean direction, mean confidence and mean hit point (of those known) of the rays with
-    the same number in ``label`` (N,), -1 left out. Raises ``ValueError`` when there is no fixation.
+    the same number in ``label`` (N,), -1 left out. Raises `NergError` when there is no fixation.
     """
     kept = np.flatnonzero(label >= 0)
     if not kept.size:
-        raise ValueError("there is no fixation among these rays; raise the velocity or the dispersion, or lower the duration")
+        raise NergError("there is no fixation among these rays; raise the velocity or the dispersion, or lower the duration")
     _, index, number = np.unique(label[kept], return_index=True, return_inverse=True)
     n = np.bincount(number).astype(np.float64)
     mean = lambda v: np.stack([np.bincount(number, weights=c) for c in v[kept].T], axis=1) / n[:, None]
@@ -155,4 +156,4 @@ def _grow(d: np.ndarray, start: int, end: int, limit: int, dispersion: float) ->
 def _positive(**values: float) -> None:
     for name, value in values.items():
         if not value > 0:
-            raise ValueError(f"{name} must be positive, got {value}")
+            raise NergError(f"{name} must be positive, got {value}")

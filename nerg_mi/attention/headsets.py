@@ -6,7 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import NergError
+from ..formats.bounded import plain
 from ..formats.column_map import ColumnMap
+from ..formats.line_blocks import OnBadLine
 from ..formats.ray_tables import iterate_table, table_columns
 from . import poses
 from .collecting import RaysBuilder
@@ -23,30 +26,30 @@ _STATUS = ("status", "gaze_status", "gazestatus", "tracking_state", "gaze_valid"
 _VALID = ("valid", "true", "1", "1.0", "tracked", "tracking", "ok")
 
 
-def unity(paths: Paths, *, tick: float = 1.0) -> Rays:
+def unity(paths: Paths, *, tick: float = 1.0, skip_bad_lines: bool = False) -> Rays:
     """Gaze in the world, as Unity projects log it: y up, left-handed, metres.
 
     Columns, by name: ``gaze_origin_{x,y,z}``; ``gaze_dir_*``, ``gaze_direction_*`` or ``gaze_forward_*``; where there are,
     ``hit_*`` (or ``gaze_hit_*``, ``hit_point_*``), a time, a person, a ``status`` (rows that are not valid are dropped) and
     ``confidence``. Without a person the file is the person. ``tick``: seconds in one unit of the time.
     """
-    return _unity(paths, tick, "unity", local=False)
+    return _unity(paths, tick, skip_bad_lines, "unity", local=False)
 
 
-def unity_local(paths: Paths, *, tick: float = 1.0) -> Rays:
+def unity_local(paths: Paths, *, tick: float = 1.0, skip_bad_lines: bool = False) -> Rays:
     """Gaze in the head's frame (z forward) beside the head's pose in the world, as Varjo's and OpenXR's interfaces give it.
 
     As :func:`unity`, with ``head_pos_{x,y,z}`` and ``head_rot_{x,y,z,w}`` (a quaternion); ``gaze_origin_*`` may be missing.
     """
-    return _unity(paths, tick, "unity_local", local=True)
+    return _unity(paths, tick, skip_bad_lines, "unity_local", local=True)
 
 
-def unity_head(paths: Paths, *, tick: float = 1.0) -> Rays:
+def unity_head(paths: Paths, *, tick: float = 1.0, skip_bad_lines: bool = False) -> Rays:
     """Heads only: ``head_pos_{x,y,z}`` with ``head_rot_{x,y,z,w}``, in Unity's world; a ray is where the head points (z).
 
     Without a ``head_rot_w``, ``head_rot_{x,y,z}`` are Unity's Euler angles in degrees (pitch, yaw, roll).
     """
-    options = {**UNITY, "tick": tick, "forward": "z", "preset": "unity_head"}
+    options = {**UNITY, "tick": tick, "forward": "z", "preset": "unity_head", "skip_bad_lines": skip_bad_lines}
     parts = []
     for path in map(Path, paths):
         find = _Finder(path)
@@ -61,8 +64,8 @@ def unity_head(paths: Paths, *, tick: float = 1.0) -> Rays:
     return _same_tables(parts, options)
 
 
-def _unity(paths: Paths, tick: float, name: str, local: bool) -> Rays:
-    options = {**UNITY, "tick": tick, "forward": "z", "preset": name}
+def _unity(paths: Paths, tick: float, skip_bad_lines: bool, name: str, local: bool) -> Rays:
+    options = {**UNITY, "tick": tick, "forward": "z", "preset": name, "skip_bad_lines": skip_bad_lines}
     parts = []
     for path in map(Path, paths):
         find = _Finder(path)
@@ -84,7 +87,7 @@ def _same_tables(parts: list, options: dict) -> Rays:
     _, columns, valid = parts[0]
     for path, other, _ in parts:
         if str(other) != str(columns):
-            raise ValueError(
+            raise NergError(
                 f"{path} has other columns ({other}) than {parts[0][0]} ({columns}); import them apart, or with one column map (--map)"
             )
     return rays_from_table([path for path, _, _ in parts], columns, valid=valid, **options)
@@ -105,7 +108,7 @@ class _Finder:
         if need:
             wanted = " or ".join(f"{s}_{{{','.join(axes)}}}" for s in stems)
             there = ", ".join(self.columns[:16])
-            raise ValueError(f"{self.path} has no columns {wanted}; its columns are {there}; name them with --map")
+            raise NergError(f"{self.path} has no columns {wanted}; its columns are {there}; name them with --map")
         return None
 
     def one(self, names: tuple[str, ...]) -> str | None:
@@ -120,7 +123,7 @@ class _Finder:
         return {status: _VALID} if status else {}
 
 
-def varjo(paths: Paths) -> Rays:
+def varjo(paths: Paths, *, skip_bad_lines: bool = False) -> Rays:
     """The log of Varjo's eye tracking example for Unity: semicolons between cells, vectors as ``(x, y, z)``.
 
     ``HMDPosition`` and ``HMDRotation`` (x, y, z, w) are the camera's pose in Unity's world, ``CombinedGazePosition`` and
@@ -128,44 +131,56 @@ def varjo(paths: Paths) -> Rays:
     ``GazeStatus`` is not VALID are dropped. The file is the person.
     """
     names = ["HMDPosition", "HMDRotation", "CombinedGazePosition", "CombinedGazeForward", "GazeStatus"]
-    builder = RaysBuilder(transform=to_rays_frame(**UNITY), preset="varjo", source_frame=UNITY, tick=1e-9)
+    builder = RaysBuilder(transform=to_rays_frame(**UNITY), preset="varjo", source_frame=UNITY, tick=1e-9, skip_bad_lines=skip_bad_lines)
     for path in map(Path, paths):
         builder.source(path)
         first = None
-        for values, texts, lines in iterate_table(path, ["CaptureTime"], names):
-            position, rotation, eye, forward = (
-                _cells(texts[:, i], size, path, name, lines) for i, (name, size) in enumerate(zip(names, (3, 4, 3, 3)))
-            )
+        for values, texts, lines in iterate_table(path, ["CaptureTime"], names, on_bad=builder.on_bad):
+            bad = np.zeros(len(lines), bool)
+            vectors = [
+                _cells(texts[:, i], size, path, name, lines, bad, builder.on_bad)
+                for i, (name, size) in enumerate(zip(names, (3, 4, 3, 3)))
+            ]
+            if bad.all():
+                continue
+            position, rotation, eye, forward = (v[~bad] for v in vectors)
             turn = poses.rotations_from_quaternions(rotation)
             # Nanoseconds since long ago are known to 0.3 us in float64: fine enough, if they are counted from the first.
-            first = values[0, 0] if first is None else first
+            first = values[~bad][0, 0] if first is None else first
             builder.add(
-                (values[:, 0] - first) * 1e-9,
+                (values[~bad, 0] - first) * 1e-9,
                 person_from_filename(path),
                 position + np.einsum("nij,nj->ni", turn, eye),
                 np.einsum("nij,nj->ni", turn, forward),
-                rows=lines,
-                drop={"GazeStatus is not VALID": np.char.upper(texts[:, 4]) != "VALID"},
+                rows=lines[~bad],
+                drop={"GazeStatus is not VALID": np.char.upper(texts[~bad, 4]) != "VALID"},
             )
     return builder.build()
 
 
-def _cells(words: np.ndarray, size: int, path: Path, name: str, lines: np.ndarray) -> np.ndarray:
-    """Vectors written ``(x, y, z)`` in one cell, (n, size); NaN where the cell is empty."""
+def _cells(
+    words: np.ndarray, size: int, path: Path, name: str, lines: np.ndarray, bad: np.ndarray, on_bad: OnBadLine | None
+) -> np.ndarray:
+    """Vectors written ``(x, y, z)`` in one cell, (n, size); NaN where the cell is empty. Lines in which it is no vector are
+    marked in ``bad`` (n,) bool and told to ``on_bad``; without it they raise `NergError`."""
     out = np.full((len(words), size), np.nan)
     for i, word in enumerate(words.tolist()):
-        if word:
+        if word and not bad[i]:
             try:
                 out[i] = [float(v) for v in word.strip("()").split(",")]
             except ValueError:
-                raise ValueError(f"{path}, line {lines[i]}, column {name!r}: {word!r} is not {size} numbers; mend the cell") from None
+                why = f", column {name!r}: {plain(word, 60)!r} is not {size} numbers; mend the cell"
+                if on_bad is None:
+                    raise NergError(f"{path}, line {lines[i]}{why}, or leave such lines out with --skip-bad-lines") from None
+                on_bad(int(lines[i]), why)
+                bad[i] = True
     return out
 
 
 _JOINTS = 26  # of a hand, a 4x4 matrix each
 
 
-def hololens(paths: Paths) -> Rays:
+def hololens(paths: Paths, *, skip_bad_lines: bool = False) -> Rays:
     """``*_head_hand_eye.csv`` of HoloLens 2's StreamRecorder (github: microsoft/HoloLens2ForCV), which has no header.
 
     A line: time in ticks of 100 ns; the head's 4x4 matrix; for each hand whether it is seen and 26 matrices; whether the
@@ -178,11 +193,11 @@ def hololens(paths: Paths) -> Rays:
               *(f"{what}{i}" for what in "od" for i in range(4)), "distance"]  # fmt: skip
     wanted = ["t", *header[17 + hands :]]
     frame = {"up": "y", "handedness": "right", "units": "m"}
-    builder = RaysBuilder(transform=to_rays_frame(**frame), preset="hololens", source_frame=frame, tick=1e-7)
+    builder = RaysBuilder(transform=to_rays_frame(**frame), preset="hololens", source_frame=frame, tick=1e-7, skip_bad_lines=skip_bad_lines)
     for path in map(Path, paths):
         builder.source(path)
         first = None
-        for v, _, lines in iterate_table(path, wanted, header=header):
+        for v, _, lines in iterate_table(path, wanted, header=header, on_bad=builder.on_bad):
             first = v[0, 0] if first is None else first
             origin, direction, distance = v[:, 2:5], v[:, 6:9], v[:, 10:]
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -202,7 +217,9 @@ def hololens(paths: Paths) -> Rays:
 _GAP = 0.1  # seconds: between head poses farther apart than this nothing is interpolated
 
 
-def pupil(paths: Paths, *, marker: float | None = None, up: str = "y", min_confidence: float = 0.6) -> Rays:
+def pupil(
+    paths: Paths, *, marker: float | None = None, up: str = "y", min_confidence: float = 0.6, skip_bad_lines: bool = False
+) -> Rays:
     """Exports of Pupil Core (Pupil Player's raw data and head pose tracker), one folder a recording.
 
     ``paths``: the folders, or the ``gaze_positions.csv`` in them; ``head_pose_tracker_poses.csv`` must lie beside it. Gaze is
@@ -215,10 +232,11 @@ def pupil(paths: Paths, *, marker: float | None = None, up: str = "y", min_confi
     from scipy.spatial.transform import Rotation, Slerp
 
     if marker is None or not marker > 0:
-        raise ValueError("Pupil's head poses count in edges of the tracking markers; give the edge's length in metres (--marker 0.05)")
+        raise NergError("Pupil's head poses count in edges of the tracking markers; give the edge's length in metres (--marker 0.05)")
     frame = {"up": up, "handedness": "right", "units": "m"}
     builder = RaysBuilder(
-        transform=to_rays_frame(**frame), preset="pupil", source_frame=frame, marker=marker, min_confidence=min_confidence
+        transform=to_rays_frame(**frame), preset="pupil", source_frame=frame, marker=marker, min_confidence=min_confidence,
+        skip_bad_lines=skip_bad_lines,
     )
     normals = [f"gaze_normal{eye}_{axis}" for eye in "01" for axis in "xyz"]
     centres = [f"eye_center{eye}_3d_{axis}" for eye in "01" for axis in "xyz"]
@@ -226,18 +244,20 @@ def pupil(paths: Paths, *, marker: float | None = None, up: str = "y", min_confi
         path = given / "gaze_positions.csv" if given.is_dir() else given
         poses_path = path.with_name("head_pose_tracker_poses.csv")
         if not poses_path.is_file():
-            raise ValueError(f"there is no {poses_path}; run the head pose tracker in Pupil Player and export again")
+            raise NergError(f"there is no {poses_path}; run the head pose tracker in Pupil Player and export again")
         person = next((p for p in reversed(path.resolve().parent.parts) if not p.isdigit() and p != "exports"), path.stem)
         builder.source(poses_path, f"{person}/{poses_path.name}")
         fields = ["timestamp", *(f"{what}_{axis}" for what in ("rotation", "translation") for axis in "xyz")]
-        track = np.concatenate([block.numbers for block in iterate_table(poses_path, fields)] or [np.empty((0, 7))])
+        blocks = iterate_table(poses_path, fields, on_bad=builder.on_bad)
+        track = np.concatenate([block.numbers for block in blocks] or [np.empty((0, 7))])
+        builder.count_lines(len(track))
         track = track[np.isfinite(track).all(axis=1)]
         track = track[np.unique(track[:, 0], return_index=True)[1]]
         if len(track) < 2:
-            raise ValueError(f"{poses_path} holds {len(track)} head poses; two are needed to interpolate between")
+            raise NergError(f"{poses_path} holds {len(track)} head poses; two are needed to interpolate between")
         turns = Slerp(track[:, 0], Rotation.from_rotvec(track[:, 1:4]))
         builder.source(path, f"{person}/{path.name}")
-        for v, _, lines in iterate_table(path, ["gaze_timestamp", "confidence", *normals, *centres]):
+        for v, _, lines in iterate_table(path, ["gaze_timestamp", "confidence", *normals, *centres], on_bad=builder.on_bad):
             t = np.clip(np.nan_to_num(v[:, 0]), track[0, 0], track[-1, 0])
             after = np.clip(np.searchsorted(track[:, 0], t), 1, len(track) - 1)
             near = np.abs(v[:, 0, None] - track[np.stack([after - 1, after], axis=1), 0])

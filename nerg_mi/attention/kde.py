@@ -13,6 +13,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..field.backend import namespace
 from .vmf import log_normaliser
 
@@ -53,7 +54,7 @@ class SphericalKde:
         if rays.ndim != 2 or rays.shape[1] != 3 or offsets.ndim != 1 or len(counts) == 0 or offsets[0] != 0 or offsets[-1] != len(rays):
             raise ValueError(f"rays {rays.shape} and offsets {offsets.shape} do not fit: offsets run from 0 to the number of rays")
         if counts.min() < 1:
-            raise ValueError(f"probe {int(np.argmin(counts))} has no ray; raise min_rays")
+            raise NergError(f"probe {int(np.argmin(counts))} has no ray; raise min_rays")
         kappa = np.broadcast_to(np.asarray(kappa, dtype=np.float64), counts.shape)
         if weights is None:
             share = np.repeat(1.0 / counts, counts)
@@ -63,7 +64,7 @@ class SphericalKde:
                 raise ValueError(f"weights {weights.shape} must be {len(rays)} non-negative numbers, one a ray")
             total = np.add.reduceat(weights, offsets[:-1])
             if not (total > 0).all():
-                raise ValueError(f"the weights of probe {int(np.argmin(total))} are all zero; leave the probe out")
+                raise NergError(f"the weights of probe {int(np.argmin(total))} are all zero; leave the probe out")
             share = weights / np.repeat(total, counts)
 
         self.count = len(counts)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import NergError
 from .index import RayIndex
 from .kde import SphericalKde
 from .kde_table import SphericalKdeTable
@@ -55,7 +56,7 @@ def kde_frame(
     rays: docs/rays.md. Raises ``ValueError`` for another word, or when it is not said where the pixels look.
     """
     if method not in METHODS:
-        raise ValueError(f'method is "{method}"; it is one of {", ".join(METHODS)}')
+        raise NergError(f'method is "{method}"; it is one of {", ".join(METHODS)}')
     if (directions is None) == (points is None) or (points is not None and observer is None):
         raise ValueError("say where the pixels look: either directions, or an observer and points")
     there = None

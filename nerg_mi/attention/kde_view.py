@@ -8,6 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..transport.gaze_ensemble import keep_or_make
 from ..transport.media import Similarity, at_nearest
 from .kde import SphericalKde
@@ -25,7 +26,7 @@ class KdeView:
 
     def __init__(self, rays: Rays, count: int = 4096, kappa: float = 20.0, to_world: Similarity | None = None, backend: object = None):
         if len(rays) == 0:
-            raise ValueError("there are no rays to show the density of")
+            raise NergError("there are no rays to show the density of")
         self.to_world, self.backend = to_world or Similarity(), backend
         self.count, self.kappa, self._known = min(count, len(rays)), kappa, []
         self._origin, self._direction = rays.origin, rays.direction

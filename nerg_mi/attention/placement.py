@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import NergError
+
 PLACEMENTS = ("data", "grid", "random", "blue")
 
 
@@ -13,11 +15,11 @@ def place_queries(
 
     ``data``: ``count`` distinct ray origins at random. ``grid``: a lattice of ``spacing`` (2R) over the origins' box.
     ``random``: ``count`` places uniform in that box. ``blue``: at most ``count`` ray origins, none nearer to another than
-    ``spacing``; without one, than the smallest distance from R on at which they are no more. Raises ``ValueError`` for
+    ``spacing``; without one, than the smallest distance from R on at which they are no more. Raises `NergError` for
     another word.
     """
     if placement not in PLACEMENTS:
-        raise ValueError(f'placement is "{placement}"; it is one of {", ".join(PLACEMENTS)}')
+        raise NergError(f'placement is "{placement}"; it is one of {", ".join(PLACEMENTS)}')
     if placement == "data":
         return origin[rng.choice(len(origin), min(count, len(origin)), replace=False)]
     if placement == "blue":

@@ -16,12 +16,16 @@ from .rays import Rays
 _OFF = 5.0  # degrees between direction and hit point
 _AHEAD = 0.2  # correlation of gaze and walking along an axis
 _MOST = 200_000  # rays looked at
+_WALKED = 1 << 21, 1 << 12  # rays looked at in runs of so many, where it matters which comes after which
+_USUAL = 5.0, 2100.0  # rays a second of devices that there are
 
 
-def warnings(rays: Rays, height: np.ndarray, extent: np.ndarray, speed: float, step: np.ndarray) -> list[str]:
+def warnings(
+    rays: Rays, height: np.ndarray, extent: np.ndarray, speed: float, step: np.ndarray, order: np.ndarray | None
+) -> list[str]:
     """Sentences about rays in our frame. ``height``: 5, 50 and 95 % of the origins' heights; ``extent`` (3,) of their box;
-    ``speed``: 95 % of the speeds; ``step``: times between a person's rays."""
-    return [*_lengths(rays, height, extent), *_times(speed, step), *_directions(rays)]
+    ``speed``: 95 % of the speeds; ``step``: times between a person's rays; ``order``: `filters.time_order` of them."""
+    return [*_lengths(rays, height, extent), *_times(rays, speed, step), *_directions(rays, order)]
 
 
 def _to_source(rays: Rays) -> np.ndarray:
@@ -62,17 +66,30 @@ def _standing_axis(rays: Rays) -> str | None:
     return None if len(found) != 1 else ("-" if mid[found[0]] < 0 else "") + "xyz"[found[0]]
 
 
-def _times(speed: float, step: np.ndarray) -> list[str]:
+def _times(rays: Rays, speed: float, step: np.ndarray) -> list[str]:
     out = []
     if speed > 5:
         out.append(f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: check the unit of time (--tick) or length")
     forward = step[step > 0]
-    if forward.size and not 1e-4 <= np.median(forward) <= 10:
-        out.append(f"a ray comes every {np.median(forward):.3g} s: check the unit of time (--tick)")
+    if not forward.size:
+        if step.size:
+            out.append("all rays of a person have the same time: is it the column of times that was named? (--map t=...)")
+        return out
+    median = float(np.median(forward))
+    # Where most rays come more than a second apart hardly anything counts as recorded time.
+    if not 1e-4 <= median <= 1.0:
+        tick = rays.metadata.get("tick", 1.0)
+        fits = [f for f in (1e-3, 1e-6, 1e-7, 1e-9, 1e3, 60.0) if _USUAL[0] <= 1 / (median * f) <= _USUAL[1]]
+        remedy = (
+            f"were a unit of the file's time {tick * fits[0]:g} s, it would be {1 / (median * fits[0]):.3g} a second (--tick {tick * fits[0]:g})"
+            if fits
+            else "check the unit of time (--tick)"
+        )
+        out.append(f"a ray comes every {median:.3g} s; {remedy}")
     return out
 
 
-def _directions(rays: Rays) -> list[str]:
+def _directions(rays: Rays, order: np.ndarray | None) -> list[str]:
     R = _to_source(rays)
     signs = np.array(list(itertools.product((1.0, -1.0), repeat=3)))[1:]
     name = lambda s: " and ".join("xyz"[i] for i in np.flatnonzero(s < 0))
@@ -102,7 +119,7 @@ def _directions(rays: Rays) -> list[str]:
             f"half of the rays look more than {abs(np.median(elevation)):.0f} degrees {up}: "
             "check the axes of the directions, or which way is forward"
         )
-    agree = walking_agreement(rays)
+    agree = walking_agreement(rays, order)
     if agree is not None:
         against = [i for i in range(3) if agree[i] < -_AHEAD]
         along = [i for i in range(3) if agree[i] > _AHEAD]
@@ -117,26 +134,34 @@ def _directions(rays: Rays) -> list[str]:
     return out
 
 
-def walking_agreement(rays: Rays) -> np.ndarray | None:
+def walking_agreement(rays: Rays, order: np.ndarray | None = None) -> np.ndarray | None:
     """Correlation of gaze with walking along each axis of the file, (3,), 0 along the up axis; ``None`` where nobody walks.
 
-    Steps of half a second, at 0.3 to 3 m/s. People look ahead: far above zero along each axis on which they walk.
+    Steps of half a second, at 0.3 to 3 m/s. People look ahead: far above zero along each axis on which they walk. ``order``:
+    `filters.time_order` of the rays, if it is known. Of millions of rays, runs of some thousands are looked at.
     """
-    from .filters import person_order
+    from .filters import time_order
 
-    order, starts = person_order(rays)
-    t = rays.t[order]
-    later = np.minimum(np.searchsorted(np.arange(len(t)), np.arange(len(t)) + _lag(t, starts)), len(t) - 1)
+    order = time_order(rays) if order is None else order
+    n, (most, run) = len(rays), _WALKED
+    order = np.arange(n) if order is None and n <= most else order
+    if n > most:
+        first = np.linspace(0, n - run, most // run).astype(np.int64)
+        rows = (first[:, None] + np.arange(run)).ravel()
+        order = rows if order is None else order[rows]
+    t, person = rays.t[order], rays.person[order]
+    starts = np.r_[np.flatnonzero(np.r_[True, np.diff(person) != 0]), len(t)]
+    later = np.minimum(np.arange(len(t)) + _lag(t, starts), len(t) - 1)
     dt = t[later] - t
-    together = (rays.person[order][later] == rays.person[order]) & (dt > 0) & (dt < 2.0)
-    moved = (rays.origin[order][later] - rays.origin[order])[together]
+    together = (person[later] == person) & (dt > 0) & (dt < 2.0)
+    moved = (rays.origin[order[later]] - rays.origin[order])[together]
     moved[:, 2] = 0
     speed = np.linalg.norm(moved, axis=1) / dt[together]
     walks = (speed > 0.3) & (speed < 3.0)
     if walks.sum() < 200:
         return None
     R = _to_source(rays)
-    d = rays.direction[order][together][walks] * (1, 1, 0)
+    d = rays.direction[order[together]][walks] * (1, 1, 0)
     v, d = moved[walks] / np.linalg.norm(moved[walks], axis=1, keepdims=True) @ R.T, d @ R.T
     norm = np.sqrt((v**2).mean(axis=0) * (d**2).mean(axis=0))
     # An axis on which hardly anybody walks says nothing.

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import NergError
+
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, s in (("", 1.0), ("-", -1.0))}
 """Unit vectors by name: x, -x, y, -y, z, -z."""
 
 
 def axis(name: str, what: str) -> np.ndarray:
-    """The unit vector of a name such as ``-z``. Raises ``ValueError`` naming ``what`` for another word."""
+    """The unit vector of a name such as ``-z``. Raises `NergError` naming ``what`` for another word."""
     if name not in AXES:
-        raise ValueError(f'{what} is "{name}"; it is one of {", ".join(AXES)}')
+        raise NergError(f'{what} is "{name}"; it is one of {", ".join(AXES)}')
     return AXES[name]
 
 
@@ -43,12 +45,12 @@ def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bo
     First the head turns about the up axis (yaw), then about its own sideways axis (pitch), then about its forward axis
     (roll), each by the usual rotation matrix about the coordinate axis of that name. So in Unity (y up, z forward) positive
     angles turn right and look down, in ROS (z up, x forward) they turn left and look down, and in OpenXR (y up, -z forward)
-    they turn left and look up. Raises ``ValueError`` where ``up`` and ``forward`` are the same axis.
+    they turn left and look up. Raises `NergError` where ``up`` and ``forward`` are the same axis.
     """
     angles = np.asarray(angles, dtype=np.float64)
     up, forward = up[-1], forward[-1]
     if up == forward:
-        raise ValueError(f"the up axis and the forward axis are both {up}; say where heads look with forward")
+        raise NergError(f"the up axis and the forward axis are both {up}; say where heads look with forward")
     (side,) = set("xyz") - {up, forward}
     sequence = (up + side + forward).upper()[: angles.shape[1]]
     return _where(np.isfinite(angles).all(axis=1), angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees))

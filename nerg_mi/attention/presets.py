@@ -11,6 +11,7 @@ from typing import Callable
 
 import numpy as np
 
+from ..errors import NergError
 from ..formats.ray_tables import iterate_table
 from . import headsets
 from .collecting import RaysBuilder
@@ -19,7 +20,7 @@ from .rays import Rays
 from .skeleton import rays_from_skeleton
 from .tables import Paths, person_from_filename
 
-def vr_supermarket(paths: Paths, *, min_openness: float = 0.5) -> Rays:
+def vr_supermarket(paths: Paths, *, min_openness: float = 0.5, skip_bad_lines: bool = False) -> Rays:
     """Eye gaze of people in a VR supermarket, one gzip CSV a person, 50 Hz.
 
     Recorded with "Fixation-based Self-calibration for Eye Tracking in VR
@@ -38,12 +39,13 @@ def vr_supermarket(paths: Paths, *, min_openness: float = 0.5) -> Rays:
     names = [*matrix, "ray_x", "ray_y", "ray_z", "eye_x", "eye_y", "eye_z", "xc", "yc", "zc", "opennessl", "opennessr", "time"]
     frame = {"up": "y", "handedness": "left", "units": "m"}
     builder = RaysBuilder(
-        transform=to_rays_frame(**frame), preset="vr_supermarket", source_frame=frame, min_openness=min_openness
+        transform=to_rays_frame(**frame), preset="vr_supermarket", source_frame=frame, min_openness=min_openness,
+        skip_bad_lines=skip_bad_lines,
     )
     for path in map(Path, paths):
         builder.source(path)
         user = re.search(r"user\d+", path.name)
-        for values, _, lines in iterate_table(path, names):
+        for values, _, lines in iterate_table(path, names, on_bad=builder.on_bad):
             pose = values[:, :12].reshape(-1, 3, 4)
             flip = np.array([1.0, 1.0, -1.0])  # +z forward to the camera of the matrix
             rotate = lambda v: np.einsum("nij,nj->ni", pose[:, :, :3], v * flip)
@@ -63,7 +65,8 @@ def vr_supermarket(paths: Paths, *, min_openness: float = 0.5) -> Rays:
 
 @dataclass(frozen=True)
 class Preset:
-    """A known recording: ``read(paths, **options)`` returns its rays."""
+    """A known recording: ``read(paths, **options)`` returns its rays; each knows ``skip_bad_lines`` (see `RaysBuilder`), and
+    the ``options`` named here."""
 
     summary: str
     read: Callable[..., Rays]
@@ -89,7 +92,7 @@ PRESETS = {
 
 
 def preset(name: str) -> Preset:
-    """The preset of this name. Raises ``ValueError`` naming those there are."""
+    """The preset of this name. Raises `NergError` naming those there are."""
     if name not in PRESETS:
-        raise ValueError(f'there is no preset "{name}"; choose one of {", ".join(PRESETS)}, or give a column map')
+        raise NergError(f'there is no preset "{name}"; choose one of {", ".join(PRESETS)}, or give a column map')
     return PRESETS[name]

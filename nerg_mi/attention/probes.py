@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..errors import NergError
 from . import vmf
 from .bandwidth import loo_kappas, silverman_kappas
 from .index import RayIndex
@@ -110,14 +111,14 @@ def place_probes(
     stood, also at the edge of where they walk. ``query``: the ball's centre, as
     in the paper's text. The two differ by less than R.
 
-    Raises ``ValueError`` for unknown words, or when no query holds enough rays.
+    Raises `NergError` for unknown words, or when no query holds enough rays.
     """
     _check_one_of("placement", placement, PLACEMENTS)
     _check_one_of("kappa_rule", kappa_rule, KAPPA_RULES)
     _check_one_of("centre", centre, ("mean", "query"))
     _check_one_of("weights", weights, WEIGHTS)
     if not radius > 0 or min_rays < 1 or cap < min_rays:
-        raise ValueError(f"radius {radius}, min_rays {min_rays}, cap {cap}: need radius > 0 and 1 <= min_rays <= cap")
+        raise NergError(f"radius {radius}, min_rays {min_rays}, cap {cap}: need radius > 0 and 1 <= min_rays <= cap")
     rng = np.random.default_rng(seed)
     if ray_weights is not None:
         ray_weights = np.asarray(ray_weights, dtype=np.float64)
@@ -139,7 +140,7 @@ def place_probes(
     counts = np.diff(near.offsets)
     enough = counts >= min_rays
     if not enough.any():
-        raise ValueError(
+        raise NergError(
             f"none of {len(queries)} probes holds {min_rays} rays within {radius} m; enlarge the radius or lower min_rays"
         )
     held = np.repeat(enough, counts)
@@ -176,4 +177,4 @@ def person_weights(rays: Rays) -> np.ndarray:
 
 def _check_one_of(name: str, value: str, words: tuple[str, ...]) -> None:
     if value not in words:
-        raise ValueError(f'{name} is "{value}"; it is one of {", ".join(words)}')
+        raise NergError(f'{name} is "{value}"; it is one of {", ".join(words)}')

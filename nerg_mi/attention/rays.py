@@ -12,7 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import NergError
 from ..formats.rays_file import read_rays_file, write_rays_file
+
+# Rows moved at a time.
+_BLOCK = 1 << 18
 
 FRAME = {"units": "m", "up": "z", "handedness": "right"}
 
@@ -29,9 +33,8 @@ class Rays:
     and ``dropped`` (reason, count, and rows of each source); ``cohort`` (N,)
     int32 index into ``cohorts``, the names of groups of people, or ``None``.
 
-    Raises ``ValueError`` naming the first offending ray for NaN, zero or
-    non-unit directions, non-finite origins or times, persons out of range, and
-    arrays of different lengths.
+    Raises `NergError` naming the first offending ray for NaN, zero or non-unit directions, non-finite origins or times, and
+    persons out of range; ``ValueError`` for arrays of different lengths.
     """
 
     t: np.ndarray
@@ -48,11 +51,11 @@ class Rays:
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)
         put("t", np.ascontiguousarray(self.t, dtype=np.float64))
-        put("person", np.ascontiguousarray(self.person, dtype=np.int32))
         put("persons", tuple(str(p) for p in self.persons))
         put("cohorts", tuple(str(c) for c in self.cohorts))
-        if self.cohort is not None:
-            put("cohort", np.ascontiguousarray(self.cohort, dtype=np.int32))
+        for name in ("person", "cohort"):
+            if getattr(self, name) is not None:
+                put(name, np.asarray(getattr(self, name)))
         for name in ("origin", "direction", "confidence", "hit"):
             if getattr(self, name) is not None:
                 put(name, np.ascontiguousarray(getattr(self, name), dtype=np.float64))
@@ -66,15 +69,19 @@ class Rays:
         if "frame" not in self.metadata:
             raise ValueError('metadata lacks "frame"; state units, up axis and handedness (see nerg_mi.attention.rays.FRAME)')
 
-        length = np.linalg.norm(self.direction, axis=1)
+        # Summed without arrays of squares: of ten million rays these alone take a quarter of a gigabyte.
+        length = np.sqrt(np.einsum("ij,ij->i", self.direction, self.direction))
         _refuse(~np.isfinite(length), "a direction that is not finite", "drop it before building Rays")
         _refuse(length == 0, "a zero direction", "drop it before building Rays")
         _refuse(np.abs(length - 1) > 1e-4, "a direction that is not of unit length", "divide it by its length")
         _refuse(~np.isfinite(self.origin).all(axis=1), "an origin that is not finite", "drop it before building Rays")
         _refuse(~np.isfinite(self.t), "a time that is not finite", "drop it before building Rays")
-        _refuse((self.person < 0) | (self.person >= len(self.persons)), "an unknown person", "extend persons")
+        # Before they become 32 bits wide, in which numbers that are too large would be those of somebody else.
+        _refuse(~((self.person >= 0) & (self.person < len(self.persons))), "an unknown person", "extend persons")
+        put("person", np.ascontiguousarray(self.person, dtype=np.int32))
         if self.cohort is not None:
-            _refuse((self.cohort < 0) | (self.cohort >= len(self.cohorts)), "an unknown cohort", "extend cohorts")
+            _refuse(~((self.cohort >= 0) & (self.cohort < len(self.cohorts))), "an unknown cohort", "extend cohorts")
+            put("cohort", np.ascontiguousarray(self.cohort, dtype=np.int32))
         _refuse(~((self.confidence >= 0) & (self.confidence <= 1)), "a confidence outside [0, 1]", "rescale it")
 
     def __len__(self) -> int:
@@ -94,6 +101,22 @@ class Rays:
             cohort=None if self.cohort is None else self.cohort[which],
         )
 
+    def keep_in_place(self, mask: np.ndarray) -> Rays:
+        """The rays of a boolean mask (N,), moved together in the memory of these, which must not be used afterwards: of
+        millions of rays there are then never two copies."""
+        kept = np.flatnonzero(mask)
+        columns = {}
+        for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort"):
+            column = getattr(self, name)
+            if column is None:
+                continue
+            for a in range(0, len(kept), _BLOCK):
+                # What is read lies at or behind what is written.
+                rows = kept[a : a + _BLOCK]
+                column[a : a + len(rows)] = column[rows]
+            columns[name] = column[: len(kept)]
+        return replace(self, **columns)
+
     def noting(self, **what: Any) -> Rays:
         """The same rays with a step added to the list ``steps`` of the metadata: what was done to them since the import."""
         return replace(self, metadata={**self.metadata, "steps": [*self.metadata.get("steps", []), what]})
@@ -107,14 +130,18 @@ class Rays:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Rays:
-        """Read what :meth:`save` wrote, checking it as on construction."""
+        """Read what :meth:`save` wrote, checking it as on construction. Raises `NergError` with the file's name."""
         columns, metadata = read_rays_file(path)
-        persons = metadata.pop("persons")
-        return cls(**columns, persons=persons, metadata=metadata, cohorts=metadata.pop("cohorts", ()))
+        persons, cohorts = metadata.pop("persons"), metadata.pop("cohorts", ())
+        try:
+            return cls(**columns, persons=persons, metadata=metadata, cohorts=cohorts)
+        except NergError as error:
+            why = str(error).split(";")[0]
+            raise NergError(f"\"{path}\" is damaged ({why}); copy it again, or make it anew with 'nerg rays import'") from error
 
 
 def _refuse(bad: np.ndarray, what: str, remedy: str) -> None:
     rows = np.flatnonzero(bad)
     if rows.size:
         listed = ", ".join(map(str, rows[:5])) + (", ..." if rows.size > 5 else "")
-        raise ValueError(f"{rows.size} of {bad.size} rays have {what} (rays {listed}); {remedy}")
+        raise NergError(f"{rows.size} of {bad.size} rays have {what} (rays {listed}); {remedy}")

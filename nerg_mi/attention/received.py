@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..transport.observer import ObserverPass, towards
 from ..transport.place import Place
 from ..transport.trace import default_settings
@@ -47,7 +48,7 @@ def patches(mesh, divisions: int = 4) -> Patches:
 
     params = mi.traverse(mesh)
     if "vertex_positions" not in params or "faces" not in params:
-        raise ValueError(f'"{mesh.id()}" is not a mesh; attention is received by meshes (cube, rectangle, ply, obj)')
+        raise NergError(f'"{mesh.id()}" is not a mesh; attention is received by meshes (cube, rectangle, ply, obj)')
     if divisions < 1:
         raise ValueError(f"a triangle is cut into at least 1 piece a side, got divisions={divisions}")
     positions, faces = params["vertex_positions"], mi.UInt32(params["faces"])

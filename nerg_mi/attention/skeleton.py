@@ -11,6 +11,7 @@ from typing import Sequence
 
 import numpy as np
 
+from ..errors import NergError
 from ..formats.skeleton_file import KEYPOINTS, iterate_skeleton
 from .collecting import RaysBuilder
 from .rays import Rays
@@ -49,7 +50,7 @@ def head_poses(
     if keypoints.ndim != 3 or keypoints.shape[1:] != (KEYPOINTS, 3):
         raise ValueError(f"keypoints have shape {keypoints.shape}, expected (N, {KEYPOINTS}, 3)")
     if len({*ears, nose}) != 3 or not all(0 <= k < KEYPOINTS for k in (*ears, nose)):
-        raise ValueError(f"ears {ears} and nose {nose} must be three different keypoints of 0 to {KEYPOINTS - 1}")
+        raise NergError(f"ears {ears} and nose {nose} must be three different keypoints of 0 to {KEYPOINTS - 1}")
     left, right = (keypoints[:, k] for k in ears)
     origin = 0.5 * (left + right)
     offset = keypoints[:, nose] - origin
@@ -122,13 +123,14 @@ def rays_from_skeleton(
     tick: float = 1.0,
     keypoints: Sequence[int] = (LEFT_EAR, RIGHT_EAR, NOSE),
     pitch: float = 0.0,
+    skip_bad_lines: bool = False,
 ) -> Rays:
     """Head-pose rays of skeleton files, one ray a pose.
 
     ``tick``: seconds in one unit of the file's integer time. ``keypoints``: left
     ear, right ear and nose among the 22. ``pitch``: see :func:`head_poses`. Poses without ears
     or nose are dropped; the metadata counts them with the lines they stand on.
-    Raises ``ValueError`` for a broken line (naming it) or when no pose is left.
+    ``skip_bad_lines``: see `RaysBuilder`. Raises `NergError` for a broken line (naming it) or when no pose is left.
     """
     if isinstance(paths, (str, os.PathLike)):
         paths = [paths]
@@ -136,10 +138,11 @@ def rays_from_skeleton(
     builder = RaysBuilder(
         preset="skeleton22", tick=tick, source_frame={"up": "z", "handedness": "right", "units": "m"},
         keypoints=[left, right, nose], pitch=pitch,
+        skip_bad_lines=skip_bad_lines,
     )  # fmt: skip
     for path in paths:
         builder.source(Path(path))
-        for rows in iterate_skeleton(path, keypoints=(left, right, nose)):
+        for rows in iterate_skeleton(path, keypoints=(left, right, nose), on_bad=builder.on_bad):
             origin, direction = head_poses(rows.keypoints, ears=(left, right), nose=nose, pitch=pitch)
             builder.add(rows.times * tick, rows.ids, origin, direction, rows=rows.lines)
     return builder.build()

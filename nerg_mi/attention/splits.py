@@ -11,6 +11,7 @@ from typing import Sequence
 
 import numpy as np
 
+from ..errors import NergError
 from .index import RayIndex
 from .rays import Rays
 
@@ -55,10 +56,10 @@ def split_by_position(
     the training side comes within R of a test centre. A few zones purge far
     less than scattered centres would. The same seed gives the same split.
 
-    Raises ``ValueError`` when the rays hold no such zone or too little is left.
+    Raises `NergError` when the rays hold no such zone or too little is left.
     """
     if zones < 1 or not radius > 0 or not zone_radius > 0:
-        raise ValueError(f"zones {zones}, radius {radius}, zone_radius {zone_radius}: all must be positive")
+        raise NergError(f"zones {zones}, radius {radius}, zone_radius {zone_radius}: all must be positive")
     rng = np.random.default_rng(seed)
     index = RayIndex(rays)
 
@@ -67,7 +68,7 @@ def split_by_position(
     candidates = rays.origin[rng.permutation(len(rays))[:256]]
     candidates = candidates[_enough(index, candidates, radius, min_rays)]
     if len(candidates) < zones:
-        raise ValueError(
+        raise NergError(
             f"only {len(candidates)} of 256 positions have {min_rays} rays within {radius} m; enlarge the radius or lower min_rays"
         )
     chosen = [0]
@@ -92,7 +93,7 @@ def split_by_position(
     near = _distance_to(test_centres, rays.origin)
     train = near > 2.0 * radius
     if train.sum() < min_rays:
-        raise ValueError(f"{train.sum()} rays are left to train on; choose fewer or smaller zones, or a smaller radius")
+        raise NergError(f"{train.sum()} rays are left to train on; choose fewer or smaller zones, or a smaller radius")
     return PositionSplit(train, near <= radius, test_centres, zone_centres, zone)
 
 
@@ -108,21 +109,21 @@ def split_by_person(
     """Hold out people: masks (N,) of training and test rays.
 
     ``test_persons`` by name, or a random ``test_share`` of those who have rays,
-    at least one on each side. Raises ``ValueError`` for an unknown name or when
+    at least one on each side. Raises `NergError` for an unknown name or when
     a side is empty.
     """
     present = np.unique(rays.person)
     if test_persons is not None:
         unknown = [p for p in test_persons if p not in rays.persons]
         if unknown:
-            raise ValueError(f"no person is called {', '.join(map(repr, unknown))}; the persons are {', '.join(rays.persons)}")
+            raise NergError(f"no person is called {', '.join(map(repr, unknown))}; the persons are {', '.join(rays.persons)}")
         held = np.array([rays.persons.index(p) for p in test_persons])
     else:
         count = int(np.clip(round(test_share * len(present)), 1, max(1, len(present) - 1)))
         held = np.random.default_rng(seed).permutation(present)[:count]
     test = np.isin(rays.person, held)
     if test.all() or not test.any():
-        raise ValueError(f"{len(present)} persons cannot be split into training and test; give rays of at least two")
+        raise NergError(f"{len(present)} persons cannot be split into training and test; give rays of at least two")
     return ~test, test
 
 
@@ -134,10 +135,10 @@ def split_by_time(
     Test is the last ``test_share`` of the time from the first ray to the last one, training what lies more than ``gap``
     seconds before it; rays between are on neither side, since gaze repeats itself for seconds. ``of``: ``all``, one cut
     for all (a day of a shop), or ``person``, each person's own time (recordings with clocks of their own). Raises
-    ``ValueError`` when a side is empty.
+    `NergError` when a side is empty.
     """
     if of not in ("all", "person") or not 0 < test_share < 1 or not gap >= 0:
-        raise ValueError(f'of "{of}", test_share {test_share}, gap {gap}: need "all" or "person", a share in (0, 1), a gap >= 0')
+        raise NergError(f'of "{of}", test_share {test_share}, gap {gap}: need "all" or "person", a share in (0, 1), a gap >= 0')
     group = np.zeros(len(rays), np.int64) if of == "all" else rays.person
     first, last = np.full(group.max(initial=0) + 1, np.inf), np.full(group.max(initial=0) + 1, -np.inf)
     np.minimum.at(first, group, rays.t)
@@ -145,7 +146,7 @@ def split_by_time(
     cut = (last - test_share * (last - first))[group]
     train, test = rays.t < cut - gap, rays.t >= cut
     if not train.any() or not test.any():
-        raise ValueError(f"{train.sum()} rays are left to train on and {test.sum()} to test; choose a smaller gap or another share")
+        raise NergError(f"{train.sum()} rays are left to train on and {test.sum()} to test; choose a smaller gap or another share")
     return train, test
 
 
@@ -153,14 +154,14 @@ def both(*splits: PositionSplit | tuple[np.ndarray, np.ndarray]) -> tuple[np.nda
     """Several splits at once: training rays are those of every training side, test rays those of every test side (unseen
     people at unseen places, say). What is on the training side of one and the test side of another is used on neither.
 
-    Raises ``ValueError`` when a side is empty.
+    Raises `NergError` when a side is empty.
     """
     masks = [(s.train, s.test) if isinstance(s, PositionSplit) else s for s in splits]
     if not masks:
         raise ValueError("say how to split: by position, person or time")
     train, test = (np.logical_and.reduce(side) for side in zip(*masks))
     if not train.any() or not test.any():
-        raise ValueError(
+        raise NergError(
             f"together the splits leave {train.sum()} rays to train on and {test.sum()} to test; hold out more of one of them"
         )
     return train, test

@@ -7,6 +7,7 @@ from typing import Sequence
 
 import numpy as np
 
+from ..errors import NergError
 from ..formats.column_map import ColumnMap
 from ..formats.ray_tables import iterate_table
 from . import poses
@@ -35,6 +36,7 @@ def rays_from_table(
     min_confidence: float = 0.0,
     tick: float = 1.0,
     valid: dict[str, Sequence[str]] | None = None,
+    skip_bad_lines: bool = False,
     **about: object,
 ) -> Rays:
     """Rays of CSV or Parquet tables through a column map.
@@ -52,12 +54,12 @@ def rays_from_table(
     a confidence below ``min_confidence`` are dropped; so are rows where a column
     of ``valid`` does not hold one of its words (upper and lower case are one).
     ``tick``: seconds in one unit of the time column; without one, in one row.
-    ``about``: further metadata. Raises ``ValueError`` for missing columns, cells
+    ``skip_bad_lines``: see `RaysBuilder`. ``about``: further metadata. Raises `NergError` for missing columns, cells
     that are no numbers, or when no ray is left.
     """
     columns = ColumnMap.parse(columns) if isinstance(columns, str) else columns
     if person_from not in ("column", "filename"):
-        raise ValueError(f'person_from is "{person_from}"; it is "column" or "filename"')
+        raise NergError(f'person_from is "{person_from}"; it is "column" or "filename"')
     by_file = person_from == "filename" or columns.person is None
     forward = forward or poses.default_forward(up, handedness)
     ahead = poses.axis(forward, "forward")
@@ -68,13 +70,13 @@ def rays_from_table(
 
     frame = {"up": up, "handedness": handedness, "units": units}
     builder = RaysBuilder(
-        transform=to_rays_frame(**frame), columns=str(columns), source_frame=frame, tick=tick, min_confidence=min_confidence,
+        transform=to_rays_frame(**frame), skip_bad_lines=skip_bad_lines, columns=str(columns), source_frame=frame, tick=tick, min_confidence=min_confidence,
         **({"forward": forward} if columns.pose else {}), **({"degrees": degrees} if columns.ypr else {}), **about,
     )  # fmt: skip
     for path in map(Path, paths):
         builder.source(path)
         rows = 0
-        for block in iterate_table(path, numbers, texts):
+        for block in iterate_table(path, numbers, texts, on_bad=builder.on_bad):
             value = dict(zip(numbers, block.numbers.T))
             word = dict(zip(texts, block.texts.T))
             vector = lambda names: np.stack([value[c] for c in names], axis=1)

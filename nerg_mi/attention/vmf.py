@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..errors import NergError
+
 KAPPA_MIN, KAPPA_MAX = 1e-8, 1e8
 
 
@@ -99,7 +101,7 @@ def silverman_kappa(resultant: np.ndarray | float, count: np.ndarray | int) -> n
     """
     count = np.asarray(count)
     if np.any(count < 1):
-        raise ValueError("a bandwidth needs at least one ray; raise min_rays")
+        raise NergError("a bandwidth needs at least one ray; raise min_rays")
     sigma2 = np.where(count == 1, 1.0, 1.0 / kappa_from_resultant(resultant))
     h2 = 1.06**2 * sigma2 * count ** (-0.4)
     return np.clip(1.0 / h2, KAPPA_MIN, KAPPA_MAX)

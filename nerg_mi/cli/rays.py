@@ -6,6 +6,8 @@ from typing import Annotated, List, Optional
 
 import typer
 
+from ..errors import NergError
+
 app = typer.Typer(
     no_args_is_help=True, help="Import tracking files as rays of attention, look at them, choose among them and split them."
 )
@@ -45,14 +47,28 @@ def import_rays(
     keypoints: Annotated[Optional[str], typer.Option(help="skeleton22: left ear, right ear, nose.  [default: 2,13,11]")] = None,
     pitch: Annotated[Optional[float], typer.Option(help="skeleton22: degrees by which rays are turned up.  [default: 0]")] = None,
     marker: Annotated[Optional[float], typer.Option(help="pupil: edge of a tracking marker in metres.")] = None,
+    skip_bad_lines: Annotated[
+        bool, typer.Option("--skip-bad-lines", help="Leave out lines that cannot be read, with an account of them: at most 1 % of a file's.")
+    ] = False,
+    pseudonyms: Annotated[
+        bool, typer.Option("--pseudonyms", help="Replace the names of persons, also in the names of files, by salted hashes.")
+    ] = False,
+    salt: Annotated[
+        Optional[Path],
+        typer.Option(help="--pseudonyms: file of 16 random bytes or more, so that several imports agree.  [default: random, not kept]"),
+    ] = None,
 ) -> None:
     """Convert tracking files to rays: right-handed, z up, metres, seconds."""
     from ..attention import presets
+    from ..attention.pseudonyms import pseudonymise, read_salt
     from ..attention.tables import rays_from_table
 
     _check(output)
+    if salt is not None and not pseudonyms:
+        raise NergError("--salt belongs to --pseudonyms; add it, or leave out --salt")
+    key = None if salt is None else read_salt(salt)
     if (preset is None) == (columns is None):
-        raise ValueError("say what the files are: either --preset NAME or --map COLUMNS")
+        raise NergError("say what the files are: either --preset NAME or --map COLUMNS")
     given = {
         "units": units, "up": up, "hand": hand, "forward": forward, "radians": radians or None, "person_from": person_from,
         "min_confidence": min_confidence, "tick": tick, "pitch": pitch, "marker": marker, "keypoints": keypoints,
@@ -63,18 +79,20 @@ def import_rays(
     if columns is not None:
         foreign = [name for name in ("keypoints", "pitch", "marker") if name in given]
         if foreign:
-            raise ValueError(f"{_options(foreign)} belongs to a preset; leave it out, or give --preset in place of --map")
+            raise NergError(f"{_options(foreign)} belongs to a preset; leave it out, or give --preset in place of --map")
         if given.pop("radians", False):
             given["degrees"] = False
         if "hand" in given:
             given["handedness"] = given.pop("hand")
-        rays = rays_from_table(files, columns, **given)
+        rays = rays_from_table(files, columns, skip_bad_lines=skip_bad_lines, **given)
     else:
         known = presets.preset(preset)
         unused = [name for name in given if name not in known.options]
         if unused:
-            raise ValueError(f"preset {preset} knows its own conventions; leave out {_options(unused)}")
-        rays = known.read(files, **given)
+            raise NergError(f"preset {preset} knows its own conventions; leave out {_options(unused)}")
+        rays = known.read(files, skip_bad_lines=skip_bad_lines, **given)
+    if pseudonyms:
+        rays = pseudonymise(rays, key)
     rays.save(output)
     _card(rays, output)
     typer.echo(f"wrote {output}")
@@ -114,9 +132,9 @@ def filter_rays(
 
     _check(output)
     if fixations not in (None, "ivt", "idt"):
-        raise ValueError(f'--fixations is "{fixations}"; it is ivt or idt')
+        raise NergError(f'--fixations is "{fixations}"; it is ivt or idt')
     if one_ray and fixations is None:
-        raise ValueError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
+        raise NergError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
     data = Rays.load(rays)
     what = {
         "time": None if start is None and end is None else (start, end),
@@ -126,7 +144,7 @@ def filter_rays(
     }  # fmt: skip
     what = {name: value for name, value in what.items() if value is not None}
     if not what and fixations is None and thin is None:
-        raise ValueError("say which rays to keep, for instance with --from, --person, --box, --fixations or --thin (--help lists all)")
+        raise NergError("say which rays to keep, for instance with --from, --person, --box, --fixations or --thin (--help lists all)")
     if what:
         data = _step(data, filters.select_mask(data, **what), "filter", what)
     if fixations is not None:
@@ -171,6 +189,8 @@ def split_rays(
 
     outputs = {side: output.with_name(f"{output.stem}-{side}{output.suffix}") for side in ("train", "test")}
     _check(*outputs.values())
+    import numpy as np
+
     data = Rays.load(rays)
     parts, about = [], {}
     if zones:
@@ -182,12 +202,12 @@ def split_rays(
     if people or person:
         held = splits.split_by_person(data, test_share=people or 0.5, test_persons=person or None, seed=seed)
         parts.append(held)
-        about["person"] = {"test": sorted({data.persons[p] for p in set(data.person[held[1]].tolist())})}
+        about["person"] = {"test": sorted(data.persons[p] for p in np.unique(data.person[held[1]]))}
     if time:
         parts.append(splits.split_by_time(data, test_share=time, gap=gap, of=clock))
         about["time"] = {"share": time, "gap": gap, "of": clock}
     if not parts:
-        raise ValueError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
+        raise NergError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
     train, test = splits.both(*parts)
     typer.echo(f"{train.sum():,} training rays, {test.sum():,} test rays, {(~(train | test)).sum():,} purged of {len(data):,}")
     for side, mask in (("train", train), ("test", test)):
@@ -212,16 +232,16 @@ def plot_rays(
     from ..view.figures import save
 
     if kind not in ("density", "layout"):
-        raise ValueError(f'--kind is "{kind}"; it is density or layout')
+        raise NergError(f'--kind is "{kind}"; it is density or layout')
     check_writable(output, ".png")
     if kind == "density":
         if test is not None:
-            raise ValueError("--test is drawn in the layout; add --kind layout")
+            raise NergError("--test is drawn in the layout; add --kind layout")
         figure = ray_figures.floor_plan(Rays.load(rays), cell)
     else:
         held = None if test is None else Rays.load(test)
         steps = [] if held is None else held.metadata.get("steps", [])
-        where = next((s["by"].get("position", {}) for s in steps if s["step"] == "split"), {})
+        where = next((s["by"].get("position", {}) for s in steps if s["step"] == "split" and isinstance(s.get("by"), dict)), {})
         figure = ray_figures.layout_figure(Rays.load(rays), held, where.get("test_centres"), where.get("radius"))
     save(figure, output)
     typer.echo(f"wrote {output}")
@@ -237,11 +257,12 @@ def _check(*outputs: Path) -> None:
 
 
 def _step(data, mask, step: str, what: dict):
-    """The rays of a mask, with a line that says how many, and a note of it in their metadata."""
+    """The rays of a mask, in the memory of ``data``, with a line that says how many, and a note of it in their metadata."""
     if not mask.any():
-        raise ValueError(f"{step} leaves none of {len(data):,} rays; widen its conditions")
+        raise NergError(f"{step} leaves none of {len(data):,} rays; widen its conditions")
     typer.echo(f"{step}: {mask.sum():,} of {len(data):,} rays")
-    return data.select(mask).noting(step=step, kept=int(mask.sum()), of=len(data), **what)
+    of, kept = len(data), int(mask.sum())
+    return data.keep_in_place(mask).noting(step=step, kept=kept, of=of, **what)
 
 
 def _options(names: list[str]) -> str:
@@ -252,54 +273,69 @@ def _numbers(text: str, what: str) -> list[float]:
     try:
         return [float(v) for v in text.split(",")]
     except ValueError:
-        raise ValueError(f"{what} is numbers with commas between them, got {text!r}") from None
+        raise NergError(f"{what} is numbers with commas between them, got {text!r}") from None
 
 
 def _three_numbers(text: str) -> tuple[int, ...]:
     try:
         left, right, nose = (int(v) for v in text.split(","))
     except ValueError:
-        raise ValueError(f"--keypoints is three numbers: left ear, right ear, nose; got {text!r}") from None
+        raise NergError(f"--keypoints is three numbers: left ear, right ear, nose; got {text!r}") from None
     return left, right, nose
 
 
 def _card(rays, path: Path) -> None:
+    import numpy as np
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
-    from ..attention.summary import summarise
+    from ..attention.summary import GAP, summarise
+    from ..formats.bounded import plain
 
     s = summarise(rays)
-    card = Table(show_header=False, box=None, title=str(path), title_justify="left")
+    # Names come from files: they are neither markup nor control characters of a terminal.
+    safe = lambda text: escape(plain(text, 10_000))
+    card = Table(show_header=False, box=None, title=safe(path), title_justify="left")
+    row = lambda name, text: card.add_row(name, safe(text))
     triple = lambda v: " ".join(f"{x:.2f}" for x in v)
-    card.add_row("rays", f"{s.rays:,} of {s.rows_read:,} rows")
-    there = [rays.persons[p] for p in sorted(set(rays.person.tolist()))]
-    card.add_row("persons", f"{s.persons}: {', '.join(there[:8])}{', ...' if len(there) > 8 else ''}")
+    row("rays", f"{s.rays:,} of {s.rows_read:,} rows")
+    there = [rays.persons[p] for p in np.flatnonzero(np.bincount(rays.person))]
+    row("persons", f"{s.persons}: {', '.join(there[:8])}{', ...' if len(there) > 8 else ''}")
     if s.cohorts:
-        card.add_row("cohorts", ", ".join(f"{name} {count:,}" for name, count in s.cohorts.items()))
-    card.add_row("recorded time", f"{s.duration:,.1f} s at {s.rate:.4g} rays a second")
+        row("cohorts", ", ".join(f"{name} {count:,}" for name, count in s.cohorts.items()))
+    if not np.isfinite(s.rate):
+        recorded = "unknown: no person has rays at two times"
+    elif s.duration == 0:
+        recorded = f"none: each ray of a person comes more than {GAP:g} s after the one before ({s.rate:.4g} rays a second)"
+    else:
+        recorded = f"{s.duration:,.1f} s at {s.rate:.4g} rays a second"
+    row("recorded time", recorded)
     for reason, count in s.dropped.items():
-        card.add_row("dropped", f"{count:,} ({100 * count / max(s.rows_read, 1):.1f} %): {reason}; {_rows(rays, reason)}")
+        row("dropped", f"{count:,} ({100 * count / max(s.rows_read, 1):.1f} %): {reason}; {_rows(rays, reason)}")
     for step in rays.metadata.get("steps", []):
         name = f"{step['step']} {step.get('side', '')}".strip()
-        card.add_row("then", f"{name}: {step['kept']:,} of {step['of']:,} rays kept")
+        row("then", f"{name}: {step['kept']:,} of {step['of']:,} rays kept")
     source = rays.metadata.get("source_frame")
     if source:
-        card.add_row("from", f"{source['up']} up, {source['handedness']}-handed, {source['units']}")
-    card.add_row("origins", f"{triple(s.box_low)} to {triple(s.box_high)} m (right-handed, z up)")
-    card.add_row("eye height", f"{s.eye_height[1]:.2f} m (5 to 95 %: {s.eye_height[0]:.2f} to {s.eye_height[2]:.2f})")
-    card.add_row("speed", f"95 % below {s.speed_p95:.2f} m/s")
+        row("from", f"{source['up']} up, {source['handedness']}-handed, {source['units']}")
+    row("origins", f"{triple(s.box_low)} to {triple(s.box_high)} m (right-handed, z up)")
+    row("eye height", f"{s.eye_height[1]:.2f} m (5 to 95 %: {s.eye_height[0]:.2f} to {s.eye_height[2]:.2f})")
+    row("speed", f"95 % below {s.speed_p95:.2f} m/s" if np.isfinite(s.speed_p95) else "unknown: see recorded time")
     if s.hit_share:
-        card.add_row("hit points", f"{100 * s.hit_share:.1f} % of the rays, median distance {s.hit_distance:.2f} m")
+        row("hit points", f"{100 * s.hit_share:.1f} % of the rays, median distance {s.hit_distance:.2f} m")
     if s.duplicates:
-        card.add_row("duplicates", f"{s.duplicates:,} rays share person and time with another")
+        row("duplicates", f"{s.duplicates:,} rays share person and time with another")
     for warning in s.warnings:
-        card.add_row("[bold]implausible[/bold]", warning)
+        row("[bold]implausible[/bold]", warning)
     Console().print(card)
 
 
 def _rows(rays, reason: str, most: int = 3) -> str:
     """The first lines concerned; all of them stand in the file's metadata."""
-    runs = [(d["file"], a, b) for d in rays.metadata.get("dropped", []) if d["reason"] == reason for a, b in d["rows"]]
-    text = ", ".join(f"{a}" if a == b else f"{a}-{b}" for _, a, b in runs[:most])
-    return f"lines {text}{', ...' if len(runs) > most else ''} of {runs[0][0]}"
+    lost = [d for d in rays.metadata.get("dropped", []) if d["reason"] == reason and d.get("rows")]
+    runs = [run for d in lost for run in d["rows"]]
+    if not runs:
+        return "lines not named"
+    text = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:most])
+    return f"lines {text}{', ...' if len(runs) > most else ''} of {lost[0].get('file', '')}"

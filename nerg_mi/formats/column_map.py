@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+from ..errors import NergError
+
 _COUNTS = {
     "origin": (3,), "direction": (3,), "xyzw": (4,), "wxyz": (4,), "ypr": (2, 3), "matrix": (12, 16), "eye": (3,),
     "hit": (3,), "t": (1,), "person": (1,), "confidence": (1,), "cohort": (1,),
@@ -21,7 +23,7 @@ class ColumnMap:
     """Names of a table's columns. Required: where (``origin``, or in ``matrix``) and whereto (``direction`` or a pose).
 
     A ``direction`` beside a pose is in the head's frame, without one in the table's. Without ``t`` rows are numbered, without
-    ``person`` the file is the person, without ``confidence`` it is one. Raises ``ValueError`` for a map that is incomplete
+    ``person`` the file is the person, without ``confidence`` it is one. Raises `NergError` for a map that is incomplete
     or says one thing twice.
     """
 
@@ -41,18 +43,18 @@ class ColumnMap:
     def __post_init__(self) -> None:
         poses = [p for p in POSES if getattr(self, p)]
         if len(poses) > 1:
-            raise ValueError(f"column map: {' and '.join(poses)} are two poses of one head; keep one of them")
+            raise NergError(f"column map: {' and '.join(poses)} are two poses of one head; keep one of them")
         if self.origin is None and self.matrix is None:
-            raise ValueError("column map: origin is missing; add origin=x,y,z with the names of its columns")
+            raise NergError("column map: origin is missing; add origin=x,y,z with the names of its columns")
         if self.origin is not None and self.matrix is not None:
-            raise ValueError("column map: origin is given twice, since matrix holds it; leave out origin")
+            raise NergError("column map: origin is given twice, since matrix holds it; leave out origin")
         if self.direction is None and not poses:
-            raise ValueError(
+            raise NergError(
                 "column map: direction is missing; add direction=x,y,z with the names of its columns, "
                 "or a pose (xyzw, wxyz, ypr or matrix)"
             )
         if self.eye is not None and not poses:
-            raise ValueError("column map: eye is in the head's frame and needs a pose; add one (xyzw, wxyz, ypr or matrix)")
+            raise NergError("column map: eye is in the head's frame and needs a pose; add one (xyzw, wxyz, ypr or matrix)")
 
     @property
     def pose(self) -> str | None:
@@ -63,19 +65,23 @@ class ColumnMap:
     def parse(cls, text: str) -> ColumnMap:
         """From ``"origin=x,y,z direction=dx,dy,dz t=time ..."``; names with spaces in double quotes.
 
-        Raises ``ValueError`` for an unknown or repeated field, a wrong number of columns, or an incomplete map.
+        Raises `NergError` for an unknown or repeated field, a wrong number of columns, or an incomplete map.
         """
         import shlex
 
+        try:
+            words = shlex.split(text)
+        except ValueError as error:
+            raise NergError(f"column map: {str(error)[:1].lower()}{str(error)[1:]} in {text!r}; close it") from None
         found: dict[str, tuple[str, ...] | str] = {}
-        for word in shlex.split(text):
+        for word in words:
             key, _, value = word.partition("=")
             columns = tuple(c.strip() for c in value.split(",") if c.strip())
             if key not in _COUNTS or key in found:
-                raise ValueError(f"column map: {key!r} is unknown or given twice; use {', '.join(_COUNTS)}, each once")
+                raise NergError(f"column map: {key!r} is unknown or given twice; use {', '.join(_COUNTS)}, each once")
             if len(columns) not in _COUNTS[key]:
                 needed = " or ".join(map(str, _COUNTS[key]))
-                raise ValueError(f"column map: {key} needs {needed} column name(s), got {len(columns)} in {word!r}")
+                raise NergError(f"column map: {key} needs {needed} column name(s), got {len(columns)} in {word!r}")
             found[key] = columns[0] if _COUNTS[key] == (1,) else columns
         return cls(**found)  # type: ignore[arg-type]
 

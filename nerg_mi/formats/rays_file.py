@@ -14,21 +14,28 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import NergError
 from .atomic import replacing
+from .bounded import JSON_BYTES, reading, size_of
+from .inflating import inflated_limit
+from .npy import open_npz
+from .rays_metadata import VERSION, read_metadata
 
-VERSION = 1
 SUFFIXES = (".npz", ".parquet")
 _REQUIRED = ("t", "person", "origin", "direction", "confidence")
 _OPTIONAL = ("hit", "cohort")
 _VECTORS = ("origin", "direction", "hit")
+# Columns of numbers of names; all others are measurements.
+_CODES = ("person", "cohort")
+# Memory of a ray with all columns.
+_BYTES = 96
 
 
 def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], metadata: dict[str, Any]) -> None:
     """Write columns of N rows (``t``, ``person``, ``origin``, ``direction``,
     ``confidence``, optionally ``hit`` and ``cohort``) and JSON-serialisable metadata, whole or not at all.
 
-    Raises ``ValueError`` for another suffix, and ``ImportError`` with the
-    remedy where Parquet is asked for without pyarrow.
+    Raises `NergError` for another suffix, and ``ImportError`` with the remedy where Parquet is asked for without pyarrow.
     """
     document = json.dumps({"version": VERSION, **metadata})
     if _suffix(path) == ".npz":
@@ -52,41 +59,104 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
 def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Columns and metadata as :func:`write_rays_file` took them.
 
-    Raises ``ValueError`` when the file is not one of ours or lacks a column.
+    Numbers of any width are read; other columns are not. Room is made for what the file's bytes warrant, column by column.
+    Raises `NergError` when the file is damaged, is not one of ours, or lacks a column.
     """
     if _suffix(path) == ".npz":
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                columns = {name: archive[name] for name in archive.files}
-        except (zipfile.BadZipFile, ValueError) as error:
-            raise ValueError(f"{path} is not a rays file ({error}); make one with 'nerg rays import'") from error
-        document = str(columns.pop("metadata", ""))
+        columns, document = _read_npz(path)
     else:
-        _, pq = pyarrow_modules()
-        table = pq.read_table(path)
-        document = ((table.schema.metadata or {}).get(b"nerg_mi") or b"").decode()
-        flat = {name: table.column(name).to_numpy() for name in table.column_names}
-        columns = {}
+        columns, document = _read_parquet(path)
+    return columns, read_metadata(document, path)
+
+
+def _read_npz(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]:
+    with open_npz(path, "rays file") as archive:
+        there = {name: archive.about(name) for name in archive.names if name in (*_REQUIRED, *_OPTIONAL)}
+        _check_columns(path, {name: (shape, dtype.kind) for name, (shape, dtype) in there.items()})
+        if "metadata" not in archive:
+            raise _not_ours(path, "it lacks the metadata")
+        shape, dtype = archive.about("metadata")
+        if shape != () or dtype.kind != "U" or dtype.itemsize > 4 * JSON_BYTES:
+            raise _not_ours(path, "its metadata are no text")
+        with reading(path, "rays file"):
+            document = str(archive["metadata"])
+        return {name: archive[name] for name in there}, document
+
+
+def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes]:
+    pa, pq = pyarrow_modules()
+    size = size_of(path, "rays file")
+    with reading(path, "rays file", also=(pa.lib.ArrowException,)), pq.ParquetFile(path) as table:
+        about, schema = table.metadata, table.schema_arrow
+        claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
+        if claimed > inflated_limit(size):
+            raise _not_warranted(path, about.num_rows, size)
+        there = {}
         for name in (*_REQUIRED, *_OPTIONAL):
-            if name in flat:
-                columns[name] = flat[name]
-            elif name in _VECTORS and f"{name}_x" in flat:
-                columns[name] = np.stack([flat[f"{name}_{axis}"] for axis in "xyz"], axis=1)
-    missing = [name for name in _REQUIRED if name not in columns]
-    if missing or not document:
-        raise ValueError(
-            f"{path} is not a rays file (it lacks {', '.join(missing) or 'the metadata'}); make one with 'nerg rays import'"
-        )
-    metadata = json.loads(document)
-    if metadata.pop("version") != VERSION:
-        raise ValueError(f"{path} was written by another version of the format; import the tracking files again")
-    return columns, metadata
+            if all(part in schema.names for part in _parts(name)):
+                kinds = "".join(sorted({_arrow_kind(pa, schema.field(part).type) for part in _parts(name)}))
+                shape = (about.num_rows, 3) if name in _VECTORS else (about.num_rows,)
+                there[name] = shape, {"fi": "f"}.get(kinds, kinds)
+        _check_columns(path, there)
+        document = (schema.metadata or {}).get(b"nerg_mi")
+        if document is None:
+            raise _not_ours(path, "it lacks the metadata")
+        columns = {name: np.empty(shape, np.int64 if name in _CODES else np.float64) for name, (shape, _) in there.items()}
+        at = 0
+        for batch in table.iter_batches(batch_size=1 << 17, columns=[part for name in there for part in _parts(name)]):
+            for name, column in columns.items():
+                for i, part in enumerate(_parts(name)):
+                    values = batch.column(batch.schema.get_field_index(part))
+                    if values.null_count and name in _CODES:
+                        raise _not_ours(path, f'its column "{part}" has cells without a value')
+                    into = column[at : at + batch.num_rows]
+                    (into[:, i] if name in _VECTORS else into)[...] = values.to_numpy(zero_copy_only=False)
+            at += batch.num_rows
+        if at != about.num_rows:
+            raise _not_ours(path, f"it holds {at:,} of the {about.num_rows:,} rays that it claims")
+    return columns, document
+
+
+def _parts(name: str) -> list[str]:
+    """Columns of a Parquet table that hold the column ``name``."""
+    return [f"{name}_{axis}" for axis in "xyz"] if name in _VECTORS else [name]
+
+
+def _arrow_kind(pa: Any, kind: Any) -> str:
+    return "f" if pa.types.is_floating(kind) else "i" if pa.types.is_integer(kind) else "O"
+
+
+def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ...], str]]) -> None:
+    """Raise `NergError` where columns of these shapes and kinds (NumPy's letters) do not make rays, or are more than the
+    file's bytes warrant."""
+    missing = [name for name in _REQUIRED if name not in there]
+    if missing:
+        raise _not_ours(path, f"it lacks {', '.join(missing)}")
+    n = (there["t"][0] or (0,))[0]
+    for name, (shape, kind) in there.items():
+        wanted = (n, 3) if name in _VECTORS else (n,)
+        if shape != wanted:
+            raise _not_ours(path, f"{name} has the shape {shape}, where {wanted} is expected")
+        if kind not in (("i", "u") if name in _CODES else ("f", "i", "u")):
+            raise _not_ours(path, f"{name} is not {'whole numbers' if name in _CODES else 'numbers'}")
+    # Narrow numbers become wide ones, and equal values may be stored once: what counts is the memory that rays take.
+    size = size_of(path, "rays file")
+    if _BYTES * n > inflated_limit(size):
+        raise _not_warranted(path, n, size)
+
+
+def _not_warranted(path: str | os.PathLike, rays: int, size: int) -> NergError:
+    return NergError(f'the rays file "{path}" claims {rays:,} rays, which its {size:,} bytes do not warrant; copy it again')
+
+
+def _not_ours(path: str | os.PathLike, why: str) -> NergError:
+    return NergError(f'"{path}" is not a rays file ({why}); make one with \'nerg rays import\'')
 
 
 def _suffix(path: str | os.PathLike) -> str:
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"{path}: rays are kept as .npz or .parquet; choose a name with one of these endings")
+        raise NergError(f"{path}: rays are kept as .npz or .parquet; choose a name with one of these endings")
     return suffix
 
 

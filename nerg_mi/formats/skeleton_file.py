@@ -18,7 +18,10 @@ from typing import IO, Iterator, NamedTuple, Sequence
 
 import numpy as np
 
+from ..errors import NergError
 from .atomic import replacing
+from .bounded import plain
+from .line_blocks import OnBadLine, line_blocks
 
 KEYPOINTS = 22
 VALUES = 3 * KEYPOINTS
@@ -65,7 +68,7 @@ def write_skeleton(
         )
     for i, name in enumerate(ids):
         if not str(name).strip() or any(c in str(name) for c in "|\r\n"):
-            raise ValueError(f"id {name!r} of pose {i} is empty or holds '|' or a line break; rename the person")
+            raise NergError(f"id {name!r} of pose {i} is empty or holds '|' or a line break; rename the person")
 
     form = ", ".join([f"%.{decimals}f"] * VALUES)
     flat = keypoints.reshape(n, VALUES)
@@ -75,81 +78,91 @@ def write_skeleton(
 
 
 def iterate_skeleton(
-    path: str | os.PathLike, chunk: int = 8192, keypoints: Sequence[int] | None = None
+    path: str | os.PathLike, chunk: int = 8192, keypoints: Sequence[int] | None = None, on_bad: OnBadLine | None = None
 ) -> Iterator[SkeletonRows]:
     """Yield the poses of a file in runs of at most ``chunk`` lines, so that
     memory stays bounded (a day of a store is some 2.6 million lines).
 
     ``keypoints``: which of the 22 are wanted; the others are counted but not
-    converted, and come out NaN. Empty lines are skipped. Raises ``ValueError`` naming file and line for a
-    line that does not follow the format.
+    converted, and come out NaN. Empty lines are skipped. Raises `NergError` for a damaged file and, naming file and line, for
+    a line that does not follow the format; where ``on_bad`` is given, that is told of such lines, which are left out.
     """
-    ids: list[str] = []
-    times: list[int] = []
-    texts: list[str] = []
-    lines: list[int] = []
-    with _read(path) as source:
-        for number, line in enumerate(source, start=1):
+    wanted = range(KEYPOINTS) if keypoints is None else sorted(set(keypoints))
+    columns = [3 * k + i for k in wanted for i in range(3)]
+    number = 0
+    for block in line_blocks(path, "skeleton file", chunk):
+        ids: list[str] = []
+        times: list[int] = []
+        texts: list[str] = []
+        lines: list[int] = []
+        for number, line in enumerate(block, start=number + 1):
             line = line.strip()
             if not line:
                 continue
-            fields = line.split("|")
-            if len(fields) != 3:
-                raise ValueError(
-                    f"{path}, line {number}: {len(fields)} fields separated by '|', expected id|time|[{VALUES} numbers]"
-                )
-            body = fields[2].strip()
-            if not (body.startswith("[") and body.endswith("]")):
-                raise ValueError(f"{path}, line {number}: the keypoints are not enclosed in '[' and ']'")
-            if body.count(",") != VALUES - 1:
-                raise ValueError(
-                    f"{path}, line {number}: {body.count(',') + 1} numbers, "
-                    f"expected {VALUES} ({KEYPOINTS} keypoints of x, y, z)"
-                )
-            try:
-                times.append(int(fields[1]))
-            except ValueError:
-                raise ValueError(f"{path}, line {number}: the time {fields[1]!r} is not an integer") from None
-            ids.append(fields[0].strip())
-            texts.append(body[1:-1])
+            found = _fields(line)
+            if isinstance(found, str):
+                _refuse(path, number, found, on_bad)
+                continue
+            for column, value in zip((ids, times, texts), found):
+                column.append(value)
             lines.append(number)
-            if len(ids) == chunk:
-                yield _rows(path, ids, times, texts, lines, keypoints)
-                ids, times, texts, lines = [], [], [], []
-    if ids:
-        yield _rows(path, ids, times, texts, lines, keypoints)
+        if ids:
+            rows = _rows(path, ids, times, texts, lines, columns, on_bad)
+            if len(rows.ids):
+                yield rows
+
+
+def _fields(line: str) -> tuple[str, int, str] | str:
+    """Id, time and the text of the numbers of a line; or what is wrong with it."""
+    fields = line.split("|")
+    if len(fields) != 3:
+        return f": {len(fields)} fields separated by '|', expected id|time|[{VALUES} numbers]"
+    body = fields[2].strip()
+    if not (body.startswith("[") and body.endswith("]")):
+        return ": the keypoints are not enclosed in '[' and ']'"
+    if body.count(",") != VALUES - 1:
+        return f": {body.count(',') + 1} numbers, expected {VALUES} ({KEYPOINTS} keypoints of x, y, z)"
+    try:
+        time = int(fields[1])
+    except ValueError:
+        return f": the time {plain(fields[1], 40)!r} is not an integer"
+    if not -(1 << 63) <= time < 1 << 63:
+        return f": the time {plain(fields[1], 40)!r} is too large for 64 bits"
+    return fields[0].strip(), time, body[1:-1]
+
+
+def _refuse(path: object, line: int, why: str, on_bad: OnBadLine | None) -> None:
+    if on_bad is None:
+        raise NergError(f"{path}, line {line}{why}; mend or remove the line, or leave such lines out with --skip-bad-lines")
+    on_bad(line, why)
 
 
 def read_skeleton(path: str | os.PathLike) -> SkeletonRows:
     """All poses of a file at once; see :func:`iterate_skeleton` for the errors."""
     runs = list(iterate_skeleton(path))
     if not runs:
-        raise ValueError(f"{path} holds no poses; expected lines id|time|[{VALUES} numbers]")
+        raise NergError(f"{path} holds no poses; expected lines id|time|[{VALUES} numbers]")
     return SkeletonRows(*(np.concatenate(column) for column in zip(*runs)))
 
 
 def _rows(
-    path: object, ids: list[str], times: list[int], texts: list[str], lines: list[int], keypoints: Sequence[int] | None
+    path: object, ids: list[str], times: list[int], texts: list[str], lines: list[int], columns: list[int], on_bad: OnBadLine | None
 ) -> SkeletonRows:
     # One conversion for the whole run; only when it fails is the line searched for.
-    wanted = range(KEYPOINTS) if keypoints is None else sorted(set(keypoints))
-    columns = [3 * k + i for k in wanted for i in range(3)]
+    pick = operator.itemgetter(*columns)
     try:
-        if keypoints is None:
-            found = np.loadtxt(texts, delimiter=",", comments=None, dtype=np.float64, ndmin=2)
-        else:
-            # Faster than loadtxt's usecols, which converts what it leaves out.
-            pick = operator.itemgetter(*columns)
-            words = itertools.chain.from_iterable(pick(text.split(",")) for text in texts)
-            found = np.fromiter(map(float, words), dtype=np.float64, count=len(texts) * len(columns)).reshape(-1, len(columns))
+        found = _numbers(texts, columns, pick)
     except ValueError:
-        for number, text in zip(lines, texts):
-            for word in operator.itemgetter(*columns)(text.split(",")):
-                try:
-                    float(word)
-                except ValueError:
-                    raise ValueError(f"{path}, line {number}: {word.strip()!r} is not a number") from None
-        raise
+        kept = []
+        for i, (line, text) in enumerate(zip(lines, texts)):
+            word = next((w for w in pick(text.split(",")) if not _is_number(w)), None)
+            if word is None:
+                kept.append(i)
+            else:
+                _refuse(path, line, f": {plain(word.strip(), 60)!r} is not a number", on_bad)
+        ids, times, texts, lines = ([column[i] for i in kept] for column in (ids, times, texts, lines))
+        # NumPy knows fewer spellings than Python.
+        found = _numbers(texts, columns, pick, fast=False)
     values = np.full((len(ids), VALUES), np.nan)
     values[:, columns] = found
     return SkeletonRows(
@@ -160,10 +173,20 @@ def _rows(
     )
 
 
-def _read(path: str | os.PathLike) -> IO[str]:
-    if str(path).endswith(".gz"):
-        return gzip.open(path, "rt", encoding="utf-8")
-    return open(path, encoding="utf-8")
+def _numbers(texts: list[str], columns: list[int], pick: operator.itemgetter, fast: bool = True) -> np.ndarray:
+    if fast and len(columns) == VALUES:
+        return np.loadtxt(texts, delimiter=",", comments=None, dtype=np.float64, ndmin=2)
+    # Faster than loadtxt's usecols, which converts what it leaves out.
+    words = itertools.chain.from_iterable(pick(text.split(",")) for text in texts)
+    return np.fromiter(map(float, words), dtype=np.float64, count=len(texts) * len(columns)).reshape(-1, len(columns))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import NergError
 from ..attention.collecting import file_sha256
 from ..attention.rays import Rays
 from ..field.box import Box
@@ -38,7 +39,7 @@ class GazePlace:
             return replace(config, escaped="nearest" if self.kind == "hits" else "constant",
                            geometry="none" if self.kind == "none" else "surface")
         if self.kind == "none":
-            raise ValueError("a gaze field of this recipe needs surfaces; without any geometry only the default recipe trains")
+            raise NergError("a gaze field of this recipe needs surfaces; without any geometry only the default recipe trains")
         return config
 
 
@@ -60,7 +61,7 @@ def place_of_scene(path: Path) -> GazePlace:
     if place.scene is not None:
         bounds.append(place.corners())
     if not bounds:
-        raise ValueError(f'the scene "{path}" has neither shapes nor a field in which people could have looked around')
+        raise NergError(f'the scene "{path}" has neither shapes nor a field in which people could have looked around')
     lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
     # A plane has no thickness, and a field needs some.
     pad = 0.01 * max(upper - lower)

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.attention import headsets
 from nerg_mi.attention.presets import PRESETS, preset
+from nerg_mi.errors import NergError
 
 TURN = Rotation.from_euler("YX", [90, 30], degrees=True)  # of Unity: to the right, then down
 
@@ -120,3 +121,15 @@ def test_pupil(tmp_path):
 
 def test_every_preset_says_what_it_reads():
     assert all(p.summary and callable(p.read) for p in PRESETS.values())
+
+
+def test_a_vector_that_is_cut_off(tmp_path):
+    """Of Varjo's cells: told by line and column, or left out and counted."""
+    head = "CaptureTime;HMDPosition;HMDRotation;CombinedGazePosition;CombinedGazeForward;GazeStatus\n"
+    row = "{};(0, 1.6, 0);(0, 0, 0, 1);(0, 0, 0);(0, 0, 1);VALID\n"
+    path = tmp_path / "ann.csv"
+    path.write_text(head + "1;(0, 1.6;(0, 0, 0, 1);(0, 0;(0, 0, 1);VALID\n" + "".join(row.format(i * 10**7) for i in range(5)))
+    with pytest.raises(NergError, match="line 2, column 'HMDPosition'.*--skip-bad-lines"):
+        headsets.varjo([path])
+    rays = headsets.varjo([path], skip_bad_lines=True)
+    assert len(rays) == 5 and rays.t[0] == 0 and rays.metadata["dropped"][0]["rows"] == [[2, 2]] and rays.metadata["rows_read"] == 6

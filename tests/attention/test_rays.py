@@ -72,3 +72,18 @@ def test_builder_with_nothing_left(tmp_path):
     builder.add(np.zeros(2), "ann", np.zeros((2, 3)), np.zeros((2, 3)), rows=np.arange(2))
     with pytest.raises(ValueError, match="no ray is left of 2 rows .*direction is zero"):
         builder.build()
+
+
+def test_kept_in_place():
+    """The same rays as selected, in the memory of all of them."""
+    rng = np.random.default_rng(0)
+    n = 700_000  # more than are moved at a time
+    d = np.tile([1.0, 0, 0], (n, 1))
+    rays = Rays(rng.random(n), rng.integers(0, 3, n), tuple("abc"), rng.random((n, 3)), d, rng.random(n), rng.random((n, 3)))
+    mask = rng.random(n) < 0.6
+    want = rays.select(mask)
+    kept = rays.keep_in_place(mask)
+    for name in ("t", "person", "origin", "direction", "confidence", "hit"):
+        assert np.array_equal(getattr(kept, name), getattr(want, name))
+        assert np.shares_memory(getattr(kept, name), getattr(rays, name))
+    assert kept.cohort is None and len(kept) == mask.sum()

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.formats import ray_tables
 from nerg_mi.formats.ray_tables import iterate_table, table_columns
 
@@ -25,7 +26,7 @@ def test_blocks_keep_line_numbers(tmp_path, monkeypatch):
     path = tmp_path / "t.csv"
     path.write_text("a,b\n" + "".join(f"{i},{-i}\n" for i in range(10)))
     blocks = read(path, ["a"])
-    assert [len(b.lines) for b in blocks] == [4, 4, 2] and blocks[-1].lines[-1] == 11
+    assert [len(b.lines) for b in blocks] == [3, 4, 3] and blocks[-1].lines[-1] == 11
     assert np.array_equal(np.concatenate([b.numbers for b in blocks])[:, 0], np.arange(10))
 
 
@@ -75,3 +76,71 @@ def test_with_and_without_pyarrow(tmp_path, monkeypatch):
     slow = read(path, ["b", "a"], ["who"])
     assert used and np.array_equal(fast[0].numbers, slow[0].numbers, equal_nan=True) and np.isinf(fast[0].numbers[11, 0])
     assert np.array_equal(fast[0].texts, slow[0].texts) and np.array_equal(fast[0].lines, slow[0].lines) and fast[0].lines[21] == 24
+
+
+BAD = ["1,x\n", "1\n", "nonsense\n", '"1,2\n', "1,2e\n", "\x00\n", "1,1 2\n"]
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("fast", [True, False])
+def test_bad_lines_are_told_and_left_out(tmp_path, monkeypatch, bad, fast):
+    if not fast:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda *a: None)
+    path, told = tmp_path / "t.csv", []
+    path.write_text("a,b\n" + "".join(f"{i},{i}\n" for i in range(5)) + bad + "7,7\n")
+    (block,) = iterate_table(path, ["a", "b"], on_bad=lambda line, why: told.append((line, why)))
+    assert block.numbers[:, 0].tolist() == [0, 1, 2, 3, 4, 7] and block.lines.tolist() == [2, 3, 4, 5, 6, 8]
+    assert [line for line, _ in told] == [7]
+    with pytest.raises(NergError, match="t.csv, line 7[:,].*--skip-bad-lines"):
+        read(path, ["a", "b"])
+
+
+def test_a_bad_line_among_texts(tmp_path):
+    """Texts and numbers of the other lines stay beside each other."""
+    path, told = tmp_path / "t.csv", []
+    path.write_text("who,a\nann,1\nbo\ncy,3\n")
+    (block,) = iterate_table(path, ["a"], ["who"], on_bad=lambda line, why: told.append(line))
+    assert block.texts[:, 0].tolist() == ["ann", "cy"] and block.numbers[:, 0].tolist() == [1, 3] and told == [3]
+    path.write_text("a,who\n1,ann\n2\n3,cy\n")
+    with pytest.raises(NergError, match="line 3: 1 cells"):
+        read(path, ["a"], ["who"])
+
+
+def test_damaged_tables_are_one_sentence(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("")
+    with pytest.raises(NergError, match="no column a; its columns are none"):
+        read(path, ["a"])
+    path.write_text("," * (ray_tables.COLUMNS + 1) + "\n")
+    with pytest.raises(NergError, match="columns that are read"):
+        table_columns(path)
+    path.write_text("a" * 200_000 + ",b\n1,2\n")
+    with pytest.raises(NergError, match="no header"):
+        read(path, ["b"])
+    for name in ("absent.csv", "absent.parquet"):
+        with pytest.raises(NergError, match=name):
+            read(tmp_path / name, ["a"])
+
+
+def test_damaged_parquet_tables(tmp_path):
+    pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
+    import pyarrow.parquet as pq
+
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.table({"a": np.arange(500.0), "who": ["x"] * 500}), path)
+    data, rng = path.read_bytes(), np.random.default_rng(0)
+    with pytest.raises(NergError, match="'who'.* holds no numbers"):
+        read(path, ["who"])
+    for at in rng.integers(0, len(data), 60).tolist():
+        for hurt in (data[:at], data[:at] + bytes([data[at] ^ 0x10]) + data[at + 1 :]):
+            path.write_bytes(hurt)
+            try:
+                read(path, ["a"], ["who"])
+            except NergError as error:
+                assert "t.parquet" in str(error)
+    pq.write_table(pa.Table.from_arrays([pa.array([1.0]), pa.array([2.0])], names=["a", "a"]), path)
+    with pytest.raises(NergError, match="several columns called 'a'"):
+        read(path, ["a"])
+    pq.write_table(pa.table({"a": pa.array(np.zeros(20_000_000, np.int8))}), path)
+    with pytest.raises(NergError, match="20,000,000 rows, which its .* bytes do not warrant"):
+        read(path, ["a"])

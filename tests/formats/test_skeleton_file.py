@@ -3,6 +3,7 @@ import gzip
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.formats.skeleton_file import iterate_skeleton, read_skeleton, write_skeleton
 
 
@@ -74,3 +75,26 @@ def test_reads_gzip_of_others(tmp_path):
     with gzip.open(path, "wt") as out:
         out.write("a|1|[" + ", ".join(["1.5"] * 66) + "]\n")
     assert read_skeleton(path).keypoints.shape == (1, 22, 3)
+
+
+def test_bad_lines_are_told_and_left_out(tmp_path, poses):
+    path, told = tmp_path / "day.csv", []
+    write_skeleton(path, *poses)
+    good = path.read_text().splitlines(keepends=True)
+    zeros = ", ".join(["0"] * 65)
+    bad = [f"a|1|[{zeros}, x]\n", "a|1\n", f"a|1.5|[{zeros}, 0]\n", f"a|{1 << 63}|[{zeros}, 0]\n", f"a|1|{zeros}, 0\n", good[0][:300]]
+    path.write_text("".join(line for pair in zip(good, [*bad[:-1], "", ""]) for line in pair) + bad[-1])
+    for keypoints in (None, (21, 2, 13)):
+        told.clear()
+        (rows,) = iterate_skeleton(path, keypoints=keypoints, on_bad=lambda line, why: told.append(line))
+        assert list(rows.ids) == poses[0] and rows.lines.tolist() == [1, 3, 5, 7, 9, 11, 12] and sorted(told) == [2, 4, 6, 8, 10, 13]
+    with pytest.raises(NergError, match="line 4: 2 fields.*--skip-bad-lines"):
+        read_skeleton(path)
+
+
+@pytest.mark.parametrize("keypoints", [None, (0, 1, 2)])
+def test_numbers_that_only_python_spells_so(tmp_path, keypoints):
+    path = tmp_path / "day.csv"
+    path.write_text("a|1|[" + ", ".join(["1_0"] * 66) + "]\n")
+    (rows,) = iterate_skeleton(path, keypoints=keypoints)
+    assert rows.keypoints[0, 0].tolist() == [10, 10, 10]
