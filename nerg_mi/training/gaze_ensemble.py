@@ -17,7 +17,7 @@ from ..errors import NergError
 from ..field.gaze_ensemble import GazeEnsemble
 from ..formats.checkpoint import read_checkpoint
 from ..formats.fields import load_gaze, save_gaze
-from .gaze_run import GazeProgress, support_of, train_gaze
+from .gaze_run import GazeProgress, identity, support_of, train_gaze
 from .gaze_settings import GazeSettings, ProbeSettings
 from .gaze_state import KIND as RUN
 from .run_state import kept_unless, require_same
@@ -87,18 +87,19 @@ def train_ensemble(
     fields, each = [], []
     for k, part in enumerate(parts):
         mine, same = replace(settings, seed=settings.seed + 100 * k), {**(about or {}), "member": [k, members]}
+        # All that a state of the run compares, of the rays that the resamples are drawn from.
+        whole = identity(rays, (), mine, probes, config, box, align, same)
         say = lambda s, k=k: on_progress and on_progress(GazeProgress(f"{k + 1}/{members} {s.stage}", (k + s.done) / members, s.steps, s.seconds, s.scores))
         if resume and part.is_file():
             field, meta = load_gaze(part, ns)
             done = meta["provenance"]
-            require_same(part, done["about"], {**same, "settings": mine.to_dict(), "probes": probes.to_dict()})
+            require_same(part, done["about"], whole)
             done = done["trained"]
             if state.is_file() and read_checkpoint(state, RUN)[1]["about"].get("member") == same["member"]:
                 # Killed between the writing of the member and the removal of its state.
                 state.unlink()
         else:
-            about_part = {**same, "settings": mine.to_dict(), "probes": probes.to_dict()}
-            keep = None if part is None else _keeper(part, about_part)
+            keep = None if part is None else _keeper(part, whole)
             field, done = train_gaze(resample(rays, (settings.seed, k)), medium, box, config, mine, probes, ns, align, say, initial, state=state,
                                      resume=resume and state.is_file(), save_every=save_every, about=same, write=keep)
             if done["interrupted"]:

@@ -114,11 +114,7 @@ def train_gaze(
     """
     say = on_progress or (lambda state: None)
     started = time.perf_counter()
-    same = {
-        **(about or {}), "rays": None if rays is None else digest(rays), "views": digest_views(views),
-        "settings": settings.to_dict(), "probes": probes.to_dict(), "architecture": config.to_dict(),
-        "box": box.to_dict(), "align": None if align is None else align.matrix.tolist(),
-    }  # fmt: skip
+    same = identity(rays, views, settings, probes, config, box, align, about)
     file = GazeRunFile(state, same, save_every, resume)
     say(GazeProgress("probes", 0.0, 0, 0.0, None))
     learn, seen, watched, held = rays, views, None, 0
@@ -179,6 +175,16 @@ def train_gaze(
         with kept_unless(state, keep, done=not interrupted):
             write(result, provenance)
     return result, provenance
+
+
+def identity(rays: Rays | None, views, settings: GazeSettings, probes: ProbeSettings, config, box: Box, align: Similarity | None,
+             about: dict | None) -> dict:
+    """What a run must agree on to be resumed (JSON): of two runs that differ in any of it, neither goes on with the other's state."""
+    return {
+        **(about or {}), "rays": None if rays is None else digest(rays), "views": digest_views(views),
+        "settings": settings.to_dict(), "probes": probes.to_dict(), "architecture": config.to_dict(),
+        "box": box.to_dict(), "align": None if align is None else align.matrix.tolist(),
+    }  # fmt: skip
 
 
 def support_of(rays: Rays, radius: float, align: Similarity | None = None) -> RaySupport:

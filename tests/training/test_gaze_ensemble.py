@@ -8,10 +8,12 @@ import pytest
 
 from nerg_mi.attention.rays import Rays
 from nerg_mi.errors import NergError
+from nerg_mi.field.box import Box
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.fields import _dump, load_gaze
 from nerg_mi.training.gaze_ensemble import blocks_of, resample, train_ensemble
 from nerg_mi.training.gaze_run import train_gaze
+from nerg_mi.transport.media import Similarity
 from .test_gaze import BOX, looking_at
 from .test_gaze_state import LIKELIHOOD, LOG, PROBES, threads  # noqa: F401  (fixture)
 
@@ -101,6 +103,29 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):  # noqa: F811
     expected = arrays(together()[0])
     for name, value in arrays(got).items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
+
+
+@pytest.mark.parametrize("change, said", [
+    ({"config": replace(PLACE, width=8)}, "architecture"), ({"config": replace(PLACE, variant="emit")}, "architecture"),
+    ({"box": Box((-3, -3, 0), (3, 3, 3))}, "box"), ({"rays": crowd(people=7)}, "rays"), ({"settings": replace(SHORT, steps=5)}, "settings"),
+    ({"align": Similarity([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}, "align"),
+])  # fmt: skip
+def test_members_of_another_run_are_refused(tmp_path, change, said):
+    """Finished members count as members only of the run that they are of: of another architecture they would be averaged with it."""
+    path, run = tmp_path / "a.run", {"rays": crowd(), "box": BOX, "config": PLACE, "settings": SHORT, "align": None}
+    train = lambda **more: train_ensemble(2, more["rays"], None, more["box"], more["config"], more["settings"], PROBES, ns, more["align"],
+                                          state=path, resume="stop" not in more, on_progress=more.get("stop"))
+
+    def stop(state):
+        if state.stage == "2/2 fit":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(**run, stop=stop)
+    assert (tmp_path / "a.member0.safetensors").is_file()
+    with pytest.raises(NergError, match=f"a.member0.safetensors.*started with other .*{said}"):
+        train(**{**run, **change})
+    assert (tmp_path / "a.member0.safetensors").is_file()
 
 
 def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):  # noqa: F811
