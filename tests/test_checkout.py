@@ -1,0 +1,70 @@
+"""A checkout that nobody has installed: everything of it is found from its root, and by PYTHONPATH from elsewhere."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy
+import pytest
+
+from nerg_mi import checkout
+from tests.conftest import ROOT
+
+# Where the dependencies are: without the site module nothing of that folder's .pth files, and so no editable installation, counts.
+SITE = Path(numpy.__file__).parents[1]
+
+
+def uninstalled(code: str, folder: Path, **environment):
+    """Run ``code`` in ``folder`` by a Python that knows the dependencies, and no installation of the package."""
+    begin = f"import sys\nsys.path.append({str(SITE)!r})\nassert not any('editable' in repr(f).lower() for f in sys.meta_path)\n"
+    kept = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    return subprocess.run([sys.executable, "-S", "-c", begin + textwrap.dedent(code)], cwd=folder, env=kept | environment,
+                          capture_output=True, text=True, timeout=300)  # fmt: skip
+
+
+USE = """
+    import nerg_mi, mitsuba as mi
+    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant("llvm_ad_mono")
+    mi.set_variant("llvm_ad_rgb")
+    print(type(mi.load_dict({"type": "nerg", "density": {"type": "constvolume"}})).__name__)
+    from nerg_mi.scenes.store import layout
+    from nerg_mi.plugins import nerg
+    print(nerg.__file__, layout.__file__)
+"""
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test01_plugins_and_scenes_are_found(tmp_path, elsewhere):
+    done = uninstalled(USE, tmp_path, PYTHONPATH=str(ROOT)) if elsewhere else uninstalled(USE, ROOT)
+    assert done.returncode == 0, done.stderr
+    kind, files = done.stdout.strip().splitlines()[-2:]
+    assert kind == "NergIntegrator"
+    assert files.split() == [str(ROOT / "plugins" / "nerg.py"), str(ROOT / "scenes" / "store" / "layout.py")]
+
+
+def test02_nothing_else_becomes_part_of_the_package():
+    done = uninstalled("import nerg_mi\ntry:\n    import nerg_mi.tests\nexcept ModuleNotFoundError as e:\n    print(e)", ROOT)
+    assert "No module named 'nerg_mi.tests'" in done.stdout, done.stderr
+
+
+def test03_an_installation_is_left_alone():
+    """Where something else finds the plugins, as here, or where they lie in the package, no finder is added."""
+    code = "import nerg_mi, importlib, sys; importlib.reload(nerg_mi); print(sum(type(f).__name__ == 'Beside' for f in sys.meta_path))"
+    here = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/")
+    assert here.stdout.strip() == "0", here.stderr
+    assert uninstalled(code, ROOT).stdout.strip() == "1"
+
+
+def test04_a_package_without_its_folders_stays_without(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
+    before = len(sys.meta_path)
+    (tmp_path / "lonely").mkdir()
+    (tmp_path / "lonely" / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    checkout.find_folders("lonely", tmp_path / "lonely")
+    assert len(sys.meta_path) == before
