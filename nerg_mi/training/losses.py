@@ -30,13 +30,13 @@ def color_loss(color, opacity, pixels: PixelBatch, background, delta: float):
     return loss / 3
 
 
-def depth_loss(weight, tau, samples: Samples, pixels: PixelBatch, margin: float, scale: float):
+def depth_loss(weight, tau, samples: Samples, pixels: PixelBatch, margin: float, scale):
     """Loss a ray of the absorption's place against the true depth; 0 where that is unknown.
 
     Two terms: the share of the light that is not absorbed within ``margin`` (scene units) of the true
     surface, or within the step that holds it (line-of-sight supervision, Rematas et al. 2022, with a
     box for its Gaussian), which forbids fog, holes and floaters alike; and the distance of the expected
-    depth from the true one, in units of ``scale``, which places the surface within the step.
+    depth from the true one, in units of ``scale`` (a number or a Float), which places the surface within the step.
     """
     s = samples.segments
     Float = type(weight)

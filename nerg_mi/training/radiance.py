@@ -14,6 +14,7 @@ import numpy as np
 from drjit.opt import Adam
 
 from ..capture.images import View
+from ..field.backend import aligned
 from ..field.box import Box
 from ..field.hashgrid import HashGrid
 from ..field.radiance import RadianceConfig, RadianceField
@@ -21,16 +22,20 @@ from .compositing import damp_near, weights
 from .density_grid import DensityGrid
 from .losses import color_loss, composite, depth_loss, distortion_loss, feature_decay
 from .model import density, density_color, density_of
+from .pace import adapted_rays, affordable_rays, refined
 from .pixels import PixelBank
 from .preview import Preview, psnr, render_view
 from .sampling import StepTable, Thinning, rays_in_box, visible_samples
 from .settings import RadianceSettings
+from .settling import Settling
+from .step_clock import StepClock
 
 # The average is taken of every fourth step.
 _AVERAGE_EVERY = 4
-_MAX_RAYS = 2**14
-# Training rays that decide, at the end, which cells matter.
-_LOOKS, _LOOK_RAYS = 64, 2**12
+# Training rays that decide, at the end, which cells matter, and their samples at most: in fog each ray has hundreds.
+_LOOKS, _LOOK_RAYS, _LOOK_SAMPLES = 64, 2**12, 2**25
+# Steps of rays that the marching kernel goes through, in batches: they cost a fiftieth of a sample of the density pass.
+_CANDIDATES = 128
 # Rays whose depth loss exceeds this are drawn again; so many are kept.
 _WRONG, _HARD = 0.3, 2**14
 
@@ -48,7 +53,7 @@ class RadianceTrainer:
         if not views:
             raise ValueError("there are no pictures to train on")
         self.config, self.settings, self.box, self.ns = config, settings, box, ns
-        self.rng = np.random.default_rng(settings.seed)
+        self.rng, self.clock = np.random.default_rng(settings.seed), StepClock()
         self.pixels = PixelBank(ns, views)
         self.use_depth = depth and self.pixels.has_depth
         self.live = RadianceField.random(config, box, ns, settings.seed)
@@ -63,13 +68,18 @@ class RadianceTrainer:
             self.grid.carve(self.pixels.surface_points())
         self.grid.update(self.density, self.rng, everywhere=True)
         self._tables: dict[int, StepTable] = {}
-        self.settled, self.hard, self.misplaced = False, np.zeros(0, np.uint32), None
+        self.settling = Settling(self.grid)
+        self.hard, self.misplaced = np.zeros(0, np.uint32), None
         self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
+        # Of the marching: how many times coarser than `march_step`, and samples a ray of the last density-only pass.
+        self.stride, self.looked = 1 if self.carved else max(settings.strides, default=1), 0.0
         self._started = time.perf_counter()
 
-    def restore(self, steps: int, rays: int, samples: int, seconds: float, settled: bool, hard: np.ndarray) -> None:
-        """Go on from stored numbers; see ``run_state``."""
-        self.steps, self.rays, self.samples, self.settled, self.hard = steps, rays, samples, settled, hard
+    def restore(self, seconds: float, hard: np.ndarray, **numbers) -> None:
+        """Go on from stored numbers (of the attributes of these names); see ``run_state``."""
+        self.hard = hard
+        for name, value in numbers.items():
+            setattr(self, name, value)
         self._started = time.perf_counter() - seconds
 
     @property
@@ -99,11 +109,13 @@ class RadianceTrainer:
 
     def density(self, p, active):
         """Current density at world points, without gradient."""
+        self.clock.count(dr.width(p))
         with dr.suspend_grad():
             return self.live.density(p, active)
 
     def _look(self, p, active):
         """Density at ``p`` for the choice of samples, and the grid's features, which need no second look-up."""
+        self.clock.count(dr.width(p))
         now = {k: dr.detach(v) for k, v in self._parameters().items()}
         features = HashGrid(self.config.grid, now["grid.table"]).by_level(self.box.to_unit(p), active)
         return density_of(self.config, now, features), features
@@ -113,31 +125,51 @@ class RadianceTrainer:
 
     def step(self) -> None:
         """Draw rays, march, composite, and move the weights once."""
-        s, ns = self.settings, self.ns
-        if self.steps % s.grid_every == 0 and self.steps > 0:
-            self.live.set_parameters({k: dr.detach(v) for k, v in self._parameters().items()})
-            if not self.settled and self.progress >= s.settle:
-                with dr.suspend_grad():
-                    self.grid.settle(self.density, self.rng, self._lit)
-                self.settled = True
-            self.grid.update(self.density, self.rng)
+        with self.clock:
+            self._step()
+
+    def _step(self) -> None:
+        s, ns, most = self.settings, self.ns, self.settings.most_looked
+        self._keep_grid()
+        self._refine()
+        table = self.table(self.stride)
+        self.rays = affordable_rays(self.rays, self.looked, table.steps, most, _CANDIDATES * s.batch)
         index = self._draw()
-        pixels = self.pixels.batch(ns.UInt32(index))
+        pixels = self.pixels.batch(ns.UInt32(aligned(index, np.uint32)))
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
-        offset = ns.Float(self.rng.random(self.rays, np.float32))
-        stride = 1 if self.carved else s.stride(self.progress)
+        offset = ns.Float(aligned(self.rng.random(self.rays, np.float32)))
         thinning = Thinning(s.thin_sure, s.thin_least, int(self.rng.integers(2**63))) if s.thin_least < 1 else None
-        samples, covered = visible_samples(rays, self.table(stride), offset, self.grid.occupied, self._look,
-                                           s.stop, s.batch, thinning)
+        samples, covered = visible_samples(rays, table, offset, self.grid.occupied, self._look, s.stop, s.batch, thinning, most)
         self.steps += 1
         if samples is None:
-            self._adapt(0)
+            self.rays = adapted_rays(self.rays, 0, 0, s.batch, most)
             return
-        background = ns.Array3f(*[ns.Float(self.rng.random(self.rays, np.float32)) for _ in range(3)])
-        self._descend(samples, pixels, background, covered, stride)
+        background = ns.Array3f(*[ns.Float(aligned(self.rng.random(self.rays, np.float32))) for _ in range(3)])
+        self._descend(samples, pixels, background, covered, self.stride)
         if self.use_depth:
             self._remember(index[:covered])
-        self._adapt(samples.count / covered)
+        self.looked = samples.looked
+        self.rays = adapted_rays(self.rays, samples.count / covered, self.looked, s.batch, most)
+
+    def _keep_grid(self) -> None:
+        """Look over a part of the density grid if it is time to, and find a piece of what rendering will visit."""
+        s = self.settings
+        settling = self.progress >= s.settle and not self.settling.done
+        due = self.steps % s.grid_every == 0 and self.steps > 0
+        if settling or due:
+            self.live.set_parameters({k: dr.detach(v) for k, v in self._parameters().items()})
+        if settling:
+            with dr.suspend_grad():
+                self.settling.advance(self.density, self._lit_by_a_few, s.seed)
+        if due:
+            self.grid.update(self.density, self.rng)
+
+    def _refine(self) -> None:
+        """March finer if it is time to and what is cleared allows it."""
+        s = self.settings
+        waits = self.progress < 2 * s.stride_share
+        stride = refined(self.stride, s.strides, s.stride(self.progress), self.looked, s.most_looked, waits)
+        self.looked, self.stride = self.looked * self.stride / stride, stride
 
     def _draw(self) -> np.ndarray:
         """Indices of the pixels of a batch: at random, a share of them from those whose depth was wrong before."""
@@ -159,18 +191,21 @@ class RadianceTrainer:
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
         parameters = self._parameters()
         sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns, samples.features)
-        reach = s.damped_within(self.progress) * self.box.side
-        if reach > 0:
+        if s.reach > 0:
+            # Never 0, and never left out: that would compile other kernels in the middle of the run.
+            reach = max(s.damped_within(self.progress), 1e-6) * self.box.side
             sigma, *rgb = damp_near([sigma, *rgb], samples.t, dr.opaque(ns.Float, reach))
         # Now: each sum along the rays would evaluate the networks again.
         dr.eval(sigma, rgb)
+        self.clock.count(s.batch)
         weight, tau, color, opacity = composite(sigma, rgb, samples)
         loss = color_loss(color, opacity, pixels, background, s.huber)
         if self.use_depth:
             # In units of the step at hand: while marching is coarse, no more can be asked for.
-            placed = depth_loss(weight, tau, samples, pixels, s.depth_margin * self.march_step, stride * self.march_step)
+            unit = dr.opaque(ns.Float, stride * self.march_step)
+            placed = depth_loss(weight, tau, samples, pixels, s.depth_margin * self.march_step, unit)
             # Places first, colours later: once surfaces stand, colour has more to say.
-            loss += s.depth_weight * s.final_depth ** self.progress * placed
+            loss += dr.opaque(ns.Float, s.depth_weight * s.final_depth ** self.progress) * placed
             self.misplaced = dr.detach(placed)
         if s.distortion_weight > 0:
             loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
@@ -183,8 +218,10 @@ class RadianceTrainer:
         if self.steps % _AVERAGE_EVERY == 0:
             # A short memory at first: the start of a run is not worth remembering.
             decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** _AVERAGE_EVERY
+            # As a literal it would compile a kernel each time.
+            part = dr.opaque(ns.Float, 1 - decay)
             for k, old in self.averaged.items():
-                self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * (1 - decay)
+                self.averaged[k] = type(old)(old + (dr.detach(self.optimiser[k]) - old) * part)
             dr.eval(self.averaged)
 
     def _clear(self, parameters: dict):
@@ -197,29 +234,38 @@ class RadianceTrainer:
         p = self.grid.empty_points(s.batch // 16, self.rng)
         if p is None or s.empty_weight == 0:
             return 0
+        self.clock.count(dr.width(p))
         cell = self.box.side / s.resolution
         sigma = density(self.config, self.box, parameters, p, self.ns)
         return s.empty_weight * dr.mean(dr.log(1 + sigma * cell))
 
     def _lit(self, density, occupied):
         """Points (Array3f) of the samples that give a training ray more than a thousandth of its light."""
-        s, ns = self.settings, self.ns
-        rng = np.random.default_rng(s.seed)
+        rng, looked = np.random.default_rng(self.settings.seed), 0
         for _ in range(min(_LOOKS, -(-self.pixels.size // _LOOK_RAYS))):
-            pixels = self.pixels.batch(ns.UInt32(rng.integers(0, self.pixels.size, _LOOK_RAYS, np.uint32)))
-            rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
-            offset = ns.Float(rng.random(_LOOK_RAYS, np.float32))
-            samples, _ = visible_samples(rays, self.table(), offset, occupied, density, s.stop)
+            samples, p = self._lit_points(density, occupied, rng, _LOOK_RAYS)
             if samples is not None:
-                weight = weights(density(samples.p, True) * samples.length, samples.segments)
-                yield dr.gather(ns.Array3f, samples.p, dr.compress(weight > 1e-3))
+                looked += samples.looked * _LOOK_RAYS
+                yield p
+            if looked > _LOOK_SAMPLES:
+                break
 
-    def _adapt(self, samples_a_ray: float) -> None:
-        """Choose the number of rays that will fill a batch."""
-        wanted = 0.95 * self.settings.batch / max(samples_a_ray, 1e-3)
-        # Damped, because a batch of few rays is a noisy estimate.
-        rays = min(max(0.5 * (self.rays + wanted), self.rays / 2), 2 * self.rays)
-        self.rays = int(np.clip(rays, 64, _MAX_RAYS))
+    def _lit_by_a_few(self, density, occupied, rng: np.random.Generator):
+        """Such points, or None, of as many rays as a step may take."""
+        most = self.settings.most_looked
+        rays = affordable_rays(_LOOK_RAYS, self.looked * self.stride, self.table().steps, most, _CANDIDATES * self.settings.batch)
+        return self._lit_points(density, occupied, rng, rays, most)[1]
+
+    def _lit_points(self, density, occupied, rng: np.random.Generator, count: int, most: int | None = None) -> tuple:
+        s, ns = self.settings, self.ns
+        pixels = self.pixels.batch(ns.UInt32(aligned(rng.integers(0, self.pixels.size, count, np.uint32), np.uint32)))
+        rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
+        offset = ns.Float(aligned(rng.random(count, np.float32)))
+        samples, _ = visible_samples(rays, self.table(), offset, occupied, density, s.stop, most=most)
+        if samples is None:
+            return None, None
+        weight = weights(density(samples.p, True) * samples.length, samples.segments)
+        return samples, dr.gather(ns.Array3f, samples.p, dr.compress(weight > 1e-3))
 
     def measure(self, views: list[View], every: int = 1, field: RadianceField | None = None) -> list[float]:
         """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel of those that their masks leave in.

@@ -19,6 +19,7 @@ from ..formats.checkpoint import read_checkpoint, write_checkpoint
 
 KIND = "radiance run"
 _GRID = ("value", "bits", "seen", "always")
+_NUMBERS = ("steps", "rays", "samples", "stride", "looked")
 
 
 def save_run(trainer, path: str | Path, about: dict, history: list) -> None:
@@ -28,9 +29,11 @@ def save_run(trainer, path: str | Path, about: dict, history: list) -> None:
     for name in _GRID:
         tensors[f"grid.{name}"] = getattr(trainer.grid, name).numpy()
     tensors["hard"] = trainer.hard
+    settling = trainer.settling
+    tensors |= {"settling.found": settling.found.numpy(), "settling.shown": settling.shown.numpy()}
     metadata = {
-        "about": about, "history": history, "taken": taken, "steps": trainer.steps, "rays": trainer.rays,
-        "samples": trainer.samples, "seconds": trainer.seconds, "settled": trainer.settled, "turn": trainer.grid.turn,
+        "about": about, "history": history, "taken": taken, **{name: getattr(trainer, name) for name in _NUMBERS},
+        "seconds": trainer.seconds, "settling": settling.at, "turn": trainer.grid.turn, "clock": trainer.clock.to_dict(),
         "random": trainer.rng.bit_generator.state,
     }  # fmt: skip
     write_checkpoint(path, KIND, tensors, metadata)
@@ -44,13 +47,17 @@ def load_run(trainer, path: str | Path, about: dict) -> list:
     tensors, meta = read_checkpoint(path, KIND)
     with restoring(path):
         require_same(path, meta["about"], about)
-        counts = [number(meta, name, "state") for name in ("steps", "rays", "samples", "seconds")]
+        counts = {name: number(meta, name, "state") for name in (*_NUMBERS, "seconds")}
         for name in _GRID:
             require_shape(tensors, f"grid.{name}", getattr(trainer.grid, name))
+        for name in ("found", "shown"):
+            require_shape(tensors, f"settling.{name}", getattr(trainer.settling, name))
         restore_optimiser(trainer, tensors, meta["taken"])
         trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], int(number(meta, "turn", "state")))
         trainer.rng.bit_generator.state = meta["random"]
-        trainer.restore(*counts, bool(meta["settled"]), tensors["hard"])
+        trainer.settling.restore(int(number(meta, "settling", "state")), tensors["settling.found"], tensors["settling.shown"])
+        trainer.clock.restore(meta["clock"])
+        trainer.restore(hard=tensors["hard"], **counts)
         return list(meta["history"])
 
 

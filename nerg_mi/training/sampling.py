@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from ..field.backend import namespace
+from ..field.backend import aligned, namespace
 from ..field.box import Box
 from ..transport.quadrature import absorbed_share
 from .compositing import Segments, Thinned
@@ -31,13 +31,22 @@ class StepTable:
         # One more, because jitter shifts every edge by up to one step.
         edges.append(edges[-1] + max(step, growth * edges[-1]))
         self.steps = len(edges) - 1
-        self.edges = ns.Float(np.array(edges, np.float32))
+        self.edges = ns.Float(aligned(np.array(edges)))
+        # As literals they would compile the kernels anew for every table.
+        self._steps = dr.opaque(ns.UInt32, self.steps)
+        self._share = dr.opaque(ns.Float64, 1 / self.steps)
+
+    def split(self, index):
+        """Ray and step (UInt32) of candidates ``index`` = ray * steps + step."""
+        # Division of integers is slow; in float64 half a step outweighs all rounding.
+        ray = type(index)((dr.float64_array_t(index)(index) + 0.5) * self._share)
+        return ray, index - ray * self._steps
 
     def interval(self, k, offset):
         """Start and length of step ``k``, shifted by ``offset`` in [0, 1) of a step."""
         Float = type(offset)
         a, b = dr.gather(Float, self.edges, k), dr.gather(Float, self.edges, k + 1)
-        c = dr.gather(Float, self.edges, dr.minimum(k + 2, self.steps))
+        c = dr.gather(Float, self.edges, dr.minimum(k + 2, self._steps))
         # The edge after the last repeats it: a step of no length beyond the far end.
         start, stop = dr.lerp(a, b, offset), dr.lerp(b, dr.maximum(c, b), offset)
         return start, stop - start
@@ -72,7 +81,7 @@ def rays_in_box(o, d, box: Box, near: float) -> Rays:
 class Samples:
     """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint
     (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding; ``features``: what the
-    density pass knew of them, or None; ``thinned``: of samples that stand for others."""
+    density pass knew of them, or None; ``thinned``: of samples that stand for others; ``looked``: samples a ray of the density pass."""
 
     ray: object
     t: object
@@ -82,6 +91,7 @@ class Samples:
     count: int
     features: list | None = None
     thinned: Thinned | None = None
+    looked: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -95,27 +105,34 @@ class Thinning:
     seed: int
 
 
-def occupied_steps(rays: Rays, table: StepTable, offset, occupied) -> tuple | None:
-    """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated.
+def occupied_steps(rays: Rays, table: StepTable, offset, occupied, most: int | None = None) -> tuple | None:
+    """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated, and the rays covered.
 
     ``offset``: each ray's jitter, [0, 1); ``occupied``: function of points (Array3f) and a mask,
-    giving a mask. None when there is not one step.
+    giving a mask. ``most``: bound of their number; the last rays, whose steps do not fit, are dropped. None when there is
+    not one step.
     """
     UInt32 = dr.uint32_array_t(type(offset))
     total = rays.count * table.steps
     if total >= 2**32:
         raise ValueError(f"{rays.count} rays of {table.steps} steps are too many for one batch")
-    # The number of steps is a literal: division by it becomes a multiplication.
-    index = dr.arange(UInt32, total)
-    ray = index // table.steps
-    _, _, p, inside = _step(rays, table, offset, ray, index - ray * table.steps)
+    ray, k = table.split(dr.arange(UInt32, total))
+    _, _, p, inside = _step(rays, table, offset, ray, k)
     kept = dr.compress(occupied(p, inside))
-    if dr.width(kept) == 0:
+    count, covered = dr.width(kept), rays.count
+    if count == 0:
         return None
-    ray = kept // table.steps
-    t, length, p, _ = _step(rays, table, offset, ray, kept - ray * table.steps)
+    if most is not None and count > most:
+        # Rays lie one after another: the first step that does not fit tells which ray is incomplete.
+        covered = int(dr.gather(UInt32, kept, UInt32(most)).numpy()[0]) // table.steps
+        if covered == 0:
+            raise ValueError(f"a single ray has more than {most} steps; enlarge the batch, look_most or the step")
+        count = dr.width(dr.compress(kept < dr.opaque(UInt32, covered * table.steps)))
+        kept = dr.gather(UInt32, kept, dr.arange(UInt32, count))
+    ray, k = table.split(kept)
+    t, length, p, _ = _step(rays, table, offset, ray, k)
     dr.eval(ray, t, length, p)
-    return ray, t, length, p
+    return ray, t, length, p, covered
 
 
 def _step(rays: Rays, table: StepTable, offset, ray, k):
@@ -128,19 +145,21 @@ def _step(rays: Rays, table: StepTable, offset, ray, k):
 
 
 def visible_samples(
-    rays: Rays, table: StepTable, offset, occupied, density, stop: float, pad: int | None = None, thinning: Thinning | None = None
+    rays: Rays, table: StepTable, offset, occupied, density, stop: float, pad: int | None = None,
+    thinning: Thinning | None = None, most: int | None = None,
 ) -> tuple[Samples | None, int]:
     """Samples that may matter, and the number of leading rays that they cover completely.
 
     ``density``: function of points and a mask giving σ without a gradient, or σ and a list of Floats that the samples
     are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make exactly so many samples,
-    dropping the last rays that do not fit. ``thinning``: let few samples stand for the many that hardly absorb.
+    dropping the last rays that do not fit. ``thinning``: let few samples stand for the many that hardly absorb. ``most``:
+    samples at most at which ``density`` is evaluated, by the same means.
     Returns (None, rays) when no ray meets anything.
     """
-    steps = occupied_steps(rays, table, offset, occupied)
+    steps = occupied_steps(rays, table, offset, occupied, most)
     if steps is None:
         return None, rays.count
-    ray, t, length, p = steps
+    ray, t, length, p, covered = steps
     Bool, Float, UInt32 = dr.mask_t(t), type(t), type(ray)
     everywhere = dr.full(Bool, True, dr.width(t))
     segments = Segments(ray, everywhere, rays.count)
@@ -160,9 +179,9 @@ def visible_samples(
         thinned = Thinned(dr.rcp(share), before, absorbed_share(Float(segments.total(tau))))
         dr.eval(chosen, thinned.copies, before, thinned.opacity)
     kept = dr.compress(chosen)
-    count, covered = dr.width(kept), rays.count
+    count, looked = dr.width(kept), dr.width(t) / covered
     if count == 0:
-        return None, rays.count
+        return None, covered
     if pad is not None and count > pad:
         # The ray in which the limit falls is incomplete: it and all later ones wait for another batch.
         covered = int(dr.gather(UInt32, ray, dr.gather(UInt32, kept, UInt32(pad))).numpy()[0])
@@ -180,4 +199,4 @@ def visible_samples(
         dr.eval(thinned.copies, thinned.before)
     dr.eval(ray, active, t, length, p, features)
     segments = Segments(ray, active, rays.count)
-    return Samples(ray, t, length, p, segments, min(count, pad or count), features, thinned), covered
+    return Samples(ray, t, length, p, segments, min(count, pad or count), features, thinned, looked), covered

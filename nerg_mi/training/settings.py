@@ -40,9 +40,10 @@ class RadianceSettings:
     stand where fog was; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on a
     sample is always kept, others by chance in proportion to their weight, with ``thin_least`` at least (1: all are kept).
     ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells that fewer
-    cameras see stay empty; ``settle``: share of the run after which all cells that rendering will visit are sampled.
+    cameras see stay empty; ``settle``: share of the run from which on the cells that rendering will visit are found, all of which are then sampled.
+    ``look_most``: samples of the density-only pass, in batches: what it costs is then of the order of the rest of a step.
     ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like part of it, which
-    clears early fog cheaply. ``huber``: error at which the colour loss turns linear (colours are in 0..1);
+    clears early fog cheaply; while the pass has no room for enough rays at the next, it waits, for as long again. ``huber``: error at which the colour loss turns linear (colours are in 0..1);
     ``empty_weight``: weight of the penalty on density in cells that are not sampled; ``grid_decay``: of the mean square of
     the grid's features, which lets go of what few rays have shaped (Barron et al. 2023, Zip-NeRF, there level by level);
     ``depth_weight``: of the depth terms
@@ -71,7 +72,8 @@ class RadianceSettings:
     resolution: int = 128
     grid_every: int = 16
     min_views: int = 2
-    settle: float = 0.85
+    settle: float = 0.8
+    look_most: float = 8.0
     strides: tuple[int, ...] = field(default=(16, 8, 4, 2))
     stride_share: float = 0.33
     huber: float = 1.0
@@ -96,8 +98,15 @@ class RadianceSettings:
         if not (self.stride_share >= 0 and self.reach_share > 0):
             shares = f"{self.stride_share} and {self.reach_share}"
             raise ValueError(f"stride_share must be 0 or more and reach_share above 0, got {shares}")
+        if self.look_most < 1:
+            raise ValueError(f"the density-only pass must have room for a batch: look_most must be 1 or more, got {self.look_most}")
         if self.resolution % 8:
             raise ValueError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
+
+    @property
+    def most_looked(self) -> int:
+        """Samples at most of a step's density-only pass."""
+        return int(self.look_most * self.batch)
 
     def rate(self, progress: float) -> float:
         """Learning rate at ``progress`` in 0..1 of the run."""
