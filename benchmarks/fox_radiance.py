@@ -68,6 +68,7 @@ def main(argv=None) -> None:
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.training.radiance import RadianceTrainer
     from nerg_mi.training.settings import RadianceSettings, sized_config
+    from nerg_mi.training.warm_up import warm_up
 
     ns = namespace("llvm_ad_rgb")
     if not args.data.exists():
@@ -80,6 +81,7 @@ def main(argv=None) -> None:
     print(f"{len(data.train)} views to train on, {len(data.held_out)} to score, width {args.width}; load {os.getloadavg()[0]:.1f}")
     begin = time.perf_counter()
     trainer = RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
+    warm_up(trainer)
     rows = []
     for stop in stops:
         while trainer.seconds < 60 * stop and trainer.progress < 1:
@@ -89,7 +91,7 @@ def main(argv=None) -> None:
         save_radiance(trainer.field(), path, {"minutes": stop, "settings": settings.to_dict()})
         train = float(np.mean(trainer.measure(data.train[::8], 2)))
         # What was spent on looking is no training.
-        trainer.restore(trainer.steps, trainer.rays, trainer.samples, seconds, trainer.settled, trainer.hard)
+        trainer.restore(seconds, trainer.hard)
         rows.append({"minutes": stop, "steps": trainer.steps, "ms_a_step": round(1e3 * seconds / trainer.steps, 1),
                      "psnr_train": round(train, 2), "load": round(os.getloadavg()[0], 1), "file": path})
         print(f"{stop:g} min: {trainer.steps} steps, training views {train:.2f} dB, load {os.getloadavg()[0]:.1f}", flush=True)
@@ -101,6 +103,8 @@ def main(argv=None) -> None:
               f"{row['psnr_train']:12.2f}", flush=True)
     table = args.out / f"fox_radiance_{args.width}.csv"
     write_rows(table, rows)
+    speed = trainer.clock.summary()
+    print(f"{speed['evaluations_a_second']:.3g} field evaluations a second; step in ms: {speed['step_ms']}")
     print(f"whole benchmark {time.perf_counter() - begin:.0f} s")
 
 

@@ -50,6 +50,7 @@ def main(argv=None) -> None:
     from nerg_mi.formats.fields import save_radiance
     from nerg_mi.training.radiance import RadianceTrainer
     from nerg_mi.training.settings import RadianceSettings, sized_config
+    from nerg_mi.training.warm_up import warm_up
 
     if not args.views.exists():
         raise SystemExit(f"{args.views} does not exist; make the pictures with: python -m nerg_mi.scenes.store.make --stage views")
@@ -64,6 +65,7 @@ def main(argv=None) -> None:
     for source in ("images", "depth") if args.only is None else (args.only,):
         trainer = RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, namespace("llvm_ad_rgb"),
                                   depth=source == "depth")
+        warm_up(trainer)
         begin = time.process_time()
         while trainer.progress < 1:
             trainer.step()

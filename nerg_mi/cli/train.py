@@ -84,9 +84,12 @@ def train_radiance(
             save_every=save_every or float("inf"), preview=preview,
             write=lambda field, provenance: save_trained(field, provenance, output, half),
         )  # fmt: skip
-    typer.echo(f"{provenance['steps']} steps in {provenance['seconds']:.0f} s")
+    speed = f"; {provenance['evaluations_a_second']:.3g} field evaluations a second" if provenance["steps"] else ""
+    typer.echo(f"{provenance['steps']} steps in {provenance['seconds']:.0f} s{speed}")
     if data.held_out:
         typer.echo(f"held-out PSNR: {provenance['psnr_held_out']['mean']:.2f} dB")
+    for line in provenance["complaints"]:
+        typer.echo(f"warning: {line}", err=True)
     typer.echo(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
     if provenance["interrupted"]:
         raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")

@@ -102,8 +102,9 @@ class DensityGrid:
 
     def mark(self, found, p) -> None:
         """Set ``found`` (UInt8 a cell) where it holds one of the points ``p`` (Array3f, world)."""
-        dr.scatter(found, self.ns.UInt8(1), self._cell(p))
-        dr.eval(found)
+        if dr.width(p) > 0:
+            dr.scatter(found, self.ns.UInt8(1), self._cell(p))
+            dr.eval(found)
 
     def _allow(self, cells) -> None:
         """Restrict samples to ``cells`` (mask), all of which count as occupied until they are looked at."""

@@ -73,6 +73,10 @@ class RadianceTrainer:
         self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
         # Of the marching: how many times coarser than `march_step`, and samples a ray of the last density-only pass.
         self.stride, self.looked = 1 if self.carved else max(settings.strides, default=1), 0.0
+        self.start()
+
+    def start(self) -> None:
+        """Start the clock of the run."""
         self._started = time.perf_counter()
 
     def restore(self, seconds: float, hard: np.ndarray, **numbers) -> None:
@@ -159,10 +163,14 @@ class RadianceTrainer:
         if settling or due:
             self.live.set_parameters({k: dr.detach(v) for k, v in self._parameters().items()})
         if settling:
-            with dr.suspend_grad():
-                self.settling.advance(self.density, self._lit_by_a_few, s.seed)
+            self.settle()
         if due:
             self.grid.update(self.density, self.rng)
+
+    def settle(self) -> None:
+        """Find a piece of what rendering will visit, by the weights that ``live`` holds."""
+        with dr.suspend_grad():
+            self.settling.advance(self.density, self._lit_by_a_few, self.settings.seed)
 
     def _refine(self) -> None:
         """March finer if it is time to and what is cleared allows it."""
@@ -266,6 +274,11 @@ class RadianceTrainer:
             return None, None
         weight = weights(density(samples.p, True) * samples.length, samples.segments)
         return samples, dr.gather(ns.Array3f, samples.p, dr.compress(weight > 1e-3))
+
+    def pixels_within(self, views: list[View], samples: int) -> int:
+        """The ``every`` of `measure` with which ``views`` take about so many ``samples``, by those of the last step's rays."""
+        rays = sum(v.pixels.shape[0] * v.pixels.shape[1] for v in views)
+        return max(1, int(np.ceil((rays * max(self.looked * self.stride, 1) / samples) ** 0.5)))
 
     def measure(self, views: list[View], every: int = 1, field: RadianceField | None = None) -> list[float]:
         """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel of those that their masks leave in.

@@ -18,10 +18,14 @@ from ..interruption import Interruption
 from .radiance import RadianceTrainer
 from .run_state import kept_unless, load_run, save_run
 from .settings import RadianceSettings
+from .verdict import complaints
+from .warm_up import warm_up
 
 # Shares of the run at which the held-out error is looked at.
 _LOOKS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
-_LOOK_VIEWS, _LOOK_EVERY = 4, 3
+_LOOK_VIEWS = 4
+# Samples at most of a look and of a preview, and of the error at the end: fog has hundreds on each ray.
+_LOOK_SAMPLES, _FINAL_SAMPLES = 2**20, 2**27
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,9 @@ def train_radiance(
 ) -> tuple[RadianceField, dict]:
     """Train a field on ``dataset``; returns it, with its occupancy, and its provenance (JSON).
 
-    The held-out views are looked at and never learnt from: a few of them, coarsely, at some shares of the run, and
-    all of them, fully, at the end. Ctrl-C ends the run after the step at hand, with what it has come to.
+    Kernels are compiled before the run's time begins. The held-out views are looked at and never learnt from: a few of them, coarsely, at some shares of the run, and
+    all of them at the end, fully unless they are still in fog or very many. What is wrong with the result is in the
+    provenance's ``complaints``. Ctrl-C ends the run after the step at hand, with what it has come to.
 
     ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
     interrupted; ``resume``: go on from there. ``write``: given the result, which it puts into a file. Once it has done so, the
@@ -53,6 +58,7 @@ def train_radiance(
     its picture beside what is true, rewritten at every look.
     """
     trainer = RadianceTrainer(dataset.train, dataset.box, config, settings, ns, depth)
+    warm_up(trainer)
     spread = np.linspace(0, len(dataset.held_out) - 1, min(_LOOK_VIEWS, len(dataset.held_out))).round().astype(int)
     watched = [dataset.held_out[i] for i in spread]
     about = {
@@ -68,8 +74,7 @@ def train_radiance(
             trainer.step()
             if looks and trainer.progress >= looks[0]:
                 looks = [x for x in looks if x > trainer.progress]
-                last = float(np.nanmean(trainer.measure(watched, _LOOK_EVERY)))
-                history.append({"steps": trainer.steps, "seconds": round(trainer.seconds, 1), "psnr": round(last, 2)})
+                last = _look(trainer, watched, history)
                 if preview is not None:
                     _write_preview(trainer, watched[0], preview)
             if state is not None and trainer.seconds - saved > save_every:
@@ -105,22 +110,37 @@ def _result(trainer: RadianceTrainer, dataset: Dataset, watched: list[View], his
         "seconds": round(seconds, 1),
         "interrupted": interrupted,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "psnr_watched": {"views": [v.name for v in watched], "every_pixel": _LOOK_EVERY, "history": history},
+        **trainer.clock.summary(),
     }
     if dataset.held_out:
-        psnr = trainer.measure(dataset.held_out, field=field)
+        every = trainer.pixels_within(dataset.held_out, _FINAL_SAMPLES)
+        psnr = trainer.measure(dataset.held_out, every, field)
         provenance["psnr_held_out"] = {
             "mean": round(float(np.mean(psnr)), 3),
+            "every_pixel": every,
             "views": {v.name: round(p, 3) for v, p in zip(dataset.held_out, psnr)},
         }
+        _look(trainer, watched, history, field)
+    provenance["psnr_watched"] = {"views": [v.name for v in watched], "history": history}
+    minutes = trainer.settings.minutes
+    provenance["complaints"] = complaints(history, trainer.steps, trainer.stride, minutes, seconds)
     return field, provenance
+
+
+def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: RadianceField | None = None) -> float:
+    """The error on the ``watched`` views, added to ``history``: every so many pixels, as many as take little time."""
+    every, seconds = trainer.pixels_within(watched, _LOOK_SAMPLES), trainer.seconds
+    psnr = float(np.nanmean(trainer.measure(watched, every, field)))
+    history.append({"steps": trainer.steps, "seconds": round(seconds, 1), "psnr": round(psnr, 2), "every_pixel": every})
+    return psnr
 
 
 def _write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
     import mitsuba as mi
 
-    seen = trainer.render(view)
-    both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)], axis=1)
+    every = trainer.pixels_within([view], _LOOK_SAMPLES)
+    seen = trainer.render(view, every)
+    both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)[every // 2 :: every, every // 2 :: every]], axis=1)
     write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)))
 
 

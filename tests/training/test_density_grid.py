@@ -207,10 +207,10 @@ def test_density_at_the_threshold_is_what_a_step_absorbs():
         assert grid.bound(lambda p, a: dr.full(ns.Float, sigma, dr.width(p)), rng(), everything).bits.all() == on
 
 
-def test_what_is_settled_stays():
+def test_what_is_kept_stays():
     grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
     point = centres()[3, 4, 2]
-    grid.settle(around(point, 0.1), rng(), everything)
+    grid.keep(grid.bound(around(point, 0.1), rng(), everything).bits)
     grid.update(lambda p, active: dr.zeros(ns.Float, dr.width(p)), rng(), everywhere=True)
     held = np.zeros((R, R, R), bool)
     held[3, 4, 2] = True

@@ -27,7 +27,8 @@ def one_thread():
 
 
 def trainer(dataset, **changes):
-    return RadianceTrainer(dataset.train, BOX, TINY, settings(**{"steps": 40, "settle": 0.75, **changes}), ns)
+    depth = changes.pop("depth", True)
+    return RadianceTrainer(dataset.train, BOX, TINY, settings(**{"steps": 40, "settle": 0.75, **changes}), ns, depth)
 
 
 def state(t):
