@@ -88,7 +88,7 @@ def _same_tables(parts: list, options: dict) -> Rays:
     for path, other, _ in parts:
         if str(other) != str(columns):
             raise NergError(
-                f"{path} has other columns ({other}) than {parts[0][0]} ({columns}); import them apart, or with one column map (--map)"
+                f"{path} has other columns ({plain(other)}) than {parts[0][0]} ({plain(columns)}); import them apart, or with one column map (--map)"
             )
     return rays_from_table([path for path, _, _ in parts], columns, valid=valid, **options)
 
@@ -107,7 +107,7 @@ class _Finder:
                 return tuple(self.by_name[n] for n in names)
         if need:
             wanted = " or ".join(f"{s}_{{{','.join(axes)}}}" for s in stems)
-            there = ", ".join(self.columns[:16])
+            there = ", ".join(plain(c, 40) for c in self.columns[:16])
             raise NergError(f"{self.path} has no columns {wanted}; its columns are {there}; name them with --map")
         return None
 

@@ -201,7 +201,7 @@ def _cells(row: str, separator: str, columns: list[str], number_at: list[int], l
         try:
             numbers.append(np.nan if word.lower() in _MISSING else float(word))
         except ValueError:
-            return f", column {columns[k]!r}: {plain(word, 60)!r} is not a number; mend the cell or the column map"
+            return f", column {plain(columns[k], 40)!r}: {plain(word, 60)!r} is not a number; mend the cell or the column map"
     return cells, numbers
 
 

@@ -2,5 +2,6 @@
 
 from tests.fuzz.capture_readers import CAPTURES
 from tests.fuzz.checkpoint_readers import CHECKPOINTS
+from tests.fuzz.tracking_readers import TRACKING
 
-READERS = [*CHECKPOINTS, *CAPTURES]
+READERS = [*CHECKPOINTS, *CAPTURES, *TRACKING]
