@@ -15,7 +15,11 @@ import copy
 
 import drjit as dr
 import numpy as np
-import torch
+
+try:
+    import torch
+except ImportError:
+    raise ImportError('fields as torch modules need torch, which is not installed: pip install "nerg-mi[torch]"') from None
 
 from ..errors import NergError
 from ..field.backend import is_cuda, namespace

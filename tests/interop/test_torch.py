@@ -1,4 +1,7 @@
 """Fields as torch modules: values of the field, gradients of a restatement in torch and of central differences."""
+import subprocess
+import sys
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
@@ -278,3 +281,10 @@ def test06_wrong_tensors(torch, interop, change):
     module, (p, d) = interop.RadianceModule(radiance()), rays(torch, 20)
     with pytest.raises(ValueError, match=r"must be a float32 tensor \(N, 3\) on cpu"):
         module(change(p), d)
+
+
+def test_without_torch_the_remedy_is_told():
+    program = "import sys; sys.modules['torch'] = None; import nerg_mi.interop.torch"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].endswith('which is not installed: pip install "nerg-mi[torch]"')
