@@ -1,26 +1,39 @@
 # Two commands on a fresh clone (Debian or Ubuntu, Python 3.10 or newer):
 #
-#   make demo    set up, render the demo place into out/demo
-#   make test    set up with the test extras, run the tests; ARGS="-k panorama" chooses among them
-#   make mutants judge the tests by 400 small mistakes in the source, resuming where it stopped (about an hour at first)
+#   make demo      set up, render the demo place into out/demo
+#   make test      set up with the test extras, run the tests; ARGS="-k panorama" chooses among them
 #
-# Set-up is done once: the second run of either only does its own work.
+# While working, and before a release:
+#
+#   make check     the quick tests of every part (a minute or so on two cores); ARGS as above
+#   make coverage  all tests, and which branches of the package they reach
+#   make mutants   judge the tests by 400 small mistakes in the source, resuming where it stopped (about an hour at first)
+#   make faults    kill commands at moments spread over their run, fill disks, forbid folders: nothing may be lost
+#   make soak      thousands of frames and steps: memory may not grow
+#   make packages  build the packages, install and try them with every Python that is here
+#
+# The last five print a table; ARGS="--update docs/trust.md" puts it there. Set-up is done once: the second run of any of
+# these only does its own work.
 
 PYTHON ?= python3
 ARGS ?=
+RUN = .venv/bin/python
 
-.PHONY: demo test mutants setup
+.PHONY: demo test check coverage mutants faults soak packages setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
 
-test: EXTRAS = test
-test: setup
-	.venv/bin/python -m pytest $(ARGS)
+test check coverage mutants faults soak packages: EXTRAS = test
 
-mutants: EXTRAS = test
-mutants: setup
-	.venv/bin/python tools/mutants.py $(ARGS)
+test: setup
+	$(RUN) -m pytest $(ARGS)
+
+check: setup
+	$(RUN) -m pytest -q -m "not slow" $(ARGS)
+
+coverage mutants faults soak packages: setup
+	$(RUN) tools/$@.py $(ARGS)
 
 setup:
 	@$(PYTHON) tools/setup.py $(EXTRAS)
