@@ -4,7 +4,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.training.compositing import Segments, ray_sum, weights
+from nerg_mi.training.compositing import Segments, Thinned, ray_sum, weights
 
 from ..reference import compositing as reference
 
@@ -87,6 +87,26 @@ def test_forward_mode_agrees_with_reverse_mode(packed):
     y = sums(x2)
     forward = dr.forward_to(y)
     assert np.allclose(forward.numpy()[0], np.sum(dr.grad(x).numpy() * direction), atol=1e-5)
+
+
+def test_forward_mode_agrees_with_reverse_mode_of_samples_that_stand_for_others(packed):
+    ray, tau, padded_tau, segments = packed
+    rng = np.random.default_rng(4)
+    n = len(padded_tau)
+    copies, before, out = ns.Float(rng.uniform(1, 9, n)), ns.Float(rng.uniform(0, 2, n)), ns.Float(rng.normal(size=n))
+    thinned = Thinned(copies, before, ns.Float(rng.random(RAYS)))
+    x = ns.Float(padded_tau)
+    dr.enable_grad(x)
+    w = weights(x, segments, thinned)
+    want = copies.numpy() * np.exp(-before.numpy()) * -np.expm1(-padded_tau) * (np.arange(n) < len(ray))
+    assert np.allclose(dr.detach(w).numpy(), want, rtol=1e-5)
+    dr.backward(dr.sum(w * out))
+    back, x = dr.grad(x).numpy(), ns.Float(padded_tau)
+    for direction in np.eye(n)[[0, 3, 20, len(ray) - 1, n - 1]]:
+        dr.enable_grad(x)
+        dr.set_grad(x, ns.Float(direction))
+        forward = dr.forward_to(dr.sum(weights(x, segments, thinned) * out))
+        assert np.allclose(forward.numpy()[0], back @ direction, rtol=1e-4, atol=1e-5)
 
 
 def test_distortion_equals_its_double_sum_and_its_derivative_finite_differences():
