@@ -21,6 +21,7 @@ They are counted apart, and the share is given with and without them.
 from __future__ import annotations
 
 import argparse
+import fcntl
 import hashlib
 import json
 import sys
@@ -141,11 +142,13 @@ def load() -> dict[str, dict]:
     return json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
 
 
-def save(results: dict[str, dict]) -> None:
-    RESULTS.parent.mkdir(parents=True, exist_ok=True)
-    draft = RESULTS.with_suffix(".part")
-    draft.write_text(json.dumps(results, indent=1))
-    draft.replace(RESULTS)
+def keep(key: str, entry: dict) -> None:
+    """Add one entry to the results on the disk, where another run may have added its own since."""
+    with open(RESULTS.with_suffix(".lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        draft = RESULTS.with_suffix(".part")
+        draft.write_text(json.dumps({**load(), key: entry}, indent=1))
+        draft.replace(RESULTS)
 
 
 # ------------------------------------------------------------------------
@@ -226,7 +229,7 @@ def run(packages: list[str], results: dict[str, dict], arguments) -> None:
             first = before.get("by") if before.get("by") in reach.of(mutant) else None
             entry = judge(bench, reach, mutant, arguments.bound, first)
             results[mutant.key] = {**entry, "bound": arguments.bound}
-            save(results)
+            keep(mutant.key, results[mutant.key])
             outcome = "survived" if entry["outcome"] not in KILLED else entry["outcome"]
             print(f"{k}/{len(todo)} {outcome:8} {entry['seconds']:6.1f} s  {mutant.place}  {entry['by'] or ''}", flush=True)
             if arguments.only:
