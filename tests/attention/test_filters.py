@@ -74,3 +74,5 @@ def test_thinning_counts_a_stop_as_long_as_asked():
     assert thin_mask(walk(line(x)), seconds=1000).all()
     with pytest.raises(ValueError, match="positive"):
         thin_mask(walk(line(x)), seconds=0)
+    with pytest.raises(ValueError, match="positive"):
+        thin_mask(walk(line(x)), distance=0)

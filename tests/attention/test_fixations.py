@@ -1,3 +1,5 @@
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -49,6 +51,21 @@ def test_people_and_pauses_end_fixations(find):
     assert np.array_equal(find(still.select(order)), find(still)[order])
 
 
+@pytest.mark.parametrize("find", [ivt, idt])
+def test_a_pause_of_a_tenth_of_a_second_ends_a_fixation_unless_told_otherwise(find):
+    paused = lambda gap: gaze([0] * 20, t=np.arange(20) * 0.02 + (np.arange(20) >= 10) * (gap - 0.02))
+    assert len(set(find(paused(0.09)))) == 1 and len(set(find(paused(0.11)))) == 2 and len(set(find(paused(0.11), gap=0.12))) == 1
+
+
+def test_straight_up_is_measured_as_anywhere():
+    """Who looks straight up has no level: what they look at next is as far away as it is."""
+    for degrees, parts in ((2.9, 1), (3.1, 2)):
+        polar = np.r_[np.zeros(5), np.full(5, degrees)]
+        d = np.stack([np.sin(np.radians(polar)), np.zeros(10), np.cos(np.radians(polar))], axis=1)
+        up = Rays(np.arange(10) * 0.02, np.zeros(10), ("ann",), np.zeros((10, 3)), d, np.ones(10))
+        assert len(set(idt(up, dispersion=3.0, least=0.04))) == parts
+
+
 @pytest.mark.parametrize("elevation", [0.0, 60.0, -85.0])
 def test_dispersion_is_measured_on_the_sphere(elevation):
     # Where gaze is steep, a degree of azimuth is less: 3 degrees of arc are kept together, 4 are not.
@@ -84,7 +101,9 @@ def test_one_ray_a_fixation():
     hit = np.full((20, 3), np.nan)
     hit[:4] = rays.origin[:4] + 2 * rays.direction[:4]
     rays = Rays(rays.t, rays.person, rays.persons, rays.origin, rays.direction, rays.confidence, hit)
-    one, seconds = fixation_rays(rays, idt(rays))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a fixation without a hit is nothing to be warned of
+        one, seconds = fixation_rays(rays, idt(rays))
     assert len(one) == 2 and np.allclose(seconds, 0.18) and np.allclose(one.t, [0.09, 0.29])
     assert np.allclose(np.degrees(np.arctan2(one.direction[:, 1], one.direction[:, 0])), [1, 40])
     assert np.allclose(one.hit[0], hit[:4].mean(axis=0)) and np.isnan(one.hit[1]).all()

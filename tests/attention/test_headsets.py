@@ -119,6 +119,21 @@ def test_pupil(tmp_path):
         preset("pupil").read([folder / "gaze_positions.csv"], marker=0.05)
 
 
+def test_between_head_poses_far_apart_gaze_is_dropped(tmp_path):
+    folder = tmp_path / "anna"
+    folder.mkdir()
+    head = "timestamp,rotation_x,rotation_y,rotation_z,translation_x,translation_y,translation_z\n"
+    (folder / "head_pose_tracker_poses.csv").write_text(head + "".join(f"{t},0,0,0,{t},0,0\n" for t in (10, 10.05, 11, 11.05)))
+    names = ",".join(f"{n}_{a}" for n in ("eye_center0_3d", "gaze_normal0", "eye_center1_3d", "gaze_normal1") for a in "xyz")
+    rows = "".join(f"{t},0.9,0,0,0,0,0,1,0,0,0,0,0,1\n" for t in (10.01, 10.06, 10.5, 10.92, 11.04))
+    (folder / "gaze_positions.csv").write_text(f"gaze_timestamp,confidence,{names}\n{rows}")
+    rays = preset("pupil").read([folder], marker=1.0, up="z")
+    assert np.allclose(rays.t, [10.01, 10.06, 10.92, 11.04]) and np.allclose(rays.origin[:, 0], rays.t)
+    assert dropped(rays) == {"there is no head pose at that time": [[4, 4]]}
+    # What was read is written down: both files, by person, since their names are alike in every recording.
+    assert [s["file"] for s in rays.metadata["sources"]] == ["anna/head_pose_tracker_poses.csv", "anna/gaze_positions.csv"]
+
+
 def test_every_preset_says_what_it_reads():
     assert all(p.summary and callable(p.read) for p in PRESETS.values())
 

@@ -105,3 +105,34 @@ def test06_the_way_out_ends_at_the_face(rgb, kind):
             assert abs(d - out - near) < 1e-5
         else:
             assert math.isclose(out, d / 64 if sigma == 20 else 0, rel_tol=1e-6)
+
+
+@pytest.mark.parametrize("sigma", [0.4, 60.0])
+def test07_evaluations_that_a_depth_takes_are_added(rgb, sigma):
+    medium, settings = slab(rgb, sigma), MarchSettings(0.01, stop=1e-3)
+    ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+    counts = {}
+    for kind in KINDS:
+        result = march(medium, ray, ray.t_near, ray.t_far, True, settings, count=True)
+        first = result.density_evals[0]
+        surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+        counts[kind] = result.density_evals[0] - first
+    # Thin matter is marched again to where half of its own opacity is reached; a refined depth takes sixteen steps at most in one.
+    again = 0 if sigma > 1 else -math.log1p(0.5 * math.expm1(-sigma)) / sigma * 100
+    assert counts["expected"] == 0 and abs(counts["median"] - again) <= 1
+    assert counts["median"] < counts["refined"] <= counts["median"] + 17
+
+
+def test08_a_refined_depth_finds_what_a_step_hides(rgb):
+    """A wall that starts within a step: the step's own rule spreads it over all of it, a finer look does not."""
+    back = 40.0
+    data = np.zeros((64, 1, 1), np.float32)
+    data[27:37] = 3.0
+    data[44:] = back
+    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "filter_type": "nearest"}))
+    total = 3 * 10 / 64 + back * 20 / 64
+    goal = -math.log1p(0.5 * math.expm1(-total))
+    want = 27 / 64 + goal / 3 if goal < 30 / 64 else 44 / 64 + (goal - 30 / 64) / back
+    steps = MarchSettings(1 / 9, stop=1e-6)
+    median, refined = (abs(depth(rgb, medium, kind, steps, (0.5, 0.5, 0))[0] - want) for kind in ("median", "refined"))
+    assert refined < 0.25 * median and median > 4e-3
