@@ -34,6 +34,7 @@ def test_spreads_are_over_seeds():
     assert both["test_loss"] == pytest.approx(1.1) and both["test_loss.spread"] == pytest.approx(np.std([1, 1.2], ddof=1))
     assert "test_loss.spread" not in emit and both["seeds"] == 2 and paper["recipe"] == "paper"
     assert "1.100 ± 0.141" in table([emit, both]) and len(table([emit, both]).splitlines()) == 4
+    assert len({line.count("|") for line in table([emit, both]).splitlines()}) == 1
 
 
 def test_files(tmp_path):

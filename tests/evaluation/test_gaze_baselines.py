@@ -90,3 +90,14 @@ def test_probes_keep_their_weights(rays, weights):
     assert np.allclose(baselines.nearest_probes(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5)
     near = np.argsort(np.linalg.norm(probes.positions - at[0], axis=1))[:3]
     assert np.allclose(baselines.nearest_probes(probes, 3, backend="llvm")(at[:1], X)[0], density[near].mean(axis=0), rtol=1e-4, atol=1e-5)
+
+
+def test_the_standard_ones_are_what_they_are_called(rays):
+    blind, named = baselines.standard_baselines(rays, 0.4, count=60)
+    at = np.array([[1.0, 1.0, 1.55], [3.0, 2.0, 1.55]])
+    assert np.allclose(blind(at, X), named["position-blind, kappa 50"](at, X))
+    assert np.allclose(blind(at, X)[0], reference(X, rays.direction, [0, len(rays)], [50.0])[0], rtol=2e-4)
+    # Without a say, one alone has the width that it has among the others.
+    assert np.allclose(blind(at, X), baselines.position_blind(rays)(at, X), rtol=1e-6)
+    assert np.allclose(named["uniform"](at, X), 1 / (4 * np.pi))
+    assert np.allclose(named["4,096 nearest rays"](at, X), baselines.nearest_rays(rays, 4096, kappa=20.0)(at, X))
