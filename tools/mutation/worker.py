@@ -10,6 +10,8 @@ first), `seconds`. A child in which a module of the project came from another pl
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import json
 import os
 import resource
@@ -23,6 +25,12 @@ STRAY = 90
 
 _MEMORY = 12 << 30  # a mutant must not take the machine with it
 _TICK = 0.05
+
+_SHARED = (
+    "drjit", "drjit.nn", "drjit.opt", "mitsuba", "pytest", "hypothesis", "hypothesis.extra.pytestplugin", "matplotlib.pyplot", "rich.console",
+    "safetensors.numpy", "scipy.ndimage", "scipy.optimize", "scipy.spatial.transform", "scipy.special", "scipy.stats", "trimesh", "typer.testing",
+)  # fmt: skip
+"""What tests and the code under test import, and mutants do not change."""
 
 
 class Watch:
@@ -100,7 +108,8 @@ def run_tests(tree: Path, request: dict, answer: int) -> int:
         coverage.start()
     watch = Watch(tree, coverage)
     stop = [] if request.get("record") else ["-x"]
-    status = pytest.main([*stop, "-q", "-p", "no:cacheprovider", "--no-header", *request["tests"]], plugins=[watch])
+    quiet = ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of what is loaded already
+    status = pytest.main([*stop, *quiet, "-q", "-p", "no:cacheprovider", "--no-header", *request["tests"]], plugins=[watch])
     if coverage is not None:
         coverage.stop()
         Path(request["record"]).write_text(json.dumps({"tests": watch.tests, "lines": watch.lines()}))
@@ -169,16 +178,10 @@ def serve(tree: Path, requests, answers) -> None:
 def main(tree: Path) -> None:
     os.chdir(tree)
     # Loaded once for all children. No variant of Mitsuba is chosen: that would load the code under test, and threads.
-    import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes first)
-
-    import drjit  # noqa: F401
-    import matplotlib.figure  # noqa: F401
-    import mitsuba  # noqa: F401
-    import pytest  # noqa: F401
-    import safetensors.numpy  # noqa: F401
-    import scipy.ndimage  # noqa: F401
-    import scipy.spatial  # noqa: F401
-    import scipy.special  # noqa: F401
+    importlib.import_module("nerg_mi")  # chooses the libLLVM, so it comes first
+    for name in _SHARED:
+        if importlib.util.find_spec(name.split(".")[0]) is not None:
+            importlib.import_module(name)
 
     answers = os.fdopen(os.dup(1), "w")
     serve(tree, sys.stdin, answers)
