@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+from . import bands
 from .errors import NergError, UnusableLLVM, sentence
 from .formats.atomic import check_writable
-from .formats.exr import write_bitmap_exr
-from .formats.png import write_png
+from .interruption import Interruption
+from .picture_file import FORMATS, picture_rows
 
-_FORMATS = (".exr", ".png")
+RESERVE = 150e6
+"""Bytes kept free beside a band, for the strips in it and for the kernel that is compiled first."""
+
 _PREFERRED = ("cuda_ad_rgb", "llvm_ad_rgb")
 
 
@@ -51,6 +55,22 @@ def activate(variant: str | None = None) -> str:
     raise NergError(f'the variant "{wanted[-1]}" does not work here ({said}); "nerg doctor" says how to mend it.')
 
 
+def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
+    """The scene of a file, with ``defaults`` for its `<default>` and `$key`; the variant must be active.
+
+    Raises NergError for what Mitsuba does not take, and for what would end its process or fill the memory.
+    """
+    import mitsuba as mi
+
+    if not Path(path).is_file():
+        raise NergError(f'there is no scene file "{path}".')
+    try:
+        loaded = mi.load_file(str(path), **(defaults or {}))
+    except RuntimeError as error:
+        raise NergError(sentence(error)) from error
+    return loaded
+
+
 def render_file(
     scene: str | Path,
     output: str | Path,
@@ -61,50 +81,72 @@ def render_file(
     spp: int = 0,
     seed: int = 0,
     threads: int = 0,
+    memory: float = 1.0,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> str:
     """Render the scene file `scene`, write the picture `output`, and give a sentence that says what was done.
 
     `output` ends in .exr (all channels of the film, AOVs among them, as float32) or in .png (its colour, tonemapped to
     sRGB); its folder is made. `defaults`: values for the `<default>` and `$key` of the scene. `sensor`: index. `spp`:
-    samples a pixel, 0 for those of the scene's sampler. `threads`: 0 for one a core. Raises NergError for what the user can mend.
+    samples a pixel, 0 for those of the scene's sampler. `threads`: 0 for one a core.
+
+    `memory`: what the process may take, in GB. A picture that needs more is rendered in bands of rows, as large as fit beside
+    what the scene itself takes. Its pixels do not depend on that where the film has a box filter; with wider filters they
+    differ by the rounding of single precision (`bands`). Samplers other than `independent`, films other than `hdrfilm`, scalar
+    and spectral variants and Mitsuba's differentiable integrators are rendered in one piece, and the sentence says so where
+    that is more than `memory`. `on_progress` is told the samples done and the samples of all.
+
+    Raises NergError for what the user can mend, and KeyboardInterrupt, between two steps of less than a second, after Ctrl-C.
     """
     scene, output = Path(scene), Path(output)
-    check_writable(output, *_FORMATS)
+    check_writable(output, *FORMATS)
+    if not memory > 0:
+        raise NergError(f"the memory to render in is {memory} GB: give it more than 0.")
     if not scene.is_file():
         raise NergError(f'there is no scene file "{scene}".')
     active = activate(variant)
 
     import drjit as dr
-    import mitsuba as mi
 
     if threads:
         dr.set_thread_count(threads)
     start = time.perf_counter()
-    try:
-        loaded = mi.load_file(str(scene), **(defaults or {}))
-    except RuntimeError as error:
-        raise NergError(sentence(error)) from error
-    count = len(loaded.sensors())
-    if not 0 <= sensor < count:
-        raise NergError(f'"{scene}" has {count} sensor(s) and number {sensor} was asked for: choose -s from 0 on.')
-    try:
-        mi.render(loaded, sensor=sensor, spp=spp, seed=seed)
-        bitmap = loaded.sensors()[sensor].film().bitmap()
-    except RuntimeError as error:
-        raise NergError(sentence(error)) from error
+    with Interruption() as stop:
 
-    _write(mi, bitmap, output)
-    width, height = bitmap.size()
+        def on_strip(done: int, total: int) -> None:
+            stop.check()
+            if on_progress is not None:
+                on_progress(done, total)
+
+        loaded = load_scene(scene, defaults)
+        stop.check()
+        count = len(loaded.sensors())
+        if not 0 <= sensor < count:
+            raise NergError(f'"{scene}" has {count} sensor(s) and number {sensor} was asked for: choose -s from 0 on.')
+        camera = loaded.sensors()[sensor]
+        width, height = map(int, camera.film().crop_size())
+        whole = bands.why_whole(loaded, camera)
+        rows = bands.rows_for(loaded, camera, 1e9 * memory - resident_bytes() - RESERVE)
+        try:
+            with picture_rows(output, width, height) as write:
+                for band in bands.render_bands(loaded, camera, spp=spp, seed=seed, rows=rows, on_strip=on_strip):
+                    bitmap = band.film.bitmap()
+                    channels = bitmap.channel_count()
+                    write(bitmap, band.rows)
+                    stop.check()
+        except RuntimeError as error:
+            raise NergError(sentence(error)) from error
     seconds = time.perf_counter() - start
-    return f"Wrote {output} ({width} x {height}, {bitmap.channel_count()} channels, {active}, {seconds:.1f} s)."
+    note = f" It was rendered in one piece, beyond {memory:g} GB, because of {whole}." if whole and rows < height else ""
+    return f"Wrote {output} ({width} x {height}, {channels} channels, {active}, {seconds:.1f} s).{note}"
 
 
-def _write(mi, bitmap, output: Path) -> None:
-    if output.suffix.lower() == ".exr":
-        # float32 whatever the component_format of the film, which counts only where the film writes itself
-        write_bitmap_exr(output, bitmap)
-        return
-    # With AOVs the bitmap has many channels, of which the colour is the layer without a name.
-    if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-        bitmap = dict(bitmap.split())["<root>"]
-    write_png(output, mi.util.convert_to_bitmap(bitmap))
+def resident_bytes() -> int:
+    """Bytes of memory that this process takes; where the system does not say, the most that it ever took."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        import resource
+        import sys
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -212,6 +212,7 @@ of these, or the integrator an explicit ``observer``. Spectral and polarized var
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
@@ -318,13 +319,18 @@ class NergIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
+        with self.seen_by(sensor, scene), no_collection():
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+
+    @contextmanager
+    def seen_by(self, sensor, scene):
+        """While this is open the rays that ``sample`` is given come from ``sensor``."""
         self._check_place(scene)
         if 0 in sensor.film().crop_size():
             raise ValueError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
         try:
-            with no_collection():
-                return super().render(scene, sensor, seed, spp, develop, evaluate)
+            yield
         finally:
             self._sensors = None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -23,6 +24,7 @@ def command(
     spp: Annotated[int, typer.Option("--spp", min=0, help="Samples a pixel; 0: as the scene says.")] = 0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random numbers.")] = 0,
     threads: Annotated[int, typer.Option("-t", "--threads", min=0, help="Worker threads; 0: one a core.")] = 0,
+    memory: Annotated[float, typer.Option("--memory", help="GB that rendering may take; larger pictures are made in bands.")] = 1.0,
 ) -> None:
     """Render a scene file to an EXR or PNG file, with the integrator that the scene names.
 
@@ -31,7 +33,27 @@ def command(
     from .. import rendering
 
     defaults = rendering.parse_defines(define or [])
-    report = rendering.render_file(
-        scene, output, defaults=defaults, sensor=sensor, variant=variant, spp=spp, seed=seed, threads=threads
-    )
+    with _bar() as (bar, task):
+        report = rendering.render_file(
+            scene, output, defaults=defaults, sensor=sensor, variant=variant, spp=spp, seed=seed, threads=threads, memory=memory,
+            on_progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )  # fmt: skip
     print(report)
+
+
+@contextmanager
+def _bar():
+    """A progress bar in samples on the terminal, with rate and time left; elsewhere none."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        def render(self, task):
+            speed = task.finished_speed or task.speed
+            return Text("" if speed is None else f"{speed:,.0f} samples/s")
+
+    console = Console(stderr=True)
+    columns = BarColumn(), TaskProgressColumn(), Rate(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield bar, bar.add_task("render", total=None)

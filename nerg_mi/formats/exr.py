@@ -9,7 +9,8 @@ from __future__ import annotations
 import errno
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +103,49 @@ def _channel_order(name: str) -> str:
     layer, dot, last = name.rpartition(".")
     place = "rgbxyza".find(last.lower()) if len(last) == 1 else -1
     return name if place < 0 else f"{layer}{dot}{place}"
+
+
+@contextmanager
+def exr_rows(path: str | os.PathLike, width: int, height: int) -> Iterator[Callable[[Mapping[str, np.ndarray]], None]]:
+    """A single-part scanline file that is written from the top in pieces, so that it need not lie in memory as a whole.
+
+    Gives a function that writes the next rows, from the name of each channel to an array (rows, width) of float32; the names
+    of the first call are those of the file. The file is whole or absent; it is absent also where rows are missing at the end.
+    Raises `NergError` where it cannot be written.
+    """
+    import Imath
+    import OpenEXR
+
+    file, rows = None, 0
+    with replacing(path) as temporary:
+
+        def write(channels: Mapping[str, np.ndarray]) -> None:
+            nonlocal file, rows
+            if file is None:
+                header = OpenEXR.Header(width, height)
+                header["compression"] = Imath.Compression(Imath.Compression.ZIP_COMPRESSION)
+                kind = Imath.Channel(Imath.PixelType(Imath.PixelType.FLOAT))
+                header["channels"] = {name: kind for name in channels}
+                file = OpenEXR.OutputFile(str(temporary), header)
+            count = len(next(iter(channels.values())))
+            data = {name: np.ascontiguousarray(value, np.float32).tobytes() for name, value in channels.items()}
+            try:
+                file.writePixels(data, count)
+            except (OSError, RuntimeError) as error:
+                _raise_if_full(temporary)
+                raise NergError(f'"{path}" could not be written ({str(error).strip()}); choose another name or folder.') from error
+            rows += count
+
+        try:
+            yield write
+        finally:
+            if file is not None:
+                file.close()
+        if rows != height:
+            raise ValueError(f"{rows} of {height} rows were written")
+        if not _whole(temporary, rows):
+            _raise_if_full(temporary)
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
 
 
 def bitmap_channels(bitmap) -> dict[str, np.ndarray]:

@@ -1,5 +1,7 @@
 """`nerg render` on a small scene of stock plugins."""
 
+import os
+import signal
 import subprocess
 import sys
 
@@ -129,3 +131,60 @@ def test08_a_picture_takes_the_place_of_another_whole(rgb, scene, tmp_path, monk
     assert out.read_bytes() == b"what was there" and set(tmp_path.iterdir()) == before
     assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb") == 0
     assert tuple(rgb.Bitmap(str(out)).size()) == (16, 8)
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test09_ctrl_c_ends_it_and_leaves_nothing(scene, tmp_path, name):
+    folder = tmp_path / "pictures"
+    large = tmp_path / "large.xml"
+    large.write_text(SCENE.replace('value="16"', 'value="3000"').replace('value="8"', 'value="3000"'))
+    arguments = [*NERG, "render", large, "-o", folder / name, "-m", "llvm_ad_rgb", "--spp", "256", "--memory", "0.3"]
+    said, code = interrupt(arguments, b"samples/s")
+    assert code == 130 and b"Interrupted." in said
+    assert not list(folder.iterdir())
+
+
+def interrupt(arguments, sign: bytes) -> tuple[bytes, int]:
+    """Run a command on a terminal, press Ctrl-C when it shows `sign`, and give what it showed and its exit code."""
+    ours, theirs = os.openpty()
+    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "120"}
+    child = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs, env=environment)
+    os.close(theirs)
+    said = b""
+    try:
+        while True:
+            try:
+                part = os.read(ours, 4096)
+            except OSError:  # the terminal is closed
+                break
+            said += part
+            if part and sign in said and sign not in said[: -len(part)]:
+                child.send_signal(signal.SIGINT)
+        return said, child.wait(timeout=120)
+    finally:
+        child.kill()
+        os.close(ours)
+
+
+@pytest.mark.parametrize("memory", [1.0, 1e-3])
+def test10_memory_changes_no_pixel(rgb, scene, tmp_path, memory):
+    def render(name, *options):
+        assert nerg("render", scene, "-o", tmp_path / name, "-m", "llvm_ad_rgb", "--spp", 3, *options) == 0
+        return np.array(rgb.Bitmap(str(tmp_path / name)))
+
+    loaded = rgb.load_file(scene)
+    rgb.render(loaded, spp=3)
+    assert np.array_equal(render("a.exr", "--memory", memory), np.array(loaded.sensors()[0].film().bitmap()))
+    assert np.array_equal(render("a.png", "--memory", memory), render("b.png"))
+
+
+def test11_one_piece_beyond_the_memory_is_said(rgb, scene, tmp_path, capsys):
+    other = tmp_path / "other.xml"
+    other.write_text(SCENE.replace('type="independent"', 'type="multijitter"'))
+    assert nerg("render", other, "-o", tmp_path / "a.exr", "-m", "llvm_ad_rgb", "--memory", 1e-3) == 0
+    assert "in one piece, beyond 0.001 GB, because of the sampler MultijitterSampler" in capsys.readouterr().out.replace("\n", " ")
+
+
+def test12_memory_of_nothing(scene, tmp_path, capsys):
+    assert nerg("render", scene, "-o", tmp_path / "a.exr", "--memory", 0) == 1
+    assert "give it more than 0" in capsys.readouterr().err
