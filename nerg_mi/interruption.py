@@ -34,3 +34,15 @@ class Interruption:
     def __exit__(self, *error) -> None:
         if self._mine:
             signal.signal(signal.SIGINT, self._before)
+
+
+def give_back_ctrl_c() -> None:
+    """Let Python hear Ctrl-C again, where Mitsuba has taken it.
+
+    Mitsuba takes the signal while a picture is rendered and remembers one handler to put back. An integrator in Python that
+    calls the render of its base class makes it do so twice, and the second time it remembers its own: from the first picture
+    on nobody would hear Ctrl-C. Called between the two, this makes the second one remember Python's.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)

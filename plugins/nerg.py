@@ -217,6 +217,7 @@ from contextlib import contextmanager
 import drjit as dr
 import mitsuba as mi
 
+from nerg_mi.interruption import give_back_ctrl_c
 from nerg_mi.properties import boolean, choice, color, integer, number, text
 from nerg_mi.registration import register
 from nerg_mi.transport import viewpoint
@@ -319,8 +320,13 @@ class NergIntegrator(mi.SamplingIntegrator):
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
+        give_back_ctrl_c()
         with self.seen_by(sensor, scene), no_collection():
-            return super().render(scene, sensor, seed, spp, develop, evaluate)
+            image = super().render(scene, sensor, seed, spp, develop, evaluate)
+        if self.should_stop():
+            # Mitsuba has heard Ctrl-C, and told nobody.
+            raise KeyboardInterrupt
+        return image
 
     @contextmanager
     def seen_by(self, sensor, scene):

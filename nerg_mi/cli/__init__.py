@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import importlib
 import os
+import signal
 import sys
+import threading
 from typing import Annotated
 
 import typer
@@ -44,26 +46,50 @@ def main(arguments: list[str] | None = None) -> None:
     full = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0") or "--traceback" in arguments
     # Allowed anywhere on the line: it is added after something went wrong, at the end.
     arguments = [a for a in arguments if a != "--traceback"]
-    try:
-        _app(next((a for a in arguments if not a.startswith("-")), None))(arguments, prog_name="nerg")
-    except (KeyboardInterrupt, SystemExit) as end:
-        interrupt = _interrupt(end)
-        if interrupt is None:
-            raise
-        print(str(interrupt) or "Interrupted.", file=sys.stderr)
-        sys.exit(130)
-    except (ValueError, OSError, ImportError) as error:  # NergError is a ValueError
-        if full:
-            raise
-        print(f"nerg: {sentence(error)}", file=sys.stderr)
-        sys.exit(1)
+    with _Listening() as ctrl_c:
+        try:
+            _app(next((a for a in arguments if not a.startswith("-")), None))(arguments, prog_name="nerg")
+        except BaseException as error:
+            interrupt = ctrl_c.behind(error)
+            if interrupt is not None:
+                print(str(interrupt) or "Interrupted.", file=sys.stderr)
+                sys.exit(130)
+            if full or not isinstance(error, (ValueError, OSError, ImportError)):  # NergError is a ValueError
+                raise
+            print(f"nerg: {sentence(error)}", file=sys.stderr)
+            sys.exit(1)
 
 
-def _interrupt(end: BaseException | None) -> KeyboardInterrupt | None:
-    """The Ctrl-C that ended the command. Typer makes of it an exit with code 130, which has it as its cause."""
-    while end is not None and not isinstance(end, KeyboardInterrupt):
-        end = end.__cause__ or end.__context__
-    return end
+class _Listening:
+    """Ctrl-C as `KeyboardInterrupt`, and afterwards whether it was what ended a command."""
+
+    def __enter__(self) -> _Listening:
+        self._heard = False
+        # Only where Python's own handler is at work: elsewhere Ctrl-C is somebody else's business.
+        self._mine = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if self._mine:
+            signal.signal(signal.SIGINT, self._hear)
+        return self
+
+    def _hear(self, *_) -> None:
+        self._heard = True
+        raise KeyboardInterrupt
+
+    def behind(self, end: BaseException) -> KeyboardInterrupt | None:
+        """The interrupt that led to ``end``; None where it is another error, or the command was done.
+
+        Typer makes an exit with code 130 of it, which has it as its cause. Mitsuba makes an error of its own of it where it is
+        raised in a plugin, with nothing but text.
+        """
+        link: BaseException | None = end
+        while link is not None and not isinstance(link, KeyboardInterrupt):
+            link = link.__cause__ or link.__context__
+        done = isinstance(end, SystemExit) and not end.code
+        return link if link is not None or not self._heard or done else KeyboardInterrupt()
+
+    def __exit__(self, *_) -> None:
+        if self._mine:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _app(asked: str | None) -> typer.Typer:

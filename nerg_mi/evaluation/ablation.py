@@ -121,9 +121,11 @@ def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: 
 
 
 def _train(train, tests, place: GazePlace, config, settings, how, ns, align, initial, made: dict, path: Path) -> dict:
-    """Train, write the checkpoint (``made``: what it is), score on ``tests``."""
+    """Train, write the checkpoint (``made``: what it is), score on ``tests``. Raises ``KeyboardInterrupt`` after Ctrl-C."""
     started = time.perf_counter()
     field, about = train_gaze(train, place.medium, place.box, config, settings, how, ns, align, initial=initial)
+    if about["interrupted"]:
+        raise KeyboardInterrupt
     row = {"steps": about["steps"], "train_seconds": time.perf_counter() - started}
     save_gaze(field, path, {**place.about, **about, **made})
     density = gaze_field(field, place.medium, align, how.depth)

@@ -94,6 +94,8 @@ def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iter
         if isinstance(error, NergError):
             said = str(error).rstrip(".")
             raise NergError(f"{said}; the training is kept: once that is mended, --resume writes it") from error
+        if isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {path})") from error
         raise
     if path is not None and done:
         path.unlink(missing_ok=True)

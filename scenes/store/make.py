@@ -61,6 +61,8 @@ def make_field(job: Job) -> list[Path]:
     data = open_dataset(job.build, None, None, None, None, True)
     settings = RadianceSettings(steps=6500, minutes=None, seed=job.seed)
     field, about = train_radiance(data, sized_config("small", data.box), settings, namespace(mi.variant()))
+    if about["interrupted"]:
+        raise KeyboardInterrupt
     path = job.store / "store.safetensors"
     save_trained(field, about, path, True)
     return [path]
@@ -98,6 +100,8 @@ def make_gaze(job: Job) -> list[Path]:
     rays, test = hold_out(Rays.load(source), probes.radius, zones=8, positions=64, seed=job.seed)
     gaze, about = train_gaze(rays, FieldMedium(field), field.box, sized_gaze_config(),
                              GazeSettings(steps=800, seed=job.seed), probes, ns)
+    if about["interrupted"]:
+        raise KeyboardInterrupt
     files = {"rays_file": source, "field_file": place}
     about |= {k: {"file": p.name, "sha256": file_sha256(p)} for k, p in files.items()} | {"test": test}
     path = job.store / "shoppers.safetensors"

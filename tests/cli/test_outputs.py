@@ -1,4 +1,5 @@
-"""Every output of every command: parents are made, what stands in the way is told before work, and a full disk loses nothing."""
+"""Every output of every command: parents are made, what stands in the way is told before work, and neither a full disk nor
+Ctrl-C loses anything."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ import importlib
 import os
 import pkgutil
 import resource
+import signal
 from contextlib import contextmanager
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -56,6 +58,19 @@ def largest_file(size: int):
 def told_in_a_sentence(code: int, said: str) -> bool:
     last = said.strip().splitlines()[-1:] or [""]
     return code == 1 and last[0].startswith("nerg: ") and "Traceback" not in said
+
+
+def interrupting(function):
+    """``function`` with a Ctrl-C during its first call."""
+    calls = []
+
+    def interrupted(*given):
+        calls.append(given)
+        if len(calls) == 1:
+            signal.raise_signal(signal.SIGINT)
+        return function(*given)
+
+    return interrupted
 
 
 def remember(monkeypatch, name: str) -> None:
@@ -114,6 +129,17 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb):
         assert set(found) == set(case.files), "a leftover, or a loss"
         assert all(content == b"old" or limit >= len(content) > 3 for content in found.values())
         assert any(content == b"old" for content in found.values())
+
+    # Ctrl-C in the middle of the first file.
+    out = tmp_path / "interrupted"
+    with monkeypatch.context() as change:
+        change.setattr(os, "fsync", interrupting(os.fsync))
+        code, said = nerg(capsys, *case.arguments(inputs, out))
+    assert code == 130 and said.strip(), said
+    if case.name == "train radiance":  # in the preview's: between two steps, with a result to be gone on from
+        assert set(files(out)) == {*case.files, "a.run"} and "go on with --resume" in said
+    else:  # what a training has come to by then is kept
+        assert set(files(out)) <= {"a.run"} and ("--resume" in said or not files(out))
 
 
 def test_filtering_in_place_keeps_its_input_where_there_is_no_room(inputs, tmp_path, capsys):

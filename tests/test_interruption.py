@@ -1,0 +1,63 @@
+"""Ctrl-C: noted between steps, and heard by Python after and while a picture is rendered."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from nerg_mi.interruption import Interruption
+
+from .plugins import fields
+
+
+def test_the_first_is_noted_and_the_second_raised():
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), Interruption() as stop:
+        stop.check()
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        stop.check()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.fixture
+def scene(rgb, tmp_path):
+    fields.radiance(tmp_path / "f.safetensors")
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    return rgb.load_dict({
+        "type": "scene", "integrator": {"type": "nerg", "field": {"type": "nerf", "filename": str(tmp_path / "f.safetensors")}},
+        "sensor": {"type": "perspective", "film": film, "to_world": rgb.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0])},
+    })  # fmt: skip
+
+
+def test_python_hears_ctrl_c_after_a_picture(rgb, scene):
+    for _ in range(2):
+        rgb.render(scene, spp=1)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    with Interruption() as stop:
+        rgb.render(scene, spp=1)
+        signal.raise_signal(signal.SIGINT)
+        assert stop.asked
+
+
+def test_ctrl_c_during_a_picture_is_raised(rgb, scene, monkeypatch):
+    integrator = scene.integrator()
+    sample = type(integrator).sample
+
+    def interrupted(self, *given):
+        signal.raise_signal(signal.SIGINT)
+        return sample(self, *given)
+
+    with monkeypatch.context() as change:
+        change.setattr(type(integrator), "sample", interrupted)
+        # `mi.render` makes an error of its own of what an integrator raises.
+        with pytest.raises(RuntimeError) as found:
+            rgb.render(scene, spp=1)
+    error = found.value
+    while error.__cause__ is not None:
+        error = error.__cause__
+    assert isinstance(error, KeyboardInterrupt)
+    rgb.render(scene, spp=1)
