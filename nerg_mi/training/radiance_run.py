@@ -24,8 +24,10 @@ from .warm_up import warm_up
 # Shares of the run at which the held-out error is looked at.
 _LOOKS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
 _LOOK_VIEWS = 4
+# Steps at least between two looks, one of which takes as long as several.
+_LOOK_GAP = 50
 # Samples at most of a look and of a preview, and of the error at the end: fog has hundreds on each ray.
-_LOOK_SAMPLES, _FINAL_SAMPLES = 2**20, 2**27
+_LOOK_SAMPLES, _FINAL_SAMPLES = 2**20, 2**24
 
 
 @dataclass(frozen=True)
@@ -48,14 +50,15 @@ def train_radiance(
 ) -> tuple[RadianceField, dict]:
     """Train a field on ``dataset``; returns it, with its occupancy, and its provenance (JSON).
 
-    Kernels are compiled before the run's time begins. The held-out views are looked at and never learnt from: a few of them, coarsely, at some shares of the run, and
-    all of them at the end, fully unless they are still in fog or very many. What is wrong with the result is in the
-    provenance's ``complaints``. Ctrl-C ends the run after the step at hand, with what it has come to.
+    Kernels are compiled before the run's time begins. The held-out views are looked at and never learnt from: a few of
+    them, coarsely, at some shares of the run, and all of them at the end, on every pixel unless that takes many samples. What
+    is wrong with the result stands in the provenance's ``complaints``. Ctrl-C ends the run after the step at hand, with what
+    it has come to.
 
     ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
     interrupted; ``resume``: go on from there. ``write``: given the result, which it puts into a file. Once it has done so, the
-    state of a run that is done is removed; if it raises, the state is that of the end. Without it the state stays. ``preview``: PNG of the first watched view,
-    its picture beside what is true, rewritten at every look.
+    state of a run that is done is removed; if it raises, the state is that of the end. Without it the state stays.
+    ``preview``: PNG of the first watched view, its picture beside what is true, rewritten at every look and at the end.
     """
     trainer = RadianceTrainer(dataset.train, dataset.box, config, settings, ns, depth)
     warm_up(trainer)
@@ -68,12 +71,12 @@ def train_radiance(
     history = load_run(trainer, state, about) if resume else []
     last = history[-1]["psnr"] if history else None
     looks = [x for x in _LOOKS if x > trainer.progress] if watched else []
-    saved, interrupted = trainer.seconds, False
+    looked, saved, interrupted = history[-1]["steps"] if history else 0, trainer.seconds, False
     with Interruption() as stop:
         while trainer.progress < 1 and not interrupted:
             trainer.step()
-            if looks and trainer.progress >= looks[0]:
-                looks = [x for x in looks if x > trainer.progress]
+            if looks and trainer.progress >= looks[0] and trainer.steps >= looked + _LOOK_GAP:
+                looks, looked = [x for x in looks if x > trainer.progress], trainer.steps
                 last = _look(trainer, watched, history)
                 if preview is not None:
                     _write_preview(trainer, watched[0], preview)
@@ -93,6 +96,8 @@ def train_radiance(
         keep()
     with kept_unless(state, keep, done=write is not None and not interrupted):
         field, provenance = _result(trainer, dataset, watched, history, seconds, interrupted)
+        if preview is not None and watched:
+            _write_preview(trainer, watched[0], preview, field)
         if write is not None:
             write(field, provenance)
     return field, provenance
@@ -135,11 +140,11 @@ def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: R
     return psnr
 
 
-def _write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
+def _write_preview(trainer: RadianceTrainer, view: View, path: Path, field: RadianceField | None = None) -> None:
     import mitsuba as mi
 
     every = trainer.pixels_within([view], _LOOK_SAMPLES)
-    seen = trainer.render(view, every)
+    seen = trainer.render(view, every, field)
     both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)[every // 2 :: every, every // 2 :: every]], axis=1)
     write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)))
 

@@ -54,17 +54,16 @@ def test_the_clock_counts_what_steps_evaluate():
     clock = StepClock()
     clock.count(1000)
     assert clock.summary() == {}
-    for pause in (0.01, 0.03, 0.02):
+    for _ in range(3):
         with clock:
-            time.sleep(pause)
             clock.count(100)
     clock.count(1000)
-    said = clock.summary()
-    assert clock.evaluations == 300 and said["evaluations_a_second"] == pytest.approx(300 / sum(clock.durations), abs=1)
-    assert 10 <= said["step_ms"]["min"] < 20 <= said["step_ms"]["median"] < 30 <= said["step_ms"]["max"]
+    assert clock.evaluations == 300 and len(clock.durations) == 3
+    clock.restore({"evaluations": 300, "durations": [0.01, 0.06, 0.02]})
+    assert clock.summary() == {"evaluations_a_second": 3333, "step_ms": {"min": 10.0, "median": 20.0, "max": 60.0}}
     again = StepClock()
     again.restore(clock.to_dict())
-    assert again.evaluations == 300 and again.durations == pytest.approx(clock.durations, abs=1e-5)
+    assert again.summary() == clock.summary()
 
 
 def test_the_result_tells_its_steps_speed_and_what_is_wrong(dataset):  # noqa: F811
