@@ -19,11 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from .. import __version__, llvm
-from ..errors import NergError, sentence
+from ..bands import render_bands
+from ..errors import NergError
 from ..formats.atomic import check_folder
 from ..formats.exr import write_bitmap_exr
 from ..formats.tables import write_json
-from ..rendering import activate
+from ..interruption import Interruption
+from ..rendering import activate, load_scene
 from . import figures
 from .overlay import Heat, top_of
 from .tonemap import srgb, write_png
@@ -69,7 +71,8 @@ def run_demo(
 
     ``scene``: another file than the store's scene.xml; ``defaults``: values for its `<default>`s; ``width`` in pixels of a
     picture (3:2; the sphere's is 2:1 and as wide); ``spp``: samples a pixel; ``variant`` None: the best that works;
-    ``on_stage`` is told the name of each of `STAGES` as it begins. Raises NergError where a checkpoint is missing.
+    ``on_stage`` is told the name of each of `STAGES` as it begins. Raises NergError where a checkpoint is missing, and
+    KeyboardInterrupt, between two steps of less than a second, after Ctrl-C.
     """
     if width < 12 or spp < 1:
         raise NergError(f"the demo needs pictures of at least 12 pixels and 1 sample a pixel, got {width} and {spp}.")
@@ -85,19 +88,21 @@ def run_demo(
     values = {k: str(v) for k, v in sizes.items()} | dict(defaults or {})
     values |= {"aovs": "depth,opacity,gaze,visibility"}
 
-    clock.start("load")
-    seen = _load(mi, scene, values)
-    unhidden = _load(mi, scene, values | {"occlusion": "false", "radiance": "false", "aovs": "opacity,gaze"})
-    if len(seen.sensors()) < 3:
-        raise NergError(f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama.')
-    clock.start("camera")
-    camera = _render(mi, seen, CAMERA, spp, seed)
-    clock.start("own view")
-    own = _render(mi, seen, OWN, spp, seed)
-    clock.start("gaze sphere")
-    sphere = _render(mi, seen, SPHERE, spp, seed)
-    clock.start("without occlusion")
-    without = _render(mi, unhidden, CAMERA, spp, seed)
+    with Interruption() as stop:
+        clock.start("load")
+        seen = load_scene(scene, values)
+        unhidden = load_scene(scene, values | {"occlusion": "false", "radiance": "false", "aovs": "opacity,gaze"})
+        if len(seen.sensors()) < 3:
+            raise NergError(f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama.')
+        clock.start("camera")
+        camera = _render(mi, seen, CAMERA, spp, seed, stop.check)
+        clock.start("own view")
+        own = _render(mi, seen, OWN, spp, seed, stop.check)
+        clock.start("gaze sphere")
+        sphere = _render(mi, seen, SPHERE, spp, seed, stop.check)
+        clock.start("without occlusion")
+        without = _render(mi, unhidden, CAMERA, spp, seed, stop.check)
+        stop.check()
 
     clock.start("pictures")
     versions = _versions(active)
@@ -153,20 +158,16 @@ def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
     return paths
 
 
-def _load(mi, scene: Path, values: Mapping[str, str]):
-    try:
-        return mi.load_file(str(scene), **values)
-    except RuntimeError as error:
-        raise NergError(sentence(error)) from error
-
-
-def _render(mi, scene, index: int, spp: int, seed: int) -> Render:
+def _render(mi, scene, index: int, spp: int, seed: int, check: Callable[[], None] | None = None) -> Render:
+    """``check`` is called between two steps, and may raise."""
     names = scene.integrator().aov_names()
-    pixels = np.array(mi.render(scene, sensor=index, spp=spp, seed=seed))
+    on_strip = None if check is None else lambda done, total: check()
+    (band,) = render_bands(scene, scene.sensors()[index], spp=spp, seed=seed, on_strip=on_strip)
+    pixels = np.array(band.film.develop())
     color = pixels[..., : pixels.shape[2] - len(names)]
     aovs = {n.split(".")[0]: pixels[..., color.shape[2] + k] for k, n in enumerate(names)}
     # Mono variants render one channel.
-    return Render(np.broadcast_to(color[..., :3], (*color.shape[:2], 3)), aovs, scene.sensors()[index].film().bitmap())
+    return Render(np.broadcast_to(color[..., :3], (*color.shape[:2], 3)), aovs, band.film.bitmap())
 
 
 def _pixel_of_observer(mi, scene):

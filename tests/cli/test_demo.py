@@ -8,6 +8,7 @@ import pytest
 
 import nerg_mi.cli
 from nerg_mi.view import demo
+from tests.cli.test_render import NERG, interrupt
 from tests.view.standins import write_standins
 
 NAMES = {
@@ -96,3 +97,10 @@ def test05_the_store_itself(rgb, tmp_path):
     assert 0 < x < 60 and 0 < y < 40
     sphere = demo._render(rgb, rgb.load_file(str(demo.store_scene()), sphere_width="64", sphere_height="32"), demo.SPHERE, 1, 0)
     assert 0.7 < demo._integral(sphere) < 1.3  # a density over the sphere
+
+
+def test06_ctrl_c_ends_it_and_leaves_nothing(standins, tmp_path):
+    arguments = [*NERG, "demo", "--out", tmp_path / "out", "--width", "2000", "--spp", "1000", "-m", "llvm_ad_rgb", *defines(standins)]
+    said, code = interrupt(arguments, b"camera")
+    assert code == 130 and b"Interrupted." in said
+    assert not (tmp_path / "out").exists()
