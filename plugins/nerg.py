@@ -52,7 +52,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
      steps, or, without a field, for 1e-4 of the scene's diagonal (or of twice the larger distance of surface and
      observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The point that the observer
      looks for lies this far, and as far as light goes into the surface (at most a 64th of the depth), in front of the
-     camera's surface, so that no surface hides itself. (Default: 0)
+     camera's surface, so that no surface hides itself. More than 1e18 counts as that. (Default: 0)
 
  * - visibility
    - |string|

@@ -23,6 +23,9 @@ _PAST = 4
 # away takes no part in how exactly a near one is met, but for the size of its triangles.
 EXACT, _FAR = 1e-4, 3e-7
 
+LARGEST = 1e18
+"""Tolerance at most, in scene units: the square of a distance so long is still finite in single precision."""
+
 
 @dataclass
 class Sight:
@@ -116,11 +119,11 @@ class ObserverPass:
 
     def _tolerance(self, place, ray, p_d, p_o):
         if self.tolerance:
-            return self.tolerance
+            return min(self.tolerance, LARGEST)
         if place.medium is None:
             near = 2 * dr.maximum(dr.norm(dr.detach(p_d)), dr.norm(dr.detach(p_o)))
             return EXACT * dr.minimum(place.diagonal, near) + _FAR * place.diagonal
-        return 2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o))
+        return dr.minimum(2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o)), LARGEST)
 
     def _map_from(self, place, p_o) -> ObserverMap:
         """The observer's map, marched anew only when the observer, the field or a shape has changed."""

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from .scenes import GAZE, camera, observer_at
+from .scenes import GAZE, camera, constant, observer_at
 
 # In front of the fog, on it, in it, on the ball, and at the camera.
 EYES = ((-2.0, 0.3, -2.0), (0.0, 0.0, -1.0), (0.1, 0.2, 0.3), (0.0, 0.9, -0.3), (0.5, 0.4, -3.0))
@@ -41,3 +41,13 @@ def test01_extremes(rgb, files, visibility, depth, eyes):
             assert np.isfinite(picture.numpy()).all(), (sigma, eye)
             dr.backward(dr.sum(picture, axis=None))
             assert np.isfinite(dr.grad(x).numpy().item()), (sigma, eye)
+
+
+@pytest.mark.parametrize("visibility", ["depth", "map", "transmittance"])
+@pytest.mark.parametrize("setting", [{"tolerance": 1e20}, {"step": 1e20}, {"tolerance": 3e38}])
+def test_observer_depth_is_finite_whatever_the_tolerance(rgb, setting, visibility):
+    aovs = "observer_depth,visibility,position"
+    integrator = constant(1.0, aovs=aovs, visibility=visibility, map_height=16, observer=observer_at(rgb, -3, 0.5, 0.5), **setting)
+    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, size=6)})
+    picture = np.array(rgb.render(scene, spp=1, seed=0))
+    assert picture[..., 3].max() > 1e17 and np.all(np.isfinite(picture))
