@@ -134,6 +134,8 @@ def render_file(
                     channels = bitmap.channel_count()
                     write(bitmap, band.rows)
                     stop.check()
+            # The picture is there, and yet whoever called this does not go on.
+            stop.check()
         except RuntimeError as error:
             raise NergError(sentence(error)) from error
     seconds = time.perf_counter() - start

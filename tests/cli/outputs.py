@@ -89,7 +89,7 @@ CASES = (
 READS_ONLY = {"doctor", "rays show"}
 """Commands that write no file."""
 INPUTS = {
-    "render": {"scene"}, "rays import": {"files"}, "rays show": {"rays"}, "rays filter": {"rays"}, "rays split": {"rays"}, "rays plot": {"rays", "test"},
+    "render": {"scene"}, "rays import": {"files", "salt"}, "rays show": {"rays"}, "rays filter": {"rays"}, "rays split": {"rays"}, "rays plot": {"rays", "test"},
     "train radiance": {"dataset"}, "train gaze": {"rays", "views", "align_views", "field", "scene", "align"}, "eval radiance": {"field", "dataset"},
     "eval gaze": {"gaze", "rays", "field", "scene", "geometry"}, "import": {"file"}, "export mesh": {"field"}, "export points": {"field"},
     "export volume": {"field"}, "export torch-ngp": {"field"}, "ablate": {"rays", "field", "scene"},

@@ -138,6 +138,8 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb):
     assert code == 130 and said.strip(), said
     if case.name == "train radiance":  # in the preview's: between two steps, with a result to be gone on from
         assert set(files(out)) == {*case.files, "a.run"} and "go on with --resume" in said
+    elif case.name == "render":  # heard between steps, of which writing is the last
+        assert set(files(out)) == set(case.files)
     else:  # what a training has come to by then is kept
         assert set(files(out)) <= {"a.run"} and ("--resume" in said or not files(out))
 
