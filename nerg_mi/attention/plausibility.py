@@ -16,15 +16,16 @@ from .rays import Rays
 _OFF = 5.0  # degrees between direction and hit point
 _AHEAD = 0.2  # correlation of gaze and walking along an axis
 _MOST = 200_000  # rays looked at
-_WALKED = 1 << 21, 1 << 12  # rays looked at in runs of so many, where it matters which comes after which
+_WALKED = 1 << 19, 1 << 11  # rays looked at in runs of so many, where it matters which comes after which
 _USUAL = 5.0, 2100.0  # rays a second of devices that there are
 
 
 def warnings(
-    rays: Rays, height: np.ndarray, extent: np.ndarray, speed: float, step: np.ndarray, order: np.ndarray | None
+    rays: Rays, height: np.ndarray, extent: np.ndarray, speed: float, step: float | None, order: np.ndarray | None
 ) -> list[str]:
     """Sentences about rays in our frame. ``height``: 5, 50 and 95 % of the origins' heights; ``extent`` (3,) of their box;
-    ``speed``: 95 % of the speeds; ``step``: times between a person's rays; ``order``: `filters.time_order` of them."""
+    ``speed``: 95 % of the speeds; ``step``: median of
+    the times between a person's rays that are positive, NaN if none is, None without any; ``order``: `filters.time_order` of them."""
     return [*_lengths(rays, height, extent), *_times(rays, speed, step), *_directions(rays, order)]
 
 
@@ -66,26 +67,24 @@ def _standing_axis(rays: Rays) -> str | None:
     return None if len(found) != 1 else ("-" if mid[found[0]] < 0 else "") + "xyz"[found[0]]
 
 
-def _times(rays: Rays, speed: float, step: np.ndarray) -> list[str]:
+def _times(rays: Rays, speed: float, step: float | None) -> list[str]:
     out = []
     if speed > 5:
         out.append(f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: check the unit of time (--tick) or length")
-    forward = step[step > 0]
-    if not forward.size:
-        if step.size:
+    if step is None or np.isnan(step):
+        if step is not None:
             out.append("all rays of a person have the same time: is it the column of times that was named? (--map t=...)")
         return out
-    median = float(np.median(forward))
     # Where most rays come more than a second apart hardly anything counts as recorded time.
-    if not 1e-4 <= median <= 1.0:
+    if not 1e-4 <= step <= 1.0:
         tick = rays.metadata.get("tick", 1.0)
-        fits = [f for f in (1e-3, 1e-6, 1e-7, 1e-9, 1e3, 60.0) if _USUAL[0] <= 1 / (median * f) <= _USUAL[1]]
+        fits = [f for f in (1e-3, 1e-6, 1e-7, 1e-9, 1e3, 60.0) if _USUAL[0] <= 1 / (step * f) <= _USUAL[1]]
         remedy = (
-            f"were a unit of the file's time {tick * fits[0]:g} s, it would be {1 / (median * fits[0]):.3g} a second (--tick {tick * fits[0]:g})"
+            f"were a unit of the file's time {tick * fits[0]:g} s, it would be {1 / (step * fits[0]):.3g} a second (--tick {tick * fits[0]:g})"
             if fits
             else "check the unit of time (--tick)"
         )
-        out.append(f"a ray comes every {median:.3g} s; {remedy}")
+        out.append(f"a ray comes every {step:.3g} s; {remedy}")
     return out
 
 

@@ -53,10 +53,18 @@ def summarise(rays: Rays) -> RaysSummary:
     if len(rays) == 0:
         raise NergError("there are no rays to summarise; select fewer away")
     order = time_order(rays)
-    step, walked = _steps(rays, order)
+    step, speed = _steps(rays, order)
+    duplicates, some = int(np.count_nonzero(step == 0)), bool(step.size)
+    positive = step[step > 0]
+    median_step = float(np.median(positive)) if positive.size else float("nan")
+    del positive
     moving = (step > 0) & (step <= GAP)
-    speed = walked[moving] / step[moving]
-    forward = step[moving] if moving.any() else step[step > 0]
+    if not moving.all():
+        step, speed = step[moving], speed[moving]
+    speed /= step
+    speed_p95 = float(np.percentile(speed, 95, overwrite_input=True)) if speed.size else float("nan")
+    del speed
+    rate = 1.0 / (float(np.median(step)) if step.size else median_step)
 
     known, distance = _hits(rays)
     dropped: dict[str, int] = defaultdict(int)
@@ -65,45 +73,49 @@ def summarise(rays: Rays) -> RaysSummary:
 
     height = np.percentile(rays.origin[:, 2], [5, 50, 95])
     low, high = rays.origin.min(axis=0), rays.origin.max(axis=0)
-    speed_p95 = float(np.percentile(speed, 95)) if speed.size else float("nan")
     return RaysSummary(
         rays=len(rays),
         persons=int(np.count_nonzero(np.bincount(rays.person))),
-        duration=float(step[moving].sum()),
-        rate=float(1.0 / np.median(forward)) if forward.size else float("nan"),
+        duration=float(step.sum()),
+        rate=rate,
         box_low=low,
         box_high=high,
         eye_height=height,
         speed_p95=speed_p95,
         hit_share=known / len(rays),
         hit_distance=distance,
-        duplicates=int((step == 0).sum()),
+        duplicates=duplicates,
         rows_read=int(rays.metadata.get("rows_read", len(rays))),
         dropped=dict(dropped),
         cohorts={} if rays.cohort is None else dict(zip(rays.cohorts, np.bincount(rays.cohort, minlength=len(rays.cohorts)).tolist())),
-        warnings=tuple(warnings(rays, height, high - low, speed_p95, step, order)),
+        warnings=tuple(warnings(rays, height, high - low, speed_p95, median_step if some else None, order)),
     )
 
 
 def _steps(rays: Rays, order: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Times and distances between successive rays of a person, in ``order`` (`time_order`); as many as there are."""
-    steps, walked = [], []
-    for a in range(0, len(rays) - 1, _BLOCK):
+    step, walked = np.empty((2, max(0, len(rays) - 1)))
+    count = 0
+    for a in range(0, len(step), _BLOCK):
         rows = slice(a, a + _BLOCK + 1)
         rows = rows if order is None else order[rows]
         same = np.diff(rays.person[rows]) == 0
-        steps.append(np.diff(rays.t[rows])[same])
+        here = slice(count, count := count + np.count_nonzero(same))
+        step[here] = np.diff(rays.t[rows])[same]
         way = np.diff(rays.origin[rows], axis=0)[same]
-        walked.append(np.sqrt(np.einsum("ij,ij->i", way, way)))
-    return tuple(np.concatenate(parts) if parts else np.empty(0) for parts in (steps, walked))
+        walked[here] = np.sqrt(np.einsum("ij,ij->i", way, way))
+    return step[:count], walked[:count]
 
 
 def _hits(rays: Rays) -> tuple[int, float]:
     """How many hit points are known, and their median distance (NaN without any)."""
-    found = []
-    for a in range(0, len(rays) if rays.hit is not None else 0, _BLOCK):
+    if rays.hit is None:
+        return 0, float("nan")
+    distance, count = np.empty(len(rays)), 0
+    for a in range(0, len(rays), _BLOCK):
         way = rays.hit[a : a + _BLOCK] - rays.origin[a : a + _BLOCK]
-        distance = np.sqrt(np.einsum("ij,ij->i", way, way))
-        found.append(distance[np.isfinite(distance)])
-    distance = np.concatenate(found) if found else np.empty(0)
-    return len(distance), float(np.median(distance)) if distance.size else float("nan")
+        found = np.sqrt(np.einsum("ij,ij->i", way, way))
+        found = found[np.isfinite(found)]
+        distance[count : count + len(found)] = found
+        count += len(found)
+    return count, float(np.median(distance[:count], overwrite_input=True)) if count else float("nan")

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from dataclasses import replace
 
+from nerg_mi.attention import plausibility
 from nerg_mi.attention.frames import to_rays_frame
 from nerg_mi.attention.plausibility import walking_agreement
 from nerg_mi.attention.rays import FRAME, Rays
@@ -79,3 +80,14 @@ def test_axes_are_told_in_the_frame_of_the_file(units, up):
     for standing in {"x", "y", "z"} - {up[-1]}:
         file = rays.origin[:, {"x": [2, 0, 1], "y": [1, 2, 0], "z": [0, 1, 2]}[standing]]
         assert f"(--up {standing})" in said(replace(rays, origin=file @ turn.T))
+
+
+def test_some_runs_speak_for_millions(monkeypatch):
+    """What people do is seen in runs of the rays of many, in whichever order they are."""
+    monkeypatch.setattr(plausibility, "_WALKED", (4096, 512))
+    rays = walk(hit=False)
+    many = replace(rays, person=np.repeat(np.arange(6), 1000), persons=tuple("abcdef"))
+    shuffled = many.select(np.random.default_rng(0).permutation(len(many)))
+    for some in (many, shuffled):
+        assert (walking_agreement(some)[:2] > 0.5).all()
+        assert (walking_agreement(replace(some, direction=some.direction * (-1, -1, 1)))[:2] < -0.5).all()

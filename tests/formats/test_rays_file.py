@@ -1,5 +1,6 @@
 import importlib.util
 import json
+import zipfile
 
 import numpy as np
 import pytest
@@ -165,3 +166,18 @@ def test_parquet_of_other_types(tmp_path, column, value):
     pq.write_table(table.replace_schema_metadata(None), path)
     with pytest.raises(NergError, match="lacks the metadata"):
         Rays.load(path)
+
+
+def test_what_does_not_shrink_is_stored(tmp_path):
+    """Random digits are not worth the time of deflating them, and of inflating them each time."""
+    rng = np.random.default_rng(0)
+    n = 20_000
+    d = rng.normal(size=(n, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    rays = Rays(np.arange(n) * 0.02, np.zeros(n, int), ("a",), np.zeros((n, 3)), d, np.ones(n))
+    rays.save(tmp_path / "r.npz")
+    with zipfile.ZipFile(tmp_path / "r.npz") as archive:
+        kinds = {m.filename: m.compress_type for m in archive.infolist()}
+    assert kinds["direction.npy"] == zipfile.ZIP_STORED
+    assert all(kind == zipfile.ZIP_DEFLATED for name, kind in kinds.items() if name not in ("direction.npy", "metadata.npy"))
+    assert np.array_equal(Rays.load(tmp_path / "r.npz").direction, rays.direction)
