@@ -7,24 +7,25 @@
 #
 #   make check     the quick tests of every part (a minute or so on two cores); ARGS as above
 #   make coverage  all tests, and which branches of the package they reach
+#   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
 #   make mutants   judge the tests by 400 small mistakes in the source, resuming where it stopped (about an hour at first)
 #   make faults    kill commands at moments spread over their run, fill disks, forbid folders: nothing may be lost
 #   make soak      thousands of frames and steps: memory may not grow
 #   make packages  build the packages, install and try them with every Python that is here
 #
-# The last five print a table; ARGS="--update docs/trust.md" puts it there. Set-up is done once: the second run of any of
+# The last six print a table; ARGS="--update docs/trust.md" puts it there. Set-up is done once: the second run of any of
 # these only does its own work.
 
 PYTHON ?= python3
 ARGS ?=
 RUN = .venv/bin/python
 
-.PHONY: demo test check coverage mutants faults soak packages setup
+.PHONY: demo test check coverage fuzz mutants faults soak packages setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
 
-test check coverage mutants faults soak packages: EXTRAS = test
+test check coverage fuzz mutants faults soak packages: EXTRAS = test
 
 test: setup
 	$(RUN) -m pytest $(ARGS)
@@ -32,7 +33,7 @@ test: setup
 check: setup
 	$(RUN) -m pytest -q -m "not slow" $(ARGS)
 
-coverage mutants faults soak packages: setup
+coverage fuzz mutants faults soak packages: setup
 	$(RUN) tools/$@.py $(ARGS)
 
 setup:

@@ -38,18 +38,18 @@ class Dataset:
 
 def open_dataset(
     path: str | Path, holdout: int | None = None, width: int | None = None, downscale: float | None = None,
-    aabb: tuple | None = None, depth: bool = True, scale: float = 1.0, coordinates: str = "file",
+    aabb: tuple | None = None, depth: bool = True, scale: float = 1.0, coordinates: str = "file", allow_outside: bool = False,
 ) -> Dataset:
     """Read the data set ``path``: a folder with a transforms file or a COLMAP model, or one of these itself.
 
-    ``holdout``, ``coordinates``, ``scale``: as `read_split` has them. ``width``, ``downscale``: size of the
+    ``holdout``, ``coordinates``, ``scale``, ``allow_outside``: as `read_split` has them. ``width``, ``downscale``: size of the
     pictures. ``aabb``: six numbers x0, y0, z0, x1, y1, z1 bounding what is seen, in the coordinates asked for; else "aabb"
     of the file, else a guess from points on surfaces (COLMAP's, or from depth) or from the cameras. ``depth``: read
     the depth files that the frames name.
 
     Frames that cannot be used are left out and listed; `NergError`, naming file and frame, when none can.
     """
-    split = read_split(path, holdout, coordinates, scale)
+    split = read_split(path, holdout, coordinates, scale, allow_outside)
     train, bad = load_usable(split.posed.frames, width, downscale, depth)
     if not train:
         raise NergError(f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '

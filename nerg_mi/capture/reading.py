@@ -37,7 +37,9 @@ def read_image(path: str | Path) -> np.ndarray:
     alpha = bitmap.has_alpha()
     straight = mi.Bitmap.AlphaTransform.Unpremultiply if alpha and bitmap.premultiplied_alpha() else \
         mi.Bitmap.AlphaTransform.Empty
-    linear = bitmap.convert(formats.RGBA if alpha else formats.RGB, kinds.Float32, srgb_gamma=False, alpha_transform=straight)
+    wanted = formats.RGBA if alpha else formats.RGB
+    with reading(path, "image", also=(RuntimeError,)):
+        linear = bitmap.convert(wanted, kinds.Float32, srgb_gamma=False, alpha_transform=straight)
     out = np.array(linear, np.float32)
     if alpha:
         # Without any light and without opacity a colour is 0 over 0.
@@ -79,7 +81,9 @@ def _exr_bitmap(channels: dict[str, np.ndarray]):
 
 def _layer(bitmap, path):
     """The colour layer of a multichannel EXR."""
-    layers = dict(bitmap.split())
+    # Layers whose channels do not fit together make Mitsuba say so.
+    with reading(path, "image", also=(RuntimeError,)):
+        layers = dict(bitmap.split())
     for name in ("<root>", "rgba", "color"):
         if name in layers:
             return layers[name]

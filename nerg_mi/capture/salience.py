@@ -13,10 +13,11 @@ import numpy as np
 
 from ..errors import MissingFile, NergError
 from ..formats.intrinsics import Intrinsics
-from ..formats.posed import Frame
+from ..formats.npy import read_npy
+from ..formats.posed import Frame, inside
 from . import lens
 from .cameras import Camera
-from .reading import read_image, read_mask
+from .reading import open_bitmap, read_image, read_mask
 from .resize import all_used, nearest, overlap
 from .solid_angle import pixel_solid_angles
 from .sources import find_source, read_posed
@@ -101,7 +102,7 @@ class SalienceSet:
 
 
 def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", align: np.ndarray | None = None,
-                  trained: dict | None = None) -> SalienceSet:
+                  trained: dict | None = None, allow_outside: bool = False) -> SalienceSet:
     """The salience images of a posed image set ``dataset`` (as `sources.find_source` knows them).
 
     ``source``: a folder with one .png, .exr or .npy a frame, called as the photo is but for the suffix, or the name of a model
@@ -109,12 +110,13 @@ def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", a
     models have it that predict where in a picture is looked, or a ``steradian``, as a rendered density has it. ``align``:
     (4, 4) similarity from the set's coordinates to those wanted; by default they stay, or become those of a radiance field that
     was trained on this very file, of which ``trained`` is the provenance. Masks of the frames hide what is not known.
+    ``allow_outside``: read files outside of the set's folder, and of that of the images, too, to which names and links may lead.
 
     Raises `NergError`, naming the file, for an image that is none, and when no frame has one.
     """
     if per not in PER:
         raise NergError(f'salience is given per {" or per ".join(PER)}, not per "{per}"')
-    posed = read_posed(find_source(dataset))
+    posed = read_posed(find_source(dataset), allow_outside)
     if align is None and trained and trained.get("sha256") == posed.sha256 and "to_file" in trained:
         align = np.linalg.inv(trained["to_file"])
     if align is not None:
@@ -123,7 +125,7 @@ def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", a
     if model is not None:
         files, stray = {f.name: None for f in posed.frames}, []
     else:
-        files, stray = _files(Path(source), posed.frames)
+        files, stray = _files(Path(source), posed.frames, allow_outside)
     views = [_view(f, files[f.name], model, per) for f in posed.frames if f.name in files]
     missing = [f.name for f in posed.frames if f.name not in files]
     if not views:
@@ -142,10 +144,7 @@ def read_salience(path: str | Path) -> np.ndarray:
     Raises `NergError`, naming the file, for what is none: NaN, negative values, colours, transparency.
     """
     path = Path(path)
-    try:
-        out = np.load(path, allow_pickle=False) if path.suffix.lower() == ".npy" else _stored(path)
-    except (OSError, EOFError, ValueError, RuntimeError) as e:
-        raise NergError(f'the salience image "{path}" cannot be read: {str(e).strip().splitlines()[-1]}') from e
+    out = read_npy(path, "salience image") if path.suffix.lower() == ".npy" else _stored(path)
     if out.ndim == 3 and out.shape[2] in (2, 4):
         if np.ptp(out[..., -1].astype(np.float64)) > 0:
             raise NergError(f'the salience image "{path}" is partly transparent; leave out its alpha channel')
@@ -170,13 +169,13 @@ def read_salience(path: str | Path) -> np.ndarray:
 def _stored(path: Path) -> np.ndarray:
     import mitsuba as mi
 
-    bitmap = mi.Bitmap(str(path))
+    bitmap = open_bitmap(path, "salience image")
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel and bitmap.channel_count() != 1:
-        raise NergError(f"it has {bitmap.channel_count()} channels and not one")
+        raise NergError(f'the salience image "{path}" has {bitmap.channel_count()} channels and not one; save it with one')
     return np.array(bitmap)
 
 
-def _files(folder: Path, frames: list[Frame]) -> tuple[dict[str, Path], list[str]]:
+def _files(folder: Path, frames: list[Frame], allow_outside: bool) -> tuple[dict[str, Path], list[str]]:
     """The file of each frame that has one, and names of the others."""
     if not folder.is_dir():
         raise MissingFile(f'there is no folder "{folder}" of salience images; '
@@ -194,7 +193,8 @@ def _files(folder: Path, frames: list[Frame]) -> tuple[dict[str, Path], list[str
         if stem in owner:
             raise NergError(f'the salience image "{found[stem]}" could be of "{owner[stem]}" or of "{frame.name}"; '
                              "give the photos different names")
-        out[frame.name], owner[stem] = found[stem], frame.name
+        path = found[stem]
+        out[frame.name], owner[stem] = path if allow_outside else inside(folder, path, "salience image"), frame.name
     return out, [p.name for stem, p in found.items() if stem not in owner]
 
 

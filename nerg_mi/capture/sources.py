@@ -43,29 +43,32 @@ def find_source(dataset: str | Path) -> Path:
     )
 
 
-def read_posed(source: Path) -> PosedImages:
-    """Read what `find_source` found."""
+def read_posed(source: Path, allow_outside: bool = False) -> PosedImages:
+    """Read what `find_source` found. ``allow_outside``: use files outside of its folder too (of a COLMAP model: of the one
+    that holds its images), to which names and links in it may lead."""
     if source.is_file():
-        return read_transforms(source)
+        return read_transforms(source, allow_outside)
     folders = [source, *list(source.resolve().parents)[:3]]
     images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
     if images is None:
         raise MissingFile(f'there is no folder "images" beside or above the COLMAP model "{source}"; '
                                 "put the photos there")
     masks = images.with_name("masks")
-    return read_colmap(source, images, masks if masks.is_dir() else None)
+    return read_colmap(source, images, masks if masks.is_dir() else None, allow_outside)
 
 
-def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str = "file", scale: float = 1.0) -> Split:
+def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str = "file", scale: float = 1.0,
+               allow_outside: bool = False) -> Split:
     """Read ``dataset`` and set its held-out frames apart.
 
     ``holdout``: every so many frames, 0 none. None: the frames of a ``transforms_test.json`` or else
     ``transforms_val.json`` beside the file, or those that the file itself lists for testing, or every 8th.
     ``coordinates``: "file"; "original", before the writer applied its ``applied_transform``; or a
-    ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that.
+    ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that. ``allow_outside``: as
+    `read_posed` has it.
     """
     source = find_source(dataset)
-    posed = read_posed(source)
+    posed = read_posed(source, allow_outside)
     similarity = _similarity(posed, coordinates, scale)
     posed = posed.moved(similarity)
     if posed.spare:
@@ -74,7 +77,7 @@ def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str
                         notes=[*posed.notes, f"{len(spare)} frames are in no training or test list of {posed.path.name}"])
     other = _test_file(source) if holdout is None else None
     if other is not None:
-        test = read_transforms(other).moved(similarity)
+        test = read_transforms(other, allow_outside).moved(similarity)
         hidden = {f.image.resolve() for f in test.frames}
         both = [f for f in posed.frames if f.image.resolve() in hidden]
         train = [f for f in posed.frames if f.image.resolve() not in hidden]

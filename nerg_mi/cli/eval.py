@@ -30,6 +30,9 @@ def eval_radiance(
     width: Annotated[Optional[int], typer.Option(help="Width of the pictures. Default: as it was trained.")] = None,
     scale: Annotated[float, typer.Option(help="As it was trained with.")] = 1.0,
     coordinates: Annotated[str, typer.Option(help="As it was trained with.")] = "file",
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="Read files outside of the data set's folder too, where it names them.")
+    ] = False,
     spp: Annotated[int, typer.Option(min=1, help="Rays a pixel. The scatter of few is part of the score.")] = 16,
     output: Annotated[
         Optional[Path], typer.Option("-o", "--output", help="Folder for the pictures. Default: FIELD.eval")
@@ -56,7 +59,7 @@ def eval_radiance(
     if threads is not None:
         dr.set_thread_count(threads)
     about = read_checkpoint(field, "radiance")[1].get("provenance", {})
-    data = open_dataset(dataset, holdout, width or about.get("width"), None, None, True, scale, coordinates)
+    data = open_dataset(dataset, holdout, width or about.get("width"), None, None, True, scale, coordinates, allow_outside)
     trained = about.get("held_out", {}).get("frames")
     if not train and trained is not None and about.get("sha256") == data.source["sha256"]:
         seen = sorted({v.name for v in data.held_out} - set(trained))

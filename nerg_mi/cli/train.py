@@ -31,6 +31,9 @@ def train_radiance(
     coordinates: Annotated[
         str, typer.Option(help="Of the field: file, original (applied_transform undone), or a dataparser_transforms.json.")
     ] = "file",
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="Read files outside of the data set's folder too, where it names them.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the weights, rays and jitter.")] = 0,
     threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
     half: Annotated[bool, typer.Option("--half", help="Store the weights in fp16.")] = False,
@@ -69,7 +72,7 @@ def train_radiance(
     settings = RadianceSettings(steps=steps, minutes=minutes, seed=seed, **weights)
     if resume and not state.is_file():
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
-    data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth, scale, coordinates)
+    data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth, scale, coordinates, allow_outside)
     config = sized_config(size, data.box)
     for line in (*data.unused, *data.notes):
         typer.echo(line)

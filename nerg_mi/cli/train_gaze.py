@@ -22,6 +22,9 @@ def train_gaze(
     align_views: Annotated[
         Optional[Path], typer.Option(help="JSON file with the 4x4 similarity from the photos' frame to the place's.")
     ] = None,
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="Read files outside of --views' folder and that of --salience too, where they name them.")
+    ] = False,
     field: Annotated[Optional[Path], typer.Option(help="Radiance field in which people looked around.")] = None,
     scene: Annotated[Optional[Path], typer.Option(help="Or: a Mitsuba scene, whose shapes they looked at.")] = None,
     geometry: Annotated[
@@ -133,7 +136,7 @@ def train_gaze(
     if rays is not None:
         data = Rays.load(rays)
         about |= {"rays_file": {"file": rays.name, "sha256": file_sha256(rays), "persons": len(data.persons)}}
-    seen, found = _views(views, salience, salience_per, align_views, field)
+    seen, found = _views(views, salience, salience_per, align_views, field, allow_outside)
     about |= found
     if test_zones:
         data, about["test"] = hold_out(data, how.radius, test_zones, test_positions, seed, max(64, how.min_rays), test_people)
@@ -189,7 +192,8 @@ def _begun(begin: str, place, config, more: dict) -> tuple:
     return replace(config, **more), None
 
 
-def _views(views: Path | None, salience: str | None, per: str, align: Path | None, field: Path | None) -> tuple[list, dict]:
+def _views(views: Path | None, salience: str | None, per: str, align: Path | None, field: Path | None,
+           allow_outside: bool) -> tuple[list, dict]:
     """Salience images, and what provenance says of them."""
     if views is None or salience is None:
         if views or salience or align:
@@ -200,7 +204,7 @@ def _views(views: Path | None, salience: str | None, per: str, align: Path | Non
 
     similarity = _similarity(align)
     trained = None if field is None else read_checkpoint(field, "radiance")[1].get("provenance")
-    found = open_salience(views, salience, per, None if similarity is None else similarity.matrix, trained)
+    found = open_salience(views, salience, per, None if similarity is None else similarity.matrix, trained, allow_outside)
     for said in found.unused:
         typer.echo(said)
     typer.echo(f"{len(found.views)} views with salience" + (f"; without: {', '.join(found.missing)}" if found.missing else "")
@@ -235,13 +239,16 @@ def _similarity(path: Path | None):
 
     if path is None:
         return None
-    import json
+    from ..errors import NergError
+    from ..formats.bounded import plain, read_json
 
+    matrix = read_json(path, "similarity of --align")
     try:
-        matrix = json.loads(path.read_text())
         return Similarity([[float(x) for x in row] for row in matrix])
-    except (TypeError, ValueError, IndexError) as e:
-        raise ValueError(f'--align needs a JSON file with the 4 rows of a similarity from rays to field; "{path}": {e}') from e
+    except (TypeError, ValueError, IndexError, OverflowError) as e:
+        raise NergError(
+            f'--align needs a JSON file with the 4 rows of a similarity from rays to field; "{path}": {plain(e)}'
+        ) from e
 
 
 def _report(p: dict) -> None:

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MissingFile, NergError
-from .posed import Frame, MaskFile, PosedImages, Unused, drop_repeated, none_usable
+from ..errors import MissingFile, NergError, sentence
+from .bounded import plain, read_bytes, text_lines
+from .posed import FARTHEST, Frame, MaskFile, PosedImages, Unused, drop_repeated, inside, none_usable
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
 _MODELS = {
@@ -31,6 +32,8 @@ _PARAMETERS = {
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 # Points that fewer images hold, or that project worse than so many pixels, are no evidence of a surface.
 _MIN_TRACK, _MAX_ERROR = 3, 4.0
+# Characters of a line that is split into words; those of observations, which are longer, are skipped.
+_LONGEST = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,12 @@ def model_files(folder: str | Path) -> dict[str, Path] | None:
     return None
 
 
-def read_colmap(folder: str | Path, images: str | Path, masks: str | Path | None = None) -> PosedImages:
+def read_colmap(folder: str | Path, images: str | Path, masks: str | Path | None = None,
+                allow_outside: bool = False) -> PosedImages:
     """Read the model in ``folder``; its image names are relative to ``images``, its masks' to ``masks`` (``NAME.png``).
 
-    In COLMAP's own world. Frames that cannot be used are listed; `NergError` names file and record for
+    Images and masks that lie outside of the capture, the folder that holds ``images``, links followed, are not used unless
+    ``allow_outside``. In COLMAP's own world. Frames that cannot be used are listed; `NergError` names file and record for
     what cannot be parsed, and when no frame can be used.
     """
     folder, images = Path(folder), Path(images)
@@ -79,32 +84,35 @@ def read_colmap(folder: str | Path, images: str | Path, masks: str | Path | None
     cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"])
     poses = (_images_bin if binary else _images_txt)(files["images"])
     frames, unused = [], []
+    root = None if allow_outside else images.parent
     for name, camera, q, t in poses:
         try:
-            frames.append(_frame(name, cameras.get(camera), camera, q, t, images, masks))
-        except ValueError as e:
-            unused.append(Unused(name, str(e)))
+            frames.append(_frame(name, cameras.get(camera), camera, q, t, images, masks, root))
+        except (ValueError, OverflowError, OSError) as e:
+            # A name may be longer than the system allows, or hold what no name can.
+            unused.append(Unused(name, sentence(e)))
     frames.sort(key=lambda f: f.name)
     frames, repeated = drop_repeated(frames)
     unused = sorted(unused + repeated, key=lambda u: u.name)
     if not frames:
         raise none_usable(files["images"], unused)
     points = (_points_bin if binary else _points_txt)(files["points3D"]) if "points3D" in files else None
-    digest = hashlib.sha256(b"".join(hashlib.sha256(files[n].read_bytes()).digest() for n in ("cameras", "images")))
+    digest = hashlib.sha256(b"".join(hashlib.sha256(read_bytes(files[n])).digest() for n in ("cameras", "images")))
     return PosedImages(files["images"], frames, unused, None, digest.hexdigest(), points=points)
 
 
-def _frame(name: str, camera: _Camera | None, number: int, q, t, images: Path, masks) -> Frame:
+def _frame(name: str, camera: _Camera | None, number: int, q, t, images: Path, masks, root: Path | None) -> Frame:
     if camera is None:
         raise NergError(f"the model has no camera {number}")
-    if not (images / name).is_file():
-        raise NergError(f'its image "{images / name}" does not exist')
+    if not inside(root, images / name, "image").is_file():
+        raise NergError(f'its image "{plain(images / name)}" does not exist')
     lens, mask = camera.lens(), None
     if masks is not None:
         # COLMAP appends the suffix; others replace it.
-        found = [p for p in (Path(masks) / f"{name}.png", (Path(masks) / name).with_suffix(".png")) if p.is_file()]
+        names = Path(masks) / f"{name}.png", (Path(masks) / name).with_suffix(".png")
+        found = [p for p in names if inside(root, p, "mask").is_file()]
         if not found:
-            raise NergError(f'its mask "{Path(masks) / name}.png" does not exist')
+            raise NergError(f'its mask "{plain(names[0])}" does not exist')
         mask = MaskFile(found[0])
     return Frame(name, images / name, _to_world(q, t), lens, mask=mask)
 
@@ -112,7 +120,7 @@ def _frame(name: str, camera: _Camera | None, number: int, q, t, images: Path, m
 def _to_world(q, t) -> np.ndarray:
     w, x, y, z = q
     norm = float(np.linalg.norm(q))
-    if not (np.isfinite(norm) and norm > 1e-6 and np.all(np.isfinite(t))):
+    if not (1e-6 < norm <= FARTHEST and np.abs(t).max() <= FARTHEST):
         raise NergError("its pose is not finite, or its quaternion is zero")
     w, x, y, z = (v / norm for v in (w, x, y, z))
     m = np.eye(4)
@@ -131,7 +139,7 @@ class _Reader:
     """Little-endian records of a file; an end that comes too early is told with its place."""
 
     def __init__(self, path: Path):
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+        self.path, self.data, self.at = path, read_bytes(path, "COLMAP file"), 0
 
     def take(self, form: str, what: str) -> tuple:
         size = struct.calcsize("<" + form)
@@ -190,16 +198,26 @@ def _points_bin(path: Path) -> np.ndarray:
     return _trusted(out, path)
 
 
-def _lines(path: Path, keep_empty: bool = False):
-    """Line numbers and words; comments left out. Lines of observations may be empty."""
-    for number, line in enumerate(path.read_text(errors="surrogateescape").splitlines(), 1):
-        if not line.startswith("#") and (keep_empty or line.strip()):
+def _lines(path: Path):
+    """Line numbers and lines; comments left out."""
+    for number, line in enumerate(text_lines(path, "COLMAP file"), 1):
+        if not line.startswith("#"):
+            yield number, line
+
+
+def _rows(path: Path):
+    """Numbers and words of the lines that are not empty."""
+    for number, line in _lines(path):
+        if len(line) > _LONGEST:
+            raise NergError(f'line {number} of "{path}" has {len(line):,} characters, and at most {_LONGEST:,} are read; '
+                            "is it a COLMAP file?")
+        if line.strip():
             yield number, line.split()
 
 
 def _cameras_txt(path: Path) -> dict[int, _Camera]:
     out = {}
-    for number, words in _lines(path):
+    for number, words in _rows(path):
         try:
             out[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         except (ValueError, IndexError) as e:
@@ -209,11 +227,12 @@ def _cameras_txt(path: Path) -> dict[int, _Camera]:
 
 def _images_txt(path: Path) -> list[tuple]:
     out, observations = [], False
-    for number, words in _lines(path, keep_empty=True):
+    for number, line in _lines(path):
         # Every second line lists observations, and may be empty.
         if observations:
             observations = False
             continue
+        words = line[:_LONGEST].split()
         if not words:
             continue
         try:
@@ -229,7 +248,7 @@ def _images_txt(path: Path) -> list[tuple]:
 
 def _points_txt(path: Path) -> np.ndarray:
     out = []
-    for number, words in _lines(path):
+    for number, words in _rows(path):
         try:
             out.append((*map(float, words[1:4]), float(words[7]), (len(words) - 8) // 2))
         except (ValueError, IndexError) as e:
@@ -239,5 +258,5 @@ def _points_txt(path: Path) -> np.ndarray:
 
 def _trusted(rows: list[tuple], path: Path) -> np.ndarray:
     table = np.array(rows, np.float64).reshape(-1, 5)
-    good = np.all(np.isfinite(table), axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
+    good = np.all(np.abs(table) <= FARTHEST, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
     return table[good, :3]

@@ -5,17 +5,40 @@ coordinates and units; readers do not re-centre, scale or turn them.
 """
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import NergError
+from .bounded import plain
 from .intrinsics import Intrinsics
 
 # Keys of `Frame.lens`, all floats; "fisheye" is 1 for fisheye lenses.
 LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6",
              "camera_angle_x", "camera_angle_y", "fisheye")
+
+
+FARTHEST = 1e12
+"""Nothing may lie farther from the origin, in units: beyond, differences of positions are lost."""
+
+# Focal lengths as shares of the picture's width: from a view of almost 180 degrees to one of a thousandth of a degree.
+_FOCAL = 1e-3, 1e5
+_BENT, _UNBENT = 1e9, 1e-30
+
+
+def inside(root: Path | None, path: Path, what: str) -> Path:
+    """``path``, where it lies below the folder ``root`` once all links are followed (None: anywhere).
+
+    Raises `NergError` otherwise: a data set of somebody else's must not make files be read that it does not hold.
+    """
+    if root is not None and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
+        raise NergError(
+            f'its {what} "{plain(path)}" lies outside of the data set\'s folder "{root}"; move it there, or allow this with '
+            "--allow-outside"
+        )
+    return path
 
 
 @dataclass(frozen=True)
@@ -68,13 +91,20 @@ class Frame:
             fy = h / (2 * np.tan(lens["camera_angle_y"] / 2))
         # One focal length means square pixels.
         fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-        if fx is None or not (np.isfinite(fx) and fx > 0 and np.isfinite(fy) and fy > 0):
+        if fx is None or not all(_FOCAL[0] * w <= f <= _FOCAL[1] * w for f in (fx, fy)):
             raise NergError(
-                f'frame "{self.name}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in radians'
+                f'frame "{plain(self.name)}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in radians'
             )
+        if not (abs(lens.get("cx", 0)) <= 100 * w and abs(lens.get("cy", 0)) <= 100 * h):
+            raise NergError(f'the principal point ("cx", "cy") of frame "{plain(self.name)}" is not near its picture; correct it')
+        bent = [lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+        if not all(abs(k) <= _BENT for k in bent):
+            raise NergError(f'the distortion of frame "{plain(self.name)}" has coefficients beyond {_BENT:g}; correct them')
+        # One that bends nothing would still be divided by where a lens is asked for its fold.
+        bent = [k if abs(k) >= _UNBENT else 0.0 for k in bent]
         stated = Intrinsics(
             w, h, float(fx), float(fy), lens.get("cx", w / 2), lens.get("cy", h / 2),
-            *(lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")), bool(lens.get("fisheye")),
+            *bent, bool(lens.get("fisheye")),
         )
         return stated.resized(width, height)
 
@@ -87,7 +117,7 @@ class Unused:
     reason: str
 
     def __str__(self) -> str:
-        return f'left out "{self.name}": {self.reason}'
+        return f'left out "{plain(self.name)}": {plain(self.reason, 1000)}'
 
 
 @dataclass(frozen=True)
@@ -136,7 +166,7 @@ def _parts(similarity: np.ndarray) -> tuple[float, np.ndarray]:
     """Scale and rotation of a similarity; `NergError` for anything else."""
     m = np.asarray(similarity, np.float64)
     scale = np.cbrt(np.linalg.det(m[:3, :3])) if m.shape == (4, 4) and np.all(np.isfinite(m)) else 0.0
-    if not scale > 0 or np.abs(m[:3, :3] @ m[:3, :3].T / scale**2 - np.eye(3)).max() > 1e-3:
+    if not scale > 0 or not np.abs(m[:3, :3] @ m[:3, :3].T / scale**2 - np.eye(3)).max() <= 1e-3:
         raise NergError("a change of coordinates must be a uniform scale, a rotation and a translation, without mirroring")
     return float(scale), m[:3, :3] / scale
 
@@ -154,7 +184,7 @@ def rigid_pose(matrix: object) -> np.ndarray:
     """The (4, 4) pose that ``matrix`` means: a scale is taken out, and rounding. `NergError` for what is no pose."""
     try:
         pose = np.asarray(matrix, np.float64)
-    except (TypeError, ValueError) as e:
+    except (TypeError, ValueError, OverflowError) as e:
         raise NergError("its pose must be a matrix of 4 x 4 numbers") from e
     if pose.shape == (3, 4):
         pose = np.vstack([pose, [0, 0, 0, 1]])
@@ -163,8 +193,10 @@ def rigid_pose(matrix: object) -> np.ndarray:
     if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise NergError("the last row of its pose is not 0, 0, 0, 1 (is the matrix transposed?)")
     rotation = pose[:3, :3]
+    if not np.abs(pose).max() <= FARTHEST:
+        raise NergError(f"its pose has numbers beyond {FARTHEST:g}")
     scale = np.cbrt(np.linalg.det(rotation))
-    if scale <= 0 or np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() > 1e-2:
+    if not scale > 0 or not np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() <= 1e-2:
         raise NergError("its pose is not a rotation and a translation (mirrored, sheared or singular)")
     # Some writers leave a scale in the rotation, or round it: the nearest rotation is what they meant.
     u, _, vt = np.linalg.svd(rotation)
@@ -192,6 +224,6 @@ def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
 def none_usable(path: Path, unused: list[Unused]) -> NergError:
     """The error of a set without a single usable frame."""
     if not unused:
-        return NergError(f'"{path}" lists no frames')
-    return NergError(f'none of the {len(unused)} frames of "{path}" can be used; the first, "{unused[0].name}": '
-                      f"{unused[0].reason}")
+        return NergError(f'"{path}" lists no frames; name the file of a posed image set')
+    return NergError(f'none of the {len(unused)} frames of "{path}" can be used; the first, "{plain(unused[0].name)}": '
+                     f"{plain(unused[0].reason, 1000)}")

@@ -12,43 +12,55 @@ What differs between the three, and how it is read:
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import NergError
-from .posed import LENS_KEYS, DepthFile, Frame, MaskFile, PosedImages, Unused, drop_repeated, none_usable, rigid_pose
+from ..errors import NergError, sentence
+from .bounded import JSON_BYTES, parse_json, plain, read_bytes
+from .posed import (
+    FARTHEST, LENS_KEYS, DepthFile, Frame, MaskFile, PosedImages, Unused, drop_repeated, inside, none_usable, rigid_pose,
+)
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 _PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 _MILLIMETRE = 1e-3
+_SCALES = 1e-9, 1e9
+# Keys of the file that hold for all of its frames. Others are many in some files, and would be copied for each.
+_SHARED = (*LENS_KEYS, "camera_model", "is_fisheye", "is_equirectangular", "depth_unit_scale_factor", "integer_depth_scale",
+           "is_euclidean_depth")
 
 
-def read_transforms(path: str | Path) -> PosedImages:
+def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImages:
     """Read a transforms file. Frames that cannot be used are listed, not fatal.
+
+    Images, masks and depth files that lie outside of the file's folder, links followed, are not used unless
+    ``allow_outside``.
 
     Raises `NergError`, naming file and frame, for malformed JSON and when not a single frame can be used.
     """
     path = Path(path)
-    raw = path.read_bytes()
+    raw = read_bytes(path, "transforms file", JSON_BYTES)
     data = _json(path, raw)
     if not isinstance(data.get("frames"), list):
-        raise NergError(f'"{path}" is not a transforms file: it has no list "frames"')
+        raise NergError(f'"{path}" is not a transforms file: it has no list "frames"; name one that has')
     original = _original(data, path)
     # Millimetres are of the original coordinates.
     metre = 1.0 if original is None else 1 / float(np.cbrt(np.linalg.det(original[:3, :3])))
     frames, unused, notes = [], [], []
+    shared = {k: v for k, v in data.items() if k in _SHARED or k.startswith("ftheta")}
+    root = None if allow_outside else path.parent
     for index, entry in enumerate(data["frames"]):
         name = entry.get("file_path") if isinstance(entry, dict) else None
         if not isinstance(name, str):
             unused.append(Unused(f"frame {index}", 'it has no "file_path"'))
             continue
         try:
-            frames.append(_frame({**data, **entry}, entry, path.parent, name, metre, notes))
-        except ValueError as e:
-            unused.append(Unused(name, str(e)))
+            frames.append(_frame({**shared, **entry}, entry, path.parent, name, metre, notes, root))
+        except (ValueError, OverflowError, OSError) as e:
+            # A name may be longer than the system allows, or hold what no name can.
+            unused.append(Unused(name, sentence(e)))
     frames.sort(key=lambda f: f.name)
     frames, repeated = drop_repeated(frames)
     unused = sorted(unused + repeated, key=lambda u: u.name)
@@ -62,37 +74,39 @@ def read_transforms(path: str | Path) -> PosedImages:
 def read_dataparser(path: str | Path) -> np.ndarray:
     """The similarity (4, 4) of nerfstudio's ``dataparser_transforms.json``: original coordinates to trained ones."""
     path = Path(path)
-    data = _json(path, path.read_bytes())
+    data = _json(path, read_bytes(path, "file of nerfstudio's coordinates", JSON_BYTES))
     try:
         m, scale = np.asarray(data["transform"], np.float64), float(data["scale"])
-    except (KeyError, TypeError, ValueError) as e:
+    except (KeyError, TypeError, ValueError, OverflowError) as e:
         raise NergError(f'"{path}" needs "transform", 3 x 4 numbers, and "scale"') from e
-    if m.shape not in ((3, 4), (4, 4)) or not (np.all(np.isfinite(m)) and np.isfinite(scale) and scale > 0):
-        raise NergError(f'"{path}" needs "transform", 3 x 4 finite numbers, and a positive "scale"')
+    if not _rigid(m) or not _SCALES[0] <= scale <= _SCALES[1]:
+        raise NergError(f'"{path}" needs "transform", a rotation and a translation of 3 x 4 numbers, and a positive "scale"')
     return np.vstack([scale * m[:3], [0, 0, 0, 1]])
 
 
 def _json(path: Path, raw: bytes) -> dict:
-    try:
-        data = json.loads(raw)
-    except ValueError as e:
-        raise NergError(f'"{path}" is not valid JSON: {e}') from e
+    data = parse_json(raw, path, "transforms file")
     if not isinstance(data, dict):
-        raise NergError(f'"{path}" is not a transforms file: it holds no JSON object')
+        raise NergError(f'"{path}" is not a transforms file: it holds no JSON object; name one that does')
     return data
 
 
-def _frame(data: dict, entry: dict, folder: Path, name: str, metre: float, notes: list[str]) -> Frame:
-    """One frame; ``data``: its keys over those of the file."""
-    image = _image_file(folder / name)
+def _frame(
+    data: dict, entry: dict, folder: Path, name: str, metre: float, notes: list[str], root: Path | None
+) -> Frame:
+    """One frame; ``data``: its keys over those of the file; ``root``: below which its files must lie."""
+    image = _image_file(inside(root, folder / name, "image"))
     if image is None:
         raise NergError("its image does not exist")
+    inside(root, image, "image")
     if "transform_matrix" not in entry:
         raise NergError('it has no "transform_matrix"')
-    pose, lens, mask = rigid_pose(entry["transform_matrix"]), _lens(data), _mask(entry, folder, image)
+    pose, lens, mask = rigid_pose(entry["transform_matrix"]), _lens(data), _mask(entry, folder, image, root)
     depth = _depth(data, entry, folder, metre)
+    if depth is not None:
+        inside(root, depth.path, "depth file")
     if depth is not None and not depth.path.is_file():
-        notes.append(f'"{name}" is used without depth: its depth file "{depth.path}" does not exist')
+        notes.append(f'"{plain(name)}" is used without depth: its depth file "{plain(depth.path)}" does not exist')
         depth = None
     return Frame(name, image, pose, lens, depth, mask)
 
@@ -105,14 +119,14 @@ def _image_file(path: Path) -> Path | None:
     return None
 
 
-def _mask(entry: dict, folder: Path, image: Path) -> MaskFile | None:
+def _mask(entry: dict, folder: Path, image: Path, root: Path | None) -> MaskFile | None:
     if entry.get("mask_path") is not None:
-        mask = folder / _path(entry, "mask_path")
+        mask = inside(root, folder / _path(entry, "mask_path"), "mask")
         if not mask.is_file():
-            raise NergError(f'its mask "{entry["mask_path"]}" does not exist; restore it, or remove its "mask_path"')
+            raise NergError(f'its mask "{plain(entry["mask_path"])}" does not exist; restore it, or remove its "mask_path"')
         return MaskFile(mask)
     dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
-    return MaskFile(dynamic, hides=True) if dynamic.is_file() else None
+    return MaskFile(inside(root, dynamic, "mask"), hides=True) if dynamic.is_file() else None
 
 
 def _depth(data: dict, entry: dict, folder: Path, metre: float) -> DepthFile | None:
@@ -126,8 +140,8 @@ def _depth(data: dict, entry: dict, folder: Path, metre: float) -> DepthFile | N
         unit = _number(data, "depth_unit_scale_factor") * metre
     elif counted and data.get("integer_depth_scale") is not None:
         unit = _number(data, "integer_depth_scale")
-    if not unit > 0:
-        raise NergError("the unit of its depth file is not positive")
+    if not 0 < unit <= FARTHEST:
+        raise NergError("the unit of its depth file is not a positive number")
     if data.get("is_euclidean_depth") is not None:
         axis = not data["is_euclidean_depth"]
     return DepthFile(path, unit, axis)
@@ -142,7 +156,7 @@ def _path(entry: dict, key: str) -> str:
 def _number(data: dict, key: str) -> float:
     try:
         return float(data[key])
-    except (TypeError, ValueError) as e:
+    except (TypeError, ValueError, OverflowError) as e:
         raise NergError(f'its "{key}" is not a number') from e
 
 
@@ -150,7 +164,7 @@ def _lens(data: dict) -> dict:
     model = data.get("camera_model", "OPENCV")
     fisheye = bool(data.get("is_fisheye")) or model in _FISHEYE
     if model not in _PINHOLE + _FISHEYE or data.get("is_equirectangular") or any(str(k).startswith("ftheta") for k in data):
-        raise NergError(f'its lens model "{model}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, p2, '
+        raise NergError(f'its lens model "{plain(model, 60)}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, p2, '
                          'to "OPENCV_FISHEYE" with k1 to k4, or to "PINHOLE"')
     lens = {k: _number(data, k) for k in LENS_KEYS if k != "fisheye" and data.get(k) is not None}
     if not all(np.isfinite(v) for v in lens.values()):
@@ -165,23 +179,28 @@ def _original(data: dict, path: Path) -> np.ndarray | None:
     """Similarity from the file's coordinates to the original ones; None where the file does not tell."""
     if data.get("applied_transform") is None and data.get("applied_scale") is None:
         return None
+    matrix, scale = data.get("applied_transform"), data.get("applied_scale")
     try:
-        m = np.asarray(data.get("applied_transform", np.eye(4)), np.float64)
-        scale = float(data.get("applied_scale", 1.0))
-        applied = np.vstack([scale * m[:3], [0, 0, 0, 1]])
-        shape = m.shape in ((3, 4), (4, 4))
-        rigid = shape and np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() < 1e-3 and np.linalg.det(m[:3, :3]) > 0
-    except (TypeError, ValueError):
-        rigid, scale = False, 0.0
-    if not rigid or not scale > 0:
+        m = np.eye(4) if matrix is None else np.asarray(matrix, np.float64)
+        scale = 1.0 if scale is None else float(scale)
+    except (TypeError, ValueError, OverflowError):
+        m, scale = np.zeros(0), 0.0
+    if not _rigid(m) or not _SCALES[0] <= scale <= _SCALES[1]:
         raise NergError(f'"applied_transform" of "{path}" must be a rotation and a translation, 3 x 4 numbers, and '
                          '"applied_scale" positive')
-    return np.linalg.inv(applied)
+    return np.linalg.inv(np.vstack([scale * m[:3], [0, 0, 0, 1]]))
+
+
+def _rigid(m: np.ndarray) -> bool:
+    """Whether ``m`` is a rotation and a translation, in 3 x 4 or 4 x 4 numbers."""
+    if m.shape not in ((3, 4), (4, 4)) or not np.abs(m).max() <= FARTHEST:
+        return False
+    return bool(np.abs(m[:3, :3] @ m[:3, :3].T - np.eye(3)).max() < 1e-3 and np.linalg.det(m[:3, :3]) > 0)
 
 
 def _splits(data: dict, frames: list[Frame]) -> tuple[list[str] | None, list[str]]:
     """Held-out and spare frames by nerfstudio's lists of file names."""
-    listed = {k: {Path(x).as_posix() for x in data[f"{k}_filenames"]}
+    listed = {k: {Path(x).as_posix() for x in data[f"{k}_filenames"] if isinstance(x, str)}
               for k in ("train", "val", "test") if isinstance(data.get(f"{k}_filenames"), list)}
     if not listed:
         return None, []
@@ -198,9 +217,9 @@ def _aabb(data: dict, path: Path) -> np.ndarray | None:
         return None
     try:
         box = np.asarray(data["aabb"], np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         box = np.zeros(0)
     box = box.reshape(2, 3) if box.size == 6 else box
-    if box.shape != (2, 3) or not np.all(np.isfinite(box)) or not np.all(box[1] > box[0]):
+    if box.shape != (2, 3) or not np.abs(box).max() <= FARTHEST or not np.all(box[1] > box[0]):
         raise NergError(f'"aabb" in "{path}" must be two corners of 3 numbers, the second above the first')
     return box

@@ -9,10 +9,9 @@ import numpy as np
 
 from ..attention.rays import Rays
 from ..errors import NergError
-from ..formats.architecture import number
 from ..formats.bounded import plain
 from ..formats.checkpoint import read_checkpoint, write_checkpoint
-from .run_state import optimiser_state, require_same, require_shape, restore_optimiser, restoring
+from .run_state import count_of, optimiser_state, require_same, require_shape, restore_optimiser, restoring
 
 KIND = "gaze run"
 STAGES = ("fit", "refit")
@@ -37,7 +36,7 @@ class GazeRunFile:
             with restoring(path):
                 require_same(path, self._meta["about"], about)
                 self.stage, self.found = self._meta["stage"], self._meta["found"]
-                self.seconds = number(self._meta, "spent", "state")
+                self.seconds = count_of(self._meta, "spent")
                 if self.stage not in STAGES or not isinstance(self.found, dict):
                     raise ValueError(f'its "stage" is {plain(self.stage, 40)} and not one of {", ".join(STAGES)}')
 
@@ -52,7 +51,7 @@ class GazeRunFile:
             return {}
         with restoring(self.path):
             restore_optimiser(trainer, self._tensors, self._meta["taken"])
-            counts = [number(self._meta, name, "state") for name in ("steps", "seconds")]
+            counts = [count_of(self._meta, name) for name in ("steps", "seconds")]
             trainer.restore(*counts, self._meta["random"])
             best = {k: v for k, v in trainer.averaged.items() if f"best.{k}" in self._tensors}
             for k, v in best.items():

@@ -18,6 +18,8 @@ from ..formats.bounded import reading
 from ..formats.checkpoint import read_checkpoint, write_checkpoint
 
 KIND = "radiance run"
+# The least and the most of what a run counts; arrays count steps in 32 bits.
+_COUNTS = {"rays": (0, 2**60), "samples": (0, 2**60), "looked": (0, 2**60), "stride": (1, 2**20)}
 _GRID = ("value", "bits", "seen", "always")
 _NUMBERS = ("steps", "rays", "samples", "stride", "looked")
 
@@ -47,13 +49,13 @@ def load_run(trainer, path: str | Path, about: dict) -> list:
     tensors, meta = read_checkpoint(path, KIND)
     with restoring(path):
         require_same(path, meta["about"], about)
-        counts = {name: number(meta, name, "state") for name in (*_NUMBERS, "seconds")}
+        counts = {name: count_of(meta, name) for name in (*_NUMBERS, "seconds")}
         for name in _GRID:
             require_shape(tensors, f"grid.{name}", getattr(trainer.grid, name))
         for name in ("found", "shown"):
             require_shape(tensors, f"settling.{name}", getattr(trainer.settling, name))
         restore_optimiser(trainer, tensors, meta["taken"])
-        trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], int(number(meta, "turn", "state")))
+        trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], int(count_of(meta, "turn")))
         trainer.rng.bit_generator.state = meta["random"]
         trainer.settling.restore(int(number(meta, "settling", "state")), tensors["settling.found"], tensors["settling.shown"])
         trainer.clock.restore(meta["clock"])
@@ -66,6 +68,14 @@ def restoring(path: str | Path) -> Iterator[None]:
     """What a damaged state makes the block raise, as a `NergError` that names ``path``."""
     with reading(path, "state of a run", "start anew without --resume", also=(TypeError, AttributeError)):
         yield
+
+
+def count_of(meta: dict, name: str) -> float:
+    """The number ``name`` of a state's metadata. Raises ``ValueError`` where it is none that a run can have come to."""
+    value, (least, most) = number(meta, name, "state"), _COUNTS.get(name, (0, 2**32 - 1))
+    if not least <= value <= most:
+        raise ValueError(f'"{name}" of its state is {value:g}, which no run comes to')
+    return value
 
 
 def require_shape(tensors: dict, name: str, like) -> None:
@@ -123,7 +133,7 @@ def restore_optimiser(trainer, tensors: dict, taken: dict) -> None:
             require_shape(tensors, f"{part}.{name}", x)
         new = {part: type(x)(tensors[f"{part}.{name}"]) for part, x in old.items()}
         dr.enable_grad(new["weights"])
-        count = dr.opaque(type(count), int(number(taken, name, "state")))
+        count = dr.opaque(type(count), int(count_of(taken, name)))
         optimiser.state[name] = new["weights"], promoted, rate, (count, new["first"], new["second"], largest)
         trainer.averaged[name] = new["averaged"]
     dr.eval(optimiser.state, trainer.averaged)

@@ -4,6 +4,7 @@ import json
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.capture.salience import open_salience, read_salience
 from nerg_mi.capture.solid_angle import pixel_solid_angles
 from nerg_mi.formats.intrinsics import Intrinsics
@@ -233,3 +234,12 @@ def test_a_model_makes_the_maps(posed, rgb):
     write(folder / "a.png", np.full((48, 64, 3), 90, np.uint8))
     with pytest.raises(ValueError, match="a.png.*one colour"):
         open_salience(folder, "spectral-residual")
+
+
+def test_maps_outside_of_their_folder_are_used_only_if_allowed(posed):
+    folder = posed(("a", "b"))
+    write(folder / "elsewhere.npy", np.ones((48, 64)))
+    (folder / "maps" / "a.npy").symlink_to(folder / "elsewhere.npy")
+    with pytest.raises(NergError, match="salience image .* outside of .*--allow-outside"):
+        open_salience(folder, folder / "maps")
+    assert len(open_salience(folder, folder / "maps", allow_outside=True).views) == 1

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nerg_mi.errors import NergError
 from nerg_mi.formats.colmap import model_files, read_colmap
 
 # COLMAP's camera models: number, name, parameters.
@@ -179,3 +180,58 @@ def test_a_folder_without_a_model(tmp_path):
     assert model_files(tmp_path) is None
     with pytest.raises(FileNotFoundError, match="no COLMAP model"):
         read_colmap(tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize("write", [write_bin, write_txt])
+def test_images_outside_of_the_capture_are_used_only_if_allowed(tmp_path, write):
+    """The capture is the folder that holds ``images``, however deep the model lies beside them."""
+    home, out = tmp_path / "capture", tmp_path / "out"
+    model = home / "colmap" / "sparse" / "0"
+    for folder in (model, home / "images", out):
+        folder.mkdir(parents=True)
+    (out / "x.png").write_bytes(b"")
+    (home / "images" / "a.png").write_bytes(b"")
+    (home / "images" / "link.png").symlink_to(out / "x.png")
+    write(model, ["a.png", "../../out/x.png", str(out / "x.png"), "link.png"])
+    posed = read_colmap(model, home / "images")
+    assert [f.name for f in posed.frames] == ["a.png"] and len(posed.unused) == 3
+    assert all("outside of the data set's folder" in u.reason and "--allow-outside" in u.reason for u in posed.unused)
+    # They all lead to one file, which counts once.
+    assert len(read_colmap(model, home / "images", allow_outside=True).frames) == 2
+
+
+def test_masks_outside_of_the_capture_are_used_only_if_allowed(tmp_path):
+    for folder in ("capture/sparse", "capture/images", "out"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "capture/images/a.png").write_bytes(b"")
+    (tmp_path / "out/a.png.png").write_bytes(b"")
+    (tmp_path / "capture/masks").symlink_to(tmp_path / "out")
+    write_bin(tmp_path / "capture/sparse", ["a.png"])
+    where = tmp_path / "capture/sparse", tmp_path / "capture/images", tmp_path / "capture/masks"
+    with pytest.raises(NergError, match="outside of the data set's folder"):
+        read_colmap(*where)
+    assert read_colmap(*where, allow_outside=True).frames[0].mask is not None
+
+
+@pytest.mark.parametrize("count", [2**63, 2**64 - 1, 10**9])
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_counts_beyond_the_file_are_told_with_its_name(tmp_path, name, count):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").write_bytes(b"")
+    write_bin(tmp_path, ["a.png"])
+    raw = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(struct.pack("<Q", count) + raw[8:])
+    with pytest.raises(NergError, match=name):
+        read_colmap(tmp_path, tmp_path / "images")
+
+
+def test_observations_may_stand_on_a_long_line_and_nothing_else(tmp_path):
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").write_bytes(b"")
+    write_txt(tmp_path, ["a.png"])
+    images = (tmp_path / "images.txt").read_text()
+    (tmp_path / "images.txt").write_text(images.rstrip("\n") + "\n" + "1.5 2.5 -1 " * 200_000 + "\n")
+    assert len(read_colmap(tmp_path, tmp_path / "images").frames) == 1
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 " + "1 " * 700_000)
+    with pytest.raises(NergError, match="line 1 .*cameras.txt.* characters"):
+        read_colmap(tmp_path, tmp_path / "images")

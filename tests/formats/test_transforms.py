@@ -4,6 +4,7 @@ import json
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.formats.posed import DepthFile, MaskFile
 from nerg_mi.formats.transforms import read_dataparser, read_transforms
 
@@ -217,3 +218,72 @@ def test_the_fox(recorded):
     assert all(u.reason == "its image does not exist" for u in t.unused)
     i = t.frames[0].intrinsics(1080, 1920)
     assert (i.fx, i.fy, i.k2) == (1375.52, 1374.49, -0.0805099)
+
+
+@pytest.mark.parametrize("keys", [{"file_path": "../out/x.png"}, {"mask_path": "../out/x.png"}, {"depth_file_path": "../out/x.png"},
+                                  {"file_path": "linked/x.png"}, {"mask_path": "linked/x.png"}, {"depth_path": "link.png"}])
+def test_files_outside_of_the_folder_are_used_only_if_allowed(tmp_path, keys):
+    home, out = tmp_path / "set", tmp_path / "out"
+    home.mkdir()
+    out.mkdir()
+    for path in (home / "a.png", home / "b.png", out / "x.png"):
+        path.write_bytes(b"")
+    (home / "linked").symlink_to(out)
+    (home / "link.png").symlink_to(out / "x.png")
+    (home / "transforms.json").write_text(json.dumps({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]}))
+    t = read_transforms(home / "transforms.json")
+    assert [f.name for f in t.frames] == ["b.png"]
+    assert "outside of the data set's folder" in t.unused[0].reason and "--allow-outside" in t.unused[0].reason
+    assert len(read_transforms(home / "transforms.json", allow_outside=True).frames) == 2
+
+
+def test_an_absolute_path_of_another_place_is_not_even_looked_for(tmp_path, write, monkeypatch):
+    path = write({"fl_x": 30.0, "frames": [frame("a.png"), frame("/etc/passwd"), frame("../../etc/hostname")]})
+    asked = []
+    monkeypatch.setattr("pathlib.Path.is_file", lambda self: asked.append(self) or True)
+    t = read_transforms(path)
+    assert len(t.unused) == 2 and not [p for p in asked if "etc" in str(p)]
+
+
+def test_links_within_the_folder_are_followed(tmp_path, write):
+    path = write({"fl_x": 30.0, "frames": [frame("here/a.png")]}, ("images/a.png",))
+    (tmp_path / "here").symlink_to(tmp_path / "images")
+    outer = tmp_path.with_name(tmp_path.name + "-link")
+    outer.symlink_to(tmp_path)
+    assert len(read_transforms(path).frames) == len(read_transforms(outer / "transforms.json").frames) == 1
+
+
+@pytest.mark.parametrize("keys", [
+    {"transform_matrix": [[1e300, 0, 0, 0], [0, 1e300, 0, 0], [0, 0, 1e300, 0], [0, 0, 0, 1]]}, {"transform_matrix": [[10**400] * 4] * 4},
+    {"transform_matrix": [[1, 0, 0, 1e13], [0, 1, 0, 0], [0, 0, 1, 0]]}, {"fl_x": 10**400}, {"k1": [1]}, {"file_path": "a\0b"},
+    {"file_path": "x" * 5000}, {"camera_model": ["OPENCV"]}, {"mask_path": "y" * 5000},
+    {"depth_file_path": "a.png", "depth_unit_scale_factor": float("inf")},
+])  # fmt: skip
+def test_numbers_and_names_that_nothing_can_hold_cost_their_frame(write, keys):
+    t = read_transforms(write({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]}))
+    assert len(t.frames) == len(t.unused) == 1 and str(t.unused[0]).isprintable()
+
+
+@pytest.mark.parametrize("keys", [{"fl_x": 1e-300}, {"fl_x": 1e300}, {"cx": 1e300}, {"cy": -1e9}, {"k2": 1e200}])
+def test_lenses_that_no_camera_has_are_refused(write, keys):
+    t = read_transforms(write({"fl_x": 30.0, **keys, "frames": [frame("a.png")]}))
+    with pytest.raises(NergError, match="a.png"):
+        t.frames[0].intrinsics(8, 8)
+
+
+@pytest.mark.parametrize("content", [{"applied_scale": 1e-320}, {"applied_scale": 10**400}, {"applied_transform": [[1e300] * 4] * 3},
+                                     {"aabb": [[10**400] * 3, [0, 0, 0]]}, {"aabb": [[-1e300] * 3, [1e300] * 3]}])
+def test_numbers_of_the_file_are_bounded(write, content):
+    with pytest.raises(NergError, match="transforms.json"):
+        read_transforms(write({"fl_x": 30.0, **content, "frames": [frame("a.png")]}))
+
+
+def test_a_file_nested_deep_is_refused(tmp_path):
+    (tmp_path / "transforms.json").write_text('{"frames": ' + "[" * 200_000)
+    with pytest.raises(NergError, match="transforms.json.*nested"):
+        read_transforms(tmp_path / "transforms.json")
+
+
+def test_a_distortion_of_nothing_is_none(write):
+    t = read_transforms(write({"fl_x": 30.0, "k1": 1e-320, "k3": -1e-300, "frames": [frame("a.png")]}))
+    assert not t.frames[0].intrinsics(8, 8).is_distorted

@@ -100,6 +100,8 @@ def _trainer():
     """What of a trainer its state consists of."""
     import mitsuba as mi
 
+    from nerg_mi.training.step_clock import StepClock
+
     ns = _parts()[0]
     optimiser = mi.ad.Adam(lr=0.1)
     optimiser["grid.table"] = ns.Float([1.0] * 6)
@@ -115,8 +117,11 @@ def _trainer():
         rays=100,
         samples=1000,
         seconds=2.5,
-        settled=False,
-        restore=lambda *numbers: None,
+        stride=4,
+        looked=10.0,
+        settling=SimpleNamespace(at=0, found=ns.UInt8([0] * 8), shown=ns.UInt8([0] * 8), restore=lambda *state: None),
+        clock=StepClock(),
+        restore=lambda *numbers, **named: None,
     )
 
 

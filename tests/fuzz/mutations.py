@@ -87,23 +87,26 @@ def mutated(data: bytes, kinds: tuple[str, ...]) -> st.SearchStrategy[bytes]:
 
 @st.composite
 def _bytes(draw, data: bytes) -> bytes:
-    for _ in range(draw(st.integers(1, 3))):
-        data = draw(st.sampled_from([_flipped, _truncated, _inserted, _overwritten, _moved]))(draw, data)
+    for _ in range(draw(_ONE_TO_THREE)):
+        data = draw(_DAMAGES)(draw, data)
     return data
 
 
 def _at(draw, data: bytes) -> int:
     """A place in ``data``: often near its start, where headers are, or its end, where archives list what they hold."""
     most = len(data)
-    near = st.integers(0, min(most, 200))
-    return draw(st.one_of(near, near.map(lambda n: most - n), st.integers(0, most)))
+    near = min(most, 200)
+    at = draw(st.integers(0, 2 * near + min(most, 2 * near)))
+    if at <= near:
+        return at
+    return most - (at - near) if at <= 2 * near else (at - 2 * near) * most // max(min(most, 2 * near), 1)
 
 
 def _flipped(draw, data: bytes) -> bytes:
     out = bytearray(data)
-    for _ in range(draw(st.integers(1, 8))):
+    for _ in range(draw(_ONE_TO_THREE)):
         if out:
-            out[min(_at(draw, data), len(out) - 1)] ^= 1 << draw(st.integers(0, 7))
+            out[min(_at(draw, data), len(out) - 1)] ^= 1 << draw(_BIT)
     return bytes(out)
 
 
@@ -113,21 +116,33 @@ def _truncated(draw, data: bytes) -> bytes:
 
 def _inserted(draw, data: bytes) -> bytes:
     at = _at(draw, data)
-    more = draw(st.binary(min_size=1, max_size=8)) * draw(st.sampled_from([1, 1, 1, 10, 1000]))
-    return data[:at] + more + data[at:]
+    return data[:at] + draw(_SOME_BYTES) * draw(_REPEATS) + data[at:]
 
 
 def _overwritten(draw, data: bytes) -> bytes:
     """An integer of one to eight bytes is given an extreme value, where one might stand."""
-    at, size, order = _at(draw, data), draw(st.sampled_from([1, 2, 4, 8])), draw(st.sampled_from(["little", "big"]))
-    value = draw(st.sampled_from(EXTREMES)) % (1 << 8 * size)
-    return data[:at] + value.to_bytes(size, order) + data[at + size :]
+    at, size = _at(draw, data), draw(_SIZES)
+    value = draw(_EXTREME) % (1 << 8 * size)
+    return data[:at] + value.to_bytes(size, draw(_ORDER)) + data[at + size :]
 
 
 def _moved(draw, data: bytes) -> bytes:
     """A piece is left out, or stands twice."""
     a, b = sorted((_at(draw, data), _at(draw, data)))
-    return data[:a] + data[b:] if draw(st.booleans()) else data[:b] + data[a:]
+    return data[:a] + data[b:] if draw(_COIN) else data[:b] + data[a:]
+
+
+# Made once: making a strategy takes longer than drawing from it.
+_ONE_TO_THREE, _BIT, _COIN, _SOME_BYTES = (
+    st.integers(1, 3),
+    st.integers(0, 7),
+    st.booleans(),
+    st.binary(min_size=1, max_size=8),
+)
+_REPEATS, _SIZES = st.sampled_from([1, 1, 1, 10, 1000]), st.sampled_from([1, 2, 4, 8])
+_ORDER, _EXTREME = st.sampled_from(["little", "big"]), st.sampled_from(EXTREMES)
+_DAMAGES = st.sampled_from([_flipped, _truncated, _inserted, _overwritten, _moved])
+_TENTH, _EIGHTH, _VALUE = st.integers(0, 9), st.integers(0, 7), st.sampled_from(_VALUES)
 
 
 # --- structures -------------------------------------------------------------------------------------------------------
@@ -143,7 +158,7 @@ def _changed_json(draw, value) -> bytes:
     if deep == 0:
         count = draw(st.sampled_from([100, 5000, 200_000]))
         return draw(st.sampled_from([b"[" * count, b"[" * count + b"]" * count, b'{"a":' * count]))
-    for _ in range(draw(st.integers(1, 3))):
+    for _ in range(draw(_ONE_TO_THREE)):
         value = _changed(draw, value)
     text = json.dumps(value)
     return text.encode()
@@ -151,29 +166,29 @@ def _changed_json(draw, value) -> bytes:
 
 def _changed(draw, value):
     """``value`` with one of its parts exchanged, left out, or named otherwise."""
-    if isinstance(value, dict) and value and draw(st.integers(0, 7)):
+    if isinstance(value, dict) and value and draw(_EIGHTH):
         key = draw(st.sampled_from(sorted(value)))
-        what, rest = draw(st.integers(0, 9)), {k: v for k, v in value.items() if k != key}
+        what, rest = draw(_TENTH), {k: v for k, v in value.items() if k != key}
         if what == 0:
             return rest
         if what == 1:
             return {**rest, key + "x": value[key]}
         return {**rest, key: _changed(draw, value[key])}
-    if isinstance(value, list) and value and draw(st.integers(0, 7)):
+    if isinstance(value, list) and value and draw(_EIGHTH):
         k = draw(st.integers(0, len(value) - 1))
-        what = draw(st.integers(0, 9))
+        what = draw(_TENTH)
         if what == 0:
             return value[:k] + value[k + 1 :]
         if what == 1:
             return value[:k] + [value[k]] * 2 + value[k:]
         return [*value[:k], _changed(draw, value[k]), *value[k + 1 :]]
-    return draw(st.sampled_from(_VALUES))
+    return draw(_VALUE)
 
 
 @st.composite
 def _text(draw, data: bytes) -> bytes:
     text = data.decode("utf-8", "surrogateescape")
-    for _ in range(draw(st.integers(1, 3))):
+    for _ in range(draw(_ONE_TO_THREE)):
         spots = [m.span() for m in re.finditer(r"[-+.\w]+", text)]
         if not spots:
             break
@@ -190,11 +205,11 @@ def _npy(draw, data: bytes) -> bytes:
     size = struct.unpack_from("<H", data, 8)[0]
     head = data[10 : 10 + size].decode("latin1")
     number, values = (
-        str(draw(st.sampled_from(EXTREMES))),
+        str(draw(_EXTREME)),
         ("'|O'", "'<U0'", "'<f8'", "'<i1'", "'|V100000'", "[('a', '<f4')]", "1", "''"),
     )
     ways = [
-        lambda: re.sub(r"\d+", number, head, count=draw(st.integers(1, 3))),
+        lambda: re.sub(r"\d+", number, head, count=draw(_ONE_TO_THREE)),
         lambda: re.sub(r"'descr': '[^']*'", f"'descr': {draw(st.sampled_from(values))}", head),
         lambda: re.sub(
             r"\(.*\)", draw(st.sampled_from(["()", "(-1,)", f"({number}, {number})", "(1,) * 9", "(" * 90])), head

@@ -1,0 +1,59 @@
+"""Damaged files: every reader gives a result or one sentence, in time and memory, and nothing is run or left behind.
+
+The cases are the same in every run; ``make fuzz`` tries ten times as many.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.cases import draw_cases, make_inputs
+from tests.fuzz.keeping import corpus, kept
+from tests.fuzz.readers import READERS
+from tests.fuzz.watch import BREACHES, Case, run_cases
+
+CASES = 2000
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    return make_inputs(READERS, tmp_path_factory.mktemp("fuzz") / "inputs")
+
+
+def breaches(cases: list[Case], inputs: Path) -> list[str]:
+    names, out = [r.name for r in READERS], []
+    for case, report in run_cases(cases, inputs, names):
+        if report.outcome in BREACHES:
+            out.append(f"{kept(case)}: {report.outcome}: {report.said}")
+    return out
+
+
+@pytest.mark.slow
+def test_damaged_files_give_a_result_or_one_sentence(inputs):
+    cases = draw_cases(READERS, inputs, CASES)
+    assert len(cases) > 0.95 * CASES and {c.reader for c in cases} == {r.name for r in READERS}
+    assert breaches(cases, inputs) == []
+
+
+def test_cases_that_once_failed(inputs):
+    """``tools/fuzz.py --keep`` puts them into the corpus."""
+    cases = corpus(READERS)
+    assert len(cases) > 40 and breaches(cases, inputs) == []
+
+
+@pytest.mark.slow
+def test_the_contract_is_seen_to_be_broken(tmp_path):
+    """The watch itself: a crash, a file left behind, something run, memory, a foreign exception."""
+    from tests.fuzz import misbehaving
+
+    inputs = make_inputs(misbehaving.READERS, tmp_path)
+    names = [r.name for r in misbehaving.READERS]
+    cases = [Case(name, "a.bin", b"damaged") for name in names]
+    found = [r.outcome for _, r in run_cases(cases, inputs, names, "tests.fuzz.misbehaving")]
+    # Each is called as what it does.
+    assert found == [name.partition(":")[0] for name in names]
