@@ -51,7 +51,7 @@ def main(argv=None) -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--validate", action="store_true")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--spp", type=int, default=4)
+    parser.add_argument("--spp", type=int, default=16, help="rays a pixel; the default is that of nerg eval radiance")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/fox_radiance"))
     args = parser.parse_args(argv)

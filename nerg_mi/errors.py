@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class NergError(ValueError):
@@ -20,6 +23,35 @@ class UnusableLLVM(ImportError):
     """The libLLVM that Dr.Jit would load cannot run its kernels. The message names the version and the remedy."""
 
 
+@contextmanager
+def chosen(options: str) -> Iterator[None]:
+    """A block whose values a user gave by ``options`` ("--aabb"): a `ValueError` of it is theirs to mend, as a `NergError`.
+
+    Functions among themselves refuse wrong values by `ValueError`, since they do not know who gave them.
+    """
+    try:
+        yield
+    except NergError:
+        raise
+    except ValueError as error:
+        raise NergError(f"{str(error).rstrip('.')}; give other values by {options}") from error
+
+
+def expected(error: BaseException) -> bool:
+    """Whether ``error`` is one that the user can mend, or the machine's, and not a mistake in the program.
+
+    The former are `NergError`, a library that is missing or cannot be used, what the system says of files and devices, and
+    memory that does not suffice. The rest is the program's: a `ValueError`, too, says that one function of it called another
+    one with wrong values.
+    """
+    if isinstance(error, ImportError):
+        # Modules of our own are always there.
+        return not (error.name or "").startswith("nerg_mi")
+    if isinstance(error, OSError):
+        return error.errno is not None or error.filename is not None or isinstance(error, NergError)
+    return isinstance(error, (NergError, MemoryError))
+
+
 def sentence(error: BaseException) -> str:
     """What `error` says, on one line.
 
@@ -27,8 +59,13 @@ def sentence(error: BaseException) -> str:
     happened (before the traceback) and what was said there (its last line).
     """
     text = str(error).strip()
-    if isinstance(error, FileNotFoundError) and error.filename is not None:
-        text = f'there is no file "{error.filename}".'
+    if isinstance(error, MemoryError):
+        text = f"there is not enough memory{': ' + text if text else ''}; ask for less, or close other programs."
+    elif isinstance(error, OSError) and error.strerror:
+        said = f"{error.strerror[:1].lower()}{error.strerror[1:]}."
+        if error.filename is not None:
+            said = f'there is no file "{error.filename}".' if error.errno == errno.ENOENT else f'"{error.filename}": {said}'
+        text = said
     before, marker, trace = text.partition("Traceback (most recent call last):")
     if marker:
         # The exception's line starts at the left margin and may run on over several lines; frames are indented.

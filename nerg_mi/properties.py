@@ -6,14 +6,16 @@ import math
 
 import numpy as np
 
+from .errors import NergError
+
 
 def number(props, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
     """A finite number in ``low .. high``."""
     value = props.get(name, default)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f'"{name}" must be a number, got {value!r}')
+        raise NergError(f'"{name}" must be a number, got {value!r}')
     if not (math.isfinite(value) and low <= value <= high):
-        raise ValueError(f'"{name}" must lie in {low:g} .. {high:g}, got {value}')
+        raise NergError(f'"{name}" must lie in {low:g} .. {high:g}, got {value}')
     return float(value)
 
 
@@ -21,7 +23,7 @@ def integer(props, name: str, default: int, low: int, high: int) -> int:
     """A whole number in ``low .. high``."""
     value = number(props, name, default, low, high)
     if value != int(value):
-        raise ValueError(f'"{name}" must be a whole number, got {value}')
+        raise NergError(f'"{name}" must be a whole number, got {value}')
     return int(value)
 
 
@@ -29,7 +31,7 @@ def boolean(props, name: str, default: bool) -> bool:
     """true or false, and nothing that merely looks like it."""
     value = props.get(name, default)
     if not isinstance(value, bool):
-        raise ValueError(f'"{name}" must be true or false, got {value!r}')
+        raise NergError(f'"{name}" must be true or false, got {value!r}')
     return value
 
 
@@ -37,7 +39,7 @@ def choice(props, name: str, default: str, choices: tuple[str, ...]) -> str:
     """One of ``choices``."""
     value = props.get(name, default)
     if value not in choices:
-        raise ValueError(f'"{name}" must be one of {", ".join(choices)}, got {value!r}')
+        raise NergError(f'"{name}" must be one of {", ".join(choices)}, got {value!r}')
     return value
 
 
@@ -46,7 +48,7 @@ def text(props, name: str, default: str | None = None) -> str:
     value = props.get(name, default)
     if not isinstance(value, str):
         found = "nothing" if value is None else repr(value)
-        raise ValueError(f'"{name}" must be a string, got {found}')
+        raise NergError(f'"{name}" must be a string, got {found}')
     return value
 
 
@@ -58,9 +60,9 @@ def color(props, name: str, default: float) -> list[float]:
     if hasattr(value, "eval_3"):  # a texture: what dict scenes make of {'type': 'rgb'}
         value = value.eval_3(mi.SurfaceInteraction3f())
     if isinstance(value, (str, bool)):
-        raise ValueError(f'"{name}" must be a number or an rgb colour, got {value!r}')
+        raise NergError(f'"{name}" must be a number or an rgb colour, got {value!r}')
     rgb = [float(c) for c in np.ravel(value)]
     rgb = rgb * 3 if len(rgb) == 1 else rgb
     if len(rgb) != 3 or not all(math.isfinite(c) and c >= 0 for c in rgb):
-        raise ValueError(f'"{name}" must be one number or three, finite and not negative, got {value}')
+        raise NergError(f'"{name}" must be one number or three, finite and not negative, got {value}')
     return rgb

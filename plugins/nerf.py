@@ -53,6 +53,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.properties import number, text
@@ -95,7 +96,7 @@ class NerfVolume(mi.Volume):
 
     def max(self):
         if not self.max_density:
-            raise ValueError(f'a medium needs a bound on the density of "{self.filename}": give the volume a "max_density"')
+            raise NergError(f'a medium needs a bound on the density of "{self.filename}": give the volume a "max_density"')
         return self.max_density
 
     def resolution(self):

@@ -217,6 +217,7 @@ from contextlib import contextmanager
 import drjit as dr
 import mitsuba as mi
 
+from nerg_mi.errors import NergError
 from nerg_mi.interruption import give_back_ctrl_c
 from nerg_mi.properties import boolean, choice, color, integer, number, text
 from nerg_mi.registration import register
@@ -254,7 +255,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def __init__(self, props):
         super().__init__(props)
         if mi.is_spectral or mi.is_polarized:
-            raise ValueError(
+            raise NergError(
                 f'"nerg" renders rgb and mono variants, not "{mi.variant()}": radiance fields are trained on rgb photos; '
                 'call mi.set_variant("llvm_ad_rgb")'
             )
@@ -263,11 +264,11 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.medium = _medium(field, density, paint)
         self._known_empty = None if density is None else KnownEmpty(self.medium)
         if gaze is not None and not hasattr(gaze, "gaze_medium"):
-            raise ValueError('"gaze" must be a volume of type "gazefield"')
+            raise NergError('"gaze" must be a volume of type "gazefield"')
         if kde is not None and not hasattr(kde, "kde_view"):
-            raise ValueError('"kde" must be a volume of type "gazekde"')
+            raise NergError('"kde" must be a volume of type "gazekde"')
         if observer is not None and not isinstance(observer, mi.Sensor):
-            raise ValueError('"observer" must be a sensor; its to_world places the observer')
+            raise NergError('"observer" must be a sensor; its to_world places the observer')
         self._given = {"field": field, "density": density, "color": paint, "gaze": gaze, "kde": kde, "observer": observer}
         self.gaze = None if gaze is None else gaze.gaze_medium()
         _check_semantics(self.gaze, field, self.medium)
@@ -333,7 +334,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         """While this is open the rays that ``sample`` is given come from ``sensor``."""
         self._check_place(scene)
         if 0 in sensor.film().crop_size():
-            raise ValueError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
+            raise NergError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
         try:
             yield
@@ -344,7 +345,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a table
         # of all sensors, the observer among them.
         if viewpoint.is_batch(sensor) and any(dr.grad_enabled(c) for c in self._eyes(sensor)):
-            raise ValueError(
+            raise NergError(
                 'a "batch" of cameras has no forward derivatives with respect to the pose of an observer or a camera; '
                 "render its cameras one by one, or use reverse mode (dr.backward)"
             )
@@ -448,17 +449,17 @@ class NergIntegrator(mi.SamplingIntegrator):
             return
         self._check_observer()
         if not dr.all(self.falloff >= 0):
-            raise ValueError(f'"falloff" must not be negative, got {self.falloff}')
+            raise NergError(f'"falloff" must not be negative, got {self.falloff}')
 
     def _check_place(self, scene):
         if self.medium is None and len(scene.shapes()) == 0:
-            raise ValueError('there is nothing to render: give "nerg" a "field" or a "density", or the scene shapes')
+            raise NergError('there is nothing to render: give "nerg" a "field" or a "density", or the scene shapes')
 
     def _check_observer(self):
         if self.observer is not None:
             viewpoint.require_center(self.observer, '"observer"')
             if not dr.all(dr.isfinite(dr.detach(viewpoint.center(self.observer))), axis=None):
-                raise ValueError('"observer" stands at a position that is not finite; correct its to_world')
+                raise NergError('"observer" stands at a position that is not finite; correct its to_world')
 
     def to_string(self):
         s = self.settings
@@ -550,20 +551,20 @@ class _Pose(mi.TraversalCallback):
 
 def _medium(field, density, color):
     if field is not None and density is not None:
-        raise ValueError('"nerg" takes either "field" (a volume of type "nerf") or "density" (any volume), and not both')
+        raise NergError('"nerg" takes either "field" (a volume of type "nerf") or "density" (any volume), and not both')
     if field is not None:
         if color is not None:
-            raise ValueError('"color" goes with "density"; a "field" brings its own colour')
+            raise NergError('"color" goes with "density"; a "field" brings its own colour')
         if not hasattr(field, "medium"):
-            raise ValueError('"field" must be a volume of type "nerf"; give other volumes as "density" and "color"')
+            raise NergError('"field" must be a volume of type "nerf"; give other volumes as "density" and "color"')
         return field.medium()
     if density is None:
         if color is not None:
-            raise ValueError('"color" goes with "density", which is missing')
+            raise NergError('"color" goes with "density", which is missing')
         return None
     for name, volume in (("density", density), ("color", color)):
         if volume is not None and not isinstance(volume, mi.Volume):
-            raise ValueError(f'"{name}" must be a volume')
+            raise NergError(f'"{name}" must be a volume')
     return VolumeMedium(density, color)
 
 
@@ -573,7 +574,7 @@ def _check_semantics(gaze, field, medium):
     wanted = gaze.field.config.geometry
     if field is None or medium.feature_count != wanted:
         has = "there is none" if field is None else f"that has {medium.feature_count}"
-        raise ValueError(f'the "gaze" field asks for {wanted} semantic features of a "field", but {has}')
+        raise NergError(f'the "gaze" field asks for {wanted} semantic features of a "field", but {has}')
 
 
 def _nested(props):
@@ -582,7 +583,7 @@ def _nested(props):
         if isinstance(child, mi.Integrator):
             props.mark_queried(name)
     if len(found) > 1:
-        raise ValueError(f'"nerg" takes one nested integrator, got {len(found)}')
+        raise NergError(f'"nerg" takes one nested integrator, got {len(found)}')
     return found[0] if found else None
 
 
@@ -590,19 +591,19 @@ def _aovs(value, gaze, field, kde):
     names = [n.strip() for n in value.split(",") if n.strip()]
     for name in names:
         if name not in CHANNELS and name not in _FEATURES:
-            raise ValueError(f'"aovs" does not know "{name}"; it knows {", ".join([*CHANNELS, *_FEATURES])}')
+            raise NergError(f'"aovs" does not know "{name}"; it knows {", ".join([*CHANNELS, *_FEATURES])}')
         if name in _FEATURES and field is None:
-            raise ValueError(f'"aovs" asks for "{name}", which needs a "field"')
+            raise NergError(f'"aovs" asks for "{name}", which needs a "field"')
         if name in _GAZE_AOVS | {"support"} and gaze is None:
-            raise ValueError(f'"aovs" asks for "{name}", which needs a "gaze" volume')
+            raise NergError(f'"aovs" asks for "{name}", which needs a "gaze" volume')
         if name == "kde" and kde is None:
-            raise ValueError('"aovs" asks for "kde", which needs a "kde" volume of type "gazekde"')
+            raise NergError('"aovs" asks for "kde", which needs a "kde" volume of type "gazekde"')
         if name == "gaze_std" and not hasattr(gaze, "spread"):
-            raise ValueError('"aovs" asks for "gaze_std", which needs a "gaze" of several members; train it with --ensemble 5')
+            raise NergError('"aovs" asks for "gaze_std", which needs a "gaze" of several members; train it with --ensemble 5')
         if name == "support" and getattr(gaze.field, "support", None) is None:
-            raise ValueError('"aovs" asks for "support", which the checkpoint of "gaze" does not hold; train it again')
+            raise NergError('"aovs" asks for "support", which the checkpoint of "gaze" does not hold; train it again')
     if len(set(names)) < len(names):
-        raise ValueError(f'"aovs" names something twice: "{value}"')
+        raise NergError(f'"aovs" names something twice: "{value}"')
     return names
 
 

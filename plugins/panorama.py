@@ -75,6 +75,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from nerg_mi.errors import NergError
 from nerg_mi.registration import register
 from nerg_mi.transport.panorama import pixel_solid_angles
 
@@ -171,14 +172,14 @@ class Panorama(mi.Sensor):
         turn = matrix[:3, :3]
         if not np.allclose(turn.T @ turn, np.eye(3), atol=1e-3):
             # mi.Transform4f.rotate does not normalise its axis, and gives a shear for one that is no unit vector.
-            raise ValueError(
+            raise NergError(
                 '"to_world" of a panorama must be a rotation and a translation: remove its scale or shear, '
                 "and give rotations an axis of unit length."
             )
 
     def _check_film(self):
         if self.film().size()[1] < 2:
-            raise ValueError('"height" of the film of a panorama must be at least 2 pixels, one for each pole.')
+            raise NergError('"height" of the film of a panorama must be at least 2 pixels, one for each pole.')
 
 
 register("sensor", "panorama", Panorama)

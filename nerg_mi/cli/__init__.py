@@ -13,12 +13,13 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from typing import Annotated
 
 import typer
 
 from .. import __version__
-from ..errors import sentence
+from ..errors import expected, sentence
 
 COMMANDS = {
     "demo": "Render the demo store: pictures of what a gaze field is.",
@@ -35,17 +36,22 @@ COMMANDS = {
 """Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""
 
 
+FAULT = 70
+"""Exit code of a mistake in the program (EX_SOFTWARE of sysexits.h)."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line `arguments` (default: that of the process) and end the process.
 
-    Exit codes: 0 done; 1 an expected error, told in one sentence (with --traceback or NERG_TRACEBACK=1 in full);
-    2 a wrong command line; 130 interrupted. A command that ends early on Ctrl-C leaves its outputs whole or absent and raises
-    `KeyboardInterrupt`, whose message, where it has one, says how to go on.
+    Exit codes: 0 done; 1 what the user can mend, told in one sentence; 2 a wrong command line; 70 a mistake in the program
+    itself, which is said to be one; 130 interrupted. With --debug (also: --traceback, or NERG_TRACEBACK=1) the traceback is
+    shown before. Whoever reads the output may go away at any time: nothing is said about that. A command that ends early on
+    Ctrl-C leaves its outputs whole or absent and raises `KeyboardInterrupt`, whose message, where it has one, says how to go on.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    full = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0") or "--traceback" in arguments
+    debug = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0") or not {"--debug", "--traceback"}.isdisjoint(arguments)
     # Allowed anywhere on the line: it is added after something went wrong, at the end.
-    arguments = [a for a in arguments if a != "--traceback"]
+    arguments = [a for a in arguments if a not in ("--debug", "--traceback")]
     with _Listening() as ctrl_c:
         try:
             _app(next((a for a in arguments if not a.startswith("-")), None))(arguments, prog_name="nerg")
@@ -54,10 +60,30 @@ def main(arguments: list[str] | None = None) -> None:
             if interrupt is not None:
                 print(str(interrupt) or "Interrupted.", file=sys.stderr)
                 sys.exit(130)
-            if full or not isinstance(error, (ValueError, OSError, ImportError)):  # NergError is a ValueError
+            _flush()
+            if not isinstance(error, Exception):  # the end of a command
                 raise
-            print(f"nerg: {sentence(error)}", file=sys.stderr)
-            sys.exit(1)
+            if debug:
+                traceback.print_exception(error)
+            mendable = expected(error)
+            print(f"nerg: {sentence(error) if mendable else _fault(error)}", file=sys.stderr)
+            sys.exit(1 if mendable else FAULT)
+
+
+def _fault(error: Exception) -> str:
+    said = " ".join(str(error).split())
+    return (
+        f"internal error ({type(error).__name__}{': ' + said if said else ''}): this is a fault of nerg_mi and not of your input; "
+        "run again with --debug and report the traceback."
+    )
+
+
+def _flush() -> None:
+    """Write what is left for the standard output; where nobody reads it any more, the interpreter must not try again."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Listening:
@@ -129,8 +155,8 @@ def _global_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
-    traceback: Annotated[
-        bool, typer.Option("--traceback", help="Show where an error arose (also: NERG_TRACEBACK=1).")
+    debug: Annotated[
+        bool, typer.Option("--debug", "--traceback", help="Show where an error arose (also: NERG_TRACEBACK=1).")
     ] = False,
 ) -> None:
     pass

@@ -6,6 +6,8 @@ from typing import Annotated, Optional
 
 import typer
 
+from ..errors import NergError
+
 
 def command(
     rays: Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet), as nerg rays import writes it.")],
@@ -34,7 +36,6 @@ def command(
 ) -> None:
     """Train every variant of a gaze field alike; losses on training and held-out positions, and the time of a frame."""
     import drjit as dr
-    import mitsuba as mi
     import numpy as np
 
     from ..attention.rays import Rays
@@ -43,18 +44,19 @@ def command(
     from ..field.backend import namespace
     from ..formats.atomic import check_folder
     from ..training.gaze_run import hold_out
+    from ..rendering import activate
     from .train_gaze import _place
 
     if sum(v is not None for v in (field, scene, geometry)) != 1:
-        raise ValueError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
+        raise NergError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
     if geometry not in (None, "hits", "none"):
-        raise ValueError(f'--geometry must be "hits" or "none", got "{geometry}"')
+        raise NergError(f'--geometry must be "hits" or "none", got "{geometry}"')
     try:
         width, height = (int(x) for x in size.lower().split("x"))
     except ValueError as e:
-        raise ValueError(f'--size needs WIDTHxHEIGHT, got "{size}"') from e
+        raise NergError(f'--size needs WIDTHxHEIGHT, got "{size}"') from e
     check_folder(output)
-    mi.set_variant(mode)
+    activate(mode)
     if threads is not None:
         dr.set_thread_count(threads)
     ns, data = namespace(mode), Rays.load(rays)
@@ -83,7 +85,7 @@ def _chosen(variants: list, names: list[str] | None) -> list:
     """Those of ``variants`` that are called one of ``names``; all without any."""
     known = list(dict.fromkeys(v.name for v in variants))
     if unknown := set(names or ()) - set(known):
-        raise ValueError(f'--variant must be one of {", ".join(known)} here, got "{sorted(unknown)[0]}"')
+        raise NergError(f'--variant must be one of {", ".join(known)} here, got "{sorted(unknown)[0]}"')
     return [v for v in variants if not names or v.name in names]
 
 
@@ -95,4 +97,4 @@ def _known_law(name: str):
     try:
         return getattr(importlib.import_module(module), kind)()
     except (ImportError, AttributeError, ValueError) as e:
-        raise ValueError(f'--law needs MODULE:CLASS that can be imported, such as nerg_mi.scenes.store.attention_law:AttentionLaw, got "{name}"') from e
+        raise NergError(f'--law needs MODULE:CLASS that can be imported, such as nerg_mi.scenes.store.attention_law:AttentionLaw, got "{name}"') from e

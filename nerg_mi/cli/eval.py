@@ -6,6 +6,7 @@ from typing import Annotated, Optional
 
 import typer
 
+from ..errors import NergError
 from .eval_gaze import eval_gaze
 
 app = typer.Typer(no_args_is_help=True, help="Score trained fields.")
@@ -43,19 +44,19 @@ def eval_radiance(
 ) -> None:
     """PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the integrator."""
     import drjit as dr
-    import mitsuba as mi
 
     from ..capture.dataset import open_dataset
     from ..evaluation.radiance_scores import score_views
     from ..formats.atomic import check_folder, check_writable
     from ..formats.checkpoint import read_checkpoint
     from ..formats.tables import write_json
+    from ..rendering import activate
 
     output = output or field.with_suffix(".eval")
     check_folder(output)
     if json_file is not None:
         check_writable(json_file)
-    mi.set_variant(variant)
+    activate(variant)
     if threads is not None:
         dr.set_thread_count(threads)
     about = read_checkpoint(field, "radiance")[1].get("provenance", {})
@@ -64,7 +65,7 @@ def eval_radiance(
     if not train and trained is not None and about.get("sha256") == data.source["sha256"]:
         seen = sorted({v.name for v in data.held_out} - set(trained))
         if seen:
-            raise ValueError(f'"{field}" was trained on {seen[0]} and {len(seen) - 1} other of the views that would be scored; '
+            raise NergError(f'"{field}" was trained on {seen[0]} and {len(seen) - 1} other of the views that would be scored; '
                              "give --holdout as it was trained with")
     views = data.train if train else data.held_out
     typer.echo(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")

@@ -6,6 +6,8 @@ from typing import Annotated, Optional
 
 import typer
 
+from ..errors import NergError
+
 
 def eval_gaze(
     gaze: Annotated[Path, typer.Argument(help="Checkpoint of a gaze field that was trained with --test-zones (.safetensors).")],
@@ -29,7 +31,6 @@ def eval_gaze(
 ) -> None:
     """Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the people."""
     import drjit as dr
-    import mitsuba as mi
 
     from ..attention.collecting import file_sha256
     from ..attention.rays import Rays
@@ -41,19 +42,20 @@ def eval_gaze(
     from ..formats.atomic import check_folder
     from ..formats.fields import load_gaze
     from ..transport.media import Similarity
+    from ..rendering import activate
 
     output = output or gaze.with_suffix(".eval")
     check_folder(output)
-    mi.set_variant(mode)
+    activate(mode)
     if threads is not None:
         dr.set_thread_count(threads)
     ns = namespace(mode)
     trained, meta = load_gaze(gaze, ns)
     about = meta["provenance"]
     if "test" not in about:
-        raise ValueError(f'"{gaze}" was trained on all positions, so that none is left to score; train it with --test-zones 3')
+        raise NergError(f'"{gaze}" was trained on all positions, so that none is left to score; train it with --test-zones 3')
     if about.get("rays_file", {}).get("sha256") not in (None, file_sha256(rays)):
-        raise ValueError(f'"{gaze}" was trained on other rays than "{rays}"; give the file {about["rays_file"]["file"]}')
+        raise NergError(f'"{gaze}" was trained on other rays than "{rays}"; give the file {about["rays_file"]["file"]}')
     account, data = about["test"], Rays.load(rays)
     split = split or ("both" if account.get("people") else "pos")
     train, scored, centres = evaluation.held_out_rays(data, account, split, seed)
@@ -100,11 +102,11 @@ def _place(gaze: Path, about: dict, field, scene, geometry, ns):
               "geometry_file": (geometry, "--geometry", places.place_of_volume)}  # fmt: skip
     key = next((k for k in makers if k in about), None)
     if key is None:
-        raise ValueError(f'"{gaze}" does not say what it was trained in')
+        raise NergError(f'"{gaze}" does not say what it was trained in')
     given, option, make = makers[key]
     path = given or gaze.parent / about[key]["file"]
     if not path.is_file():
-        raise ValueError(f'"{path}", which the field was trained in, does not exist; say where it is with {option}')
+        raise NergError(f'"{path}", which the field was trained in, does not exist; say where it is with {option}')
     if file_sha256(path) != about[key]["sha256"]:
-        raise ValueError(f'"{path}" is not the file that "{gaze}" was trained in; give that one with {option}')
+        raise NergError(f'"{path}" is not the file that "{gaze}" was trained in; give that one with {option}')
     return make(path).medium

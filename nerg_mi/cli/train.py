@@ -1,11 +1,13 @@
 """``nerg train``: fields from recordings."""
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 
+from ..errors import NergError, chosen
 from .train_gaze import train_gaze
 
 app = typer.Typer(no_args_is_help=True, help="Train fields from recordings.")
@@ -48,12 +50,11 @@ def train_radiance(
 ) -> None:
     """Train a radiance field on posed pictures, and report the error on those held out."""
     import drjit as dr
-    import mitsuba as mi
 
     from ..capture.dataset import open_dataset
-    from ..errors import NergError
     from ..field.backend import namespace
     from ..formats.atomic import check_writable
+    from ..rendering import activate
     from ..training.radiance_run import save_trained, train_radiance
     from ..training.settings import RadianceSettings, sized_config
 
@@ -61,7 +62,7 @@ def train_radiance(
     check_writable(output, ".safetensors")
     check_writable(state)
     check_writable(preview)
-    mi.set_variant(variant)
+    activate(variant)
     if threads is not None:
         dr.set_thread_count(threads)
     if minutes is None and steps is None:
@@ -72,7 +73,8 @@ def train_radiance(
     settings = RadianceSettings(steps=steps, minutes=minutes, seed=seed, **weights)
     if resume and not state.is_file():
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
-    data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth, scale, coordinates, allow_outside)
+    with chosen("--aabb") if aabb else nullcontext():
+        data = open_dataset(dataset, holdout, width, downscale, _numbers(aabb), depth, scale, coordinates, allow_outside)
     config = sized_config(size, data.box)
     for line in (*data.unused, *data.notes):
         typer.echo(line)
@@ -104,7 +106,7 @@ def _numbers(text: str | None) -> tuple | None:
     try:
         return tuple(float(x) for x in text.replace(",", " ").split())
     except ValueError as e:
-        raise ValueError(f'--aabb needs numbers x0,y0,z0,x1,y1,z1, got "{text}"') from e
+        raise NergError(f'--aabb needs numbers x0,y0,z0,x1,y1,z1, got "{text}"') from e
 
 
 class _Bar:

@@ -8,6 +8,8 @@ from typing import Annotated, Optional
 
 import typer
 
+from ..errors import NergError, chosen
+
 
 def train_gaze(
     output: Annotated[Path, typer.Option("-o", "--output", help="Checkpoint to write (.safetensors).")],
@@ -82,15 +84,14 @@ def train_gaze(
 ) -> None:
     """Train a gaze field on rays of attention, and report its scores at positions that were held out."""
     import drjit as dr
-    import mitsuba as mi
     import numpy as np
 
     from ..attention.collecting import file_sha256
     from ..attention.rays import Rays
-    from ..errors import NergError
     from ..field.backend import namespace
     from ..formats.atomic import check_writable
     from ..formats.fields import save_gaze
+    from ..rendering import activate
     from ..training.gaze_ensemble import train_ensemble
     from ..training.gaze_recipes import gaze_recipe
     from ..training.gaze_run import hold_out, train_gaze
@@ -98,35 +99,36 @@ def train_gaze(
     from ..training.salience_supervision import far_views
 
     if sum(v is not None for v in (field, scene, geometry)) != 1:
-        raise ValueError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
+        raise NergError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
     if geometry not in (None, "hits", "none"):
-        raise ValueError(f'--geometry must be "hits" or "none", got "{geometry}"')
+        raise NergError(f'--geometry must be "hits" or "none", got "{geometry}"')
     if rays is None and views is None:
-        raise ValueError("say what to learn from: a rays file, or --views with --salience, or both")
+        raise NergError("say what to learn from: a rays file, or --views with --salience, or both")
     if rays is None and (test_zones or geometry == "hits" or align or semantic):
-        raise ValueError("--test-zones, --geometry hits, --align and --semantic belong to rays; give a rays file besides --views "
+        raise NergError("--test-zones, --geometry hits, --align and --semantic belong to rays; give a rays file besides --views "
                          "(or hold views out by leaving their images out of the folder, and align them with --align-views)")
     if geometry is not None and align is not None:
-        raise ValueError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
+        raise NergError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
     if test_people and not test_zones:
-        raise ValueError("--test-people leaves people out at test positions: say where, with --test-zones")
+        raise NergError("--test-people leaves people out at test positions: say where, with --test-zones")
     state = output.with_suffix(".run")
     check_writable(output, ".safetensors")
     check_writable(state)
     if geometry == "hits":
         check_writable(output.with_suffix(".vol"))
-    mi.set_variant(mode)
+    activate(mode)
     if threads is not None:
         dr.set_thread_count(threads)
     _check_start(begin, freeze, semantic, field)
-    chosen = gaze_recipe(recipe, gaze, activation, size)
+    with chosen("--variant and --activation"):
+        plan = gaze_recipe(recipe, gaze, activation, size)
     if recipe == "default" and (semantic or begin == "field" or loss or normalized or integral is not None):
-        raise ValueError("--semantic, --begin field, --loss, --integral and --normalized belong to fields of the recipes small and paper; add --recipe small")
-    settings = GazeSettings(**chosen.settings | (chosen.views_alone if rays is None else {}) | _given(
+        raise NergError("--semantic, --begin field, --loss, --integral and --normalized belong to fields of the recipes small and paper; add --recipe small")
+    settings = GazeSettings(**plan.settings | (plan.views_alone if rays is None else {}) | _given(
         minutes=minutes, steps=steps, seed=seed, loss=loss, zones=zones, refit=refit,
         frozen=freeze, learning_rate=learning_rate, weight_decay=weight_decay, integral=integral,
     ) | ({"steps": None} if minutes is not None and steps is None else {}))  # fmt: skip
-    how = ProbeSettings(**chosen.probes | _given(
+    how = ProbeSettings(**plan.probes | _given(
         radius=radius, count=probes, placement=placement, cap=cap, min_rays=min_rays, kappa_rule=kappa_rule, kappa=kappa, weights=weights, directions=directions,
         fresh=fresh or None,
     ))  # fmt: skip
@@ -146,12 +148,13 @@ def train_gaze(
     place = _place(field, scene, geometry, data, seen, output, voxel, ns)
     about |= place.about
     if recipe == "default":
-        config, initial = place.told(chosen.config), None
+        config, initial = place.told(plan.config), None
     else:
-        config, initial = _begun(begin, place, chosen.config, {
-            # Views alone do not say how much is looked altogether.
-            "semantic": semantic, "semantic_own": semantic_own, "normalized": normalized or rays is None,
-        })  # fmt: skip
+        with chosen("--semantic, --variant and --begin"):
+            config, initial = _begun(begin, place, plan.config, {
+                # Views alone do not say how much is looked altogether.
+                "semantic": semantic, "semantic_own": semantic_own, "normalized": normalized or rays is None,
+            })  # fmt: skip
         about |= {"begins_as": field.name} if initial else {}
     train = partial(train_ensemble, ensemble) if ensemble else train_gaze
     with _Bar() as bar:
@@ -172,11 +175,11 @@ def _given(**options) -> dict:
 
 def _check_start(begin: str, freeze: bool, semantic: str, field: Path | None) -> None:
     if begin not in ("random", "field"):
-        raise ValueError(f'--begin must be "random" or "field", got "{begin}"')
+        raise NergError(f'--begin must be "random" or "field", got "{begin}"')
     if freeze and begin != "field":
-        raise ValueError("--freeze keeps the weights that --begin field gives; add it, or leave --freeze out")
+        raise NergError("--freeze keeps the weights that --begin field gives; add it, or leave --freeze out")
     if field is None and (semantic or begin == "field"):
-        raise ValueError(f'{"--semantic" if semantic else "--begin field"} needs a radiance field: give it with --field')
+        raise NergError(f'{"--semantic" if semantic else "--begin field"} needs a radiance field: give it with --field')
 
 
 def _begun(begin: str, place, config, more: dict) -> tuple:
@@ -197,7 +200,7 @@ def _views(views: Path | None, salience: str | None, per: str, align: Path | Non
     """Salience images, and what provenance says of them."""
     if views is None or salience is None:
         if views or salience or align:
-            raise ValueError("salience needs both: --views, the posed photos, and --salience, the images' folder or spectral-residual")
+            raise NergError("salience needs both: --views, the posed photos, and --salience, the images' folder or spectral-residual")
         return [], {}
     from ..capture.salience import open_salience
     from ..formats.checkpoint import read_checkpoint
@@ -239,7 +242,6 @@ def _similarity(path: Path | None):
 
     if path is None:
         return None
-    from ..errors import NergError
     from ..formats.bounded import plain, read_json
 
     matrix = read_json(path, "similarity of --align")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import NergError
 from ..attention.probes import place_probes
 from ..attention.rays import Rays
 from ..attention.kde import SphericalKde
@@ -48,15 +49,15 @@ def held_out_rays(rays: Rays, account: dict, split: str = "both", seed: int = 0)
     """``(training rays, test rays, test centres)`` of a checkpoint's ``account`` of what it held out (``hold_out``).
 
     ``split``: ``both``: positions and people that are new; ``pos``: people who were trained on, at new positions; ``people``:
-    new people where others were trained on. Raises ``ValueError`` where nobody was held out.
+    new people where others were trained on. Raises ``NergError`` where nobody was held out.
     """
     if split not in SPLITS:
-        raise ValueError(f'the split must be one of {", ".join(SPLITS)}, got "{split}"')
+        raise NergError(f'the split must be one of {", ".join(SPLITS)}, got "{split}"')
     centres, unseen = np.array(account["centres"]), np.zeros(len(rays), bool)
     if account.get("people"):
         unseen = split_by_person(rays, test_persons=account["people"])[1]
     elif split != "pos":
-        raise ValueError(f'no people were held out of this training, so that there is no split "{split}"; train with --test-people')
+        raise NergError(f'no people were held out of this training, so that there is no split "{split}"; train with --test-people')
     away = purge(rays, centres, account["purged_within"])
     train = rays.select(~unseen & away)
     if split == "people":
@@ -69,10 +70,10 @@ def make_test(rays: Rays, centres: np.ndarray, radius: float, kappa: float = 20.
               cap: int = 1024, seed: int = 0) -> GazeTest:
     """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, with a kernel of ``kappa``.
 
-    Raises ``ValueError`` where none has."""
+    Raises ``NergError`` where none has."""
     enough = _enough(rays, centres, radius, min_rays)
     if not enough.any():
-        raise ValueError(f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; lower min_rays")
+        raise NergError(f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; lower min_rays")
     probes = place_probes(rays, radius, queries=centres[enough], cap=cap, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query")
     d, rng = fibonacci_directions(directions), np.random.default_rng(seed)
     person = rays.person[probes.indices]

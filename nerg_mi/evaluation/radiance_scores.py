@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import NergError
 from ..capture.cameras import Camera, pixel_directions, sensor_dict
 from ..capture.images import View
 from ..capture.undistort import pinhole, through_lens
@@ -130,7 +131,7 @@ def score_views(field: str | Path, views: list[View], spp: int = 16, pictures: P
     ``depth``: where a view has true depth, see `DepthScore`, means over the views. ``on_view(name, psnr, ssim)``.
     """
     if not views:
-        raise ValueError("there are no views to score; the data set holds none out, so give --holdout 8 or --train")
+        raise NergError("there are no views to score; the data set holds none out, so give --holdout 8 or --train")
     render, rows, depths = Renderer(field, spp), [], []
     if pictures is not None:
         make_folder(pictures)

@@ -11,13 +11,15 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
+
 
 def namespace(source: object) -> ModuleType:
     """Module holding the differentiable array types of a backend.
 
     ``source``: a Mitsuba variant name (``"llvm_ad_rgb"``), ``"llvm"``,
     ``"cuda"``, or any JIT array or array type. Returns ``drjit.llvm.ad`` or
-    ``drjit.cuda.ad``. Raises ``ValueError`` for scalar variants, which have no
+    ``drjit.cuda.ad``. Raises ``NergError`` for scalar variants, which have no
     JIT arrays.
     """
     if isinstance(source, str):
@@ -30,7 +32,7 @@ def namespace(source: object) -> ModuleType:
     elif name.startswith("cuda"):
         import drjit.cuda.ad as ns
     else:
-        raise ValueError(
+        raise NergError(
             f'fields need a JIT variant such as "llvm_ad_rgb" or "cuda_ad_rgb", not "{name}"; '
             "select one with mi.set_variant()"
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..capture.cameras import Camera, view_tangents
 from ..field.backend import aligned
 from ..field.box import Box
@@ -32,7 +33,7 @@ class DensityGrid:
         self.index = dr.arange(ns.UInt32, cells)
         self._allow(self._seen(cameras, min_views, near))
         if self.seen_count == 0:
-            raise ValueError(
+            raise NergError(
                 f"not one cell of the scene box {box.lower} to {box.upper} is seen by {min_views} cameras; "
                 "give a box that holds what the pictures show with --aabb"
             )

@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 from drjit.opt import AdamW
 
+from ..errors import NergError
 from ..field.box import Box
 from ..field.gaze import GazeConfig, GazeField
 from .gaze_losses import VANISHED, gaze_loss
@@ -170,7 +171,7 @@ class _Samples:
     def __init__(self, s: Supervision, ns):
         self.ns, self.probes, self.count = ns, *s.truth.shape
         if self.probes == 0:
-            raise ValueError("there are no probes to train on")
+            raise NergError("there are no probes to train on")
         flat = lambda v: ns.Float(np.ascontiguousarray(v, np.float32).ravel())
         self._extent = None if s.extent is None else np.asarray(s.extent, np.float32)
         self._positions, self._directions = flat(s.positions), flat(s.directions)

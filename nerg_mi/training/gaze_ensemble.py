@@ -31,7 +31,7 @@ BLOCK = 30.0
 def blocks_of(rays: Rays) -> tuple[np.ndarray, str]:
     """The block (N,) that each ray is resampled with, and what the blocks are: ``people``, or ``blocks of 30 s``.
 
-    Raises ``ValueError`` where there are too few of either.
+    Raises ``NergError`` where there are too few of either.
     """
     persons, block = np.unique(rays.person, return_inverse=True)
     if len(persons) >= FEW:
@@ -40,7 +40,7 @@ def blocks_of(rays: Rays) -> tuple[np.ndarray, str]:
     stretch = np.floor((rays.t - first[block]) / BLOCK).astype(np.int64)
     _, block = np.unique(np.stack([block, stretch]), axis=1, return_inverse=True)
     if block.max() + 1 < FEW:
-        raise ValueError(f"{block.max() + 1} stretches of {BLOCK:g} s of {len(persons)} people are too few to resample; leave out --ensemble")
+        raise NergError(f"{block.max() + 1} stretches of {BLOCK:g} s of {len(persons)} people are too few to resample; leave out --ensemble")
     return block.ravel(), f"blocks of {BLOCK:g} s"
 
 
@@ -73,11 +73,11 @@ def train_ensemble(
     members stay. Raises `KeyboardInterrupt`, whose message says how to go on, where it is interrupted.
     """
     if members < 2:
-        raise ValueError(f"an ensemble needs at least two members, got {members}")
+        raise NergError(f"an ensemble needs at least two members, got {members}")
     if rays is None or views:
-        raise ValueError("an ensemble resamples people: it is trained on rays alone; leave out --ensemble or --views")
+        raise NergError("an ensemble resamples people: it is trained on rays alone; leave out --ensemble or --views")
     if probes.kappa_rule == "loo":
-        raise ValueError('an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"')
+        raise NergError('an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"')
     if settings.minutes is not None:
         settings = replace(settings, minutes=settings.minutes / members)
     _, kind = blocks_of(rays)

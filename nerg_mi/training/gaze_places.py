@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import NergError
+from ..errors import MissingFile, NergError
 from ..attention.collecting import file_sha256
 from ..attention.rays import Rays
 from ..field.box import Box
@@ -86,7 +86,7 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
     import mitsuba as mi
 
     if not path.is_file():
-        raise FileNotFoundError(f'the place of hit points "{path}" does not exist; it is written beside the gaze field')
+        raise MissingFile(f'the place of hit points "{path}" does not exist; it is written beside the gaze field')
     medium = VolumeMedium(mi.load_dict(volume_dict(path)))
     lower, upper = medium.bounds()
     return GazePlace(medium, Box(tuple(lower.tolist()), tuple(upper.tolist())), "hits", {"geometry_file": {**_file(path), **(about or {})}})

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ..errors import NergError
 from ..field.gaze import GazeConfig
 from ..field.hashgrid import HashGridConfig
 from ..field.log_gaze import LogGazeConfig
@@ -30,11 +31,11 @@ def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation
     best to positions and people that it was not trained on. ``small``: a density without normalisation on a small grid,
     trained on the paper's losses and its integral. ``paper``: the paper's networks and losses, R = 0.1 m, 4,096 probes with
     the bandwidth of the authors' code, as many steps as 50 epochs have. ``activation``, ``size``: of ``small`` and ``paper``.
-    Raises ``ValueError`` for another name, and for an activation or a size of ``default``.
+    Raises ``NergError`` for another name, and for an activation or a size of ``default``.
     """
     if name == "default":
         if activation or size:
-            raise ValueError("the default recipe has an activation and sizes of its own; choose --recipe small or paper to set them")
+            raise NergError("the default recipe has an activation and sizes of its own; choose --recipe small or paper to set them")
         return Recipe(
             LogGazeConfig(grid=HashGridConfig(levels=5, log2_rows=14, base=2, finest=32), variant=variant, sh_degree=3, mix=0.05),
             # No zones: fits without those that a validation takes, and all around them, lack most of the probes. The decay and the few
@@ -56,4 +57,4 @@ def gaze_recipe(name: str = "default", variant: str = "emit_capture", activation
              "final_rate": 0.1, "hold": 0.0, "weight_decay": 0.0},
             {"radius": 0.1, "count": 4096, "cap": 1024, "kappa_rule": "silverman", "directions": 1024, "min_rays": 8},
         )
-    raise ValueError(f'the recipe must be one of {", ".join(RECIPES)}, got "{name}" (sizes: {", ".join(SIZES)})')
+    raise NergError(f'the recipe must be one of {", ".join(RECIPES)}, got "{name}" (sizes: {", ".join(SIZES)})')

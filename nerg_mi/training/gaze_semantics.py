@@ -7,6 +7,7 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..field.gaze import GazeConfig
 from ..field.radiance import RadianceConfig, RadianceField
 from ..transport.features import accumulated, snapshot
@@ -20,12 +21,12 @@ BATCH = 1 << 18
 def semantic_features(medium, origins, directions, distance, kind: str) -> np.ndarray:
     """Features (N, F), float16, of what rays see: ``accumulated`` along them, or the ``snapshot`` at ``distance`` (N,).
 
-    ``medium``: a ``FieldMedium``; ``origins``, ``directions`` (N, 3) in its frame, unit. Raises ``ValueError`` for another medium.
+    ``medium``: a ``FieldMedium``; ``origins``, ``directions`` (N, 3) in its frame, unit. Raises ``NergError`` for another medium.
     """
     import mitsuba as mi
 
     if not hasattr(medium, "feature_count"):
-        raise ValueError("semantic features are those of a radiance field; give one with --field")
+        raise NergError("semantic features are those of a radiance field; give one with --field")
     out = np.empty((len(origins), medium.feature_count), np.float16)
     with dr.suspend_grad():
         for a in range(0, len(out), BATCH):
@@ -52,11 +53,11 @@ def config_like(radiance: RadianceConfig, variant: str, activation: str, **more)
 def trunk_of(field: RadianceField, config: GazeConfig) -> dict:
     """Grid and position network of ``field`` by the names of a gaze field: what its features, but not its density, come from.
 
-    Raises ``ValueError`` where ``config`` has other sizes.
+    Raises ``NergError`` where ``config`` has other sizes.
     """
     like = config_like(field.config, config.variant, config.activation)
     if (config.grid, config.position_sizes) != (like.grid, like.position_sizes):
-        raise ValueError("a gaze field that begins with a radiance field's weights must have its sizes")
+        raise NergError("a gaze field that begins with a radiance field's weights must have its sizes")
     weights = [dr.detach(w) for w in field.density_net.weights]
     # The first output is the logarithm of the density.
     weights[-1] = weights[-1][1:, :]

@@ -4,6 +4,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict, dataclass
 
+from ..errors import NergError
 from ..field.gaze import GazeConfig
 from ..field.hashgrid import HashGridConfig
 from . import gaze_losses
@@ -21,9 +22,9 @@ SIZES = tuple(_SIZES)
 
 
 def sized_gaze_config(size: str = "small", variant: str = "emit_capture", activation: str = "softplus") -> GazeConfig:
-    """Architecture of a ``size``: ``small`` or ``paper``. Raises ``ValueError`` for unknown words."""
+    """Architecture of a ``size``: ``small`` or ``paper``. Raises ``NergError`` for unknown words."""
     if size not in _SIZES:
-        raise ValueError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
+        raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
     levels, rows, base, finest, width, geometry = _SIZES[size]
     grid = HashGridConfig(levels=levels, log2_rows=rows, base=base, finest=finest)
     return GazeConfig(grid=grid, variant=variant, activation=activation, width=width, geometry=geometry,
@@ -67,7 +68,7 @@ class ProbeSettings:
 
     def __post_init__(self):
         if self.directions < 16 or self.count < 1:
-            raise ValueError(
+            raise NergError(
                 f"supervision needs at least one probe and 16 directions, got {self.count} probes and {self.directions} directions"
             )
 
@@ -116,13 +117,13 @@ class GazeSettings:
 
     def __post_init__(self):
         if (self.steps is None) == (self.minutes is None):
-            raise ValueError("give the length of the training either in steps or in minutes")
+            raise NergError("give the length of the training either in steps or in minutes")
         if (self.steps if self.steps is not None else self.minutes) <= 0:
-            raise ValueError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
+            raise NergError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
         if self.loss not in LOSSES:
-            raise ValueError(f'the loss must be one of {", ".join(LOSSES)}, got "{self.loss}"')
+            raise NergError(f'the loss must be one of {", ".join(LOSSES)}, got "{self.loss}"')
         if min(self.probes, self.directions, self.rays, self.looks) < 1 or min(self.weight_decay, self.integral) < 0 or min(self.zones, self.patience) < 0:
-            raise ValueError(f"a training needs probes, directions and looks, and nothing negative, got {self}")
+            raise NergError(f"a training needs probes, directions and looks, and nothing negative, got {self}")
 
     def rate(self, progress: float) -> float:
         """Learning rate at ``progress`` in 0..1 of the run."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..capture.images import View
 from .unproject import LensTable
 
@@ -39,7 +40,7 @@ class PixelBank:
         used = [n if v.mask is None else int(np.count_nonzero(v.mask)) for n, v in zip(counts, views)]
         self.size = sum(used)
         if sum(counts) >= _MOST:
-            raise ValueError(f"{sum(counts)} training pixels are too many; load the pictures at a smaller width")
+            raise NergError(f"{sum(counts)} training pixels are too many; load the pictures at a smaller width")
         self.centers = np.array([v.camera.center for v in views])
         self._ends = ns.UInt32(np.cumsum(counts).astype(np.uint32))
         self._starts = ns.UInt32(np.cumsum([0, *counts[:-1]]).astype(np.uint32))

@@ -13,6 +13,7 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
+from ..errors import NergError
 from ..capture.images import View
 from ..field.backend import aligned
 from ..field.box import Box
@@ -51,7 +52,7 @@ class RadianceTrainer:
     def __init__(self, views: list[View], box: Box, config: RadianceConfig, settings: RadianceSettings, ns,
                  depth: bool = True):
         if not views:
-            raise ValueError("there are no pictures to train on")
+            raise NergError("there are no pictures to train on")
         self.config, self.settings, self.box, self.ns = config, settings, box, ns
         self.rng, self.clock = np.random.default_rng(settings.seed), StepClock()
         self.pixels = PixelBank(ns, views)

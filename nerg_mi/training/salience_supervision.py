@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..errors import NergError
 from ..attention.kde import SphericalKde
 from ..attention.sphere import fibonacci_directions
 from ..capture.salience import SalienceView
@@ -115,7 +116,7 @@ def split_views(views: list[SalienceView], zones: int, distance: float, seed: in
     """``(learn, watched)``: ``zones`` groups of neighbouring views, an eighth of all, are watched, and no other within
     ``distance`` of one is learnt from.
 
-    Raises ``ValueError`` when too few are left.
+    Raises ``NergError`` when too few are left.
     """
     centres = np.array([v.camera.center for v in views])
     rng = np.random.default_rng(seed)
@@ -129,7 +130,7 @@ def split_views(views: list[SalienceView], zones: int, distance: float, seed: in
     watched = np.unique(np.argsort(near, axis=0, kind="stable")[:each])
     learn = far_views(views, centres[watched], distance)
     if len(learn) < max(2, len(views) // 4):
-        raise ValueError(f"{len(learn)} of {len(views)} views are left to train on, the others are watched or within "
+        raise NergError(f"{len(learn)} of {len(views)} views are left to train on, the others are watched or within "
                          f"{distance:g} of one that is; choose fewer --zones (0: none), or a smaller --radius")
     return learn, [views[k] for k in watched]
 

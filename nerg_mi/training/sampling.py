@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..field.backend import aligned, namespace
 from ..field.box import Box
 from ..transport.quadrature import absorbed_share
@@ -186,7 +187,7 @@ def visible_samples(
         # The ray in which the limit falls is incomplete: it and all later ones wait for another batch.
         covered = int(dr.gather(UInt32, ray, dr.gather(UInt32, kept, UInt32(pad))).numpy()[0])
         if covered == 0:
-            raise ValueError(f"a single ray has more than {pad} samples; enlarge the batch or the step")
+            raise NergError(f"a single ray has more than {pad} samples; enlarge the batch or the step")
     j = dr.arange(UInt32, pad if pad is not None else count)
     source = dr.gather(UInt32, kept, dr.minimum(j, dr.opaque(UInt32, count - 1)))
     ray = dr.gather(UInt32, ray, source)

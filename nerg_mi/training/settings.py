@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 
+from ..errors import NergError
 from ..field.box import Box
 from ..field.hashgrid import HashGridConfig
 from ..field.radiance import RadianceConfig
@@ -19,7 +20,7 @@ _SIZES = {
 def sized_config(size: str, box: Box) -> RadianceConfig:
     """Architecture of a ``size`` for a scene box: an untrained field absorbs about 1 - 1/e across it."""
     if size not in _SIZES:
-        raise ValueError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
+        raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
     levels, rows, base, finest, width, color_hidden = _SIZES[size]
     return RadianceConfig(
         grid=HashGridConfig(levels=levels, log2_rows=rows, base=base, finest=finest), width=width, color_hidden=color_hidden,
@@ -87,21 +88,21 @@ class RadianceSettings:
 
     def __post_init__(self):
         if (self.steps is None) == (self.minutes is None):
-            raise ValueError("give the length of the training either in steps or in minutes")
+            raise NergError("give the length of the training either in steps or in minutes")
         if (self.steps if self.steps is not None else self.minutes) <= 0:
-            raise ValueError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
+            raise NergError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
         given = self.depth_weight, self.distortion_weight, self.grid_decay
         if min(given) < 0:
-            raise ValueError(f"weights of losses must be 0 or more, got {', '.join(map(str, given))}")
+            raise NergError(f"weights of losses must be 0 or more, got {', '.join(map(str, given))}")
         if not (self.thin_sure > 0 and 0 < self.thin_least <= 1):
-            raise ValueError(f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}")
+            raise NergError(f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}")
         if not (self.stride_share >= 0 and self.reach_share > 0):
             shares = f"{self.stride_share} and {self.reach_share}"
-            raise ValueError(f"stride_share must be 0 or more and reach_share above 0, got {shares}")
+            raise NergError(f"stride_share must be 0 or more and reach_share above 0, got {shares}")
         if self.look_most < 1:
-            raise ValueError(f"the density-only pass must have room for a batch: look_most must be 1 or more, got {self.look_most}")
+            raise NergError(f"the density-only pass must have room for a batch: look_most must be 1 or more, got {self.look_most}")
         if self.resolution % 8:
-            raise ValueError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
+            raise NergError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
 
     @property
     def most_looked(self) -> int:

@@ -6,6 +6,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..field.occupancy import OccupancyGrid
 
 # Share of a voxel by which a point on a boundary counts as beyond it; far below what a sample can tell.
@@ -53,7 +54,7 @@ def describe(volume) -> tuple[VoxelCells, np.ndarray] | None:
     data = data.reshape(data.shape[:3] + (-1,))[..., 0]
     if not np.all(np.isfinite(data)):
         bad = np.argwhere(~np.isfinite(data))
-        raise ValueError(
+        raise NergError(
             f'the grid of "density" holds {len(bad)} values that are not finite, the first in voxel '
             f"(z, y, x) = {tuple(bad[0].tolist())}; replace them"
         )

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import drjit as dr
 
+from ..errors import NergError
 from ..field.gaze_ensemble import GazeEnsemble
 from ..field.support import RaySupport
 from .freezing import recording
@@ -83,9 +84,9 @@ class _Sum:
 def keep_or_make(known: list, observers: list, make) -> list:
     """For each of ``observers`` the one of ``known`` with that ``center``, or what ``make`` makes.
 
-    Raises ``ValueError`` in a function that is being frozen, where the observers' positions cannot be read."""
+    Raises ``NergError`` in a function that is being frozen, where the observers' positions cannot be read."""
     if recording():
-        raise ValueError('"support" and "kde" depend on where the observer is, which a frozen function does not know while it is recorded: '
+        raise NergError('"support" and "kde" depend on where the observer is, which a frozen function does not know while it is recorded: '
                          'leave them out of "aovs"')
     same = lambda k, p_o: bool(dr.all(k.center == dr.detach(p_o), axis=None))
     return [next((k for k in known if same(k, p_o)), None) or make(p_o) for p_o in observers]

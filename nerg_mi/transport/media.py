@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from ..field.backend import namespace
 from ..field.gaze import GazeField
 from ..field.radiance import RadianceField
@@ -28,7 +29,7 @@ MAX_DENSITY = 1e30
 class Similarity:
     """A rotation, uniform scale and translation: a field's ``to_world``.
 
-    ``matrix``: (4, 4), field to scene. Raises ``ValueError`` when it shears, mirrors or scales
+    ``matrix``: (4, 4), field to scene. Raises ``NergError`` when it shears, mirrors or scales
     unevenly: densities and directions would then have no single scale.
     """
 
@@ -41,7 +42,7 @@ class Similarity:
             determinant > 0 and np.array_equal(m[3], [0, 0, 0, 1])
             and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
         ):
-            raise ValueError(
+            raise NergError(
                 '"to_world" of a field must be a rotation, a uniform scale and a translation; bake any other '
                 "transform into the field's training data"
             )
@@ -183,7 +184,7 @@ class VolumeMedium:
         box = density.bbox()
         self._lower, self._upper = np.array(box.min, float), np.array(box.max, float)
         if not np.all(np.isfinite(self._lower) & np.isfinite(self._upper)) or np.any(self._upper <= self._lower):
-            raise ValueError(
+            raise NergError(
                 f'the volume "density" has no finite extent (its bounding box is {self._lower} to {self._upper}); '
                 "give it a to_world that places it in the scene"
             )

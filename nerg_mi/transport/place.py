@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from ..errors import NergError
 from .depth import surface_depth, way_out
 from .march import MarchResult, scouted_march
 
@@ -44,7 +45,7 @@ class View:
 
 
 class Place:
-    """``medium``: a ``media`` medium or None; ``scene``: the Mitsuba scene whose shapes are met, or None. Raises ``ValueError`` for
+    """``medium``: a ``media`` medium or None; ``scene``: the Mitsuba scene whose shapes are met, or None. Raises ``NergError`` for
     meshes that have no faces."""
 
     def __init__(self, medium, scene=None):
@@ -54,7 +55,7 @@ class Place:
         for shape in shapes:
             if shape.is_mesh() and shape.face_count() == 0:
                 # Mitsuba 3.9.1 builds a scene of it, but cannot shade what it does not meet.
-                raise ValueError(f'the mesh "{shape.id()}" has no faces; take it out of the scene')
+                raise NergError(f'the mesh "{shape.id()}" has no faces; take it out of the scene')
 
     @property
     def diagonal(self) -> float:

@@ -15,6 +15,7 @@ from typing import Callable
 
 import drjit as dr
 
+from ..errors import NergError
 from ..field.elementary import quotient
 from .quadrature import linear_crossing, linear_share, mean_depth_share
 
@@ -139,9 +140,9 @@ def rule(kind: str, medium):
     if kind == "linear":
         return Linear()
     if kind != "cells":
-        raise ValueError(f'"quadrature" must be one of {", ".join(KINDS)}, got "{kind}"')
+        raise NergError(f'"quadrature" must be one of {", ".join(KINDS)}, got "{kind}"')
     if medium.cells is None:
-        raise ValueError(
+        raise NergError(
             'the quadrature "cells" needs an axis-aligned "gridvolume" as density; use "constant" or "linear"'
         )
     return Cells(medium.cells)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import drjit as dr
 
+from ..errors import NergError
+
 
 class Shading:
     """``nested``: a Mitsuba sampling integrator that lights the shapes, or None: ``path`` where the scene has emitters
     and shapes, otherwise every shape shows its albedo.
 
-    Raises ``ValueError`` for integrators whose radiance is not to be had ray by ray.
+    Raises ``NergError`` for integrators whose radiance is not to be had ray by ray.
     """
 
     def __init__(self, nested=None):
@@ -18,7 +20,7 @@ class Shading:
         # By name: each change of variant makes that class anew.
         whole = nested is not None and any(c.__name__ == "ADIntegrator" for c in type(nested).__mro__)
         if whole or not (nested is None or isinstance(nested, mi.SamplingIntegrator)):
-            raise ValueError(
+            raise NergError(
                 f'the integrator nested in "nerg" is a {type(nested).__name__}, which cannot be asked for the radiance of '
                 'one ray; use "path", "direct", "volpath" or another one that samples pixels'
             )

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import drjit as dr
 
+from ..errors import NergError
 from .freezing import recording
 
 _CENTERED = {"PerspectiveCamera", "ThinLensCamera", "Panorama", "RadianceMeter"}
@@ -49,7 +50,7 @@ def _kind(sensor) -> str:
 def require_center(sensor, role: str) -> None:
     """Raise ``ValueError`` when ``sensor`` (called ``role`` in the message) has no single centre."""
     if _kind(sensor) not in _CENTERED:
-        raise ValueError(
+        raise NergError(
             f"{role} is a {_kind(sensor)}, which has no centre to look from: "
             'give the integrator an explicit "observer" such as a perspective sensor'
         )
@@ -84,7 +85,7 @@ def center_of_ray(sensors, ray):
     for member in members:
         require_center(member, "the rendering sensor")
     if not members:
-        raise ValueError('there is no sensor to take the observer from: give the integrator an "observer"')
+        raise NergError('there is no sensor to take the observer from: give the integrator an "observer"')
     best = center(members[0])
     if len(members) == 1:
         return best

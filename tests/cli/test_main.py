@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.errors import NergError, sentence
+from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, chosen, sentence
 
 HEAVY = {"mitsuba", "drjit", "numpy", "scipy", "matplotlib", "torch", "trimesh", "OpenEXR"}
 
@@ -58,8 +58,13 @@ def failing(monkeypatch, error):
     "error, said",
     [
         (NergError('there is no "x": write "y".'), 'nerg: there is no "x": write "y".'),
-        (FileNotFoundError(2, "No such file", "a.xml"), 'nerg: there is no file "a.xml".'),
-        (ImportError("LLVM 15 cannot run."), "nerg: LLVM 15 cannot run."),
+        (MissingFile('there is no file "a".'), 'nerg: there is no file "a".'),
+        (FileNotFoundError(2, "No such file or directory", "a.xml"), 'nerg: there is no file "a.xml".'),
+        (PermissionError(13, "Permission denied", "a.exr"), 'nerg: "a.exr": permission denied.'),
+        (OSError(28, "No space left on device"), "nerg: no space left on device."),
+        (UnusableLLVM("LLVM 15 cannot run."), "nerg: LLVM 15 cannot run."),
+        (ModuleNotFoundError("No module named 'torch'", name="torch"), "nerg: No module named 'torch'"),
+        (MemoryError("Unable to allocate 9 GiB"), "nerg: there is not enough memory: Unable to allocate 9 GiB; ask for less, or close other programs."),
     ],
 )
 def test05_expected_error_is_one_sentence(monkeypatch, capsys, error, said):
@@ -70,19 +75,66 @@ def test05_expected_error_is_one_sentence(monkeypatch, capsys, error, said):
     assert capsys.readouterr().err.strip() == said
 
 
-def test06_traceback_on_request(monkeypatch):
-    failing(monkeypatch, NergError("no."))
-    with pytest.raises(NergError):
-        nerg_mi.cli.main(["doctor", "--traceback"])
-    monkeypatch.setenv("NERG_TRACEBACK", "1")
-    with pytest.raises(NergError):
+@pytest.mark.parametrize("error, code", [(NergError("no."), 1), (TypeError("a bug"), 70)])
+@pytest.mark.parametrize("ask", ["--debug", "--traceback", "NERG_TRACEBACK"])
+def test06_traceback_on_request(monkeypatch, capsys, error, code, ask):
+    failing(monkeypatch, error)
+    if ask.isupper():
+        monkeypatch.setenv(ask, "1")
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(["doctor"] + [ask] * ask.startswith("--"))
+    said = capsys.readouterr().err
+    assert end.value.code == code and "Traceback (most recent call last)" in said and "in command" in said
+    assert said.strip().splitlines()[-1].startswith("nerg: ")
+
+
+@pytest.mark.parametrize(
+    "error, said",
+    [
+        (TypeError("a\n  bug"), "TypeError: a bug"), (ValueError("of one function by another"), "ValueError: of one function by another"),
+        (KeyError("x"), "KeyError: 'x'"), (RuntimeError(), "RuntimeError"),
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"), (OSError("of nothing"), "OSError: of nothing"),
+        (ImportError("cannot import name 'x' from 'nerg_mi.field'", name="nerg_mi.field"), "ImportError: cannot import name 'x' from 'nerg_mi.field'"),
+    ],
+)  # fmt: skip
+def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, capsys, error, said):
+    failing(monkeypatch, error)
+    with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(["doctor"])
+    out = capsys.readouterr()
+    assert end.value.code == 70 and not out.out
+    assert out.err == (
+        f"nerg: internal error ({said}): this is a fault of nerg_mi and not of your input; run again with --debug and report the traceback.\n"
+    )
 
 
-def test07_a_bug_is_not_dressed_up(monkeypatch):
-    failing(monkeypatch, TypeError("a bug"))
+@pytest.mark.parametrize("lines", [1, 100_000])
+def test07b_nothing_is_said_where_nobody_reads(lines):
+    """Neither in the middle of the output nor at its end, which is written when the interpreter stops."""
+    code = (
+        "import sys\nimport nerg_mi.cli.doctor as doctor\n"
+        f"def command():\n    for i in range({lines}): print('a line of output')\n"
+        "doctor.command = command\nfrom nerg_command import main\nsys.argv[1:] = ['doctor']\nmain()"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.close()
+    said = process.stderr.read()
+    process.wait(timeout=60)
+    process.stderr.close()
+    assert said == "" and process.returncode in (0, 1)
+
+
+def test07c_what_a_contract_refuses_is_the_users_where_they_chose_it():
+    with pytest.raises(NergError, match="^the corner is wrong; give other values by --aabb$") as raised:
+        with chosen("--aabb"):
+            raise ValueError("the corner is wrong.")
+    assert isinstance(raised.value.__cause__, ValueError)
+    with pytest.raises(NergError, match="^write y$"):
+        with chosen("--aabb"):
+            raise NergError("write y")
     with pytest.raises(TypeError):
-        nerg_mi.cli.main(["doctor"])
+        with chosen("--aabb"):
+            raise TypeError("a bug")
 
 
 def test08_sentence_of_a_mitsuba_error():

@@ -1,0 +1,87 @@
+"""What the pages say of options and defaults is what the code has."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import fields
+
+import pytest
+import typer
+
+import nerg_mi.cli
+from nerg_mi.evaluation import study_subject
+from nerg_mi.formats import unpickling
+from nerg_mi.training.gaze_recipes import gaze_recipe
+from nerg_mi.transport.gaze_integral import COUNT
+from nerg_mi.transport.march import MarchSettings
+from tests.conftest import ROOT
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+FOREIGN = {"--tcnn", "--ff"}  # of torch-ngp
+NUMBERS = "zero one two three four five six seven eight nine ten".split()
+
+
+def options() -> set[str]:
+    """Every option of every command and of every script."""
+    found = {"--help"}
+
+    def walk(command):
+        for parameter in command.params:
+            found.update(parameter.opts + parameter.secondary_opts)
+        for other in getattr(command, "commands", {}).values():
+            walk(other)
+
+    for name in nerg_mi.cli.COMMANDS:
+        walk(typer.main.get_command(nerg_mi.cli._app(name)))
+    for folder in ("benchmarks", "examples", "tools", "scenes/store", "tests/renders"):
+        for script in (ROOT / folder).glob("*.py"):
+            found.update(re.findall(r'"(--[a-z][a-z0-9-]*)"', script.read_text()))
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test01_options_that_are_named_exist(page):
+    named = set(re.findall(r"(?<![\w-])(--[a-z][a-z0-9-]*)", page.read_text()))
+    assert named <= options() | FOREIGN
+
+
+def test02_defaults_of_the_integrator_are_those_of_its_manual(rgb):
+    made = rgb.load_dict({"type": "nerg", "density": {"type": "constvolume"}})
+    said = {}
+    for name, text in re.findall(r"^ \* - (\w+)\n(.*?)(?=^ \* - |^This integrator)", inspect.getdoc(type(made)).replace("\n     ", "\n"), re.S | re.M):
+        value = re.search(r"\(Default: ``?([^`]+)``|\(Default: ([^;),]+)", text)
+        if value is not None:
+            said[name] = value[1] or value[2].strip()
+    real = study_subject.parameters(made) | {"tolerance": made.observer_pass.tolerance, "aovs": ",".join(made.aovs), "background": 0.0, "step": 0.0}
+    assert set(real) - set(said) == set() and len(said) >= 15
+    for name, value in real.items():
+        text = str(value).lower() if isinstance(value, bool) else value
+        assert said[name] == text if isinstance(text, str) else float(said[name].split(",")[0]) == pytest.approx(value), name
+
+
+def test03_defaults_of_the_march_are_the_integrators(rgb):
+    made = rgb.load_dict({"type": "nerg", "density": {"type": "constvolume"}}).settings
+    for f in fields(MarchSettings):
+        if f.name != "step":
+            assert getattr(made, f.name) == f.default, f.name
+
+
+def test04_the_default_recipe_is_as_described():
+    row = next(line for line in (ROOT / "docs" / "gaze-training.md").read_text().splitlines() if line.startswith("| `default`"))
+    plan = gaze_recipe()
+    c, s, p = plan.config, plan.settings, plan.probes
+    assert f"{NUMBERS[c.grid.levels].capitalize()} levels of a grid ({c.grid.base} to {c.grid.finest})" in row
+    assert f"up to degree {c.sh_degree - 1}, two networks {c.width} wide" in row and c.layers == 2
+    assert f"weight decay {s['weight_decay']:g}, {s['steps']} steps, kernels of kappa {p['kappa']:g}, a share of {c.mix:g} of the blind" in row
+
+
+def test05_numbers_that_are_constants():
+    page = lambda name: (ROOT / "docs" / name).read_text()
+    assert f"a sum over {COUNT:,} directions" in page("gaze-evaluation.md")
+    assert f"allow-list of {NUMBERS[len(unpickling._ALLOWED)]} names" in page("interchange.md")
+    assert f"{study_subject.FINER} times shorter" in page("error-and-time.md")
+    spp = inspect.signature(__import__("nerg_mi.evaluation.radiance_scores", fromlist=["x"]).score_views).parameters["spp"].default
+    assert f"{spp} rays a pixel (`--spp`)" in page("radiance-training.md")
+    for script in ("fox_radiance.py", "store_radiance.py"):
+        assert f'"--spp", type=int, default={spp}' in (ROOT / "benchmarks" / script).read_text(), script
