@@ -46,20 +46,6 @@ def test01_options_that_are_named_exist(page):
     assert named <= options() | FOREIGN
 
 
-def test02_defaults_of_the_integrator_are_those_of_its_manual(rgb):
-    made = rgb.load_dict({"type": "nerg", "density": {"type": "constvolume"}})
-    said = {}
-    for name, text in re.findall(r"^ \* - (\w+)\n(.*?)(?=^ \* - |^This integrator)", inspect.getdoc(type(made)).replace("\n     ", "\n"), re.S | re.M):
-        value = re.search(r"\(Default: ``?([^`]+)``|\(Default: ([^;),]+)", text)
-        if value is not None:
-            said[name] = value[1] or value[2].strip()
-    real = study_subject.parameters(made) | {"tolerance": made.observer_pass.tolerance, "aovs": ",".join(made.aovs), "background": 0.0, "step": 0.0}
-    assert set(real) - set(said) == set() and len(said) >= 15
-    for name, value in real.items():
-        text = str(value).lower() if isinstance(value, bool) else value
-        assert said[name] == text if isinstance(text, str) else float(said[name].split(",")[0]) == pytest.approx(value), name
-
-
 def test03_defaults_of_the_march_are_the_integrators(rgb):
     made = rgb.load_dict({"type": "nerg", "density": {"type": "constvolume"}}).settings
     for f in fields(MarchSettings):

@@ -36,7 +36,7 @@ def _dump(parameters: dict, half: bool) -> dict[str, np.ndarray]:
         if not np.all(np.isfinite(stored)):
             if np.all(np.isfinite(value)):
                 raise NergError(f'the weight array "{name}" exceeds what fp16 can hold; leave out --half')
-            raise ValueError(f'the weight array "{name}" is not finite')
+            raise NergError(f'the weight array "{name}" is not finite, so that the training has diverged; train with a lower learning rate')
         out[name] = stored
     return out
 

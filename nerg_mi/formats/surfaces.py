@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import NergError
 from ..field.extraction import Lattice, Sampler, crossings, opacity, surface_density
 from ..field.radiance import RadianceField
 from .atomic import write_bytes
@@ -45,7 +46,7 @@ def mesh(field: RadianceField, resolution: int = 256, threshold: float | None = 
     level = float(opacity(np.array(threshold), lattice))
     volume, filled = _closed(opacity(density, lattice), level, fill)
     if not volume.min() < level < volume.max():
-        raise ValueError(
+        raise NergError(
             f"density crosses {threshold:g} per unit nowhere (it lies in {density.min():g} .. {density.max():g} on "
             f"{lattice.shape} points): choose another --density"
         )
@@ -55,7 +56,7 @@ def mesh(field: RadianceField, resolution: int = 256, threshold: float | None = 
     if not unseen:
         faces = faces[hidden[faces].sum(1) < 2]
         if len(faces) == 0:
-            raise ValueError("no face of this surface has free space in front of it: the occupancy grid ends in it everywhere")
+            raise NergError("no face of this surface has free space in front of it: the occupancy grid ends in it everywhere; keep all faces with --unseen")
     left = len(faces)
     body = trimesh.Trimesh(vertices, faces[:, ::-1] if _inside_out(vertices, faces, sampler) else faces, process=False)
     body, pieces, kept = _without_floaters(body, keep)
@@ -134,7 +135,7 @@ def points(field: RadianceField, resolution: int = 256, threshold: float | None 
         index.append(found)
     index = np.concatenate(index)
     if len(index) == 0:
-        raise ValueError(f"density crosses {threshold:g} per unit nowhere on {lattice.shape} points: choose another --density")
+        raise NergError(f"density crosses {threshold:g} per unit nowhere on {lattice.shape} points: choose another --density")
     if count is not None and count < len(index):
         index = index[np.sort(np.random.default_rng(seed).choice(len(index), count, replace=False))]
     index, hidden = crossings(sampler, lattice, index, threshold)

@@ -127,7 +127,7 @@ def occupied_steps(rays: Rays, table: StepTable, offset, occupied, most: int | N
         # Rays lie one after another: the first step that does not fit tells which ray is incomplete.
         covered = int(dr.gather(UInt32, kept, UInt32(most)).numpy()[0]) // table.steps
         if covered == 0:
-            raise ValueError(f"a single ray has more than {most} steps; enlarge the batch, look_most or the step")
+            raise NergError(f"a single ray has more than {most} steps; enlarge the batch, look_most or the step")
         count = dr.width(dr.compress(kept < dr.opaque(UInt32, covered * table.steps)))
         kept = dr.gather(UInt32, kept, dr.arange(UInt32, count))
     ray, k = table.split(kept)
