@@ -196,6 +196,15 @@ def test_validation_stops_and_the_best_is_fitted_again(rgb):
     assert field.config == SMALL
 
 
+@pytest.mark.parametrize("patience, looks", [(3, 4), (1, 2), (0, 10)])
+def test_a_run_ends_when_looking_has_been_in_vain_for_long_enough(wall, patience, looks):
+    """Nothing is learnt at a rate of next to nothing: the first look is the best, and ``patience`` more are taken."""
+    settings = GazeSettings(steps=20, looks=10, patience=patience, zones=2, watched=6, probes=4, directions=32, learning_rate=1e-30, refit=False)
+    _, about = gaze_run.train_gaze(looking_at((1.5, 0, 1.2), 3000, spread=6.0), wall, BOX, SMALL, settings, PROBES, namespace("llvm"))
+    v = about["validation"]
+    assert [h["steps"] for h in v["history"]] == [2 * k for k in range(1, looks + 1)] and v["best_step"] == 2 and about["steps"] == 2 * looks
+
+
 def test_a_place_made_of_hits(rgb, rays, tmp_path):
     density, box = voxelise_hits(rays, 0.1)
     assert density.dtype == np.float32 and (density > 0).any()

@@ -87,6 +87,19 @@ def test_another_run_is_not_resumed(wall, tmp_path):  # noqa: F811
         train(wall, PRODUCT, SMALL, state=tmp_path / "b.run", resume=True)
 
 
+def test_the_state_is_kept_every_so_often_and_when_asked(monkeypatch, tmp_path):
+    from nerg_mi.training import gaze_state
+
+    clock, kept = [100.0], []
+    monkeypatch.setattr(gaze_state.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(gaze_state, "write_checkpoint", lambda path, kind, tensors, meta: kept.append((clock[0], meta["spent"])))
+    file = gaze_state.GazeRunFile(tmp_path / "a.run", {}, 10.0, False)
+    for clock[0] in (105.0, 109.0, 111.0, 112.0, 120.0, 122.5):
+        file.keep("fit", None, {}, {}, now=clock[0] == 112.0)
+    assert kept == [(111.0, 11.0), (112.0, 12.0), (122.5, 22.5)]
+    gaze_state.GazeRunFile(None, {}, 10.0, False).keep("fit", None, {}, {}, now=True)
+
+
 def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):  # noqa: F811
     """16 probes, 4 a step: an epoch is four steps. Without it there is one set of directions."""
     from nerg_mi.training import gaze_supervision
