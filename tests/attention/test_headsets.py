@@ -68,6 +68,7 @@ def test_varjo(tmp_path):
     rays = preset("varjo").read([path])
     assert np.allclose(rays.t, [0, 0.01], atol=1e-6) and dropped(rays) == {"GazeStatus is not VALID": [[3, 3]]}
     ahead = np.array([3**0.5 / 2, 0, -0.5])
+    assert [s["file"] for s in rays.metadata["sources"]] == ["2026-01-02.csv"]
     assert np.allclose(rays.direction[1], ahead, atol=1e-6) and np.allclose(rays.origin, [[1, 2, 1.6] + 0.1 * ahead, [1, 2, 1.6]], atol=1e-6)
     path.write_text(path.read_text().replace("(0.000, 0.500, 1.000)", "(0.000, oops)"))
     with pytest.raises(ValueError, match="line 2, column 'CombinedGazeForward'"):
@@ -148,3 +149,6 @@ def test_a_vector_that_is_cut_off(tmp_path):
         headsets.varjo([path])
     rays = headsets.varjo([path], skip_bad_lines=True)
     assert len(rays) == 5 and rays.t[0] == 0 and rays.metadata["dropped"][0]["rows"] == [[2, 2]] and rays.metadata["rows_read"] == 6
+    path.write_text(head + "".join(row.format(i * 10**7) for i in range(5)) + "50000000;(0, 1.6, 0);(0, 0")
+    rays = headsets.varjo([path], skip_bad_lines=True)
+    assert len(rays) == 5 and rays.metadata["dropped"][0]["rows"] == [[7, 7]]

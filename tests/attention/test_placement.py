@@ -38,3 +38,12 @@ def test_lattice_and_box(origin):
     assert len(box) == 300 and (box >= origin.min(axis=0)).all() and (box <= origin.max(axis=0)).all()
     with pytest.raises(ValueError, match="placement"):
         place_queries(origin, "hexagons", 1, None, 0.25, rng)
+
+
+def test_places_that_are_far_enough_apart_all_have_a_probe():
+    """Few, down a steep line, where the cells of candidates are easily taken for one another."""
+    steps = np.arange(5.0)
+    for axes in ([0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1]):
+        down = np.stack([0 * steps, 0.26 * steps, 1.26 * (4 - steps)], axis=1)[:, axes]
+        found = place_queries(np.repeat(down, 7, axis=0), "blue", 100, 1.0, 0.25, np.random.default_rng(0))
+        assert sorted(map(tuple, found)) == sorted(map(tuple, down))

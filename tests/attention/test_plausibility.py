@@ -91,3 +91,9 @@ def test_some_runs_speak_for_millions(monkeypatch):
     for some in (many, shuffled):
         assert (walking_agreement(some)[:2] > 0.5).all()
         assert (walking_agreement(replace(some, direction=some.direction * (-1, -1, 1)))[:2] < -0.5).all()
+
+
+def test_the_order_of_rays_makes_no_difference():
+    rays = walk()
+    mixed = rays.select(np.random.default_rng(3).permutation(len(rays)))
+    assert np.allclose(walking_agreement(mixed), walking_agreement(rays))

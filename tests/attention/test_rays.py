@@ -44,6 +44,12 @@ def test_refuses_by_row(change, message):
         some(**change)
 
 
+def test_whole_numbers_are_taken_as_what_they_stand_for():
+    n = 4
+    rays = Rays(np.arange(n), np.zeros(n, np.int8), ("ann",), np.zeros((n, 3), int), np.tile([0, 0, 1], (n, 1)), np.ones(n, int), np.ones((n, 3), int))
+    assert {a.dtype for a in (rays.t, rays.origin, rays.direction, rays.hit)} == {np.dtype(float)} and (rays.t + 0.5).tolist() == [0.5, 1.5, 2.5, 3.5]
+
+
 def test_select_keeps_codes_and_provenance():
     rays = some()
     part = rays.select(rays.person == 1)
