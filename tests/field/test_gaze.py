@@ -144,10 +144,14 @@ def test09_names_and_sizes():
 @pytest.mark.parametrize("wrong, words", [
     (dict(variant="both"), 'variant must be one of emit, capture, emit_capture, got "both"'),
     (dict(activation="relu"), 'activation must be one of softplus, exp, linear, got "relu"'), (dict(width=0), "at least 1"),
+    (dict(semantic="snapshot", normalized=True), "cannot be normalised"), (dict(semantic="snapshot", variant="capture"), "no emit"),
 ])  # fmt: skip
 def test10_wrong_settings(wrong, words):
     with pytest.raises(ValueError, match=words):
         GazeConfig(**wrong)
+    # One of two that do not go together is no mistake.
+    for name, value in wrong.items() if len(wrong) > 1 else ():
+        assert getattr(GazeConfig(**{name: value}), name) == value
 
 
 def test11_one_observer_and_many_directions():

@@ -172,3 +172,11 @@ def test13_an_evaluation_leaves_no_cycles():
         assert gc.collect() == 0
     finally:
         gc.enable()
+
+
+def test14_the_smallest_grid_has_one_vertex_a_corner():
+    config = HashGridConfig(levels=1, log2_rows=3, base=1, finest=1)
+    assert list(config.offsets()) == [0, 8] and config.level_scales().tolist() == [0]
+    for wrong in ({"levels": 0}, {"base": 0}, {"base": 2}):
+        with pytest.raises(ValueError, match="finest >= base >= 1"):
+            HashGridConfig(**{**config.to_dict(), **wrong})

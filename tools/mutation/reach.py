@@ -62,6 +62,9 @@ class Reach:
     def of(self, mutant: Mutant) -> list[str]:
         """The tests that reach the mutant's lines; of what runs at import alone, those that reach its file."""
         source = mutant.file.replace("nerg_mi/plugins", "plugins")
+        if not mutant.called:
+            # Whichever test came first has run it, when it imported the file.
+            return self._reaching(source, None)
         lines = range(mutant.line, mutant.last + 1)
         exact = self._reaching(source, set(lines))
         return exact or self._reaching(source, {mutant.statement}) or self._reaching(source, None)

@@ -50,7 +50,8 @@ class Mutant:
     """One change: `before`, the source text of the node from byte `start` to `end`, becomes `after`.
 
     Named by its contents (`key`), so that changes elsewhere in the file leave its name as it is. `line`, `last`: the
-    lines of the node; `statement`: the first line of the statement around it.
+    lines of the node; `statement`: the first line of the statement around it; `called`: whether it lies in the body of a
+    function, and not in what runs once, when the file is imported.
     """
 
     file: str
@@ -64,6 +65,7 @@ class Mutant:
     statement: int
     start: int
     end: int
+    called: bool
 
     @property
     def key(self) -> str:
@@ -81,16 +83,16 @@ class Mutant:
 
 
 class _Finder:
-    """Walks one file; `found` holds (function, kind, node, replacement, first line of the statement)."""
+    """Walks one file; `found` holds what becomes a `Mutant`."""
 
     def __init__(self, source: str):
         self.source = source.encode()
         self.lines = [0]
         for line in self.source.splitlines(keepends=True):
             self.lines.append(self.lines[-1] + len(line))
-        self.found: list[tuple[str, str, ast.AST, str, int]] = []
+        self.found: list[tuple[str, str, ast.AST, str, int, bool]] = []
         self.scope: list[str] = []
-        self.statement = 0
+        self.statement, self.depth = 0, 0
 
     def span(self, node: ast.AST) -> tuple[int, int]:
         return self.lines[node.lineno - 1] + node.col_offset, self.lines[node.end_lineno - 1] + node.end_col_offset
@@ -107,7 +109,7 @@ class _Finder:
 
     def put(self, kind: str, node: ast.AST, replacement: str) -> None:
         if replacement != self.text(node):
-            self.found.append((".".join(self.scope) or "module", kind, node, replacement, self.statement))
+            self.found.append((".".join(self.scope) or "module", kind, node, replacement, self.statement, self.depth > 0))
 
     # -- statements ------------------------------------------------------------
 
@@ -127,7 +129,9 @@ class _Finder:
             if not isinstance(s, ast.ClassDef):
                 for default in [*s.args.defaults, *filter(None, s.args.kw_defaults)]:
                     self.expression(default)
+            self.depth += not isinstance(s, ast.ClassDef)
             self.block(s.body)
+            self.depth -= not isinstance(s, ast.ClassDef)
             self.scope.pop()
             return
         if isinstance(s, ast.Expr) and isinstance(s.value, ast.Call):
@@ -272,13 +276,12 @@ def find(file: str, source: str) -> list[Mutant]:
     finder.block(ast.parse(source).body)
     seen: Counter = Counter()
     mutants = []
-    for function, kind, node, after, statement in sorted(finder.found, key=lambda f: finder.span(f[2])):
+    for function, kind, node, after, statement, called in sorted(finder.found, key=lambda f: finder.span(f[2])):
         before = finder.text(node)
         same = (function, kind, " ".join(before.split()), " ".join(after.split()))
         seen[same] += 1
-        mutants.append(
-            Mutant(file, function, kind, before, after, seen[same], node.lineno, node.end_lineno, statement, *finder.span(node))
-        )
+        place = node.lineno, node.end_lineno, statement, *finder.span(node), called
+        mutants.append(Mutant(file, function, kind, before, after, seen[same], *place))
     return mutants
 
 
