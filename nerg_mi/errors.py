@@ -52,6 +52,28 @@ def expected(error: BaseException) -> bool:
     return isinstance(error, (NergError, MemoryError))
 
 
+_TRACEBACK = "Traceback (most recent call last):"
+_MENDABLE = ("NergError", "MissingFile", "UnusableLLVM", "ValueError", "ImportError", "ModuleNotFoundError", "OSError", "FileNotFoundError",
+             "PermissionError", "IsADirectoryError", "MemoryError")  # fmt: skip
+
+
+@contextmanager
+def mitsuba_says() -> Iterator[None]:
+    """A block whose `RuntimeError`s are Mitsuba's, about a scene, as `NergError`.
+
+    It makes one of whatever a plugin's constructor raises, with the traceback as text. Where that ends in an exception that
+    only a mistake of the program raises (a `TypeError`, say), the error is left as it is.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        _, marker, trace = str(error).partition(_TRACEBACK)
+        kind = _raised(trace).partition(":")[0].strip().rpartition(".")[2] if marker else None
+        if kind is not None and kind not in _MENDABLE:
+            raise
+        raise NergError(sentence(error)) from error
+
+
 def sentence(error: BaseException) -> str:
     """What `error` says, on one line.
 
@@ -66,10 +88,14 @@ def sentence(error: BaseException) -> str:
         if error.filename is not None:
             said = f'there is no file "{error.filename}".' if error.errno == errno.ENOENT else f'"{error.filename}": {said}'
         text = said
-    before, marker, trace = text.partition("Traceback (most recent call last):")
+    before, marker, trace = text.partition(_TRACEBACK)
     if marker:
-        # The exception's line starts at the left margin and may run on over several lines; frames are indented.
-        said = re.split(r"\n(?=[A-Za-z_][\w.]*:\s)", trace)[-1]
-        text = before.rstrip() + " " + re.sub(r"^[A-Za-z_][\w.]*:\s+", "", said.strip())
+        text = before.rstrip() + " " + re.sub(r"^[A-Za-z_][\w.]*:\s+", "", _raised(trace))
     text = re.sub(r"^\[[\w.]+\.(cpp|h):\d+\]\s*", "", text)
     return " ".join(text.split()) or type(error).__name__
+
+
+def _raised(trace: str) -> str:
+    """The end of a traceback: the exception's class and what it says."""
+    # It starts at the left margin and may run on over several lines; frames are indented.
+    return re.split(r"\n(?=[A-Za-z_][\w.]*(?::\s|$))", trace)[-1].strip()

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from . import bands
-from .errors import NergError, UnusableLLVM, sentence
+from .errors import NergError, UnusableLLVM, mitsuba_says, sentence
 from .formats.atomic import check_writable
 from .interruption import Interruption
 from .picture_file import FORMATS, picture_rows
@@ -64,11 +64,8 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
 
     if not Path(path).is_file():
         raise NergError(f'there is no scene file "{path}".')
-    try:
-        loaded = mi.load_file(str(path), **(defaults or {}))
-    except RuntimeError as error:
-        raise NergError(sentence(error)) from error
-    return loaded
+    with mitsuba_says():
+        return mi.load_file(str(path), **(defaults or {}))
 
 
 def render_file(

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import NergError, sentence
+from ..errors import NergError
+from ..rendering import load_scene
 from . import study_reference, study_scenes, study_shapes
 from ..transport.observer import EXACT
 from ..transport.place import Place
@@ -259,12 +260,7 @@ class ShapesSubject(FileSubject):
 
 
 def _load(path: Path, width: int, height: int, defaults: Mapping[str, str]) -> FileSubject:
-    import mitsuba as mi
-
-    try:
-        loaded = mi.load_file(str(path), **defaults)
-    except RuntimeError as error:
-        raise NergError(sentence(error)) from error
+    loaded = load_scene(path, defaults)
     if type(loaded.integrator()).__name__ != "NergIntegrator":
         raise NergError(f'the integrator of "{path}" is not "nerg": name a scene whose integrator is.')
     if not loaded.sensors():

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, chosen, sentence
+from nerg_mi.errors import MissingFile, NergError, UnusableLLVM, chosen, mitsuba_says, sentence
 
 HEAVY = {"mitsuba", "drjit", "numpy", "scipy", "matplotlib", "torch", "trimesh", "OpenEXR"}
 
@@ -135,6 +135,36 @@ def test07c_what_a_contract_refuses_is_the_users_where_they_chose_it():
     with pytest.raises(TypeError):
         with chosen("--aabb"):
             raise TypeError("a bug")
+
+
+QUOTED = '[parser.cpp:1718] At string: failed to instantiate: Traceback (most recent call last):\n  File "a.py", line 15, in f\n    g()\n'
+
+
+@pytest.mark.parametrize("said", ["[scene.cpp:3] no plugin of that name", QUOTED + "nerg_mi.errors.NergError: write y", QUOTED + 'ValueError: "x" must\n be 3'])
+def test07d_what_mitsuba_says_of_a_scene_is_the_users(said):
+    with pytest.raises(NergError):
+        with mitsuba_says():
+            raise RuntimeError(said)
+
+
+@pytest.mark.parametrize("said", [QUOTED + "TypeError: f() takes no arguments", QUOTED + "KeyError: 'x'", QUOTED + "AssertionError", QUOTED + "a.b.Odd: x"])
+def test07e_a_mistake_in_a_plugin_is_not(said):
+    with pytest.raises(RuntimeError) as raised:
+        with mitsuba_says():
+            raise RuntimeError(said)
+    assert not isinstance(raised.value, NergError)
+
+
+def test07f_a_plugin_with_a_mistake(rgb, tmp_path, capsys, monkeypatch):
+    """From its constructor through Mitsuba to the command line."""
+    scene = tmp_path / "a.xml"
+    scene.write_text('<scene version="3.0.0"><integrator type="nerg"/><sensor type="perspective"/></scene>')
+    rgb.set_variant("llvm_ad_rgb")
+    monkeypatch.setattr("nerg_mi.plugins.nerg.choice", lambda *a: 1 / 0)
+    with pytest.raises(SystemExit) as end:
+        nerg_mi.cli.main(["render", str(scene), "-o", str(tmp_path / "a.exr"), "-m", "llvm_ad_rgb"])
+    said = capsys.readouterr().err
+    assert end.value.code == 70 and "internal error" in said and "ZeroDivisionError: division by zero" in said
 
 
 def test08_sentence_of_a_mitsuba_error():
