@@ -16,6 +16,9 @@ from .rays import FRAME, Rays
 BAD_LINES = 0.01
 """Share of a file's lines that may be left out since they cannot be read."""
 
+NAMED_RUNS = 500_000
+"""So many runs of dropped rows are named; of more, as where every other row is a blink, only the number is kept."""
+
 
 def file_sha256(path: str | os.PathLike) -> str:
     """Hex digest of a file's bytes. Raises `NergError` for what is no ordinary file, or cannot be read."""
@@ -58,7 +61,7 @@ class RaysBuilder:
         self._persons, self._cohorts = _Names(), _Names()
         self._sources: list[dict[str, Any]] = []
         self._dropped: list[dict[str, Any]] = []
-        self._rows_read = 0
+        self._rows_read = self._runs = 0
         self._skips, self._lines, self._bad, self._first_bad = skip_bad_lines, 0, [], ""
 
     @property
@@ -154,12 +157,17 @@ class RaysBuilder:
 
     def _drop(self, reason: str, rows: np.ndarray) -> None:
         name = self._sources[-1]["file"] if self._sources else ""
-        for entry in self._dropped:
-            if entry["reason"] == reason and entry["file"] == name:
-                entry["count"] += int(rows.size)
-                entry["rows"] += _ranges(rows)
-                return
-        self._dropped.append({"reason": reason, "file": name, "count": int(rows.size), "rows": _ranges(rows)})
+        entry = next((e for e in self._dropped if e["reason"] == reason and e["file"] == name), None)
+        if entry is None:
+            entry = {"reason": reason, "file": name, "count": 0, "rows": []}
+            self._dropped.append(entry)
+        runs = _ranges(rows)
+        named = runs[: max(0, NAMED_RUNS - self._runs)]
+        self._runs += len(named)
+        entry["count"] += int(rows.size)
+        entry["rows"] += named
+        if len(named) < len(runs):
+            entry["rows_not_named"] = entry.get("rows_not_named", 0) + sum(last - first + 1 for first, last in runs[len(named) :])
 
     def build(self) -> Rays:
         """The rays collected. Raises `NergError` when none is left."""

@@ -38,9 +38,14 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
     """Write columns of N rows (``t``, ``person``, ``origin``, ``direction``,
     ``confidence``, optionally ``hit`` and ``cohort``) and JSON-serialisable metadata, whole or not at all.
 
-    Raises `NergError` for another suffix, and ``ImportError`` with the remedy where Parquet is asked for without pyarrow.
+    Raises `NergError` for another suffix and for metadata that `read_rays_file` would refuse, and ``ImportError`` with the remedy where Parquet is asked for without pyarrow.
     """
     document = json.dumps({"version": VERSION, **metadata})
+    try:
+        read_metadata(document, path)
+    except NergError as error:
+        # What is written can be read again.
+        raise NergError(f"these rays cannot be kept: {error}") from error
     if _suffix(path) == ".npz":
         # What savez_compressed writes, with a faster level of zlib, and stored what hardly shrinks: millions of rays in seconds.
         with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", compresslevel=1) as archive:

@@ -7,6 +7,7 @@ import pytest
 
 from nerg_mi.attention.rays import FRAME, Rays
 from nerg_mi.errors import NergError
+from nerg_mi.formats.rays_file import write_rays_file
 
 ENDINGS = [
     "npz",
@@ -181,3 +182,12 @@ def test_what_does_not_shrink_is_stored(tmp_path):
     assert kinds["direction.npy"] == zipfile.ZIP_STORED
     assert all(kind == zipfile.ZIP_DEFLATED for name, kind in kinds.items() if name not in ("direction.npy", "metadata.npy"))
     assert np.array_equal(Rays.load(tmp_path / "r.npz").direction, rays.direction)
+
+
+@pytest.mark.parametrize("metadata", [{"tick": 0}, {"persons": 3}, {"note": [[]] * 9_000_000}])
+def test_nothing_is_written_that_could_not_be_read(tmp_path, metadata):
+    rays = some(False)
+    columns = {k: getattr(rays, k) for k in ("t", "person", "origin", "direction", "confidence")}
+    with pytest.raises(NergError, match="cannot be kept"):
+        write_rays_file(tmp_path / "r.npz", columns, {**rays.metadata, "persons": list(rays.persons), **metadata})
+    assert not list(tmp_path.iterdir())
