@@ -31,8 +31,8 @@ _KEPT = 0.75
 # Metres around where people were that a box keeps at least: what is looked at most is near.
 _MARGIN = 1.0
 _SAMPLE, _STEPS = 1 << 15, 512
-# A box that is cut goes on being cut while one step, a 512th of the points, saves this share of its voxels.
-_WORTH = 0.05
+# A box that is cut goes on being cut while one step, a 512th of the points, saves this share of the most voxels that may be.
+_WORTH = 0.01
 
 
 @dataclass(frozen=True)
@@ -127,6 +127,7 @@ def _cut(
     step = max(1, len(points) // _STEPS)
     while True:
         points = points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
+        count = np.prod(_count(*box, voxel))
         best, cut = 0.0, None
         for axis in range(3):
             along = np.sort(points[:, axis])
@@ -139,7 +140,7 @@ def _cut(
                 worth = abs(to - box[side, axis]) / (box[1, axis] - box[0, axis]) * step / max(lost, step)
                 if worth > best:
                     best, cut = worth, (side, axis, to)
-        if np.prod(_count(*box, voxel)) <= most and best < _WORTH:
+        if count <= most and best * count < _WORTH * most:
             break
         if cut is None:
             return None
