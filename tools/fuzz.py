@@ -51,16 +51,20 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         inputs = make_inputs(readers, Path(folder))
         cases = draw_cases(readers, inputs, given.cases, given.start)
-        for case, report in run_cases(cases, inputs, [r.name for r in readers]):
-            name = case.reader
-            outcomes[name][report.outcome] += 1
-            slowest[name] = max(slowest[name], report.seconds)
-            most[name] = max(most[name], report.memory)
-            if report.outcome in BREACHES:
-                broken.append((case, report))
-                if given.keep:
-                    (CORPUS / kept(case)).write_bytes(case.data)
-    rows = [_row(r.name, outcomes[r.name], slowest[r.name], most[r.name]) for r in readers]
+        try:
+            for case, report in run_cases(cases, inputs, [r.name for r in readers]):
+                name = case.reader
+                outcomes[name][report.outcome] += 1
+                slowest[name] = max(slowest[name], report.seconds)
+                most[name] = max(most[name], report.memory)
+                if report.outcome in BREACHES:
+                    broken.append((case, report))
+                    if given.keep:
+                        (CORPUS / kept(case)).write_bytes(case.data)
+        except KeyboardInterrupt:
+            # What was tried until then counts.
+            pass
+    rows = [_row(r.name, outcomes[r.name], slowest[r.name], most[r.name]) for r in readers if outcomes[r.name]]
     rows.append(_row("all", sum(outcomes.values(), Counter()), max(slowest.values()), max(most.values())))
     update(given.update, "Readers", table(HEAD, rows))
     for case, report in broken:

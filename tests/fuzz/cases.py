@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterator
 from pathlib import Path
 
 from hypothesis import HealthCheck, Phase, given, seed, settings
@@ -20,16 +21,14 @@ def make_inputs(readers: list[Reader], folder: Path) -> Path:
     return folder
 
 
-def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) -> list[Case]:
+def draw_cases(readers: list[Reader], inputs: Path, count: int, start: int = 0) -> Iterator[Case]:
     """``count`` cases, as many for each reader and each of its targets; ``start``: another gives others."""
     targets = [(r, t, kinds) for r in readers for t, kinds in r.targets.items()]
-    out = []
     for k, (reader, target, kinds) in enumerate(targets):
         share = count * (k + 1) // len(targets) - count * k // len(targets)
         data = (inputs / reader.name / target).read_bytes()
-        drawn = _drawn(data, kinds, share, f"{start} {reader.name} {target}")
-        out += [Case(reader.name, target, d) for d in drawn]
-    return out
+        for damaged in _drawn(data, kinds, share, f"{start} {reader.name} {target}"):
+            yield Case(reader.name, target, damaged)
 
 
 def _drawn(data: bytes, kinds: tuple[str, ...], count: int, name: str) -> list[bytes]:
