@@ -56,7 +56,7 @@ class Child:
             env={**os.environ, "OMP_NUM_THREADS": "1"},
         )
         first = self._line()
-        if first is None or not json.loads(first).get("ready"):
+        if not first or not json.loads(first).get("ready"):
             self.close()
             raise RuntimeError(f"the child did not start: {self.last_words()}")
 
