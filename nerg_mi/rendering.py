@@ -12,6 +12,7 @@ from .errors import NergError, UnusableLLVM, mitsuba_says, sentence
 from .formats.atomic import check_writable
 from .interruption import Interruption
 from .picture_file import FORMATS, picture_rows
+from .scene_file import check_samples, check_scene, check_scene_file
 
 RESERVE = 150e6
 """Bytes kept free beside a band, for the strips in it and for the kernel that is compiled first."""
@@ -64,8 +65,11 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
 
     if not Path(path).is_file():
         raise NergError(f'there is no scene file "{path}".')
+    check_scene_file(path, defaults)
     with mitsuba_says():
-        return mi.load_file(str(path), **(defaults or {}))
+        loaded = mi.load_file(str(path), **(defaults or {}))
+    check_scene(path, loaded)
+    return loaded
 
 
 def render_file(
@@ -99,6 +103,8 @@ def render_file(
     check_writable(output, *FORMATS)
     if not memory > 0:
         raise NergError(f"the memory to render in is {memory} GB: give it more than 0.")
+    if spp:
+        check_samples(spp, "the picture")
     if not scene.is_file():
         raise NergError(f'there is no scene file "{scene}".')
     active = activate(variant)

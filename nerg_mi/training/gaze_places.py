@@ -12,6 +12,7 @@ from ..attention.rays import Rays
 from ..field.box import Box
 from ..field.gaze import GazeConfig
 from ..field.log_gaze import LogGazeConfig
+from ..formats.mesh_file import check_vol
 from ..formats.volumes import write_volume
 from ..transport.media import FieldMedium, VolumeMedium
 from ..transport.place import Place
@@ -53,9 +54,9 @@ def place_of_field(path: Path, ns) -> GazePlace:
 
 def place_of_scene(path: Path) -> GazePlace:
     """The shapes of a Mitsuba scene, and the field or volume of its integrator where that is a ``nerg``."""
-    import mitsuba as mi
+    from ..rendering import load_scene
 
-    scene = mi.load_file(str(path))
+    scene = load_scene(path)
     place = Place(getattr(scene.integrator(), "medium", None), scene)
     bounds = [] if place.medium is None else [place.medium.bounds()]
     if place.scene is not None:
@@ -87,6 +88,7 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
 
     if not path.is_file():
         raise MissingFile(f'the place of hit points "{path}" does not exist; it is written beside the gaze field')
+    check_vol(path)
     medium = VolumeMedium(mi.load_dict(volume_dict(path)))
     lower, upper = medium.bounds()
     return GazePlace(medium, Box(tuple(lower.tolist()), tuple(upper.tolist())), "hits", {"geometry_file": {**_file(path), **(about or {})}})
