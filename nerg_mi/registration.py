@@ -13,6 +13,7 @@ import importlib.util
 import sys
 
 from . import llvm
+from .errors import NergError
 
 PLUGINS = (
     ("panorama", "sensor"),
@@ -53,7 +54,7 @@ def _excuse(variant: str, what: str) -> str:
 
 def _refusal(name: str, variant: str):
     def refuse(props):
-        raise RuntimeError(_excuse(variant, f'"{name}"'))
+        raise NergError(_excuse(variant, f'"{name}"'))
 
     return refuse
 
