@@ -59,6 +59,24 @@ def _free_memory():
 
 
 # ------------------------------------------------------------------------
+#  Slow tests: those of slow.txt are marked here, so that their list can be made anew from what was measured
+# ------------------------------------------------------------------------
+
+
+def listed_as_slow() -> set[str]:
+    """``file::function`` of the tests in slow.txt."""
+    lines = (ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines()
+    return {line for line in lines if line and not line.startswith("#")}
+
+
+def pytest_collection_modifyitems(items):
+    slow = listed_as_slow()
+    for item in items:
+        if item.nodeid.partition("[")[0] in slow:
+            item.add_marker(pytest.mark.slow)
+
+
+# ------------------------------------------------------------------------
 #  torch: an extra. With NERG_REQUIRE_TORCH=1 a test skipped for want of it is a failure
 # ------------------------------------------------------------------------
 
