@@ -33,7 +33,10 @@ test: setup
 check: setup
 	$(RUN) -m pytest -q -m "not slow" $(ARGS)
 
-coverage fuzz mutants faults soak packages: setup
+coverage: setup
+	$(RUN) tools/branches.py $(ARGS)
+
+fuzz mutants faults soak packages: setup
 	$(RUN) tools/$@.py $(ARGS)
 
 setup:
