@@ -60,8 +60,10 @@ def eval_radiance(
     if threads is not None:
         dr.set_thread_count(threads)
     about = read_checkpoint(field, "radiance")[1].get("provenance", {})
-    data = open_dataset(dataset, holdout, width or about.get("width"), None, None, True, scale, coordinates, allow_outside)
-    trained = about.get("held_out", {}).get("frames")
+    trained_width = about.get("width") if isinstance(about.get("width"), int) else None
+    data = open_dataset(dataset, holdout, width or trained_width, None, None, True, scale, coordinates, allow_outside)
+    held_out = about.get("held_out")
+    trained = held_out.get("frames") if isinstance(held_out, dict) else None
     if not train and trained is not None and about.get("sha256") == data.source["sha256"]:
         seen = sorted({v.name for v in data.held_out} - set(trained))
         if seen:

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..attention.rays import Rays
 from ..formats.atomic import write_text
+from ..formats.bounded import read_json
 from ..formats.fields import save_gaze
 from ..formats.png import write_figure
 from ..formats.tables import write_csv, write_json
@@ -109,7 +110,8 @@ def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: 
     same = {"architecture": config.to_dict(), "settings": settings.to_dict(), "probes": how.to_dict(), "rays": digest(train),
             "tests": {k: hashlib.sha256(t.truth.tobytes()).hexdigest() for k, t in tests.items()}, "begin": v.begin, **place.about}
     kept = path.with_suffix(".json")
-    if path.exists() and kept.exists() and (found := json.loads(kept.read_text()))["same"] == json.loads(json.dumps(same)):
+    found = read_json(kept, "kept row") if path.exists() and kept.exists() else None
+    if isinstance(found, dict) and "row" in found and found.get("same") == json.loads(json.dumps(same)):
         row = found["row"]
     else:
         made = {"recipe": v.recipe, "variant": v.name, "seed": seed}
