@@ -171,3 +171,44 @@ def test_watched_views_are_far_from_the_others():
     at = (views[0].camera.center - [1, 0, 0]) / 2
     near = far_views(views, at[None], 0.1, moved)
     assert views[0] not in near and far_views(near, views[0].camera.center[None], 0.2) == near
+
+
+def in_a_row(count):
+    """Cameras a metre apart, on a line."""
+    return [view(lobe, (float(k), 0, 1.6), (0, 1, 0), name=f"v{k}") for k in range(count)]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_zones_lie_far_from_one_another(seed):
+    """Of two, the second is around one of the quarter of the views that is farthest from the first; an eighth is watched."""
+    views = in_a_row(40)
+    learn, watched = split_views(views, 2, 0.5, seed)
+    at = sorted(int(v.name[1:]) for v in watched)
+    assert {int(v.name[1:]) for v in learn} == set(range(40)) - set(at)
+    gap = int(np.argmax(np.diff(at)))
+    groups = [at[: gap + 1], at[gap + 1 :]]
+    assert [len(g) for g in groups] == [2, 2] and all(np.ptp(g) == 1 for g in groups)
+    apart = [abs(k - groups[0][0]) for k in range(40)], [abs(k - groups[1][0]) for k in range(40)]
+    far = lambda of, group: max(of[k] for k in group) >= sorted(of)[-10] - 1
+    assert far(apart[0], groups[1]) or far(apart[1], groups[0])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_of_few_views_the_farthest_is_the_second_zone(seed):
+    learn, watched = split_views(in_a_row(7), 2, 0.5, seed)
+    at = sorted(int(v.name[1:]) for v in watched)
+    assert len(at) == 2 and len(learn) == 5 and (at[0] == 0 or at[1] == 6)
+    # From either one the other is the farthest, or the other way round.
+    assert at[1] - at[0] == max(at[0], 6 - at[0]) or at[1] - at[0] == max(at[1], 6 - at[1])
+
+
+def test_as_many_views_must_be_left_as_a_quarter():
+    views = in_a_row(12)
+    for distance in np.arange(0.5, 12.0):
+        try:
+            learn, _ = split_views(views, 1, distance, 3)
+        except ValueError:
+            break
+        assert len(learn) >= 3
+    left = len(far_views(views, np.array([v.camera.center for v in split_views(views, 1, 0.5, 3)[1]]), distance))
+    assert left < 3
