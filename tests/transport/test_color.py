@@ -50,3 +50,23 @@ def test04_no_opacity_no_nan(rgb, α):
     assert np.allclose(np.array(out), α * iec(np.array(0.5)), rtol=1e-4)
     dr.backward(dr.sum(out), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
     assert np.all(np.isfinite(np.array(dr.grad(total)))) and np.all(np.isfinite(np.array(dr.grad(alpha))))
+
+
+@pytest.mark.parametrize("alpha", [0.02, 0.5, 1.0])
+def test05_derivatives_of_a_composite_are_those_of_its_colour(rgb, alpha):
+    """With respect to the weighted sum and to the opacity it is divided by: central differences of a lin(C / a)."""
+    shares = np.array([0.01, 0.03, 0.05, 0.3, 0.9])
+    lin = lambda c: np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)  # noqa: E731
+    value = lambda total, a: a * lin(total / a)  # noqa: E731
+    total, a = rgb.Float((shares * alpha).tolist()), rgb.Float(alpha)
+    dr.enable_grad(total, a)
+    a_lanes = a + dr.zeros(rgb.Float, 5)
+    out = composite_to_linear(rgb.Color3f(total, 0, 0), a_lanes, "srgb")
+    assert np.allclose(np.array(dr.detach(out))[0], value(shares * alpha, alpha), rtol=1e-5)
+    weights = np.array([1, 2, 3, 4, 5.0])
+    dr.backward(dr.sum(out[0] * rgb.Float(weights.tolist())))
+    h = 1e-7
+    by_total = (value(shares * alpha + h, alpha) - value(shares * alpha - h, alpha)) / (2 * h) * weights
+    by_alpha = ((value(shares * alpha, alpha + h) - value(shares * alpha, alpha - h)) / (2 * h) * weights).sum()
+    assert np.allclose(dr.grad(total).numpy(), by_total, rtol=1e-4)
+    assert np.isclose(dr.grad(a).numpy()[0], by_alpha, rtol=1e-3)
