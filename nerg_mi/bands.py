@@ -25,8 +25,8 @@ PACKET = 64
 LEAST = 1 << 12
 """Samples below which the overhead of a strip outweighs its work."""
 
-STRIP_SECONDS = 0.4
-"""A strip that took longer than this is followed by shorter ones, one that took less than a third of it by longer ones."""
+STRIP_SECONDS = 0.5
+"""A strip that took longer than this is followed by shorter ones, one that took less than half of it by longer ones."""
 
 BYTES_PER_VALUE = 22
 """Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the others in
@@ -95,11 +95,13 @@ def render_bands(
                 block.put(*_trace(scene, sensor, grid, base, seed, top, first, count, start))
                 # What was traced while the strip before it was computed is computed now.
                 pace.wait()
+                if on_strip is not None and done:
+                    on_strip(min(done, grid.total), grid.total)
                 _evaluate(block)
                 done += count
-                if on_strip is not None:
-                    on_strip(min(done, grid.total), grid.total)
             pace.wait()
+        if on_strip is not None:
+            on_strip(min(done, grid.total), grid.total)
         grid.develop(scene.integrator(), block)
         yield Band(top, min(grid.rows, grid.height - top), sensor.film())
 
@@ -245,7 +247,7 @@ class _Pace:
         import mitsuba as mi
 
         self._fixed = fixed
-        self._count = fixed or (1 << 20 if mi.variant().startswith("cuda") else 1 << 14)
+        self._count = fixed or (1 << 20 if mi.variant().startswith("cuda") else 1 << 15)
         self._most = 1 << 24 if mi.variant().startswith("cuda") else 1 << 18
         self._since, self._strips = None, 0
 
@@ -270,6 +272,6 @@ class _Pace:
             seconds = now - self._since
             if seconds > STRIP_SECONDS:
                 self._count = max(self._count // 2, LEAST)
-            elif seconds < STRIP_SECONDS / 3:
+            elif seconds < STRIP_SECONDS / 2:
                 self._count = min(self._count * 2, self._most)
         self._since, self._strips = now, self._strips + 1
