@@ -263,12 +263,8 @@ def _zip(draw, data: bytes) -> bytes:
     data = out.getvalue()
     if what in (10, 11):
         at = data.rindex(b"PK\1\2") + draw(st.sampled_from([8, 10, 16, 20, 24, 28, 42]))
-        data = (
-            data[:at]
-            + draw(st.sampled_from([b"\xff\xff", b"\xff\xff\xff\x7f", b"\0\0", b"\0\0\0\x40", b"\1\0"]))
-            + data[at:]
-        )
-        data = data[:at] + data[at + (len(data) - len(out.getvalue())) :] if draw(st.booleans()) else data
+        claim = draw(st.sampled_from([b"\xff\xff", b"\xff\xff\xff\x7f", b"\0\0", b"\0\0\0\x40", b"\1\0"]))
+        data = data[:at] + claim + data[at + len(claim) :]
     return data
 
 
