@@ -6,6 +6,7 @@
 # While working, and before a release:
 #
 #   make check     the quick tests of every part (a minute or so on two cores); ARGS as above
+#   make onecore   the tests that render, write pictures and train, on one core, where Dr.Jit has one thread
 #   make coverage  all tests, and which branches of the package they reach
 #   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
 #   make mutants   judge the tests by 400 small mistakes in the source, resuming where it stopped (about an hour at first)
@@ -19,19 +20,25 @@
 PYTHON ?= python3
 ARGS ?=
 RUN = .venv/bin/python
+ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/formats/test_exr.py tests/formats/test_png.py \
+	tests/test_interruption.py
 
-.PHONY: demo test check coverage fuzz mutants faults soak packages setup
+.PHONY: demo test check onecore coverage fuzz mutants faults soak packages setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
 
-test check coverage fuzz mutants faults soak packages: EXTRAS = test
+test check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
 
 test: setup
 	$(RUN) -m pytest $(ARGS)
 
 check: setup
 	$(RUN) -m pytest -q -m "not slow" $(ARGS)
+
+onecore: setup
+	@if command -v taskset > /dev/null; then taskset -c 0 $(RUN) -m pytest -q $(ONE_CORE) $(ARGS); \
+	else echo "One core is not tried: taskset (of util-linux) is not installed."; fi
 
 coverage: setup
 	$(RUN) tools/branches.py $(ARGS)

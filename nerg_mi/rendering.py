@@ -9,6 +9,7 @@ from pathlib import Path
 
 from . import bands
 from .errors import NergError, UnusableLLVM, mitsuba_says, sentence
+from .formats.exr import threads_for_mitsuba
 from .formats.atomic import check_writable
 from .interruption import Interruption
 from .picture_file import FORMATS, picture_rows
@@ -66,7 +67,7 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
     if not Path(path).is_file():
         raise NergError(f'there is no scene file "{path}".')
     check_scene_file(path, defaults)
-    with mitsuba_says():
+    with mitsuba_says(), threads_for_mitsuba():
         loaded = mi.load_file(str(path), **(defaults or {}))
     check_scene(path, loaded)
     return loaded

@@ -148,6 +148,23 @@ def exr_rows(path: str | os.PathLike, width: int, height: int) -> Iterator[Calla
             raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
 
 
+@contextmanager
+def threads_for_mitsuba() -> Iterator[None]:
+    """Two threads at least, for as long as Mitsuba reads files: with one its EXR reader, too, waits for ever, and a scene may
+    hold textures and emitters in that format."""
+    import drjit as dr
+
+    threads = dr.thread_count()
+    if threads > 1:
+        yield
+        return
+    dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(threads)
+
+
 def bitmap_channels(bitmap) -> dict[str, np.ndarray]:
     """The channels of a Mitsuba bitmap as float32 arrays (h, w), by the names that it gives them."""
     import mitsuba as mi

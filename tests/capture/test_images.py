@@ -6,6 +6,7 @@ import pytest
 
 from nerg_mi.capture.images import View, load_usable, load_view, split_holdout
 from nerg_mi.capture.reading import read_image
+from nerg_mi.formats.exr import write_bitmap_exr
 from nerg_mi.formats.transforms import read_transforms
 
 
@@ -60,7 +61,7 @@ def test_downscale_and_width_errors(dataset):
 
 
 def test_linear_images_become_srgb(tmp_path, rgb):
-    rgb.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write(str(tmp_path / "a.exr"))
+    write_bitmap_exr(tmp_path / "a.exr", rgb.Bitmap(np.full((2, 2, 3), 0.5, np.float32)))
     assert np.allclose(read_image(tmp_path / "a.exr"), 0.7354, atol=1e-3)
 
 

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.capture.reading import read_depth, read_image, read_mask
+from nerg_mi.formats.exr import write_bitmap_exr
 from nerg_mi.formats.posed import DepthFile, MaskFile
 
 
@@ -28,7 +29,7 @@ def test_jpeg(tmp_path, rgb):
 
 def test_exr_is_linear_and_clipped(tmp_path, rgb):
     linear = np.array([[[0.001, 0.2, 0.5], [1.0, 3.0, -0.5]]], np.float32)
-    rgb.Bitmap(linear).write(str(tmp_path / "a.exr"))
+    write_bitmap_exr(tmp_path / "a.exr", rgb.Bitmap(linear))
     assert np.allclose(read_image(tmp_path / "a.exr"), to_srgb(np.clip(linear, 0, 1)), atol=1e-3)
 
 
@@ -36,7 +37,7 @@ def test_exr_with_alpha_is_premultiplied(tmp_path, rgb):
     straight = np.array([[[0.8, 0.4, 0.1, 0.5], [0.3, 0.2, 0.1, 1.0], [0, 0, 0, 0]]], np.float32)
     premultiplied = straight.copy()
     premultiplied[..., :3] *= straight[..., 3:]
-    rgb.Bitmap(premultiplied, rgb.Bitmap.PixelFormat.RGBA).write(str(tmp_path / "a.exr"))
+    write_bitmap_exr(tmp_path / "a.exr", rgb.Bitmap(premultiplied, rgb.Bitmap.PixelFormat.RGBA))
     expected = np.concatenate([to_srgb(straight[..., :3]), straight[..., 3:]], axis=2)
     assert np.allclose(read_image(tmp_path / "a.exr"), expected, atol=1e-3)
 
@@ -58,7 +59,7 @@ def test_unreadable_and_broken_images_are_named(tmp_path, rgb):
     (tmp_path / "a.png").write_bytes(b"no image")
     with pytest.raises(ValueError, match="a.png"):
         read_image(tmp_path / "a.png")
-    rgb.Bitmap(np.full((2, 2, 3), np.nan, np.float32)).write(str(tmp_path / "b.exr"))
+    write_bitmap_exr(tmp_path / "b.exr", rgb.Bitmap(np.full((2, 2, 3), np.nan, np.float32)))
     with pytest.raises(ValueError, match="b.exr.*not finite"):
         read_image(tmp_path / "b.exr")
 
@@ -66,7 +67,7 @@ def test_unreadable_and_broken_images_are_named(tmp_path, rgb):
 def test_depth_of_every_kind(tmp_path, rgb):
     depth = np.array([[0.5, 1.25, 0.0], [2.0, 60.0, 3.5]], np.float32)
     np.save(tmp_path / "a.npy", depth)
-    rgb.Bitmap(depth).write(str(tmp_path / "a.exr"))
+    write_bitmap_exr(tmp_path / "a.exr", rgb.Bitmap(depth))
     rgb.Bitmap((depth * 1000).astype(np.uint16)).write(str(tmp_path / "a.png"))
     for name, unit in (("a.npy", 1.0), ("a.exr", 1.0), ("a.png", 1e-3)):
         assert np.allclose(read_depth(DepthFile(tmp_path / name, unit)), depth, rtol=1e-6), name

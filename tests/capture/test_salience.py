@@ -7,6 +7,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.capture.salience import open_salience, read_salience
 from nerg_mi.capture.solid_angle import pixel_solid_angles
+from nerg_mi.formats.exr import write_bitmap_exr
 from nerg_mi.formats.intrinsics import Intrinsics
 
 LENSES = {
@@ -21,6 +22,8 @@ def write(path, values):
 
     if path.suffix == ".npy":
         np.save(path, values)
+    elif path.suffix == ".exr":
+        write_bitmap_exr(path, mi.Bitmap(values))
     else:
         mi.Bitmap(values).write(str(path))
     return path

@@ -10,6 +10,7 @@ import nerg_mi.cli
 from nerg_mi.view import demo
 from tests.cli.test_render import NERG, interrupt
 from tests.view.standins import write_standins
+from tests.pictures import mitsuba_bitmap
 
 NAMES = {
     "occlusion.png", "gaze.png", "gaze_sphere.png", "depth.png", "visibility.png", "color.png", "scene.exr", "run.json",
@@ -42,7 +43,7 @@ def test01_writes_and_names_everything(rgb, standins, tmp_path, capsys):
     assert {p.name for p in out.iterdir()} == NAMES
     assert all(str(out / n) in said for n in NAMES) and "Look at them with: " in said
 
-    bitmap = rgb.Bitmap(str(out / "scene.exr"))
+    bitmap = mitsuba_bitmap(out / "scene.exr")
     fields = [f.name for f in bitmap.struct_()]
     assert set(fields) == {"R", "G", "B", "depth.T", "opacity.Y", "gaze.Y", "visibility.Y"}
     assert bitmap.component_format() == rgb.Struct.Type.Float32 and tuple(bitmap.size()) == (48, 32)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import nerg_mi.cli
+from tests.pictures import mitsuba_bitmap
 
 SCENE = """
 <scene version="3.0.0">
@@ -49,7 +50,7 @@ def test01_exr_has_all_channels_in_float32(rgb, scene, tmp_path, capsys):
     out = tmp_path / "new" / "out.exr"
     assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb") == 0
     assert str(out) in capsys.readouterr().out
-    bitmap = rgb.Bitmap(str(out))
+    bitmap = mitsuba_bitmap(out)
     assert tuple(bitmap.size()) == (16, 8)
     fields = [field.name for field in bitmap.struct_()]
     assert set("RGB") <= set(fields) and "dd.T" in fields
@@ -60,7 +61,7 @@ def test01_exr_has_all_channels_in_float32(rgb, scene, tmp_path, capsys):
 def test02_png_is_tonemapped_colour(rgb, scene, tmp_path):
     out = tmp_path / "out.png"
     assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb", "-D", "level=0.5") == 0
-    picture = np.array(rgb.Bitmap(str(out)))
+    picture = np.array(mitsuba_bitmap(out))
     assert picture.shape == (8, 16, 3) and picture.dtype == np.uint8
     assert abs(int(picture[0, 0, 0]) - 188) <= 1  # 0.5 in sRGB
 
@@ -68,7 +69,7 @@ def test02_png_is_tonemapped_colour(rgb, scene, tmp_path):
 def test03_define_sensor_spp_and_seed(rgb, scene, tmp_path):
     def render(name, *options):
         assert nerg("render", scene, "-o", tmp_path / name, "-m", "llvm_ad_rgb", *options) == 0
-        return np.array(rgb.Bitmap(str(tmp_path / name)))
+        return np.array(mitsuba_bitmap(tmp_path / name))
 
     assert render("panorama.exr", "-s", 1).shape[:2] == (6, 12)
     assert np.allclose(render("level.exr", "-D", "level=0.75", "-D", "integrator=direct")[0, 0, :3], 0.75)
@@ -79,7 +80,7 @@ def test03_define_sensor_spp_and_seed(rgb, scene, tmp_path):
 def test04_mono(rgb, scene, tmp_path):
     out = tmp_path / "mono.exr"
     assert nerg("render", scene, "-o", out, "-m", "llvm_ad_mono") == 0
-    assert {"Y", "dd.T"} <= {field.name for field in rgb.Bitmap(str(out)).struct_()}
+    assert {"Y", "dd.T"} <= {field.name for field in mitsuba_bitmap(out).struct_()}
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def test07_one_thread_is_enough(rgb, scene, tmp_path, name):
     # Mitsuba's EXR writer never returns where Dr.Jit has one thread.
     out = tmp_path / name
     subprocess.run([*NERG, "render", scene, "-o", out, "-m", "llvm_ad_rgb", "-t", "1"], check=True, timeout=180)
-    assert tuple(rgb.Bitmap(str(out)).size()) == (16, 8)
+    assert tuple(mitsuba_bitmap(out).size()) == (16, 8)
 
 
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
@@ -130,7 +131,7 @@ def test08_a_picture_takes_the_place_of_another_whole(rgb, scene, tmp_path, monk
         assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb") == 1
     assert out.read_bytes() == b"what was there" and set(tmp_path.iterdir()) == before
     assert nerg("render", scene, "-o", out, "-m", "llvm_ad_rgb") == 0
-    assert tuple(rgb.Bitmap(str(out)).size()) == (16, 8)
+    assert tuple(mitsuba_bitmap(out).size()) == (16, 8)
 
 
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
@@ -170,7 +171,7 @@ def interrupt(arguments, sign: bytes) -> tuple[bytes, int]:
 def test10_memory_changes_no_pixel(rgb, scene, tmp_path, memory):
     def render(name, *options):
         assert nerg("render", scene, "-o", tmp_path / name, "-m", "llvm_ad_rgb", "--spp", 3, *options) == 0
-        return np.array(rgb.Bitmap(str(tmp_path / name)))
+        return np.array(mitsuba_bitmap(tmp_path / name))
 
     loaded = rgb.load_file(scene)
     rgb.render(loaded, spp=3)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.exr import read_exr, write_bitmap_exr, write_exr
+from nerg_mi.formats.exr import read_exr, threads_for_mitsuba, write_bitmap_exr, write_exr
+from tests.pictures import mitsuba_bitmap
 
 
 def test_channels_come_back_in_another_reader(tmp_path, rgb):
@@ -19,7 +20,7 @@ def test_channels_come_back_in_another_reader(tmp_path, rgb):
     channels = {name: random.normal(size=(7, 5)).astype(np.float32) for name in names}
     channels["depth.T"][2, 3] = np.inf
     write_exr(tmp_path / "a.exr", channels, {"seed": "3"})
-    bitmap = rgb.Bitmap(str(tmp_path / "a.exr"))
+    bitmap = mitsuba_bitmap(tmp_path / "a.exr")
     read = dict(zip([f.name for f in bitmap.struct_()], np.moveaxis(np.array(bitmap), 2, 0)))
     assert read.keys() == channels.keys()
     assert all(np.array_equal(read[name], channels[name]) for name in names)
@@ -28,9 +29,10 @@ def test_channels_come_back_in_another_reader(tmp_path, rgb):
 
 def test_a_bitmap_is_written_as_mitsuba_writes_it(tmp_path, rgb):
     pixels = np.random.default_rng(2).random((6, 4, 3)).astype(np.float32)
-    rgb.Bitmap(pixels).write(str(tmp_path / "theirs.exr"))
+    with threads_for_mitsuba():
+        rgb.Bitmap(pixels).write(str(tmp_path / "theirs.exr"))
     write_bitmap_exr(tmp_path / "ours.exr", rgb.Bitmap(pixels))
-    theirs, ours = (rgb.Bitmap(str(tmp_path / f"{name}.exr")) for name in ("theirs", "ours"))
+    theirs, ours = (mitsuba_bitmap(tmp_path / f"{name}.exr") for name in ("theirs", "ours"))
     assert np.array_equal(np.array(theirs), np.array(ours))
     assert ours.pixel_format() == theirs.pixel_format() == rgb.Bitmap.PixelFormat.RGB
 
@@ -73,6 +75,25 @@ write_bitmap_exr(sys.argv[1], mi.Bitmap(np.ones((64, 64, 3), np.float32)))
 """
 
 
+_READ = """
+import sys
+import nerg_mi, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+dr.set_thread_count(1)
+from nerg_mi.rendering import load_scene
+load_scene(sys.argv[1])
+assert dr.thread_count() == 1
+"""
+
+
+def test_a_scene_with_an_exr_file_is_read_with_one_thread(tmp_path):
+    # Nor does its reader.
+    write_exr(tmp_path / "sky.exr", {c: np.ones((8, 16), np.float32) for c in "RGB"})
+    text = '<scene version="3.0.0"><emitter type="envmap"><string name="filename" value="sky.exr"/></emitter><sensor type="perspective"/></scene>'
+    (tmp_path / "scene.xml").write_text(text)
+    subprocess.run([sys.executable, "-c", _READ, str(tmp_path / "scene.xml")], check=True, timeout=120)
+
+
 def test_one_thread_is_enough(tmp_path):
     # Mitsuba's writer never returns here.
     subprocess.run([sys.executable, "-c", _ONE_THREAD, str(tmp_path / "a.exr")], check=True, timeout=120)
@@ -89,7 +110,7 @@ def test_pictures_are_read_as_mitsuba_reads_them(rgb, tmp_path, names, kind):
 
     values = np.random.default_rng(0).random((len(names.split()), 4, 3)).astype(kind)
     write_exr(tmp_path / "a.exr", dict(zip(names.split(), values)))
-    mine, theirs = open_bitmap(tmp_path / "a.exr", "image"), rgb.Bitmap(str(tmp_path / "a.exr"))
+    mine, theirs = open_bitmap(tmp_path / "a.exr", "image"), mitsuba_bitmap(tmp_path / "a.exr")
     assert mine.pixel_format() == theirs.pixel_format() and mine.component_format() == theirs.component_format()
     if mine.pixel_format() == rgb.Bitmap.PixelFormat.MultiChannel:
         assert [f.name for f in mine.struct_()] == [f.name for f in theirs.struct_()]

@@ -12,6 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats import image_header
 from nerg_mi.formats.exr import write_exr
 from nerg_mi.formats.image_header import check_image
+from tests.pictures import mitsuba_bitmap
 
 
 def png(width: int, height: int, bits: int = 8, color: int = 2, data: bytes = b"") -> bytes:
@@ -35,7 +36,7 @@ def test_sizes_of_what_mitsuba_writes(rgb, tmp_path, name):
         bitmap.write(str(tmp_path / name))
     header = check_image(tmp_path / name)
     assert header.size == (7, 5) and header.bytes >= 105
-    assert list(rgb.Bitmap(str(tmp_path / name)).size()) == [7, 5]
+    assert list(mitsuba_bitmap(tmp_path / name).size()) == [7, 5]
 
 
 def test_exr_counts_the_bytes_of_all_channels(tmp_path):
