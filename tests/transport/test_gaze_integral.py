@@ -7,11 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from nerg_mi.attention.sphere import fibonacci_directions
 from nerg_mi.field.log_gaze import LogGazeField
 from nerg_mi.field.backend import namespace
 from nerg_mi.training.gaze_places import place_of_volume
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.transport.gaze_integral import GazeIntegral, nearest_depth
+from nerg_mi.transport.march import MarchSettings
 from nerg_mi.transport.media import GazeMedium
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
@@ -41,6 +43,24 @@ def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
     integral = lambda count, p: float(GazeIntegral(GazeMedium(field), place, mi.Point3f(*p), settings, "median", 0.5, count).value()[0])
     for p in ((0, 0, 1.5), (0.3, -0.2, 1.6)):
         assert integral(1 << 17, p) == pytest.approx(integral(1 << 19, p), rel=3e-4), p
+
+
+@pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
+def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
+    """In a room of shapes, whose walls are where a formula says."""
+    ns, rng = namespace("llvm_ad_rgb"), np.random.default_rng(1)
+    field = LogGazeField.random(replace(SMALL, variant=variant, mix=0.0), BOX, ns, 1, rng.normal(size=(SMALL.prior, 2 * SMALL.prior)))
+    field.set_parameters({"grid.table": ns.Float(3 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    room = rgb.load_dict({"type": "scene", "walls": {"type": "cube", "to_world": rgb.ScalarTransform4f().translate([0, 0, 1.5]).scale([1.9, 1.9, 1.4])}})
+    o = np.array([0.4, -0.7, 1.7])
+    gaze = GazeMedium(field)
+    found = GazeIntegral(gaze, Place(None, room), rgb.Point3f(*map(float, o)), MarchSettings(0.1), "median", 0.5, 1 << 16).value()[0]
+    d = fibonacci_directions(20_000)
+    walls = np.where(d > 0, [1.9, 1.9, 2.9], [-1.9, -1.9, 0.1])
+    distance = ((walls - o) / d).min(axis=1)
+    array = lambda v: ns.Array3f(np.ascontiguousarray(v.T, np.float32))
+    emit, capture = field.unnormalized(array(o + d * distance[:, None]), array(np.broadcast_to(o, d.shape)), array(d))
+    assert found == pytest.approx(4 * np.pi * np.mean(np.array(emit * capture, np.float64)), rel=3e-3)
 
 
 @pytest.mark.parametrize("count", [1, 5, 8, 40])
