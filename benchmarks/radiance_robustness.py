@@ -1,11 +1,12 @@
-"""What a radiance training comes to on a machine that is slow or busy: steps, how long they take, and PSNR on held-out photos.
+"""Radiance training on a machine that is slow or busy: steps, how long they take, and PSNR on held-out photos.
 
-    python benchmarks/radiance_robustness.py [--rows 1,2,40s,400s] [--threads 1,2] [--busy 0,2] [--validate] [--new] [--update docs/radiance-training.md]
+    python benchmarks/radiance_robustness.py [--rows 1,2,40s,400s] [--threads 1,2] [--busy 0,2] [--validate] [--new]
+                                             [--update docs/radiance-training.md]
 
-``--rows``: minutes, or steps with an "s". Each is run once for each number of ``--threads`` and of ``--busy`` loops beside it,
-in a process of its own, by ``train_radiance`` as the command runs it; held-out photos are rendered by the trainer. ``--validate``
-never opens them: every 8th of the training photos takes their place. The CSV keeps the rows of earlier calls (``--new``: drops
-them), so that the table can be measured in parts, and the table of all is printed.
+``--rows``: minutes, or steps with an "s". Each is run once for each number of ``--threads`` and of ``--busy`` loops beside
+it, in a process of its own, by ``train_radiance`` as the command runs it; held-out photos are rendered by the trainer.
+``--validate`` never opens them: every 8th of the training photos takes their place. The CSV keeps the rows of earlier calls
+(``--new``: drops them), so that the table can be measured in parts, and the table of all is printed.
 """
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ import json, sys
 from pathlib import Path
 job = json.loads(sys.argv[1])
 sys.path.insert(0, job["benchmarks"])
-import drjit as dr, mitsuba as mi
+import nerg_mi, drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 dr.set_thread_count(job["threads"])
 from fox_radiance import validation

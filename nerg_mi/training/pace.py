@@ -34,8 +34,8 @@ def affordable_rays(rays: int, looked: float, steps: int, most: int, candidates:
 def refined(stride: int, strides: tuple[int, ...], scheduled: int, looked: float, most: int, waits: bool = True) -> int:
     """The stride of the next step: ``stride``, or the next finer one of ``strides`` and 1.
 
-    It is refined when the schedule has come to a finer one (``scheduled``), and free space is cleared far enough that the
-    pass has room for ``FEW_RAYS`` rays at it. ``looked``: samples a ray that the pass last looked at, at ``stride``;
+    It is refined when the schedule has come to a finer one (``scheduled``), and free space is cleared far enough that
+    the pass has room for ``FEW_RAYS`` rays at it. ``looked``: samples a ray that the pass last looked at, at ``stride``;
     ``most``: of its samples a step. ``waits``: False refines without regard to what is cleared.
     """
     if scheduled >= stride:

@@ -144,7 +144,9 @@ class RadianceTrainer:
         rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
         offset = ns.Float(aligned(self.rng.random(self.rays, np.float32)))
         thinning = Thinning(s.thin_sure, s.thin_least, int(self.rng.integers(2**63))) if s.thin_least < 1 else None
-        samples, covered = visible_samples(rays, table, offset, self.grid.occupied, self._look, s.stop, s.batch, thinning, most)
+        samples, covered = visible_samples(
+            rays, table, offset, self.grid.occupied, self._look, s.stop, s.batch, thinning, most
+        )
         self.steps += 1
         if samples is None:
             self.rays = adapted_rays(self.rays, 0, 0, s.batch, most)
@@ -262,7 +264,8 @@ class RadianceTrainer:
     def _lit_by_a_few(self, density, occupied, rng: np.random.Generator):
         """Such points, or None, of as many rays as a step may take."""
         most = self.settings.most_looked
-        rays = affordable_rays(_LOOK_RAYS, self.looked * self.stride, self.table().steps, most, _CANDIDATES * self.settings.batch)
+        looked, candidates = self.looked * self.stride, _CANDIDATES * self.settings.batch
+        rays = affordable_rays(_LOOK_RAYS, looked, self.table().steps, most, candidates)
         return self._lit_points(density, occupied, rng, rays, most)[1]
 
     def _lit_points(self, density, occupied, rng: np.random.Generator, count: int, most: int | None = None) -> tuple:

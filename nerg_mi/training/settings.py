@@ -41,10 +41,12 @@ class RadianceSettings:
     stand where fog was; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on a
     sample is always kept, others by chance in proportion to their weight, with ``thin_least`` at least (1: all are kept).
     ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells that fewer
-    cameras see stay empty; ``settle``: share of the run from which on the cells that rendering will visit are found, all of which are then sampled.
+    cameras see stay empty; ``settle``: share of the run from which on the cells that rendering will visit
+    are found, all of which are then sampled.
     ``look_most``: samples of the density-only pass, in batches: what it costs is then of the order of the rest of a step.
     ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like part of it, which
-    clears early fog cheaply; while the pass has no room for enough rays at the next, it waits, for as long again. ``huber``: error at which the colour loss turns linear (colours are in 0..1);
+    clears early fog cheaply; while the pass has no room for enough rays at the next, it waits, for as long again.
+    ``huber``: error at which the colour loss turns linear (colours are in 0..1);
     ``empty_weight``: weight of the penalty on density in cells that are not sampled; ``grid_decay``: of the mean square of
     the grid's features, which lets go of what few rays have shaped (Barron et al. 2023, Zip-NeRF, there level by level);
     ``depth_weight``: of the depth terms
@@ -100,7 +102,7 @@ class RadianceSettings:
             shares = f"{self.stride_share} and {self.reach_share}"
             raise NergError(f"stride_share must be 0 or more and reach_share above 0, got {shares}")
         if self.look_most < 1:
-            raise NergError(f"the density-only pass must have room for a batch: look_most must be 1 or more, got {self.look_most}")
+            raise NergError(f"look_most must be 1 or more, room for a batch in the density-only pass, got {self.look_most}")
         if self.resolution % 8:
             raise NergError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
 

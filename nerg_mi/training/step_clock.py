@@ -33,9 +33,10 @@ class StepClock:
         if not self.durations:
             return {}
         ms = 1e3 * np.array(self.durations)
+        numbers = {"min": np.min(ms), "median": np.median(ms), "max": np.max(ms)}
         return {
             "evaluations_a_second": round(self.evaluations / max(sum(self.durations), 1e-9)),
-            "step_ms": {name: round(float(f(ms)), 1) for name, f in (("min", np.min), ("median", np.median), ("max", np.max))},
+            "step_ms": {name: round(float(x), 1) for name, x in numbers.items()},
         }
 
     def to_dict(self) -> dict:

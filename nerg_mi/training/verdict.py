@@ -10,18 +10,20 @@ _FEW_STEPS = 500
 def complaints(history: list[dict], steps: int, stride: int, minutes: float | None, seconds: float = 0.0) -> list[str]:
     """One sentence for each thing that makes the result worse than it might be; none for a sound run.
 
-    ``history``: looks at the watched views in order, each with ``steps`` and ``psnr`` in dB, the last being that of the result;
-    ``steps``: taken; ``stride``: how many times coarser than it is rendered the field was sampled at the end; ``minutes``: that
-    were asked for, or None for a run by steps; ``seconds``: that it took.
+    ``history``: looks at the watched views in order, each with ``steps`` and ``psnr`` in dB, the last being that of the
+    result; ``steps``: taken; ``stride``: how many times coarser than it is rendered the field was sampled at the end;
+    ``minutes``: that were asked for, or None for a run by steps; ``seconds``: that it took.
     """
     out = []
     more = "more --steps" if minutes is None else "more --minutes, or --steps"
     if steps < _FEW_STEPS:
-        rate = f" ({steps / seconds:.2g} a second: this machine is slow or busy)" if minutes is not None and seconds > 0 else ""
+        timed = minutes is not None and seconds > 0
+        rate = f" ({steps / seconds:.2g} a second: this machine is slow or busy)" if timed else ""
         out.append(f"only {steps} steps{rate}, where a field needs {_FEW_STEPS} before it is of use; give {more}")
     if stride > 1:
         out.append(
-            f"the run ended while marching {stride} times coarser than the field is rendered: fog was not yet cleared; give {more}"
+            f"the run ended while marching {stride} times coarser than the field is rendered: fog was not yet cleared; "
+            f"give {more}"
         )
     if len(history) > 1:
         best = max(history[:-1], key=lambda x: x["psnr"])

@@ -12,8 +12,9 @@ from .step_clock import StepClock
 def warm_up(trainer) -> None:
     """Run, and forget, what the steps of ``trainer`` (`RadianceTrainer`) consist of.
 
-    Compiling takes seconds where the kernels are not in Dr.Jit's cache on the disk: a large share of a run of a minute, in the
-    part that decides how it ends. Weights, random numbers and all else are as they were before; the clock of the run starts.
+    Compiling takes seconds where the kernels are not in Dr.Jit's cache on the disk: a large share of a run of a minute, in
+    the part that decides how it ends. Weights, random numbers and all else are as they were before; the clock of the run
+    starts.
     """
     with _forgotten(trainer):
         # The kernels of the average differ the first two times; a step whose number is divisible looks over the grid.
