@@ -90,6 +90,11 @@ def measure(row: str, threads: int, loops: int, args) -> dict:
     }  # fmt: skip
 
 
+def _order(row: dict) -> tuple:
+    number, unit = row["length"].split()
+    return unit, float(number), -int(row["threads"]), row["beside"] != "nothing"
+
+
 def printed(rows: list[dict]) -> str:
     """The table of ``rows`` in Markdown."""
     head = ("run", "threads", "beside", "steps", "seconds", "million evaluations a second", "least, median, most ms a step",
@@ -98,7 +103,7 @@ def printed(rows: list[dict]) -> str:
         (r["length"], r["threads"], r["beside"], f"{int(r['steps']):,}", f"{float(r['seconds']):.0f}",
          f"{float(r['evaluations_a_second']) / 1e6:.2f}", f"{r['ms_min']}, {r['ms_median']}, {r['ms_max']}", r["max_by_median"],
          f"{float(r['psnr']):.2f}", r["warnings"])
-        for r in rows
+        for r in sorted(rows, key=_order)
     ])  # fmt: skip
 
 
