@@ -110,6 +110,14 @@ def test_the_table_is_interpolated_all_around():
     np.testing.assert_allclose(found, (1 - (y - j)) * above + (y - j) * below, atol=2e-4)
 
 
+def test_the_table_is_not_read_beyond_its_end():
+    """At the poles the outermost rows stand alone; what lies behind them in memory has no part in it."""
+    ns, rows = namespace("llvm"), 4
+    table = np.concatenate([np.full(2 * rows, 1.0), np.full(4 * rows, 7.0), np.full(2 * rows, 2.0), np.full(8 * rows, np.nan)])
+    found = np.array(look_up(ns.Float(table.astype(np.float32)), rows, jit([[0, 0, 1.0], [0, 0, -1.0], [1e-4, 0, -1.0], [1e-4, -1e-5, 1.0]])))
+    np.testing.assert_allclose(found, [1, 2, 2, 1])
+
+
 def test_a_lobe_on_the_seam_is_as_one_beside_it():
     """Turned by whole texels the table is the same: at azimuth pi, at 0 and elsewhere, far out on the lobe too."""
     ns, rows, kappa = namespace("llvm"), 64, 20.0
