@@ -54,6 +54,9 @@ def test_what_stands_in_between_is_met_instead(rgb):
 def test_transmittance_is_what_matter_lets_through(rgb):
     sight = look(rgb, slab(rgb, 0.7), "transmittance", (0.5, 0.5, 2.0), (0.5, 0.5, -2), camera=(0.5, 0.5, 5))
     assert sight.visibility[0] == pytest.approx(math.exp(-0.7), rel=1e-4)
+    # Only what lies before the point: half of the slab.
+    sight = look(rgb, slab(rgb, 0.7), "transmittance", (0.5, 0.5, 0.5), (0.5, 0.5, -2), camera=(0.5, 0.5, -1), tolerance=1e-4)
+    assert sight.visibility[0] == pytest.approx(math.exp(-0.35), rel=1e-3)
 
 
 @pytest.mark.parametrize("kind, evals", [("transmittance", 100), ("depth", 100)])
