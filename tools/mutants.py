@@ -223,6 +223,8 @@ def run(packages: list[str], results: dict[str, dict], arguments) -> None:
         else:
             mutants = [m for p in packages for m in sample(p, bench.tree)]
         todo = [m for m in mutants if arguments.again or not is_known(results.get(m.key), m, reach, arguments.bound)]
+        if arguments.survived:
+            todo = [m for m in todo if (results.get(m.key) or {}).get("outcome") not in KILLED]
         print(f"{len(mutants)} mutants, {len(todo)} of them to be judged", flush=True)
         for k, mutant in enumerate(todo, 1):
             before = results.get(mutant.key) or {}
@@ -242,6 +244,7 @@ def main() -> int:
     parser.add_argument("--only", action="append", metavar="FILE:LINE[:KIND]", help="every mutant of this line")
     parser.add_argument("--survivors", action="store_true", help="print the survivors of the sample, run nothing")
     parser.add_argument("--update", metavar="PAGE", help="put the table on this page, run nothing")
+    parser.add_argument("--survived", action="store_true", help="judge only what was not killed when it was last judged")
     parser.add_argument("--again", action="store_true", help="judge also what is known")
     parser.add_argument("--tests", action="append", metavar="PREFIX", help="judge by the files of tests that begin so (default: all)")
     parser.add_argument("--bound", type=float, default=45.0, help="seconds of tests at most for a mutant (default: 45)")
