@@ -72,6 +72,7 @@ def train_radiance(
     last = history[-1]["psnr"] if history else None
     looks = [x for x in _LOOKS if x > trainer.progress] if watched else []
     looked, saved, interrupted = history[-1]["steps"] if history else 0, trainer.seconds, False
+    keep = lambda: save_run(trainer, state, about, history)
     with Interruption() as stop:
         while trainer.progress < 1 and not interrupted:
             trainer.step()
@@ -90,14 +91,16 @@ def train_radiance(
             except KeyboardInterrupt:
                 # Only here, between two steps: elsewhere there would be weights and random numbers of different steps.
                 interrupted = True
+        if preview is not None and watched:
+            with kept_unless(state, keep, done=False):
+                _write_preview(trainer, watched[0], preview)
+        # One that came while the last preview was made.
+        interrupted = interrupted or stop.asked
     seconds = trainer.seconds
-    keep = lambda: save_run(trainer, state, about, history)
     if state is not None and interrupted:
         keep()
     with kept_unless(state, keep, done=write is not None and not interrupted):
         field, provenance = _result(trainer, dataset, watched, history, seconds, interrupted)
-        if preview is not None and watched:
-            _write_preview(trainer, watched[0], preview, field)
         if write is not None:
             write(field, provenance)
     return field, provenance
@@ -140,11 +143,11 @@ def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: R
     return psnr
 
 
-def _write_preview(trainer: RadianceTrainer, view: View, path: Path, field: RadianceField | None = None) -> None:
+def _write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
     import mitsuba as mi
 
     every = trainer.pixels_within([view], _LOOK_SAMPLES)
-    seen = trainer.render(view, every, field)
+    seen = trainer.render(view, every)
     both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)[every // 2 :: every, every // 2 :: every]], axis=1)
     write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)))
 
