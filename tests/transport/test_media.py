@@ -1,4 +1,6 @@
 """What media answer: scale, bounds, errors."""
+from types import SimpleNamespace
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from nerg_mi.field.gaze import GazeConfig, GazeField
 from nerg_mi.field.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.transport.march import MarchSettings, march
-from nerg_mi.transport.media import FieldMedium, GazeMedium, Similarity, VolumeMedium
+from nerg_mi.transport.media import at_nearest, FieldMedium, GazeMedium, Similarity, VolumeMedium
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((0, 0, 0), (1, 1, 2))
@@ -134,3 +136,12 @@ def test07_volume_answers(rgb):
     assert np.isclose(medium.length_scale, 3**0.5)
     ray = medium.local(rgb.Point3f(0.5, 0.5, -2), rgb.Vector3f(0, 0, 1))
     assert (ray.t_near.numpy()[0], ray.t_far.numpy()[0]) == (2, 3)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test08_each_lane_has_what_belongs_to_the_nearest(rgb, count):
+    rng = np.random.default_rng(count)
+    centers, p = rng.normal(size=(count, 3)), rng.normal(size=(60, 3))
+    known = [SimpleNamespace(center=rgb.Point3f(*map(float, c)), number=rgb.Float(k)) for k, c in enumerate(centers)]
+    found = at_nearest(known, rgb.Point3f(np.ascontiguousarray(p.T, np.float32)), lambda k: k.number).numpy()
+    assert np.array_equal(np.broadcast_to(found, 60), np.linalg.norm(p[:, None] - centers, axis=2).argmin(axis=1))

@@ -87,3 +87,12 @@ def test06_center_is_attached_to_the_placement(rgb):
     c = viewpoint.center(sensor)
     dr.backward(c.x + c.y)
     assert np.isclose(dr.grad(x).numpy()[0], 3)
+
+
+@pytest.mark.parametrize("near", [0.5, 1.5])
+def test_cameras_on_one_line_are_told_apart_by_where_their_rays_start(rgb, near):
+    """Both look along the line that both stand on: a ray on it starts on the near plane of its own."""
+    sensor = batch(rgb, camera(rgb, [0, 0, 3], near_clip=near), camera(rgb, [0, 0, 1], [0, 0, -1], near_clip=near))
+    for z in (3, 1):
+        ray = rgb.Ray3f(rgb.Point3f(0, 0, z - near), rgb.Vector3f(0, 0, -1))
+        assert np.allclose(np.array(viewpoint.center_of_ray([sensor], ray)).ravel(), [0, 0, z], atol=1e-5)

@@ -47,3 +47,12 @@ def test06_gradients(falloff):
     # d/dd_f of 1 - 0.15 / d_f = 0.15 / d_f²; only the point on the ramp counts
     assert np.allclose(dr.grad(f).numpy(), 0 if falloff == 0 else 0.15 / 0.25, rtol=1e-5)
     assert np.allclose(dr.grad(d).numpy(), [0, 0, 0 if falloff == 0 else -2, 0], rtol=1e-5)
+
+
+def test07_gradients_are_finite_on_the_very_edge():
+    d = ns.Float([2.25, 2.0, 3.0])
+    dr.enable_grad(d)
+    y = visibility(d, ns.Float(2), ns.Float(0), ns.Float(0.25))
+    assert y.numpy().tolist() == [1, 1, 0]
+    dr.backward(dr.sum(y), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+    assert not dr.grad(d).numpy().any()
