@@ -28,6 +28,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+import nerg_mi  # noqa: E402, F401 (before Mitsuba, since it chooses the libLLVM)
 _LIMIT = 900.0
 _NOBODY = 65534
 
@@ -414,8 +415,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="commands with this word in their name")
     parser.add_argument("--update", type=Path, help="page whose table is exchanged")
     options = parser.parse_args(arguments)
-    import nerg_mi  # noqa: F401
-
     # Children have what is loaded here; nothing may be begun with it.
     import matplotlib, mitsuba, scipy, trimesh, typer  # noqa: E401, F401
 

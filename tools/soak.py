@@ -25,6 +25,8 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+import nerg_mi  # noqa: E402, F401 (before Mitsuba, since it chooses the libLLVM)
+
 _SAMPLES = 120
 _SIZES = {"width": "36", "height": "24"}
 
@@ -87,7 +89,6 @@ def watch(unit: Callable[[int], object], count: int, bound: float, name: str = "
 
 
 def _variant(name: str = "llvm_ad_rgb"):
-    import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
     import mitsuba as mi
 
     mi.set_variant(name)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
+
 SIDE = 24
 """Pixels of a photo's edge."""
 _FOCAL, _RADIUS = 30.0, 0.6
