@@ -1,7 +1,7 @@
 # Two commands on a fresh clone (Debian or Ubuntu, Python 3.10 or newer):
 #
 #   make demo      set up, render the demo place into out/demo
-#   make test      set up with the test extras, run the tests; ARGS="-k panorama" chooses among them
+#   make test      set up with the test extras, run the tests; ARGS="-k panorama" chooses among them, JOBS=0 runs them in one process
 #
 # While working, and before a release:
 #
@@ -20,6 +20,9 @@
 PYTHON ?= python3
 ARGS ?=
 RUN = .venv/bin/python
+# One process a core, four at most since each takes a gigabyte; a file's tests share what they have made.
+JOBS ?= auto
+PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/formats/test_exr.py tests/formats/test_png.py \
 	tests/test_interruption.py
 
@@ -31,10 +34,10 @@ demo: setup
 test check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
 
 test: setup
-	$(RUN) -m pytest $(ARGS)
+	$(PYTEST) $(ARGS)
 
 check: setup
-	$(RUN) -m pytest -q -m "not slow" $(ARGS)
+	$(PYTEST) -q -m "not slow" $(ARGS)
 
 onecore: setup
 	@if command -v taskset > /dev/null; then taskset -c 0 $(RUN) -m pytest -q $(ONE_CORE) $(ARGS); \
