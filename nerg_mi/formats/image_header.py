@@ -85,9 +85,6 @@ def _png(start: bytes) -> ImageHeader:
 def _jpeg(file, length: int) -> ImageHeader:
     file.seek(0)
     data = file.read()
-    # In the coded pixels a byte of ones is followed by a zero, so that these two are nothing else.
-    if data.count(b"\xff\xda") > SCANS:
-        raise ValueError(f"it runs over its pixels more than {SCANS} times")
     at = 2
     while at + 4 <= length:
         if data[at] != 0xFF:
@@ -98,11 +95,30 @@ def _jpeg(file, length: int) -> ImageHeader:
             continue
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             bits, height, width, channels = struct.unpack_from(">BHHB", data, at + 4)
+            if _scans(data, at) > SCANS:
+                raise ValueError(f"it runs over its pixels more than {SCANS} times")
             return ImageHeader("jpeg", (width, height), width * height * max(channels, 1) * (1 if bits == 8 else 2))
         if marker in (0xD9, 0xDA):
             break
         at += 2 + struct.unpack_from(">H", data, at + 2)[0]
     raise ValueError("its header names no size")
+
+
+# In the coded pixels a byte of ones is followed by a zero, or by one of eight marks that have no segment.
+_SEGMENT = re.compile(rb"\xff([^\x00\x01\xff\xd0-\xd8])", re.DOTALL)
+
+
+def _scans(data: bytes, at: int) -> int:
+    """How many scans the JPEG ``data`` has from ``at`` on. What lies in its other segments, such as notes, and behind its end,
+    such as the film that telephones append, may hold any bytes and is none."""
+    count = 0
+    while found := _SEGMENT.search(data, at):
+        kind, at = found[1][0], found.end()
+        if kind == 0xD9:
+            break
+        count += kind == 0xDA
+        at += int.from_bytes(data[at : at + 2], "big")
+    return count
 
 
 def _plain(file) -> ImageHeader:

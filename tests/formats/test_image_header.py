@@ -68,6 +68,24 @@ def test_data_windows_of_exr_are_bounded(tmp_path, window):
         check_image(tmp_path / "a.exr")
 
 
+def test_what_a_photo_carries_besides_its_pixels_is_not_taken_for_scans(rgb, tmp_path):
+    rgb.Bitmap(np.zeros((5, 7, 3), np.uint8)).write(str(tmp_path / "a.jpg"))
+    raw = (tmp_path / "a.jpg").read_bytes()
+    # A note, and, as telephones append it, a film: any bytes.
+    noted = raw[:2] + b"\xff\xe5" + struct.pack(">H", 2 + 600) + b"\xff\xda\0\2\0\0" * 100 + raw[2:]
+    (tmp_path / "b.jpg").write_bytes(noted + b"\xff\xda\0\2" * 1000)
+    assert check_image(tmp_path / "b.jpg").size == (7, 5)
+
+
+def test_scans_of_a_jpeg_are_counted(rgb, tmp_path):
+    rgb.Bitmap(np.zeros((5, 7, 3), np.uint8)).write(str(tmp_path / "a.jpg"))
+    raw = (tmp_path / "a.jpg").read_bytes()
+    at = raw.index(b"\xff\xda")
+    (tmp_path / "b.jpg").write_bytes(raw[:at] + raw[at:-2] * 101 + raw[-2:])
+    with pytest.raises(NergError, match="b.jpg.*more than 100 times"):
+        check_image(tmp_path / "b.jpg")
+
+
 @pytest.mark.parametrize("raw", [
     b"", b"hello", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"\xff\xd8\xff\xe0\0\0" * 3, b"\xff\xd8" + b"\xff\xda\0\2" * 101,
     b"\x76\x2f\x31\x01\2\0\0\0", b"\x76\x2f\x31\x01\2\0\0\0abc\0int\0\xff\xff\xff\x7f", b"\x76\x2f\x31\x01\2\x08\0\0",
