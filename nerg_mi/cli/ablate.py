@@ -62,7 +62,7 @@ def command(
     ns, data = namespace(mode), Rays.load(rays)
     _, account = hold_out(data, radius, zones, positions, 0, min_rays, people)
     train, scored, centres = held_out_rays(data, account, "both" if people else "pos")
-    place = _place(field, scene, geometry, train, [], output / "place", 0.08, ns)
+    place = _place(field, scene, geometry, train, [], output / "place", None, ns)
     names = tuple(recipes.split(","))
     variants = _chosen(all_variants(place.kind == "field", names), variant)
     render = frame_timer(place, np.asarray(centres), (field or output / "x").parent, cameras, width, height) if cameras else None

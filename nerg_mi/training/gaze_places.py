@@ -13,7 +13,6 @@ from ..field.box import Box
 from ..field.gaze import GazeConfig
 from ..field.log_gaze import LogGazeConfig
 from ..formats.mesh_file import check_vol
-from ..formats.mesh_file import check_vol
 from ..formats.volumes import write_volume
 from ..transport.media import FieldMedium, VolumeMedium
 from ..transport.place import Place
@@ -89,11 +88,6 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
 
     if not path.is_file():
         raise MissingFile(f'the place of hit points "{path}" does not exist; it is written beside the gaze field')
-    check_vol(path)
-    box = np.fromfile(path, "<f4", 6, offset=24)
-    # Mitsuba makes some box of any six numbers.
-    if not (np.isfinite(box).all() and (box[:3] < box[3:]).all()):
-        raise NergError(f'the place of hit points "{path}" has no box with a lower and an upper corner; make it anew')
     check_vol(path)
     box = np.fromfile(path, "<f4", 6, offset=24)
     # Mitsuba makes some box of any six numbers.
