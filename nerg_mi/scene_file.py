@@ -21,7 +21,7 @@ ELEMENTS = 1_000_000
 """A scene may have so many elements, with those of the files that it includes."""
 
 BYTES = 256 << 20
-"""A scene may have so many bytes of XML."""
+"""A scene may have so many bytes of XML, with what is filled in for its `$key`s: those of values may double at each of them."""
 
 INCLUDES = 16
 """Files may be included so deep."""
@@ -88,7 +88,7 @@ class _Scene:
                 self._refuse(path, parser, f"nests elements more than {DEPTH} deep; nest fewer")
             if self._elements > ELEMENTS:
                 self._refuse(path, parser, f"has more than {ELEMENTS:,} elements; keep meshes in files of their own")
-            values = {key: self._filled(value) for key, value in attributes.items()}
+            values = {key: self._filled(value, path, parser) for key, value in attributes.items()}
             parent = stack[-1] if stack else ("", "")
             stack.append((tag, values.get("type", "")))
             self._element(path, parser, tag, values, parent, depth + len(stack), (*within, whole))
@@ -98,9 +98,7 @@ class _Scene:
         try:
             with path.open("rb") as file:
                 while part := file.read(1 << 16):
-                    self._bytes += len(part)
-                    if self._bytes > BYTES:
-                        self._refuse(path, parser, f"has more than {BYTES >> 20} MB of XML; keep meshes in files of their own")
+                    self._count(len(part), path, parser)
                     parser.Parse(part, False)
             parser.Parse(b"", True)
         except expat.ExpatError as error:
@@ -111,11 +109,17 @@ class _Scene:
     def _refuse(self, path, parser, why):
         raise NergError(f'the scene file "{path}" (line {parser.CurrentLineNumber}) {why}.')
 
-    def _filled(self, value: str) -> str:
+    def _count(self, more: int, path, parser) -> None:
+        self._bytes += more
+        if self._bytes > BYTES:
+            self._refuse(path, parser, f"has more than {BYTES >> 20} MB of XML; keep meshes in files of their own")
+
+    def _filled(self, value: str, path, parser) -> str:
         if "$" not in value:
             return value
         # The longest name first, as Mitsuba does.
         for key in sorted(self._values, key=len, reverse=True):
+            self._count(value.count(f"${key}") * len(self._values[key]), path, parser)
             value = value.replace(f"${key}", self._values[key])
         return value
 

@@ -68,6 +68,13 @@ def refused(tmp_path, text, said, **defaults):
     assert "\n" not in str(error.value)
 
 
+def test_values_that_grow_with_every_default_are_refused_before_they_are_made(tmp_path):
+    grown = "".join(f'<default name="{b}" value="{f"${a}" * 100}"/>' for a, b in zip("abcdef", "bcdefg"))
+    (tmp_path / "s.xml").write_text(scene(f'<default name="a" value="{"x" * 1000}"/>{grown}'))
+    with pytest.raises(NergError, match="more than 256 MB of XML"):
+        check_scene_file(tmp_path / "s.xml")
+
+
 def test_good_scenes_load(rgb, tmp_path):
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "part.xml").write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
