@@ -5,15 +5,20 @@ import time
 
 import numpy as np
 
+KEPT = 1 << 12
+"""Durations that are kept at most: the state of a run of days must stay small enough to be read again."""
+
 
 class StepClock:
-    """A context around each step. ``evaluations``: of the field, in steps; ``durations``: of the steps, in seconds.
+    """A context around each step. ``evaluations``: of the field, in steps; ``steps`` and ``seconds``: of all of them;
+    ``extremes``: the shortest and the longest, in seconds; ``durations``: of every ``each``-th, for the median.
 
     Dr.Jit may still be computing when a step ends; the next one then waits for it.
     """
 
     def __init__(self):
-        self.evaluations, self.durations, self._running = 0, [], False
+        self.evaluations, self.steps, self.seconds, self.each = 0, 0, 0.0, 1
+        self.extremes, self.durations, self._running = [float("inf"), 0.0], [], False
 
     def __enter__(self) -> StepClock:
         self._running, self._begin = True, time.perf_counter()
@@ -21,7 +26,16 @@ class StepClock:
 
     def __exit__(self, *error) -> None:
         self._running = False
-        self.durations.append(time.perf_counter() - self._begin)
+        self.add(time.perf_counter() - self._begin)
+
+    def add(self, seconds: float) -> None:
+        """One more step, of so many ``seconds``."""
+        if self.steps % self.each == 0:
+            self.durations.append(seconds)
+        self.steps, self.seconds = self.steps + 1, self.seconds + seconds
+        self.extremes = [min(self.extremes[0], seconds), max(self.extremes[1], seconds)]
+        if len(self.durations) > KEPT:
+            self.durations, self.each = self.durations[::2], 2 * self.each
 
     def count(self, evaluations: int) -> None:
         """Add to the evaluations, if there is a step on: others, for looks and bounds, are not timed."""
@@ -30,18 +44,24 @@ class StepClock:
 
     def summary(self) -> dict:
         """``evaluations_a_second``, and ``step_ms`` with ``min``, ``median`` and ``max``; empty without a step."""
-        if not self.durations:
+        if not self.steps:
             return {}
-        ms = 1e3 * np.array(self.durations)
-        numbers = {"min": np.min(ms), "median": np.median(ms), "max": np.max(ms)}
+        ms = {"min": self.extremes[0], "median": np.median(self.durations), "max": self.extremes[1]}
         return {
-            "evaluations_a_second": round(self.evaluations / max(sum(self.durations), 1e-9)),
-            "step_ms": {name: round(float(x), 1) for name, x in numbers.items()},
+            "evaluations_a_second": round(self.evaluations / max(self.seconds, 1e-9)),
+            "step_ms": {name: round(1e3 * float(value), 1) for name, value in ms.items()},
         }
 
     def to_dict(self) -> dict:
         """State for ``restore``."""
-        return {"evaluations": self.evaluations, "durations": [round(x, 5) for x in self.durations]}
+        return {
+            "evaluations": self.evaluations, "steps": self.steps, "seconds": self.seconds, "each": self.each,
+            "extremes": self.extremes if self.steps else [], "durations": [round(x, 5) for x in self.durations],
+        }  # fmt: skip
 
     def restore(self, state: dict) -> None:
-        self.evaluations, self.durations = int(state["evaluations"]), [float(x) for x in state["durations"]]
+        self.evaluations, self.steps, self.each = (int(state[name]) for name in ("evaluations", "steps", "each"))
+        self.seconds, self.durations = float(state["seconds"]), [float(x) for x in state["durations"]]
+        self.extremes = [float(x) for x in state["extremes"]] or [float("inf"), 0.0]
+        if self.steps < 0 or self.each < 1 or len(self.extremes) != 2 or bool(self.durations) != bool(self.steps):
+            raise ValueError('its "clock" is not one of a run')

@@ -1,4 +1,5 @@
 """What a machine's speed changes in a training: nothing at equal steps, and the result says when there were few."""
+import json
 import time
 
 import drjit as dr
@@ -59,11 +60,24 @@ def test_the_clock_counts_what_steps_evaluate():
             clock.count(100)
     clock.count(1000)
     assert clock.evaluations == 300 and len(clock.durations) == 3
-    clock.restore({"evaluations": 300, "durations": [0.01, 0.06, 0.02]})
+    clock = StepClock()
+    clock.evaluations = 300
+    for seconds in (0.01, 0.06, 0.02):
+        clock.add(seconds)
     assert clock.summary() == {"evaluations_a_second": 3333, "step_ms": {"min": 10.0, "median": 20.0, "max": 60.0}}
     again = StepClock()
     again.restore(clock.to_dict())
     assert again.summary() == clock.summary()
+
+
+def test_the_clock_of_a_long_run_stays_small():
+    clock, seconds = StepClock(), np.random.default_rng(0).permutation(100_000) * 1e-5 + 0.02
+    for s in seconds:
+        clock.add(float(s))
+    assert len(json.dumps(clock.to_dict())) < 50_000
+    said = clock.summary()["step_ms"]
+    assert said["min"] == 20.0 and said["max"] == 1020.0 and abs(said["median"] - 520) < 20
+    assert abs(clock.seconds - seconds.sum()) < 1e-6
 
 
 def test_the_result_tells_its_steps_speed_and_what_is_wrong(dataset):  # noqa: F811
