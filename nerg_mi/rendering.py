@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -68,7 +69,13 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
         raise NergError(f'there is no scene file "{path}".')
     check_scene_file(path, defaults)
     with mitsuba_says(), threads_for_mitsuba():
-        loaded = mi.load_file(str(path), **(defaults or {}))
+        try:
+            loaded = mi.load_file(str(path), **(defaults or {}))
+        except RuntimeError as error:
+            unused = re.findall(r"^\s*- \$(\w+)=", str(error), re.MULTILINE) if "unused parameters" in str(error) else []
+            if unused:
+                raise NergError(f'the scene "{path}" asks for no "${unused[0]}": correct the name that is given a value.') from error
+            raise
     check_scene(path, loaded)
     return loaded
 
@@ -131,17 +138,14 @@ def render_file(
         width, height = map(int, camera.film().crop_size())
         whole = bands.why_whole(loaded, camera)
         rows = bands.rows_for(loaded, camera, 1e9 * memory - resident_bytes() - RESERVE)
-        try:
-            with picture_rows(output, width, height) as write:
-                for band in bands.render_bands(loaded, camera, spp=spp, seed=seed, rows=rows, on_strip=on_strip):
-                    bitmap = band.film.bitmap()
-                    channels = bitmap.channel_count()
-                    write(bitmap, band.rows)
-                    stop.check()
-            # The picture is there, and yet whoever called this does not go on.
-            stop.check()
-        except RuntimeError as error:
-            raise NergError(sentence(error)) from error
+        with mitsuba_says(), picture_rows(output, width, height) as write:
+            for band in bands.render_bands(loaded, camera, spp=spp, seed=seed, rows=rows, on_strip=on_strip):
+                bitmap = band.film.bitmap()
+                channels = bitmap.channel_count()
+                write(bitmap, band.rows)
+                stop.check()
+        # The picture is there, and yet whoever called this does not go on.
+        stop.check()
     seconds = time.perf_counter() - start
     note = f" It was rendered in one piece, beyond {memory:g} GB, because of {whole}." if whole and rows < height else ""
     return f"Wrote {output} ({width} x {height}, {channels} channels, {active}, {seconds:.1f} s).{note}"

@@ -91,6 +91,7 @@ def test04_mono(rgb, scene, tmp_path):
         (["-o", "out.exr", "-m", "llvm_rgb"], 'there is no variant "llvm_rgb"'),
         (["-o", "out.exr", "-D", "level"], "write -D key=value"),
         (["-o", "out.exr", "-D", "integrator=nope"], '"nope" not found'),
+        (["-o", "out.exr", "-D", "levle=2"], 'asks for no "$levle": correct the name'),
         (["-o", "out.exr", "-m", "scalar_rgb", "-s", "1"], '"panorama" needs a variant that compiles its kernels'),
     ],
 )
@@ -100,6 +101,15 @@ def test05_one_sentence(scene, tmp_path, monkeypatch, capsys, options, said):
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and lines[0].startswith("nerg: ") and said in lines[0]
     assert not (tmp_path / "out.exr").exists()
+
+
+def test05b_a_mistake_of_the_program_while_it_renders_is_told_as_one(scene, tmp_path, monkeypatch, capsys):
+    def broken(*args, **options):
+        raise RuntimeError("in a plugin:\nTraceback (most recent call last):\n  File \"x.py\", line 1, in f\nTypeError: no len()")
+
+    monkeypatch.setattr("nerg_mi.rendering.bands.render_bands", broken)
+    assert nerg("render", scene, "-o", tmp_path / "out.exr") == 70
+    assert "internal error" in capsys.readouterr().err and not (tmp_path / "out.exr").exists()
 
 
 def test06_missing_scene(tmp_path, capsys):
