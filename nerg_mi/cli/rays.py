@@ -334,8 +334,9 @@ def _card(rays, path: Path) -> None:
 def _rows(rays, reason: str, most: int = 3) -> str:
     """The first lines concerned; all of them stand in the file's metadata."""
     lost = [d for d in rays.metadata.get("dropped", []) if d["reason"] == reason and d.get("rows")]
-    runs = [run for d in lost for run in d["rows"]]
-    if not runs:
+    if not lost:
         return "lines not named"
+    runs = lost[0]["rows"]
     text = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:most])
-    return f"lines {text}{', ...' if len(runs) > most else ''} of {lost[0].get('file', '')}"
+    more = f" and of {len(lost) - 1} more" if len(lost) > 1 else ""
+    return f"lines {text}{', ...' if len(runs) > most else ''} of {lost[0].get('file', '')}{more}"

@@ -169,6 +169,10 @@ def test_one_line_that_was_cut_off_among_many_files(tmp_path):
     assert lost["file"] == "p2.csv" and lost["rows"] == [[152, 152]] and lost["count"] == 1
     words = " ".join(done.output.split())
     assert "600 of 601 rows" in words and "line is cut off" in words and "lines 152 of p2.csv" in words
+    # Of several files that lost lines one is named with its lines, and the others are counted.
+    files[1].write_text(files[1].read_text() + "\n1,x,1,1,1,1,1\n")
+    done = run("import", *files, "-o", tmp_path / "both.npz", *about, "--skip-bad-lines")
+    assert "of p1.csv and of 1 more" in " ".join(done.output.split()), done.output
     # Two of 152 lines are more than one in a hundred; one is always allowed.
     files[2].write_text(files[2].read_text() + "\n3,x,1,1,1,1,1\n")
     done = run("import", *files, "-o", tmp_path / "s.npz", *about, "--skip-bad-lines")
