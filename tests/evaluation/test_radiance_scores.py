@@ -112,3 +112,10 @@ def test_scores_of_views_and_what_is_written(fog, tmp_path):
     json.dumps(scores)
     with pytest.raises(ValueError, match="--holdout"):
         score_views(fog, [])
+
+
+@pytest.mark.parametrize("size", [(10, 30), (30, 10), (11, 11)])
+def test_a_picture_smaller_than_the_window_has_no_similarity(size):
+    a = np.random.default_rng(0).random((*size, 3))
+    value = ssim(a, a)
+    assert np.isnan(value) if min(size) < 11 else value == pytest.approx(1)

@@ -203,6 +203,13 @@ def test10_settings_vary_one_factor_at_a_time():
     assert groups >= {"dt_gamma", "coarse", "stop", "color_cutoff", "depth", "visibility", "jitter", "leave out", "spp", "resolution", "paper"}
 
 
+def test10b_a_quick_study_is_a_part_of_a_whole_one():
+    subject = open_subject("slab", "auto", 12, 8)
+    whole = {r.name for r in settings(subject)}
+    quick = [r for r in settings(subject, quick=True) if r.group not in ("visibility", "spp", "paper")]
+    assert len(quick) > 15 and {r.name for r in quick} <= whole
+
+
 def test11_errors_of_known_pictures():
     n = 1000
     one, none = np.ones(n), np.zeros(n)
