@@ -146,8 +146,12 @@ def keep(key: str, entry: dict) -> None:
     """Add one entry to the results on the disk, where another run may have added its own since."""
     with open(RESULTS.with_suffix(".lock"), "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
+        known = load()
+        before = known.get(key, {})
+        if before.get("outcome") in KILLED and entry["outcome"] not in KILLED and before["source"] == entry["source"]:
+            return  # by other tests than these
         draft = RESULTS.with_suffix(".part")
-        draft.write_text(json.dumps({**load(), key: entry}, indent=1))
+        draft.write_text(json.dumps({**known, key: entry}, indent=1))
         draft.replace(RESULTS)
 
 
