@@ -54,6 +54,8 @@ def why_whole(scene, sensor) -> str | None:
         return f"the variant {mi.variant()}"
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         return f"the integrator {integrator.class_name()}"
+    if not hasattr(integrator, "seen_by") and _renders_itself(type(integrator), mi.SamplingIntegrator):
+        return f"the integrator {integrator.class_name()}, which renders in a way of its own"
     if film.class_name() != "HDRFilm":
         return f"the film {film.class_name()}"
     if is_batch(sensor):
@@ -61,6 +63,12 @@ def why_whole(scene, sensor) -> str | None:
     if pixel_sampler.base_seed(sensor.sampler()) is None:
         return f"the sampler {sensor.sampler().class_name()}"
     return None
+
+
+def _renders_itself(kind: type, base: type) -> bool:
+    """Whether a class of integrators in Python has a ``render`` of its own, below ``base``."""
+    above = kind.__mro__
+    return any("render" in vars(c) for c in above[: above.index(base)])
 
 
 def rows_for(scene, sensor, memory: float) -> int:
@@ -154,7 +162,7 @@ def _trace(scene, sensor, grid: _Grid, base, seed, top, first, count, start):
     ray, weight = sensor.sample_ray_differential(moment, 0, relative, aperture, active)
     if ray.has_differentials:
         ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(spp))))
-    radiance, valid, aovs = scene.integrator().sample(scene, sampler, ray, None, active)
+    radiance, valid, aovs = scene.integrator().sample(scene, sampler, ray, sensor.get_medium(), active)
     radiance = mi.Spectrum(radiance) * weight
     color = [radiance.x] * 3 if mi.is_monochromatic else [radiance.x, radiance.y, radiance.z]
     alpha = [dr.select(valid, mi.Float(1), 0)] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []

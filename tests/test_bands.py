@@ -57,6 +57,32 @@ def test_shapes_are_the_same_to_the_bit(rgb, spp):
         assert np.array_equal(divided(scene, spp, rows=rows, strip=strip), expected), (rows, strip)
 
 
+def test_a_camera_in_fog_is_the_same_to_the_bit(rgb):
+    fog = {"type": "homogeneous", "albedo": 0.9, "sigma_t": 0.8}
+    scene = rgb.load_dict({
+        "type": "scene", "integrator": {"type": "volpath", "max_depth": 4}, "sky": {"type": "constant"},
+        "room": {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(3), "bsdf": {"type": "null"}, "interior": fog},
+        "ball": {"type": "sphere", "radius": 0.5},
+        "sensor": {"type": "perspective", "to_world": rgb.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]),
+                   "medium": fog, "film": {"type": "hdrfilm", **BOX}},
+    })  # fmt: skip
+    assert bands.why_whole(scene, scene.sensors()[0]) is None
+    assert np.array_equal(divided(scene, 4, rows=4), whole(rgb, scene, 4))
+
+
+def test_an_integrator_that_renders_in_a_way_of_its_own_is_asked_to(rgb):
+    class Own(rgb.SamplingIntegrator):
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            return rgb.Color3f(0), True, []
+
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            return super().render(scene, sensor, seed, spp, develop, evaluate)
+
+    rgb.register_integrator("own_render", lambda props: Own(props))
+    scene = rgb.load_dict({"type": "scene", "integrator": {"type": "own_render"}, "sensor": {"type": "perspective"}})
+    assert "a way of its own" in bands.why_whole(scene, scene.sensors()[0])
+
+
 @pytest.mark.parametrize("sensor", ["perspective", "panorama"])
 def test_fields_seen_by_an_observer_elsewhere_are_the_same_to_the_bit(rgb, tmp_path, sensor):
     eye = camera(rgb, size=17) if sensor == "perspective" else panorama(rgb)
