@@ -43,6 +43,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        _check_unprotected(target)
         if os.path.exists(path) and not os.path.isfile(path):
             # A pipe or a device, such as /dev/stdout, has nothing to be kept, and must not become a file.
             with tempfile.TemporaryDirectory() as folder:
@@ -93,6 +94,7 @@ def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
         target = Path(os.path.realpath(path))
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        _check_unprotected(target)
         _check_parents(target)
 
 
@@ -117,6 +119,12 @@ def writing(path: str | os.PathLike) -> Iterator[None]:
     except OSError as error:
         remedy = _REMEDIES.get(error.errno, "choose another folder")
         raise NergError(f'"{path}" could not be written ({error.strerror or error}): {remedy}.') from error
+
+
+def _check_unprotected(target: Path) -> None:
+    """Raise `PermissionError` for a file that may not be written: the folder would let it be replaced all the same."""
+    if target.exists() and not os.access(target, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(target))
 
 
 def _check_parents(target: Path) -> None:

@@ -43,6 +43,18 @@ def test_permissions_are_those_of_any_other_file(tmp_path):
     assert (tmp_path / "new").stat().st_mode & 0o777 == 0o604
 
 
+def test_a_file_that_is_protected_is_not_replaced(tmp_path, monkeypatch):
+    path = tmp_path / "kept"
+    path.write_bytes(b"old")
+    path.chmod(0o444)
+    # Root may write everything.
+    monkeypatch.setattr(os, "access", lambda p, mode: mode & os.W_OK == 0 or os.stat(p).st_mode & 0o200 != 0)
+    for write in (lambda: write_bytes(path, b"new"), lambda: check_writable(path)):
+        with pytest.raises(NergError, match="you may not write there"):
+            write()
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["kept"]
+
+
 def test_a_link_is_followed(tmp_path):
     (tmp_path / "real").write_bytes(b"old")
     (tmp_path / "link").symlink_to("real")
