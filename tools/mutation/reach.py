@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
+import os
 from pathlib import Path
 
 from .bench import BUILD, Bench
@@ -42,12 +43,13 @@ class Reach:
 
     def _record(self, bench: Bench, file: str, path: Path, stamp: str) -> None:
         (_FOLDER / "sources").mkdir(parents=True, exist_ok=True)
-        raw = BUILD / "record.json"
+        raw = BUILD / f"record-{os.getpid()}.json"
         raw.unlink(missing_ok=True)
         answer = bench.run([file], _LONGEST, raw)
         if not raw.exists():
             raise SystemExit(f"{file} did not come to its end ({answer['outcome']}): see {bench.log}")
         record = json.loads(raw.read_text())
+        raw.unlink()
         record["stamp"], record["sources"] = stamp, {}
         for source in record["lines"]:
             text = bench.source(source)
