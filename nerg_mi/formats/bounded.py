@@ -104,6 +104,11 @@ def plain(text: object, most: int = _SAID) -> str:
     return kept if len(kept) <= most else kept[:most] + "..."
 
 
+def is_count(value: object) -> bool:
+    """Whether ``value``, read from a file, is a whole number from 0 on that 64 bits hold with room to add."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
+
+
 def size_of(path: str | os.PathLike, what: str = "file", most: int | None = None) -> int:
     """Bytes of the ordinary file ``path``; `NergError` for a folder, a device or a pipe, and beyond ``most`` bytes."""
     with reading(path, what):

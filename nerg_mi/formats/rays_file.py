@@ -20,7 +20,7 @@ from .atomic import replacing
 from .bounded import JSON_BYTES, reading, size_of
 from .inflating import inflated_limit
 from .npy import open_npz
-from .rays_metadata import VERSION, read_metadata
+from .rays_metadata import VERSION, not_rays, read_metadata
 
 SUFFIXES = (".npz", ".parquet")
 _REQUIRED = ("t", "person", "origin", "direction", "confidence")
@@ -91,10 +91,10 @@ def _read_npz(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]:
         there = {name: archive.about(name) for name in archive.names if name in (*_REQUIRED, *_OPTIONAL)}
         _check_columns(path, {name: (shape, dtype.kind) for name, (shape, dtype) in there.items()})
         if "metadata" not in archive:
-            raise _not_ours(path, "it lacks the metadata")
+            raise not_rays(path, "it lacks the metadata")
         shape, dtype = archive.about("metadata")
         if shape != () or dtype.kind != "U" or dtype.itemsize > 4 * JSON_BYTES:
-            raise _not_ours(path, "its metadata are no text")
+            raise not_rays(path, "its metadata are no text")
         with reading(path, "rays file"):
             document = str(archive["metadata"])
         return {name: archive[name] for name in there}, document
@@ -117,7 +117,7 @@ def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes
         _check_columns(path, there)
         document = (schema.metadata or {}).get(b"nerg_mi")
         if document is None:
-            raise _not_ours(path, "it lacks the metadata")
+            raise not_rays(path, "it lacks the metadata")
         columns = {name: np.empty(shape, np.int64 if name in _CODES else np.float64) for name, (shape, _) in there.items()}
         at = 0
         for batch in table.iter_batches(batch_size=1 << 17, columns=[part for name in there for part in _parts(name)]):
@@ -125,12 +125,12 @@ def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes
                 for i, part in enumerate(_parts(name)):
                     values = batch.column(batch.schema.get_field_index(part))
                     if values.null_count and name in _CODES:
-                        raise _not_ours(path, f'its column "{part}" has cells without a value')
+                        raise not_rays(path, f'its column "{part}" has cells without a value')
                     into = column[at : at + batch.num_rows]
                     (into[:, i] if name in _VECTORS else into)[...] = values.to_numpy(zero_copy_only=False)
             at += batch.num_rows
         if at != about.num_rows:
-            raise _not_ours(path, f"it holds {at:,} of the {about.num_rows:,} rays that it claims")
+            raise not_rays(path, f"it holds {at:,} of the {about.num_rows:,} rays that it claims")
     return columns, document
 
 
@@ -148,14 +148,14 @@ def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ..
     file's bytes warrant."""
     missing = [name for name in _REQUIRED if name not in there]
     if missing:
-        raise _not_ours(path, f"it lacks {', '.join(missing)}")
+        raise not_rays(path, f"it lacks {', '.join(missing)}")
     n = (there["t"][0] or (0,))[0]
     for name, (shape, kind) in there.items():
         wanted = (n, 3) if name in _VECTORS else (n,)
         if shape != wanted:
-            raise _not_ours(path, f"{name} has the shape {shape}, where {wanted} is expected")
+            raise not_rays(path, f"{name} has the shape {shape}, where {wanted} is expected")
         if kind not in (("i", "u") if name in _CODES else ("f", "i", "u")):
-            raise _not_ours(path, f"{name} is not {'whole numbers' if name in _CODES else 'numbers'}")
+            raise not_rays(path, f"{name} is not {'whole numbers' if name in _CODES else 'numbers'}")
     # Narrow numbers become wide ones, and equal values may be stored once: what counts is the memory that rays take.
     size = size_of(path, "rays file")
     if _BYTES * n > inflated_limit(size):
@@ -164,10 +164,6 @@ def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ..
 
 def _not_warranted(path: str | os.PathLike, rays: int, size: int) -> NergError:
     return NergError(f'the rays file "{path}" claims {rays:,} rays, which its {size:,} bytes do not warrant; copy it again')
-
-
-def _not_ours(path: str | os.PathLike, why: str) -> NergError:
-    return NergError(f'"{path}" is not a rays file ({why}); make one with \'nerg rays import\'')
 
 
 def _suffix(path: str | os.PathLike) -> str:

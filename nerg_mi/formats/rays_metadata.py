@@ -7,7 +7,7 @@ import os
 from typing import Any
 
 from ..errors import NergError
-from .bounded import parse_json
+from .bounded import is_count, parse_json
 
 VERSION = 1
 
@@ -20,32 +20,29 @@ def read_metadata(document: str | bytes, path: str | os.PathLike) -> dict[str, A
     """
     found = parse_json(document, path, "rays file")
     if not isinstance(found, dict):
-        raise _bad(path, "its metadata are no JSON object")
+        raise not_rays(path, "its metadata are no JSON object")
     if "version" not in found:
-        raise _bad(path, 'its metadata lack "version"')
+        raise not_rays(path, 'its metadata lack "version"')
     if found.pop("version") != VERSION:
         raise NergError(
             f'the rays file "{path}" was written by another version of the format; import the tracking files again'
         )
     for key, (holds, what) in _KNOWN.items():
         if key in found and not holds(found[key]):
-            raise _bad(path, f'"{key}" of its metadata is no {what}')
+            raise not_rays(path, f'"{key}" of its metadata is no {what}')
     for key in ("persons", "frame"):
         if key not in found:
-            raise _bad(path, f'its metadata lack "{key}"')
+            raise not_rays(path, f'its metadata lack "{key}"')
     return found
 
 
-def _bad(path: str | os.PathLike, why: str) -> NergError:
+def not_rays(path: str | os.PathLike, why: str) -> NergError:
+    """The error of a file ``path`` that is not one of rays, and ``why`` not."""
     return NergError(f'"{path}" is not a rays file ({why}); make one with \'nerg rays import\'')
 
 
 def _names(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(v, str) for v in value)
-
-
-def _count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
 
 
 def _objects(value: object, **keys) -> bool:
@@ -62,7 +59,7 @@ def _text(value: object) -> bool:
 
 
 def _runs(value: object) -> bool:
-    return isinstance(value, list) and all(isinstance(v, list) and len(v) == 2 and all(map(_count, v)) for v in value)
+    return isinstance(value, list) and all(isinstance(v, list) and len(v) == 2 and all(map(is_count, v)) for v in value)
 
 
 def _by(value: object) -> bool:
@@ -104,9 +101,9 @@ _KNOWN = {
     "frame": (_frame, "frame of units, up and handedness"),
     "source_frame": (_frame, "frame of units, up and handedness"),
     "transform": (_transform, "4 x 4 matrix that can be inverted"),
-    "rows_read": (_count, "number of rows"),
+    "rows_read": (is_count, "number of rows"),
     "sources": (lambda v: _objects(v, file=_text, sha256_=_text), "list of files"),
-    "dropped": (lambda v: _objects(v, reason=_text, count=_count, file_=_text, rows_=_runs), "list of reasons and counts"),
-    "steps": (lambda v: _objects(v, step=_text, kept=_count, of=_count, by_=_by), "list of steps with their counts"),
+    "dropped": (lambda v: _objects(v, reason=_text, count=is_count, file_=_text, rows_=_runs), "list of reasons and counts"),
+    "steps": (lambda v: _objects(v, step=_text, kept=is_count, of=is_count, by_=_by), "list of steps with their counts"),
     "tick": (lambda v: _number(v) and v > 0, "time in seconds"),
 }

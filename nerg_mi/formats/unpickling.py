@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import MissingFile, NergError
-from .bounded import plain, reading, size_of
+from .bounded import is_count, plain, reading, size_of
 from .inflating import open_zip, read_member
 
 PICKLE_BYTES = 8 << 20
@@ -132,14 +132,10 @@ class _Dtype:
     name: str
 
 
-def _whole(value) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
-
-
 def _tensor(storage, offset, shape, stride, *rest) -> StoredTensor:
     if not isinstance(storage, _Storage):
         raise ValueError("a tensor without a stored array is not read here")
-    whole = isinstance(shape, tuple) and isinstance(stride, tuple) and all(map(_whole, (offset, *shape, *stride)))
+    whole = isinstance(shape, tuple) and isinstance(stride, tuple) and all(map(is_count, (offset, *shape, *stride)))
     if not whole or len(shape) != len(stride) or len(shape) > 32:
         raise ValueError(f"a tensor of shape {_short(shape)} with strides {_short(stride)} is none")
     return StoredTensor(storage.key, storage.dtype, offset, shape, stride)
