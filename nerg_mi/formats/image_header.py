@@ -17,6 +17,10 @@ PIXELS = 1 << 27
 DECODED_BYTES = 3 << 27
 """Its values may take so many bytes: three 8-bit channels of as many pixels."""
 
+WARRANTED = 16
+"""So many times its file's bytes a picture may take in any case, in pixels as in bytes: photos of 200 million pixels and large
+environment maps are no attack, where a small file that claims as much is one."""
+
 SCANS = 100
 """A progressive JPEG may run over its pixels so many times; encoders make ten."""
 
@@ -35,17 +39,19 @@ class ImageHeader:
 
 
 def check_image(path: str | os.PathLike, what: str = "image") -> ImageHeader:
-    """The header of the picture ``path``; `NergError` where it is damaged or beyond `PIXELS` and `DECODED_BYTES`."""
+    """The header of the picture ``path``; `NergError` where it is damaged, or beyond both `PIXELS` or `DECODED_BYTES` and
+    `WARRANTED` times its file."""
     length = size_of(path, what)
     with reading(path, what), open(path, "rb") as file:
         header = _header(file, length)
     width, height = header.size
     if not (width > 0 and height > 0):
         raise NergError(f'the {what} "{path}" has {width} x {height} pixels; give one that shows something')
-    if width * height > PIXELS or header.bytes > DECODED_BYTES:
+    pixels, most = (max(limit, WARRANTED * length) for limit in (PIXELS, DECODED_BYTES))
+    if width * height > pixels or header.bytes > most:
         raise NergError(
             f'the {what} "{path}" has {width:,} x {height:,} pixels, {header.bytes:,} bytes, and at most '
-            f"{PIXELS:,} pixels and {DECODED_BYTES:,} bytes are read; make it smaller"
+            f"{pixels:,} pixels and {most:,} bytes are read of a file of {length:,}; make it smaller"
         )
     return header
 

@@ -53,6 +53,16 @@ def test_large_pictures_in_small_files_are_refused(tmp_path, size, bits, color):
         check_image(tmp_path / "a.png", "mask")
 
 
+def test_a_large_picture_in_a_large_file_is_read(tmp_path):
+    raw = png(16384, 12288)
+    (tmp_path / "a.png").write_bytes(raw)
+    with pytest.raises(NergError, match="make it smaller"):
+        check_image(tmp_path / "a.png")
+    with open(tmp_path / "a.png", "ab") as file:  # as many bytes as there may be, without room on the disk
+        file.truncate(3 * 16384 * 12288 // image_header.WARRANTED)
+    assert check_image(tmp_path / "a.png").size == (16384, 12288)
+
+
 def test_a_picture_of_the_largest_size_is_read(tmp_path):
     (tmp_path / "a.png").write_bytes(png(16384, 8192))
     assert check_image(tmp_path / "a.png").bytes == image_header.DECODED_BYTES
