@@ -22,6 +22,16 @@ def test_the_first_is_noted_and_the_second_raised():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_handler_that_is_not_pythons_is_left_alone(monkeypatch):
+    """As where Python is part of another program: it could not be put back."""
+    set_handlers = []
+    monkeypatch.setattr(signal, "getsignal", lambda which: None)
+    monkeypatch.setattr(signal, "signal", lambda *given: set_handlers.append(given))
+    with Interruption() as stop:
+        stop.check()
+    assert not set_handlers
+
+
 @pytest.fixture
 def scene(rgb, tmp_path):
     fields.radiance(tmp_path / "f.safetensors")
