@@ -16,7 +16,8 @@ class Interruption:
     def __enter__(self) -> Interruption:
         self.asked = False
         # Signals can only be dealt with in the main thread; a handler that is not Python's could not be put back.
-        self._mine = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is not None
+        main = threading.current_thread() is threading.main_thread()
+        self._mine = main and signal.getsignal(signal.SIGINT) is not None
         if self._mine:
             self._before = signal.signal(signal.SIGINT, self._note)
         return self

@@ -21,7 +21,8 @@ ELEMENTS = 1_000_000
 """A scene may have so many elements, with those of the files that it includes."""
 
 BYTES = 256 << 20
-"""A scene may have so many bytes of XML, with what is filled in for its `$key`s: those of values may double at each of them."""
+"""A scene may have so many bytes of XML, with what is filled in for its `$key`s: values that name others may grow with
+each of them."""
 
 INCLUDES = 16
 """Files may be included so deep."""

@@ -18,8 +18,8 @@ DECODED_BYTES = 3 << 27
 """Its values may take so many bytes: three 8-bit channels of as many pixels."""
 
 WARRANTED = 16
-"""So many times its file's bytes a picture may take in any case, in pixels as in bytes: photos of 200 million pixels and large
-environment maps are no attack, where a small file that claims as much is one."""
+"""So many times its file's bytes a picture may take in any case, in pixels as in bytes: photos of 200 million pixels
+and large environment maps are no attack, where a small file that claims as much is one."""
 
 SCANS = 100
 """A progressive JPEG may run over its pixels so many times; encoders make ten."""
@@ -39,8 +39,8 @@ class ImageHeader:
 
 
 def check_image(path: str | os.PathLike, what: str = "image") -> ImageHeader:
-    """The header of the picture ``path``; `NergError` where it is damaged, or beyond both `PIXELS` or `DECODED_BYTES` and
-    `WARRANTED` times its file."""
+    """The header of the picture ``path``; `NergError` where it is damaged, or beyond both `PIXELS` or `DECODED_BYTES`
+    and `WARRANTED` times its file."""
     length = size_of(path, what)
     with reading(path, what), open(path, "rb") as file:
         header = _header(file, length)
@@ -115,8 +115,8 @@ _SEGMENT = re.compile(rb"\xff([^\x00\x01\xff\xd0-\xd8])", re.DOTALL)
 
 
 def _scans(data: bytes, at: int) -> int:
-    """How many scans the JPEG ``data`` has from ``at`` on. What lies in its other segments, such as notes, and behind its end,
-    such as the film that telephones append, may hold any bytes and is none."""
+    """How many scans the JPEG ``data`` has from ``at`` on. What lies in its other segments, such as notes, and behind
+    its end, such as the film that telephones append, may hold any bytes and is none."""
     count = 0
     while found := _SEGMENT.search(data, at):
         kind, at = found[1][0], found.end()

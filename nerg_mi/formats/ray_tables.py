@@ -261,4 +261,4 @@ def _require(path: object, wanted: list[str], there: list[str]) -> None:
     missing = [c for c in wanted if c not in there]
     if missing:
         brief = lambda names: ", ".join(plain(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
-        raise NergError(f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}")
+        raise NergError(f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}; name those by --map")
