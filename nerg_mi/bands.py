@@ -72,10 +72,16 @@ def _renders_itself(kind: type, base: type) -> bool:
 
 
 def rows_for(scene, sensor, memory: float) -> int:
-    """Rows of a band that needs at most ``memory`` bytes; at least 1."""
+    """Rows of a band that needs at most ``memory`` bytes; at least 1, and of a filter that is wider than a pixel so many
+    that the rows around a band, which are rendered again for it, are a quarter of it at most."""
     width, height = sensor.film().crop_size()
     values = 5 + len(scene.integrator().aov_names())
-    return int(min(max(memory // (width * values * BYTES_PER_VALUE), 1), height))
+    return int(min(max(memory // (width * values * BYTES_PER_VALUE), 8 * _reach(sensor.film()), 1), height))
+
+
+def _reach(film) -> int:
+    """How many rows further than their own the samples of ``film`` reach."""
+    return 0 if film.rfilter().is_box_filter() else int(film.rfilter().border_size())
 
 
 def render_bands(
@@ -184,8 +190,7 @@ class _Grid:
         self.divided = self.rows < self.height
         filters = film.rfilter()
         self.border = int(filters.border_size()) if film.sample_border() else 0
-        # How many rows further samples reach.
-        self._reach = 0 if filters.is_box_filter() else int(filters.border_size())
+        self._reach = _reach(film)
         self.width = self.size[0] + 2 * self.border
         self.total = sum(b - a for a, b in map(self.samples, range(0, self.height, self.rows)))
 

@@ -156,6 +156,16 @@ def test_eight_times_the_pixels_take_eight_times_the_bands(rgb):
     assert bands.rows_for(small, small.sensors()[0], 1.0) == 1
 
 
+def test_a_wide_filter_is_not_rendered_many_times_for_want_of_memory(rgb):
+    """As where the scene itself takes all of it: each band renders the rows around it again."""
+    scene = lit(rgb, {"width": 18, "height": 200, "rfilter": {"type": "gaussian"}})
+    rows = bands.rows_for(scene, scene.sensors()[0], -1e9)
+    told = []
+    for _ in bands.render_bands(scene, scene.sensors()[0], spp=1, rows=rows, on_strip=lambda done, total: told.append(total)):
+        pass
+    assert 1 < rows < 50 and told[-1] < 1.3 * 18 * 200
+
+
 def test_progress_and_stopping(rgb):
     scene, seen = lit(rgb, BOX), []
     divided(scene, 2, rows=4, strip=64, on_strip=lambda done, total: seen.append((done, total)))
