@@ -30,7 +30,7 @@ print("\\n" + json.dumps([asdict(sound), asdict(leaking)]))
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part, count, bound", [
-    ("moving observer", 60, 100.0), ("gaze training", 300, 50.0), ("changes of variant", 6, 2000.0), ("two threads, two scenes", 24, 200.0),
+    ("moving observer", 60, 100.0), ("gaze training", 300, 50.0), ("changes of variant", 30, 2000.0), ("two threads, two scenes", 24, 200.0),
 ])  # fmt: skip
 def test_memory_stays_flat_and_a_leak_is_seen(part, count, bound):
     """Sixty frames, or as much of another part, keep a bound (KiB a unit) that leaking four times as much exceeds."""
