@@ -97,3 +97,14 @@ def test_the_order_of_rays_makes_no_difference():
     rays = walk()
     mixed = rays.select(np.random.default_rng(3).permutation(len(rays)))
     assert np.allclose(walking_agreement(mixed), walking_agreement(rays))
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_a_kilometre_is_the_most_that_origins_in_metres_span(along):
+    """Heads at eye height: nothing but how far they are apart gives the unit away."""
+    rays = walk(hit=False)
+    for span, warned in ((999.5, False), (1000.5, True)):
+        origin = rays.origin.copy()
+        origin[:, along] *= span / np.ptp(origin[:, along])
+        slow = replace(rays, origin=origin, t=rays.t * 40)  # nobody runs
+        assert ("--units mm" in said(slow)) == warned

@@ -53,6 +53,14 @@ def test01_patches_tile_the_mesh(rgb):
     assert np.isclose(dr.sum(dr.dot(cube.p, cube.n) * cube.area)[0], 3 * 2 * 4 * 6, rtol=1e-5)
 
 
+def test13_one_piece_is_the_triangle_itself(rgb):
+    corners = np.array([(0.3, 0.1, -0.2), (1.1, 0.2, 0.4), (0.2, 1.7, 0.6)])
+    whole, across = patches(mesh(rgb, corners, [(0, 1, 2)]), 1), np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    assert np.allclose(np.array(whole.p).T, [corners.mean(0)], atol=1e-6)
+    assert np.allclose(whole.area.numpy(), [np.linalg.norm(across) / 2], rtol=1e-6)
+    assert np.allclose(np.array(whole.n).T, [across / np.linalg.norm(across)], atol=1e-6)
+
+
 @pytest.mark.parametrize("bad", ["sphere", "divisions"])
 def test02_what_cannot_be_cut(rgb, bad):
     shape = rgb.load_dict({"type": "sphere" if bad == "sphere" else "cube"})
@@ -113,6 +121,14 @@ def test08_a_surface_in_the_place_does_not_hide_itself(rgb):
     eyes = rgb.Point3f(np.array([(3, 2, 1.5), (1.001, 4, 0), (0, 0, 1.2)], np.float32).T)
     surface = patches(box, 6)
     assert np.allclose(received(place, uniform, eyes, surface).numpy(), received(None, uniform, eyes, surface).numpy(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("z", [0.9, -0.9])
+def test14_neither_side_of_an_open_sheet_hides_itself(rgb, z):
+    surface, eye = patches(sheet(rgb), 8), rgb.Point3f(0.2, -0.1, z)
+    each = contributions(Place(None, rgb.load_dict({"type": "scene", "sheet": sheet(rgb)})), uniform, eye, surface, two_sided=True)
+    free = contributions(None, uniform, eye, surface, two_sided=True).numpy()
+    assert (free > 0).all() and np.allclose(each.numpy(), free, rtol=1e-5)
 
 
 def moved(rgb, surface, x, kind):

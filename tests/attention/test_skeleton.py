@@ -72,3 +72,30 @@ def test_other_keypoints_and_pitch(tmp_path):
         skeleton.rays_from_skeleton(path, keypoints=(19, 8, 10))
     with pytest.raises(ValueError, match="three different keypoints"):
         skeleton.head_poses(body, nose=skeleton.LEFT_EAR)
+
+
+def test_a_body_is_the_same_on_both_sides():
+    origin, heading = np.array([[2.0, 3.0, 1.58], [0.0, -1.0, 0.79], [0.5, 0.0, 1.7]]), np.array([0.3, 2.0, -1.1])
+    direction = np.stack([np.cos(heading), np.sin(heading), np.zeros(3)], axis=1)
+    body = skeleton.keypoints_from_head(origin, direction)
+    left = np.cross([0, 0, 1.0], direction)
+    pairs = np.array([(skeleton.LEFT_EAR, skeleton.RIGHT_EAR), (4, 15), (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19)])
+    # Mirrored in the plane through the middle of the ears in which the head looks.
+    aside = np.einsum("nkj,nj->nk", body - origin[:, None], left)[..., None]
+    mirrored = body - 2 * aside * left[:, None]
+    assert np.allclose(body[:, pairs[:, 0]], mirrored[:, pairs[:, 1]], atol=1e-12)
+    assert (aside[:, pairs[:, 0], 0] > 0.01).all()
+    # The eyes lie between the ears; heels, knees, hips and shoulders one above the other, in proportion to the height.
+    eyes, ears = (np.linalg.norm(body[:, i] - body[:, j], axis=1) for i, j in ((4, 15), (skeleton.LEFT_EAR, skeleton.RIGHT_EAR)))
+    assert (eyes < 0.6 * ears).all()
+    heights = body[:, [5, 7, 6, 8], 2] / origin[:, 2:]
+    assert (np.diff(heights, axis=1) > 0.1).all() and np.allclose(heights, heights[0])
+
+
+@pytest.mark.parametrize("origin, bad", [((0, 0, 1.6), False), ((1, 0, 0), False), ((np.nan, 1, 1.6), True), ((1, 1, np.inf), True)])
+def test_a_head_may_be_at_zero_but_not_nowhere(origin, bad):
+    if bad:
+        with pytest.raises(ValueError, match="head pose 0"):
+            skeleton.keypoints_from_head([origin], [(1, 0, 0)])
+    else:
+        assert np.allclose(skeleton.head_poses(skeleton.keypoints_from_head([origin], [(1, 0, 0)]))[0], [origin])

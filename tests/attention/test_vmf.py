@@ -1,3 +1,5 @@
+from decimal import Decimal, localcontext
+
 import numpy as np
 import pytest
 
@@ -70,3 +72,33 @@ def test_convolution_multiplies_resultants():
     assert np.allclose(vmf.convolved_kappa(a, b), vmf.convolved_kappa(b, a))
     assert np.allclose(vmf.convolved_kappa(37.0, vmf.KAPPA_MAX), 37.0, rtol=1e-4)
     assert np.isclose(vmf.convolved_kappa(1e5, 1e5), 5e4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kappa", [1e-8, 1e-3, 5e-3, 9.99e-3, 1.01e-2, 0.3, 4.0, 30.0])
+def test_resultant_length_keeps_its_digits(kappa):
+    with localcontext() as context:
+        context.prec = 60
+        k = Decimal(kappa)
+        grown, shrunk = k.exp(), (-k).exp()
+        exact = float((grown + shrunk) / (grown - shrunk) - 1 / k)
+    # Where coth κ - 1/κ is computed as it stands it loses κ² of its digits, and at 1e-2 the series takes over.
+    assert np.isclose(vmf.mean_resultant_length(kappa), exact, rtol=1e-14 if kappa < 1e-2 else 1e-11, atol=0)
+
+
+def test_kappa_of_a_resultant_length_is_its_root():
+    # Up to where the other form takes over the root is found by Newton, and to the last digits, not only nearly.
+    kappa = np.linspace(0.5, 25, 500)
+    assert np.allclose(vmf.kappa_from_resultant(1 / np.tanh(kappa) - 1 / kappa), kappa, rtol=1e-10, atol=0)
+
+
+def test_bandwidth_of_rays_that_agree_is_limited():
+    # 1/h² of rays without any spread would be above what all else is limited to.
+    assert vmf.silverman_kappa(1.0, 50) == vmf.KAPPA_MAX
+    assert np.array_equal(vmf.silverman_kappa([1.0, 1.0], [1000, 1]), [vmf.KAPPA_MAX, 1 / 1.06**2])
+
+
+def test_samples_of_no_concentration_are_uniform():
+    x = vmf.sample(np.tile([0.48, -0.6, -0.64], (20_000, 1)), 0.0, np.random.default_rng(5))
+    assert np.allclose(x.mean(axis=0), 0, atol=0.02) and np.allclose(x.T @ x / len(x), np.eye(3) / 3, atol=0.02)
+    with pytest.raises(ValueError, match="negative or NaN"):
+        vmf.sample(np.array([[0.0, 0.0, 1.0]]), -1.0, np.random.default_rng(5))
