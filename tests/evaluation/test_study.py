@@ -264,8 +264,14 @@ def test12_quick_run_of_the_command(tmp_path, capsys):
 def test12b_only_some_settings(tmp_path):
     from nerg_mi.evaluation.study import run_study
 
-    report = run_study("slab", tmp_path, width=12, height=8, quick=True, only="jitter|paper, 1024 steps$", variant="llvm_ad_rgb").report
+    told = []
+    report = run_study("slab", tmp_path, width=12, height=8, quick=True, only="jitter|paper, 1024 steps$", variant="llvm_ad_rgb",
+                       on_step=lambda name, share: told.append((name, share))).report  # fmt: skip
     assert [r["setting"] for r in report["rows"]] == ["default", "jitter", "paper, 1024 steps"]
+    # Of the share done the first renders have as much as the times, and the cost against size the rest.
+    shares = [share for _, share in told]
+    assert shares == sorted(shares) and shares[0] == 0 and shares[-1] < 1
+    assert 0.4 < dict(told)["time of default"] < 0.5 and 0.8 < dict(told)["pixels 16"] < 1
 
 
 @pytest.mark.parametrize(
