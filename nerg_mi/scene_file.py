@@ -33,7 +33,7 @@ SAMPLES = 1 << 24
 PIXELS = 1 << 28
 """A picture may have so many pixels: 16384 x 16384."""
 
-_PICTURES = {".png", ".jpg", ".jpeg", ".exr"}
+_PICTURES = {".png", ".jpg", ".jpeg", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".bmp"}
 _CHECKS = {
     "ply": check_ply, "obj": check_obj, "gridvolume": check_vol, "sdfgrid": check_vol,
     "ellipsoids": lambda path: check_ply(path, faces=False), "ellipsoidsmesh": lambda path: check_ply(path, faces=False),

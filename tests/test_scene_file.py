@@ -118,10 +118,18 @@ def test_too_many_elements(tmp_path, monkeypatch):
     refused(tmp_path, scene('<shape type="cube"/>' * 101), "more than 100 elements")
 
 
-def test_pictures_of_a_scene_are_looked_at(tmp_path):
-    head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 100000, 100000, 1, 0, 0, 0, 0)
-    (tmp_path / "a.png").write_bytes(head + bytes(40))
-    texture = '<texture name="reflectance" type="bitmap"><string name="filename" value="a.png"/></texture>'
+HUGE = {
+    "a.png": b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 100000, 100000, 1, 0, 0, 0, 0),
+    "a.hdr": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 100000 +X 100000\n",
+    "a.pfm": b"PF\n100000 100000\n-1.0\n",
+    "a.bmp": b"BM" + struct.pack("<IHHIIiiHH", 94, 0, 0, 54, 40, 100000, 100000, 1, 24),
+}
+
+
+@pytest.mark.parametrize("name", HUGE)
+def test_pictures_of_a_scene_are_looked_at(tmp_path, name):
+    (tmp_path / name).write_bytes(HUGE[name] + bytes(40))
+    texture = f'<texture name="reflectance" type="bitmap"><string name="filename" value="{name}"/></texture>'
     refused(tmp_path, scene(f'<shape type="cube"><bsdf type="diffuse">{texture}</bsdf></shape>'), "100,000 x 100,000")
 
 

@@ -48,6 +48,7 @@ def main() -> int:
     mi.set_variant("llvm_ad_rgb")
     readers = [r for r in READERS if given.only is None or given.only in r.name]
     outcomes, slowest, most, broken = defaultdict(Counter), Counter(), Counter(), []
+    interrupted = False
     with tempfile.TemporaryDirectory() as folder:
         inputs = make_inputs(readers, Path(folder))
         cases = draw_cases(readers, inputs, given.cases, given.start)
@@ -62,13 +63,15 @@ def main() -> int:
                     if given.keep:
                         (CORPUS / kept(case)).write_bytes(case.data)
         except KeyboardInterrupt:
-            # What was tried until then counts.
-            pass
+            # What was tried until then is shown; a page must not take it for the whole.
+            interrupted = True
     rows = [_row(r.name, outcomes[r.name], slowest[r.name], most[r.name]) for r in readers if outcomes[r.name]]
     rows.append(_row("all", sum(outcomes.values(), Counter()), max(slowest.values()), max(most.values())))
-    update(given.update, "Readers", table(HEAD, rows))
+    update(None if interrupted else given.update, "Readers", table(HEAD, rows))
     for case, report in broken:
         print(f"{kept(case)}: {report.outcome}: {report.said}", file=sys.stderr)
+    if interrupted:
+        return 130
     return 1 if broken else 0
 
 
