@@ -1,6 +1,7 @@
 """Evaluation of gaze: truth from persons, scores against closed forms, what is held out, the command."""
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -51,6 +52,48 @@ def test_scores_of_the_truth_and_of_nothing(test_set):
     assert flat["KLD"] == pytest.approx(float(metrics.kld(test_set.truth, np.ones((2, 512)), eps=1e-6).mean()))
     assert best["KLD.less"] == pytest.approx(best["KLD"] - flat["KLD"]) and best["KLD.less.low"] < best["KLD.less"] < best["KLD.less.high"]
     assert flat["bits.low"] == 0 and flat["KLD.low"] < flat["KLD"] < flat["KLD.high"]
+
+
+def test_other_rays_are_of_positions_farther_than_two_radii_where_there_are_any(rays):
+    """A to C stand in a row; B is within 2R of A, C of none."""
+    centres = np.array([[-0.5, 0, 1.6], [-0.5, 1, 1.6], [-0.5, 4, 1.6]])
+    of = lambda a: {tuple(v) for v in a.reshape(-1, 3)}
+    found = evaluation.make_test(rays, centres, 0.6, 20.0, 64, min_rays=20)
+    (a, b, c), others = map(of, found.at), [of(o) for o in found.others]
+    assert a.isdisjoint(c) and b.isdisjoint(c)
+    assert others[0] <= c and others[1] <= c and others[2] <= a | b and others[2] & a and others[2] & b
+    # Where all are nearer, any other one, and its own where it is alone.
+    found = evaluation.make_test(rays, centres[:2], 0.6, 20.0, 64, min_rays=20)
+    a, b = map(of, found.at)
+    assert of(found.others[0]) <= b and of(found.others[1]) <= a
+    found = evaluation.make_test(rays, centres[:1], 0.6, 20.0, 64, min_rays=20)
+    assert np.array_equal(found.others, found.at)
+
+
+def by_hand(persons: int) -> evaluation.GazeTest:
+    """One position and sixteen directions, of which each person sees one of their own; the rays are of them in turn."""
+    d = np.eye(16, 3)
+    parts = 16 / (4 * np.pi) * np.eye(16)[None, :persons]
+    who = np.arange(4 * persons)[None] % persons
+    at = np.zeros((1, 4 * persons, 3))
+    return evaluation.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, np.full((1, persons), 4.0), tuple("abcdefgh"[:persons]), at, who, at)
+
+
+def test_intervals_are_a_bootstrap_over_persons():
+    """Of three persons all 27 draws can be made: the error of a map of what one of them sees is the share of the others."""
+    test = by_hand(3)
+    first = lambda positions, directions: test.parts[:, 0] if directions.ndim == 2 else np.ones(directions.shape[:2])
+    (row,) = evaluation.evaluate_gaze(test, {"first": first}, uniform(), resamples=2000)
+    mae = [2 * (1 - draw.count(0) / 3) / (4 * np.pi) for draw in itertools.product(range(3), repeat=3)]
+    assert row["MAE"] == pytest.approx(np.mean(mae))
+    assert row["MAE.high"] - row["MAE"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
+    assert row["MAE"] - row["MAE.low"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
+
+
+@pytest.mark.parametrize("persons, known", [(2, False), (3, True), (4, True)])
+def test_fewer_than_three_persons_have_no_interval(persons, known):
+    for row in evaluation.evaluate_gaze(by_hand(persons), {"a": uniform(), "b": uniform()}, uniform(), resamples=5):
+        assert all((f"{k}.low" in row) == known and (f"{k}.high" in row) == known for k in evaluation.SCORES)
 
 
 def test_ray_scores_by_hand():

@@ -60,6 +60,10 @@ def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
 
     side_by_side(test, {"twice": twice}, tmp_path / "a.png", count=2, height=8)
     images = [a for a in drawn[0].axes if a.images]
+    # Each row has a scale of its own, which says what its colours mean.
+    scales = [a for a in drawn[0].axes if a not in images]
+    assert [a.get_ylabel() for a in scales] == ["1/sr", "1/sr"]
+    assert [tuple(a.get_ylim()) for a in scales] == [images[k].images[0].get_clim() for k in (0, 2)]
     assert np.array_equal(asked[0], centres[[0, 4]]) and [a.get_title() for a in images] == ["truth", "twice", "", ""]
     assert images[0].get_ylabel() == "0.0, 1.0, 2.0 m" and images[2].get_ylabel() == "12.0, 13.0, 14.0 m"
     for a, b in (images[:2], images[2:]):

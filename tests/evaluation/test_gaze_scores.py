@@ -121,3 +121,14 @@ def test07_scores_of_a_map_and_of_itself():
     found = scores(truth, 2 * truth)
     assert found["KLD"] < 1e-6 and found["CC"] == pytest.approx(1) and found["SIM"] == pytest.approx(1)
     assert found["MAE"] == pytest.approx(truth.mean()) and found["integral"] == pytest.approx(8 * np.pi * truth.mean())
+
+
+def test_a_density_of_zero_costs_what_a_millionth_of_the_uniform_one_does():
+    """Half of the sphere is empty, the other twice as dense: ½ ln 1/2 + ½ ln 1e6."""
+    half = np.repeat([0.0, 2.0], 32)[None] / (4 * np.pi)
+    flat = np.ones((1, 64)) / (4 * np.pi)
+    millionth = np.where(half > 0, half, 1e-6 / (4 * np.pi))
+    assert scores(flat, half)["KLD"] == pytest.approx(0.5 * np.log(1e6 / 2), abs=1e-5)
+    assert scores(flat, half)["KLD"] == pytest.approx(np.mean(np.log(flat / millionth)), abs=1e-5)
+    # The other way round nothing hinges on it.
+    assert scores(half, flat)["KLD"] == pytest.approx(np.log(2), abs=2e-5)
