@@ -15,9 +15,10 @@ class Interruption:
 
     def __enter__(self) -> Interruption:
         self.asked = False
-        # Signals can only be dealt with in the main thread; a handler that is not Python's could not be put back.
+        # Signals can only be dealt with in the main thread; a handler that is not Python's could not be put back; and where
+        # the signal is ignored, as for what a script runs in the background, it is meant for somebody else.
         main = threading.current_thread() is threading.main_thread()
-        self._mine = main and signal.getsignal(signal.SIGINT) is not None
+        self._mine = main and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN)
         if self._mine:
             self._before = signal.signal(signal.SIGINT, self._note)
         return self

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import importlib.util
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -82,6 +83,9 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_configure(config):
+    # Where tests run in the background of a script, Ctrl-C is ignored, and their children would ignore it too.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if TORCH_REQUIRED and importlib.util.find_spec("torch") is None:
         pytest.exit("NERG_REQUIRE_TORCH is set and torch is not installed: pip install torch, or unset it.", returncode=1)
 

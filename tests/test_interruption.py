@@ -32,6 +32,18 @@ def test_a_handler_that_is_not_pythons_is_left_alone(monkeypatch):
     assert not set_handlers
 
 
+def test_an_ignored_ctrl_c_stays_ignored():
+    """As for a command in the background of a script, which Ctrl-C is not meant for."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Interruption() as stop:
+            signal.raise_signal(signal.SIGINT)
+            stop.check()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture
 def scene(rgb, tmp_path):
     fields.radiance(tmp_path / "f.safetensors")
