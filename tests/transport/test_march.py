@@ -353,3 +353,21 @@ def test22_fine_steps_begin_before_matter_does(rgb):
         assert face - 2.1 * 0.08 < start[0] < face and 1 <= evals[0] <= 14
     vacuum = grid(rgb, np.zeros((4, 1, 1)))
     assert fine_start(vacuum, ray, rgb.Float(0), rgb.Float(1), rgb.Bool(True), settings)[0][0] == np.inf
+
+
+def test23_a_march_goes_on_where_it_begins_on_a_wall(rgb):
+    """Whatever rounding says of the boundary that has just been reached, also at the ray's very start."""
+
+    class Reached:
+        edge = 1 / 64
+
+        def next_boundary(self, ray, t):
+            return t - 1e-7
+
+    medium = grid(rgb, np.ones((4, 4, 4)))
+    t = rgb.Float([0, 1e-30, 1e-3, 5, 1e6])
+    ray = medium.local(rgb.Point3f(0.4, 0.6, 0), rgb.Vector3f(0, 0, 1))
+    _, begin, delta, after = advance(medium, ray, t, rgb.Float(1e9), rgb.Float(1), MarchSettings(0.01), rgb.Bool(True), Reached())
+    assert (after.numpy() > begin.numpy()).all() and (delta.numpy() > 0).all()
+    # Nothing that counts is passed over.
+    assert (delta.numpy() <= 2e-6 * np.maximum(t.numpy(), 0.01)).all()

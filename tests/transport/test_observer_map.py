@@ -84,3 +84,14 @@ def test_gaze_is_that_of_the_entries_that_see_the_point(rgb, around):
     assert np.allclose(found[sure], (interpolated(known * gaze, phi, theta) / np.where(sure, share, 1))[sure], rtol=2e-2, atol=2e-3)
     around.depth = dr.full(rgb.Float, 3.0, 2 * HEIGHT**2)
     assert (around.gaze_along(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.1, True).numpy() == -1).all()
+
+
+def test_a_map_serves_until_a_shape_moves(rgb):
+    scene = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
+    place, params = Place(None, scene), rgb.traverse(scene)
+    known = ObserverMap(place, rgb.Point3f(0.0), HEIGHT, MarchSettings(0.1), "expected", 0.5)
+    assert known.serves(place) and known.serves(Place(None, scene))
+    params[next(k for k in params.keys() if k.endswith("to_world"))] = rgb.Transform4f().translate([0, 0, 0.5])
+    params.update()
+    assert not known.serves(place) and not known.serves(Place(None))
+    assert ObserverMap(place, rgb.Point3f(0.0), HEIGHT, MarchSettings(0.1), "expected", 0.5).serves(place)

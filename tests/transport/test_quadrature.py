@@ -170,3 +170,10 @@ def test10_its_ends(mode):
     assert np.allclose(share, [0.5, 0.5, 0.5, 0, 0, 0, 0, 0], atol=1e-8)
     assert np.all(np.isfinite(slope_of(lambda x: linear_share(x, ns.Float(b)), a, mode)))
     assert np.all(np.isfinite(slope_of(lambda y: linear_share(ns.Float(a), y), b, mode)))
+
+
+def test11_the_polynomial_of_thin_steps_is_as_good_as_stated():
+    # In double precision, where its coefficients are all that errs.
+    total, r = np.meshgrid(np.linspace(2e-3, 2.999, 31), np.linspace(-1, 1, 31))
+    a, b = (0.5 * total * (1 - r)).ravel(), (0.5 * total * (1 + r)).ravel()
+    assert np.abs(linear_share(ns.Float64(a), ns.Float64(b)).numpy() - exact_linear_share(a, b)).max() < 2e-8

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.transport.cells import VoxelCells
 from nerg_mi.transport.march import MarchSettings, march
 from nerg_mi.transport.media import LocalRay, VolumeMedium
-from nerg_mi.transport.rules import KINDS, linear_crossing, linear_share, rule
+from nerg_mi.transport.rules import KINDS, color_share, linear_crossing, linear_share, rule
 
 from ..reference import march_numpy as reference
 
@@ -224,3 +225,19 @@ for distance in (3, 30, 300, 3e4):
     except subprocess.TimeoutExpired:
         pytest.fail("the march does not end")
     assert run.returncode == 0, run.stderr[-1500:]
+
+
+def test13_where_a_step_takes_its_colour():
+    # At the mean absorption for equal ends, at the denser end where the other is empty, in between by the square of (b - a) / (a + b).
+    first, last = ns.Float([2, 0, 5, 1, 3, 1, 0]), ns.Float([2, 5, 0, 3, 1, 4, 0])
+    got = color_share(first, last, ns.Float(0.4)).numpy()
+    assert np.allclose(got, [0.4, 1, 0, 0.4 + 0.6 / 4, 0.4 - 0.4 / 4, 0.4 + 0.6 * 0.36, 0.4], rtol=1e-5)
+
+
+def test14_cells_show_the_features_colour(rgb):
+    """Of homogeneous matter whose colour is linear in depth, which steps of any length integrate exactly."""
+    medium = Colored(lambda z, x: 3 * x + 0 * z, lambda z: z, ns.Float(1))
+    medium.cells = VoxelCells((0, 0, 0), (1, 1, 1), (4, 4, 4), 0.5)
+    shown = np.array(along_z(medium, 8, quadrature="cells").color)[0, 0]
+    # ∫ z σ exp(-σ z) dz over [0, 1]
+    assert np.isclose(shown, (1 - np.exp(-3) * (1 + 3)) / 3, rtol=1e-5)
