@@ -98,6 +98,23 @@ def test03_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_dep
         assert thick.sum() > 100 and np.array_equal(known.visibility[thick] > 0.999, visible[thick]), kind
 
 
+@pytest.mark.parametrize("visibility", ["depth", "transmittance"])
+def test03_what_is_no_surface_is_not_visible(visibility):
+    scene = study_scenes.SCENES["ramp"]
+    o, d = rays(scene, 64)
+    known = study_reference.truth(scene, None, o, d, depth="expected", visibility=visibility, falloff=0.1, tolerance=1e-3, surface_opacity=0.9)
+    thin = known.opacity < 0.9
+    assert 5 < thin.sum() < 60 and (known.opacity[thin] > 0.1).any() and known.opacity[-1] == 0
+    assert (known.visibility[thin] == 0).all() and (known.visibility[~thin] > 0).any() and (known.gaze == 0).all()
+
+
+def test03_volumes_fill_the_unit_cube(rgb):
+    for resolution in (0, 4):
+        for name, volume in study_scenes.volumes(study_scenes.SCENES["slab"], resolution).items():
+            box = volume.bbox()
+            assert np.array_equal([box.min, box.max], [[0, 0, 0], [1, 1, 1]]), name
+
+
 @pytest.mark.parametrize("x", [0, 1e-300, 1e-6, 9.9e-3, 1.01e-2, 1, 50, 1e9])
 def test04_mean_share(x):
     value = study_reference.mean_share(np.array([x]))[0]
