@@ -62,7 +62,7 @@ COMMANDS = (
     Command("export points", "export points IN/store.safetensors -o OUT --resolution 48", "points.ply", ("points.ply",), 8),
     Command("export volume", "export volume IN/store.safetensors -o OUT --resolution 48", "density.vol", ("density.vol",), 8),
     Command("render", "render IN/scene.xml -o OUT --spp 1 -m llvm_ad_rgb -D width=96 -D height=64", "scene.exr", ("scene.exr",), 10),
-    Command("study", "study sphere -o OUT --quick --width 24 --height 16 -m llvm_ad_rgb --only level", "study",
+    Command("study", "study sphere -o OUT --quick --width 24 --height 16 -m llvm_ad_rgb --only coarse", "study",
             ("study/study.csv", "study/study.md", "study/study.json"), 6),
 )  # fmt: skip
 
