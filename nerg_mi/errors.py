@@ -71,7 +71,8 @@ def mitsuba_says() -> Iterator[None]:
         kind = _raised(trace).partition(":")[0].strip().rpartition(".")[2] if marker else None
         if kind is not None and kind not in _MENDABLE:
             raise
-        raise NergError(sentence(error)) from error
+        # Mitsuba quotes the files that it cannot read.
+        raise NergError(plain(sentence(error), 1000)) from error
 
 
 def sentence(error: BaseException) -> str:
@@ -93,6 +94,14 @@ def sentence(error: BaseException) -> str:
         text = before.rstrip() + " " + re.sub(r"^[A-Za-z_][\w.]*:\s+", "", _raised(trace))
     text = re.sub(r"^\[[\w.]+\.(cpp|h):\d+\]\s*", "", text)
     return " ".join(text.split()) or type(error).__name__
+
+
+def plain(text: object, most: int = 300) -> str:
+    """``text`` from a file, fit for one line of a message: control characters and what lies beyond ``most`` left
+    out.
+    """
+    kept = "".join(c if c.isprintable() else "?" for c in str(text)[: most + 1])
+    return kept if len(kept) <= most else kept[:most] + "..."
 
 
 def _raised(trace: str) -> str:

@@ -76,6 +76,9 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
             if unused:
                 raise NergError(f'the scene "{path}" asks for no "${unused[0]}": correct the name that is given a value.') from error
             raise
+        except UnicodeDecodeError as error:
+            # Mitsuba quotes what it cannot read, and that is no text.
+            raise NergError(f'a mesh or another file that the scene "{path}" names is damaged: make it anew.') from error
     check_scene(path, loaded)
     return loaded
 

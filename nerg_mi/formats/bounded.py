@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MissingFile, NergError, sentence
+from ..errors import MissingFile, NergError, plain, sentence
 
 JSON_BYTES = 64 << 20
 """A JSON file may have so many bytes: the poses of some 80,000 frames."""
@@ -36,8 +36,6 @@ JSON_DEPTH = 64
 
 LINE_CHARACTERS = 16 << 20
 """A line of a text file may be so long: COLMAP lists all observations of an image on one."""
-
-_SAID = 300
 
 _DAMAGED = (
     OSError, EOFError, ValueError, KeyError, IndexError, OverflowError, MemoryError, RecursionError,
@@ -94,14 +92,6 @@ def _remedy(error: BaseException, remedy: str) -> str:
     if isinstance(error, (IsADirectoryError, NotADirectoryError)):
         return "give the name of a file"
     return remedy
-
-
-def plain(text: object, most: int = _SAID) -> str:
-    """``text`` from a file, fit for one line of a message: control characters and what lies beyond ``most`` left
-    out.
-    """
-    kept = "".join(c if c.isprintable() else "?" for c in str(text)[: most + 1])
-    return kept if len(kept) <= most else kept[:most] + "..."
 
 
 def is_count(value: object) -> bool:

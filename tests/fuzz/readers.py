@@ -2,6 +2,7 @@
 
 from tests.fuzz.capture_readers import CAPTURES
 from tests.fuzz.checkpoint_readers import CHECKPOINTS
+from tests.fuzz.scene_readers import SCENES
 from tests.fuzz.tracking_readers import TRACKING
 
-READERS = [*CHECKPOINTS, *CAPTURES, *TRACKING]
+READERS = [*CHECKPOINTS, *CAPTURES, *SCENES, *TRACKING]

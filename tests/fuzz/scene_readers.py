@@ -1,0 +1,62 @@
+"""Scene files and what they name: meshes and grid volumes, which Mitsuba reads once they have been looked at."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from tests.fuzz.describe import Reader
+
+_SCENE = """<scene version="3.0.0">
+    <default name="side" value="8"/>
+    <integrator type="nerg">
+        <volume name="density" type="gridvolume">
+            <string name="filename" value="fog.vol"/>
+        </volume>
+        <string name="aovs" value="depth,opacity"/>
+    </integrator>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, -4" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="$side"/><integer name="height" value="4"/></film>
+        <sampler type="independent"><integer name="sample_count" value="1"/></sampler>
+    </sensor>
+    <shape type="ply"><string name="filename" value="binary.ply"/></shape>
+    <shape type="ply"><string name="filename" value="text.ply"/></shape>
+    <shape type="obj"><string name="filename" value="a.obj"/></shape>
+</scene>
+"""
+_PLY = "ply\nformat {} 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+_CORNERS = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+
+
+def _make(folder: Path) -> None:
+    (folder / "scene.xml").write_text(_SCENE)
+    triangle = np.array(_CORNERS, "<f4").tobytes() + struct.pack("<Biii", 3, 0, 1, 2)
+    (folder / "binary.ply").write_bytes(_PLY.format("binary_little_endian").encode() + triangle)
+    (folder / "text.ply").write_text(_PLY.format("ascii") + "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    (folder / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    head = struct.pack("<3sBiiiii6f", b"VOL", 3, 1, 3, 2, 2, 1, 0, 0, 0, 1, 1, 1)
+    (folder / "fog.vol").write_bytes(head + np.ones(12, "<f4").tobytes())
+
+
+def _read(folder: Path) -> object:
+    import mitsuba as mi
+
+    import nerg_mi  # noqa: F401
+    from nerg_mi.rendering import load_scene
+
+    if mi.variant() != "llvm_ad_rgb":
+        mi.set_variant("llvm_ad_rgb")
+    scene = load_scene(folder / "scene.xml")
+    return [shape.bbox() for shape in scene.shapes()]
+
+
+def _reader(name: str, *kinds: str) -> Reader:
+    return Reader(f"scene's {name}", _make, {name: kinds}, _read)
+
+
+SCENES = [
+    _reader("scene.xml", "text"), _reader("binary.ply"), _reader("text.ply", "text"), _reader("a.obj", "text"), _reader("fog.vol"),
+]  # fmt: skip
