@@ -12,9 +12,9 @@ GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((-1, -1, -1), (1, 1, 1))
 
 
-def radiance(path, density_scale=2.0, seed=0, occupancy=None, **kwargs):
+def radiance(path, density_scale=2.0, seed=0, occupancy=None, geometry=7, **kwargs):
     field = RadianceField.random(
-        RadianceConfig(GRID, width=16, geometry=7, sh_degree=2, density_scale=density_scale), BOX, ns, seed,
+        RadianceConfig(GRID, width=16, geometry=geometry, sh_degree=2, density_scale=density_scale), BOX, ns, seed,
         occupancy=occupancy, march_step=0.1, **kwargs,
     )  # fmt: skip
     table = np.random.default_rng(seed).normal(size=len(field.grid.table)).astype(np.float32)

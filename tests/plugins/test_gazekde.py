@@ -140,3 +140,15 @@ def test08_a_frozen_function_is_refused_in_a_sentence(rgb, rays):
     while error is not None and "leave them out" not in str(error):
         error = error.__cause__ or error.__context__
     assert error is not None
+
+
+def test09_where_no_surface_is_there_is_no_density(rgb, rays):
+    """Neither beside a shape nor where matter is thinner than a surface."""
+    eye, sensor = (0.1, -0.2, 0.3), camera(rgb, (0.5, 0.4, -3), (0, 0, 0), fov=60)
+    ball = {"type": "sphere", "center": [0.3, 0.2, -0.4], "radius": 0.5}
+    thin = {"density": {"type": "constvolume", "value": 0.4}, "surface_opacity": 0.5, "occlusion": False}
+    out = channels(rgb, shown(rays, "kde,position,opacity", observer=observer_at(rgb, *eye), **thin), sensor, ball=ball)
+    solid = out["opacity.Y"] == 1
+    assert solid.sum() > 5 and (out["opacity.Y"][~solid] > 0).any() and (out["opacity.Y"] == 0).any()
+    assert not out["kde.Y"][~solid].any()
+    np.testing.assert_allclose(out["kde.Y"][solid], expected(eye, out)[solid], rtol=1e-3, atol=1e-5)

@@ -244,3 +244,19 @@ def test15_a_voxel_grid_that_changes_is_seen(rgb):
     params.update()
     after = np.array(rgb.render(scene, spp=1))[..., 3].item()
     assert before < 0.5 and np.isclose(after, 1 - math.exp(-2), rtol=1e-4)
+
+
+def test16_another_integrator_may_ask_for_some_rays_only(rgb):
+    """All of them, unless it says which; the others are black, not valid, and have no depth."""
+    scene = rgb.load_dict({"type": "scene", "integrator": constant(aovs="depth,opacity", background=0.5), "sensor": camera(rgb)})
+    x = np.linspace(0.1, 1.9, 10, dtype=np.float32)  # five through the cube, five past it
+    ray = rgb.RayDifferential3f(rgb.Point3f(x, 0.4, -1), rgb.Vector3f(0, 0, 1))
+    sampler = rgb.load_dict({"type": "independent"})
+    sampler.seed(0, len(x))
+    ask = scene.integrator().sample
+    whole, wanted = ask(scene, sampler, ray), np.arange(10) % 3 > 0
+    color, valid, aovs = (np.array(whole[0]), np.array(whole[1]), np.array(whole[2]))
+    assert np.allclose(color, 0.5 * np.where(x < 1, np.exp(-3), 1), rtol=1e-4) and np.array_equal(valid, x < 1)
+    some = ask(scene, sampler, ray, None, rgb.Bool(wanted))
+    assert np.array_equal(np.array(some[0]), color * wanted) and np.array_equal(np.array(some[1]), valid & wanted)
+    assert np.array_equal(np.array(some[2]), aovs * wanted)
