@@ -16,10 +16,10 @@ from nerg_mi.field.gaze import GazeConfig, GazeField
 from nerg_mi.field.hashgrid import HashGridConfig
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.training import gaze_run
-from nerg_mi.training.gaze import GazeTrainer
+from nerg_mi.training.gaze import GazeTrainer, _Samples
 from nerg_mi.training.gaze_model import gaze_density, used_parameters
 from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
-from nerg_mi.training.gaze_supervision import box_exit, rotated_sets, supervise, supervise_rays
+from nerg_mi.training.gaze_supervision import Supervision, box_exit, rotated_sets, supervise, supervise_rays
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.training.hit_geometry import volume_dict, voxelise_hits
 from nerg_mi.transport.media import Similarity, VolumeMedium
@@ -53,6 +53,40 @@ def wall(rgb):
     to_world = rgb.ScalarTransform4f().translate([-2, -2, 0]).scale([4, 4, 3])
     volume = {"type": "gridvolume", "data": rgb.TensorXf(data), "filter_type": "nearest", "to_world": to_world}
     return VolumeMedium(rgb.load_dict(volume))
+
+
+@pytest.fixture
+def drawn():
+    """Three probes of four directions, the first of the whole sphere, the others of parts of it; and the same on the device."""
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(3, 4, 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    data = Supervision(rng.uniform(-1, 1, (3, 3)), directions, rng.random((3, 4)), rng.uniform(1, 2, (3, 4)), np.zeros((3, 4), bool),
+                       extent=np.array([4 * np.pi, 1.5, 0.5], np.float32))  # fmt: skip
+    return data, _Samples(data, namespace("llvm"))
+
+
+def test_directions_of_a_batch_are_those_of_its_probes(drawn):
+    data, samples = drawn
+    probe, which = np.array([2, 0, 2]), np.array([[3, 1], [0, 0], [1, 2]])
+    p_od, p_o, r_o, index = samples.gather(probe, which)
+    towards, distance = data.directions[probe[:, None], which], data.distance[probe[:, None], which]
+    np.testing.assert_allclose(p_o.numpy().T, data.positions[probe], rtol=1e-6)
+    np.testing.assert_allclose(r_o.numpy().T, towards.reshape(-1, 3), rtol=1e-6)
+    ends = data.positions[probe][:, None] + towards * distance[..., None]
+    np.testing.assert_allclose(p_od.numpy().T, ends.reshape(-1, 3), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(samples.truth(index).numpy(), data.truth[probe[:, None], which].ravel(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_only_views_are_given_what_they_show(drawn, known):
+    """A part of the sphere has the truth's integral, or one; the whole sphere and what is zero throughout stay as they are."""
+    data, samples = drawn
+    density = np.array([[1.0, 2, 3, 4], [0, 1, 0, 2], [0, 0, 0, 0]])
+    flat = lambda v: samples.ns.Float(v.ravel().astype(np.float32))
+    got = samples.given_view(flat(density), np.arange(3), flat(data.truth) if known else None).numpy().reshape(3, 4)
+    goal = data.truth[1].mean() * 1.5 if known else 1.0
+    np.testing.assert_allclose(got, [density[0], density[1] * goal / (0.75 * 1.5), density[2]], rtol=1e-5)
 
 
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])

@@ -96,9 +96,13 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):  # noqa: F811
         together(state=path, resume=True, probes=replace(PROBES, kappa=9.0))
     seen.clear()
     written = []
-    got, about = together(state=path, resume=True, on_progress=lambda s: seen.append(s.stage),
+    shares = []
+    got, about = together(state=path, resume=True, on_progress=lambda s: (seen.append(s.stage), shares.append(s.done)),
                           write=lambda *_: written.append(sorted(p.name for p in tmp_path.iterdir())))
     assert set(seen) == {"2/3 probes", "2/3 fit", "3/3 probes", "3/3 fit"} and seen.count("2/3 fit") == 2
+    # Each member is a third of what is done, the first of them from before.
+    assert shares == sorted(shares) and shares[-1] == pytest.approx(1)
+    assert all(int(stage[0]) - 1 - 1e-9 <= 3 * share <= int(stage[0]) + 1e-9 for stage, share in zip(seen, shares))
     assert written == [[f"a.member{k}.safetensors" for k in range(3)]] and not list(tmp_path.iterdir()) and about["steps"] == 12
     expected = arrays(together()[0])
     for name, value in arrays(got).items():

@@ -1,6 +1,7 @@
 """Settings of a gaze training: their limits, and the learning rate over a run."""
 import pytest
 
+from nerg_mi.training.gaze_recipes import gaze_recipe
 from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
 
 
@@ -28,3 +29,12 @@ def test_the_learning_rate_is_held_and_then_falls_to_its_last():
 def test_a_larger_field_has_more_of_everything():
     small, paper = sized_gaze_config("small"), sized_gaze_config("paper")
     assert small.grid.size < paper.grid.size and small.grid.levels < paper.grid.levels and small.grid.log2_rows < paper.grid.log2_rows
+
+
+def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():
+    """Each probe is drawn fifty times; the rate of the authors' scheduler is lower with every step, to a tenth at the end."""
+    recipe = gaze_recipe("paper")
+    assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["count"]
+    settings = GazeSettings(**recipe.settings)
+    assert settings.rate(0) == 1e-3 and settings.rate(0.01) < 1e-3
+    assert settings.rate(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.rate(1) == pytest.approx(1e-4)

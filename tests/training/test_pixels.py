@@ -101,6 +101,16 @@ def test_views_without_alpha_or_depth_among_others():
     assert np.allclose(batch.depth.numpy(), depth, atol=9 / 65535)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_what_has_no_alpha_is_opaque_among_what_has(dtype):
+    rng = np.random.default_rng(3)
+    views = [view(PLAIN, rng, dtype, channels=4), view(PLAIN, rng, dtype)]
+    bank = PixelBank(ns, views)
+    count = PLAIN.width * PLAIN.height
+    alpha = bank.batch(dr.arange(ns.UInt32, bank.size)).alpha.numpy()
+    assert bank.size == 2 * count and np.abs(alpha[count:] - 1).max() < 1e-6 and alpha[:count].min() < 0.1
+
+
 def test_known_depth_never_rounds_to_unknown():
     v = view(PLAIN, np.random.default_rng(4))
     depth = np.full(v.shape, 1e-3, np.float32)

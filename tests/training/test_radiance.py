@@ -274,3 +274,85 @@ def test_features_that_no_ray_shapes_are_let_go(dataset):
     assert left(0.1) < 0.4 < left(0.0)
     with pytest.raises(ValueError, match="must be 0 or more"):
         settings(grid_decay=-1.0)
+
+
+def test_a_march_takes_1024_steps_through_the_box():
+    """From corner to corner of a cube, as the paper's."""
+    assert RadianceSettings(steps=1).march_step * BOX.side * 1024 == pytest.approx(BOX.diagonal)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_free_space_is_carved_where_all_depth_is_known(dataset, depth):
+    """Cells far in front of the surface are then empty from the start; without depth nothing is known of them."""
+    views = [replace(v, depth=np.where(v.depth > 0, v.depth, 9).astype(np.float32)) for v in dataset.train]
+    trainer = RadianceTrainer(views, BOX, TINY, settings(), ns, depth=depth)
+    assert trainer.carved == depth and trainer.pixels.depth_everywhere
+    # Where the cameras are looking from to the ball: nearer to them than its surface by four cells and more.
+    p = dr.normalize(ns.Array3f(*np.random.default_rng(0).normal(size=(3, 500)).astype(np.float32))) * 0.9
+    seen = trainer.grid.occupied(p, dr.full(ns.Bool, True, 500)).numpy()
+    assert (seen.mean() < 0.2) == depth
+
+
+def test_places_count_first_and_colours_later(dataset, monkeypatch):
+    """The loss of depth alone, of one a ray: its weight, which falls by ``final_depth`` over the run."""
+    from nerg_mi.training import radiance
+
+    monkeypatch.setattr(radiance, "color_loss", lambda *given: 0 * color_loss(*given))
+    monkeypatch.setattr(radiance, "depth_loss", lambda *given: 0 * depth_loss(*given) + 1)
+    for steps in (0, 49, 99):
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(steps=100, depth_weight=0.3, final_depth=0.04, distortion_weight=0.0), ns)
+        trainer.steps = steps
+        trainer.step()
+        assert float(trainer.loss[0]) == pytest.approx(0.3 * 0.04 ** ((steps + 1) / 100), rel=1e-4)
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.4])
+def test_damping_reaches_a_share_of_the_box_from_the_camera(dataset, monkeypatch, reach):
+    from nerg_mi.training import radiance
+
+    reaches = []
+    monkeypatch.setattr(radiance, "damp_near", lambda values, t, width: reaches.append(float(width[0])) or damp_near(values, t, width))
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(steps=100, reach=reach, reach_share=0.5), ns)
+    trainer.step()
+    # The first of a hundred steps, of which half are damped.
+    assert reaches == ([pytest.approx(reach * BOX.side * 0.98)] if reach else [])
+
+
+def test_weights_move_however_faint_their_gradient(dataset):
+    """Entries of the grid that few rays see are not left behind: a step is that of Adam, whatever the gradient's scale."""
+    moved = []
+    for scale in (1.0, 1e-13):
+        optimiser = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns).optimiser
+        name = "grid.table"
+        before = optimiser[name].numpy().astype(float)
+        dr.set_grad(optimiser[name], dr.full(type(optimiser[name]), scale, dr.width(optimiser[name])))
+        optimiser.step()
+        moved.append(np.abs(optimiser[name].numpy() - before))
+    assert moved[0].min() > 0 and np.allclose(moved[1], moved[0], rtol=0.05)
+
+
+def test_a_preview_shows_colours_within_their_range_beside_the_truth(dataset, tmp_path, rgb):
+    """What is brighter than white is white, and not dark again."""
+    from types import SimpleNamespace
+
+    from nerg_mi.training.radiance_run import _write_preview
+
+    seen = np.zeros((12, 12, 3), np.float32)
+    seen[:, :4], seen[:, 4:8], seen[:, 8:] = 1.7, -0.4, 0.5
+    trainer = SimpleNamespace(pixels_within=lambda views, most: 2, render=lambda view, every: SimpleNamespace(color=seen))
+    _write_preview(trainer, dataset.held_out[0], tmp_path / "a.png")
+    picture = np.array(rgb.Bitmap(str(tmp_path / "a.png")))
+    assert picture.shape == (12, 24, 3)
+    assert (picture[:, :4] == 255).all() and (picture[:, 4:8] == 0).all() and (picture[:, 8:12] == 128).all()
+    truth = 255 * dataset.held_out[0].over(0)[1::2, 1::2]
+    assert np.abs(picture[:, 12:] - truth).max() <= 1
+
+
+def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
+    from nerg_mi.training import radiance_run
+
+    shown = []
+    monkeypatch.setattr(radiance_run, "_write_preview", lambda trainer, view, path: shown.append(view))
+    monkeypatch.setattr(radiance_run, "_LOOK_GAP", 1)
+    train_radiance(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
+    assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)

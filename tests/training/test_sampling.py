@@ -1,4 +1,6 @@
 """Marching: each candidate has its ray and step, and no step of a training takes on more than it may."""
+from types import SimpleNamespace
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
@@ -68,3 +70,19 @@ def test_a_ray_that_alone_is_too_long_is_refused():
     r, offset = rays(3)
     with pytest.raises(ValueError, match="a single ray has more than 50 steps"):
         occupied_steps(r, StepTable(ns, 0.01, 4, 0.01, 0), offset, lambda p, a: a, most=50)
+
+
+@pytest.mark.parametrize("growth", [0, 1 / 16])
+def test_edges_rise_by_the_rule_and_one_step_beyond_the_end(growth):
+    """Jitter shifts every edge by up to a step: a ray that is shifted by all of the last one still ends beyond ``far``."""
+    table = StepTable(ns, 0.1, 4.03, 0.05, growth)
+    edges = table.edges.numpy()[: table.steps + 1].astype(float)
+    np.testing.assert_allclose(np.diff(edges), np.maximum(0.05, growth * edges[:-1]), rtol=1e-4)
+    assert edges[0] == pytest.approx(0.1) and edges[-3] < 4.03 <= edges[-2]
+
+
+def test_more_candidates_than_indices_are_refused():
+    """They are counted in 32 bits: one more would be the first again."""
+    table = SimpleNamespace(steps=2, split=lambda index: pytest.fail("candidates are made"))
+    with pytest.raises(ValueError, match="2147483648 rays of 2 steps are too many"):
+        occupied_steps(SimpleNamespace(count=2**31), table, ns.Float(0), lambda p, a: a)
