@@ -100,6 +100,29 @@ def test_the_state_is_kept_every_so_often_and_when_asked(monkeypatch, tmp_path):
     gaze_state.GazeRunFile(None, {}, 10.0, False).keep("fit", None, {}, {}, now=True)
 
 
+def test_what_was_found_is_kept_before_the_second_fit_is_prepared(wall, monkeypatch, tmp_path):  # noqa: F811
+    """Probes and depths of all rays take long: whoever ends the run there does not train the first fit again."""
+    from nerg_mi.training import gaze_run
+
+    supervise, calls = gaze_run.supervise_both, []
+
+    def killed(rays, *rest):
+        calls.append(len(rays))
+        if len(calls) == 3:
+            raise MemoryError("killed")
+        return supervise(rays, *rest)
+
+    path, how = tmp_path / "a.run", {"state": tmp_path / "a.run", "save_every": 1e9}
+    monkeypatch.setattr(gaze_run, "supervise_both", killed)
+    with pytest.raises(MemoryError):
+        train(wall, PRODUCT, SMALL, **how)
+    # To watch, to learn without what is watched, and of all rays.
+    assert calls[0] == calls[2] > calls[1] and path.is_file()
+    watch = stopping("", 0)
+    _, about = train(wall, PRODUCT, SMALL, resume=True, on_progress=watch, **how)
+    assert {stage for stage, _ in watch.seen} == {"probes", "refit"} and about["refitted"]
+
+
 def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):  # noqa: F811
     """16 probes, 4 a step: an epoch is four steps. Without it there is one set of directions."""
     from nerg_mi.training import gaze_supervision

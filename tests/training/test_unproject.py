@@ -65,6 +65,18 @@ def test_fisheyes(name):
     assert np.abs(projected(lens, d) - np.stack(pixels(lens), axis=1)).max() < 5e-5
 
 
+@pytest.mark.parametrize("name", FISHEYES)
+def test_angles_of_fisheyes_are_right_to_rounding(name):
+    """The polynomial of the angle is the pixel's radius, in the median to a unit in the last place of single precision."""
+    lens = FISHEYES[name]
+    column, row = pixels(lens)
+    d = directions([lens], 0)
+    t = np.arctan2(np.hypot(d[:, 0], d[:, 1]), d[:, 2])
+    radius = t * (1 + lens.k1 * t**2 + lens.k2 * t**4 + lens.k3 * t**6 + lens.k4 * t**8)
+    error = np.abs(radius - np.hypot((column + 0.5 - lens.cx) / lens.fx, (row + 0.5 - lens.cy) / lens.fy))
+    assert np.median(error) < 2.0**-23 and error.max() < 1e-6
+
+
 def test_the_pixel_on_the_axis_looks_along_it():
     lens = replace(FISHEYES["rising"], cx=11.5, cy=9.5)
     d = directions([lens], 0).reshape(18, 24, 3)
