@@ -57,7 +57,8 @@ def test_the_plot_has_as_much_room_for_each_variant_however_many_there_are(tmp_p
     assert widths[1] - widths[0] == widths[2] - widths[1] > 0 and np.ptp(heights) == 0
     # Two bars a variant, of training and of test probes, and their names below.
     (axis,) = drawn[1].axes
-    assert len(axis.patches) == 12 and [t.get_text() for t in axis.get_xticklabels()] == [f"v{k}\n(default)" for k in range(6)]
+    assert len(axis.patches) == 12
+    assert [t.get_text() for t in axis.get_xticklabels()] == [f"v{k}\n(default)" for k in range(6)]
     assert np.allclose([b.get_height() for b in axis.patches], [1.0] * 6 + [1.0 / 1.1] * 6)
 
 

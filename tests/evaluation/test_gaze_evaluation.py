@@ -75,12 +75,12 @@ def by_hand(persons: int) -> evaluation.GazeTest:
     d = np.eye(16, 3)
     parts = 16 / (4 * np.pi) * np.eye(16)[None, :persons]
     who = np.arange(4 * persons)[None] % persons
-    at = np.zeros((1, 4 * persons, 3))
-    return evaluation.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, np.full((1, persons), 4.0), tuple("abcdefgh"[:persons]), at, who, at)
+    at, counts, names = np.zeros((1, 4 * persons, 3)), np.full((1, persons), 4.0), tuple("abcdefgh"[:persons])
+    return evaluation.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, counts, names, at, who, at)
 
 
 def test_intervals_are_a_bootstrap_over_persons():
-    """Of three persons all 27 draws can be made: the error of a map of what one of them sees is the share of the others."""
+    """Of three persons all 27 draws can be made: the error of what one of them sees is the share of the others."""
     test = by_hand(3)
     first = lambda positions, directions: test.parts[:, 0] if directions.ndim == 2 else np.ones(directions.shape[:2])
     (row,) = evaluation.evaluate_gaze(test, {"first": first}, uniform(), resamples=2000)

@@ -102,7 +102,8 @@ def test03_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_dep
 def test03_what_is_no_surface_is_not_visible(visibility):
     scene = study_scenes.SCENES["ramp"]
     o, d = rays(scene, 64)
-    known = study_reference.truth(scene, None, o, d, depth="expected", visibility=visibility, falloff=0.1, tolerance=1e-3, surface_opacity=0.9)
+    known = study_reference.truth(scene, None, o, d, depth="expected", visibility=visibility, falloff=0.1, tolerance=1e-3,
+                                  surface_opacity=0.9)  # fmt: skip
     thin = known.opacity < 0.9
     assert 5 < thin.sum() < 60 and (known.opacity[thin] > 0.1).any() and known.opacity[-1] == 0
     assert (known.visibility[thin] == 0).all() and (known.visibility[~thin] > 0).any() and (known.gaze == 0).all()
@@ -282,8 +283,8 @@ def test12b_only_some_settings(tmp_path):
     from nerg_mi.evaluation.study import run_study
 
     told = []
-    report = run_study("slab", tmp_path, width=12, height=8, quick=True, only="jitter|paper, 1024 steps$", variant="llvm_ad_rgb",
-                       on_step=lambda name, share: told.append((name, share))).report  # fmt: skip
+    report = run_study("slab", tmp_path, width=12, height=8, quick=True, only="jitter|paper, 1024 steps$",
+                       variant="llvm_ad_rgb", on_step=lambda name, share: told.append((name, share))).report  # fmt: skip
     assert [r["setting"] for r in report["rows"]] == ["default", "jitter", "paper, 1024 steps"]
     # Of the share done the first renders have as much as the times, and the cost against size the rest.
     shares = [share for _, share in told]

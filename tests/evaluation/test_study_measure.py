@@ -61,6 +61,7 @@ def test_cost_is_taken_along_doublings_from_the_scene_itself(quick):
 
 def test_every_row_is_announced_before_it_is_rendered_and_before_its_times():
     subject, said = open_subject("slab", "auto", 6, 4), []
-    rows = [Setting("default", "default"), Setting("depth only", "leave out", {"aovs": "depth,opacity", "radiance": False})]
+    less = {"aovs": "depth,opacity", "radiance": False}
+    rows = [Setting("default", "default"), Setting("depth only", "leave out", less)]
     study_measure.measure(subject, rows, 2, on_step=said.append)
     assert said == ["default", "depth only", "time of default", "time of depth only"]

@@ -36,7 +36,8 @@ def test_the_observers_evaluations_are_added_and_gaze_takes_none(seen):
     more = looked["density_evals"] - depth["density_evals"]
     assert surface.any() and not surface.all()
     assert (depth["density_evals"] >= 0).all() and (more[surface] >= 1).all() and (more[~surface] == 0).all()
-    assert np.array_equal(looked["density_evals"], gazed["density_evals"]) and np.array_equal(looked["visibility"], gazed["visibility"])
+    for name in ("density_evals", "visibility"):
+        assert np.array_equal(looked[name], gazed[name])
     attended = gazed["visibility"] > 0
     assert attended.any() and (gazed["gaze"][attended] > 0).any() and (gazed["gaze"][~attended] == 0).all()
 
@@ -51,7 +52,7 @@ def test_the_picture_tends_to_the_true_one_and_is_black_without_radiance(seen):
 
 @pytest.mark.parametrize("dt_gamma", [0.0, 0.05])
 def test_empty_cells_are_left_without_a_loss(dt_gamma):
-    """Where steps do not grow, the same samples are taken beyond an empty cell as without a leap; nothing in it is evaluated."""
+    """Where steps do not grow, the same samples are taken beyond an empty cell as without a leap; none in it."""
     rng = np.random.default_rng(3)
     grid = OccupancyGrid(rng.random((5, 4, 6)) < 0.4, ns, 0)
 
@@ -64,17 +65,20 @@ def test_empty_cells_are_left_without_a_loss(dt_gamma):
     d = np.stack([rng.random(count), rng.random(count), np.full(count, 1.2)]) - o
     d /= np.linalg.norm(d, axis=0)
     t0, t1 = (ns.Float(np.asarray(a / d[2], np.float32)) for a in (0.5, 1.5))
-    ray = LocalRay(ns.Array3f(o.astype(np.float32)), ns.Array3f(d.astype(np.float32)), ns.Array3f(d.astype(np.float32)), t0, t1)
+    origin, way = (ns.Array3f(v.astype(np.float32)) for v in (o, d))
+    ray = LocalRay(origin, way, way, t0, t1)
     found = []
     for occupancy in (grid, None):
         medium = SimpleNamespace(occupancy=occupancy, to_unit=lambda p: p, vector_to_unit=lambda v: v, density=density)
-        alpha, depth, _, n = study_paper.march(medium, ray, t0, t1, True, None, steps=4096, shortest=step, longest=0.02, dt_gamma=dt_gamma)
+        how = {"steps": 4096, "shortest": step, "longest": 0.02, "dt_gamma": dt_gamma}
+        alpha, depth, _, n = study_paper.march(medium, ray, t0, t1, True, None, **how)
         found.append([np.array(v, float) for v in (alpha, depth, n)])
     leaping, whole = found
     assert (leaping[2] <= whole[2]).all() and leaping[2].mean() < 0.6 * whole[2].mean()
     # A sample at a wall may fall to either side of it by rounding; grown steps begin elsewhere behind a leap.
     bound = 0.04 if dt_gamma else 0.01
-    assert whole[0].max() > 0.5 and np.abs(leaping[0] - whole[0]).max() < bound and np.abs(leaping[1] - whole[1]).max() < 2 * bound
+    assert whole[0].max() > 0.5 and np.abs(leaping[0] - whole[0]).max() < bound
+    assert np.abs(leaping[1] - whole[1]).max() < 2 * bound
     if not dt_gamma:
         assert np.median(np.abs(leaping[0] - whole[0])) < 1e-5
         # As many as lie in occupied cells of the unit cube.

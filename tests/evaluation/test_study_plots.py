@@ -23,25 +23,35 @@ def row(group, seconds, error, pareto=""):
 
 
 ALL = "color depth visibility gaze"
-ROWS = [row("default", 0.02, 1e-3, ALL), row("steps", 0.01, 2e-3, ALL), row("steps", 0.16, 0.0, ALL), row("paper", 0.08, 5e-3)]
-SCALING = [{"axis": axis, "value": v, "seconds": 0.1 * v**p} for axis, p in (("pixels", 1.0), ("samples", 0.5), ("extent", 2.0)) for v in (1, 2, 4, 8)]
+ROWS = [
+    row("default", 0.02, 1e-3, ALL), row("steps", 0.01, 2e-3, ALL), row("steps", 0.16, 0.0, ALL),
+    row("paper", 0.08, 5e-3),
+]  # fmt: skip
+SCALING = [
+    {"axis": axis, "value": v, "seconds": 0.1 * v**p}
+    for axis, p in (("pixels", 1.0), ("samples", 0.5), ("extent", 2.0)) for v in (1, 2, 4, 8)
+]  # fmt: skip
 
 
 def test_panels_show_all_rows_and_the_front_below_them(drawn):
     study_plots.plot_errors("a.png", ROWS, "title")
     panels = drawn[0].axes
-    assert [a.get_ylabel() for a in panels] == [label for _, label in study_plots.PANELS] and {a.get_xlabel() for a in panels} == {"seconds a picture"}
+    assert [a.get_ylabel() for a in panels] == [label for _, label in study_plots.PANELS]
+    assert {a.get_xlabel() for a in panels} == {"seconds a picture"}
     for axes in panels:
         (front,) = axes.lines
         # In the order of time; an error of zero stands on the axis' lower end.
-        assert np.allclose(front.get_xydata(), [(0.01, 2e-3), (0.02, 1e-3), (0.16, study_plots.FLOOR)]) and front.get_drawstyle() == "steps-post"
+        assert np.allclose(front.get_xydata(), [(0.01, 2e-3), (0.02, 1e-3), (0.16, study_plots.FLOOR)])
+        assert front.get_drawstyle() == "steps-post"
         points = {len(c.get_offsets()): c for c in axes.collections}
-        assert sum(len(c.get_offsets()) for c in axes.collections) == 4 and np.allclose(points[2].get_offsets(), [(0.01, 2e-3), (0.16, study_plots.FLOOR)])
+        assert sum(len(c.get_offsets()) for c in axes.collections) == 4
+        assert np.allclose(points[2].get_offsets(), [(0.01, 2e-3), (0.16, study_plots.FLOOR)])
         assert all(c.get_zorder() > front.get_zorder() for c in axes.collections)
         assert axes.get_xscale() == axes.get_yscale() == "log"
     crosses = [c for c in panels[0].collections if np.allclose(c.get_offsets(), [(0.08, 5e-3)])]
     assert len(crosses) == 1 and tuple(crosses[0].get_facecolor()[0]) == to_rgba("crimson")
-    assert sorted(t.get_text() for t in drawn[0].legends[0].get_texts()) == ["Pareto front", "default", "paper", "steps"]
+    named = sorted(t.get_text() for t in drawn[0].legends[0].get_texts())
+    assert named == ["Pareto front", "default", "paper", "steps"]
 
 
 def test_an_axis_of_hardly_a_decade_is_labelled_at_2_and_5_and_nowhere_between(drawn):
@@ -49,7 +59,8 @@ def test_an_axis_of_hardly_a_decade_is_labelled_at_2_and_5_and_nowhere_between(d
     for seconds, labelled in (((0.012, 0.24), True), ((0.012, 12.0), False)):
         study_plots.plot_errors("a.png", [row("steps", s, 1e-3 * s) for s in seconds], "title")
         axis = drawn[-1].axes[0].xaxis
-        shown = [round(t, 6) for t, text in zip(axis.get_minorticklocs(), axis.get_minor_formatter().format_ticks(axis.get_minorticklocs())) if text]
+        at = axis.get_minorticklocs()
+        shown = [round(t, 6) for t, text in zip(at, axis.get_minor_formatter().format_ticks(at)) if text]
         assert [t for t in shown if seconds[0] < t < seconds[1]] == ([0.02, 0.05, 0.2] if labelled else [])
 
 
@@ -57,7 +68,8 @@ def test_cost_is_drawn_over_named_axes_with_the_exponent(drawn):
     study_plots.plot_scaling("a.png", SCALING, "title")
     panels = drawn[0].axes
     assert [a.get_xlabel() for a in panels] == ["pixels", "samples a pixel", "extent of the scene at equal step"]
-    assert [a.get_title().split()[1] for a in panels] == ["1.00", "0.50", "2.00"] and {a.get_ylabel() for a in panels} == {"seconds a picture"}
+    assert [a.get_title().split()[1] for a in panels] == ["1.00", "0.50", "2.00"]
+    assert {a.get_ylabel() for a in panels} == {"seconds a picture"}
     assert np.allclose(panels[2].lines[0].get_xydata(), [(v, 0.1 * v**2) for v in (1, 2, 4, 8)])
     # The exponent is that of the upper half: what a render costs at least is none of it.
     study_plots.plot_scaling("a.png", [r | {"seconds": 9.0} if r["value"] == 1 else r for r in SCALING], "title")
@@ -71,4 +83,5 @@ def test_both_pictures_are_as_wide_and_their_lines_as_thin(drawn):
     errors, cost = drawn
     pixels = [f.get_size_inches()[0] * f.dpi for f in drawn]
     assert pixels[0] == pixels[1] and errors.get_size_inches()[1] > cost.get_size_inches()[1]
-    assert {line.get_linewidth() for f in drawn for a in f.axes for line in a.lines} == {cost.axes[0].lines[0].get_linewidth()}
+    widths = {line.get_linewidth() for f in drawn for a in f.axes for line in a.lines}
+    assert widths == {cost.axes[0].lines[0].get_linewidth()}

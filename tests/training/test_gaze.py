@@ -57,12 +57,13 @@ def wall(rgb):
 
 @pytest.fixture
 def drawn():
-    """Three probes of four directions, the first of the whole sphere, the others of parts of it; and the same on the device."""
+    """Three probes of four directions, the first of the whole sphere, the others of parts of it; and that on the device."""
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3, 4, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
-    data = Supervision(rng.uniform(-1, 1, (3, 3)), directions, rng.random((3, 4)), rng.uniform(1, 2, (3, 4)), np.zeros((3, 4), bool),
-                       extent=np.array([4 * np.pi, 1.5, 0.5], np.float32))  # fmt: skip
+    positions, truth, distance = rng.uniform(-1, 1, (3, 3)), rng.random((3, 4)), rng.uniform(1, 2, (3, 4))
+    extent = np.array([4 * np.pi, 1.5, 0.5], np.float32)
+    data = Supervision(positions, directions, truth, distance, np.zeros((3, 4), bool), extent=extent)
     return data, _Samples(data, namespace("llvm"))
 
 
@@ -80,7 +81,7 @@ def test_directions_of_a_batch_are_those_of_its_probes(drawn):
 
 @pytest.mark.parametrize("known", [False, True])
 def test_only_views_are_given_what_they_show(drawn, known):
-    """A part of the sphere has the truth's integral, or one; the whole sphere and what is zero throughout stay as they are."""
+    """A part of the sphere has the truth's integral, or one; the whole sphere and what is zero stay as they are."""
     data, samples = drawn
     density = np.array([[1.0, 2, 3, 4], [0, 1, 0, 2], [0, 0, 0, 0]])
     flat = lambda v: samples.ns.Float(v.ravel().astype(np.float32))

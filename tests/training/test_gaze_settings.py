@@ -32,7 +32,7 @@ def test_a_larger_field_has_more_of_everything():
 
 
 def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():
-    """Each probe is drawn fifty times; the rate of the authors' scheduler is lower with every step, to a tenth at the end."""
+    """Each probe is drawn fifty times; the rate is lower with every step, down to a tenth."""
     recipe = gaze_recipe("paper")
     assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["count"]
     settings = GazeSettings(**recipe.settings)

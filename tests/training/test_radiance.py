@@ -300,7 +300,8 @@ def test_places_count_first_and_colours_later(dataset, monkeypatch):
     monkeypatch.setattr(radiance, "color_loss", lambda *given: 0 * color_loss(*given))
     monkeypatch.setattr(radiance, "depth_loss", lambda *given: 0 * depth_loss(*given) + 1)
     for steps in (0, 49, 99):
-        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(steps=100, depth_weight=0.3, final_depth=0.04, distortion_weight=0.0), ns)
+        given = settings(steps=100, depth_weight=0.3, final_depth=0.04, distortion_weight=0.0)
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, given, ns)
         trainer.steps = steps
         trainer.step()
         assert float(trainer.loss[0]) == pytest.approx(0.3 * 0.04 ** ((steps + 1) / 100), rel=1e-4)
@@ -311,7 +312,8 @@ def test_damping_reaches_a_share_of_the_box_from_the_camera(dataset, monkeypatch
     from nerg_mi.training import radiance
 
     reaches = []
-    monkeypatch.setattr(radiance, "damp_near", lambda values, t, width: reaches.append(float(width[0])) or damp_near(values, t, width))
+    noted = lambda values, t, width: reaches.append(float(width[0])) or damp_near(values, t, width)
+    monkeypatch.setattr(radiance, "damp_near", noted)
     trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(steps=100, reach=reach, reach_share=0.5), ns)
     trainer.step()
     # The first of a hundred steps, of which half are damped.
@@ -319,7 +321,7 @@ def test_damping_reaches_a_share_of_the_box_from_the_camera(dataset, monkeypatch
 
 
 def test_weights_move_however_faint_their_gradient(dataset):
-    """Entries of the grid that few rays see are not left behind: a step is that of Adam, whatever the gradient's scale."""
+    """Entries of the grid that few rays see are not left behind: steps do not depend on the gradient's scale."""
     moved = []
     for scale in (1.0, 1e-13):
         optimiser = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns).optimiser
@@ -339,7 +341,8 @@ def test_a_preview_shows_colours_within_their_range_beside_the_truth(dataset, tm
 
     seen = np.zeros((12, 12, 3), np.float32)
     seen[:, :4], seen[:, 4:8], seen[:, 8:] = 1.7, -0.4, 0.5
-    trainer = SimpleNamespace(pixels_within=lambda views, most: 2, render=lambda view, every: SimpleNamespace(color=seen))
+    found = SimpleNamespace(color=seen)
+    trainer = SimpleNamespace(pixels_within=lambda views, most: 2, render=lambda view, every: found)
     _write_preview(trainer, dataset.held_out[0], tmp_path / "a.png")
     picture = np.array(rgb.Bitmap(str(tmp_path / "a.png")))
     assert picture.shape == (12, 24, 3)

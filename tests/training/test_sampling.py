@@ -74,7 +74,7 @@ def test_a_ray_that_alone_is_too_long_is_refused():
 
 @pytest.mark.parametrize("growth", [0, 1 / 16])
 def test_edges_rise_by_the_rule_and_one_step_beyond_the_end(growth):
-    """Jitter shifts every edge by up to a step: a ray that is shifted by all of the last one still ends beyond ``far``."""
+    """Jitter shifts every edge by up to a step: a ray that is shifted by a whole one still ends beyond ``far``."""
     table = StepTable(ns, 0.1, 4.03, 0.05, growth)
     edges = table.edges.numpy()[: table.steps + 1].astype(float)
     np.testing.assert_allclose(np.diff(edges), np.maximum(0.05, growth * edges[:-1]), rtol=1e-4)

@@ -67,7 +67,7 @@ def test_fisheyes(name):
 
 @pytest.mark.parametrize("name", FISHEYES)
 def test_angles_of_fisheyes_are_right_to_rounding(name):
-    """The polynomial of the angle is the pixel's radius, in the median to a unit in the last place of single precision."""
+    """The polynomial of the angle is the pixel's radius, in the median to a unit in the last place."""
     lens = FISHEYES[name]
     column, row = pixels(lens)
     d = directions([lens], 0)
