@@ -283,7 +283,7 @@ def refused(command: Command, inputs: Path, output: Path, log: Path, said: str, 
 def small_disk(folder: Path):
     """``folder`` as a disk of its own with 4 KiB of room (a tmpfs, which only root can mount), with a file "filler"."""
     folder.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", folder], check=True, capture_output=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256m", "tmpfs", folder], check=True, capture_output=True)
     try:
         yield folder
     finally:
@@ -348,8 +348,11 @@ def refusals(work: Path, inputs: Path, only: str) -> tuple[list[list[object]], l
     def row(what: str, each) -> None:
         tally = Tally()
         for command in chosen:
+            found = each(command)
+            if found is None:
+                continue
+            bad, lost = found
             tally.tried += 1
-            bad, lost = each(command)
             tally.lost += lost
             tally.started += not bad
             wrong.extend([f"{what}: {bad}"] if bad else [])
@@ -371,7 +374,9 @@ def refusals(work: Path, inputs: Path, only: str) -> tuple[list[list[object]], l
             before = contents(disk)
             bad = refused(command, inputs, output, log, "the disk is full")
             kept = contents(disk)
-            lost = sum(kept.get(p) != digest for p, digest in before.items()) + len(set(kept) - set(before) - {disk / command.state})
+            # A state to go on from, and a small preview, may still find room.
+            more = {p for p in set(kept) - set(before) if p != disk / command.state and not p.name.endswith(".preview.png")}
+            lost = sum(kept.get(p) != digest for p, digest in before.items()) + len(more)
             (disk / "filler").unlink()
             if not bad and wait(start(begin(command, inputs, disk), log)) != 0:
                 bad = f"the next start of nerg {command.name} fails: {log.read_text()[-300:]}"
@@ -389,14 +394,14 @@ def refusals(work: Path, inputs: Path, only: str) -> tuple[list[list[object]], l
 
     def missing(command: Command):
         if "place" in command.output:
-            return "", 0  # its input is where its output is
+            return None  # its input is where its output is
         output = work / "new" / command.output.partition(".")[0] / "below" / command.output
         code = wait(start(command.arguments(inputs, output), log))
         return "" if code == 0 and output.exists() else f"nerg {command.name} ended with {code}: {log.read_text()[-300:]}", 0
 
     def blocked(command: Command):
         if "place" in command.output:
-            return "", 0
+            return None
         return refused(command, inputs, inputs / "track.csv" / command.output, log, "one of its parents is a file"), 0
 
     if os.geteuid() == 0:
