@@ -242,7 +242,8 @@ def try_tests(there: Environment, unpacked: Path, out: Path) -> str:
     there.install(f"{there.package}[test,{','.join(EXTRAS)}]")
     (out / "outside").mkdir()
     # Only the tests: next to the sources these would be imported in place of what is installed.
-    shutil.copytree(unpacked / "tests", out / "outside" / "tests")
+    for read in ("tests", "docs"):
+        shutil.copytree(unpacked / read, out / "outside" / read)
     (out / "outside" / "pytest.ini").write_text("[pytest]\naddopts = --import-mode=importlib\nmarkers = slow: takes seconds\n")
     report = out / "tests.xml"
     paths = [f"tests/{path}" for path in TESTS]

@@ -121,7 +121,7 @@ def test05_files(tmp_path):
     assert len(trimesh.load(tmp_path / "c.ply").vertices) == len(cloud.vertices)
     for up in ("z", "y"):
         write_glb(triangles, tmp_path / "m.glb", up)
-        shown = trimesh.load(tmp_path / "m.glb").to_geometry()
+        shown = trimesh.load(tmp_path / "m.glb", force="mesh")
         v = triangles.vertices
         assert np.allclose(shown.vertices, v if up == "y" else np.stack([v[:, 0], v[:, 2], -v[:, 1]], 1), atol=1e-6)
     raw = (tmp_path / "m.glb").read_bytes()
