@@ -71,3 +71,10 @@ def test05_numbers_that_are_constants():
     assert f"{spp} rays a pixel (`--spp`)" in page("radiance-training.md")
     for script in ("fox_radiance.py", "store_radiance.py"):
         assert f'"--spp", type=int, default={spp}' in (ROOT / "benchmarks" / script).read_text(), script
+
+
+def test06_tests_that_are_named_exist():
+    named = {m for page in PAGES for m in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", page.read_text(encoding="utf-8"))}
+    assert len(named) > 20
+    missing = [f"{file}::{name}" for file, name in sorted(named) if f"\ndef {name}(" not in (ROOT / file).read_text(encoding="utf-8")]
+    assert not missing

@@ -373,14 +373,13 @@ def refusals(work: Path, inputs: Path, only: str) -> tuple[list[list[object]], l
             fill(disk)
             before = contents(disk)
             bad = refused(command, inputs, output, log, "the disk is full")
-            kept = contents(disk)
-            # A state to go on from, and a small preview, may still find room.
-            more = {p for p in set(kept) - set(before) if p != disk / command.state and not p.name.endswith(".preview.png")}
-            lost = sum(kept.get(p) != digest for p, digest in before.items()) + len(more)
+            # What is small may still find room, and must be whole then.
+            lost = lost_files(before, contents(disk))
+            wrong.extend(lost)
             (disk / "filler").unlink()
             if not bad and wait(start(begin(command, inputs, disk), log)) != 0:
                 bad = f"the next start of nerg {command.name} fails: {log.read_text()[-300:]}"
-            return bad, lost
+            return bad, len(lost)
 
     def forbidden(command: Command):
         folder = work / f"forbidden {command.output}"
