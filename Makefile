@@ -24,7 +24,7 @@ RUN = .venv/bin/python
 JOBS ?= auto
 PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/formats/test_exr.py tests/formats/test_png.py \
-	tests/test_interruption.py
+	tests/test_interruption.py tests/renders
 
 .PHONY: demo test check onecore coverage fuzz mutants faults soak packages setup
 
