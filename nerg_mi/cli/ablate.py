@@ -45,7 +45,7 @@ def command(
     from ..formats.atomic import check_folder
     from ..training.gaze_run import hold_out
     from ..rendering import activate
-    from .train_gaze import _place
+    from .train_gaze import place_for
 
     if sum(v is not None for v in (field, scene, geometry)) != 1:
         raise NergError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
@@ -62,7 +62,7 @@ def command(
     ns, data = namespace(mode), Rays.load(rays)
     _, account = hold_out(data, radius, zones, positions, 0, min_rays, people)
     train, scored, centres = held_out_rays(data, account, "both" if people else "pos")
-    place = _place(field, scene, geometry, train, [], output / "place", None, ns)
+    place = place_for(field, scene, geometry, train, [], output / "place", None, ns)
     names = tuple(recipes.split(","))
     variants = _chosen(all_variants(place.kind == "field", names), variant)
     render = frame_timer(place, np.asarray(centres), (field or output / "x").parent, cameras, width, height) if cameras else None

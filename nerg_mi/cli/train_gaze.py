@@ -145,7 +145,7 @@ def train_gaze(
         test = about["test"]
         typer.echo(f"{len(test['centres'])} test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays left")
         seen = far_views(seen, np.array(test["centres"]), 2 * how.radius, _similarity(align))
-    place = _place(field, scene, geometry, data, seen, output, voxel, ns)
+    place = place_for(field, scene, geometry, data, seen, output, voxel, ns)
     about |= place.about
     if recipe == "default":
         config, initial = place.told(plan.config), None
@@ -215,7 +215,7 @@ def _views(views: Path | None, salience: str | None, per: str, align: Path | Non
     return found.views, {"salience": found.about, **({} if similarity is None else {"align_views": similarity.matrix.tolist()})}
 
 
-def _place(field, scene, geometry, rays, views, output: Path, voxel: float | None, ns):
+def place_for(field, scene, geometry, rays, views, output: Path, voxel: float | None, ns):
     import numpy as np
 
     from ..training import gaze_places as places

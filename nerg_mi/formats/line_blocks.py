@@ -45,9 +45,10 @@ def line_blocks(path: str | os.PathLike, what: str, most: int) -> Iterator[list[
             lines = io.StringIO(text, newline="").readlines()
             # The last line may go on, or end in the \r of a \r\n.
             rest = "" if ended or not lines else lines.pop()
-            if len(rest) > LINE_CHARACTERS:
+            if max(map(len, [*lines, rest])) > LINE_CHARACTERS:
+                at = next(k for k, line in enumerate([*lines, rest]) if len(line) > LINE_CHARACTERS)
                 raise NergError(
-                    f'line {count + len(found) + len(lines) + 1} of the {what} "{path}" has more than the {LINE_CHARACTERS:,} '
+                    f'line {count + len(found) + at + 1} of the {what} "{path}" has more than the {LINE_CHARACTERS:,} '
                     "characters that are read; is it a text file?"
                 )
             found += lines

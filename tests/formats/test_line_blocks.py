@@ -51,6 +51,10 @@ def test_what_is_no_text(tmp_path, monkeypatch):
     path.write_text("a\n" + "x" * 300)
     with pytest.raises(NergError, match="line 2 .* more than the 100 characters"):
         lines(path)
+    monkeypatch.setattr(module, "_CHUNK", 4096)  # the line ends within what is read at once
+    path.write_text("a\n" + "x" * 300 + "\nb\n")
+    with pytest.raises(NergError, match="line 2 .* more than the 100 characters"):
+        lines(path)
     with pytest.raises(NergError, match="no table"):
         lines(tmp_path / "absent.csv")
     with pytest.raises(NergError, match="folder"):
