@@ -12,14 +12,9 @@ parent that is missing and one that is a file. Exit code 1 where a file is lost 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import hashlib
-import json
 import os
 import random
 import signal
-import struct
-import subprocess
 import sys
 import tempfile
 import time
@@ -29,8 +24,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import nerg_mi  # noqa: E402, F401 (before Mitsuba, since it chooses the libLLVM)
-_LIMIT = 900.0
-_NOBODY = 65534
+from tools.child_commands import become_nobody, fill, kill_at, kill_while_writing, small_disk, start, wait  # noqa: E402
+from tools.whole_files import contents, lost_files, part  # noqa: E402
 
 
 @dataclass(frozen=True)
@@ -80,7 +75,7 @@ class Tally:
 
 
 # ----------------------------------------------------------------------------
-# Files
+# Commands
 # ----------------------------------------------------------------------------
 
 
@@ -99,137 +94,6 @@ def prepare(folder: Path) -> None:
     tiny.looks(2_000).save(folder / "rays.npz")
     for name in ("scene.xml", "store.safetensors", "shoppers.safetensors"):
         shutil.copy(store_scene().parent / name, folder / name)
-
-
-def contents(*folders: Path) -> dict[Path, str]:
-    """SHA-256 of every file in ``folders``, without the hidden ones that a killed writer leaves."""
-    found = (p for folder in folders for p in folder.rglob("*") if p.is_file() and not part(p))
-    return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
-
-
-def part(path: Path) -> bool:
-    """Whether ``path`` is a file that was being written."""
-    return path.name.startswith(".") and ".part" in path.name
-
-
-def read_whole(path: Path) -> None:
-    """Read ``path`` to its end by the reader of its kind; raises whatever that raises where it is not whole."""
-    data = path.read_bytes()
-    if path.suffix in (".safetensors", ".run"):
-        from safetensors.numpy import load
-
-        assert load(data)
-    elif path.suffix == ".npz":
-        from nerg_mi.attention.rays import Rays
-
-        assert len(Rays.load(path))
-    elif path.suffix == ".ply":
-        import trimesh
-
-        assert len(trimesh.load(path, process=False).vertices)
-    elif path.suffix == ".vol":
-        x, y, z, channels = struct.unpack("<4i", data[8:24])
-        assert data[:3] == b"VOL" and len(data) == 48 + 4 * x * y * z * channels
-    elif path.suffix == ".exr":
-        import OpenEXR
-
-        with OpenEXR.File(str(path)) as picture:
-            assert all(c.pixels is not None for c in picture.channels().values())
-    elif path.suffix == ".json":
-        json.loads(data)
-    elif path.suffix == ".png":
-        import matplotlib.image
-
-        assert matplotlib.image.imread(path).size
-    else:
-        assert data.endswith(b"\n"), "its last line is cut off"
-
-
-def lost_files(before: dict[Path, str], after: dict[Path, str]) -> list[str]:
-    """Files that are gone, or neither as they were nor whole, each with what is wrong."""
-    found = [f"{path} is gone" for path in before if path not in after and path.suffix != ".run"]
-    for path, digest in after.items():
-        if before.get(path) == digest:
-            continue
-        try:
-            read_whole(path)
-        except Exception as error:  # whatever a reader says of what is not whole
-            found.append(f"{path} is not whole: {type(error).__name__}: {error}")
-    return found
-
-
-# ----------------------------------------------------------------------------
-# Running
-# ----------------------------------------------------------------------------
-
-
-def start(arguments: list[str], log: Path, before=lambda: None) -> int:
-    """Begin `nerg` with ``arguments`` in a process of its own, which does ``before()`` first; returns its id.
-
-    It is forked from this one, which has the modules loaded and has not begun anything with them.
-    """
-    pid = os.fork()
-    if pid:
-        return pid
-    code = 70
-    try:
-        with open(log, "wb") as out, open(os.devnull, "rb") as nothing:
-            for target, stream in ((0, nothing), (1, out), (2, out)):
-                os.dup2(stream.fileno(), target)
-        sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
-        from nerg_mi import cli
-
-        before()
-        # A column map has spaces in it.
-        cli.main([a.replace("~", " ") for a in arguments])
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else int(end.code is not None)
-    except BaseException:
-        import traceback
-
-        traceback.print_exc()
-    finally:
-        with contextlib.suppress(Exception):
-            sys.stdout.flush()
-            sys.stderr.flush()
-        os._exit(code)
-
-
-def wait(pid: int, limit: float = _LIMIT) -> int:
-    """Exit code of the process ``pid``, negative for the signal that ended it; it is killed after ``limit`` seconds."""
-    end = time.monotonic() + limit
-    while time.monotonic() < end:
-        done, status = os.waitpid(pid, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(0.005)
-    os.kill(pid, signal.SIGKILL)
-    os.waitpid(pid, 0)
-    raise TimeoutError(f"no end after {limit:.0f} s")
-
-
-def kill_at(pid: int, seconds: float) -> int:
-    """Kill ``pid`` after ``seconds`` unless it has ended; its exit code."""
-    with contextlib.suppress(TimeoutError):
-        return wait(pid, seconds)
-    return -signal.SIGKILL
-
-
-def kill_while_writing(pid: int, folder: Path, turn: random.Random, skip: int) -> int:
-    """Kill ``pid`` within the ``skip``-th write after this, or a few milliseconds later; its exit code."""
-    there, seen = set(filter(part, folder.rglob("*"))), 0
-    end = time.monotonic() + _LIMIT
-    while time.monotonic() < end:
-        done, status = os.waitpid(pid, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status)
-        new = set(filter(part, folder.rglob("*"))) - there
-        there |= new
-        seen += len(new)
-        if seen > skip:
-            return kill_at(pid, turn.choice((0, 0.001, 0.003, 0.01)))
-        time.sleep(0.0005)
-    return kill_at(pid, 0)
 
 
 def begin(command: Command, inputs: Path, out: Path) -> list[str]:
@@ -277,41 +141,6 @@ def refused(command: Command, inputs: Path, output: Path, log: Path, said: str, 
     if code != 1 or len(sentences) != 1 or said not in text or "Traceback" in text:
         return f"nerg {command.name} ended with {code}: {text[-400:]}"
     return ""
-
-
-@contextlib.contextmanager
-def small_disk(folder: Path):
-    """``folder`` as a disk of its own with 4 KiB of room (a tmpfs, which only root can mount), with a file "filler"."""
-    folder.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256m", "tmpfs", folder], check=True, capture_output=True)
-    try:
-        yield folder
-    finally:
-        subprocess.run(["umount", folder], check=True)
-
-
-def fill(folder: Path) -> None:
-    """Leave 4 KiB of room on the disk of ``folder``."""
-    with open(folder / "filler", "wb", buffering=0) as out:
-        with contextlib.suppress(OSError):
-            while out.write(b"\0" * 4096):
-                pass
-        out.truncate(out.tell() - 4096)
-
-
-def become_nobody() -> None:
-    """Give up root for good, but not the right to read: the interpreter may lie in root's own folder."""
-    import ctypes
-
-    libc = ctypes.CDLL(None, use_errno=True)
-    keep, read = 8, 1 << 2  # PR_SET_KEEPCAPS, CAP_DAC_READ_SEARCH
-    os.setgroups([])
-    os.setgid(_NOBODY)
-    libc.prctl(keep, 1, 0, 0, 0)
-    os.setuid(_NOBODY)
-    header, sets = struct.pack("<Ii", 0x20080522, 0), struct.pack("<6I", read, read, 0, 0, 0, 0)
-    if libc.capset(header, sets) != 0:
-        raise OSError(ctypes.get_errno(), "capset")
 
 
 # ----------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT
-from tools import faults, tiny
+from tools import child_commands, tiny, whole_files
 
 # In a process of its own: it forks, and this one has long begun to compute.
 _KILLS = """
@@ -48,15 +48,15 @@ def test_kills_and_refusals_lose_nothing(name):
 
 def test_a_file_that_is_cut_off_is_lost(tmp_path):
     tiny.looks(50).save(tmp_path / "rays.npz")
-    whole, before = (tmp_path / "rays.npz").read_bytes(), faults.contents(tmp_path)
-    assert faults.lost_files(before, faults.contents(tmp_path)) == []
+    whole, before = (tmp_path / "rays.npz").read_bytes(), whole_files.contents(tmp_path)
+    assert whole_files.lost_files(before, whole_files.contents(tmp_path)) == []
     tiny.looks(60).save(tmp_path / "rays.npz")
-    assert faults.lost_files(before, faults.contents(tmp_path)) == []
+    assert whole_files.lost_files(before, whole_files.contents(tmp_path)) == []
     (tmp_path / "rays.npz").write_bytes(whole[:-30])
-    (said,) = faults.lost_files(before, faults.contents(tmp_path))
+    (said,) = whole_files.lost_files(before, whole_files.contents(tmp_path))
     assert "rays.npz is not whole" in said
     (tmp_path / "rays.npz").unlink()
-    (said,) = faults.lost_files(before, faults.contents(tmp_path))
+    (said,) = whole_files.lost_files(before, whole_files.contents(tmp_path))
     assert "rays.npz is gone" in said
 
 
@@ -67,12 +67,12 @@ def test_a_file_that_is_cut_off_is_lost(tmp_path):
 def test_what_is_no_whole_file(tmp_path, name, data):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(Exception):
-        faults.read_whole(tmp_path / name)
+        whole_files.read_whole(tmp_path / name)
 
 
 def test_a_file_being_written_is_hidden_and_no_result(tmp_path):
     (tmp_path / ".rays.12-ab.part.npz").write_bytes(b"half")
-    assert faults.contents(tmp_path) == {}
+    assert whole_files.contents(tmp_path) == {}
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
@@ -81,8 +81,8 @@ def test_a_kill_lands_and_an_end_is_seen():
     if pid == 0:
         time.sleep(60)
         os._exit(0)
-    assert faults.kill_at(pid, 0.05) == -9
+    assert child_commands.kill_at(pid, 0.05) == -9
     pid = os.fork()
     if pid == 0:
         os._exit(3)
-    assert faults.kill_at(pid, 30) == 3
+    assert child_commands.kill_at(pid, 30) == 3
