@@ -14,7 +14,6 @@ import re
 def base_seed(sampler) -> int | None:
     """The ``seed`` of an ``independent`` sampler of Mitsuba; None for another kind, or for one that draws in another way."""
     import drjit as dr
-    import mitsuba as mi
 
     found = re.search(r"base_seed = (\d+)", str(sampler))
     if sampler.class_name() != "IndependentSampler" or not found:

@@ -36,7 +36,7 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
     goal = np.asarray(xy, np.float64)
     if not any(lens.distortion):
         return goal.copy()
-    u, p1, p2 = goal.copy(), lens.p1, lens.p2
+    u = goal.copy()
     # Beside the fold a step may overflow; what comes of it is found out below.
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(_NEWTON):

@@ -68,7 +68,7 @@ class CascadeGrid:
 
     def _distances(self) -> list[np.ndarray]:
         """For each level, chessboard distances in its own cells to what is occupied or beyond it; 0: occupied."""
-        r, out, finer, inner = self.resolution, [], None, 0.0
+        out, finer, inner = [], None, 0.0
         for level, bits in enumerate(self.bits):
             full = bits & ~self._within(level, inner)
             if finer is not None:

@@ -14,7 +14,6 @@ import numpy as np
 
 from ..errors import NergError
 from ..field.backend import namespace
-from ..field.gaze import GazeField
 from ..field.radiance import RadianceField
 from .cells import bound, describe
 from .fingerprint import Fingerprint

@@ -4,7 +4,6 @@ import time
 
 import drjit as dr
 import numpy as np
-import pytest
 
 from nerg_mi.training.radiance import RadianceTrainer
 from nerg_mi.training.radiance_run import train_radiance
