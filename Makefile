@@ -23,7 +23,7 @@ RUN = .venv/bin/python
 # One process a core, four at most since each takes a gigabyte; a file's tests share what they have made.
 JOBS ?= auto
 PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
-ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/formats/test_exr.py tests/formats/test_png.py \
+ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
 .PHONY: demo test check onecore coverage fuzz mutants faults soak packages setup

@@ -63,12 +63,12 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
     from nerg_mi.capture.dataset import open_dataset
-    from nerg_mi.evaluation.radiance_scores import score_views
+    from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.training.radiance import RadianceTrainer
-    from nerg_mi.training.settings import RadianceSettings, sized_config
-    from nerg_mi.training.warm_up import warm_up
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
+    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+    from nerg_mi.training.radiance.warm_up import warm_up
 
     ns = namespace("llvm_ad_rgb")
     if not args.data.exists():

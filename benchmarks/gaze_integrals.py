@@ -24,9 +24,9 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_gaze
-    from nerg_mi.training.gaze_places import place_of_field, place_of_volume
-    from nerg_mi.transport.gaze_integral import COUNT, GazeIntegral
-    from nerg_mi.transport.media import GazeMedium
+    from nerg_mi.training.geometry.places import place_of_field, place_of_volume
+    from nerg_mi.transport.observer.integral import COUNT, GazeIntegral
+    from nerg_mi.transport.media.media import GazeMedium
     from nerg_mi.transport.place import Place
     from nerg_mi.transport.trace import default_settings
 

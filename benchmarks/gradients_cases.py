@@ -14,10 +14,10 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.backend import namespace
-from nerg_mi.field.box import Box
-from nerg_mi.field.gaze import GazeConfig, GazeField
-from nerg_mi.field.gaze_ensemble import GazeEnsemble
-from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.maths.box import Box
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
 

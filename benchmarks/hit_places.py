@@ -24,7 +24,7 @@ import nerg_mi  # noqa: E402, F401 (before Mitsuba, since it chooses the libLLVM
 
 def row(name: str, rays, seen, far: np.ndarray) -> str:
     """A row of the table: the place of ``rays``, looked at along ``seen``, of which ``far`` (N,) go far."""
-    from nerg_mi.training.gaze_places import place_of_hits
+    from nerg_mi.training.geometry.places import place_of_hits
     from nerg_mi.transport.trace import trace_depth
 
     start = time.perf_counter()
@@ -46,7 +46,7 @@ def row(name: str, rays, seen, far: np.ndarray) -> str:
 
 def supermarket(count: int):
     """Rays of recorded people with hit points, at most ``count``; None where the recording is not there."""
-    from nerg_mi.attention import presets
+    from nerg_mi.rays.readers import presets
 
     folder = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "vr_supermarket"
     if not folder.is_dir():

@@ -7,12 +7,12 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 import drjit as dr
 import numpy as np
 
-from nerg_mi.attention import vmf
-from nerg_mi.attention.kde import SphericalKde
-from nerg_mi.attention.sphere import direction_to_latlong, latlong_to_direction, logsumexp
-from nerg_mi.evaluation import metrics
-from nerg_mi.field.gaze import activate, softplus
-from nerg_mi.training.gaze_losses import gaze_loss, probe_cc, probe_kld
+from nerg_mi.maths import vmf
+from nerg_mi.density.kde.estimate import SphericalKde
+from nerg_mi.maths.sphere import direction_to_latlong, latlong_to_direction, logsumexp
+from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.field.gaze.product import activate, softplus
+from nerg_mi.training.gaze.losses import gaze_loss, probe_cc, probe_kld
 from numerics import Row
 from numerics_march import HEAD, gradient, said, values, worst
 

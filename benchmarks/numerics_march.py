@@ -8,11 +8,11 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.radiance import density_from_log
-from nerg_mi.transport.depth import surface_depth
-from nerg_mi.transport.march import MarchSettings, march
-from nerg_mi.transport.media import LocalRay, VolumeMedium
-from nerg_mi.transport.quadrature import absorbed_share, mean_depth_share
-from nerg_mi.transport.rules import linear_crossing, linear_share
+from nerg_mi.transport.march.depth import surface_depth
+from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.media.media import LocalRay, VolumeMedium
+from nerg_mi.transport.march.quadrature import absorbed_share, mean_depth_share
+from nerg_mi.transport.march.rules import linear_crossing, linear_share
 from numerics import Row
 
 HEAD = ["case", "range", "quantity", "largest error", "reference"]

@@ -10,14 +10,14 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.backend import namespace
-from nerg_mi.field.box import Box
-from nerg_mi.field.gaze import GazeConfig, GazeField
-from nerg_mi.field.harmonics import encode_direction
-from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.maths.box import Box
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.encoding.harmonics import encode_direction
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.transport.color import composite_to_linear
-from nerg_mi.transport.observer import towards
-from nerg_mi.transport.visibility import visibility
+from nerg_mi.maths.color import composite_to_linear
+from nerg_mi.transport.observer.sight import towards
+from nerg_mi.transport.observer.visibility import visibility
 from numerics import Row
 from numerics_march import HEAD, gradient, said, share, values, worst
 

@@ -7,11 +7,11 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.elementary import log1p, one_minus_exp
+from nerg_mi.maths.elementary import log1p, one_minus_exp
 from nerg_mi.field.radiance import sigmoid
-from nerg_mi.transport.march import MarchSettings, march
-from nerg_mi.transport.ray_box import intersect_box
-from nerg_mi.transport.rules import KINDS
+from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.maths.ray_box import intersect_box
+from nerg_mi.transport.march.rules import KINDS
 from numerics import Row
 from numerics_march import (
     HEAD, STEP, Profile, along_z, box, exact_box, gradient, grid, said, share, through, values, worst,

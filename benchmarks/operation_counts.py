@@ -17,7 +17,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 import mitsuba as mi
 
 import nerg_mi.scenes.store
-from nerg_mi.evaluation.operations import traced_operations
+from nerg_mi.evaluation.study.operations import traced_operations
 
 STORE = Path(nerg_mi.scenes.store.__file__).parent
 CAMERA, OBSERVER, TARGET = [1.0, 0.8, 1.6], [1.0, 2.8, 1.6], [1.2, 5.0, 1.2]

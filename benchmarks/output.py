@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nerg_mi.formats.tables import write_csv
+from nerg_mi.files.tables import write_csv
 
 
 def write_rows(path: Path, rows: list[dict]) -> None:

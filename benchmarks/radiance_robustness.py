@@ -41,8 +41,8 @@ dr.set_thread_count(job["threads"])
 from fox_radiance import validation
 from nerg_mi.capture.dataset import open_dataset
 from nerg_mi.field.backend import namespace
-from nerg_mi.training.radiance_run import save_trained, train_radiance
-from nerg_mi.training.settings import RadianceSettings, sized_config
+from nerg_mi.training.radiance.run import save_trained, train_radiance
+from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 data = open_dataset(Path(job["data"]), None, job["width"])
 data = validation(data) if job["validate"] else data
 out = Path(job["out"])

@@ -63,13 +63,13 @@ def main() -> None:
     import numpy as np
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.attention.index import RayIndex
-    from nerg_mi.attention.kde_frame import kde_frame, probe_at
-    from nerg_mi.attention.presets import vr_supermarket
-    from nerg_mi.attention.probes import place_probes
-    from nerg_mi.attention.rays import Rays
-    from nerg_mi.attention.summary import summarise
-    from nerg_mi.attention.tables import rays_from_table
+    from nerg_mi.rays.index import RayIndex
+    from nerg_mi.density.kde.frame import kde_frame, probe_at
+    from nerg_mi.rays.readers.presets import vr_supermarket
+    from nerg_mi.density.probes import place_probes
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.rays.summary import summarise
+    from nerg_mi.rays.readers.tables import rays_from_table
 
     table = []
 

@@ -30,8 +30,8 @@ import nerg_mi, drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.capture.dataset import open_dataset
 from nerg_mi.field.backend import namespace
-from nerg_mi.training.radiance_run import save_trained, train_radiance
-from nerg_mi.training.settings import RadianceSettings, sized_config
+from nerg_mi.training.radiance.run import save_trained, train_radiance
+from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 data, width, steps, threads, out, resume = sys.argv[1:]
 dr.set_thread_count(int(threads))
 data = open_dataset(data, None, int(width))

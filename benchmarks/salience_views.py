@@ -56,8 +56,8 @@ def write_views(folder: Path, law, positions: np.ndarray, rng) -> None:
     import mitsuba as mi
 
     from nerg_mi.capture.cameras import pixel_directions
-    from nerg_mi.capture.solid_angle import pixel_solid_angles
-    from nerg_mi.formats.intrinsics import Intrinsics
+    from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
+    from nerg_mi.capture.intrinsics import Intrinsics
 
     lens = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     local, solid = pixel_directions(lens).reshape(-1, 3), pixel_solid_angles(lens)
@@ -75,7 +75,7 @@ def write_views(folder: Path, law, positions: np.ndarray, rng) -> None:
 
 def draw_rays(law, positions: np.ndarray, count: int, rng):
     """``count`` rays at each of ``positions``, of ten people in turn."""
-    from nerg_mi.attention.rays import Rays
+    from nerg_mi.rays.rays import Rays
 
     origin = np.repeat(positions, count, axis=0)
     n = len(origin)
@@ -88,19 +88,19 @@ def main(argv=None) -> list[dict]:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.attention.sphere import fibonacci_directions
-    from nerg_mi.capture.salience import open_salience
-    from nerg_mi.evaluation import gaze_baselines as baselines
-    from nerg_mi.evaluation.gaze_scores import gaze_field, print_scores, score_rows
+    from nerg_mi.maths.sphere import fibonacci_directions
+    from nerg_mi.capture.salience.views import open_salience
+    from nerg_mi.evaluation.gaze import baselines
+    from nerg_mi.evaluation.gaze.scores import gaze_field, print_scores, score_rows
     from nerg_mi.field.backend import namespace
-    from nerg_mi.field.log_gaze import look_up
+    from nerg_mi.field.gaze.log_density import look_up
     from nerg_mi.scenes import store
     from nerg_mi.scenes.store.attention_law import AttentionLaw
-    from nerg_mi.training.gaze_places import place_of_scene
-    from nerg_mi.training.gaze_recipes import gaze_recipe
-    from nerg_mi.training.gaze_run import train_gaze
-    from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings
-    from nerg_mi.training.salience_supervision import blind_of_views
+    from nerg_mi.training.geometry.places import place_of_scene
+    from nerg_mi.training.gaze.recipes import gaze_recipe
+    from nerg_mi.training.gaze.run import train_gaze
+    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+    from nerg_mi.training.gaze.salience import blind_of_views
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--places", type=int, default=150)

@@ -26,7 +26,7 @@ DIRECTIONS = 2048
 
 def fresh_draws(law, count: int, kappa: float):
     """Baseline: kernel densities of ``count`` draws from ``law`` at each position itself."""
-    from nerg_mi.attention.kde import SphericalKde
+    from nerg_mi.density.kde.estimate import SphericalKde
 
     def evaluate(positions, directions):
         rng = np.random.default_rng(1)
@@ -42,17 +42,17 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.attention.probes import place_probes
-    from nerg_mi.attention.rays import Rays
-    from nerg_mi.attention.sphere import fibonacci_directions
-    from nerg_mi.attention.splits import purge
-    from nerg_mi.evaluation import gaze_baselines as baselines
-    from nerg_mi.evaluation.gaze_scores import EPS, gaze_field, print_scores, score_rows
+    from nerg_mi.density.probes import place_probes
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.maths.sphere import fibonacci_directions
+    from nerg_mi.rays.splits import purge
+    from nerg_mi.evaluation.gaze import baselines
+    from nerg_mi.evaluation.gaze.scores import EPS, gaze_field, print_scores, score_rows
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
     from nerg_mi.scenes import store
     from nerg_mi.scenes.store.attention_law import AttentionLaw
-    from nerg_mi.transport.media import FieldMedium
+    from nerg_mi.transport.media.media import FieldMedium
 
     here = Path(store.__file__).resolve().parent
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

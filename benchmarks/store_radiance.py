@@ -45,12 +45,12 @@ def main(argv=None) -> None:
     from fox_radiance import parse_settings, validation
 
     from nerg_mi.capture.dataset import open_dataset
-    from nerg_mi.evaluation.radiance_scores import score_views
+    from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.training.radiance import RadianceTrainer
-    from nerg_mi.training.settings import RadianceSettings, sized_config
-    from nerg_mi.training.warm_up import warm_up
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
+    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+    from nerg_mi.training.radiance.warm_up import warm_up
 
     if not args.views.exists():
         raise SystemExit(f"{args.views} does not exist; make the pictures with: python -m nerg_mi.scenes.store.make --stage views")

@@ -23,7 +23,7 @@ def main(arguments: list[str] | None = None) -> None:
     import mitsuba as mi
     import numpy as np
 
-    from nerg_mi.bands import render_bands
+    from nerg_mi.rendering.bands import render_bands
     from nerg_mi.view.demo import store_scene
 
     mi.set_variant("llvm_ad_rgb")

@@ -213,7 +213,7 @@ def same_model(trainer, peer) -> float:
     """Largest relative difference of densities, and of colours, at random points."""
     import drjit as dr
     import torch
-    from nerg_mi.training.model import density_color
+    from nerg_mi.training.radiance.model import density_color
 
     rng = np.random.default_rng(0)
     p = rng.uniform(trainer.box.lower, trainer.box.upper, (4096, 3)).astype(np.float32)
@@ -252,11 +252,11 @@ def main(argv=None) -> None:
     dr.set_thread_count(args.threads)
     torch.set_num_threads(args.threads)
     from nerg_mi.capture.dataset import open_dataset
-    from nerg_mi.evaluation.radiance_scores import score_views
+    from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.training.radiance import RadianceTrainer
-    from nerg_mi.training.settings import RadianceSettings, sized_config
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
+    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 
     ns = namespace("llvm_ad_rgb")
     data = open_dataset(args.data, None, args.width)

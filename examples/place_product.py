@@ -4,7 +4,7 @@
 
 A box stands at the front edge of a shelf of the demo store. Synthetic shoppers pass; the gaze field says where they look.
 The expected share of their looks that lands on the box is an integral over the box's own points
-(``nerg_mi.attention.received``), so that its derivative with respect to the box's position comes from automatic
+(``nerg_mi.density.received``), so that its derivative with respect to the box's position comes from automatic
 differentiation through distance, direction, gaze networks and fall-off. The box climbs from several starts; a brute-force
 sweep along the whole shelf checks where it arrives, and central differences check its derivatives. Not differentiated: the
 moving edges of what else hides the box. What that leaves out is measured.
@@ -97,7 +97,7 @@ class Attention:
     def __init__(self, shelf: Shelf, heads: np.ndarray, settings: Settings, falloff: float = 0.05):
         import mitsuba as mi
 
-        from nerg_mi.attention.received import patches
+        from nerg_mi.density.received import patches
         from nerg_mi.scenes.store.attention_law import HERE
         from nerg_mi.transport.place import Place
 
@@ -113,7 +113,7 @@ class Attention:
     def _each(self, at, density):
         import mitsuba as mi
 
-        from nerg_mi.attention.received import contributions
+        from nerg_mi.density.received import contributions
 
         offset = [mi.Float(0)] * 3
         offset[self.shelf.along] = at
@@ -185,7 +185,7 @@ def elevation(attention: Attention, at: float, spacing: float):
     import drjit as dr
     import mitsuba as mi
 
-    from nerg_mi.attention.received import Patches, contributions
+    from nerg_mi.density.received import Patches, contributions
     from nerg_mi.scenes.store.attention_law import HERE
     from nerg_mi.transport.place import Place
 

@@ -66,8 +66,8 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.properties import text
 from nerg_mi.registration import register
-from nerg_mi.transport.gaze_ensemble import EnsembleMedium
-from nerg_mi.transport.media import GazeMedium, Similarity
+from nerg_mi.transport.observer.ensemble import EnsembleMedium
+from nerg_mi.transport.media.media import GazeMedium, Similarity
 
 
 class GazeFieldVolume(mi.Volume):

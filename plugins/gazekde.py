@@ -51,12 +51,12 @@ from __future__ import annotations
 
 import mitsuba as mi
 
-from nerg_mi.attention.kde_view import KdeView
-from nerg_mi.attention.rays import Rays
+from nerg_mi.density.kde.view import KdeView
+from nerg_mi.rays.rays import Rays
 from nerg_mi.field.backend import namespace
 from nerg_mi.properties import integer, number, text
 from nerg_mi.registration import register
-from nerg_mi.transport.media import Similarity
+from nerg_mi.transport.media.media import Similarity
 
 
 class GazeKdeVolume(mi.Volume):

@@ -58,7 +58,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.properties import number, text
 from nerg_mi.registration import register
-from nerg_mi.transport.media import FieldMedium, Similarity
+from nerg_mi.transport.media.media import FieldMedium, Similarity
 
 
 class NerfVolume(mi.Volume):

@@ -221,19 +221,19 @@ from nerg_mi.errors import NergError
 from nerg_mi.interruption import give_back_ctrl_c
 from nerg_mi.properties import boolean, choice, color, integer, number, text
 from nerg_mi.registration import register
-from nerg_mi.transport import viewpoint
-from nerg_mi.transport.color import composite_to_linear
-from nerg_mi.transport.depth import KINDS
-from nerg_mi.transport.features import Featured, snapshot, what_gaze_wants
-from nerg_mi.transport.gaze_ensemble import SupportView
+from nerg_mi.transport.observer import viewpoint
+from nerg_mi.maths.color import composite_to_linear
+from nerg_mi.transport.march.depth import KINDS
+from nerg_mi.transport.media.features import Featured, snapshot, what_gaze_wants
+from nerg_mi.transport.observer.ensemble import SupportView
 from nerg_mi.transport.freezing import no_collection, recording
-from nerg_mi.transport.march import MarchSettings
-from nerg_mi.transport.media import KnownEmpty, VolumeMedium
-from nerg_mi.transport.observer import KINDS as VISIBILITIES
-from nerg_mi.transport.observer import ObserverPass, Sight, towards
+from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.media.media import KnownEmpty, VolumeMedium
+from nerg_mi.transport.observer.sight import KINDS as VISIBILITIES
+from nerg_mi.transport.observer.sight import ObserverPass, Sight, towards
 from nerg_mi.transport.place import Place
-from nerg_mi.transport.rules import KINDS as QUADRATURES
-from nerg_mi.transport.rules import rule
+from nerg_mi.transport.march.rules import KINDS as QUADRATURES
+from nerg_mi.transport.march.rules import rule
 from nerg_mi.transport.shading import Shading
 
 CHANNELS = {

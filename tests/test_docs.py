@@ -10,11 +10,11 @@ import pytest
 import typer
 
 import nerg_mi.cli
-from nerg_mi.evaluation import study_subject
-from nerg_mi.formats import unpickling
-from nerg_mi.training.gaze_recipes import gaze_recipe
-from nerg_mi.transport.gaze_integral import COUNT
-from nerg_mi.transport.march import MarchSettings
+from nerg_mi.evaluation.study import subject as study_subject
+from nerg_mi.formats.torch_ngp import unpickling
+from nerg_mi.training.gaze.recipes import gaze_recipe
+from nerg_mi.transport.observer.integral import COUNT
+from nerg_mi.transport.march.primal import MarchSettings
 from tests.conftest import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -67,7 +67,7 @@ def test05_numbers_that_are_constants():
     assert f"a sum over {COUNT:,} directions" in page("gaze-evaluation.md")
     assert f"allow-list of {NUMBERS[len(unpickling._ALLOWED)]} names" in page("interchange.md")
     assert f"{study_subject.FINER} times shorter" in page("error-and-time.md")
-    spp = inspect.signature(__import__("nerg_mi.evaluation.radiance_scores", fromlist=["x"]).score_views).parameters["spp"].default
+    spp = inspect.signature(__import__("nerg_mi.evaluation.images", fromlist=["x"]).score_views).parameters["spp"].default
     assert f"{spp} rays a pixel (`--spp`)" in page("radiance-training.md")
     for script in ("fox_radiance.py", "store_radiance.py"):
         assert f'"--spp", type=int, default={spp}' in (ROOT / "benchmarks" / script).read_text(), script

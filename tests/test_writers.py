@@ -1,4 +1,4 @@
-"""Nothing in the package writes a file but through `nerg_mi.formats.atomic`: found in the source, so that none comes back."""
+"""Nothing in the package writes a file but through `nerg_mi.files.atomic`: found in the source, so that none comes back."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ METHODS = {
 OPENERS = {"open", "ZipFile", "GzipFile", "fdopen", "TarFile"}
 
 EXCEPTIONS = {
-    "nerg_mi/formats/atomic.py": "the writer itself",
-    "nerg_mi/formats/exr.py:_raise_if_full": "finds out why the file that `replacing` has named does not take any more",
-    "nerg_mi/formats/pickling.py": "puts a pickle together in memory before it opens the file",
-    "nerg_mi/formats/png.py": "encodes in memory",
-    "nerg_mi/formats/skeleton_file.py:_written": "is given the name that `replacing` has chosen",
+    "nerg_mi/files/atomic.py": "the writer itself",
+    "nerg_mi/files/exr.py:_raise_if_full": "finds out why the file that `replacing` has named does not take any more",
+    "nerg_mi/formats/torch_ngp/pickling.py": "puts a pickle together in memory before it opens the file",
+    "nerg_mi/files/png.py": "encodes in memory",
+    "nerg_mi/rays/readers/skeleton_file.py:_written": "is given the name that `replacing` has chosen",
 }
 
 
@@ -67,7 +67,7 @@ def test_no_file_is_written_directly():
         for function, line, text in direct_writers(path.read_text(encoding="utf-8")):
             if not {name, f"{name}:{function}"} & set(EXCEPTIONS):
                 found.append(f"{name}:{line}: {text}")
-    assert len(SOURCES) > 100 and not found, "write through nerg_mi.formats.atomic:\n" + "\n".join(found)
+    assert len(SOURCES) > 100 and not found, "write through nerg_mi.files.atomic:\n" + "\n".join(found)
 
 
 def test_exceptions_are_still_needed():

@@ -29,13 +29,12 @@ ROWS = ("3.10/oldest/wheel", "3.10/newest/sdist", "3.11/newest/wheel", "3.12/new
 EXTRAS = ("parquet", "mesh")
 """Extras that the tests of a row run with. torch is none of them: its oldest version is a download of gigabytes."""
 TESTS = (
-    "attention", "field/test_gaze.py", "field/test_log_gaze.py", "field/test_radiance.py", "formats/test_atomic.py",
-    "formats/test_checkpoint.py", "formats/test_colmap.py", "formats/test_exr.py", "formats/test_fields.py",
-    "formats/test_ray_tables.py", "formats/test_rays_file.py", "formats/test_surfaces.py", "formats/test_transforms.py",
-    "formats/test_unpickling.py", "interop", "plugins/test_gazefield.py", "plugins/test_nerf.py", "plugins/test_nerg_gradients.py",
-    "plugins/test_nerg_observer.py", "plugins/test_panorama.py", "renders", "test_registration.py", "training/test_gaze_losses.py",
-    "transport/test_gaze_integral.py", "transport/test_quadrature.py", "view", "cli/test_demo.py", "cli/test_rays.py",
-    "cli/test_render.py",
+    "rays", "density", "maths", "field/gaze", "field/test_radiance.py", "files", "formats/test_checkpoint.py",
+    "formats/test_fields.py", "formats/test_surfaces.py", "formats/torch_ngp/test_unpickling.py", "capture/test_colmap.py",
+    "capture/test_transforms.py", "interop", "plugins/test_gazefield.py", "plugins/test_nerf.py",
+    "plugins/test_nerg_gradients.py", "plugins/test_nerg_observer.py", "plugins/test_panorama.py", "renders",
+    "test_registration.py", "training/gaze/test_losses.py", "transport/observer/test_integral.py",
+    "transport/march/test_quadrature.py", "view", "cli/test_demo.py", "cli/test_rays.py", "cli/test_render.py",
 )  # fmt: skip
 """Tests of an installed package, below tests/: they ask for nothing of the checkout but themselves."""
 # Folder of the checkout -> folder in the wheel

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from page import table, update
 
-from nerg_mi.attention.rays import Rays
+from nerg_mi.rays.rays import Rays
 
 PEOPLE = 500
 

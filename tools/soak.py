@@ -129,12 +129,12 @@ def radiance_steps() -> Callable[[int], None]:
 
     from nerg_mi.capture.cameras import Camera
     from nerg_mi.capture.images import View
-    from nerg_mi.field.box import Box
-    from nerg_mi.field.hashgrid import HashGridConfig
+    from nerg_mi.maths.box import Box
+    from nerg_mi.field.encoding.hashgrid import HashGridConfig
     from nerg_mi.field.radiance import RadianceConfig
-    from nerg_mi.formats.intrinsics import Intrinsics
-    from nerg_mi.training.radiance import RadianceTrainer
-    from nerg_mi.training.settings import RadianceSettings
+    from nerg_mi.capture.intrinsics import Intrinsics
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
+    from nerg_mi.training.radiance.settings import RadianceSettings
     from tools import tiny
 
     assert mi.variant()
@@ -163,12 +163,12 @@ def gaze_steps() -> Callable[[int], None]:
     import drjit as dr
     import drjit.llvm.ad as ns
 
-    from nerg_mi.field.gaze import GazeConfig
-    from nerg_mi.field.hashgrid import HashGridConfig
-    from nerg_mi.training.gaze import GazeTrainer
-    from nerg_mi.training.gaze_places import place_of_nothing
-    from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings
-    from nerg_mi.training.gaze_supervision import supervise_rays
+    from nerg_mi.field.gaze.product import GazeConfig
+    from nerg_mi.field.encoding.hashgrid import HashGridConfig
+    from nerg_mi.training.gaze.trainer import GazeTrainer
+    from nerg_mi.training.geometry.places import place_of_nothing
+    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+    from nerg_mi.training.gaze.supervision import supervise_rays
     from tools import tiny
 
     rays = tiny.looks()

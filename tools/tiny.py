@@ -56,8 +56,8 @@ def write_photos(folder: Path, count: int = 12) -> Path:
 
 
 def looks(count: int = 400):
-    """Rays (`attention.rays.Rays`) of two people who walk about and look at one point of the wall x = 1.5."""
-    from nerg_mi.attention.rays import Rays
+    """Rays (`rays.rays.Rays`) of two people who walk about and look at one point of the wall x = 1.5."""
+    from nerg_mi.rays.rays import Rays
 
     rng = np.random.default_rng(0)
     origin = np.stack([rng.uniform(-1.2, 0, count), rng.uniform(-1.2, 1.2, count), rng.uniform(1.5, 1.7, count)], axis=1)

@@ -27,7 +27,7 @@ def read_whole(path: Path) -> None:
 
         assert load(data)
     elif path.suffix == ".npz":
-        from nerg_mi.attention.rays import Rays
+        from nerg_mi.rays.rays import Rays
 
         assert len(Rays.load(path))
     elif path.suffix == ".ply":

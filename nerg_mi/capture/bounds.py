@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import NergError
-from ..field.box import Box
+from nerg_mi.errors import NergError
+from nerg_mi.maths.box import Box
 from .cameras import Camera, project
 
 # Cameras whose axes miss their common point by less than this look at one thing.

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import NergError
-from ..formats.intrinsics import Intrinsics
+from nerg_mi.errors import NergError
+from .intrinsics import Intrinsics
 from . import lens
 
 # OpenGL cameras look along -z with x to the right, Mitsuba's along +z with x to the left.

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import NergError
-from ..field.box import Box
-from ..formats.posed import PosedImages, Unused
+from nerg_mi.errors import NergError
+from nerg_mi.maths.box import Box
+from .posed import PosedImages, Unused
 from .bounds import lonely, scene_box
 from .cameras import pixel_directions
 from .images import View, load_usable

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import NergError
-from ..formats.posed import Frame, Unused
+from nerg_mi.errors import NergError
+from .posed import Frame, Unused
 from . import lens
 from .cameras import Camera, pixel_directions, pixel_grid, view_tangents
 from .reading import read_depth, read_image, read_mask

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import NergError
-from ..formats.intrinsics import Intrinsics
+from nerg_mi.errors import NergError
+from .intrinsics import Intrinsics
 
 _NEWTON = 20
 # Samples of the angle that decide how far a fisheye's polynomial rises.

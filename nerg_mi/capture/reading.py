@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import NergError
-from ..formats.bounded import plain, reading
-from ..formats.exr import read_exr
-from ..formats.image_header import check_image
-from ..formats.npy import read_npy
-from ..formats.posed import DepthFile, MaskFile
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import plain, reading
+from nerg_mi.files.exr import read_exr
+from nerg_mi.files.image_header import check_image
+from nerg_mi.files.npy import read_npy
+from .posed import DepthFile, MaskFile
 
 
 def read_image(path: str | Path) -> np.ndarray:

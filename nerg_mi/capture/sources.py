@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MissingFile, NergError
-from ..formats.colmap import model_files, read_colmap
-from ..formats.posed import Frame, PosedImages, Unused
-from ..formats.transforms import read_dataparser, read_transforms
+from nerg_mi.errors import MissingFile, NergError
+from .colmap import model_files, read_colmap
+from .posed import Frame, PosedImages, Unused
+from .transforms import read_dataparser, read_transforms
 from .images import split_holdout
 
 _MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")

@@ -12,7 +12,7 @@ import numpy as np
 from . import lens
 from .cameras import Camera, pixel_directions, pixel_grid, sensor_dict
 from .images import View
-from ..formats.intrinsics import Intrinsics
+from .intrinsics import Intrinsics
 
 # Beyond this angle from the axis a pinhole picture wastes its pixels.
 _WIDEST = np.radians(75)

@@ -18,8 +18,8 @@ from typing import Annotated
 
 import typer
 
-from .. import __version__
-from ..errors import expected, sentence
+from nerg_mi import __version__
+from nerg_mi.errors import expected, sentence
 
 COMMANDS = {
     "demo": "Render the demo store: pictures of what a gaze field is.",

@@ -6,7 +6,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from ..errors import NergError
+from nerg_mi.errors import NergError
 
 
 def command(
@@ -38,13 +38,13 @@ def command(
     import drjit as dr
     import numpy as np
 
-    from ..attention.rays import Rays
-    from ..evaluation.ablation import ablate, all_variants, frame_timer, write_ablation
-    from ..evaluation.gaze_evaluation import held_out_rays
-    from ..field.backend import namespace
-    from ..formats.atomic import check_folder
-    from ..training.gaze_run import hold_out
-    from ..rendering import activate
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.evaluation.ablation import ablate, all_variants, frame_timer, write_ablation
+    from nerg_mi.evaluation.gaze.evaluation import held_out_rays
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.files.atomic import check_folder
+    from nerg_mi.training.gaze.run import hold_out
+    from nerg_mi.rendering.pictures import activate
     from .train_gaze import place_for
 
     if sum(v is not None for v in (field, scene, geometry)) != 1:

@@ -25,8 +25,8 @@ def command(
     """Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, EXR, run.json."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from .. import rendering
-    from ..view import demo
+    from nerg_mi.rendering import pictures as rendering
+    from nerg_mi.view import demo
 
     columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
     with Progress(*columns) as progress:

@@ -10,7 +10,7 @@ def command() -> None:
 
     Ends with exit code 0 if some compiled variant of Mitsuba works, else with 1.
     """
-    from ..diagnosis import examine
+    from nerg_mi.diagnosis import examine
 
     diagnosis = examine()
     print(diagnosis)

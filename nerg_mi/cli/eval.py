@@ -6,7 +6,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from ..errors import NergError
+from nerg_mi.errors import NergError
 from .eval_gaze import eval_gaze
 
 app = typer.Typer(no_args_is_help=True, help="Score trained fields.")
@@ -45,12 +45,12 @@ def eval_radiance(
     """PSNR and SSIM on held-out views, and the error of depth where it is known, rendered by the integrator."""
     import drjit as dr
 
-    from ..capture.dataset import open_dataset
-    from ..evaluation.radiance_scores import score_views
-    from ..formats.atomic import check_folder, check_writable
-    from ..formats.checkpoint import read_checkpoint
-    from ..formats.tables import write_json
-    from ..rendering import activate
+    from nerg_mi.capture.dataset import open_dataset
+    from nerg_mi.evaluation.images import score_views
+    from nerg_mi.files.atomic import check_folder, check_writable
+    from nerg_mi.formats.checkpoint import read_checkpoint
+    from nerg_mi.files.tables import write_json
+    from nerg_mi.rendering.pictures import activate
 
     output = output or field.with_suffix(".eval")
     check_folder(output)

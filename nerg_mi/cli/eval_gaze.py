@@ -6,7 +6,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from ..errors import NergError
+from nerg_mi.errors import NergError
 
 
 def eval_gaze(
@@ -32,17 +32,17 @@ def eval_gaze(
     """Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the people."""
     import drjit as dr
 
-    from ..attention.collecting import file_sha256
-    from ..attention.rays import Rays
-    from ..evaluation import gaze_evaluation as evaluation
-    from ..evaluation.gaze_baselines import standard_baselines
-    from ..evaluation.gaze_report import side_by_side, write_report
-    from ..evaluation.gaze_scores import EPS, gaze_field
-    from ..field.backend import namespace
-    from ..formats.atomic import check_folder
-    from ..formats.fields import load_gaze
-    from ..transport.media import Similarity
-    from ..rendering import activate
+    from nerg_mi.rays.readers.collecting import file_sha256
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.evaluation.gaze import evaluation
+    from nerg_mi.evaluation.gaze.baselines import standard_baselines
+    from nerg_mi.evaluation.gaze.report import side_by_side, write_report
+    from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.files.atomic import check_folder
+    from nerg_mi.formats.fields import load_gaze
+    from nerg_mi.transport.media.media import Similarity
+    from nerg_mi.rendering.pictures import activate
 
     output = output or gaze.with_suffix(".eval")
     check_folder(output)
@@ -85,16 +85,16 @@ def eval_gaze(
 
 
 def _print(rows: list[dict], title: str) -> None:
-    from ..evaluation.gaze_evaluation import SCORES
-    from ..evaluation.gaze_scores import print_scores
+    from nerg_mi.evaluation.gaze.evaluation import SCORES
+    from nerg_mi.evaluation.gaze.scores import print_scores
 
     print_scores([{k: r[k] for k in ("method", *SCORES, "integral")} for r in rows], title)
 
 
 def _place(gaze: Path, about: dict, field, scene, geometry, ns):
     """What the field was trained in: the file that is named, or the one of the checkpoint's beside it."""
-    from ..attention.collecting import file_sha256
-    from ..training import gaze_places as places
+    from nerg_mi.rays.readers.collecting import file_sha256
+    from nerg_mi.training.geometry import places
 
     if about.get("geometry") == "none":
         return None

@@ -29,7 +29,7 @@ def export_mesh(
     up: _Up = "z", variant: _Variant = "llvm_ad_rgb",
 ) -> None:  # fmt: skip
     """A mesh by marching cubes, with vertex colours: .ply or .glb."""
-    from ..formats.surfaces import mesh
+    from nerg_mi.formats.surfaces import mesh
 
     write = _writer(output, up)
     start = time.perf_counter()
@@ -51,7 +51,7 @@ def export_points(
     up: _Up = "z", variant: _Variant = "llvm_ad_rgb",
 ) -> None:  # fmt: skip
     """A cloud of surface points with normals and colours: .ply or .glb."""
-    from ..formats.surfaces import points
+    from nerg_mi.formats.surfaces import points
 
     write = _writer(output, up)
     start = time.perf_counter()
@@ -68,8 +68,8 @@ def export_volume(
     resolution: _Resolution = 256, variant: _Variant = "llvm_ad_rgb",
 ) -> None:  # fmt: skip
     """Density, and colour, as Mitsuba grid volumes (.vol)."""
-    from ..formats.atomic import check_writable
-    from ..formats.volumes import density_and_color, write_volume
+    from nerg_mi.files.atomic import check_writable
+    from nerg_mi.formats.volumes import density_and_color, write_volume
 
     for path in (output, color):
         if path is not None:
@@ -88,8 +88,8 @@ def export_volume(
 @app.command("torch-ngp")
 def export_torch_ngp(field: _Field, output: _Output, variant: _Variant = "llvm_ad_rgb") -> None:
     """A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes."""
-    from ..formats.atomic import check_writable
-    from ..formats.torch_ngp import write_torch_ngp
+    from nerg_mi.files.atomic import check_writable
+    from nerg_mi.formats.torch_ngp.fields import write_torch_ngp
 
     check_writable(output, ".pth")
     start = time.perf_counter()
@@ -98,17 +98,17 @@ def export_torch_ngp(field: _Field, output: _Output, variant: _Variant = "llvm_a
 
 
 def _load(path: Path, variant: str):
-    from ..field.backend import namespace
-    from ..formats.fields import load_radiance
-    from ..rendering import activate
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.formats.fields import load_radiance
+    from nerg_mi.rendering.pictures import activate
 
     return load_radiance(path, namespace(activate(variant)))[0]
 
 
 def _writer(output: Path, up: str):
-    from ..errors import NergError
-    from ..formats.atomic import check_writable
-    from ..formats.surfaces import write_glb, write_ply
+    from nerg_mi.errors import NergError
+    from nerg_mi.files.atomic import check_writable
+    from nerg_mi.formats.surfaces import write_glb, write_ply
 
     if up not in ("y", "z"):
         raise NergError(f'--up must be z or y, not "{up}".')

@@ -24,13 +24,13 @@ def command(
     variant: Annotated[str, typer.Option(help="Mitsuba variant.")] = "llvm_ad_rgb",
 ) -> None:
     """Convert a checkpoint to the fields of the volumes `nerf` and `gazefield`. Nothing in the file is run."""
-    from ..errors import NergError
-    from ..field.backend import namespace
-    from ..formats.atomic import check_writable
-    from ..formats.fields import save_gaze, save_radiance
-    from ..formats.nerg_checkpoint import is_nerg, read_nerg
-    from ..formats.torch_ngp import Given, open_checkpoint, read_torch_ngp
-    from ..rendering import activate
+    from nerg_mi.errors import NergError
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.files.atomic import check_writable
+    from nerg_mi.formats.fields import save_gaze, save_radiance
+    from nerg_mi.formats.torch_ngp.nerg import is_nerg, read_nerg
+    from nerg_mi.formats.torch_ngp.fields import Given, open_checkpoint, read_torch_ngp
+    from nerg_mi.rendering.pictures import activate
 
     if output is None and gaze is None:
         raise NergError("nothing is asked for: give -o FIELD.safetensors, --gaze GAZE.safetensors, or both.")

@@ -6,7 +6,7 @@ from typing import Annotated, List, Optional
 
 import typer
 
-from ..errors import NergError
+from nerg_mi.errors import NergError
 
 app = typer.Typer(
     no_args_is_help=True, help="Import tracking files as rays of attention, look at them, choose among them and split them."
@@ -59,9 +59,9 @@ def import_rays(
     ] = None,
 ) -> None:
     """Convert tracking files to rays: right-handed, z up, metres, seconds."""
-    from ..attention import presets
-    from ..attention.pseudonyms import pseudonymise, read_salt
-    from ..attention.tables import rays_from_table
+    from nerg_mi.rays.readers import presets
+    from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
+    from nerg_mi.rays.readers.tables import rays_from_table
 
     _check(output)
     if salt is not None and not pseudonyms:
@@ -101,7 +101,7 @@ def import_rays(
 @app.command("show")
 def show_rays(rays: _Rays) -> None:
     """The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height."""
-    from ..attention.rays import Rays
+    from nerg_mi.rays.rays import Rays
 
     _card(Rays.load(rays), rays)
 
@@ -127,8 +127,8 @@ def filter_rays(
     thin_distance: Annotated[float, typer.Option(help="--thin: a stop is a stay within this many metres.")] = 0.1,
 ) -> None:
     """Keep some rays: conditions first, then fixations, then thinning of those who stand still."""
-    from ..attention import filters, fixations as fix
-    from ..attention.rays import Rays
+    from nerg_mi.rays import filters, fixations as fix
+    from nerg_mi.rays.rays import Rays
 
     _check(output)
     if fixations not in (None, "ivt", "idt"):
@@ -184,8 +184,8 @@ def split_rays(
 
     Of several, training rays are on the training side of each and test rays on the test side of each; the rest is purged.
     """
-    from ..attention import splits
-    from ..attention.rays import Rays
+    from nerg_mi.rays import splits
+    from nerg_mi.rays.rays import Rays
 
     outputs = {side: output.with_name(f"{output.stem}-{side}{output.suffix}") for side in ("train", "test")}
     _check(*outputs.values())
@@ -226,10 +226,10 @@ def plot_rays(
     test: Annotated[Optional[Path], typer.Option(help="layout: the test rays of a split, drawn beside.")] = None,
 ) -> None:
     """The floor plan: where people stood and how densely, or the layout."""
-    from ..attention.rays import Rays
-    from ..formats.atomic import check_writable
-    from ..view import ray_figures
-    from ..view.figures import save
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.files.atomic import check_writable
+    from nerg_mi.view import ray_figures
+    from nerg_mi.view.figures import save
 
     if kind not in ("density", "layout"):
         raise NergError(f'--kind is "{kind}"; it is density or layout')
@@ -249,8 +249,8 @@ def plot_rays(
 
 def _check(*outputs: Path) -> None:
     """Raise `NergError` where rays cannot be written to one of ``outputs``: before minutes of reading."""
-    from ..formats.atomic import check_writable
-    from ..formats.rays_file import SUFFIXES
+    from nerg_mi.files.atomic import check_writable
+    from nerg_mi.rays.io import SUFFIXES
 
     for path in outputs:
         check_writable(path, *SUFFIXES)
@@ -290,8 +290,8 @@ def _card(rays, path: Path) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from ..attention.summary import GAP, summarise
-    from ..formats.bounded import plain
+    from nerg_mi.rays.summary import GAP, summarise
+    from nerg_mi.files.bounded import plain
 
     s = summarise(rays)
     # Names come from files: they are neither markup nor control characters of a terminal.

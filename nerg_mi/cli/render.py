@@ -1,4 +1,4 @@
-"""`nerg render`: the command line of `nerg_mi.rendering`."""
+"""`nerg render`: the command line of `nerg_mi.rendering.pictures`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def command(
 
     An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour, tonemapped to sRGB.
     """
-    from .. import rendering
+    from nerg_mi.rendering import pictures as rendering
 
     defaults = rendering.parse_defines(define or [])
     with _bar() as (bar, task):

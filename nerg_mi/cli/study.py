@@ -1,4 +1,4 @@
-"""`nerg study`: the command line of `nerg_mi.evaluation.study`."""
+"""`nerg study`: the command line of `nerg_mi.evaluation.study.run`."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def command(
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from .. import rendering
-    from ..evaluation.study import run_study
+    from nerg_mi.rendering import pictures as rendering
+    from nerg_mi.evaluation.study.run import run_study
 
     defaults = rendering.parse_defines(define or [])
     with Progress(TextColumn("{task.description:<44}"), BarColumn(), TimeElapsedColumn()) as progress:

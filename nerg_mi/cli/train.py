@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from ..errors import NergError, chosen
+from nerg_mi.errors import NergError, chosen
 from .train_gaze import train_gaze
 
 app = typer.Typer(no_args_is_help=True, help="Train fields from recordings.")
@@ -51,12 +51,12 @@ def train_radiance(
     """Train a radiance field on posed pictures, and report the error on those held out."""
     import drjit as dr
 
-    from ..capture.dataset import open_dataset
-    from ..field.backend import namespace
-    from ..formats.atomic import check_writable
-    from ..rendering import activate
-    from ..training.radiance_run import save_trained, train_radiance
-    from ..training.settings import RadianceSettings, sized_config
+    from nerg_mi.capture.dataset import open_dataset
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.files.atomic import check_writable
+    from nerg_mi.rendering.pictures import activate
+    from nerg_mi.training.radiance.run import save_trained, train_radiance
+    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 
     state, preview = output.with_suffix(".run"), output.with_suffix(".preview.png")
     check_writable(output, ".safetensors")

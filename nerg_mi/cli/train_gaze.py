@@ -8,7 +8,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from ..errors import NergError, chosen
+from nerg_mi.errors import NergError, chosen
 
 
 def train_gaze(
@@ -86,17 +86,17 @@ def train_gaze(
     import drjit as dr
     import numpy as np
 
-    from ..attention.collecting import file_sha256
-    from ..attention.rays import Rays
-    from ..field.backend import namespace
-    from ..formats.atomic import check_writable
-    from ..formats.fields import save_gaze
-    from ..rendering import activate
-    from ..training.gaze_ensemble import train_ensemble
-    from ..training.gaze_recipes import gaze_recipe
-    from ..training.gaze_run import hold_out, train_gaze
-    from ..training.gaze_settings import GazeSettings, ProbeSettings
-    from ..training.salience_supervision import far_views
+    from nerg_mi.rays.readers.collecting import file_sha256
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.field.backend import namespace
+    from nerg_mi.files.atomic import check_writable
+    from nerg_mi.formats.fields import save_gaze
+    from nerg_mi.rendering.pictures import activate
+    from nerg_mi.training.gaze.ensemble import train_ensemble
+    from nerg_mi.training.gaze.recipes import gaze_recipe
+    from nerg_mi.training.gaze.run import hold_out, train_gaze
+    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+    from nerg_mi.training.gaze.salience import far_views
 
     if sum(v is not None for v in (field, scene, geometry)) != 1:
         raise NergError("say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none")
@@ -186,7 +186,7 @@ def _begun(begin: str, place, config, more: dict) -> tuple:
     """Configuration, and the arrays to begin with (None: random ones), of a field of the recipes small and paper."""
     config = place.told(config)
     if begin == "field":
-        from ..training.gaze_semantics import config_like, trunk_of
+        from nerg_mi.training.gaze.semantics import config_like, trunk_of
 
         config = config_like(place.medium.field.config, config.variant, config.activation, **more)
         return config, trunk_of(place.medium.field, config)
@@ -202,8 +202,8 @@ def _views(views: Path | None, salience: str | None, per: str, align: Path | Non
         if views or salience or align:
             raise NergError("salience needs both: --views, the posed photos, and --salience, the images' folder or spectral-residual")
         return [], {}
-    from ..capture.salience import open_salience
-    from ..formats.checkpoint import read_checkpoint
+    from nerg_mi.capture.salience.views import open_salience
+    from nerg_mi.formats.checkpoint import read_checkpoint
 
     similarity = _similarity(align)
     trained = None if field is None else read_checkpoint(field, "radiance")[1].get("provenance")
@@ -218,7 +218,7 @@ def _views(views: Path | None, salience: str | None, per: str, align: Path | Non
 def place_for(field, scene, geometry, rays, views, output: Path, voxel: float | None, ns):
     import numpy as np
 
-    from ..training import gaze_places as places
+    from nerg_mi.training.geometry import places
 
     if field is not None:
         return places.place_of_field(field, ns)
@@ -238,11 +238,11 @@ def place_for(field, scene, geometry, rays, views, output: Path, voxel: float | 
 
 
 def _similarity(path: Path | None):
-    from ..transport.media import Similarity
+    from nerg_mi.transport.media.media import Similarity
 
     if path is None:
         return None
-    from ..formats.bounded import plain, read_json
+    from nerg_mi.files.bounded import plain, read_json
 
     matrix = read_json(path, "similarity of --align")
     try:

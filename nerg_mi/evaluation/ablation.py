@@ -15,20 +15,20 @@ from typing import Callable
 
 import numpy as np
 
-from ..attention.rays import Rays
-from ..formats.atomic import write_text
-from ..formats.bounded import read_json
-from ..formats.fields import save_gaze
-from ..formats.png import write_figure
-from ..formats.tables import write_csv, write_json
-from ..training.gaze_places import GazePlace
-from ..training.gaze_recipes import gaze_recipe
-from ..training.gaze_run import train_gaze
-from ..training.gaze_semantics import config_like, trunk_of
-from ..training.gaze_settings import GazeSettings, ProbeSettings
-from ..training.gaze_state import digest
-from .gaze_evaluation import GazeTest, make_test, map_scores
-from .gaze_scores import gaze_field
+from nerg_mi.rays.rays import Rays
+from nerg_mi.files.atomic import write_text
+from nerg_mi.files.bounded import read_json
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.files.png import write_figure
+from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.training.gaze.recipes import gaze_recipe
+from nerg_mi.training.gaze.run import train_gaze
+from nerg_mi.training.gaze.semantics import config_like, trunk_of
+from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+from nerg_mi.training.gaze.state import digest
+from .gaze.evaluation import GazeTest, make_test, map_scores
+from .gaze.scores import gaze_field
 
 COLUMNS = ("recipe", "variant", "seed", "steps", "train_loss", "test_loss", "train_relative", "test_relative", "train_KLD", "test_KLD",
            "train_CC", "test_CC", "train_MAE", "test_MAE", "train_seconds", "frame_seconds")  # fmt: skip
@@ -169,7 +169,7 @@ def frame_timer(place: GazePlace, centres: np.ndarray, folder: Path, cameras: in
         if place.kind == "field":
             return {"field": {"type": "nerf", "filename": str(folder / place.about["field_file"]["file"])}}
         if place.kind == "hits":
-            from ..training.hit_geometry import volume_dict
+            from nerg_mi.training.geometry.hit_geometry import volume_dict
 
             return {"density": volume_dict(folder / place.about["geometry_file"]["file"])}
         return {}

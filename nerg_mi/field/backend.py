@@ -11,7 +11,7 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from ..errors import NergError
+from nerg_mi.errors import NergError
 
 
 def namespace(source: object) -> ModuleType:

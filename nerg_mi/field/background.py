@@ -12,8 +12,8 @@ import drjit as dr
 import numpy as np
 
 from .backend import namespace
-from .harmonics import encode_direction
-from .hashgrid import HashGrid, HashGridConfig
+from .encoding.harmonics import encode_direction
+from .encoding.hashgrid import HashGrid, HashGridConfig
 from .mlp import MLP
 
 

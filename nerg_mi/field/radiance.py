@@ -13,10 +13,10 @@ import drjit as dr
 import numpy as np
 
 from .background import Background
-from .box import Box
+from nerg_mi.maths.box import Box
 from .cascades import CascadeGrid
-from .harmonics import encode_direction
-from .hashgrid import HashGrid, HashGridConfig
+from .encoding.harmonics import encode_direction
+from .encoding.hashgrid import HashGrid, HashGridConfig
 from .mlp import MLP
 from .occupancy import OccupancyGrid
 

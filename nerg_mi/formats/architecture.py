@@ -10,8 +10,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from ..errors import NergError
-from .bounded import plain
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import plain
 
 _MOST = {
     "levels": 64, "features": 4, "log2_rows": 26, "base": 1 << 20, "dimensions": 3, "width": 4096, "geometry": 4096,

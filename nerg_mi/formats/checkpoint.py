@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import MissingFile, NergError
-from .atomic import write_bytes
-from .bounded import parse_json, plain, reading, size_of
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.files.atomic import write_bytes
+from nerg_mi.files.bounded import parse_json, plain, reading, size_of
 
 FORMAT = 1
 

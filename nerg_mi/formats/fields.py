@@ -9,21 +9,21 @@ from types import ModuleType
 
 import numpy as np
 
-from ..errors import NergError
-from ..field.backend import aligned
-from ..field.background import Background, BackgroundConfig
-from ..field.box import Box
-from ..field.cascades import CascadeGrid
-from ..field.gaze import GazeConfig, GazeField
-from ..field.gaze_ensemble import GazeEnsemble
-from ..field.hashgrid import HashGrid
-from ..field.log_gaze import LogGazeConfig, LogGazeField
-from ..field.mlp import MLP
-from ..field.occupancy import OccupancyGrid
-from ..field.radiance import RadianceConfig, RadianceField
-from ..field.support import RaySupport
+from nerg_mi.errors import NergError
+from nerg_mi.field.backend import aligned
+from nerg_mi.field.background import Background, BackgroundConfig
+from nerg_mi.maths.box import Box
+from nerg_mi.field.cascades import CascadeGrid
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+from nerg_mi.field.mlp import MLP
+from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.field.gaze.support import RaySupport
 from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
-from .bounded import plain
+from nerg_mi.files.bounded import plain
 from .checkpoint import read_checkpoint, write_checkpoint
 
 

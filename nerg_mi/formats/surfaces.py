@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import NergError
-from ..field.extraction import Lattice, Sampler, crossings, opacity, surface_density
-from ..field.radiance import RadianceField
-from .atomic import write_bytes
+from nerg_mi.errors import NergError
+from nerg_mi.field.extraction import Lattice, Sampler, crossings, opacity, surface_density
+from nerg_mi.field.radiance import RadianceField
+from nerg_mi.files.atomic import write_bytes
 
 
 @dataclass

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..field.extraction import Lattice, Sampler, surface_density
-from ..field.radiance import RadianceField
-from .atomic import write_bytes
+from nerg_mi.field.extraction import Lattice, Sampler, surface_density
+from nerg_mi.field.radiance import RadianceField
+from nerg_mi.files.atomic import write_bytes
 
 # Optical depth of a voxel at most, and the opacity from which on it has a colour.
 _DEEPEST, _FAINT = 5.0, 1e-3

@@ -21,15 +21,15 @@ try:
 except ImportError:
     raise ImportError('fields as torch modules need torch, which is not installed: pip install "nerg-mi[torch]"') from None
 
-from ..errors import NergError
-from ..field.backend import is_cuda, namespace
-from ..field.background import Background
-from ..field.gaze import GazeField
-from ..field.gaze_ensemble import GazeEnsemble
-from ..field.hashgrid import HashGrid
-from ..field.log_gaze import LogGazeField
-from ..field.mlp import MLP
-from ..field.radiance import RadianceField
+from nerg_mi.errors import NergError
+from nerg_mi.field.backend import is_cuda, namespace
+from nerg_mi.field.background import Background
+from nerg_mi.field.gaze.product import GazeField
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.gaze.log_density import LogGazeField
+from nerg_mi.field.mlp import MLP
+from nerg_mi.field.radiance import RadianceField
 
 
 _FIXED = ("prior",)
@@ -153,7 +153,7 @@ class GazeModule(_FieldModule):
 
     def integral(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None) -> torch.Tensor:
         """The integral over the sphere (one number) of one observer, who is ``p_o`` in every row, from N directions ``r_o`` of
-        equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's (``transport.gaze_integral``)."""
+        equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's (``transport.observer.integral``)."""
         return 4 * torch.pi * self.unnormalized(p_od, p_o, r_o, escaped).mean()
 
     def _extra(self, count: int, integral, escaped) -> torch.Tensor:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import NergError
+from nerg_mi.errors import NergError
 
 
 def _check(width: int, height: int) -> None:

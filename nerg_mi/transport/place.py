@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from ..errors import NergError
-from .depth import surface_depth, way_out
-from .march import MarchResult, scouted_march
+from nerg_mi.errors import NergError
+from .march.depth import surface_depth, way_out
+from .march.primal import MarchResult, scouted_march
 
 
 @dataclass

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from ..errors import NergError
+from nerg_mi.errors import NergError
 
 
 class Shading:

@@ -4,9 +4,9 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
-from ..field.backend import namespace
-from .depth import KINDS, surface_depth
-from .march import MarchSettings, march
+from nerg_mi.field.backend import namespace
+from .march.depth import KINDS, surface_depth
+from .march.primal import MarchSettings, march
 from .place import Place
 
 BATCH = 1 << 19
@@ -25,7 +25,7 @@ def trace_depth(medium, origins, directions, settings: MarchSettings | None = No
 
     ``medium``: a ``FieldMedium`` or ``VolumeMedium``, or a ``Place`` (of shapes, whose rays are cast exactly, or of both). ``origins``, ``directions``: N rays in the scene's frame, directions
     unit, either as NumPy arrays (N, 3) or as Dr.Jit 3-arrays of N lanes. ``settings``: see ``default_settings``.
-    ``kind``: ``median``, ``expected`` or ``refined`` (``transport.depth``). Returns ``(depth, opacity)`` of the kind that
+    ``kind``: ``median``, ``expected`` or ``refined`` (``transport.march.depth``). Returns ``(depth, opacity)`` of the kind that
     the rays came in (float32 (N,), or Dr.Jit Floats, evaluated): depth is the distance from the origin in scene units, 0
     where nothing absorbs; which opacity makes a surface is the caller's to say. At most ``batch`` rays are marched in one
     launch. Carries no derivatives. Raises ``ValueError`` for an unknown kind and for shapes that do not fit.

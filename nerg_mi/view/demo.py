@@ -18,14 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import __version__, llvm
-from ..bands import render_bands
-from ..errors import NergError
-from ..formats.atomic import check_folder
-from ..formats.exr import write_bitmap_exr
-from ..formats.tables import write_json
-from ..interruption import Interruption
-from ..rendering import activate, load_scene
+from nerg_mi import __version__, llvm
+from nerg_mi.rendering.bands import render_bands
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.exr import write_bitmap_exr
+from nerg_mi.files.tables import write_json
+from nerg_mi.interruption import Interruption
+from nerg_mi.rendering.pictures import activate, load_scene
 from . import figures
 from .overlay import Heat, top_of
 from .tonemap import srgb, write_png
@@ -131,7 +131,7 @@ def run_demo(
 
 def store_scene() -> Path:
     """The demo store's scene.xml, as installed."""
-    from .. import scenes
+    from nerg_mi import scenes
 
     return Path(scenes.__file__).resolve().parent / "store" / "scene.xml"
 
@@ -172,7 +172,7 @@ def _render(mi, scene, index: int, spp: int, seed: int, check: Callable[[], None
 
 def _pixel_of_observer(mi, scene):
     """Where the observer stands in the picture of the camera, in pixels (x, y); None outside of it."""
-    from ..transport.viewpoint import center
+    from nerg_mi.transport.observer.viewpoint import center
 
     camera = scene.sensors()[CAMERA]
     film = camera.film()
@@ -190,7 +190,7 @@ def _pixel_of_observer(mi, scene):
 
 def _integral(sphere: Render) -> float:
     """What the gaze density adds up to over the observer's sphere: 1 for a density that is one."""
-    from ..transport.panorama import pixel_solid_angles
+    from nerg_mi.transport.panorama import pixel_solid_angles
 
     height, width = sphere.aovs["gaze"].shape
     return float((sphere.aovs["gaze"].astype(np.float64) * pixel_solid_angles(width, height)).sum())

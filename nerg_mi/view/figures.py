@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..formats.png import write_figure
+from nerg_mi.files.png import write_figure
 from .overlay import Heat, overlay, scale_strip
 from .tonemap import LUMINANCE, srgb
 

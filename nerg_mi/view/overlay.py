@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import NergError
+from nerg_mi.errors import NergError
 from .tonemap import LUMINANCE, srgb
 
 MAPS = ("inferno", "magma", "plasma", "viridis", "cividis")

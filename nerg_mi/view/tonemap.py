@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..formats import png
+from nerg_mi.files import png
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Weights of linear sRGB for the luminance (Rec. 709)."""

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.formats.tables import write_json
+from nerg_mi.files.tables import write_json
 
 ROOM = (8.0, 6.0, 3.0)  # metres
 SOUTH, NORTH, WEST, EAST = (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)

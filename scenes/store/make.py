@@ -54,8 +54,8 @@ def make_field(job: Job) -> list[Path]:
 
     from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.field.backend import namespace
-    from nerg_mi.training.radiance_run import save_trained, train_radiance
-    from nerg_mi.training.settings import RadianceSettings, sized_config
+    from nerg_mi.training.radiance.run import save_trained, train_radiance
+    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 
     _require(job.build / "transforms.json", "views")
     data = open_dataset(job.build, None, None, None, None, True)
@@ -70,7 +70,7 @@ def make_field(job: Job) -> list[Path]:
 
 def make_rays(job: Job) -> list[Path]:
     """Rays of attention from the tracking data, as `nerg rays import --preset skeleton22 --tick 0.001` makes them."""
-    from nerg_mi.attention.presets import preset
+    from nerg_mi.rays.readers.presets import preset
 
     tracking, path = job.build / "shoppers.csv", job.build / "rays.npz"
     _require(tracking, "shoppers")
@@ -82,13 +82,13 @@ def make_gaze(job: Job) -> list[Path]:
     """The gaze field, trained on the rays in the store's radiance field; 64 positions are held out and recorded in it."""
     import mitsuba as mi
 
-    from nerg_mi.attention.collecting import file_sha256
-    from nerg_mi.attention.rays import Rays
+    from nerg_mi.rays.readers.collecting import file_sha256
+    from nerg_mi.rays.rays import Rays
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_radiance, save_gaze
-    from nerg_mi.training.gaze_run import hold_out, train_gaze
-    from nerg_mi.training.gaze_settings import GazeSettings, ProbeSettings, sized_gaze_config
-    from nerg_mi.transport.media import FieldMedium
+    from nerg_mi.training.gaze.run import hold_out, train_gaze
+    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings, sized_gaze_config
+    from nerg_mi.transport.media.media import FieldMedium
 
     source, place = job.build / "rays.npz", job.store / "store.safetensors"
     _require(source, "rays")
@@ -134,7 +134,7 @@ def main(argv=None) -> None:
 
     import mitsuba as mi
 
-    from nerg_mi.formats.atomic import check_folder
+    from nerg_mi.files.atomic import check_folder
 
     mi.set_variant(args.variant)
     job = Job(args.seed)

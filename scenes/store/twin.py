@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.formats.atomic import write_bytes, write_text
+from nerg_mi.files.atomic import write_bytes, write_text
 
 HERE = Path(__file__).resolve().parent
 TWIN_XML = HERE / "twin.xml"

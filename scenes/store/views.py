@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.formats.atomic import replacing
-from nerg_mi.formats.png import write_png
-from nerg_mi.formats.tables import write_json
+from nerg_mi.files.atomic import replacing
+from nerg_mi.files.png import write_png
+from nerg_mi.files.tables import write_json
 from nerg_mi.scenes.store import cameras, twin
 from nerg_mi.scenes.store.layout import Layout
 

@@ -4,8 +4,8 @@ import pytest
 
 from nerg_mi.capture.bounds import lonely, scene_box
 from nerg_mi.capture.cameras import Camera
-from nerg_mi.field.box import Box
-from nerg_mi.formats.intrinsics import Intrinsics
+from nerg_mi.maths.box import Box
+from nerg_mi.capture.intrinsics import Intrinsics
 
 LENS = Intrinsics(10, 10, 10.0, 10.0, 5.0, 5.0)
 

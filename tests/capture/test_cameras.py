@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.capture.cameras import Camera, pixel_directions, project, sensor_dict, view_tangents
-from nerg_mi.formats.intrinsics import Intrinsics
+from nerg_mi.capture.intrinsics import Intrinsics
 
 FOX = Intrinsics(135, 240, 171.94, 171.81, 69.3, 120.7, 0.0578421, -0.0805099, -0.000980296, 0.00015575)
 

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.dataset import open_dataset
-from nerg_mi.formats.intrinsics import Intrinsics
+from nerg_mi.capture.intrinsics import Intrinsics
 
-from ..reference import opencv
+from tests.reference import opencv
 
 W, H = 14, 10
 OPENCV = Intrinsics(W, H, 12.0, 12.5, 6.6, 5.3, 0.05, -0.02, 0.003, -0.002)

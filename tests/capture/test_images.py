@@ -6,8 +6,8 @@ import pytest
 
 from nerg_mi.capture.images import View, load_usable, load_view, split_holdout
 from nerg_mi.capture.reading import read_image
-from nerg_mi.formats.exr import write_bitmap_exr
-from nerg_mi.formats.transforms import read_transforms
+from nerg_mi.files.exr import write_bitmap_exr
+from nerg_mi.capture.transforms import read_transforms
 
 
 @pytest.fixture

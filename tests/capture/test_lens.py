@@ -6,8 +6,8 @@ import pytest
 
 from nerg_mi.capture import lens
 from nerg_mi.capture.cameras import pixel_directions, pixel_grid
-from nerg_mi.formats.intrinsics import Intrinsics
-from ..reference import opencv
+from nerg_mi.capture.intrinsics import Intrinsics
+from tests.reference import opencv
 
 FOX = Intrinsics(135, 240, 171.94, 171.81, 69.3, 120.7, 0.0578421, -0.0805099, -0.000980296, 0.00015575)
 LENSES = {

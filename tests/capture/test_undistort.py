@@ -7,7 +7,7 @@ import pytest
 from nerg_mi.capture.cameras import Camera, pixel_directions
 from nerg_mi.capture.images import View
 from nerg_mi.capture.undistort import pinhole, through_lens, undistorted
-from nerg_mi.formats.intrinsics import Intrinsics
+from nerg_mi.capture.intrinsics import Intrinsics
 
 PLAIN = Intrinsics(90, 70, 80.0, 80.0, 44.0, 36.5)
 LENSES = {

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.attention.rays import Rays
+from nerg_mi.rays.rays import Rays
 
-from ..evaluation.test_gaze_evaluation import crowd
-from ..formats.test_nerg_checkpoint import save, small_gaze
-from ..formats.test_torch_ngp import small_state
-from ..plugins import fields
-from ..reference.torch_ngp_numpy import nerf_state
-from ..view.standins import write_standins
+from tests.evaluation.gaze.test_evaluation import crowd
+from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.formats.torch_ngp.test_fields import small_state
+from tests.plugins import fields
+from tests.reference.torch_ngp_numpy import nerf_state
+from tests.view.standins import write_standins
 from .test_render import SCENE
 
 DEMO = ("occlusion.png", "gaze.png", "gaze_sphere.png", "depth.png", "visibility.png", "color.png", "scene.exr", "run.json")
@@ -103,8 +103,8 @@ def make_inputs(folder: Path) -> Path:
     import mitsuba as mi
 
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.formats.pickling import write_torch
-    from nerg_mi.formats.torch_ngp import read_torch_ngp
+    from nerg_mi.formats.torch_ngp.pickling import write_torch
+    from nerg_mi.formats.torch_ngp.fields import read_torch_ngp
 
     (folder / "scene.xml").write_text(SCENE)
     (folder / "demo").mkdir()

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.field.box import Box
-from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.maths.box import Box
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
 

@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from nerg_mi.cli import _app, main
 
-from ..plugins import fields
+from tests.plugins import fields
 
 
 @pytest.fixture

@@ -4,10 +4,10 @@ import pytest
 from typer.testing import CliRunner
 
 from nerg_mi.cli import _app, main
-from nerg_mi.formats.pickling import write_torch
+from nerg_mi.formats.torch_ngp.pickling import write_torch
 
-from ..formats.test_nerg_checkpoint import save, small_gaze
-from ..formats.test_torch_ngp import small_state
+from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.formats.torch_ngp.test_fields import small_state
 
 
 def run(*arguments):

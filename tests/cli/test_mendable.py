@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.attention.rays import Rays
+from nerg_mi.rays.rays import Rays
 from nerg_mi.cli import main
 
 

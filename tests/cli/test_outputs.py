@@ -148,7 +148,7 @@ def test_filtering_in_place_keeps_its_input_where_there_is_no_room(inputs, tmp_p
     for name in ("rays.npz", "rays.parquet"):
         if name.endswith(".parquet"):
             pytest.importorskip("pyarrow")
-        from nerg_mi.attention.rays import Rays
+        from nerg_mi.rays.rays import Rays
 
         Rays.load(inputs / "rays.npz").save(tmp_path / name)
         before = (tmp_path / name).read_bytes()

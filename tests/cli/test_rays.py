@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from nerg_mi.attention.rays import Rays
-from nerg_mi.attention.skeleton import keypoints_from_head
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.skeleton import keypoints_from_head
 from nerg_mi.cli.rays import app
 from nerg_mi.errors import NergError
-from nerg_mi.formats.skeleton_file import write_skeleton
+from nerg_mi.rays.readers.skeleton_file import write_skeleton
 
 
 def run(*arguments):

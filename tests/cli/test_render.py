@@ -107,7 +107,7 @@ def test05b_a_mistake_of_the_program_while_it_renders_is_told_as_one(scene, tmp_
     def broken(*args, **options):
         raise RuntimeError("in a plugin:\nTraceback (most recent call last):\n  File \"x.py\", line 1, in f\nTypeError: no len()")
 
-    monkeypatch.setattr("nerg_mi.rendering.bands.render_bands", broken)
+    monkeypatch.setattr("nerg_mi.rendering.pictures.bands.render_bands", broken)
     assert nerg("render", scene, "-o", tmp_path / "out.exr") == 70
     assert "internal error" in capsys.readouterr().err and not (tmp_path / "out.exr").exists()
 
@@ -127,7 +127,7 @@ def test07_one_thread_is_enough(rgb, scene, tmp_path, name):
 
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
 def test08_a_picture_takes_the_place_of_another_whole(rgb, scene, tmp_path, monkeypatch, name):
-    from nerg_mi.formats import atomic
+    from nerg_mi.files import atomic
 
     out = tmp_path / name
     out.write_bytes(b"what was there")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.attention.sphere import fibonacci_directions
-from nerg_mi.field.box import Box
-from nerg_mi.field.gaze import GazeConfig, GazeField
-from nerg_mi.field.gaze_ensemble import GazeEnsemble
-from nerg_mi.field.hashgrid import HashGridConfig
-from nerg_mi.field.log_gaze import LogGazeConfig, LogGazeField, blind_table
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.box import Box
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField, blind_table
 from nerg_mi.formats.fields import save_gaze
 
 KINDS = ("linear", "normalised", "default recipe", "ensemble")

@@ -9,7 +9,7 @@ import pytest
 
 from nerg_mi.evaluation.ablation import COLUMNS, all_variants, summarise, table, write_ablation
 
-from .test_gaze_evaluation import crowd
+from .gaze.test_evaluation import crowd
 
 
 def rows():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.hashgrid import HashGrid, HashGridConfig
+from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.mlp import MLP
 
 GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8, dimensions=2)

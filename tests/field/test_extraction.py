@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.field import extraction
-from nerg_mi.field.box import Box
+from nerg_mi.maths.box import Box
 from nerg_mi.field.extraction import Lattice, Sampler, crossings, opacity, surface_density
 from nerg_mi.field.occupancy import OccupancyGrid
 

@@ -6,7 +6,7 @@ import pytest
 
 from nerg_mi.field.mlp import MLP
 
-from ..reference import fields_numpy as reference
+from tests.reference import fields_numpy as reference
 
 SIZES = [[3, 1], [8, 16, 5], [6, 16, 16, 3]]
 

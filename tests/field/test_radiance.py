@@ -4,11 +4,11 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.box import Box
-from nerg_mi.field.hashgrid import HashGrid, HashGridConfig
+from nerg_mi.maths.box import Box
+from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField, density_from_log, sigmoid
 
-from ..reference import fields_numpy as reference
+from tests.reference import fields_numpy as reference
 
 GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)
 CONFIG = RadianceConfig(grid=HashGridConfig(**GRID), width=16, geometry=7, density_scale=2.5)

@@ -3,10 +3,10 @@ import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.field.box import Box
-from nerg_mi.field.gaze import GazeConfig, GazeField
-from nerg_mi.field.hashgrid import HashGridConfig
-from nerg_mi.field.harmonics import encode_direction
+from nerg_mi.maths.box import Box
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.mlp import MLP
 
 RNG = np.random.default_rng(0)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.field.box import Box
+from nerg_mi.maths.box import Box
 from nerg_mi.field.extraction import Lattice, Sampler, surface_density
-from nerg_mi.field.hashgrid import HashGrid, HashGridConfig
+from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.formats.surfaces import mesh, points, write_glb, write_ply
 from nerg_mi.formats.volumes import density_and_color, write_volume

@@ -27,13 +27,13 @@ with atheris.instrument_imports(include=["nerg_mi.formats", "nerg_mi.capture", "
     import nerg_mi  # noqa: F401
     from nerg_mi.capture.reading import read_image
     from nerg_mi.errors import NergError
-    from nerg_mi.formats.bounded import parse_json
-    from nerg_mi.formats.colmap import read_colmap
+    from nerg_mi.files.bounded import parse_json
+    from nerg_mi.capture.colmap import read_colmap
     from nerg_mi.formats.fields import load_radiance
-    from nerg_mi.formats.image_header import check_image
-    from nerg_mi.formats.npy import read_npy, read_npz
-    from nerg_mi.formats.torch_ngp import Given, read_torch_ngp
-    from nerg_mi.formats.unpickling import _Machine
+    from nerg_mi.files.image_header import check_image
+    from nerg_mi.files.npy import read_npy, read_npz
+    from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
+    from nerg_mi.formats.torch_ngp.unpickling import _Machine
 
 from tests.fuzz.cases import make_inputs  # noqa: E402
 from tests.fuzz.readers import READERS  # noqa: E402

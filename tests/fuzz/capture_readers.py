@@ -66,7 +66,7 @@ def _read_dataset(folder: Path) -> object:
 
 
 def _read_salience_set(folder: Path) -> object:
-    from nerg_mi.capture.salience import open_salience
+    from nerg_mi.capture.salience.views import open_salience
 
     return open_salience(folder, "spectral-residual")
 
@@ -108,7 +108,7 @@ def _colmap_txt(model: Path) -> None:
 
 def _picture(name: str):
     def make(folder: Path) -> None:
-        from nerg_mi.formats.exr import write_exr
+        from nerg_mi.files.exr import write_exr
 
         w, h = _SIZE
         random = np.random.default_rng(0)
@@ -131,9 +131,9 @@ def _picture(name: str):
 def _read_picture(name: str):
     def read(folder: Path) -> object:
         from nerg_mi.capture.reading import read_depth, read_image, read_mask
-        from nerg_mi.capture.salience import read_salience
+        from nerg_mi.capture.salience.views import read_salience
         from nerg_mi.errors import NergError
-        from nerg_mi.formats.posed import DepthFile, MaskFile
+        from nerg_mi.capture.posed import DepthFile, MaskFile
 
         path, out = folder / name, []
         ways = [

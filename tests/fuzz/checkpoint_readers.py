@@ -15,15 +15,15 @@ _ABOUT = {"sha": 1, "width": 24}
 def _parts():
     from drjit.llvm import ad as ns
 
-    from nerg_mi.field.box import Box
-    from nerg_mi.field.hashgrid import HashGridConfig
+    from nerg_mi.maths.box import Box
+    from nerg_mi.field.encoding.hashgrid import HashGridConfig
 
     return ns, Box((-1, 0, 2), (3, 2, 4)), HashGridConfig(levels=2, log2_rows=3, base=2, finest=4)
 
 
 def _make_radiance(folder: Path) -> None:
     from nerg_mi.field.background import Background, BackgroundConfig
-    from nerg_mi.field.hashgrid import HashGridConfig
+    from nerg_mi.field.encoding.hashgrid import HashGridConfig
     from nerg_mi.field.occupancy import OccupancyGrid
     from nerg_mi.field.radiance import RadianceConfig, RadianceField
     from nerg_mi.formats.fields import save_radiance
@@ -50,10 +50,10 @@ def _read_radiance(folder: Path) -> object:
 
 
 def _gaze(kind: str):
-    from nerg_mi.field.gaze import GazeConfig, GazeField
-    from nerg_mi.field.gaze_ensemble import GazeEnsemble
-    from nerg_mi.field.log_gaze import LogGazeConfig, LogGazeField
-    from nerg_mi.field.support import RaySupport
+    from nerg_mi.field.gaze.product import GazeConfig, GazeField
+    from nerg_mi.field.gaze.ensemble import GazeEnsemble
+    from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+    from nerg_mi.field.gaze.support import RaySupport
 
     ns, box, grid = _parts()
     if kind == "product":
@@ -100,7 +100,7 @@ def _trainer():
     """What of a trainer its state consists of."""
     import mitsuba as mi
 
-    from nerg_mi.training.step_clock import StepClock
+    from nerg_mi.training.common.step_clock import StepClock
 
     ns = _parts()[0]
     optimiser = mi.ad.Adam(lr=0.1)
@@ -126,26 +126,26 @@ def _trainer():
 
 
 def _make_radiance_run(folder: Path) -> None:
-    from nerg_mi.training.run_state import save_run
+    from nerg_mi.training.common.run_state import save_run
 
     save_run(_trainer(), folder / "field.run", _ABOUT, [{"psnr": 20.0}])
 
 
 def _read_radiance_run(folder: Path) -> object:
-    from nerg_mi.training.run_state import load_run
+    from nerg_mi.training.common.run_state import load_run
 
     return load_run(_trainer(), folder / "field.run", _ABOUT)
 
 
 def _make_gaze_run(folder: Path) -> None:
-    from nerg_mi.training.gaze_state import GazeRunFile
+    from nerg_mi.training.gaze.state import GazeRunFile
 
     trainer = _trainer()
     GazeRunFile(folder / "gaze.run", _ABOUT).keep("fit", trainer, {"best": 1.5}, trainer.averaged, now=True)
 
 
 def _read_gaze_run(folder: Path) -> object:
-    from nerg_mi.training.gaze_state import GazeRunFile
+    from nerg_mi.training.gaze.state import GazeRunFile
 
     file = GazeRunFile(folder / "gaze.run", _ABOUT, resume=True)
     return file.restore("fit", _trainer())
@@ -178,7 +178,7 @@ def _radiance_state() -> dict:
 
 
 def _make_ngp(folder: Path) -> None:
-    from nerg_mi.formats.pickling import write_torch
+    from nerg_mi.formats.torch_ngp.pickling import write_torch
 
     state = _radiance_state()
     shadow = [v for k, v in state.items() if k.endswith((".embeddings", ".weight"))]
@@ -196,13 +196,13 @@ def _make_ngp(folder: Path) -> None:
 
 
 def _read_ngp(folder: Path) -> object:
-    from nerg_mi.formats.torch_ngp import Given, read_torch_ngp
+    from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
 
     return read_torch_ngp(folder / "ngp.pth", _parts()[0], given=Given(finest=32))
 
 
 def _make_nerg(folder: Path) -> None:
-    from nerg_mi.formats.pickling import write_torch
+    from nerg_mi.formats.torch_ngp.pickling import write_torch
 
     names = (
         "net1.0.weight",
@@ -225,8 +225,8 @@ def _make_nerg(folder: Path) -> None:
 
 
 def _read_nerg(folder: Path) -> object:
-    from nerg_mi.formats.nerg_checkpoint import read_nerg
-    from nerg_mi.formats.torch_ngp import Given
+    from nerg_mi.formats.torch_ngp.nerg import read_nerg
+    from nerg_mi.formats.torch_ngp.fields import Given
 
     return read_nerg(folder / "nerg.pth", _parts()[0], given=Given(finest=32))
 

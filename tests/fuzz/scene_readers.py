@@ -45,7 +45,7 @@ def _read(folder: Path) -> object:
     import mitsuba as mi
 
     import nerg_mi  # noqa: F401
-    from nerg_mi.rendering import load_scene
+    from nerg_mi.rendering.pictures import load_scene
 
     if mi.variant() != "llvm_ad_rgb":
         mi.set_variant("llvm_ad_rgb")

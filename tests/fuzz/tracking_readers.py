@@ -14,7 +14,7 @@ from tests.fuzz.describe import Reader
 
 
 def _rays():
-    from nerg_mi.attention.rays import Rays
+    from nerg_mi.rays.rays import Rays
 
     rng = np.random.default_rng(0)
     d = rng.normal(size=(40, 3))
@@ -35,8 +35,8 @@ def _rays():
 
 def _shown(rays) -> None:
     """What the commands ask of rays: the card, a selection, pseudonyms."""
-    from nerg_mi.attention.filters import select_mask
-    from nerg_mi.attention.pseudonyms import pseudonymise
+    from nerg_mi.rays.filters import select_mask
+    from nerg_mi.rays.pseudonyms import pseudonymise
     from nerg_mi.cli.rays import _card
 
     with contextlib.redirect_stdout(io.StringIO()):
@@ -47,7 +47,7 @@ def _shown(rays) -> None:
 
 def _rays_file(name: str, *kinds: str) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.attention.rays import Rays
+        from nerg_mi.rays.rays import Rays
 
         _shown(Rays.load(folder / name))
 
@@ -63,7 +63,7 @@ def _make_metadata(folder: Path) -> None:
 def _read_metadata(folder: Path) -> None:
     from dataclasses import replace
 
-    from nerg_mi.formats.rays_metadata import read_metadata
+    from nerg_mi.rays.metadata import read_metadata
 
     about = read_metadata((folder / "metadata.json").read_bytes(), folder / "metadata.json")
     persons, cohorts = about.pop("persons"), about.pop("cohorts", [])
@@ -80,7 +80,7 @@ def _table() -> str:
 
 def _tables(name: str, make, *kinds: str, **options) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.attention.tables import rays_from_table
+        from nerg_mi.rays.readers.tables import rays_from_table
 
         _shown(rays_from_table([folder / name], _MAP, **options))
 
@@ -98,8 +98,8 @@ def _make_parquet(path: Path) -> None:
 
 
 def _make_skeleton(path: Path) -> None:
-    from nerg_mi.attention.skeleton import keypoints_from_head
-    from nerg_mi.formats.skeleton_file import write_skeleton
+    from nerg_mi.rays.readers.skeleton import keypoints_from_head
+    from nerg_mi.rays.readers.skeleton_file import write_skeleton
 
     body = keypoints_from_head(np.array([[0.1 * k, 0, 1.65] for k in range(6)]), np.tile([0.0, 1.0, 0.0], (6, 1)))
     write_skeleton(path, ["ann", "bo"] * 3, np.arange(6), body, decimals=2)
@@ -107,8 +107,8 @@ def _make_skeleton(path: Path) -> None:
 
 def _skeletons(name: str, *kinds: str, skip: bool = False) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.attention.skeleton import rays_from_skeleton
-        from nerg_mi.formats.skeleton_file import read_skeleton
+        from nerg_mi.rays.readers.skeleton import rays_from_skeleton
+        from nerg_mi.rays.readers.skeleton_file import read_skeleton
 
         _shown(rays_from_skeleton(folder / name, tick=0.1, skip_bad_lines=skip))
         if not skip:
@@ -123,7 +123,7 @@ def _recording(preset: str, files: dict[str, str], **options) -> Reader:
             (folder / name).write_bytes(gzip.compress(text.encode(), mtime=0) if name.endswith(".gz") else text.encode())
 
     def read(folder: Path) -> None:
-        from nerg_mi.attention.presets import PRESETS
+        from nerg_mi.rays.readers.presets import PRESETS
 
         _shown(PRESETS[preset].read([folder / list(files)[-1]], **options))
 
@@ -164,7 +164,7 @@ def _make_salt(folder: Path) -> None:
 
 
 def _read_salt(folder: Path) -> None:
-    from nerg_mi.attention.pseudonyms import read_salt
+    from nerg_mi.rays.pseudonyms import read_salt
 
     read_salt(folder / "salt")
 

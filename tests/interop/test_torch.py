@@ -9,16 +9,16 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.box import Box
-from nerg_mi.field.gaze import GazeConfig, GazeField
-from nerg_mi.field.gaze_ensemble import GazeEnsemble
-from nerg_mi.field.hashgrid import HashGridConfig
-from nerg_mi.field.log_gaze import LogGazeConfig, LogGazeField
+from nerg_mi.maths.box import Box
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.transport.gaze_integral import GazeIntegral
-from nerg_mi.transport.march import MarchSettings
-from nerg_mi.transport.media import GazeMedium
+from nerg_mi.transport.observer.integral import GazeIntegral
+from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.media.media import GazeMedium
 from nerg_mi.transport.place import Place
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
@@ -73,7 +73,7 @@ def test01_values_of_the_field(torch, interop):
 
 def test02_gradients_of_a_restatement_in_torch(torch, interop):
     # The same networks in torch behind the same features, so that its autograd shares nothing with ours.
-    from nerg_mi.field.harmonics import encode_direction
+    from nerg_mi.field.encoding.harmonics import encode_direction
 
     field = radiance()
     module, (p, d) = interop.RadianceModule(field), rays(torch)

@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.attention.rays import Rays
-from nerg_mi.attention.vmf import log_normaliser
+from nerg_mi.rays.rays import Rays
+from nerg_mi.maths.vmf import log_normaliser
 from tests.reference import kde as reference
 
 from .scenes import camera, channels, named, observer_at, wall

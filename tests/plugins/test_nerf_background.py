@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.hashgrid import HashGridConfig
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.formats.fields import load_radiance
 
 from . import fields

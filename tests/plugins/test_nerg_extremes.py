@@ -5,7 +5,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from ..reference import march_numpy as reference
+from tests.reference import march_numpy as reference
 from .scenes import GAZE, camera, channels, constant, look_at, observer_at, render, with_gaze
 
 DEPTH_SLOPE = 1e-4

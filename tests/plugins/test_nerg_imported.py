@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.formats.fields import save_gaze, save_radiance
-from nerg_mi.formats.nerg_checkpoint import read_nerg
+from nerg_mi.formats.torch_ngp.nerg import read_nerg
 
-from ..formats.test_nerg_checkpoint import save
-from ..reference import march_numpy, torch_ngp_numpy as reference
+from tests.formats.torch_ngp.test_nerg import save
+from tests.reference import march_numpy, torch_ngp_numpy as reference
 from .scenes import camera, named, render
 
 SIZE, STEP = 6, 0.02

@@ -3,9 +3,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.field.box import Box
-from nerg_mi.field.hashgrid import HashGridConfig
-from nerg_mi.field.log_gaze import LogGazeConfig, LogGazeField
+from nerg_mi.maths.box import Box
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.formats.fields import save_gaze
 
 from . import fields
@@ -72,7 +72,7 @@ def test02_what_escapes_counts(rgb, tmp_path):
     share = (angle * ~seen).sum() / (4 * np.pi)
     assert share == pytest.approx(1 / 6, abs=0.02)
     medium = rgb.load_dict(gaze).gaze_medium()
-    from nerg_mi.transport.march import MarchSettings
+    from nerg_mi.transport.march.primal import MarchSettings
     from nerg_mi.transport.place import Place
 
     scene = rgb.load_dict({"type": "scene", **room(rgb, True)})

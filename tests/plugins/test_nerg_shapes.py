@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.operations import traced_operations
+from nerg_mi.evaluation.study.operations import traced_operations
 
 from .scenes import camera, channels, constant, look_at, named, observer_at, render, with_gaze
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.transport import media
+from nerg_mi.transport.media import media
 
 from .scenes import camera, channels, observer_at, wall, with_field
 
@@ -129,9 +129,9 @@ def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
     """By transmittance the point stays the same, so that hidden and open differ by that share alone, whatever it is."""
     import drjit.llvm.ad as ns
 
-    from nerg_mi.attention.rays import Rays
-    from nerg_mi.field.gaze_ensemble import GazeEnsemble
-    from nerg_mi.field.support import RaySupport
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.field.gaze.ensemble import GazeEnsemble
+    from nerg_mi.field.gaze.support import RaySupport
     from nerg_mi.formats.fields import load_gaze, save_gaze
 
     from . import fields

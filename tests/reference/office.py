@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nerg_mi.attention.rays import Rays
+from nerg_mi.rays.rays import Rays
 
 ROOM = np.array([[0.0, 0.0, 0.0], [8.0, 6.0, 3.0]])
 WINDOW = np.array([[1.0, 0.8], [5.0, 2.4]])

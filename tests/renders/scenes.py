@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..plugins import fields
-from ..plugins.scenes import camera, constant, observer_at
+from tests.plugins import fields
+from tests.plugins.scenes import camera, constant, observer_at
 
 REFERENCES = Path(__file__).parent / "references"
 SIZE = 24

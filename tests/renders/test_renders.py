@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from nerg_mi.formats.exr import threads_for_mitsuba
+from nerg_mi.files.exr import threads_for_mitsuba
 
 from .scenes import REFERENCES, SCENES, scene, test_of
 

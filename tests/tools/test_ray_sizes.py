@@ -19,7 +19,7 @@ def test_a_row_for_each_command(tmp_path):
     assert done.returncode == 0, done.stderr
     rows = [line.split("|") for line in page.read_text().splitlines() if line.startswith("| rays ")]
     assert len(rows) == 3 and all(row[2].strip() == "5,000" and float(row[5]) > 0 for row in rows)
-    from nerg_mi.attention.rays import Rays
+    from nerg_mi.rays.rays import Rays
 
     half = Rays.load(tmp_path / "made" / "half.npz")
     assert 2000 < len(half) < 3000 and half.confidence.min() >= 0.5

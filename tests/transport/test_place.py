@@ -4,8 +4,8 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march import MarchSettings
-from nerg_mi.transport.media import VolumeMedium
+from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.media.media import VolumeMedium
 from nerg_mi.transport.place import Place
 
 SETTINGS = MarchSettings(0.01)

@@ -12,7 +12,7 @@ CELLS = 64
 
 def solid_cells() -> np.ndarray:
     """Cells (z, y, x), bool, that walls or furniture fill: 13 cm wide, on the unit cube of the store's box."""
-    from nerg_mi.field.box import Box
+    from nerg_mi.maths.box import Box
     from nerg_mi.scenes.store import layout
 
     box = Box(*BOX)
@@ -30,9 +30,9 @@ def write_standins(folder: Path) -> dict[str, str]:
     import mitsuba as mi
 
     from nerg_mi.field.backend import namespace
-    from nerg_mi.field.box import Box
-    from nerg_mi.field.gaze import GazeConfig, GazeField
-    from nerg_mi.field.hashgrid import HashGridConfig
+    from nerg_mi.maths.box import Box
+    from nerg_mi.field.gaze.product import GazeConfig, GazeField
+    from nerg_mi.field.encoding.hashgrid import HashGridConfig
     from nerg_mi.field.occupancy import OccupancyGrid
     from nerg_mi.field.radiance import RadianceConfig, RadianceField
     from nerg_mi.formats.fields import save_gaze, save_radiance

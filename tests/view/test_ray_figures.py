@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.attention.rays import Rays
+from nerg_mi.rays.rays import Rays
 from nerg_mi.view.figures import DPI
 from nerg_mi.view.ray_figures import floor_plan, layout_figure
 

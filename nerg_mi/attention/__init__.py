@@ -1,1 +1,0 @@
-"""From tracking data to supervision: rays, skeletons, von Mises-Fisher densities, probes, splits."""

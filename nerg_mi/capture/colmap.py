@@ -1,0 +1,262 @@
+"""COLMAP's sparse models: ``cameras``, ``images`` and ``points3D``, as ``.bin`` or as ``.txt``.
+
+The layout of both is COLMAP's (src/colmap/scene/reconstruction_io): little-endian; world-to-camera poses as a
+quaternion (w, x, y, z) and a translation; cameras look along +z with y down; the first pixel's centre is (0.5, 0.5).
+"""
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import MissingFile, NergError, sentence
+from nerg_mi.files.bounded import plain, read_bytes, text_lines
+from .posed import FARTHEST, Frame, MaskFile, PosedImages, Unused, drop_repeated, inside, none_usable
+
+# COLMAP's numbers of its camera models, and how many parameters each has.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+}
+# Their parameters in COLMAP's order, as far as the mapping is known here; "f" is both focal lengths.
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fl_x fl_y cx cy", "SIMPLE_RADIAL": "f cx cy k1", "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2", "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4", "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+}
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# Points that fewer images hold, or that project worse than so many pixels, are no evidence of a surface.
+_MIN_TRACK, _MAX_ERROR = 3, 4.0
+# Characters of a line that is split into words; those of observations, which are longer, are skipped.
+_LONGEST = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Camera:
+    model: str
+    width: int
+    height: int
+    parameters: tuple
+
+    def lens(self) -> dict:
+        names = _PARAMETERS.get(self.model)
+        if names is None:
+            raise NergError(f'its camera model "{self.model}" is not supported; run "colmap image_undistorter" and train on '
+                             f"its result, or use one of {', '.join(_PARAMETERS)}")
+        names = names.split()
+        if len(names) != len(self.parameters) or not np.all(np.isfinite(self.parameters)):
+            raise NergError(f"its camera needs {len(names)} finite parameters for {self.model}, not {self.parameters}")
+        lens = dict(zip(names, map(float, self.parameters)))
+        if "f" in lens:
+            lens["fl_x"] = lens["fl_y"] = lens.pop("f")
+        if self.model.endswith("FISHEYE"):
+            lens["fisheye"] = 1.0
+        return {"w": float(self.width), "h": float(self.height), **lens}
+
+
+def model_files(folder: str | Path) -> dict[str, Path] | None:
+    """The files "cameras", "images" and, where it exists, "points3D" of a model in ``folder``; None if there is none."""
+    folder = Path(folder)
+    for suffix in (".bin", ".txt"):
+        if all((folder / (n + suffix)).is_file() for n in ("cameras", "images")):
+            return {n: folder / (n + suffix) for n in ("cameras", "images", "points3D") if (folder / (n + suffix)).is_file()}
+    return None
+
+
+def read_colmap(folder: str | Path, images: str | Path, masks: str | Path | None = None,
+                allow_outside: bool = False) -> PosedImages:
+    """Read the model in ``folder``; its image names are relative to ``images``, its masks' to ``masks`` (``NAME.png``).
+
+    Images and masks that lie outside of the capture, the folder that holds ``images``, links followed, are not used unless
+    ``allow_outside``. In COLMAP's own world. Frames that cannot be used are listed; `NergError` names file and record for
+    what cannot be parsed, and when no frame can be used.
+    """
+    folder, images = Path(folder), Path(images)
+    files = model_files(folder)
+    if files is None:
+        raise MissingFile(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
+    binary = files["cameras"].suffix == ".bin"
+    cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"])
+    poses = (_images_bin if binary else _images_txt)(files["images"])
+    frames, unused = [], []
+    root = None if allow_outside else images.parent
+    for name, camera, q, t in poses:
+        try:
+            frames.append(_frame(name, cameras.get(camera), camera, q, t, images, masks, root))
+        except (ValueError, OverflowError, OSError) as e:
+            # A name may be longer than the system allows, or hold what no name can.
+            unused.append(Unused(name, sentence(e)))
+    frames.sort(key=lambda f: f.name)
+    frames, repeated = drop_repeated(frames)
+    unused = sorted(unused + repeated, key=lambda u: u.name)
+    if not frames:
+        raise none_usable(files["images"], unused)
+    points = (_points_bin if binary else _points_txt)(files["points3D"]) if "points3D" in files else None
+    digest = hashlib.sha256(b"".join(hashlib.sha256(read_bytes(files[n])).digest() for n in ("cameras", "images")))
+    return PosedImages(files["images"], frames, unused, None, digest.hexdigest(), points=points)
+
+
+def _frame(name: str, camera: _Camera | None, number: int, q, t, images: Path, masks, root: Path | None) -> Frame:
+    if camera is None:
+        raise NergError(f"the model has no camera {number}")
+    if not inside(root, images / name, "image").is_file():
+        raise NergError(f'its image "{plain(images / name)}" does not exist')
+    lens, mask = camera.lens(), None
+    if masks is not None:
+        # COLMAP appends the suffix; others replace it.
+        names = Path(masks) / f"{name}.png", (Path(masks) / name).with_suffix(".png")
+        found = [p for p in names if inside(root, p, "mask").is_file()]
+        if not found:
+            raise NergError(f'its mask "{plain(names[0])}" does not exist')
+        mask = MaskFile(found[0])
+    return Frame(name, images / name, _to_world(q, t), lens, mask=mask)
+
+
+def _to_world(q, t) -> np.ndarray:
+    w, x, y, z = q
+    norm = float(np.linalg.norm(q))
+    if not (1e-6 < norm <= FARTHEST and np.abs(t).max() <= FARTHEST):
+        raise NergError("its pose is not finite, or its quaternion is zero")
+    w, x, y, z = (v / norm for v in (w, x, y, z))
+    m = np.eye(4)
+    m[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    out = np.eye(4)
+    out[:3, :3] = m[:3, :3].T
+    out[:3, 3] = -m[:3, :3].T @ np.asarray(t, np.float64)
+    return out @ _FLIP
+
+
+class _Reader:
+    """Little-endian records of a file; an end that comes too early is told with its place."""
+
+    def __init__(self, path: Path):
+        self.path, self.data, self.at = path, read_bytes(path, "COLMAP file"), 0
+
+    def take(self, form: str, what: str) -> tuple:
+        size = struct.calcsize("<" + form)
+        self.need(size, what)
+        out = struct.unpack_from("<" + form, self.data, self.at)
+        self.at += size
+        return out
+
+    def need(self, size: int, what: str) -> None:
+        if self.at + size > len(self.data):
+            raise NergError(f'"{self.path}" ends in the middle of {what} (byte {self.at} of {len(self.data)}); copy it again')
+
+    def skip(self, size: int, what: str) -> None:
+        self.need(size, what)
+        self.at += size
+
+    def name(self, what: str) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise NergError(f'"{self.path}" ends in the middle of the name of {what}; copy it again')
+        out, self.at = self.data[self.at:end], end + 1
+        return out.decode("utf-8", errors="surrogateescape")
+
+
+def _cameras_bin(path: Path) -> dict[int, _Camera]:
+    r, out = _Reader(path), {}
+    for k in range(r.take("Q", "its header")[0]):
+        number, model, width, height = r.take("iiQQ", f"camera record {k + 1}")
+        if model not in _MODELS:
+            raise NergError(f'camera {number} of "{path}" has the unknown model number {model}, so that the file cannot be '
+                             'read on; convert it with "colmap model_converter --output_type TXT"')
+        name, count = _MODELS[model]
+        out[number] = _Camera(name, width, height, r.take(f"{count}d", f"camera record {k + 1}"))
+    return out
+
+
+def _images_bin(path: Path) -> list[tuple]:
+    r, out = _Reader(path), []
+    for k in range(r.take("Q", "its header")[0]):
+        what = f"image record {k + 1}"
+        values = r.take("i7di", what)
+        name = r.name(what)
+        # Per observation: x, y as doubles and the number of its point.
+        r.skip(24 * r.take("Q", what)[0], what)
+        out.append((name, values[8], values[1:5], values[5:8]))
+    return out
+
+
+def _points_bin(path: Path) -> np.ndarray:
+    r, out = _Reader(path), []
+    for k in range(r.take("Q", "its header")[0]):
+        what = f"point record {k + 1}"
+        values = r.take("Q3d3BdQ", what)
+        r.skip(8 * values[8], what)
+        out.append((*values[1:4], values[7], values[8]))
+    return _trusted(out, path)
+
+
+def _lines(path: Path):
+    """Line numbers and lines; comments left out."""
+    for number, line in enumerate(text_lines(path, "COLMAP file"), 1):
+        if not line.startswith("#"):
+            yield number, line
+
+
+def _rows(path: Path):
+    """Numbers and words of the lines that are not empty."""
+    for number, line in _lines(path):
+        if len(line) > _LONGEST:
+            raise NergError(f'line {number} of "{path}" has {len(line):,} characters, and at most {_LONGEST:,} are read; '
+                            "is it a COLMAP file?")
+        if line.strip():
+            yield number, line.split()
+
+
+def _cameras_txt(path: Path) -> dict[int, _Camera]:
+    out = {}
+    for number, words in _rows(path):
+        try:
+            out[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
+        except (ValueError, IndexError) as e:
+            raise NergError(f'line {number} of "{path}" is not "CAMERA_ID MODEL WIDTH HEIGHT PARAMETERS"') from e
+    return out
+
+
+def _images_txt(path: Path) -> list[tuple]:
+    out, observations = [], False
+    for number, line in _lines(path):
+        # Every second line lists observations, and may be empty.
+        if observations:
+            observations = False
+            continue
+        words = line[:_LONGEST].split()
+        if not words:
+            continue
+        try:
+            q, t = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
+            out.append((" ".join(words[9:]), int(words[8]), q, t))
+            if len(q) != 4 or len(t) != 3 or not words[9:]:
+                raise ValueError
+        except (ValueError, IndexError) as e:
+            raise NergError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
+        observations = True
+    return out
+
+
+def _points_txt(path: Path) -> np.ndarray:
+    out = []
+    for number, words in _rows(path):
+        try:
+            out.append((*map(float, words[1:4]), float(words[7]), (len(words) - 8) // 2))
+        except (ValueError, IndexError) as e:
+            raise NergError(f'line {number} of "{path}" is not "POINT3D_ID X Y Z R G B ERROR TRACK"') from e
+    return _trusted(out, path)
+
+
+def _trusted(rows: list[tuple], path: Path) -> np.ndarray:
+    table = np.array(rows, np.float64).reshape(-1, 5)
+    good = np.all(np.abs(table) <= FARTHEST, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
+    return table[good, :3]

@@ -1,0 +1,229 @@
+"""A posed image set as its file describes it, before a picture is opened.
+
+Poses are OpenGL camera-to-world matrices (x right, y up, z back) in the data set's own
+coordinates and units; readers do not re-centre, scale or turn them.
+"""
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import plain
+from .intrinsics import Intrinsics
+
+# Keys of `Frame.lens`, all floats; "fisheye" is 1 for fisheye lenses.
+LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6",
+             "camera_angle_x", "camera_angle_y", "fisheye")
+
+
+FARTHEST = 1e12
+"""Nothing may lie farther from the origin, in units: beyond, differences of positions are lost."""
+
+# Focal lengths as shares of the picture's width: from a view of almost 180 degrees to one of a thousandth of a degree.
+_FOCAL = 1e-3, 1e5
+_BENT, _UNBENT = 1e9, 1e-30
+
+
+def inside(root: Path | None, path: Path, what: str) -> Path:
+    """``path``, where it lies below the folder ``root`` once all links are followed (None: anywhere).
+
+    Raises `NergError` otherwise: a data set of somebody else's must not make files be read that it does not hold.
+    """
+    if root is not None and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
+        raise NergError(
+            f'its {what} "{plain(path)}" lies outside of the data set\'s folder "{root}"; move it there, or allow this with '
+            "--allow-outside"
+        )
+    return path
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """``unit``: scene units of one unit of the file; ``along_axis``: distances along the viewing axis (z) rather than
+    along each pixel's ray."""
+
+    path: Path
+    unit: float = 1.0
+    along_axis: bool = False
+
+
+@dataclass(frozen=True)
+class MaskFile:
+    """``hides``: white marks what is left out (instant-ngp's dynamic masks), not what is used (nerfstudio, COLMAP)."""
+
+    path: Path
+    hides: bool = False
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed image. ``name``: its path as the file spells it; ``to_world``: (4, 4) OpenGL camera-to-world;
+    ``lens``: its camera keys, see `LENS_KEYS`."""
+
+    name: str
+    image: Path
+    to_world: np.ndarray
+    lens: dict
+    depth: DepthFile | None = None
+    mask: MaskFile | None = None
+
+    def intrinsics(self, width: int, height: int) -> Intrinsics:
+        """Intrinsics for this frame's image, whose file has ``width`` x ``height`` pixels.
+
+        Focal lengths in pixels (``fl_x``) are preferred to angles, which some writers round.
+        Raises `NergError` when the file gives neither, or another shape than the image's.
+        """
+        lens = self.lens
+        w, h = lens.get("w", width), lens.get("h", height)
+        if not (w > 0 and h > 0) or abs(w * height - h * width) > 0.01 * h * width:
+            raise NergError(
+                f'the image "{self.image}" has {width} x {height} pixels but its camera says {w:g} x {h:g}; '
+                'correct width and height ("w" and "h"), or the image'
+            )
+        fx, fy = lens.get("fl_x"), lens.get("fl_y")
+        if fx is None and "camera_angle_x" in lens:
+            fx = w / (2 * np.tan(lens["camera_angle_x"] / 2))
+        if fy is None and "camera_angle_y" in lens:
+            fy = h / (2 * np.tan(lens["camera_angle_y"] / 2))
+        # One focal length means square pixels.
+        fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
+        if fx is None or not all(_FOCAL[0] * w <= f <= _FOCAL[1] * w for f in (fx, fy)):
+            raise NergError(
+                f'frame "{plain(self.name)}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in radians'
+            )
+        if not (abs(lens.get("cx", 0)) <= 100 * w and abs(lens.get("cy", 0)) <= 100 * h):
+            raise NergError(f'the principal point ("cx", "cy") of frame "{plain(self.name)}" is not near its picture; correct it')
+        bent = [lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+        if not all(abs(k) <= _BENT for k in bent):
+            raise NergError(f'the distortion of frame "{plain(self.name)}" has coefficients beyond {_BENT:g}; correct them')
+        # One that bends nothing would still be divided by where a lens is asked for its fold.
+        bent = [k if abs(k) >= _UNBENT else 0.0 for k in bent]
+        stated = Intrinsics(
+            w, h, float(fx), float(fy), lens.get("cx", w / 2), lens.get("cy", h / 2),
+            *bent, bool(lens.get("fisheye")),
+        )
+        return stated.resized(width, height)
+
+
+@dataclass(frozen=True)
+class Unused:
+    """A frame that is left out, and why."""
+
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f'left out "{plain(self.name)}": {plain(self.reason, 1000)}'
+
+
+@dataclass(frozen=True)
+class PosedImages:
+    """What a file says about its frames, sorted by file name.
+
+    ``unused``: frames that cannot be used; ``notes``: sentences about frames that can, with something missing;
+    ``aabb``: (2, 3) scene box from the file, or None; ``points``: (N, 3) points on surfaces, or None;
+    ``held_out``: names of the frames that the file itself holds out, or None; ``spare``: of frames that it sets apart from
+    both; ``original``: (4, 4) similarity from these coordinates to those before the writer turned them
+    (``applied_transform``), or None; ``to_file``: (4, 4) similarity from these coordinates to those of the file;
+    ``sha256``: of the file, for provenance.
+    """
+
+    path: Path
+    frames: list[Frame]
+    unused: list[Unused]
+    aabb: np.ndarray | None
+    sha256: str
+    notes: list[str] = field(default_factory=list)
+    points: np.ndarray | None = None
+    held_out: list[str] | None = None
+    spare: list[str] = field(default_factory=list)
+    original: np.ndarray | None = None
+    to_file: np.ndarray = field(default_factory=lambda: np.eye(4))
+
+    def moved(self, similarity: np.ndarray) -> PosedImages:
+        """The same in other coordinates: ``similarity`` (4, 4), a uniform scale, a rotation and a translation."""
+        scale, rotation = _parts(similarity)
+        back = np.linalg.inv(similarity)
+        frames = []
+        for f in self.frames:
+            pose = np.eye(4)
+            pose[:3, :3] = rotation @ f.to_world[:3, :3]
+            pose[:3, 3] = similarity[:3, :3] @ f.to_world[:3, 3] + similarity[:3, 3]
+            depth = None if f.depth is None else replace(f.depth, unit=f.depth.unit * scale)
+            frames.append(replace(f, to_world=pose, depth=depth))
+        return replace(
+            self, frames=frames, aabb=_moved_box(self.aabb, similarity),
+            points=None if self.points is None else self.points @ similarity[:3, :3].T + similarity[:3, 3],
+            original=None if self.original is None else self.original @ back, to_file=self.to_file @ back,
+        )
+
+
+def _parts(similarity: np.ndarray) -> tuple[float, np.ndarray]:
+    """Scale and rotation of a similarity; `NergError` for anything else."""
+    m = np.asarray(similarity, np.float64)
+    scale = np.cbrt(np.linalg.det(m[:3, :3])) if m.shape == (4, 4) and np.all(np.isfinite(m)) else 0.0
+    if not scale > 0 or not np.abs(m[:3, :3] @ m[:3, :3].T / scale**2 - np.eye(3)).max() <= 1e-3:
+        raise NergError("a change of coordinates must be a uniform scale, a rotation and a translation, without mirroring")
+    return float(scale), m[:3, :3] / scale
+
+
+def _moved_box(box: np.ndarray | None, m: np.ndarray) -> np.ndarray | None:
+    """The box around a moved box."""
+    if box is None:
+        return None
+    corners = np.array([[box[k][a] for a, k in enumerate(pick)] for pick in np.ndindex(2, 2, 2)])
+    corners = corners @ m[:3, :3].T + m[:3, 3]
+    return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def rigid_pose(matrix: object) -> np.ndarray:
+    """The (4, 4) pose that ``matrix`` means: a scale is taken out, and rounding. `NergError` for what is no pose."""
+    try:
+        pose = np.asarray(matrix, np.float64)
+    except (TypeError, ValueError, OverflowError) as e:
+        raise NergError("its pose must be a matrix of 4 x 4 numbers") from e
+    if pose.shape == (3, 4):
+        pose = np.vstack([pose, [0, 0, 0, 1]])
+    if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
+        raise NergError("its pose must be a matrix of 4 x 4 finite numbers")
+    if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise NergError("the last row of its pose is not 0, 0, 0, 1 (is the matrix transposed?)")
+    rotation = pose[:3, :3]
+    if not np.abs(pose).max() <= FARTHEST:
+        raise NergError(f"its pose has numbers beyond {FARTHEST:g}")
+    scale = np.cbrt(np.linalg.det(rotation))
+    if not scale > 0 or not np.abs(rotation @ rotation.T / scale**2 - np.eye(3)).max() <= 1e-2:
+        raise NergError("its pose is not a rotation and a translation (mirrored, sheared or singular)")
+    # Some writers leave a scale in the rotation, or round it: the nearest rotation is what they meant.
+    u, _, vt = np.linalg.svd(rotation)
+    pose = pose.copy()
+    pose[:3, :3] = u @ vt
+    return pose
+
+
+def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
+    """``frames`` with each image file once, and what was said about it again."""
+    first: dict[Path, Frame] = {}
+    kept, unused = [], []
+    for frame in frames:
+        key = frame.image.resolve()
+        if key not in first:
+            first[key] = frame
+            kept.append(frame)
+            continue
+        same = np.allclose(first[key].to_world, frame.to_world, atol=1e-6)
+        said = "" if same else ", with another pose; the first counts"
+        unused.append(Unused(frame.name, f"its image is listed twice{said}"))
+    return kept, unused
+
+
+def none_usable(path: Path, unused: list[Unused]) -> NergError:
+    """The error of a set without a single usable frame."""
+    if not unused:
+        return NergError(f'"{path}" lists no frames; name the file of a posed image set')
+    return NergError(f'none of the {len(unused)} frames of "{path}" can be used; the first, "{plain(unused[0].name)}": '
+                     f"{plain(unused[0].reason, 1000)}")

@@ -1,0 +1,1 @@
+"""Salience images as densities over directions."""

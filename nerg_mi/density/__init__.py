@@ -1,0 +1,1 @@
+"""From rays to densities over directions: probes, bandwidths, what a surface receives."""

@@ -1,0 +1,72 @@
+"""The kernel density of tracked rays as an observer's view: the ground truth beside a gaze field, inside the integrator.
+
+An observer's density is that of the rays that started nearest (NeRG, Section 5.3, and the baseline of ``nerg eval gaze``). It
+is gathered once an observer, and summed at every pixel or tabulated (:mod:`nerg_mi.density.kde.table`).
+"""
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.transport.observer.ensemble import keep_or_make
+from nerg_mi.transport.media.media import Similarity, at_nearest
+from .estimate import SphericalKde
+from .frame import WORTH
+from .table import SphericalKdeTable
+from nerg_mi.rays.rays import Rays
+
+
+class KdeView:
+    """``rays`` around observers in the scene. ``count``: how many of the nearest; ``kappa``: of their kernels; ``to_world``: from
+    the rays' frame to the scene's; ``backend``: as of ``SphericalKde``. What is hidden from the observer fades, as gaze does.
+    """
+
+    occluded = True
+
+    def __init__(self, rays: Rays, count: int = 4096, kappa: float = 20.0, to_world: Similarity | None = None, backend: object = None):
+        if len(rays) == 0:
+            raise NergError("there are no rays to show the density of")
+        self.to_world, self.backend = to_world or Similarity(), backend
+        self.count, self.kappa, self._known = min(count, len(rays)), kappa, []
+        self._origin, self._direction = rays.origin, rays.direction
+
+    def nearest(self, p: np.ndarray) -> np.ndarray:
+        """Directions (count, 3) of the rays that started nearest to ``p`` (3,), in metres in the rays' frame."""
+        square = ((self._origin - p) ** 2).sum(axis=1)
+        if self.count == len(square):
+            return self._direction
+        return self._direction[np.argpartition(square, self.count - 1)[: self.count]]
+
+    def face(self, observers: list) -> None:
+        """Gather the rays around each of ``observers`` (Point3f of one lane); kept until the observer changes."""
+        self._known = keep_or_make(self._known, observers, lambda p_o: _Density(self, p_o))
+
+    def value(self, p_o, r_o):
+        """Density (1/sr) in direction ``r_o``, unit, of the observer that is faced nearest to ``p_o``, lane by lane; without derivatives.
+
+        ``kde_frame.WORTH`` directions or more are looked up in a table, where that costs less; fewer are summed exactly.
+        """
+        d = self.to_world.direction_to_local(dr.detach(r_o))
+        return at_nearest(self._known, p_o, lambda known: known.density(d))
+
+
+class _Density:
+    """That of one observer."""
+
+    def __init__(self, view: KdeView, p_o):
+        self.center, self._table = type(p_o)(dr.detach(p_o)), None
+        p = np.array(view.to_world.point_to_local(self.center), np.float64).ravel()
+        rays = view.nearest(p)
+        self.kde = SphericalKde(rays, np.array([0, len(rays)]), view.kappa, backend=view.backend)
+
+    def density(self, d):
+        ns, lanes = self.kde.ns, dr.width(d)
+        d = ns.Array3f(d.x, d.y, d.z)
+        with dr.suspend_grad():
+            # All of a table is made, whatever is seen of it; a texel costs a fifth of a lane.
+            if lanes < WORTH or not SphericalKdeTable.fits(self.kde, lanes // 4):
+                return self.kde.density(dr.zeros(ns.UInt32, lanes), d)
+            if self._table is None:
+                self._table = SphericalKdeTable(self.kde)
+            return self._table.density(d)

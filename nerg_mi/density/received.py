@@ -1,0 +1,130 @@
+r"""Attention received by a surface, in area form.
+
+An observer at p_o looks into the direction ω with the density g(ω), in 1/sr. The probability that the look lands on a
+surface S is the integral of g over the directions in which S is seen. Over the surface's own points y it reads
+
+    A = ∫_S g V(y, p_o) max(0, -n · ω) / |y - p_o|² dA,    ω = (y - p_o) / |y - p_o|,
+
+with the change of variables dω = |cos θ| dA / d² (Veach 1997, section 8.2.2.2, "three-point form"), n the normal at y, and
+V the visibility of ``transport.observer.sight``. Unlike pixels, the points move with the surface: A has derivatives with
+respect to where the surface is, without any edge of its own that would have to be sampled. The moving edges of what
+*else* hides it are not seen by derivatives; the fall-off behind them is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.transport.observer.sight import ObserverPass, towards
+from nerg_mi.transport.place import Place
+from nerg_mi.transport.trace import default_settings
+
+
+@dataclass
+class Patches:
+    """Small flat pieces of a surface: centroids ``p`` (Point3f), unit normals ``n`` (Vector3f), ``area`` (Float, square
+    scene units)."""
+
+    p: object
+    n: object
+    area: object
+
+    def moved(self, offset) -> Patches:
+        """The same pieces, shifted by ``offset`` (Vector3f)."""
+        return Patches(self.p + offset, self.n, self.area)
+
+
+def patches(mesh, divisions: int = 4) -> Patches:
+    """A Mitsuba mesh, each triangle cut into ``divisions``² congruent ones: the centroid rule, of second order.
+
+    Normals are the faces' own, to the side that sees the vertices counter-clockwise. Attached to the ``vertex_positions``
+    of the mesh. ``ValueError`` for what is not a mesh.
+    """
+    import mitsuba as mi
+
+    params = mi.traverse(mesh)
+    if "vertex_positions" not in params or "faces" not in params:
+        raise NergError(f'"{mesh.id()}" is not a mesh; attention is received by meshes (cube, rectangle, ply, obj)')
+    if divisions < 1:
+        raise ValueError(f"a triangle is cut into at least 1 piece a side, got divisions={divisions}")
+    positions, faces = params["vertex_positions"], mi.UInt32(params["faces"])
+    centre = _centroids(divisions)
+    count = len(faces) // 3
+    index = dr.arange(mi.UInt32, count * len(centre))
+    face, piece = index // len(centre), index % len(centre)
+    a, b, c = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3))
+    u, v = (dr.gather(mi.Float, mi.Float(np.ascontiguousarray(centre[:, k])), piece) for k in range(2))
+    across = dr.cross(b - a, c - a)
+    twice = dr.norm(across)
+    flat = twice > 0
+    n = dr.select(flat, across / dr.select(flat, twice, 1), mi.Vector3f(0, 0, 1))
+    return Patches(a + u * (b - a) + v * (c - a), n, 0.5 * twice / len(centre))
+
+
+def _centroids(n: int) -> np.ndarray:
+    """Barycentric u, v (n², 2) of the centroids of a triangle's n² congruent parts."""
+    upright = [(i + 1 / 3, j + 1 / 3) for i in range(n) for j in range(n - i)]
+    turned = [(i + 2 / 3, j + 2 / 3) for i in range(n) for j in range(n - i - 1)]
+    return np.array(upright + turned, np.float32) / n
+
+
+def arriving(place: Place | None, density, p_o, p, n, falloff=0.0, sight: ObserverPass | None = None,
+             two_sided: bool = False):
+    """Attention per area, in 1 / square scene unit, that arrives at ``p`` with normal ``n`` from the observer ``p_o``.
+
+    ``density(p_od, p_o, r_o, active)``: gaze in 1/sr of an observer at ``p_o`` along the unit direction ``r_o``, who sees the
+    surface ``p_od`` there (``GazeMedium.evaluate(...)[0]``, or anything else). ``place``: what may stand in between
+    (shapes, a field, both; None: nothing). ``falloff`` d_f in scene units, ``sight``: as of the integrator. A closed
+    surface hides its own back, which therefore receives nothing; ``two_sided`` counts both sides of an open one. Lanes are
+    pairs; differentiable in all of them, in the density's parameters and in ``falloff``, but not over the edges of ``place``.
+    """
+    import mitsuba as mi
+
+    distance, r_o = towards(p_o, p)
+    cosine = -dr.dot(n, r_o)
+    n = dr.select(two_sided & (cosine < 0), -n, n)
+    cosine = dr.abs(cosine) if two_sided else cosine
+    active = (cosine > 0) & (distance > 0)
+    p_od, seen = p, mi.Float(1)
+    if place is not None:
+        sight = sight or ObserverPass(default_settings(place), "depth", "median", 0.5, 0, 512)
+        # Looked for a tolerance above the surface, as if a camera stood there.
+        found = sight.look(place, mi.Ray3f(p + n, -n), p, p_o, 0, active, mi.Float(falloff), False)
+        p_od, seen = found.p_od, found.visibility
+        active &= seen > 0
+    g = dr.select(active, density(p_od, p_o, r_o, active), 0)
+    square = dr.square(dr.select(active, distance, 1))
+    return dr.select(active, g * seen * cosine / square, 0)
+
+
+def contributions(place: Place | None, density, observers, surface: Patches, falloff=0.0, sight: ObserverPass | None = None,
+                  two_sided: bool = False):
+    """Share of each observer's look that each patch receives: Float, all patches of the first observer first.
+
+    Arguments as of ``arriving``; ``observers``: Point3f, a lane an observer.
+    """
+    import mitsuba as mi
+
+    count, people = dr.width(surface.p, surface.n, surface.area), dr.width(observers)
+    index = dr.arange(mi.UInt32, count * people)
+    who, where = index // count, index % count
+    p_o = dr.gather(mi.Point3f, mi.Point3f(observers), who)
+    p = dr.gather(mi.Point3f, mi.Point3f(surface.p), where)
+    n = dr.gather(mi.Vector3f, mi.Vector3f(surface.n), where)
+    area = dr.gather(mi.Float, mi.Float(surface.area), where)
+    return area * arriving(place, density, p_o, p, n, falloff, sight, two_sided)
+
+
+def received(place: Place | None, density, observers, surface: Patches, falloff=0.0, sight: ObserverPass | None = None,
+             two_sided: bool = False):
+    """Probability (Float, a lane an observer) that the look of each of ``observers`` (Point3f) lands on ``surface``.
+
+    Arguments as of ``arriving``. Makes observers x patches lanes at once. Exact as patches shrink against their distance
+    from the observer: at a distance of k patch diameters the error is of the order 1 / k².
+    """
+    each = contributions(place, density, observers, surface, falloff, sight, two_sided)
+    return dr.block_sum(each, dr.width(each) // dr.width(observers))

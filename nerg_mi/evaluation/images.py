@@ -1,0 +1,156 @@
+"""How well a radiance field's pictures equal posed pictures: PSNR, SSIM, depth.
+
+Pictures are rendered by the `nerg` integrator at its defaults, through ``mi.render``. A photo with lens distortion is left as
+it is; the rendering is bent to its lens.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.capture.cameras import Camera, pixel_directions, sensor_dict
+from nerg_mi.capture.images import View
+from nerg_mi.capture.undistort import pinhole, through_lens
+from nerg_mi.files.atomic import make_folder
+from nerg_mi.training.radiance.preview import psnr
+from nerg_mi.view.tonemap import srgb, write_png
+
+# Wang et al. 2004: window of 11 x 11 pixels, a Gaussian of 1.5; constants for values in 0..1.
+_RADIUS, _SIGMA, _C1, _C2 = 5, 1.5, 0.01**2, 0.03**2
+
+
+def ssim(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Structural similarity (Wang et al. 2004) of values in 0..1, (h, w, c), the mean over channels.
+
+    Averaged over the windows that lie in the picture and, where one is given, in ``mask`` (h, w); NaN if there is none.
+    """
+    from scipy.ndimage import correlate1d, minimum_filter
+
+    height, width = truth.shape[:2]
+    if min(height, width) <= 2 * _RADIUS:
+        return float("nan")
+    x = np.arange(-_RADIUS, _RADIUS + 1)
+    window = np.exp(-0.5 * (x / _SIGMA) ** 2)
+    window /= window.sum()
+    blur = lambda a: correlate1d(correlate1d(a, window, 0), window, 1)
+    a, b = np.clip(picture, 0, 1).astype(np.float64), np.asarray(truth, np.float64)
+    mean_a, mean_b = blur(a), blur(b)
+    var_a, var_b, covariance = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
+    score = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
+    score /= (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
+    whole = np.ones((height, width), bool) if mask is None else minimum_filter(mask, 2 * _RADIUS + 1)
+    inner = (slice(_RADIUS, -_RADIUS),) * 2
+    kept = score[inner][whole[inner]]
+    return float(kept.mean()) if kept.size else float("nan")
+
+
+@dataclass(frozen=True)
+class DepthScore:
+    """Over pixels whose true depth is known: ``median``, ``mean``: of the absolute error, scene units; ``off``: share that is
+    wrong by more than a tenth (or empty); ``opacity``: mean, and ``translucent``: share below 0.9."""
+
+    median: float
+    mean: float
+    off: float
+    opacity: float
+    translucent: float
+
+
+def depth_score(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray) -> DepthScore | None:
+    """Score of ``depth`` (h, w), 0 where there is none, against ``truth`` (h, w), 0 where unknown; None if it is nowhere."""
+    known = truth > 0
+    if not known.any():
+        return None
+    # A hole is as wrong as its depth of 0 says.
+    error = np.abs(depth[known] - truth[known])
+    alpha = opacity[known]
+    return DepthScore(float(np.median(error)), float(error.mean()), float(np.mean(error > 0.1 * truth[known])),
+                      float(alpha.mean()), float(np.mean(alpha < 0.9)))
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """``color`` (h, w, 3): sRGB before black, composited as a picture with alpha is; ``depth`` (h, w): the
+    integrator's default, the median, from the camera's centre, scene units; ``opacity`` (h, w); ``mask``: pixels that could be rendered."""
+
+    color: np.ndarray
+    depth: np.ndarray
+    opacity: np.ndarray
+    mask: np.ndarray
+
+
+class Renderer:
+    """Renders the field in a checkpoint as the cameras of a data set see it. Needs a Mitsuba variant."""
+
+    def __init__(self, field: str | Path, spp: int = 16):
+        import mitsuba as mi
+
+        self.spp = spp
+        self.scene = mi.load_dict({
+            "type": "scene",
+            "integrator": {"type": "nerg", "field": {"type": "nerf", "filename": str(field)}, "aovs": "depth,opacity"},
+        })
+
+    def __call__(self, camera: Camera, seed: int = 0) -> Rendered:
+        """``camera``'s picture, ``spp`` rays a pixel."""
+        import drjit as dr
+        import mitsuba as mi
+
+        i = camera.intrinsics
+        plain = not i.is_distorted and abs(i.fx / i.fy - 1) < 1e-9
+        source = camera if plain else pinhole(camera)
+        about = sensor_dict(source)
+        about["sampler"] = {"type": "multijitter", "sample_count": self.spp}
+        sensor = mi.load_dict(about)
+        params = mi.traverse(sensor)
+        # As a literal every pose would compile kernels of its own.
+        pose = mi.Transform4f(params["to_world"])
+        dr.make_opaque(pose)
+        params["to_world"] = pose
+        params.update()
+        out = np.array(mi.render(self.scene, sensor=sensor, spp=self.spp, seed=mi.UInt32(seed)), np.float64)
+        opacity = np.clip(out[..., 4], 0, 1)
+        some = np.maximum(opacity, 1e-6)[..., None]
+        color = opacity[..., None] * srgb(out[..., :3] / some)
+        # Rays start at the near plane; depth is counted from there.
+        along = -pixel_directions(source.intrinsics)[..., 2]
+        depth = np.where(opacity > 0, out[..., 3] + about["near_clip"] / along, 0)
+        if plain:
+            return Rendered(color, depth, opacity, np.ones(opacity.shape, bool))
+        stacked, mask = through_lens(np.dstack([color, depth, opacity]).astype(np.float32), source, camera)
+        return Rendered(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
+
+
+def score_views(field: str | Path, views: list[View], spp: int = 16, pictures: Path | None = None, on_view=None) -> dict:
+    """Scores (JSON) of the field in a checkpoint on ``views``; writes each picture beside its truth into ``pictures``.
+
+    ``psnr``, ``ssim``: a list with one entry a view, in the order of ``views`` (names); ``*_mean``: their means;
+    ``depth``: where a view has true depth, see `DepthScore`, means over the views. ``on_view(name, psnr, ssim)``.
+    """
+    if not views:
+        raise NergError("there are no views to score; the data set holds none out, so give --holdout 8 or --train")
+    render, rows, depths = Renderer(field, spp), [], []
+    if pictures is not None:
+        make_folder(pictures)
+    for k, view in enumerate(views):
+        seen, truth = render(view.camera, k), view.over(0)
+        mask = seen.mask if view.mask is None else seen.mask & view.mask
+        rows.append((psnr(seen.color, truth, mask), ssim(seen.color, truth, mask)))
+        if view.depth is not None:
+            depths.append(depth_score(seen.depth, seen.opacity, np.where(mask, view.depth, 0)))
+        if pictures is not None:
+            write_png(pictures / f"{Path(view.name).stem}.png", np.concatenate([seen.color, truth], axis=1))
+        if on_view is not None:
+            on_view(view.name, *rows[-1])
+    out = {
+        "views": [v.name for v in views], "width": views[0].shape[1], "height": views[0].shape[0], "spp": spp,
+        "psnr": [p for p, _ in rows], "psnr_mean": float(np.mean([p for p, _ in rows])),
+        "ssim": [s for _, s in rows], "ssim_mean": float(np.mean([s for _, s in rows])),
+    }  # fmt: skip
+    depths = [d for d in depths if d is not None]
+    if depths:
+        out["depth"] = {k: float(np.mean([getattr(d, k) for d in depths])) for k in DepthScore.__dataclass_fields__}
+    return out

@@ -1,0 +1,1 @@
+"""Error against run time: scenes whose truth is known, at many settings."""

@@ -1,0 +1,284 @@
+"""What is studied: a scene of which integrators with any parameters can be made, its rays, and its truth.
+
+Three kinds: analytic scenes and scenes of shapes, with float64 references, and scene files with a field, whose reference is
+a render with much smaller steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.rendering.pictures import load_scene
+from . import reference as study_reference, scenes as study_scenes, shapes as study_shapes
+from nerg_mi.transport.observer.sight import EXACT
+from nerg_mi.transport.place import Place
+from .reference import Truth
+
+KINDS = ("auto", "analytic", "file")
+AOVS = "depth,opacity,visibility,gaze"
+FALLOFF = 0.1
+# The reference of a scene file has steps this many times shorter than the scene's own.
+FINER = 32
+# Nothing is skipped, merged or cut short in a reference.
+_CONVERGED = {"coarse": 1.0, "dt_gamma": 0.0, "jitter": False, "color_cutoff": 0.0, "stop": 1e-9, "quadrature": "constant"}
+
+
+def open_subject(scene: str, kind: str, width: int, height: int, defaults: Mapping[str, str] | None = None) -> Subject:
+    """The scene called, or in the file, ``scene``, with a picture of ``width`` x ``height``. Raises NergError for what the user can mend."""
+    if kind not in KINDS:
+        raise NergError(f'there is no kind of scene "{kind}": choose one of {", ".join(KINDS)}.')
+    if kind == "analytic" or (kind == "auto" and scene in study_scenes.SCENES):
+        if scene not in study_scenes.SCENES:
+            raise NergError(f'there is no analytic scene "{scene}": choose one of {", ".join(study_scenes.SCENES)}.')
+        return AnalyticSubject(study_scenes.SCENES[scene], width, height)
+    if not Path(scene).is_file():
+        names = ", ".join(study_scenes.SCENES)
+        raise NergError(f'there is no scene file "{scene}", and no analytic scene of that name; those are {names}.')
+    return _load(Path(scene), width, height, defaults or {})
+
+
+class Subject:
+    """Common to all kinds. ``scene``: `mi.Scene`; ``sensor``; ``size``: (width, height) in pixels; ``base``: the
+    integrator's parameters and children; ``extent``: diagonal of the medium in scene units; ``tolerance``: fixed, so that
+    all settings answer the same question of visibility (the integrator's own default follows the step)."""
+
+    name: str
+    opaque: bool
+    has_gaze = True
+    marched = True
+    """Whether there is a medium, whose marching can be set."""
+
+    def _set_up(self, scene, sensor, base: dict) -> None:
+        self.scene, self.sensor, self.base = scene, sensor, base
+        self._truths: dict = {}
+        first = self.integrator()
+        self.step = first.settings.step
+        if self.marched:
+            self.extent, self.tolerance = first.medium.length_scale, 2 * self.step
+        else:
+            self.extent = Place(None, scene).diagonal
+            self.tolerance = EXACT * self.extent
+        self.base = {**base, "tolerance": self.tolerance}
+
+    def integrator(self, params: Mapping = {}, resolution: int = 0):
+        """A ``nerg`` integrator with ``params`` over the scene's own; ``resolution``: density as a grid of so many voxels."""
+        import mitsuba as mi
+
+        if resolution:
+            raise NergError(f'"{self.name}" has no grids of other resolutions; only analytic scenes do.')
+        return mi.load_dict({"type": "nerg", **self.base, **params})
+
+    def aovs(self) -> str:
+        return AOVS if self.has_gaze else AOVS.replace(",gaze", "")
+
+    def resize(self, width: int, height: int) -> None:
+        """Another picture size from now on; its truth is found anew."""
+        import mitsuba as mi
+
+        params = mi.traverse(self.sensor)
+        params["film.size"] = params["film.crop_size"] = [width, height]
+        params["film.crop_offset"] = [0, 0]
+        params.update()
+        self.size = (width, height)
+        self._truths.clear()
+
+    def rays(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and directions (N, 3) float64 of the rays that a render with one sample a pixel and ``seed`` traces."""
+        import mitsuba as mi
+
+        class Recorder(mi.SamplingIntegrator):
+            def aov_names(self):
+                return [f"{name}.{c}" for name in "od" for c in "XYZ"]
+
+            def sample(self, scene, sampler, ray, medium=None, active=True):
+                return mi.Spectrum(0), mi.Bool(True), [ray.o.x, ray.o.y, ray.o.z, ray.d.x, ray.d.y, ray.d.z]
+
+        picture = self.render(Recorder(mi.Properties()), 1, seed)[..., -6:].reshape(-1, 6).astype(float)
+        return picture[:, :3], picture[:, 3:]
+
+    def render(self, integrator, spp: int, seed: int) -> np.ndarray:
+        """The picture (h, w, channels)."""
+        import mitsuba as mi
+
+        return np.array(mi.render(self.scene, integrator=integrator, sensor=self.sensor, spp=spp, seed=seed))
+
+    def channels(self, integrator, spp: int, seed: int) -> dict[str, np.ndarray]:
+        """A render as columns: ``color`` (N, 3), and each AOV (N,)."""
+        picture = self.render(integrator, spp, seed)
+        picture = picture.reshape(-1, picture.shape[-1]).astype(float)
+        names = [n.split(".")[0] for n in integrator.aov_names()]
+        first = picture.shape[1] - len(names)
+        out = {n: picture[:, first + k] for k, n in enumerate(names)}
+        return out | {"color": np.broadcast_to(picture[:, :first][:, :3], (len(picture), 3))}
+
+    def truth(self, seed: int, depth: str, visibility: str) -> Truth:
+        """The reference for the rays of ``seed``, for kinds of depth and visibility as the integrator names them."""
+        # Refined depths and maps are ways to find the same answers.
+        key = seed, "expected" if depth == "expected" else "median", "transmittance" if visibility == "transmittance" else "depth"
+        if key not in self._truths:
+            self._truths[key] = self._find_truth(*key)
+        return self._truths[key]
+
+    def exact(self, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Where surfaces are exactly, and whether the observer sees them exactly: (N,) distances, inf on a miss, and (N,) bool.
+        None where that is not known."""
+        raise NotImplementedError
+
+
+class AnalyticSubject(Subject):
+    """A scene of `study_scenes`."""
+
+    def __init__(self, scene: study_scenes.AnalyticScene, width: int, height: int):
+        import mitsuba as mi
+
+        self.analytic, self.name, self.opaque = scene, scene.name, scene.opaque
+        self._volumes = study_scenes.volumes(scene)
+        observer = study_scenes.sensor(scene.observer, (0.5, 0.5, 0.5), 40, 1, 1)
+        sensor = mi.load_dict(study_scenes.sensor(scene.camera, scene.target, scene.fov, width, height))
+        self.size = (width, height)
+        base = {**self._volumes, "observer": observer, "falloff": FALLOFF, "aovs": AOVS}
+        self._set_up(mi.load_dict({"type": "scene", "sensor": sensor}), sensor, base)
+
+    def integrator(self, params: Mapping = {}, resolution: int = 0):
+        import mitsuba as mi
+
+        grid = {"density": study_scenes.volumes(self.analytic, resolution)["density"]} if resolution else {}
+        return mi.load_dict({"type": "nerg", **self.base, **grid, **params})
+
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+        o, d = self.rays(seed)
+        return study_reference.truth(
+            self.analytic, self._volumes["gaze"].gaze_medium(), o, d, depth=depth, visibility=visibility, falloff=FALLOFF,
+            tolerance=self.tolerance, surface_opacity=0.5,
+        )
+
+    def exact(self, seed: int):
+        if not self.opaque:
+            return None
+        o, d = self.rays(seed)
+        t = study_reference.first_solid(self.analytic, o, d)
+        hit = np.isfinite(t)
+        eye = np.asarray(self.analytic.observer, float)
+        towards = o + d * np.where(hit, t, 0)[:, None] - eye
+        distance = np.linalg.norm(towards, axis=-1)
+        met = study_reference.first_solid(self.analytic, np.broadcast_to(eye, o.shape), towards / distance[:, None])
+        # Both distances lead to the same point, but for rounding.
+        return t, hit & (met > distance - 1e-6)
+
+
+class FileSubject(Subject):
+    """A scene file whose integrator is ``nerg`` and whose first sensor takes the picture.
+
+    Where a ``twin.xml`` lies beside it, its shapes say where surfaces exactly are.
+    """
+
+    def __init__(self, path: Path, loaded, width: int, height: int):
+        integrator, sensor = loaded.integrator(), loaded.sensors()[0]
+        self.name, self.twin = path.stem if path.stem != "scene" else path.resolve().parent.name, path.parent / "twin.xml"
+        self.opaque = self.twin.is_file()
+        children = integrator.children
+        self.has_gaze = "gaze" in children
+        self._set_up(loaded, sensor, {**children, **parameters(integrator), "aovs": self.aovs()})
+        self.resize(width, height)
+
+    def eye(self) -> np.ndarray:
+        """Where the observer stands (3,)."""
+        from nerg_mi.transport.observer.viewpoint import center
+
+        observer = self.base.get("observer")
+        return np.array(center(observer if observer is not None else self.sensor), float).reshape(3)
+
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+        """A render with steps `FINER` times shorter, and how far one with steps twice as long is from it."""
+        from .errors import errors
+
+        kinds = {**_CONVERGED, "depth": depth, "visibility": visibility, "radiance": True}
+        fine, half = (
+            self.channels(self.integrator({**kinds, "step": self.step / n}), 1, seed) for n in (FINER, FINER // 2)
+        )
+        none = np.zeros(len(fine["depth"]))
+        names = ("color", "opacity", "depth", "visibility")
+        known = Truth(*(fine[n] for n in names), fine.get("gaze", none), f"render with steps of {self.step / FINER:.3g} units", {})
+        return Truth(*(fine[n] for n in names), known.gaze, known.source, errors(half, known))
+
+    def exact(self, seed: int):
+        if not self.opaque:
+            return None
+        from nerg_mi.scenes.store import twin
+
+        o, d = self.rays(seed)
+        shapes = twin.load_twin(self.twin)
+        t = twin.cast(o, d, shapes)
+        eye = self.eye()
+        hit = np.isfinite(t)
+        seen = np.zeros(len(t), bool)
+        # A millimetre before the surface: the point itself must not hide itself.
+        seen[hit] = twin.visible(eye, o[hit] + d[hit] * (t[hit, None] - 1e-3), shapes)
+        return t, seen
+
+
+class ShapesSubject(FileSubject):
+    """A scene file of meshes and no field."""
+
+    marched = False
+
+    def __init__(self, path: Path, loaded, width: int, height: int):
+        self.corners = study_shapes.triangles(loaded)
+        self._hits: dict = {}
+        self._color = None
+        super().__init__(path, loaded, width, height)
+        self.opaque = True
+
+    def resize(self, width: int, height: int) -> None:
+        super().resize(width, height)
+        self._hits.clear()
+        self._color = None
+
+    def first_hits(self, seed: int) -> np.ndarray:
+        """Distances (N,) to the shapes along the rays of ``seed``; inf on a miss."""
+        if seed not in self._hits:
+            self._hits[seed] = study_shapes.first_hit(self.corners, *self.rays(seed))
+        return self._hits[seed]
+
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+        if self._color is None:
+            self._color = self.channels(self.integrator({"aovs": ""}), study_shapes.COLOR_SPP, seed + 1)["color"]
+        return study_shapes.truth(self, seed, visibility, self._color)
+
+    def exact(self, seed: int):
+        o, d = self.rays(seed)
+        t = self.first_hits(seed)
+        hit = np.isfinite(t)
+        distance, r_o = study_reference.towards(self.eye(), o + d * np.where(hit, t, 0)[:, None])
+        met = study_shapes.first_hit(self.corners, np.broadcast_to(self.eye(), o.shape), r_o)
+        # Both distances lead to the same point, but for rounding.
+        return t, hit & (met > distance - 1e-6)
+
+
+def _load(path: Path, width: int, height: int, defaults: Mapping[str, str]) -> FileSubject:
+    loaded = load_scene(path, defaults)
+    if type(loaded.integrator()).__name__ != "NergIntegrator":
+        raise NergError(f'the integrator of "{path}" is not "nerg": name a scene whose integrator is.')
+    if not loaded.sensors():
+        raise NergError(f'"{path}" has no sensor: add the camera that takes the pictures.')
+    if not loaded.sensors()[0].film().rfilter().is_box_filter():
+        raise NergError(f'the film of "{path}" does not have a box filter, without which depths cannot be compared: give it one.')
+    if loaded.integrator().medium is not None and len(loaded.shapes()) > 0:
+        raise NergError(f'"{path}" holds a field and shapes, of which there is no reference: study each alone.')
+    return (ShapesSubject if loaded.integrator().medium is None else FileSubject)(path, loaded, width, height)
+
+
+def parameters(integrator) -> dict:
+    """The parameters of an integrator of type ``nerg``, read back by the names of its manual page."""
+    names = ("occlusion", "surface_opacity", "radiance", "jitter")
+    march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse")
+    out = {n: getattr(integrator, n) for n in names} | {n: getattr(integrator.settings, n) for n in march}
+    observer = integrator.observer_pass
+    return out | {
+        "falloff": float(integrator.falloff[0]), "depth": integrator.depth_kind, "visibility": observer.kind,
+        "map_height": observer.map_height, "background": np.array(integrator.background, float).ravel().tolist(),
+    }  # fmt: skip

@@ -1,0 +1,118 @@
+"""What follows from a study's rows: the Pareto front, the comparison with the paper's marching, and the files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from nerg_mi.files.atomic import write_text
+from nerg_mi.files.tables import write_csv, write_json
+from .measure import COLUMNS
+from .settings import PAPER
+
+FRONTS = ("color_rmse", "depth_mae", "visibility_mae", "gaze_mae")
+"""The errors that are set against time; a row's ``pareto`` names those for which it is on the front."""
+
+
+def pareto(points: list[tuple[float, float]]) -> list[bool]:
+    """Which of the points (time, error) no other one beats: no other is at most as large in both and smaller in one."""
+    order = sorted(range(len(points)), key=lambda i: points[i])
+    on, best = [False] * len(points), math.inf
+    for i in order:
+        time, error = points[i]
+        # Of equal points all are on the front.
+        if error < best or (error == best and any(on[j] and points[j] == points[i] for j in order)):
+            on[i], best = True, error
+    return on
+
+
+def comparable(row: dict) -> bool:
+    """Whether a row renders all that the default does, for one ray a pixel of the scene itself."""
+    return row["spp"] == 1 and not row["resolution"] and row["group"] not in ("leave out", "spp")
+
+
+def mark_fronts(rows: list[dict]) -> None:
+    """Set ``pareto`` of each row: the errors of `FRONTS` for which it is on the front, without their suffix, space-separated."""
+    for row in rows:
+        row["pareto"] = ""
+    for error in FRONTS:
+        able = [r for r in rows if comparable(r) and error in r]
+        for row, on in zip(able, pareto([(r["seconds"], r[error]) for r in able])):
+            if on:
+                row["pareto"] = f"{row['pareto']} {error.rsplit('_', 1)[0]}".strip()
+
+
+def against_paper(rows: list[dict], clock: str = "seconds") -> list[dict]:
+    """For each row of the paper's marching: the default beside it, the least depth error of ours that takes no longer, and
+    the shortest time of ours whose depth error is no larger, with the ratios; None where ours has no such row.
+
+    ``clock``: ``seconds``, or ``cpu_seconds`` where other work shares the machine.
+    """
+    # A map is made once for many frames: its rows' times are not those of one picture.
+    ours = [r for r in rows if r["group"] != PAPER and comparable(r) and r["visibility"] != "map"]
+    default = next(r for r in rows if r["group"] == "default")
+    out = []
+    for paper in (r for r in rows if r["group"] == PAPER):
+        no_longer = min((r for r in ours if r[clock] <= paper[clock]), key=lambda r: r["depth_mae"], default=None)
+        no_worse = min((r for r in ours if r["depth_mae"] <= paper["depth_mae"]), key=lambda r: r[clock], default=None)
+        out.append({
+            "paper": _brief(paper), "default": _brief(default),
+            "equal_time": no_longer and _brief(no_longer) | {"error_ratio": paper["depth_mae"] / max(no_longer["depth_mae"], 1e-12)},
+            "equal_error": no_worse and _brief(no_worse) | {"time_ratio": paper[clock] / no_worse[clock]},
+        })  # fmt: skip
+    return out
+
+
+def _brief(row: dict) -> dict:
+    names = ("setting", "seconds", "cpu_seconds", "density_evals", "color_evals", "depth_mae", "depth_p99", "surface_mae", "visibility_wrong")
+    return {n: row[n] for n in names if n in row}
+
+
+def write_tables(out: Path, report: dict) -> list[Path]:
+    """Write ``study.csv`` (the rows), ``study.md`` (the same by factor, to read), ``scaling.csv`` and ``study.json`` (all of
+    ``report``); returns their paths."""
+    paths = [out / "study.csv", out / "study.md", out / "scaling.csv", out / "study.json"]
+    for path, rows, columns in ((paths[0], report["rows"], COLUMNS), (paths[2], report["scaling"], None)):
+        write_csv(path, ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows), columns or list(rows[0]))
+    write_text(paths[1], markdown(report))
+    write_json(paths[3], report)
+    return paths
+
+
+# Column of study.csv, its heading to read, and what it is multiplied with.
+_SHOWN = (
+    ("seconds", "ms", 1e3), ("cpu_seconds", "CPU ms", 1e3), ("density_evals", "density", 1), ("color_evals", "colour", 1), ("color_rmse", "colour RMSE", 1),
+    ("depth_mae", "depth MAE", 1), ("depth_p99", "depth 99 %", 1), ("surface_mae", "surface MAE", 1), ("visibility_mae", "visibility MAE", 1),
+    ("visibility_wrong", "wrong %", 100), ("gaze_mae", "gaze MAE", 1), ("gaze_kld", "gaze KLD", 1), ("peak_mb", "MiB", 1),
+)  # fmt: skip
+
+
+def markdown(report: dict) -> str:
+    """A table for each factor, the default first in all of them, and the comparison with the paper's marching."""
+    rows = report["rows"]
+    shown = [c for c in _SHOWN if any(c[0] in r for r in rows)]
+    default = rows[0]
+    head = ["setting", *(title for _, title, _ in shown)]
+    text = [f"{report['scene']}, {report['size'][0]} x {report['size'][1]}, {report['variant']}, reference: {report['reference']}"]
+    if report["reference_change_when_step_halved"]:
+        change = ", ".join(f"{k} {v:.2g}" for k, v in report["reference_change_when_step_halved"].items())
+        text.append(f"Steps twice as long change the reference by: {change}")
+    for group in dict.fromkeys(r["group"] for r in rows[1:]):
+        mine = [default, *(r for r in rows if r["group"] == group)]
+        cells = [[r["setting"], *(f"{r[k] * by:.3g}" if k in r else "" for k, _, by in shown)] for r in mine]
+        text.append(_table(group, head, cells))
+    for clock, unit in (("seconds", "ms"), ("cpu_seconds", "CPU ms")):
+        head = ["paper", unit, "depth MAE", "no slower", "times less error", "no worse", "times faster"]
+        cells = []
+        for pair in against_paper(rows, clock):
+            paper, time, error = pair["paper"], pair["equal_time"], pair["equal_error"]
+            cells.append([paper["setting"], f"{1e3 * paper[clock]:.3g}", f"{paper['depth_mae']:.3g}"])
+            cells[-1] += [time["setting"], f"{time['error_ratio']:.3g}"] if time else ["none", ""]
+            cells[-1] += [error["setting"], f"{error['time_ratio']:.3g}"] if error else ["none", ""]
+        text.append(_table(f"against the paper's marching, by {clock.replace('_', ' ')}", head, cells))
+    return "\n\n".join(text) + "\n"
+
+
+def _table(title: str, head: list[str], rows: list[list[str]]) -> str:
+    lines = [f"### {title}", "", f"| {' | '.join(head)} |", f"|-{'|-' * (len(head) - 1)}|"]
+    return "\n".join([*lines, *(f"| {' | '.join(r)} |" for r in rows)])

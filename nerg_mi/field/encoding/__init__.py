@@ -1,0 +1,1 @@
+"""Encodings of positions and directions, which the networks are given."""

@@ -1,0 +1,1 @@
+"""Files in and out, whole or absent, within bounds; knows nothing of what they are for."""

@@ -1,0 +1,183 @@
+"""What every reader of a file needs against a damaged or hostile one: limits before allocation, and one sentence after.
+
+A reader asks first how large things are, by the bytes that are there and by the limits stated here, and only then makes
+room for them. Compressed files: `inflating`; NumPy's: `npy`; pictures: `image_header`.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import lzma
+import os
+import pickle
+import re
+import stat
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import MissingFile, NergError, plain, sentence
+
+JSON_BYTES = 64 << 20
+"""A JSON file may have so many bytes: the poses of some 80,000 frames."""
+
+JSON_VALUES = 8_000_000
+"""So many values may stand in it: each takes up to 100 bytes of memory."""
+
+JSON_DEPTH = 64
+"""So deep may arrays and objects be nested; what this package reads is six deep at most."""
+
+LINE_CHARACTERS = 16 << 20
+"""A line of a text file may be so long: COLMAP lists all observations of an image on one."""
+
+_DAMAGED = (
+    OSError, EOFError, ValueError, KeyError, IndexError, OverflowError, MemoryError, RecursionError,
+    NotImplementedError, struct.error, zlib.error, lzma.LZMAError, gzip.BadGzipFile, zipfile.BadZipFile,
+    zipfile.LargeZipFile, tokenize.TokenError, SyntaxError, pickle.UnpicklingError,
+)  # fmt: skip
+
+
+@contextmanager
+def reading(
+    path: str | os.PathLike,
+    what: str = "file",
+    remedy: str = "copy it again, or make it anew",
+    also: tuple[type[Exception], ...] = (),
+) -> Iterator[None]:
+    """Whatever a damaged file makes the block raise, as one `NergError` that names ``path`` and the ``remedy``.
+
+    ``what``: the kind of file, with which the sentence begins ("the depth file"). ``also``: further exceptions that
+    only the file can be to blame for. Keep the block to the parse alone: `KeyError` and `IndexError` are taken for the
+    file's, and a `TypeError` passes, since it is a mistake of the program's. A `NergError` passes as it is.
+    """
+    try:
+        yield
+    except NergError:
+        raise
+    except FileNotFoundError as error:
+        raise MissingFile(f'there is no {what} "{path}"; correct its name') from error
+    except (*_DAMAGED, *also) as error:
+        raise NergError(f'the {what} "{path}" cannot be read: {_said(error)}; {_remedy(error, remedy)}') from error
+    except Exception as error:
+        # The library is imported by those who read its files: without it the exception cannot be one of its own.
+        if type(error).__name__ != "SafetensorError":
+            raise
+        raise NergError(f'the {what} "{path}" cannot be read: {_said(error)}; {remedy}') from error
+
+
+def _said(error: BaseException) -> str:
+    if isinstance(error, MemoryError):
+        return "it needs more memory than there is"
+    if isinstance(error, RecursionError):
+        return "it is nested too deep"
+    if isinstance(error, EOFError):
+        return "it ends too early"
+    if isinstance(error, KeyError):
+        return f"it lacks {plain(error)}"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror[:1].lower() + error.strerror[1:]
+    return plain(sentence(error)).rstrip(".")
+
+
+def _remedy(error: BaseException, remedy: str) -> str:
+    if isinstance(error, PermissionError):
+        return "change its permissions"
+    if isinstance(error, (IsADirectoryError, NotADirectoryError)):
+        return "give the name of a file"
+    return remedy
+
+
+def is_count(value: object) -> bool:
+    """Whether ``value``, read from a file, is a whole number from 0 on that 64 bits hold with room to add."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
+
+
+def size_of(path: str | os.PathLike, what: str = "file", most: int | None = None) -> int:
+    """Bytes of the ordinary file ``path``; `NergError` for a folder, a device or a pipe, and beyond ``most`` bytes."""
+    with reading(path, what):
+        # A name may hold what no file's can, such as a zero byte.
+        found = os.stat(path)
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "no ordinary file"
+        raise NergError(f'the {what} "{path}" is {kind}; give the name of a file')
+    if most is not None and found.st_size > most:
+        raise NergError(
+            f'the {what} "{path}" has {found.st_size:,} bytes, more than the {most:,} that are read; give a smaller one'
+        )
+    return found.st_size
+
+
+def read_bytes(path: str | os.PathLike, what: str = "file", most: int | None = None) -> bytes:
+    """The bytes of the ordinary file ``path``, at most ``most``; see `size_of`."""
+    size_of(path, what, most)
+    with reading(path, what):
+        return Path(path).read_bytes()
+
+
+def read_json(path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES) -> object:
+    """The JSON document ``path``. `NergError` for what is none, is larger than ``most`` bytes or is nested too deep."""
+    return parse_json(read_bytes(path, what, most), path, what)
+
+
+def parse_json(raw: bytes | str, path: str | os.PathLike, what: str = "file") -> object:
+    """The JSON document ``raw``, which stood in ``path``. `NergError` for what is none, is nested deeper than
+    `JSON_DEPTH` or holds more than `JSON_VALUES` values."""
+    with reading(path, what, "correct it, or make it anew"):
+        if isinstance(raw, (bytes, bytearray)):
+            raw = raw.decode(json.detect_encoding(raw))
+        _check_json(raw, path, what)
+        try:
+            return json.loads(raw)
+        except json.JSONDecodeError as error:
+            raise NergError(
+                f'the {what} "{path}" is not valid JSON: {plain(error)}; correct it, or make it anew'
+            ) from error
+
+
+# An unfinished string runs to the end, so that each character is looked at once.
+_STRING = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"?', re.DOTALL)
+
+
+def _check_json(text: str, path, what: str) -> None:
+    opened = text.count("[") + text.count("{")
+    if opened <= JSON_DEPTH and text.count(",") <= JSON_VALUES // 2:
+        return
+    bare = np.frombuffer(_STRING.sub("", text).encode("ascii", "ignore"), np.uint8)
+    up, down = (bare == 0x5B) | (bare == 0x7B), (bare == 0x5D) | (bare == 0x7D)
+    values = int(up.sum()) + int((bare == 0x2C).sum())
+    if values > JSON_VALUES:
+        raise NergError(
+            f'the {what} "{path}" holds more than the {JSON_VALUES:,} values that are read; give a smaller one'
+        )
+    brackets = np.where(up, 1, -1)[up | down]
+    depth = int(np.cumsum(brackets, dtype=np.int64).max(initial=0))
+    if depth > JSON_DEPTH:
+        raise NergError(
+            f'the {what} "{path}" is nested {depth:,} deep, and at most {JSON_DEPTH} deep is read; make it anew'
+        )
+
+
+def text_lines(
+    path: str | os.PathLike, what: str = "file", errors: str = "surrogateescape", most: int = LINE_CHARACTERS
+) -> Iterator[str]:
+    """Lines of the text file ``path`` (UTF-8) without their ends; `NergError` for a line of more than ``most``
+    characters.
+    """
+    size_of(path, what)
+    with reading(path, what), open(path, encoding="utf-8", errors=errors) as file:
+        number = 0
+        while line := file.readline(most + 1):
+            number += 1
+            if len(line) > most:
+                raise NergError(
+                    f'line {number} of the {what} "{path}" has more than the {most:,} characters that are read; '
+                    "is it a text file?"
+                )
+            yield line.rstrip("\n")

@@ -1,0 +1,1 @@
+"""Checkpoints of torch-ngp and of the NeRG paper's authors, read and written without torch."""

@@ -1,0 +1,147 @@
+"""Rays of attention: who looked from where to where, and when.
+
+Frame of every :class:`Rays`: right-handed, z up, metres, seconds. Readers
+convert into it and record the transform they applied in the metadata
+(:mod:`nerg_mi.rays.readers.collecting`).
+"""
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from .io import read_rays_file, write_rays_file
+
+# Rows moved at a time.
+_BLOCK = 1 << 18
+
+FRAME = {"units": "m", "up": "z", "handedness": "right"}
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """N rays of attention, checked on construction.
+
+    ``t`` (N,) seconds; ``person`` (N,) int32 index into ``persons``, the names;
+    ``origin`` (N, 3) metres; ``direction`` (N, 3) unit; ``confidence`` (N,) in
+    [0, 1]; ``hit`` (N, 3) metres, the point looked at, NaN where unknown, or
+    ``None``; ``metadata``: ``frame`` (units, up, handedness), ``sources`` (file
+    name and sha256), ``transform`` (4x4 from the source's frame), ``rows_read``
+    and ``dropped`` (reason, count, and rows of each source); ``cohort`` (N,)
+    int32 index into ``cohorts``, the names of groups of people, or ``None``.
+
+    Raises `NergError` naming the first offending ray for NaN, zero or non-unit directions, non-finite origins or times, and
+    persons out of range; ``ValueError`` for arrays of different lengths.
+    """
+
+    t: np.ndarray
+    person: np.ndarray
+    persons: tuple[str, ...]
+    origin: np.ndarray
+    direction: np.ndarray
+    confidence: np.ndarray
+    hit: np.ndarray | None = None
+    metadata: dict[str, Any] = field(default_factory=lambda: {"frame": dict(FRAME)})
+    cohort: np.ndarray | None = None
+    cohorts: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        put = lambda name, value: object.__setattr__(self, name, value)
+        put("t", np.ascontiguousarray(self.t, dtype=np.float64))
+        put("persons", tuple(str(p) for p in self.persons))
+        put("cohorts", tuple(str(c) for c in self.cohorts))
+        for name in ("person", "cohort"):
+            if getattr(self, name) is not None:
+                put(name, np.asarray(getattr(self, name)))
+        for name in ("origin", "direction", "confidence", "hit"):
+            if getattr(self, name) is not None:
+                put(name, np.ascontiguousarray(getattr(self, name), dtype=np.float64))
+
+        n = len(self.t)
+        shapes = {"person": (n,), "origin": (n, 3), "direction": (n, 3), "confidence": (n,), "hit": (n, 3), "cohort": (n,)}
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"{name} has shape {value.shape}, expected {shape}: one row for each of {n} times")
+        if "frame" not in self.metadata:
+            raise ValueError('metadata lacks "frame"; state units, up axis and handedness (see nerg_mi.rays.rays.FRAME)')
+
+        # Summed without arrays of squares: of ten million rays these alone take a quarter of a gigabyte.
+        length = np.sqrt(np.einsum("ij,ij->i", self.direction, self.direction))
+        _refuse(~np.isfinite(length), "a direction that is not finite", "drop it before building Rays")
+        _refuse(length == 0, "a zero direction", "drop it before building Rays")
+        _refuse(np.abs(length - 1) > 1e-4, "a direction that is not of unit length", "divide it by its length")
+        _refuse(~np.isfinite(self.origin).all(axis=1), "an origin that is not finite", "drop it before building Rays")
+        _refuse(~np.isfinite(self.t), "a time that is not finite", "drop it before building Rays")
+        # Before they become 32 bits wide, in which numbers that are too large would be those of somebody else.
+        _refuse(~((self.person >= 0) & (self.person < len(self.persons))), "an unknown person", "extend persons")
+        put("person", np.ascontiguousarray(self.person, dtype=np.int32))
+        if self.cohort is not None:
+            _refuse(~((self.cohort >= 0) & (self.cohort < len(self.cohorts))), "an unknown cohort", "extend cohorts")
+            put("cohort", np.ascontiguousarray(self.cohort, dtype=np.int32))
+        _refuse(~((self.confidence >= 0) & (self.confidence <= 1)), "a confidence outside [0, 1]", "rescale it")
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def select(self, which: np.ndarray) -> Rays:
+        """The rays of a boolean mask (N,) or an index array; persons and
+        metadata are kept, so that codes and provenance stay comparable."""
+        return replace(
+            self,
+            t=self.t[which],
+            person=self.person[which],
+            origin=self.origin[which],
+            direction=self.direction[which],
+            confidence=self.confidence[which],
+            hit=None if self.hit is None else self.hit[which],
+            cohort=None if self.cohort is None else self.cohort[which],
+        )
+
+    def keep_in_place(self, mask: np.ndarray) -> Rays:
+        """The rays of a boolean mask (N,), moved together in the memory of these, which must not be used afterwards: of
+        millions of rays there are then never two copies."""
+        kept = np.flatnonzero(mask)
+        columns = {}
+        for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort"):
+            column = getattr(self, name)
+            if column is None:
+                continue
+            for a in range(0, len(kept), _BLOCK):
+                # What is read lies at or behind what is written.
+                rows = kept[a : a + _BLOCK]
+                column[a : a + len(rows)] = column[rows]
+            columns[name] = column[: len(kept)]
+        return replace(self, **columns)
+
+    def noting(self, **what: Any) -> Rays:
+        """The same rays with a step added to the list ``steps`` of the metadata: what was done to them since the import."""
+        return replace(self, metadata={**self.metadata, "steps": [*self.metadata.get("steps", []), what]})
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write ``.npz`` or ``.parquet``; see :mod:`nerg_mi.rays.io`."""
+        columns = {k: getattr(self, k) for k in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")}
+        columns = {k: v for k, v in columns.items() if v is not None}
+        cohorts = {"cohorts": list(self.cohorts)} if self.cohort is not None else {}
+        write_rays_file(path, columns, {**self.metadata, "persons": list(self.persons), **cohorts})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Rays:
+        """Read what :meth:`save` wrote, checking it as on construction. Raises `NergError` with the file's name."""
+        columns, metadata = read_rays_file(path)
+        persons, cohorts = metadata.pop("persons"), metadata.pop("cohorts", ())
+        try:
+            return cls(**columns, persons=persons, metadata=metadata, cohorts=cohorts)
+        except NergError as error:
+            why = str(error).split(";")[0]
+            raise NergError(f"\"{path}\" is damaged ({why}); copy it again, or make it anew with 'nerg rays import'") from error
+
+
+def _refuse(bad: np.ndarray, what: str, remedy: str) -> None:
+    rows = np.flatnonzero(bad)
+    if rows.size:
+        listed = ", ".join(map(str, rows[:5])) + (", ..." if rows.size > 5 else "")
+        raise NergError(f"{rows.size} of {bad.size} rays have {what} (rays {listed}); {remedy}")

@@ -1,0 +1,1 @@
+"""Recordings of headsets, trackers and skeletons, read as rays of attention."""

@@ -1,0 +1,228 @@
+"""Collecting rays from sources: dropping what cannot be used, with an account of it."""
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Any, Sequence
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import reading, size_of
+from nerg_mi.files.line_blocks import OnBadLine
+from nerg_mi.rays.rays import FRAME, Rays
+
+BAD_LINES = 0.01
+"""Share of a file's lines that may be left out since they cannot be read."""
+
+NAMED_RUNS = 500_000
+"""So many runs of dropped rows are named; of more, as where every other row is a blink, only the number is kept."""
+
+
+def file_sha256(path: str | os.PathLike) -> str:
+    """Hex digest of a file's bytes. Raises `NergError` for what is no ordinary file, or cannot be read."""
+    digest = hashlib.sha256()
+    size_of(path)
+    with reading(path), open(path, "rb") as source:
+        while block := source.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _ranges(rows: np.ndarray) -> list[list[int]]:
+    """Sorted row numbers as inclusive [first, last] runs: blinks come in runs,
+    so that every dropped row can be named in little space."""
+    if not rows.size:
+        return []
+    rows = np.unique(rows)
+    cuts = np.flatnonzero(np.diff(rows) > 1)
+    first = rows[np.r_[0, cuts + 1]]
+    last = rows[np.r_[cuts, rows.size - 1]]
+    return [[int(a), int(b)] for a, b in zip(first, last)]
+
+
+class RaysBuilder:
+    """Collects rays source by source, drops what cannot be used, and keeps the
+    account: how many rows of which source were dropped, and why.
+
+    ``about`` goes into the metadata as it is (preset, tick, column map, ...). ``skip_bad_lines``: leave out lines that
+    cannot be read, with an account of them too, as long as they are at most `BAD_LINES` of a file's, or one.
+    """
+
+    def __init__(self, *, transform: np.ndarray | None = None, skip_bad_lines: bool = False, **about: Any) -> None:
+        tick = about.get("tick", 1.0)
+        if not (0 < tick < 1e12):
+            raise NergError(f"a unit of the file's time is a positive number of seconds, got {tick} (--tick)")
+        self._transform = np.eye(4) if transform is None else np.asarray(transform, dtype=np.float64)
+        self._about = about
+        self._parts: list[dict[str, np.ndarray]] = []
+        self._kept: list[int] = []
+        self._persons, self._cohorts = _Names(), _Names()
+        self._sources: list[dict[str, Any]] = []
+        self._dropped: list[dict[str, Any]] = []
+        self._rows_read = self._runs = 0
+        self._skips, self._lines, self._bad, self._first_bad = skip_bad_lines, 0, [], ""
+
+    @property
+    def on_bad(self) -> OnBadLine | None:
+        """What readers tell of lines that cannot be read; None where such a line ends the import."""
+        return self._bad_line if self._skips else None
+
+    def _bad_line(self, line: int, why: str) -> None:
+        self._first_bad = self._first_bad or f"line {line}{why}"
+        self._bad.append(line)
+        # Files of another format altogether: their lines need not all be counted.
+        if len(self._bad) > 10_000 + BAD_LINES * self._lines:
+            self._end_source()
+
+    def count_lines(self, n: int) -> None:
+        """Count lines of the present source that were read and give no rays."""
+        self._lines += n
+
+    def _end_source(self) -> None:
+        """Account for the bad lines of the present source. Raises `NergError` if they are too many."""
+        bad, lines = len(self._bad), self._lines + len(self._bad)
+        if bad > max(1, BAD_LINES * lines):
+            raise NergError(
+                f"{self._sources[-1]['file']}: {bad:,} of {lines:,} lines cannot be read, more than the {100 * BAD_LINES:g} % that "
+                f"--skip-bad-lines leaves out (the first is {self._first_bad})"
+            )
+        if bad:
+            self._drop("the line is cut off or holds a cell that is no number", np.array(self._bad))
+            self._rows_read += bad
+        self._lines, self._bad, self._first_bad = 0, [], ""
+
+    def source(self, path: Path, name: str | None = None) -> None:
+        """Begin a file; only its name (or another one, where files share theirs) is recorded, with its checksum."""
+        self._end_source()
+        self._sources.append({"file": name or path.name, "sha256": file_sha256(path)})
+
+    def add(
+        self,
+        t: np.ndarray,
+        person: Sequence[str] | np.ndarray | str,
+        origin: np.ndarray,
+        direction: np.ndarray,
+        *,
+        rows: np.ndarray,
+        confidence: np.ndarray | None = None,
+        hit: np.ndarray | None = None,
+        cohort: Sequence[str] | np.ndarray | None = None,
+        drop: dict[str, np.ndarray] | None = None,
+    ) -> None:
+        """Add n rows in the source's frame; directions need not be unit.
+
+        ``rows`` (n,): 1-based rows of the source. ``drop``: reasons of the
+        recording's own, each with its mask (n,), before those found here. A row
+        counts under the first reason it meets; one without a person's name is dropped, one without a cohort is of the
+        cohort "unknown".
+        """
+        n = len(t)
+        person = self._persons.codes(person, n)
+        length = np.linalg.norm(direction, axis=1)
+        confidence = np.ones(n) if confidence is None else np.asarray(confidence, dtype=np.float64)
+        reasons = {
+            **(drop or {}),
+            "person is missing": person == self._persons.code(""),
+            "time is missing": ~np.isfinite(t),
+            "origin is missing": ~np.isfinite(origin).all(axis=1),
+            "direction is missing": ~np.isfinite(length),
+            "direction is zero": length == 0,
+            "confidence is missing or outside [0, 1]": ~((confidence >= 0) & (confidence <= 1)),
+        }
+        keep = np.ones(n, dtype=bool)
+        for reason, mask in reasons.items():
+            gone = keep & mask
+            if gone.any():
+                self._drop(reason, np.asarray(rows)[gone])
+                keep &= ~mask
+        self._rows_read += n
+        self._lines += n
+        R, shift = self._transform[:3, :3], self._transform[:3, 3]
+        scale = np.cbrt(abs(np.linalg.det(R)))
+        part = {
+            "t": np.asarray(t, dtype=np.float64)[keep],
+            "person": person[keep],
+            "origin": origin[keep] @ R.T + shift,
+            "direction": (direction[keep] / length[keep, None]) @ (R / scale).T,
+            "confidence": confidence[keep],
+        }
+        if hit is not None:
+            part["hit"] = hit[keep] @ R.T + shift
+        if cohort is not None:
+            part["cohort"] = self._cohorts.codes(cohort, n)[keep]
+        self._parts.append(part)
+        self._kept.append(int(keep.sum()))
+
+    def _drop(self, reason: str, rows: np.ndarray) -> None:
+        name = self._sources[-1]["file"] if self._sources else ""
+        entry = next((e for e in self._dropped if e["reason"] == reason and e["file"] == name), None)
+        if entry is None:
+            entry = {"reason": reason, "file": name, "count": 0, "rows": []}
+            self._dropped.append(entry)
+        runs = _ranges(rows)
+        named = runs[: max(0, NAMED_RUNS - self._runs)]
+        self._runs += len(named)
+        entry["count"] += int(rows.size)
+        entry["rows"] += named
+        if len(named) < len(runs):
+            entry["rows_not_named"] = entry.get("rows_not_named", 0) + sum(last - first + 1 for first, last in runs[len(named) :])
+
+    def build(self) -> Rays:
+        """The rays collected. Raises `NergError` when none is left."""
+        self._end_source()
+        if not sum(self._kept):
+            why = "; ".join(f"{d['count']} rows: {d['reason']}" for d in self._dropped[:4]) or "the files hold no rows"
+            raise NergError(f"no ray is left of {self._rows_read} rows ({why}); check the column map and the preset")
+        metadata = {
+            "frame": dict(FRAME),
+            "transform": self._transform.tolist(),
+            "sources": self._sources,
+            "rows_read": self._rows_read,
+            "dropped": self._dropped,
+            **self._about,
+        }
+        columns = {name: self._column(name) for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")}
+        columns["person"], persons = self._persons.sorted(columns["person"])
+        cohorts: tuple[str, ...] = ()
+        if columns["cohort"] is not None:
+            columns["cohort"], cohorts = self._cohorts.sorted(columns["cohort"])
+            cohorts = tuple(c or "unknown" for c in cohorts)
+        return Rays(**columns, persons=persons, cohorts=cohorts, metadata=metadata)
+
+    def _column(self, name: str) -> np.ndarray | None:
+        """A column of all parts; parts without hits or cohorts get NaN or the cohort ""; ``None`` where all are without.
+        The parts' own are let go, so that no more than one column is there twice."""
+        if not any(name in part for part in self._parts):
+            return None
+        lacking = {"hit": lambda n: np.full((n, 3), np.nan), "cohort": lambda n: self._cohorts.codes("", n)}
+        return np.concatenate([part.pop(name) if name in part else lacking[name](n) for part, n in zip(self._parts, self._kept)])
+
+
+class _Names:
+    """Numbers for names, in the order met: texts of millions of rows are not kept."""
+
+    def __init__(self) -> None:
+        self._code: dict[str, int] = {}
+
+    def code(self, name: str) -> int:
+        return self._code.setdefault(name, len(self._code))
+
+    def codes(self, names: Sequence[str] | np.ndarray | str, n: int) -> np.ndarray:
+        """Codes (n,) int32 of one name for all or of n names."""
+        if isinstance(names, str):
+            return np.full(n, self.code(names.strip()), dtype=np.int32)
+        names = np.asarray(names, dtype=str)
+        # Rows of one person mostly follow each other: names are looked up where they change.
+        starts = np.flatnonzero(np.r_[True, names[1:] != names[:-1]][:n])
+        codes = np.array([self.code(name.strip()) for name in names[starts].tolist()], dtype=np.int32)
+        return np.repeat(codes, np.diff(np.r_[starts, n]))
+
+    def sorted(self, codes: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Codes into the sorted names of those that occur, and these names."""
+        names = list(self._code)
+        used = sorted(np.unique(codes), key=lambda c: names[c])
+        place = np.zeros(len(names), dtype=np.int32)
+        place[used] = np.arange(len(used))
+        return place[codes], tuple(names[c] for c in used)

@@ -1,0 +1,264 @@
+"""Tables of rays: CSV (also ``.gz``) and Parquet, read by named columns."""
+from __future__ import annotations
+
+import csv
+import os
+from contextlib import closing
+from typing import Any, Callable, Iterator, NamedTuple, Sequence
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import plain, reading, size_of
+from nerg_mi.files.inflating import inflated_limit
+from nerg_mi.files.line_blocks import OnBadLine, line_blocks
+
+BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
+
+COLUMNS = 1 << 14
+"""A table may have so many columns."""
+
+# Memory of a row that is read, at least.
+_ROW_BYTES = 32
+
+_MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
+
+
+class TableBlock(NamedTuple):
+    """``numbers`` (n, C) float64 in the order asked, NaN where a cell is empty;
+    ``texts`` (n, T) str; ``lines`` (n,) 1-based lines of the file (rows for
+    Parquet)."""
+
+    numbers: np.ndarray
+    texts: np.ndarray
+    lines: np.ndarray
+
+
+def table_columns(path: str | os.PathLike) -> list[str]:
+    """Names of a table's columns; of a CSV those of its first line. Raises `NergError` for a damaged file."""
+    if str(path).lower().endswith(".parquet"):
+        with _parquet(path) as table:
+            return list(table.schema_arrow.names)
+    with closing(line_blocks(path, "table", 1)) as blocks:
+        return _header(path, next(blocks, [""])[0])[0]
+
+
+def iterate_table(
+    path: str | os.PathLike,
+    numbers: Sequence[str],
+    texts: Sequence[str] = (),
+    header: Sequence[str] | None = None,
+    on_bad: OnBadLine | None = None,
+) -> Iterator[TableBlock]:
+    """Yield named columns of a table in blocks of at most ``BLOCK`` rows.
+
+    The separator (comma, semicolon or tab) is taken from the header. Cells
+    that are empty or say nan, na, null or none are NaN. ``header``: the names
+    of the columns of a CSV whose first line is none. Raises `NergError`
+    for a damaged file, a missing column (naming those there are), and, unless ``on_bad`` is given, a row with too few cells or
+    a cell that is no number (naming its line); ``on_bad`` is told of such lines, which are left out. Where pyarrow is
+    installed it converts the cells, to the same numbers.
+    """
+    if str(path).lower().endswith(".parquet"):
+        yield from _iterate_parquet(path, numbers, texts)
+        return
+    columns, separator, count, convert = list(header or ()), ",", 0, None
+    for raw in line_blocks(path, "table", BLOCK):
+        if convert is None:
+            if header is None:
+                columns, separator = _header(path, raw[0])
+                raw, count = raw[1:], 1
+            where = {c: i for i, c in reversed(list(enumerate(columns)))}
+            _require(path, [*numbers, *texts], columns)
+            number_at, text_at = [where[c] for c in numbers], [where[c] for c in texts]
+            convert = _fast_reader(separator, columns, number_at, text_at) or (lambda rows: None)
+        blank = [line.isspace() for line in raw]
+        lines = count + 1 + np.flatnonzero(~np.array(blank, dtype=bool))
+        kept = raw if len(lines) == len(raw) else [line for line, gone in zip(raw, blank) if not gone]
+        count += len(raw)
+        if kept:
+            found = convert(kept)
+            block = TableBlock(*found, lines) if found else _convert(
+                path, kept, lines, separator, columns, number_at, text_at, on_bad
+            )  # fmt: skip
+            if len(block.lines):
+                yield block
+    if convert is None and header is None:
+        _require(path, [*numbers, *texts], [])
+
+
+def _header(path: object, line: str) -> tuple[list[str], str]:
+    """Column names and the separator between them."""
+    line = line.rstrip("\r\n").lstrip("\ufeff")
+    separator = max(",;\t", key=line.count)
+    if line.count(separator) >= COLUMNS:
+        raise NergError(f'the table "{path}" has more than the {COLUMNS:,} columns that are read; give one with fewer')
+    try:
+        return [c.strip() for c in next(csv.reader([line], delimiter=separator))] if line else [], separator
+    except csv.Error as error:
+        raise NergError(f'the first line of the table "{path}" is no header ({error}); is it a table?') from error
+
+
+def _fast_reader(
+    separator: str, columns: list[str], number_at: list[int], text_at: list[int]
+) -> Callable[[list[str]], tuple[np.ndarray, np.ndarray] | None] | None:
+    """A function of lines that converts them with pyarrow, three times as fast and on all cores; ``None`` without pyarrow.
+
+    It gives ``None`` for lines that are in any way unusual (missing cells, words among numbers), which the slower reader
+    converts, or refuses by line and column.
+    """
+    try:
+        import pyarrow as pa
+        from pyarrow import csv as pc
+    except ImportError:
+        return None
+    if set(number_at) & set(text_at):  # one column, wanted as both
+        return None
+    # By place, not by name: names may be given twice.
+    names = [str(i) for i in range(len(columns))]
+    options = dict(
+        read_options=pc.ReadOptions(column_names=names),
+        parse_options=pc.ParseOptions(delimiter=separator, ignore_empty_lines=False),
+        convert_options=pc.ConvertOptions(
+            include_columns=list(dict.fromkeys(names[i] for i in (*number_at, *text_at))),
+            column_types={**{names[i]: pa.string() for i in text_at}, **{names[i]: pa.float64() for i in number_at}},
+            null_values=["", *(spelt for word in _MISSING if word for spelt in (word, word.upper(), word.title()))],
+            strings_can_be_null=False,
+        ),
+    )
+
+    def convert(rows: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
+        try:
+            table = pc.read_csv(pa.BufferReader("".join(rows).encode()), **options)
+        except pa.lib.ArrowException:
+            return None
+        if table.num_rows != len(rows):  # a quoted cell with a line break
+            return None
+        values = np.stack([table.column(names[i]).to_numpy() for i in number_at], axis=1) if number_at else np.empty((len(rows), 0))
+        words = [np.char.strip(table.column(names[i]).to_numpy().astype(str)) for i in text_at]
+        return values, np.stack(words, axis=1) if words else np.empty((len(rows), 0), dtype=str)
+
+    return convert
+
+
+def _convert(
+    path: object, rows: list[str], lines: np.ndarray, separator: str, columns: list[str], number_at: list[int],
+    text_at: list[int], on_bad: OnBadLine | None,
+) -> TableBlock:  # fmt: skip
+    # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast
+    # reader refuses them, so they are spelt out first.
+    gap = separator * 2
+    filled = rows
+    if any(gap in row for row in rows):
+        filled = [r.replace(gap, f"{separator}nan{separator}").replace(gap, f"{separator}nan{separator}") if gap in r else r for r in rows]
+    options = dict(delimiter=separator, comments=None, quotechar='"', ndmin=2)
+    try:
+        values = np.loadtxt(filled, usecols=number_at, dtype=np.float64, **options)
+        words = np.loadtxt(rows, usecols=text_at, dtype=str, **options) if text_at else np.empty((len(rows), 0), dtype=str)
+    except (ValueError, OverflowError):
+        return _convert_slowly(path, rows, lines, separator, columns, number_at, text_at, on_bad)
+    if len(values) != len(rows) or len(words) != len(rows):  # a quote that is never closed joins lines
+        return _convert_slowly(path, rows, lines, separator, columns, number_at, text_at, on_bad)
+    return TableBlock(values, words, lines)
+
+
+def _convert_slowly(
+    path: object, rows: list[str], lines: np.ndarray, separator: str, columns: list[str], number_at: list[int],
+    text_at: list[int], on_bad: OnBadLine | None,
+) -> TableBlock:  # fmt: skip
+    """Line by line, cell by cell: knows more spellings of "missing", and names the bad cell."""
+    values, words, kept = [], [], []
+    least = max([*number_at, *text_at], default=0)
+    for row, line in zip(rows, lines.tolist()):
+        found = _cells(row, separator, columns, number_at, least)
+        if isinstance(found, str):
+            if on_bad is None:
+                raise NergError(f"{path}, line {line}{found}, or leave such lines out with --skip-bad-lines")
+            on_bad(line, found)
+            continue
+        cells, numbers = found
+        values.append(numbers)
+        words.append([cells[k].strip() for k in text_at])
+        kept.append(line)
+    return TableBlock(
+        np.array(values, np.float64).reshape(len(kept), len(number_at)),
+        np.array(words, dtype=str).reshape(len(kept), len(text_at)),
+        np.array(kept, np.int64),
+    )
+
+
+def _cells(row: str, separator: str, columns: list[str], number_at: list[int], least: int) -> tuple[list[str], list[float]] | str:
+    """The cells of a line and the numbers among them; or what is wrong with it, and the remedy."""
+    try:
+        cells = next(csv.reader([row], delimiter=separator), [])
+    except csv.Error as error:
+        return f": it cannot be split into cells ({error}); mend or remove the line"
+    if len(cells) <= least:
+        return f": {len(cells)} cells, the header has {len(columns)}; mend or remove the line"
+    numbers = []
+    for k in number_at:
+        word = cells[k].strip()
+        try:
+            numbers.append(np.nan if word.lower() in _MISSING else float(word))
+        except ValueError:
+            return f", column {plain(columns[k], 40)!r}: {plain(word, 60)!r} is not a number; mend the cell or the column map"
+    return cells, numbers
+
+
+def _parquet(path: str | os.PathLike) -> Any:
+    """The open Parquet file ``path``; `NergError` for one that is damaged or claims more than its bytes warrant."""
+    from nerg_mi.rays.io import pyarrow_modules
+
+    pa, pq = pyarrow_modules()
+    size = size_of(path, "table")
+    with reading(path, "table", also=(pa.lib.ArrowException,)):
+        table = pq.ParquetFile(path)
+        about = table.metadata
+        claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
+    # Equal values are stored once: what counts is also what they become.
+    if max(claimed, _ROW_BYTES * about.num_rows) > inflated_limit(size):
+        raise NergError(f'the table "{path}" claims {about.num_rows:,} rows, which its {size:,} bytes do not warrant; copy it again')
+    return table
+
+
+def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[TableBlock]:
+    import pyarrow as pa
+
+    with _parquet(path) as table:
+        names = table.schema_arrow.names
+        _require(path, [*numbers, *texts], names)
+        twice = [c for c in (*numbers, *texts) if names.count(c) > 1]
+        if twice:
+            raise NergError(f'the table "{path}" has several columns called {plain(twice[0], 40)!r}; rename all but one')
+        first, wanted = 1, list(dict.fromkeys([*numbers, *texts]))
+        with reading(path, "table", also=(pa.lib.ArrowException,)):
+            batches = table.iter_batches(batch_size=BLOCK, columns=wanted)
+        while True:
+            with reading(path, "table", also=(pa.lib.ArrowException,)):
+                batch = next(batches, None)
+                if batch is None:
+                    return
+                n = batch.num_rows
+                column = lambda c: batch.column(batch.schema.get_field_index(c))
+                values = [_as_numbers(path, c, column(c)) for c in numbers]
+                words = [np.array(["" if v is None else str(v) for v in column(c).to_pylist()], dtype=str) for c in texts]
+            yield TableBlock(
+                np.stack(values, axis=1) if values else np.empty((n, 0)),
+                np.stack(words, axis=1) if words else np.empty((n, 0), dtype=str),
+                np.arange(first, first + n),
+            )
+            first += n
+
+
+def _as_numbers(path: object, name: str, column: Any) -> np.ndarray:
+    try:
+        return column.to_numpy(zero_copy_only=False).astype(np.float64)
+    except (TypeError, ValueError):
+        raise NergError(f'the column {plain(name, 40)!r} of the table "{path}" holds no numbers; name another one') from None
+
+
+def _require(path: object, wanted: list[str], there: list[str]) -> None:
+    missing = [c for c in wanted if c not in there]
+    if missing:
+        brief = lambda names: ", ".join(plain(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
+        raise NergError(f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}; name those by --map")

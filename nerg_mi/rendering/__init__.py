@@ -1,0 +1,1 @@
+"""From a scene file to a picture file: checks, bands of rows, writers."""

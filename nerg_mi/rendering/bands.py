@@ -1,0 +1,290 @@
+"""A picture rendered in pieces: bands of rows, which bound the memory, in strips of samples, which bound the time of one step.
+
+A picture does not depend on how it is divided. Every sample keeps the position, the ray and the random numbers that it has in
+the whole picture (`pixel_sampler`), and the samples of a pixel are added in the same groups, so that with a box filter the
+pixels are those of ``mi.render``, bit by bit, also where a pixel's samples fall into two strips. With a wider filter the samples
+of the rows around a band are rendered again for it; what is added up is the same, in another order, and pixels differ by
+the rounding of single precision.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import pixel_sampler
+
+PACKET = 64
+"""Samples that Dr.Jit may add up as one (16 on a CPU, 32 on a GPU): a strip begins at a multiple of this many."""
+
+LEAST = 1 << 12
+"""Samples below which the overhead of a strip outweighs its work."""
+
+STRIP_SECONDS = 0.5
+"""A strip that took longer than this is followed by shorter ones, one that took less than half of it by longer ones."""
+
+BYTES_PER_VALUE = 22
+"""Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the others in
+the copies on the way to the file."""
+
+
+@dataclass(frozen=True)
+class Band:
+    """Rows ``top``, ..., ``top + rows - 1`` of the film's crop window. ``film`` holds them (``bitmap()``, ``develop()``) until the
+    next band is asked for, perhaps followed by empty rows."""
+
+    top: int
+    rows: int
+    film: object
+
+
+def why_whole(scene, sensor) -> str | None:
+    """Why a picture of ``sensor`` can only be rendered in one piece; None where it can be divided."""
+    import mitsuba as mi
+
+    from nerg_mi.transport.observer.viewpoint import is_batch
+
+    integrator, film = scene.integrator(), sensor.film()
+    if mi.variant().startswith("scalar") or mi.is_spectral or mi.is_polarized:
+        return f"the variant {mi.variant()}"
+    if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
+        return f"the integrator {integrator.class_name()}"
+    if not hasattr(integrator, "seen_by") and _renders_itself(type(integrator), mi.SamplingIntegrator):
+        return f"the integrator {integrator.class_name()}, which renders in a way of its own"
+    if film.class_name() != "HDRFilm":
+        return f"the film {film.class_name()}"
+    if is_batch(sensor):
+        return "a batch of sensors"
+    if pixel_sampler.base_seed(sensor.sampler()) is None:
+        return f"the sampler {sensor.sampler().class_name()}"
+    return None
+
+
+def _renders_itself(kind: type, base: type) -> bool:
+    """Whether a class of integrators in Python has a ``render`` of its own, below ``base``."""
+    above = kind.__mro__
+    return any("render" in vars(c) for c in above[: above.index(base)])
+
+
+def rows_for(scene, sensor, memory: float) -> int:
+    """Rows of a band that needs at most ``memory`` bytes; at least 1, and of a filter that is wider than a pixel so many
+    that the rows around a band, which are rendered again for it, are a quarter of it at most."""
+    width, height = sensor.film().crop_size()
+    values = 5 + len(scene.integrator().aov_names())
+    return int(min(max(memory // (width * values * BYTES_PER_VALUE), 8 * _reach(sensor.film()), 1), height))
+
+
+def _reach(film) -> int:
+    """How many rows further than their own the samples of ``film`` reach."""
+    return 0 if film.rfilter().is_box_filter() else int(film.rfilter().border_size())
+
+
+def render_bands(
+    scene, sensor, *, spp: int = 0, seed: int = 0, rows: int = 0, strip: int = 0, on_strip: Callable[[int, int], None] | None = None
+) -> Iterator[Band]:
+    """Render the picture of ``sensor`` band by band, from the top; in one piece where `why_whole` has a reason.
+
+    ``spp``: samples a pixel, 0 for those of the sampler. ``rows`` of a band; 0: all. ``strip``: samples of a strip, 0: as many as
+    take about `STRIP_SECONDS`. ``on_strip`` is told the number of samples done and that of all after every strip, and may raise.
+    Raises ``KeyboardInterrupt`` after a picture in one piece that was to be stopped: there Mitsuba itself takes the signal.
+    """
+    if why_whole(scene, sensor):
+        yield _whole(scene, sensor, spp, seed, on_strip)
+        return
+    grid = _Grid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
+    seen_by = getattr(scene.integrator(), "seen_by", None)
+    base = pixel_sampler.base_seed(sensor.sampler())
+    pace = _Pace(strip)
+    done = 0
+    for top in range(0, grid.height, grid.rows):
+        block = grid.block(scene.integrator())
+        start, stop = grid.samples(top)
+        with nullcontext() if seen_by is None else seen_by(sensor, scene), grid.as_whole(block):
+            for first, count in pace.strips(start, stop, grid.spp):
+                block.put(*_trace(scene, sensor, grid, base, seed, top, first, count, start))
+                # What was traced while the strip before it was computed is computed now.
+                pace.wait()
+                if on_strip is not None and done:
+                    on_strip(min(done, grid.total), grid.total)
+                _evaluate(block)
+                done += count
+            pace.wait()
+        if on_strip is not None:
+            on_strip(min(done, grid.total), grid.total)
+        grid.develop(scene.integrator(), block)
+        yield Band(top, min(grid.rows, grid.height - top), sensor.film())
+
+
+def _whole(scene, sensor, spp, seed, on_strip) -> Band:
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.render(scene, sensor=sensor, spp=spp, seed=seed)
+    dr.sync_thread()
+    if scene.integrator().should_stop():
+        raise KeyboardInterrupt
+    if on_strip is not None:
+        total = int(np.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count())
+        on_strip(total, total)
+    return Band(0, int(sensor.film().crop_size()[1]), sensor.film())
+
+
+def _evaluate(block):
+    import drjit as dr
+
+    dr.eval(block.tensor())
+
+
+def _trace(scene, sensor, grid: _Grid, base, seed, top, first, count, start):
+    """Trace samples ``first``, ..., of which those before ``start`` are of no account: where they lie in the block of the band at
+    ``top``, their values and who counts. Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by operation."""
+    import drjit as dr
+    import mitsuba as mi
+
+    film, spp = sensor.film(), grid.spp
+    sampler = pixel_sampler.for_samples(spp, base, seed, first, count)
+    # Numbers that differ from strip to strip are kept out of the kernel, which is then the same for all.
+    number = dr.arange(mi.UInt32, count)
+    active = number >= dr.opaque(mi.UInt32, max(start - first, 0))
+    number += dr.opaque(mi.UInt32, first % spp)
+    number = number // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first // spp % grid.width)
+    line = number // grid.width
+    pixel = mi.Vector2i(number - line * grid.width, line + dr.opaque(mi.UInt32, first // spp // grid.width))
+    pixel += mi.Vector2i(film.crop_offset()) - grid.border
+
+    position = mi.Vector2f(pixel) + sampler.next_2d(active)
+    scale = dr.rcp(mi.ScalarVector2f(film.crop_size()))
+    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+    relative = mi.Point2f(dr.fma(position, mi.Vector2f(scale), mi.Vector2f(offset)))
+    aperture = sampler.next_2d(active) if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    moment = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        moment = moment + sampler.next_1d(active) * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(moment, 0, relative, aperture, active)
+    if ray.has_differentials:
+        ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(spp))))
+    radiance, valid, aovs = scene.integrator().sample(scene, sampler, ray, sensor.get_medium(), active)
+    radiance = mi.Spectrum(radiance) * weight
+    color = [radiance.x] * 3 if mi.is_monochromatic else [radiance.x, radiance.y, radiance.z]
+    alpha = [dr.select(valid, mi.Float(1), 0)] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+    # With a box filter the pixel itself, as its samples may be rounded up into the next.
+    where = mi.Point2f(pixel) if film.rfilter().is_box_filter() else mi.Point2f(position)
+    if grid.divided:
+        where -= mi.Vector2f(mi.Vector2i(film.crop_offset()) + mi.Vector2i(0, dr.opaque(mi.Int32, top)))
+    return where, [*color, *alpha, mi.Float(1), *aovs], active
+
+
+class _Grid:
+    """Pixels that are sampled, row by row, and the bands of them."""
+
+    def __init__(self, film, spp: int, rows: int):
+        self.film, self.spp = film, spp
+        self.size, self.offset = [int(v) for v in film.crop_size()], [int(v) for v in film.crop_offset()]
+        self.height = self.size[1]
+        self.rows = min(rows or self.height, self.height)
+        self.divided = self.rows < self.height
+        filters = film.rfilter()
+        self.border = int(filters.border_size()) if film.sample_border() else 0
+        self._reach = _reach(film)
+        self.width = self.size[0] + 2 * self.border
+        self.total = sum(b - a for a, b in map(self.samples, range(0, self.height, self.rows)))
+
+    def samples(self, top: int) -> tuple[int, int]:
+        """The samples, of those of the whole picture, that reach the band at ``top``: the first, and the one after the last."""
+        first = max(top - self._reach + self.border, 0)
+        last = min(top + self.rows + self._reach + self.border, self.height + 2 * self.border)
+        if not self.divided:
+            first, last = 0, self.height + 2 * self.border
+        return first * self.width * self.spp, last * self.width * self.spp
+
+    def block(self, integrator):
+        """What the samples of a band are added to."""
+        with self._cropped():
+            self.film.prepare(integrator.aov_names())
+            block = self.film.create_block()
+            block.set_offset(self.film.crop_offset())
+        block.set_coalesce(block.coalesce() and self.spp >= 4)
+        return block
+
+    @contextmanager
+    def as_whole(self, block):
+        """Add samples to ``block`` in the way in which Dr.Jit would add them to the whole picture, which is another for more
+        than a million values (`dr.set_expand_threshold`) and rounds differently."""
+        import drjit as dr
+
+        threshold = dr.expand_threshold()
+        if self.size[0] * self.size[1] * block.channel_count() > threshold:
+            dr.set_expand_threshold(0)
+        try:
+            yield
+        finally:
+            dr.set_expand_threshold(threshold)
+
+    def develop(self, integrator, block) -> None:
+        """Let the film hold what is in ``block``."""
+        with self._cropped():
+            self.film.prepare(integrator.aov_names())
+            self.film.put_block(block)
+
+    @contextmanager
+    def _cropped(self):
+        # Only for as long as no ray is made: sensors see the whole film. All bands lie at the film's corner, so that the place of
+        # a band is not part of the kernel.
+        if not self.divided:
+            yield
+            return
+        _crop(self.film, [self.size[0], self.rows], [0, 0])
+        try:
+            yield
+        finally:
+            _crop(self.film, self.size, self.offset)
+
+
+def _crop(film, size, offset) -> None:
+    import mitsuba as mi
+
+    params = mi.traverse(film)
+    params["crop_size"], params["crop_offset"] = mi.ScalarVector2u(size), mi.ScalarPoint2u(offset)
+    params.update()
+
+
+class _Pace:
+    """How many samples a strip has, from the time that those before it took."""
+
+    def __init__(self, fixed: int):
+        import mitsuba as mi
+
+        self._fixed = fixed
+        self._count = fixed or (1 << 20 if mi.variant().startswith("cuda") else 1 << 15)
+        self._most = 1 << 24 if mi.variant().startswith("cuda") else 1 << 18
+        self._since, self._strips = None, 0
+
+    def strips(self, start: int, stop: int, spp: int) -> Iterator[tuple[int, int]]:
+        # With whole pixels in every strip, unless a pixel alone has more samples than a strip may have.
+        unit = math.lcm(PACKET, spp)
+        unit = unit if unit <= self._most else PACKET
+        first = start - start % PACKET
+        while first < stop:
+            last = min(max((first + self._count) // unit, first // unit + 1) * unit, stop)
+            yield first, last - first
+            first = last
+
+    def wait(self) -> None:
+        """Until the strip before is done."""
+        import drjit as dr
+
+        dr.sync_thread()
+        now = time.perf_counter()
+        # The first strip's kernel had to be compiled.
+        if self._strips > 1 and not self._fixed:
+            seconds = now - self._since
+            if seconds > STRIP_SECONDS:
+                self._count = max(self._count // 2, LEAST)
+            elif seconds < STRIP_SECONDS / 2:
+                self._count = min(self._count * 2, self._most)
+        self._since, self._strips = now, self._strips + 1

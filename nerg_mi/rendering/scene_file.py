@@ -1,0 +1,156 @@
+"""A scene file looked at before Mitsuba reads it: what would end the process or fill the memory is refused in a sentence.
+
+The XML is read as a stream of tags, without recursion and without entities; the files that it includes are followed, and the
+meshes, volumes and pictures that it names are looked at by their headers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from xml.parsers import expat
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.image_header import check_image
+from .mesh_file import check_obj, check_ply, check_vol
+
+DEPTH = 256
+"""Elements may be nested so deep; Mitsuba's parser ends the process at some thousands."""
+
+ELEMENTS = 1_000_000
+"""A scene may have so many elements, with those of the files that it includes."""
+
+BYTES = 256 << 20
+"""A scene may have so many bytes of XML, with what is filled in for its `$key`s: values that name others may grow with
+each of them."""
+
+INCLUDES = 16
+"""Files may be included so deep."""
+
+SAMPLES = 1 << 24
+"""So many samples a pixel at most."""
+
+PIXELS = 1 << 28
+"""A picture may have so many pixels: 16384 x 16384."""
+
+_PICTURES = {".png", ".jpg", ".jpeg", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".bmp"}
+_CHECKS = {
+    "ply": check_ply, "obj": check_obj, "gridvolume": check_vol, "sdfgrid": check_vol,
+    "ellipsoids": lambda path: check_ply(path, faces=False), "ellipsoidsmesh": lambda path: check_ply(path, faces=False),
+}  # fmt: skip
+
+
+def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None) -> None:
+    """Look at the scene file ``path`` and at all that it names; ``defaults``: values for its `<default>` and `$key`.
+
+    What is missing or unknown is left to Mitsuba, which says so. Raises `NergError`.
+    """
+    path = Path(path)
+    _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).read(path, 0, ())
+
+
+def check_scene(path: str | Path, scene) -> None:
+    """Look at what Mitsuba has made of the file: films and samplers. Raises `NergError`."""
+    for index, sensor in enumerate(scene.sensors()):
+        film, count = sensor.film(), sensor.sampler().sample_count()
+        width, height = map(int, film.crop_size())
+        if not 0 < width * height <= PIXELS:
+            raise NergError(f'the film of sensor {index} of "{path}" has {width:,} x {height:,} pixels: give it 1 to {PIXELS:,}.')
+        check_samples(count, f'the sampler of sensor {index} of "{path}"')
+
+
+def check_samples(count: int, what: str) -> None:
+    """Raise `NergError` for no samples and for more than `SAMPLES`."""
+    if not 1 <= count <= SAMPLES:
+        raise NergError(f"{what} takes {count:,} samples a pixel: give it 1 to {SAMPLES:,}.")
+
+
+class _Scene:
+    def __init__(self, folder: Path, defaults: dict[str, str]):
+        self._folders, self._values = [folder], dict(defaults)
+        self._given = set(defaults)
+        self._elements = self._bytes = 0
+
+    def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
+        whole = path.resolve()
+        if whole in within:
+            raise NergError(f'the scene file "{path}" includes itself; take that <include> out.')
+        if len(within) > INCLUDES:
+            raise NergError(f'the scene file "{path}" is included more than {INCLUDES} files deep; include fewer.')
+        parser = expat.ParserCreate()
+        # The parser itself would grow the text of entities without bound.
+        parser.EntityDeclHandler = lambda *_: self._refuse(path, parser, "declares an entity; write out what it stands for")
+        parser.SetParamEntityParsing(expat.XML_PARAM_ENTITY_PARSING_NEVER)
+        stack: list[tuple[str, str]] = []
+
+        def start(tag, attributes):
+            self._elements += 1
+            if depth + len(stack) >= DEPTH:
+                self._refuse(path, parser, f"nests elements more than {DEPTH} deep; nest fewer")
+            if self._elements > ELEMENTS:
+                self._refuse(path, parser, f"has more than {ELEMENTS:,} elements; keep meshes in files of their own")
+            values = {key: self._filled(value, path, parser) for key, value in attributes.items()}
+            parent = stack[-1] if stack else ("", "")
+            stack.append((tag, values.get("type", "")))
+            self._element(path, parser, tag, values, parent, depth + len(stack), (*within, whole))
+
+        parser.StartElementHandler = start
+        parser.EndElementHandler = lambda tag: stack.pop()
+        try:
+            with path.open("rb") as file:
+                while part := file.read(1 << 16):
+                    self._count(len(part), path, parser)
+                    parser.Parse(part, False)
+            parser.Parse(b"", True)
+        except expat.ExpatError as error:
+            raise NergError(f'the scene file "{path}" is no well-formed XML ({error}); correct it.') from error
+        except OSError as error:
+            raise NergError(f'the scene file "{path}" could not be read ({error.strerror}); check its name and permissions.') from error
+
+    def _refuse(self, path, parser, why):
+        raise NergError(f'the scene file "{path}" (line {parser.CurrentLineNumber}) {why}.')
+
+    def _count(self, more: int, path, parser) -> None:
+        self._bytes += more
+        if self._bytes > BYTES:
+            self._refuse(path, parser, f"has more than {BYTES >> 20} MB of XML; keep meshes in files of their own")
+
+    def _filled(self, value: str, path, parser) -> str:
+        if "$" not in value:
+            return value
+        # The longest name first, as Mitsuba does.
+        for key in sorted(self._values, key=len, reverse=True):
+            self._count(value.count(f"${key}") * len(self._values[key]), path, parser)
+            value = value.replace(f"${key}", self._values[key])
+        return value
+
+    def _element(self, path, parser, tag, values, parent, depth, within) -> None:
+        name, value = values.get("name", ""), values.get("value", "")
+        if tag == "default" and name not in self._given:
+            self._values.setdefault(name, value)
+        elif tag == "path":
+            self._folders.append(self._folders[0] / value)
+        elif tag == "include":
+            found = self._find(values.get("filename", ""))
+            if found is not None:
+                self.read(found, depth, within)
+        elif name == "sample_count" and parent[0] == "sampler" and tag == "integer":
+            try:
+                count = int(value)
+            except ValueError:
+                return  # Mitsuba names the line
+            check_samples(count, f'the sampler of "{path}" (line {parser.CurrentLineNumber})')
+        elif name == "filename" and tag == "string":
+            found = self._find(value)
+            if found is None:
+                return
+            if parent[1] in _CHECKS:
+                _CHECKS[parent[1]](found)
+            elif parent[1] in ("bitmap", "envmap") and found.suffix.lower() in _PICTURES:
+                check_image(found, "texture")
+
+    def _find(self, name: str) -> Path | None:
+        import mitsuba as mi
+
+        places = [folder / name for folder in self._folders] + [Path(str(mi.file_resolver().resolve(name)))]
+        return next((place for place in places if name and place.is_file()), None)

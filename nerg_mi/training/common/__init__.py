@@ -1,0 +1,1 @@
+"""What all trainings share: the state of a run, and the clock of its steps."""

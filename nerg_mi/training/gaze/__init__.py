@@ -1,0 +1,1 @@
+"""Training a gaze field on rays and on salience images."""

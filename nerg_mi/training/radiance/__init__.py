@@ -1,0 +1,1 @@
+"""Training a radiance field on posed photos."""

@@ -1,0 +1,68 @@
+"""The radiance field's forward pass in the form that trains fastest: networks as tensor products."""
+from __future__ import annotations
+
+import drjit as dr
+
+from nerg_mi.maths.box import Box
+from nerg_mi.field.encoding.harmonics import encode_direction
+from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.mlp import MLP
+from nerg_mi.field.radiance import RadianceConfig, density_from_log, sigmoid
+
+
+def stack(rows: list, ns):
+    """Rows (Floats of one length, or constants) as a TensorXf (rows, N)."""
+    flat = dr.ravel(ns.ArrayXf(rows), order="C")
+    return ns.TensorXf(flat, (len(rows), dr.width(flat) // len(rows)))
+
+
+def unstack(x, ns) -> list:
+    """Rows of a TensorXf (rows, N) as Floats.
+
+    A plain slice would send its gradient back through atomic additions; no two rows share an
+    entry, so that ``Permute`` (plain stores) is right.
+    """
+    rows, width = x.shape
+    index = dr.arange(ns.UInt32, width)
+    return [dr.gather(ns.Float, x.array, index + dr.opaque(ns.UInt32, k * width), mode=dr.ReduceMode.Permute)
+            for k in range(rows)]
+
+
+def density_color(config: RadianceConfig, box: Box, parameters: dict, p, d, ns, features: list | None = None):
+    """Density (1/unit) and colour (list of 3 Floats in 0..1) at world points ``p`` seen along ``d``.
+
+    The same maths as ``RadianceField.density_features`` and ``color`` on ``parameters`` spelt as the field spells them; points
+    must lie in ``box``. Gradients reach every entry of ``parameters``. ``features``: what the grid returns at ``p``, where
+    that has been looked up already.
+    """
+    h = unstack(_net(parameters, "density_net").tensor(_features(config, box, parameters, p, ns, features)), ns)
+    sigma = density_from_log(h[0], config.density_scale)
+    c = _net(parameters, "color_net").tensor(stack(encode_direction(d, config.sh_degree) + h[1:], ns))
+    return sigma, [sigmoid(x) for x in unstack(c, ns)]
+
+
+def density(config: RadianceConfig, box: Box, parameters: dict, p, ns):
+    """Density (1/unit) alone, at world points ``p`` in ``box``; see `density_color`."""
+    head = _head(parameters)
+    return density_from_log(head.tensor(_features(config, box, parameters, p, ns)).array, config.density_scale)
+
+
+def density_of(config: RadianceConfig, parameters: dict, features: list):
+    """Density (1/unit) where the grid returns ``features`` (list of Floats); without weight gradients, as one kernel."""
+    return density_from_log(_head(parameters)(features)[0], config.density_scale)
+
+
+def _head(parameters: dict) -> MLP:
+    net = _net(parameters, "density_net")
+    return MLP(net.weights[:-1] + [net.weights[-1][0:1, :]])
+
+
+def _features(config: RadianceConfig, box: Box, parameters: dict, p, ns, known: list | None = None):
+    # Expand: every thread adds to a copy of the table of its own; a fraction of the cost of atomics.
+    rows = HashGrid(config.grid, parameters["grid.table"])(box.to_unit(p), True, dr.ReduceMode.Expand)
+    return stack(rows if known is None else [dr.replace_grad(a, b) for a, b in zip(known, rows)], ns)
+
+
+def _net(parameters: dict, name: str) -> MLP:
+    count = sum(k.startswith(name + ".") for k in parameters)
+    return MLP([parameters[f"{name}.{i}"] for i in range(count)])

@@ -1,0 +1,203 @@
+"""Samples of training rays: steps in cells that may hold density, in front of what is opaque.
+
+Plain marching with true steps. Every ray shares one table of step edges, shifted by its own jitter;
+steps are kept where the density grid has a bit, then where a density-only pass still sees light.
+What is kept lies packed, ray after ray (see ``compositing``).
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.backend import aligned, namespace
+from nerg_mi.maths.box import Box
+from nerg_mi.transport.march.quadrature import absorbed_share
+from .compositing import Segments, Thinned
+
+
+class StepTable:
+    """Edges t_0 < t_1 < ... from ``near`` to ``far``, in scene units.
+
+    A step is ``step`` long, or ``growth`` times its distance where that is longer: pixels widen with
+    distance, and so may steps. The rule is scale-free, as ``transport.march.primal`` has it.
+    """
+
+    def __init__(self, ns, near: float, far: float, step: float, growth: float):
+        edges = [near]
+        while edges[-1] < far:
+            edges.append(edges[-1] + max(step, growth * edges[-1]))
+        # One more, because jitter shifts every edge by up to one step.
+        edges.append(edges[-1] + max(step, growth * edges[-1]))
+        self.steps = len(edges) - 1
+        self.edges = ns.Float(aligned(np.array(edges)))
+        # As literals they would compile the kernels anew for every table.
+        self._steps = dr.opaque(ns.UInt32, self.steps)
+        self._share = dr.opaque(ns.Float64, 1 / self.steps)
+
+    def split(self, index):
+        """Ray and step (UInt32) of candidates ``index`` = ray * steps + step."""
+        # Division of integers is slow; in float64 half a step outweighs all rounding.
+        ray = type(index)((dr.float64_array_t(index)(index) + 0.5) * self._share)
+        return ray, index - ray * self._steps
+
+    def interval(self, k, offset):
+        """Start and length of step ``k``, shifted by ``offset`` in [0, 1) of a step."""
+        Float = type(offset)
+        a, b = dr.gather(Float, self.edges, k), dr.gather(Float, self.edges, k + 1)
+        c = dr.gather(Float, self.edges, dr.minimum(k + 2, self._steps))
+        # The edge after the last repeats it: a step of no length beyond the far end.
+        start, stop = dr.lerp(a, b, offset), dr.lerp(b, dr.maximum(c, b), offset)
+        return start, stop - start
+
+
+@dataclass
+class Rays:
+    """``o``, ``d``: Array3f origins and unit directions, world frame; ``t0``, ``t1``: where each crosses
+    the box (empty where t1 <= t0); ``count``: how many."""
+
+    o: object
+    d: object
+    t0: object
+    t1: object
+    count: int
+
+
+def rays_in_box(o, d, box: Box, near: float) -> Rays:
+    """Rays clipped to ``box``, from ``near`` on."""
+    Float = type(d.x)
+    t0, t1 = Float(near), Float(dr.inf)
+    for axis in range(3):
+        inverse = dr.rcp(d[axis])
+        a, b = (box.lower[axis] - o[axis]) * inverse, (box.upper[axis] - o[axis]) * inverse
+        # fmin/fmax pass over the NaN of a ray that runs within a face.
+        t0, t1 = dr.fmax(t0, dr.fmin(a, b)), dr.fmin(t1, dr.fmax(a, b))
+    dr.eval(o, d, t0, t1)
+    return Rays(o, d, t0, t1, dr.width(o))
+
+
+@dataclass
+class Samples:
+    """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint
+    (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding; ``features``: what the
+    density pass knew of them, or None; ``thinned``: of samples that stand for others; ``looked``: samples a ray of the density pass."""
+
+    ray: object
+    t: object
+    length: object
+    p: object
+    segments: Segments
+    count: int
+    features: list | None = None
+    thinned: Thinned | None = None
+    looked: float = 0.0
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """Which samples to keep: those of a weight of ``sure`` or more all, others with a probability in proportion to their
+    weight, but ``least`` at least. ``seed``: of the choices. They are independent of one another, because derivatives hold
+    products of two samples, whose average is right only if so."""
+
+    sure: float
+    least: float
+    seed: int
+
+
+def occupied_steps(rays: Rays, table: StepTable, offset, occupied, most: int | None = None) -> tuple | None:
+    """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated, and the rays covered.
+
+    ``offset``: each ray's jitter, [0, 1); ``occupied``: function of points (Array3f) and a mask,
+    giving a mask. ``most``: bound of their number; the last rays, whose steps do not fit, are dropped. None when there is
+    not one step.
+    """
+    UInt32 = dr.uint32_array_t(type(offset))
+    total = rays.count * table.steps
+    if total >= 2**32:
+        raise ValueError(f"{rays.count} rays of {table.steps} steps are too many for one batch")
+    ray, k = table.split(dr.arange(UInt32, total))
+    _, _, p, inside = _step(rays, table, offset, ray, k)
+    kept = dr.compress(occupied(p, inside))
+    count, covered = dr.width(kept), rays.count
+    if count == 0:
+        return None
+    if most is not None and count > most:
+        # Rays lie one after another: the first step that does not fit tells which ray is incomplete.
+        covered = int(dr.gather(UInt32, kept, UInt32(most)).numpy()[0]) // table.steps
+        if covered == 0:
+            raise NergError(f"a single ray has more than {most} steps; enlarge the batch, look_most or the step")
+        count = dr.width(dr.compress(kept < dr.opaque(UInt32, covered * table.steps)))
+        kept = dr.gather(UInt32, kept, dr.arange(UInt32, count))
+    ray, k = table.split(kept)
+    t, length, p, _ = _step(rays, table, offset, ray, k)
+    dr.eval(ray, t, length, p)
+    return ray, t, length, p, covered
+
+
+def _step(rays: Rays, table: StepTable, offset, ray, k):
+    Float = type(offset)
+    t, length = table.interval(k, dr.gather(Float, offset, ray))
+    middle = t + 0.5 * length
+    o, d = (dr.gather(type(rays.o), v, ray) for v in (rays.o, rays.d))
+    inside = (middle > dr.gather(Float, rays.t0, ray)) & (middle < dr.gather(Float, rays.t1, ray)) & (length > 0)
+    return t, length, o + d * middle, inside
+
+
+def visible_samples(
+    rays: Rays, table: StepTable, offset, occupied, density, stop: float, pad: int | None = None,
+    thinning: Thinning | None = None, most: int | None = None,
+) -> tuple[Samples | None, int]:
+    """Samples that may matter, and the number of leading rays that they cover completely.
+
+    ``density``: function of points and a mask giving σ without a gradient, or σ and a list of Floats that the samples
+    are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make exactly so many samples,
+    dropping the last rays that do not fit. ``thinning``: let few samples stand for the many that hardly absorb. ``most``:
+    samples at most at which ``density`` is evaluated, by the same means.
+    Returns (None, rays) when no ray meets anything.
+    """
+    steps = occupied_steps(rays, table, offset, occupied, most)
+    if steps is None:
+        return None, rays.count
+    ray, t, length, p, covered = steps
+    Bool, Float, UInt32 = dr.mask_t(t), type(t), type(ray)
+    everywhere = dr.full(Bool, True, dr.width(t))
+    segments = Segments(ray, everywhere, rays.count)
+    sigma = density(p, everywhere)
+    sigma, features = sigma if isinstance(sigma, tuple) else (sigma, None)
+    tau = dr.minimum(sigma * length, 60.0)
+    # At once: each on its own would evaluate the field again.
+    dr.eval(tau, features)
+    before = Float(segments.before(tau))
+    light = dr.exp(-before)
+    chosen, thinned = light > stop, None
+    if thinning is not None:
+        weight = light * absorbed_share(tau)
+        share = dr.clip(weight / thinning.sure, thinning.least, 1)
+        random = namespace(t).PCG32(dr.width(t), dr.opaque(dr.uint64_array_t(Float), thinning.seed)).next_float32()
+        chosen &= random < share
+        thinned = Thinned(dr.rcp(share), before, absorbed_share(Float(segments.total(tau))))
+        dr.eval(chosen, thinned.copies, before, thinned.opacity)
+    kept = dr.compress(chosen)
+    count, looked = dr.width(kept), dr.width(t) / covered
+    if count == 0:
+        return None, covered
+    if pad is not None and count > pad:
+        # The ray in which the limit falls is incomplete: it and all later ones wait for another batch.
+        covered = int(dr.gather(UInt32, ray, dr.gather(UInt32, kept, UInt32(pad))).numpy()[0])
+        if covered == 0:
+            raise NergError(f"a single ray has more than {pad} samples; enlarge the batch or the step")
+    j = dr.arange(UInt32, pad if pad is not None else count)
+    source = dr.gather(UInt32, kept, dr.minimum(j, dr.opaque(UInt32, count - 1)))
+    ray = dr.gather(UInt32, ray, source)
+    active = (j < dr.opaque(UInt32, count)) & (ray < dr.opaque(UInt32, covered))
+    t, length, p = (dr.gather(type(v), v, source) for v in (t, length, p))
+    if features is not None:
+        features = [dr.gather(type(f), f, source) for f in features]
+    if thinned is not None:
+        thinned.copies, thinned.before = (dr.gather(Float, v, source) for v in (thinned.copies, thinned.before))
+        dr.eval(thinned.copies, thinned.before)
+    dr.eval(ray, active, t, length, p, features)
+    segments = Segments(ray, active, rays.count)
+    return Samples(ray, t, length, p, segments, min(count, pad or count), features, thinned, looked), covered

@@ -1,0 +1,309 @@
+"""Training a radiance field on posed pictures.
+
+instant-ngp's training (Müller et al. 2022) in Dr.Jit, arranged for the CPU backend: rays march a grid
+of occupied cells with true steps; a density-only pass drops what lies behind opaque surfaces, and lets one in many stand for
+samples that hardly absorb; what remains is packed into batches of constant size, the number of rays adapting; networks run
+as tensor products.
+"""
+from __future__ import annotations
+
+import time
+
+import drjit as dr
+import numpy as np
+from drjit.opt import Adam
+
+from nerg_mi.errors import NergError
+from nerg_mi.capture.images import View
+from nerg_mi.field.backend import aligned
+from nerg_mi.maths.box import Box
+from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from .compositing import damp_near, weights
+from .density_grid import DensityGrid
+from .losses import color_loss, composite, depth_loss, distortion_loss, feature_decay
+from .model import density, density_color, density_of
+from .pace import adapted_rays, affordable_rays, refined
+from .pixels import PixelBank
+from .preview import Preview, psnr, render_view
+from .sampling import StepTable, Thinning, rays_in_box, visible_samples
+from .settings import RadianceSettings
+from .settling import Settling
+from nerg_mi.training.common.step_clock import StepClock
+
+# The average is taken of every fourth step.
+_AVERAGE_EVERY = 4
+# Training rays that decide, at the end, which cells matter, and their samples at most: in fog each ray has hundreds.
+_LOOKS, _LOOK_RAYS, _LOOK_SAMPLES = 64, 2**12, 2**25
+# Steps of rays that the marching kernel goes through, in batches: they cost a fiftieth of a sample of the density pass.
+_CANDIDATES = 128
+# Rays whose depth loss exceeds this are drawn again; so many are kept.
+_WRONG, _HARD = 0.3, 2**14
+
+
+class RadianceTrainer:
+    """One run: state, ``step()``, and ``field()`` for what it has come to.
+
+    ``views``: the training pictures; ``box``: where density may be, in their coordinates; ``depth``: supervise with
+    the views' depth. Equal seeds draw equal rays; sums over threads are not ordered, so that weights agree
+    between runs to rounding (and bit for bit only with one thread).
+    """
+
+    def __init__(self, views: list[View], box: Box, config: RadianceConfig, settings: RadianceSettings, ns,
+                 depth: bool = True):
+        if not views:
+            raise NergError("there are no pictures to train on")
+        self.config, self.settings, self.box, self.ns = config, settings, box, ns
+        self.rng, self.clock = np.random.default_rng(settings.seed), StepClock()
+        self.pixels = PixelBank(ns, views)
+        self.use_depth = depth and self.pixels.has_depth
+        self.live = RadianceField.random(config, box, ns, settings.seed)
+        self.optimiser = Adam(settings.learning_rate, self.live.parameters(), beta_2=0.99, epsilon=1e-15)
+        self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.live.parameters().items()}
+        self.march_step = settings.march_step * box.side
+        self.grid = DensityGrid(ns, box, settings.resolution, self.march_step, [v.camera for v in views],
+                                settings.min_views, near=settings.near * box.side)
+        # With exact depth everywhere the free space is known from the start, and there is no fog to clear.
+        self.carved = self.use_depth and self.pixels.depth_everywhere
+        if self.carved:
+            self.grid.carve(self.pixels.surface_points())
+        self.grid.update(self.density, self.rng, everywhere=True)
+        self._tables: dict[int, StepTable] = {}
+        self.settling = Settling(self.grid)
+        self.hard, self.misplaced = np.zeros(0, np.uint32), None
+        self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
+        # Of the marching: how many times coarser than `march_step`, and samples a ray of the last density-only pass.
+        self.stride, self.looked = 1 if self.carved else max(settings.strides, default=1), 0.0
+        self.start()
+
+    def start(self) -> None:
+        """Start the clock of the run."""
+        self._started = time.perf_counter()
+
+    def restore(self, seconds: float, hard: np.ndarray, **numbers) -> None:
+        """Go on from stored numbers (of the attributes of these names); see ``run_state``."""
+        self.hard = hard
+        for name, value in numbers.items():
+            setattr(self, name, value)
+        self._started = time.perf_counter() - seconds
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of the run, without that between an interruption and its resumption."""
+        return time.perf_counter() - self._started
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0..1."""
+        s = self.settings
+        return min(1.0, self.steps / s.steps if s.steps is not None else self.seconds / (60 * s.minutes))
+
+    def table(self, stride: int = 1) -> StepTable:
+        """Step edges ``stride`` times as coarse as the finest."""
+        if stride not in self._tables:
+            s, side = self.settings, self.box.side
+            self._tables[stride] = StepTable(self.ns, s.near * side, self._far(), stride * self.march_step,
+                                             stride * s.growth)
+        return self._tables[stride]
+
+    def _far(self) -> float:
+        """The farthest that a training camera can be from a point of the box."""
+        corners = np.array([[b[i] for i, b in zip(k, zip(self.box.lower, self.box.upper))]
+                            for k in np.ndindex(2, 2, 2)])
+        return float(max(np.linalg.norm(corners - c, axis=1).max() for c in self.pixels.centers))
+
+    def density(self, p, active):
+        """Current density at world points, without gradient."""
+        self.clock.count(dr.width(p))
+        with dr.suspend_grad():
+            return self.live.density(p, active)
+
+    def _look(self, p, active):
+        """Density at ``p`` for the choice of samples, and the grid's features, which need no second look-up."""
+        self.clock.count(dr.width(p))
+        now = {k: dr.detach(v) for k, v in self._parameters().items()}
+        features = HashGrid(self.config.grid, now["grid.table"]).by_level(self.box.to_unit(p), active)
+        return density_of(self.config, now, features), features
+
+    def _parameters(self) -> dict:
+        return {k: self.optimiser[k] for k in self.averaged}
+
+    def step(self) -> None:
+        """Draw rays, march, composite, and move the weights once."""
+        with self.clock:
+            self._step()
+
+    def _step(self) -> None:
+        s, ns, most = self.settings, self.ns, self.settings.most_looked
+        self._keep_grid()
+        self._refine()
+        table = self.table(self.stride)
+        self.rays = affordable_rays(self.rays, self.looked, table.steps, most, _CANDIDATES * s.batch)
+        index = self._draw()
+        pixels = self.pixels.batch(ns.UInt32(aligned(index, np.uint32)))
+        rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
+        offset = ns.Float(aligned(self.rng.random(self.rays, np.float32)))
+        thinning = Thinning(s.thin_sure, s.thin_least, int(self.rng.integers(2**63))) if s.thin_least < 1 else None
+        samples, covered = visible_samples(
+            rays, table, offset, self.grid.occupied, self._look, s.stop, s.batch, thinning, most
+        )
+        self.steps += 1
+        if samples is None:
+            self.rays = adapted_rays(self.rays, 0, 0, s.batch, most)
+            return
+        background = ns.Array3f(*[ns.Float(aligned(self.rng.random(self.rays, np.float32))) for _ in range(3)])
+        self._descend(samples, pixels, background, covered, self.stride)
+        if self.use_depth:
+            self._remember(index[:covered])
+        self.looked = samples.looked
+        self.rays = adapted_rays(self.rays, samples.count / covered, self.looked, s.batch, most)
+
+    def _keep_grid(self) -> None:
+        """Look over a part of the density grid if it is time to, and find a piece of what rendering will visit."""
+        s = self.settings
+        settling = self.progress >= s.settle and not self.settling.done
+        due = self.steps % s.grid_every == 0 and self.steps > 0
+        if settling or due:
+            self.live.set_parameters({k: dr.detach(v) for k, v in self._parameters().items()})
+        if settling:
+            self.settle()
+        if due:
+            self.grid.update(self.density, self.rng)
+
+    def settle(self) -> None:
+        """Find a piece of what rendering will visit, by the weights that ``live`` holds."""
+        with dr.suspend_grad():
+            self.settling.advance(self.density, self._lit_by_a_few, self.settings.seed)
+
+    def _refine(self) -> None:
+        """March finer if it is time to and what is cleared allows it."""
+        s = self.settings
+        waits = self.progress < 2 * s.stride_share
+        stride = refined(self.stride, s.strides, s.stride(self.progress), self.looked, s.most_looked, waits)
+        self.looked, self.stride = self.looked * self.stride / stride, stride
+
+    def _draw(self) -> np.ndarray:
+        """Indices of the pixels of a batch: at random, a share of them from those whose depth was wrong before."""
+        index = self.rng.integers(0, self.pixels.size, self.rays, np.uint32)
+        if self.hard.size and self.progress > self.settings.hold:
+            again = int(self.settings.replay * self.rays)
+            index[:again] = self.hard[self.rng.integers(0, self.hard.size, again)]
+            # In mixed order, because the last rays of a batch may not fit into it.
+            self.rng.shuffle(index)
+        return index
+
+    def _remember(self, index: np.ndarray) -> None:
+        """Keep the pixels of this batch whose depth was wrong, in place of the oldest kept."""
+        wrong = self.misplaced.numpy()[:len(index)] > _WRONG
+        self.hard = np.concatenate([self.hard, index[wrong]])[-_HARD:]
+
+    def _descend(self, samples, pixels, background, covered: int, stride: int) -> None:
+        s, ns = self.settings, self.ns
+        d = dr.gather(ns.Array3f, pixels.d, samples.ray)
+        parameters = self._parameters()
+        sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns, samples.features)
+        if s.reach > 0:
+            # Never 0, and never left out: that would compile other kernels in the middle of the run.
+            reach = max(s.damped_within(self.progress), 1e-6) * self.box.side
+            sigma, *rgb = damp_near([sigma, *rgb], samples.t, dr.opaque(ns.Float, reach))
+        # Now: each sum along the rays would evaluate the networks again.
+        dr.eval(sigma, rgb)
+        self.clock.count(s.batch)
+        weight, tau, color, opacity = composite(sigma, rgb, samples)
+        loss = color_loss(color, opacity, pixels, background, s.huber)
+        if self.use_depth:
+            # In units of the step at hand: while marching is coarse, no more can be asked for.
+            unit = dr.opaque(ns.Float, stride * self.march_step)
+            placed = depth_loss(weight, tau, samples, pixels, s.depth_margin * self.march_step, unit)
+            # Places first, colours later: once surfaces stand, colour has more to say.
+            loss += dr.opaque(ns.Float, s.depth_weight * s.final_depth ** self.progress) * placed
+            self.misplaced = dr.detach(placed)
+        if s.distortion_weight > 0:
+            loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
+        complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
+        loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
+        dr.backward(loss + self._clear(parameters) + s.grid_decay * feature_decay(parameters["grid.table"]))
+        self.optimiser.set_learning_rate(s.rate(self.progress))
+        self.optimiser.step()
+        self.loss, self.samples = loss, samples.count
+        if self.steps % _AVERAGE_EVERY == 0:
+            # A short memory at first: the start of a run is not worth remembering.
+            decay = min(s.average, (1 + self.steps) / (10 + self.steps)) ** _AVERAGE_EVERY
+            # As a literal it would compile a kernel each time.
+            part = dr.opaque(ns.Float, 1 - decay)
+            for k, old in self.averaged.items():
+                self.averaged[k] = type(old)(old + (dr.detach(self.optimiser[k]) - old) * part)
+            dr.eval(self.averaged)
+
+    def _clear(self, parameters: dict):
+        """Penalty on density in cells that are not sampled.
+
+        Nothing else would hold them to what they are taken for, empty, and hashing fills them with the echoes of
+        surfaces elsewhere. The logarithm pulls at fog and at echoes alike.
+        """
+        s = self.settings
+        p = self.grid.empty_points(s.batch // 16, self.rng)
+        if p is None or s.empty_weight == 0:
+            return 0
+        self.clock.count(dr.width(p))
+        cell = self.box.side / s.resolution
+        sigma = density(self.config, self.box, parameters, p, self.ns)
+        return s.empty_weight * dr.mean(dr.log(1 + sigma * cell))
+
+    def _lit(self, density, occupied):
+        """Points (Array3f) of the samples that give a training ray more than a thousandth of its light."""
+        rng, looked = np.random.default_rng(self.settings.seed), 0
+        for _ in range(min(_LOOKS, -(-self.pixels.size // _LOOK_RAYS))):
+            samples, p = self._lit_points(density, occupied, rng, _LOOK_RAYS)
+            if samples is not None:
+                looked += samples.looked * _LOOK_RAYS
+                yield p
+            if looked > _LOOK_SAMPLES:
+                break
+
+    def _lit_by_a_few(self, density, occupied, rng: np.random.Generator):
+        """Such points, or None, of as many rays as a step may take."""
+        most = self.settings.most_looked
+        looked, candidates = self.looked * self.stride, _CANDIDATES * self.settings.batch
+        rays = affordable_rays(_LOOK_RAYS, looked, self.table().steps, most, candidates)
+        return self._lit_points(density, occupied, rng, rays, most)[1]
+
+    def _lit_points(self, density, occupied, rng: np.random.Generator, count: int, most: int | None = None) -> tuple:
+        s, ns = self.settings, self.ns
+        pixels = self.pixels.batch(ns.UInt32(aligned(rng.integers(0, self.pixels.size, count, np.uint32), np.uint32)))
+        rays = rays_in_box(pixels.o, pixels.d, self.box, s.near * self.box.side)
+        offset = ns.Float(aligned(rng.random(count, np.float32)))
+        samples, _ = visible_samples(rays, self.table(), offset, occupied, density, s.stop, most=most)
+        if samples is None:
+            return None, None
+        weight = weights(density(samples.p, True) * samples.length, samples.segments)
+        return samples, dr.gather(ns.Array3f, samples.p, dr.compress(weight > 1e-3))
+
+    def pixels_within(self, views: list[View], samples: int) -> int:
+        """The ``every`` of `measure` with which ``views`` take about so many ``samples``, by those of the last step's rays."""
+        rays = sum(v.pixels.shape[0] * v.pixels.shape[1] for v in views)
+        return max(1, int(np.ceil((rays * max(self.looked * self.stride, 1) / samples) ** 0.5)))
+
+    def measure(self, views: list[View], every: int = 1, field: RadianceField | None = None) -> list[float]:
+        """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel of those that their masks leave in.
+
+        Of ``field``, by its own occupancy; without one, of the averaged weights so far.
+        """
+        field, part = field or self.field(bound=False), (slice(every // 2, None, every),) * 2
+        return [psnr(self.render(v, every, field).color, v.over(0)[part], None if v.mask is None else v.mask[part]) for v in views]
+
+    def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
+        """``view`` by the trainer's own marcher; ``every`` and ``field`` as `measure` has them."""
+        field, occupied = field or self.field(bound=False), self.grid.occupied
+        if field.occupancy is not None:
+            occupied = lambda p, active: active & (field.occupancy.empty_cells(self.box.to_unit(p), active) == 0)
+        return render_view(field, occupied, self.table(), view, self.settings.near * self.box.side, every=every)
+
+    def field(self, bound: bool = True) -> RadianceField:
+        """The field with averaged weights. ``bound``: with the occupancy that rendering may rest on."""
+        out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step)
+        out.set_parameters({k: type(v)(v) for k, v in self.averaged.items()})
+        if bound:
+            with dr.suspend_grad():
+                out.occupancy = self.grid.bound(out.density, np.random.default_rng(self.settings.seed), self._lit)
+        return out

@@ -1,0 +1,289 @@
+"""Reading transforms files: what is understood, what is listed, what is refused."""
+import json
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.capture.posed import DepthFile, MaskFile
+from nerg_mi.capture.transforms import read_dataparser, read_transforms
+
+POSE = np.eye(4).tolist()
+
+
+@pytest.fixture
+def write(tmp_path):
+    """`write(content, images)`: a transforms file beside empty files of the names given; its path."""
+
+    def make(content, images=("b.png", "a.png"), name="transforms.json"):
+        for image in images:
+            (tmp_path / image).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / image).write_bytes(b"")
+        (tmp_path / name).write_text(json.dumps(content))
+        return tmp_path / name
+
+    return make
+
+
+def frame(name, **keys):
+    return {"file_path": name, "transform_matrix": POSE, **keys}
+
+
+def test_shared_intrinsics_prefer_the_focal_length(write):
+    t = read_transforms(write({"w": 20.0, "h": 10.0, "fl_x": 30.0, "camera_angle_x": 1.0, "cx": 9.0, "k1": 0.1,
+                               "frames": [frame("b.png"), frame("a.png")]}))
+    assert [f.name for f in t.frames] == ["a.png", "b.png"]
+    i = t.frames[0].intrinsics(20, 10)
+    assert (i.fx, i.fy, i.cx, i.cy, i.distortion[:4]) == (30.0, 30.0, 9.0, 5.0, (0.1, 0, 0, 0))
+    half = t.frames[0].intrinsics(10, 5)
+    assert (half.fx, half.cx, half.width) == (15.0, 4.5, 10)
+
+
+def test_intrinsics_of_a_frame_overrule_shared_ones(write):
+    t = read_transforms(write({"fl_x": 30.0, "k1": 0.1, "frames": [frame("a.png", fl_x=40.0, k1=0.0), frame("b.png")]}))
+    assert [f.intrinsics(8, 8).fx for f in t.frames] == [40.0, 30.0]
+    assert [f.intrinsics(8, 8).k1 for f in t.frames] == [0.0, 0.1]
+
+
+@pytest.mark.parametrize("keys", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_fisheyes_of_nerfstudio_and_instant_ngp(write, keys):
+    t = read_transforms(write({"fl_x": 3.0, "k1": 0.1, "k4": 0.01, **keys, "frames": [frame("a.png")]}))
+    i = t.frames[0].intrinsics(8, 8)
+    assert i.fisheye and (i.k1, i.k4) == (0.1, 0.01)
+
+
+def test_rational_lens_only_where_it_is_named(write):
+    content = {"fl_x": 3.0, "k4": 0.2, "frames": [frame("a.png")]}
+    with pytest.raises(ValueError, match="FULL_OPENCV"):
+        read_transforms(write(content))
+    assert read_transforms(write({**content, "camera_model": "FULL_OPENCV"})).frames[0].intrinsics(8, 8).k4 == 0.2
+
+
+def test_blender_style(write):
+    path = write({"camera_angle_x": np.pi / 2, "frames": [frame("./train/r_0")]}, ["train/r_0.png"], "transforms_train.json")
+    t = read_transforms(path)
+    assert t.frames[0].image.name == "r_0.png"
+    assert np.isclose(t.frames[0].intrinsics(800, 800).fx, 400)
+
+
+def test_scene_box(write):
+    content = {"fl_x": 1.0, "aabb": [[0, 0, 0], [1, 2, 3]], "frames": [frame("a.png")]}
+    assert np.array_equal(read_transforms(write(content)).aabb, [[0, 0, 0], [1, 2, 3]])
+
+
+def test_masks_of_nerfstudio_and_instant_ngp(write):
+    path = write({"fl_x": 1.0, "frames": [frame("a.png", mask_path="m/a.png"), frame("b.jpg"), frame("c.png")]},
+                 ["a.png", "m/a.png", "b.jpg", "dynamic_mask_b.png", "c.png"])
+    folder = path.parent
+    assert [f.mask for f in read_transforms(path).frames] == \
+        [MaskFile(folder / "m/a.png"), MaskFile(folder / "dynamic_mask_b.png", hides=True), None]
+
+
+def test_units_and_kinds_of_depth(write):
+    images = ["a.png", "d.png", "d.npy", "d.exr"]
+
+    def depth(name, key="depth_file_path", **keys):
+        path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png", **{key: name})]}, images)
+        return read_transforms(path).frames[0].depth
+
+    folder = write({}).parent
+    assert depth("d.png") == DepthFile(folder / "d.png", 1e-3, True)
+    assert depth("d.png", "depth_path", integer_depth_scale=0.01) == DepthFile(folder / "d.png", 0.01, True)
+    assert depth("d.png", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
+    assert depth("d.npy") == DepthFile(folder / "d.npy", 1.0, False)
+    assert depth("d.exr", is_euclidean_depth=False) == DepthFile(folder / "d.exr", 1.0, True)
+
+
+def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
+    mirrored, sheared, transposed = np.diag([-1.0, 1, 1, 1]), np.eye(4), np.eye(4)
+    sheared[0, 1], transposed[3, :3] = 0.3, [1, 2, 3]
+    names = [f"{c}.png" for c in "abcdefghijk"]
+    path = write({"fl_x": 1.0, "frames": [
+        frame("a.png"),
+        frame("b.png", transform_matrix=mirrored.tolist()),
+        frame("c.png", transform_matrix=sheared.tolist()),
+        frame("d.png", transform_matrix=transposed.tolist()),
+        frame("e.png", transform_matrix=[[float("nan")] * 4] * 4),
+        frame("f.png", mask_path="none.png"),
+        frame("./a.png"),
+        frame("g.png", camera_model="EQUIRECTANGULAR"),
+        {"file_path": "h.png"},
+        {"transform_matrix": POSE},
+        frame("gone.png"),
+        frame("i.png", fl_x="wide"),
+        frame("j.png", transform_matrix=[[1, 2], [3]]),
+        frame("k.png", mask_path=5),
+    ]}, names)
+    t = read_transforms(path)
+    # The name that sorts first of the two spellings of one file is the one kept.
+    assert [f.name for f in t.frames] == ["./a.png"]
+    reasons = {u.name: u.reason for u in t.unused}
+    for name, part in {
+        "b.png": "mirrored", "c.png": "sheared", "d.png": "transposed", "e.png": "finite", "f.png": "none.png",
+        "a.png": "twice", "g.png": "EQUIRECTANGULAR", "h.png": "transform_matrix", "frame 9": "file_path",
+        "gone.png": "does not exist", "i.png": "fl_x", "j.png": "4 x 4",
+        "k.png": "mask_path",
+    }.items():
+        assert part in reasons.pop(name), name
+    assert not reasons
+
+
+def test_a_missing_depth_file_costs_the_depth_only(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", depth_file_path="d.npy")]}))
+    assert t.frames[0].depth is None and "a.png" in t.notes[0] and "d.npy" in t.notes[0]
+
+
+def test_a_scale_within_a_pose_is_taken_out(write):
+    scaled = np.diag([2.0, 2, 2, 1])
+    scaled[:3, 3] = 5
+    f = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", transform_matrix=scaled.tolist())]})).frames[0]
+    assert np.allclose(f.to_world[:3, :3], np.eye(3)) and np.allclose(f.to_world[:3, 3], 5)
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ({"frames": [frame("gone.png")], "fl_x": 1.0}, "gone.png.*does not exist"),
+        ({"fl_x": 1.0}, '"frames"'),
+        ({"fl_x": 1.0, "frames": []}, "no frames"),
+        ({"fl_x": 1.0, "frames": [{"transform_matrix": POSE}]}, "frame 0"),
+        ({"fl_x": 1.0, "aabb": [[0, 0, 0], [1, 0, 1]], "frames": [frame("a.png")]}, "aabb"),
+        ({"fl_x": 1.0, "aabb": "wide", "frames": [frame("a.png")]}, "aabb"),
+        ({"fl_x": 1.0, "applied_transform": [[1, 0], [2]], "frames": [frame("a.png")]}, "applied_transform"),
+        ({"fl_x": 1.0, "applied_scale": 0, "frames": [frame("a.png")]}, "applied_scale"),
+    ],
+)
+def test_bad_files_are_named(write, content, message):
+    with pytest.raises(ValueError, match=message):
+        read_transforms(write(content))
+
+
+def test_bad_intrinsics_name_the_frame(write):
+    t = read_transforms(write({"frames": [frame("a.png")]}))
+    with pytest.raises(ValueError, match="a.png.*focal length"):
+        t.frames[0].intrinsics(8, 8)
+    t = read_transforms(write({"w": 8, "h": 4, "fl_x": 3.0, "frames": [frame("a.png")]}))
+    with pytest.raises(ValueError, match="a.png.*8 x 8"):
+        t.frames[0].intrinsics(8, 8)
+
+
+def test_broken_json_is_named(tmp_path):
+    (tmp_path / "transforms.json").write_text("{")
+    with pytest.raises(ValueError, match="not valid JSON"):
+        read_transforms(tmp_path / "transforms.json")
+
+
+def test_original_coordinates_undo_what_was_applied(write):
+    """x_file = s (A x + t): a pose of the original goes there and comes back."""
+    turn, shift, s = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.array([1.0, 2, 3]), 2.5
+    pose = np.eye(4)
+    pose[:3, 3] = [4, 5, 6]
+    applied = np.eye(4)
+    applied[:3, :3], applied[:3, 3] = turn, s * (turn @ pose[:3, 3] + shift)
+    t = read_transforms(write({"fl_x": 1.0, "applied_transform": np.column_stack([turn, shift]).tolist(), "applied_scale": s,
+                               "aabb": [[0, 0, 0], [1, 2, 3]],
+                               "frames": [frame("a.png", transform_matrix=applied.tolist())]}))
+    back = t.moved(t.original)
+    assert np.allclose(back.frames[0].to_world, pose)
+    assert np.allclose(back.original, np.eye(4)) and np.allclose(back.to_file @ t.original, np.eye(4))
+    assert np.allclose(back.aabb[1] - back.aabb[0], np.array([2, 1, 3]) / s)
+
+
+def test_dataparser_transforms(tmp_path):
+    path = tmp_path / "dataparser_transforms.json"
+    path.write_text(json.dumps({"transform": [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]], "scale": 0.5}))
+    assert np.allclose(read_dataparser(path) @ [1, 1, 1, 1], [0, 1.5, 2, 1])
+    path.write_text(json.dumps({"transform": [[0, -1, 0, 1]], "scale": 0.5}))
+    with pytest.raises(ValueError, match="dataparser_transforms.json"):
+        read_dataparser(path)
+
+
+def test_a_mirroring_change_of_coordinates_is_refused(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png")]}))
+    with pytest.raises(ValueError, match="mirroring"):
+        t.moved(np.diag([1.0, 1, -1, 1]))
+
+
+def test_nerfstudios_lists_of_files_split(write):
+    names = ["a.png", "b.png", "c.png", "d.png"]
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame(n) for n in names], "train_filenames": ["a.png", "./b.png"],
+                               "test_filenames": ["d.png"]}, names))
+    assert (t.held_out, t.spare) == (["d.png"], ["c.png"])
+
+
+def test_the_fox(recorded):
+    """Real photos: 17 of the 67 listed images do not exist."""
+    t = read_transforms(recorded("fox") / "transforms.json")
+    assert (len(t.frames), len(t.unused)) == (50, 17)
+    assert all(u.reason == "its image does not exist" for u in t.unused)
+    i = t.frames[0].intrinsics(1080, 1920)
+    assert (i.fx, i.fy, i.k2) == (1375.52, 1374.49, -0.0805099)
+
+
+@pytest.mark.parametrize("keys", [{"file_path": "../out/x.png"}, {"mask_path": "../out/x.png"}, {"depth_file_path": "../out/x.png"},
+                                  {"file_path": "linked/x.png"}, {"mask_path": "linked/x.png"}, {"depth_path": "link.png"}])
+def test_files_outside_of_the_folder_are_used_only_if_allowed(tmp_path, keys):
+    home, out = tmp_path / "set", tmp_path / "out"
+    home.mkdir()
+    out.mkdir()
+    for path in (home / "a.png", home / "b.png", out / "x.png"):
+        path.write_bytes(b"")
+    (home / "linked").symlink_to(out)
+    (home / "link.png").symlink_to(out / "x.png")
+    (home / "transforms.json").write_text(json.dumps({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]}))
+    t = read_transforms(home / "transforms.json")
+    assert [f.name for f in t.frames] == ["b.png"]
+    assert "outside of the data set's folder" in t.unused[0].reason and "--allow-outside" in t.unused[0].reason
+    assert len(read_transforms(home / "transforms.json", allow_outside=True).frames) == 2
+
+
+def test_an_absolute_path_of_another_place_is_not_even_looked_for(tmp_path, write, monkeypatch):
+    path = write({"fl_x": 30.0, "frames": [frame("a.png"), frame("/etc/passwd"), frame("../../etc/hostname")]})
+    asked = []
+    monkeypatch.setattr("pathlib.Path.is_file", lambda self: asked.append(self) or True)
+    t = read_transforms(path)
+    assert len(t.unused) == 2 and not [p for p in asked if "etc" in str(p)]
+
+
+def test_links_within_the_folder_are_followed(tmp_path, write):
+    path = write({"fl_x": 30.0, "frames": [frame("here/a.png")]}, ("images/a.png",))
+    (tmp_path / "here").symlink_to(tmp_path / "images")
+    outer = tmp_path.with_name(tmp_path.name + "-link")
+    outer.symlink_to(tmp_path)
+    assert len(read_transforms(path).frames) == len(read_transforms(outer / "transforms.json").frames) == 1
+
+
+@pytest.mark.parametrize("keys", [
+    {"transform_matrix": [[1e300, 0, 0, 0], [0, 1e300, 0, 0], [0, 0, 1e300, 0], [0, 0, 0, 1]]}, {"transform_matrix": [[10**400] * 4] * 4},
+    {"transform_matrix": [[1, 0, 0, 1e13], [0, 1, 0, 0], [0, 0, 1, 0]]}, {"fl_x": 10**400}, {"k1": [1]}, {"file_path": "a\0b"},
+    {"file_path": "x" * 5000}, {"camera_model": ["OPENCV"]}, {"mask_path": "y" * 5000},
+    {"depth_file_path": "a.png", "depth_unit_scale_factor": float("inf")},
+])  # fmt: skip
+def test_numbers_and_names_that_nothing_can_hold_cost_their_frame(write, keys):
+    t = read_transforms(write({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]}))
+    assert len(t.frames) == len(t.unused) == 1 and str(t.unused[0]).isprintable()
+
+
+@pytest.mark.parametrize("keys", [{"fl_x": 1e-300}, {"fl_x": 1e300}, {"cx": 1e300}, {"cy": -1e9}, {"k2": 1e200}])
+def test_lenses_that_no_camera_has_are_refused(write, keys):
+    t = read_transforms(write({"fl_x": 30.0, **keys, "frames": [frame("a.png")]}))
+    with pytest.raises(NergError, match="a.png"):
+        t.frames[0].intrinsics(8, 8)
+
+
+@pytest.mark.parametrize("content", [{"applied_scale": 1e-320}, {"applied_scale": 10**400}, {"applied_transform": [[1e300] * 4] * 3},
+                                     {"aabb": [[10**400] * 3, [0, 0, 0]]}, {"aabb": [[-1e300] * 3, [1e300] * 3]}])
+def test_numbers_of_the_file_are_bounded(write, content):
+    with pytest.raises(NergError, match="transforms.json"):
+        read_transforms(write({"fl_x": 30.0, **content, "frames": [frame("a.png")]}))
+
+
+def test_a_file_nested_deep_is_refused(tmp_path):
+    (tmp_path / "transforms.json").write_text('{"frames": ' + "[" * 200_000)
+    with pytest.raises(NergError, match="transforms.json.*nested"):
+        read_transforms(tmp_path / "transforms.json")
+
+
+def test_a_distortion_of_nothing_is_none(write):
+    t = read_transforms(write({"fl_x": 30.0, "k1": 1e-320, "k3": -1e-300, "frames": [frame("a.png")]}))
+    assert not t.frames[0].intrinsics(8, 8).is_distorted

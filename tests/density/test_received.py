@@ -1,0 +1,203 @@
+"""Attention received by a surface: solid angles, visibility, derivatives, and the integrator's picture."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.density.received import Patches, contributions, patches, received
+from nerg_mi.transport.panorama import pixel_solid_angles
+from nerg_mi.transport.place import Place
+from tests.plugins import fields
+
+
+def uniform(p_od, p_o, r_o, active):
+    return type(p_o.x)(1 / (4 * np.pi))
+
+
+def rectangle(mi, a=0.6, b=0.4, at=(0, 0, 0), **kwargs):
+    """2a x 2b, facing +z."""
+    return mi.load_dict({"type": "rectangle", "to_world": mi.ScalarTransform4f().translate(list(at)).scale([a, b, 1]), **kwargs})
+
+
+def mesh(mi, corners, faces):
+    out = mi.Mesh("sheet", len(corners), len(faces))
+    params = mi.traverse(out)
+    params["vertex_positions"] = np.ravel(corners).astype(np.float32)
+    params["faces"] = np.ravel(faces).astype(np.uint32)
+    params.update()
+    return out
+
+
+def sheet(mi, a=0.6, b=0.4, z=0.0):
+    return mesh(mi, [(-a, -b, z), (a, -b, z), (a, b, z), (-a, b, z)], [(0, 1, 2), (0, 2, 3)])
+
+
+def solid_angle(a, b, p):
+    """Of the rectangle 2a x 2b in z = 0 from p above it: four corners' arctangents."""
+    x, y, z = p
+    out = 0
+    for i, u in ((1, a - x), (-1, -a - x)):
+        for j, v in ((1, b - y), (-1, -b - y)):
+            out += i * j * np.arctan2(u * v, z * np.sqrt(u * u + v * v + z * z))
+    return out
+
+
+EYES = np.array([(0, 0, 1), (0.9, -0.3, 0.8), (2.0, 1.5, 0.5), (0.1, 0.2, -1.0)], np.float32)
+
+
+def test01_patches_tile_the_mesh(rgb):
+    cube = patches(rgb.load_dict({"type": "cube", "to_world": rgb.ScalarTransform4f().scale([1, 2, 3])}), 3)
+    assert dr.width(cube.p) == 12 * 9
+    assert np.isclose(dr.sum(cube.area)[0], 2 * (2 * 4 + 4 * 6 + 2 * 6))
+    # Gauss: the flux of x through a closed surface is three times its volume, exactly, facets being flat.
+    assert np.isclose(dr.sum(dr.dot(cube.p, cube.n) * cube.area)[0], 3 * 2 * 4 * 6, rtol=1e-5)
+
+
+def test13_one_piece_is_the_triangle_itself(rgb):
+    corners = np.array([(0.3, 0.1, -0.2), (1.1, 0.2, 0.4), (0.2, 1.7, 0.6)])
+    whole, across = patches(mesh(rgb, corners, [(0, 1, 2)]), 1), np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    assert np.allclose(np.array(whole.p).T, [corners.mean(0)], atol=1e-6)
+    assert np.allclose(whole.area.numpy(), [np.linalg.norm(across) / 2], rtol=1e-6)
+    assert np.allclose(np.array(whole.n).T, [across / np.linalg.norm(across)], atol=1e-6)
+
+
+@pytest.mark.parametrize("bad", ["sphere", "divisions"])
+def test02_what_cannot_be_cut(rgb, bad):
+    shape = rgb.load_dict({"type": "sphere" if bad == "sphere" else "cube"})
+    with pytest.raises(ValueError, match="not a mesh" if bad == "sphere" else "divisions=0"):
+        patches(shape, 4 if bad == "sphere" else 0)
+
+
+def test03_a_uniform_density_gives_the_share_of_the_solid_angle(rgb):
+    got = received(None, uniform, rgb.Point3f(EYES.T), patches(sheet(rgb), 24)).numpy()
+    expected = [solid_angle(0.6, 0.4, p) / (4 * np.pi) for p in EYES[:3]]
+    assert np.allclose(got[:3], expected, rtol=5e-4)
+    assert got[3] == 0  # from behind
+    both = received(None, uniform, rgb.Point3f(EYES.T), patches(sheet(rgb), 24), two_sided=True).numpy()
+    behind = solid_angle(0.6, 0.4, EYES[3] * [1, 1, -1]) / (4 * np.pi)
+    assert np.allclose(both, [*expected, behind], rtol=5e-4)
+
+
+def test04_the_error_is_of_second_order(rgb):
+    eye = rgb.Point3f(0.3, 0.1, 0.7)
+    exact = solid_angle(0.6, 0.4, (0.3, 0.1, 0.7)) / (4 * np.pi)
+    errors = [abs(received(None, uniform, eye, patches(sheet(rgb), n))[0] - exact) for n in (2, 4, 8)]
+    assert 3.2 < errors[0] / errors[1] < 4.8 and 3.2 < errors[1] / errors[2] < 4.8
+
+
+def test05_from_inside_of_a_box_everything_is_seen_once(rgb):
+    eyes = rgb.Point3f([0.1, -0.3], [0.2, 0.0], [0.0, 0.4])
+    box = patches(rgb.load_dict({"type": "cube"}), 24)
+    assert np.allclose(received(None, uniform, eyes, box, two_sided=True).numpy(), 1, rtol=1e-3)
+    assert np.allclose(received(None, uniform, eyes, box).numpy(), 0)
+
+
+def test06_what_stands_in_between_hides(rgb):
+    # A plate over x < 0 halfway to the eye: what lies under x < 0 at z = 0 is hidden.
+    plate = sheet(rgb, 10, 10, 0.5)
+    vertices = rgb.traverse(plate)
+    vertices["vertex_positions"] = np.ravel([(-10, -10, 0.5), (0, -10, 0.5), (0, 10, 0.5), (-10, 10, 0.5)]).astype(np.float32)
+    vertices.update()
+    place = Place(None, rgb.load_dict({"type": "scene", "plate": plate}))
+    eye, surface = rgb.Point3f(0, 0, 1), patches(sheet(rgb), 8)
+    each = contributions(place, uniform, eye, surface).numpy()
+    free = contributions(None, uniform, eye, surface).numpy()
+    right = surface.p.numpy()[0] > 0
+    assert np.array_equal(each[right], free[right]) and not each[~right].any() and right.mean() == 0.5
+
+
+@pytest.mark.parametrize("falloff, share", [(0.0, 0.0), (0.5, 0.6), (4.0, 0.95)])
+def test07_the_fall_off_behind_a_plate(rgb, falloff, share):
+    # The plate lies 0.2 above a small patch right below the eye.
+    place = Place(None, rgb.load_dict({"type": "scene", "plate": sheet(rgb, 0.5, 0.5, 0.2)}))
+    eye, surface = rgb.Point3f(0, 0, 1), patches(sheet(rgb, 0.01, 0.01), 2)
+    got = received(place, uniform, eye, surface, falloff)[0] / received(None, uniform, eye, surface)[0]
+    assert got == pytest.approx(share, abs=1e-3)
+
+
+def test08_a_surface_in_the_place_does_not_hide_itself(rgb):
+    box = rgb.load_dict({"type": "cube"})
+    place = Place(None, rgb.load_dict({"type": "scene", "box": {"type": "cube"}}))
+    eyes = rgb.Point3f(np.array([(3, 2, 1.5), (1.001, 4, 0), (0, 0, 1.2)], np.float32).T)
+    surface = patches(box, 6)
+    assert np.allclose(received(place, uniform, eyes, surface).numpy(), received(None, uniform, eyes, surface).numpy(), rtol=1e-5)
+
+
+@pytest.mark.parametrize("z", [0.9, -0.9])
+def test14_neither_side_of_an_open_sheet_hides_itself(rgb, z):
+    surface, eye = patches(sheet(rgb), 8), rgb.Point3f(0.2, -0.1, z)
+    each = contributions(Place(None, rgb.load_dict({"type": "scene", "sheet": sheet(rgb)})), uniform, eye, surface, two_sided=True)
+    free = contributions(None, uniform, eye, surface, two_sided=True).numpy()
+    assert (free > 0).all() and np.allclose(each.numpy(), free, rtol=1e-5)
+
+
+def moved(rgb, surface, x, kind):
+    if kind == "observer":
+        return rgb.Point3f(0.4 + 0.5 * x, x, 0.9 - x), surface
+    return rgb.Point3f(0.4, 0, 0.9), surface.moved(rgb.Vector3f(-0.5 * x, -x, x))
+
+
+@pytest.mark.parametrize("kind", ["observer", "surface"])
+def test09_derivatives_of_a_solid_angle(rgb, kind):
+    surface, x = patches(sheet(rgb), 24), rgb.Float(0)
+    dr.enable_grad(x)
+    eye, there = moved(rgb, surface, x, kind)
+    dr.backward(received(None, uniform, eye, there))
+    h = 1e-4
+    ends = [solid_angle(0.6, 0.4, (0.4 + 0.5 * s, s, 0.9 - s)) / (4 * np.pi) for s in (h, -h)]
+    assert np.isclose(dr.grad(x)[0], (ends[0] - ends[1]) / (2 * h), rtol=2e-3)
+
+
+def test10_derivatives_of_vertices_and_of_the_fall_off(rgb):
+    plate = sheet(rgb)
+    params = rgb.traverse(plate)
+    scale, falloff = rgb.Float(1), rgb.Float(0.5)
+    dr.enable_grad(scale, falloff)
+    params["vertex_positions"] = scale * rgb.Float(params["vertex_positions"])
+    params.update()
+    dr.backward(received(None, uniform, rgb.Point3f(0, 0, 1), patches(plate, 24)))
+    ends = [solid_angle(0.6 * s, 0.4 * s, (0, 0, 1)) / (4 * np.pi) for s in (1.0001, 0.9999)]
+    assert np.isclose(dr.grad(scale)[0], (ends[0] - ends[1]) / 2e-4, rtol=2e-3)
+
+    place = Place(None, rgb.load_dict({"type": "scene", "plate": sheet(rgb, 0.5, 0.5, 0.2)}))
+    eye, surface = rgb.Point3f(0, 0, 1), patches(sheet(rgb, 0.01, 0.01), 2)
+    dr.backward(received(place, uniform, eye, surface, falloff))
+    # d/dd_f of 1 - 0.2 / d_f
+    assert np.isclose(dr.grad(falloff)[0] / received(None, uniform, eye, surface)[0], 0.2 / 0.25, rtol=0.01)
+
+
+def test11_no_derivative_is_nan_where_the_eye_touches_the_surface(rgb):
+    p, n = rgb.Point3f([0, 1], [0, 0], [0, 0]), rgb.Vector3f([0, 0], [0, 0], [1, 1])
+    x = rgb.Float(0)
+    dr.enable_grad(x)
+    total = dr.sum(received(None, uniform, rgb.Point3f(x, 0, 0), Patches(p, n, rgb.Float(0.1))))
+    dr.backward(total)
+    assert np.isfinite(total[0]) and np.isfinite(dr.grad(x)[0])
+
+
+def test12_the_integrator_sees_the_same_attention(rgb, tmp_path):
+    # Pixels of all that the observer could turn to, times their solid angle: the same integral over directions.
+    fields.gaze(tmp_path / "gaze.safetensors")
+    eye, h = (-0.2, 0.3, 0.8), 96
+    hidden = {"type": "sphere", "center": [0.1, 0.25, 0.3], "radius": 0.12}
+    scene = rgb.load_dict({
+        "type": "scene", "hidden": hidden,
+        "box": {"type": "cube", "to_world": rgb.ScalarTransform4f().translate([0.3, 0.1, -0.2]).scale([0.3, 0.2, 0.25])},
+        "integrator": {"type": "nerg", "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")},
+                       "aovs": "gaze,position", "radiance": False},
+        "sensor": {"type": "panorama", "to_world": rgb.ScalarTransform4f().translate(list(eye)),
+                   "sampler": {"type": "independent", "sample_count": 1},
+                   "film": {"type": "hdrfilm", "width": 2 * h, "height": h, "rfilter": {"type": "box"}, "component_format": "float32"}},
+    })  # fmt: skip
+    picture = np.array(rgb.render(scene, spp=1, sensor=0))
+    gaze, p = picture[..., -4], picture[..., -3:]
+    inside = np.all(np.abs(p - (0.3, 0.1, -0.2)) < np.array([0.3, 0.2, 0.25]) + 1e-3, axis=-1)
+    expected = np.sum(gaze * inside * pixel_solid_angles(2 * h, h))
+    medium = scene.integrator().gaze
+
+    def density(*args):
+        return medium.evaluate(*args)[0]
+
+    box = next(s for s in scene.shapes() if s.is_mesh())
+    got = received(Place(None, scene), density, rgb.Point3f(*eye), patches(box, 24))[0]
+    assert expected > 0 and got == pytest.approx(expected, rel=0.03)

@@ -1,0 +1,184 @@
+"""Evaluation of gaze: truth from persons, scores against closed forms, what is held out, the command."""
+from __future__ import annotations
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from nerg_mi.density.probes import place_probes
+from nerg_mi.rays.rays import Rays
+from nerg_mi.evaluation.gaze import evaluation
+from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.evaluation.gaze.baselines import position_blind, uniform
+from nerg_mi.evaluation.gaze.report import markdown
+from nerg_mi.training.gaze.run import hold_out
+
+
+def crowd(n=3000, people=4, seed=0):
+    """People along a corridor who look at a point of the wall x = 1.5, each at another height."""
+    rng = np.random.default_rng(seed)
+    origin = np.stack([rng.uniform(-1, 0, n), rng.uniform(-5, 5, n), rng.uniform(1.5, 1.7, n)], axis=1)
+    person = rng.integers(0, people, n)
+    hit = np.stack([np.full(n, 1.5), rng.normal(0, 0.2, n), 1 + 0.3 * person + rng.normal(0, 0.1, n)], axis=1)
+    way = hit - origin
+    return Rays(np.arange(n), person, tuple("abcdefgh"[:people]), origin, way / np.linalg.norm(way, axis=1, keepdims=True), np.ones(n), hit)
+
+
+@pytest.fixture(scope="module")
+def rays():
+    return crowd()
+
+
+@pytest.fixture(scope="module")
+def test_set(rays):
+    return evaluation.make_test(rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, 512, min_rays=20)
+
+
+def test_truth_is_the_probes(rays, test_set):
+    assert len(test_set.centres) == 2
+    probes = place_probes(rays, 0.6, queries=test_set.centres, cap=1024, min_rays=1, kappa_rule="fixed", kappa=20.0, centre="query")
+    np.testing.assert_allclose(test_set.truth, probes.density(test_set.directions), rtol=1e-4, atol=1e-6)
+    assert (test_set.counts.sum(axis=1) == probes.counts).all() and set(test_set.persons) == set("abcd")
+
+
+def test_scores_of_the_truth_and_of_nothing(test_set):
+    rows = evaluation.evaluate_gaze(test_set, {"truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]), "uniform": uniform()}, uniform(), 20)
+    best, flat = rows
+    assert best["KLD"] < 1e-6 and best["CC"] == pytest.approx(1) and best["SIM"] == pytest.approx(1) and best["MAE"] == 0
+    assert flat["CC"] == 0 and flat["AUC"] == 0.5 and flat["sAUC"] == 0.5 and flat["NSS"] == 0
+    assert flat["bits"] == 0 and flat["loglik"] == pytest.approx(-np.log(4 * np.pi)) and flat["integral"] == pytest.approx(1)
+    assert flat["KLD"] == pytest.approx(float(metrics.kld(test_set.truth, np.ones((2, 512)), eps=1e-6).mean()))
+    assert best["KLD.less"] == pytest.approx(best["KLD"] - flat["KLD"]) and best["KLD.less.low"] < best["KLD.less"] < best["KLD.less.high"]
+    assert flat["bits.low"] == 0 and flat["KLD.low"] < flat["KLD"] < flat["KLD.high"]
+
+
+def test_other_rays_are_of_positions_farther_than_two_radii_where_there_are_any(rays):
+    """A to C stand in a row; B is within 2R of A, C of none."""
+    centres = np.array([[-0.5, 0, 1.6], [-0.5, 1, 1.6], [-0.5, 4, 1.6]])
+    of = lambda a: {tuple(v) for v in a.reshape(-1, 3)}
+    found = evaluation.make_test(rays, centres, 0.6, 20.0, 64, min_rays=20)
+    (a, b, c), others = map(of, found.at), [of(o) for o in found.others]
+    assert a.isdisjoint(c) and b.isdisjoint(c)
+    assert others[0] <= c and others[1] <= c and others[2] <= a | b and others[2] & a and others[2] & b
+    # Where all are nearer, any other one, and its own where it is alone.
+    found = evaluation.make_test(rays, centres[:2], 0.6, 20.0, 64, min_rays=20)
+    a, b = map(of, found.at)
+    assert of(found.others[0]) <= b and of(found.others[1]) <= a
+    found = evaluation.make_test(rays, centres[:1], 0.6, 20.0, 64, min_rays=20)
+    assert np.array_equal(found.others, found.at)
+
+
+def by_hand(persons: int) -> evaluation.GazeTest:
+    """One position and sixteen directions, of which each person sees one of their own; the rays are of them in turn."""
+    d = np.eye(16, 3)
+    parts = 16 / (4 * np.pi) * np.eye(16)[None, :persons]
+    who = np.arange(4 * persons)[None] % persons
+    at, counts, names = np.zeros((1, 4 * persons, 3)), np.full((1, persons), 4.0), tuple("abcdefgh"[:persons])
+    return evaluation.GazeTest(np.zeros((1, 3)), d, parts.mean(axis=1), parts, counts, names, at, who, at)
+
+
+def test_intervals_are_a_bootstrap_over_persons():
+    """Of three persons all 27 draws can be made: the error of what one of them sees is the share of the others."""
+    test = by_hand(3)
+    first = lambda positions, directions: test.parts[:, 0] if directions.ndim == 2 else np.ones(directions.shape[:2])
+    (row,) = evaluation.evaluate_gaze(test, {"first": first}, uniform(), resamples=2000)
+    mae = [2 * (1 - draw.count(0) / 3) / (4 * np.pi) for draw in itertools.product(range(3), repeat=3)]
+    assert row["MAE"] == pytest.approx(np.mean(mae))
+    assert row["MAE.high"] - row["MAE"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
+    assert row["MAE"] - row["MAE.low"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
+
+
+@pytest.mark.parametrize("persons, known", [(2, False), (3, True), (4, True)])
+def test_fewer_than_three_persons_have_no_interval(persons, known):
+    for row in evaluation.evaluate_gaze(by_hand(persons), {"a": uniform(), "b": uniform()}, uniform(), resamples=5):
+        assert all((f"{k}.low" in row) == known and (f"{k}.high" in row) == known for k in evaluation.SCORES)
+
+
+def test_ray_scores_by_hand():
+    maps = np.array([[0.0, 1.0, 2.0, 5.0]]) / (4 * np.pi * 2)
+    at, others = maps[:, [3, 1]], maps[:, [0, 0, 1, 3]]
+    scores = evaluation.ray_scores(maps, at, others, np.zeros((1, 2)))
+    np.testing.assert_allclose(scores["AUC"], [[3.5 / 4, 1.5 / 4]])
+    np.testing.assert_allclose(scores["sAUC"], [[3.5 / 4, 2.5 / 4]])
+    np.testing.assert_allclose(scores["loglik"], np.log(at), rtol=1e-6)
+    np.testing.assert_allclose(scores["bits"], np.log2(at), rtol=1e-6)
+    values = np.array([0, 1, 2, 5.0])
+    np.testing.assert_allclose(scores["NSS"], [[(5 - 2) / values.std(), (1 - 2) / values.std()]])
+
+
+def test_persons_are_scored_each_by_their_own(rays, test_set):
+    blind = position_blind(rays, kappa=50)
+    rows = evaluation.person_rows(test_set, {"blind": blind}, blind, min_rays=10)
+    assert [r["person"] for r in rows] == list(test_set.persons) and sum(r["rays"] for r in rows) == test_set.counts.sum()
+    assert all(r["bits"] == pytest.approx(0) for r in rows)
+    # The heights of what they look at differ, and so does how well one density for all fits.
+    assert np.ptp([r["KLD"] for r in rows]) > 0.01
+
+
+def test_nothing_is_on_both_sides(rays):
+    _, account = hold_out(rays, 0.3, zones=2, positions=8, min_rays=8, people=0.5)
+    for split in evaluation.SPLITS:
+        train, scored, centres = evaluation.held_out_rays(rays, account, split)
+        named = lambda r: {rays.persons[i] for i in np.unique(r.person)}
+        assert named(train).isdisjoint(account["people"])
+        assert named(scored) == (named(train) if split == "pos" else set(account["people"]))
+        assert np.linalg.norm(train.origin[:, None] - np.array(account["centres"])[None], axis=2).min() > 0.6
+    _, without = hold_out(rays, 0.3, zones=2, positions=8, min_rays=8)
+    with pytest.raises(ValueError, match="--test-people"):
+        evaluation.held_out_rays(rays, without, "both")
+    with pytest.raises(ValueError, match="both, pos, people"):
+        evaluation.held_out_rays(rays, account, "time")
+
+
+def test_positions_without_rays_are_refused(rays):
+    with pytest.raises(ValueError, match="lower min_rays"):
+        evaluation.make_test(rays, np.array([[40.0, 0, 0]]), 0.5)
+
+
+def test_markdown_has_intervals_and_gaps():
+    text = markdown([{"method": "a", "KLD": 0.5, "KLD.low": 0.4, "KLD.high": 0.6, "MAE": 0.01234}, {"method": "b", "KLD": float("nan")}])
+    assert text.splitlines()[0] == "| method | KLD | MAE |"
+    assert text.splitlines()[2:] == ["| a | 0.500 [0.400, 0.600] | 0.0123 |", "| b |  |  |"]
+
+
+def test_the_command(rgb, rays, tmp_path, capsys):
+    from nerg_mi.cli import main
+
+    rays.save(tmp_path / "rays.npz")
+    gaze = tmp_path / "gaze.safetensors"
+
+    def nerg(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main([str(a) for a in arguments])
+        return end.value.code, " ".join(capsys.readouterr().err.split())
+
+    train = ["train", "gaze", tmp_path / "rays.npz", "-o", gaze, "--geometry", "hits", "--voxel", "0.2", "--radius", "0.6", "--steps", "5",
+             "--directions", "64", "--probes", "20", "--zones", "0"]  # fmt: skip
+    assert nerg(*train)[0] in (0, None)
+    code, said = nerg("eval", "gaze", gaze, tmp_path / "rays.npz")
+    assert code == 1 and "--test-zones 3" in said
+    assert nerg(*train, "--test-zones", "2", "--test-positions", "6", "--test-people", "0.5")[0] in (0, None)
+    assert nerg("eval", "gaze", gaze, tmp_path / "rays.npz", "--min-rays", "16", "--resamples", "4", "--directions", "256", "--pictures", "1")[0] in (0, None)
+    found = json.loads((tmp_path / "gaze.eval" / "gaze.json").read_text())
+    names = [r["method"] for r in found["methods"]]
+    assert names[:2] == ["gaze field", "uniform"] and "4,096 nearest rays" in names and found["split"] == "both"
+    assert found["methods"][0]["integral"] == pytest.approx(1, abs=0.02)
+    for name in ("gaze.md", "gaze.csv", "persons.csv", "positions.png"):
+        assert (tmp_path / "gaze.eval" / name).stat().st_size > 100
+    crowd(seed=1).save(tmp_path / "others.npz")
+    code, said = nerg("eval", "gaze", gaze, tmp_path / "others.npz")
+    assert code == 1 and "trained on other rays" in said
+
+
+def test_halves_of_the_people_are_compared_where_both_were(rays, test_set):
+    row = evaluation.split_half(rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, uniform(), min_rays=20)
+    assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
+    nobody = np.array([[40.0, 0, 0]])
+    assert evaluation.split_half(rays, nobody, 0.6, 20.0, uniform(), min_rays=20) is None
+    alone = rays.select(rays.person == 0)
+    assert evaluation.split_half(alone, test_set.centres, 0.6, 20.0, uniform(), min_rays=20) is None
+    with pytest.raises(ValueError, match="kappa is negative"):
+        # What is wrong is said, and not taken for "nobody was there".
+        evaluation.split_half(rays, test_set.centres, 0.6, -1.0, uniform(), min_rays=20)

@@ -1,0 +1,52 @@
+"""The rows of a study: sweeps that are even on log axes, and what a row's name promises."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from nerg_mi.evaluation.study.settings import RESOLUTIONS, STEP_COUNTS, settings
+
+
+@pytest.fixture(scope="module")
+def rows():
+    return settings(SimpleNamespace(marched=True, extent=2.0, has_gaze=True, analytic=None))
+
+
+def test_sweeps_are_even_on_a_log_axis(rows):
+    steps = lambda group: [2.0 / r.params["step"] for r in rows if r.group == group]
+    sweeps = {
+        "steps": steps("steps, linear"),
+        "resolutions": [r.resolution for r in rows if re.fullmatch(r"grid \d+, cells", r.name)],
+        "dt_gamma": [r.params["dt_gamma"] for r in rows if r.group == "dt_gamma"],
+        "coarse": [r.params["coarse"] for r in rows if r.group == "coarse"],
+        "steps at a grid": [2.0 / r.params["step"] for r in rows if re.fullmatch(r"grid 64, cells, \d+ steps", r.name)],
+        "map heights": [r.params["map_height"] for r in rows if "map_height" in r.params and not r.first_frame],
+        "samples": [r.spp for r in rows if r.group == "spp"],
+    }
+    for name, values in sweeps.items():
+        ratios = np.divide(values[1:], values[:-1])
+        assert len(values) >= 3 and np.allclose(ratios, ratios[0]) and ratios[0] in (2, 4), (name, values)
+    assert tuple(sweeps["steps"]) == STEP_COUNTS and tuple(sweeps["resolutions"]) == RESOLUTIONS
+
+
+def test_a_sweep_ends_before_what_the_factor_is_without(rows):
+    """The default stands for them: steps that do not grow, and nothing coarser than a step."""
+    assert min(r.params["coarse"] for r in rows if r.group == "coarse") > 1
+    assert min(r.params["dt_gamma"] for r in rows if r.group == "dt_gamma") > 0
+
+
+def test_rows_do_what_their_names_say(rows):
+    for row in rows:
+        assert row.first_frame == row.name.endswith("first frame"), row.name
+        if found := re.search(r"(\d+) steps", row.name):
+            n = row.paper[0] if row.paper else 2.0 / row.params["step"]
+            assert n == int(found[1]), row.name
+        if found := re.search(r"dt_gamma 1/(\d+)", row.name):
+            gamma = row.paper[1] if row.paper else row.params["dt_gamma"]
+            assert gamma == 1 / int(found[1]), row.name
+        elif row.paper:
+            assert row.paper[1] == 0, row.name

@@ -1,0 +1,143 @@
+"""Output files are whole or absent, and errors say what to do."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import check_folder, check_writable, make_folder, replacing, write_bytes, write_text
+
+
+def test_parents_are_made_and_nothing_else_is_left(tmp_path):
+    path = tmp_path / "a" / "b" / "c.txt"
+    write_text(path, "é\n")
+    assert path.read_bytes() == "é\n".encode()
+    assert os.listdir(path.parent) == ["c.txt"]
+
+
+def test_a_failing_writer_leaves_the_old_file(tmp_path):
+    path = tmp_path / "a.npz"
+    path.write_bytes(b"old")
+    with pytest.raises(ZeroDivisionError), replacing(path) as temporary:
+        assert temporary.suffix == ".npz" and temporary.parent == tmp_path
+        temporary.write_bytes(b"half")
+        raise ZeroDivisionError
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.npz"]
+
+
+def test_permissions_are_those_of_any_other_file(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_bytes(tmp_path / "new", b"")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o640
+    os.chmod(tmp_path / "new", 0o604)
+    write_bytes(tmp_path / "new", b"1")
+    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o604
+
+
+def test_a_file_that_is_protected_is_not_replaced(tmp_path, monkeypatch):
+    path = tmp_path / "kept"
+    path.write_bytes(b"old")
+    path.chmod(0o444)
+    # Root may write everything.
+    monkeypatch.setattr(os, "access", lambda p, mode: mode & os.W_OK == 0 or os.stat(p).st_mode & 0o200 != 0)
+    for write in (lambda: write_bytes(path, b"new"), lambda: check_writable(path)):
+        with pytest.raises(NergError, match="you may not write there"):
+            write()
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["kept"]
+
+
+def test_a_link_is_followed(tmp_path):
+    (tmp_path / "real").write_bytes(b"old")
+    (tmp_path / "link").symlink_to("real")
+    write_bytes(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
+
+
+def test_what_cannot_be_written_is_told_with_its_remedy(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(NergError, match="is a folder; choose the name of a file"):
+        write_bytes(tmp_path, b"")
+    with pytest.raises(NergError, match="one of its parents is a file"):
+        write_bytes(tmp_path / "file" / "x", b"")
+    with pytest.raises(NergError, match="parents is a file"):
+        make_folder(tmp_path / "file" / "x")
+    with pytest.raises(NergError, match="name is too long"):
+        write_bytes(tmp_path / ("x" * 300), b"")
+
+
+def test_a_pipe_is_written_to_and_stays_one(tmp_path):
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    write_bytes(path, b"through")
+    assert os.read(reader, 100) == b"through" and path.is_fifo() and os.listdir(tmp_path) == ["pipe"]
+    os.close(reader)
+
+
+def test_what_cannot_be_written_is_found_before_and_nothing_is_made(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"")
+    check_writable(tmp_path / "file")
+    check_writable(tmp_path / "a" / "b.NPZ", ".npz", ".parquet")
+    check_folder(tmp_path)
+    check_folder(tmp_path / "a" / "b")
+    with pytest.raises(NergError, match="end in .npz or .parquet"):
+        check_writable(tmp_path / "b.txt", ".npz", ".parquet")
+    for path, said in ((tmp_path, "is a folder"), (tmp_path / "file" / "x" / "y", "parents is a file"), (tmp_path / ("x" * 300), "too long")):
+        with pytest.raises(NergError, match=said):
+            check_writable(path)
+    with pytest.raises(NergError, match="parents is a file"):
+        check_folder(tmp_path / "file")
+    with pytest.raises(NergError, match="parents is a file"):
+        check_folder(tmp_path / "file" / "x")
+    assert os.listdir(tmp_path) == ["file"]
+    # A superuser may write everywhere: what the system says of others.
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    for check in (check_writable, check_folder):
+        with pytest.raises(NergError, match="you may not write there"):
+            check(tmp_path / "new")
+
+
+_LIMITED = """
+import resource, sys
+from nerg_mi.files.atomic import write_bytes
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+write_bytes(sys.argv[1], b"x" * 5000)
+"""
+
+
+def test_a_file_that_does_not_fit_leaves_the_old_one(tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+    done = subprocess.run([sys.executable, "-c", _LIMITED, str(path)], capture_output=True, text=True)
+    assert done.returncode == 1 and "largest size" in done.stderr
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a"]
+
+
+_ENDLESS = """
+import sys
+from nerg_mi.files.atomic import write_bytes
+for k in range(10**6):
+    write_bytes(sys.argv[1], bytes([k % 256]) * 100_000)
+"""
+
+
+def test_a_killed_writer_leaves_a_whole_file(tmp_path):
+    for k in range(5):
+        path = tmp_path / str(k) / "a"
+        child = subprocess.Popen([sys.executable, "-c", _ENDLESS, str(path)])
+        while not path.exists():
+            assert child.poll() is None
+        time.sleep(0.013 * k)
+        child.send_signal(signal.SIGKILL)
+        child.wait()
+        data = path.read_bytes()
+        assert len(data) == 100_000 and len(set(data)) == 1

@@ -1,0 +1,110 @@
+"""Damaged and hostile files get one sentence, before anything is allocated for what they claim."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+
+import pytest
+
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.files import bounded
+from nerg_mi.files.bounded import parse_json, plain, read_bytes, read_json, reading, size_of, text_lines
+
+
+@pytest.mark.parametrize("error", [
+    EOFError(), KeyError("frames"), OverflowError("too large"), RecursionError(), MemoryError(), 
+    struct.error("4 bytes needed"), zlib.error("incorrect header"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"),
+    OSError(5, "Input/output error"), ValueError("two\nlines \x1b[31m"),
+])  # fmt: skip
+def test_what_a_damaged_file_raises_becomes_one_sentence(error):
+    with pytest.raises(NergError) as told, reading("a.bin", "depth file", "copy it again"):
+        raise error
+    said = str(told.value)
+    assert 'the depth file "a.bin" cannot be read: ' in said and said.endswith("; copy it again")
+    assert said.isprintable() and told.value.__cause__ is error
+
+
+def test_programming_errors_and_finished_sentences_pass():
+    with pytest.raises(TypeError), reading("a.bin"):
+        None + 1
+    with pytest.raises(NergError, match="^as it is$"), reading("a.bin"):
+        raise NergError("as it is")
+    with pytest.raises(AttributeError), reading("a.bin"):
+        None.shape
+    with pytest.raises(NergError), reading("a.bin", also=(AttributeError,)):
+        None.shape
+
+
+def test_the_safetensors_library_is_known_by_name(tmp_path):
+    safetensors = pytest.importorskip("safetensors")
+    with pytest.raises(NergError, match="a.safetensors"), reading("a.safetensors"):
+        raise safetensors.SafetensorError("header too large")
+
+
+def test_a_missing_file_is_both_kinds_of_error(tmp_path):
+    for kind in (MissingFile, FileNotFoundError, NergError):
+        with pytest.raises(kind, match=r'there is no checkpoint ".*a\.bin"'):
+            read_bytes(tmp_path / "a.bin", "checkpoint")
+
+
+def test_only_ordinary_files_of_bounded_size_are_read(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_bytes(tmp_path / "a", most=5) == b"12345" and size_of(tmp_path / "a") == 5
+    with pytest.raises(NergError, match="5 bytes, more than the 4"):
+        read_bytes(tmp_path / "a", most=4)
+    with pytest.raises(NergError, match="is a folder"):
+        read_bytes(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(NergError, match="no ordinary file"):
+        read_bytes(tmp_path / "pipe")
+    with pytest.raises(NergError, match="no ordinary file"):
+        read_bytes("/dev/zero")
+    with pytest.raises(NergError):
+        read_bytes("a\0b")
+
+
+def test_json_is_read_as_before(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_bytes('{"a": [1, 2.5, "é"], "a": 3}'.encode("utf-16"))
+    assert read_json(path) == {"a": 3}
+    deep = "[" * 60 + "]" * 60
+    assert parse_json(
+        '{"brackets": "' + "[" * 500 + '", "escaped": "\\"' + "{" * 500 + '", "deep": ' + deep + "}", path
+    )
+
+
+@pytest.mark.parametrize("raw", [b"[" * 200_000, b'{"a":' * 70 + b"1" + b"}" * 70, b"[" * 65 + b"]" * 65])
+def test_deep_json_is_refused_before_it_is_parsed(tmp_path, raw, monkeypatch):
+    monkeypatch.setattr(bounded.json, "loads", lambda text: pytest.fail("it was parsed"))
+    (tmp_path / "a.json").write_bytes(raw)
+    with pytest.raises(NergError, match="nested"):
+        read_json(tmp_path / "a.json")
+
+
+def test_json_of_very_many_values_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(bounded, "JSON_VALUES", 100)
+    assert len(parse_json("[" + "[]," * 40 + "1]", "a.json")) == 41
+    with pytest.raises(NergError, match="more than the 100 values"):
+        parse_json("[" + "{}," * 99 + "1]", "a.json")
+
+
+@pytest.mark.parametrize("raw", [b"", b"{", b"\xff\xfe\xfa", b'{"a": NaNN}', b'"' + b'\\"' * 50_000, b"1" * 5000])
+def test_what_is_no_json_is_told_with_the_file(tmp_path, raw):
+    (tmp_path / "a.json").write_bytes(raw)
+    with pytest.raises(NergError, match=r"a\.json"):
+        read_json(tmp_path / "a.json")
+
+
+def test_lines_are_bounded(tmp_path):
+    (tmp_path / "a.txt").write_bytes(b"one\r\ntwo \xff\n\nlast")
+    assert list(text_lines(tmp_path / "a.txt")) == ["one", "two \udcff", "", "last"]
+    with pytest.raises(NergError, match="line 2 .* more than the 4 characters"):
+        list(text_lines(tmp_path / "a.txt", most=4))
+    with pytest.raises(NergError, match="a.txt"):
+        list(text_lines(tmp_path / "a.txt", errors="strict"))
+
+
+def test_words_of_a_file_are_made_fit_for_a_message():
+    assert plain("a\x1b[2J\nb") == "a?[2J?b" and plain("x" * 400) == "x" * 300 + "..."

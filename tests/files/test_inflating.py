@@ -1,0 +1,118 @@
+"""Compressed files are inflated no further than their size warrants."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import struct
+import zipfile
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.files import inflating
+from nerg_mi.files.inflating import inflated_limit, open_gzip, open_zip, read_member
+
+
+def _zip(path, **members):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return path
+
+
+def test_what_is_sound_is_read(tmp_path):
+    path = tmp_path / "a.csv.gz"
+    path.write_bytes(gzip.compress(b"x,y\n1,2\n" * 1000))
+    with open_gzip(path) as stream:
+        assert io.TextIOWrapper(stream).read() == "x,y\n1,2\n" * 1000
+    with open_zip(_zip(tmp_path / "a.zip", a=b"1" * 3_000_000, b=b"")) as archive:
+        assert read_member(archive, "a", "a.zip") == b"1" * 3_000_000 and read_member(archive, "b", "a.zip") == b""
+    assert inflated_limit(10) == inflating.FREE and inflated_limit(1 << 30) == 100 << 30
+
+
+def test_inflation_stops_at_the_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr(inflating, "FREE", 1 << 20)
+    path = tmp_path / "a.gz"
+    path.write_bytes(gzip.compress(bytes(20 << 20)))
+    taken = 0
+    with open_gzip(path, "table") as stream, pytest.raises(NergError, match='the table ".*a.gz" inflates to more than'):
+        while data := stream.read(1 << 16):
+            taken += len(data)
+    assert taken <= inflated_limit(path.stat().st_size)
+    with pytest.raises(NergError, match="inflates to more than"), open_zip(_zip(tmp_path / "a.zip", a=bytes(20 << 20))):
+        pytest.fail("it was opened")
+
+
+def test_a_member_that_is_larger_than_it_claims_is_cut(tmp_path):
+    """Both the claim in the list and that before the member say 10; asked for all at once, zlib would make 50 MB."""
+    path = _zip(tmp_path / "a.zip", a=bytes(50 << 20))
+    raw = path.read_bytes().replace(struct.pack("<I", 50 << 20), struct.pack("<I", 10))
+    path.write_bytes(raw)
+    import tracemalloc
+
+    tracemalloc.start()
+    with open_zip(path) as archive, pytest.raises(NergError, match="a.zip"):
+        read_member(archive, "a", path)
+    assert tracemalloc.get_traced_memory()[1] < 5 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("claim", [1 << 27, (1 << 32) - 2])
+def test_a_member_that_claims_more_than_it_can_hold_is_refused(tmp_path, claim):
+    path = _zip(tmp_path / "a.zip", a=b"123")
+    raw = bytearray(path.read_bytes())
+    at = raw.rindex(b"PK\1\2")
+    raw[at + 24 : at + 28] = struct.pack("<I", claim)
+    path.write_bytes(raw)
+    with pytest.raises(NergError, match="a.zip"), open_zip(path) as archive:
+        read_member(archive, "a", path)
+
+
+@pytest.mark.parametrize("cut", [0, 1, 30, 60, 99])
+def test_damaged_archives_are_told_with_their_name(tmp_path, cut):
+    path = _zip(tmp_path / "a.zip", a=b"1234567890" * 20)
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(NergError, match="a.zip"), open_zip(path) as archive:
+        read_member(archive, "a", path)
+    path.write_bytes(gzip.compress(b"1234567890" * 20)[: -1 - cut // 10])
+    with pytest.raises(NergError, match="a.zip"), open_gzip(path) as stream:
+        stream.read()
+
+
+def test_a_changed_byte_is_found_by_its_checksum(tmp_path):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a", b"1234567890")
+    path.write_bytes(path.read_bytes().replace(b"345", b"346"))
+    with open_zip(path) as archive, pytest.raises(NergError, match="a.zip"):
+        read_member(archive, "a", path)
+
+
+def test_encrypted_doubled_and_missing_members_are_refused(tmp_path):
+    path = _zip(tmp_path / "a.zip", a=b"1", b=b"2")
+    raw = path.read_bytes()
+    path.write_bytes(raw.replace(b"PK\1\2\x14\x03\x14\0\0\0", b"PK\1\2\x14\x03\x14\0\1\0"))
+    with pytest.raises(NergError, match="encrypted"), open_zip(path):
+        pass
+    at = raw.rindex(b"PK\1\2") + 46
+    path.write_bytes(raw[:at] + b"a" + raw[at + 1 :])
+    with pytest.raises(NergError, match="two members of one name"), open_zip(path):
+        pass
+    path.write_bytes(raw)
+    with open_zip(path) as archive, pytest.raises(NergError, match="c"):
+        read_member(archive, "c", path)
+
+
+def test_a_long_list_of_members_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    path = _zip(tmp_path / "a.zip", **{f"member{k}": b"" for k in range(50)})
+    monkeypatch.setattr(inflating, "DIRECTORY_BYTES", 1000)
+    monkeypatch.setattr(zipfile, "ZipFile", lambda path: pytest.fail("it was read"))
+    with pytest.raises(NergError, match="fewer members"), open_zip(path):
+        pass
+
+
+def test_errors_of_the_block_are_its_own(tmp_path):
+    path = _zip(tmp_path / "a.zip", a=b"1")
+    with pytest.raises(KeyError), open_zip(path):
+        raise KeyError("mine")

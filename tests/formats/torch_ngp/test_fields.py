@@ -1,0 +1,249 @@
+"""torch-ngp checkpoints of the real sizes against a restatement of its kernels in NumPy float32, and back again."""
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.maths.box import Box
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.fields import load_radiance, save_radiance
+from nerg_mi.formats.torch_ngp.pickling import write_torch
+from nerg_mi.formats.torch_ngp.fields import Given, morton_order, read_torch_ngp, write_torch_ngp
+from nerg_mi.formats.torch_ngp.unpickling import read_torch
+
+from tests.reference import torch_ngp_numpy as reference
+
+PARITY = 1e-6
+
+
+def save(path, state, **more):
+    write_torch(path, {"epoch": 7, "global_step": 99, "stats": {}, "model": state, **more})
+    return path
+
+
+def points(bound, n=4000, seed=3):
+    """Inside, on the faces and edges, and a little outside."""
+    rng = np.random.default_rng(seed)
+    p = rng.uniform(-1.02 * bound, 1.02 * bound, (n, 3)).astype(np.float32)
+    p[: n // 10] = np.clip(p[: n // 10] * 3, -bound, bound)
+    d = rng.normal(size=(n, 3))
+    return p, (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
+
+
+def columns(values):
+    values = list(values)
+    dr.eval(values)  # one kernel, not one a column
+    return np.stack([v.numpy() for v in values], -1)
+
+
+def worst(got, expected):
+    """Largest difference, as a share of the largest value."""
+    return np.abs(np.asarray(got, np.float64) - expected).max() / np.abs(expected).max()
+
+
+@pytest.mark.parametrize("bound, behind", [(1, False), (2, True), (5, True)])
+def test01_equals_the_restatement(tmp_path, bound, behind):
+    state = reference.nerf_state(bound, np.random.default_rng(bound), behind)
+    given = Given(background_radius=3.0 * bound if behind else None)
+    field, origin = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns, given=given)
+    p, d = points(bound)
+    at, along = ns.Array3f(p.T), ns.Array3f(d.T)
+
+    # One kernel has the grid in it once; the sizes of bound 5 are those that show the last bit of a coordinate.
+    ours = field.grid(field.box.to_unit(at)) if bound == 5 else []
+    density, geometry = field.density_features(at)
+    painted = field.color(geometry, along)
+    dr.eval(ours, density, painted)
+    if bound == 5:
+        features = reference.encode(p, state["encoder.embeddings"], state["encoder.offsets"], 2048 * bound, bound)
+        assert worst(columns(ours), features) <= PARITY
+    sigma, color, _ = reference.nerf(state, bound, p, d)
+    inside = np.all(np.abs(p) <= bound, axis=1)
+    assert 0 < (~inside).sum() < len(p)
+    got = density.numpy()
+    # An exponential turns an absolute error of its argument, which is of size 8 here, into a relative one.
+    assert np.abs(got[inside] / sigma[inside] - 1).max() <= 2 * np.abs(np.log(sigma)).max() * PARITY
+    assert not got[~inside].any()
+    assert np.abs(columns(painted) - color).max() <= PARITY
+    if behind:
+        o = np.clip(p, -bound, bound)
+        shown = columns(field.background(ns.Array3f(o.T), along))
+        # The last bit of an angle is 4e-4 cells of the finest level, so that this much differs by the machine's atan2 too.
+        assert np.abs(shown - reference.background(state, 3.0 * bound, o, d)).max() <= 1e-3
+        angles = columns(field.background.coordinates(ns.Array3f(o.T), along))
+        features = reference.encode(angles, state["encoder_bg.embeddings"], state["encoder_bg.offsets"], 2048, 1)
+        square = ns.Array2f(*[0.5 * ns.Float(a) + 0.5 for a in angles.T])
+        assert worst(columns(field.background.grid(square)), features) <= PARITY
+    assert origin["epoch"] == 7 and origin["weights"] == "raw"
+    assert field.march_step == pytest.approx(2 * 3**0.5 / 1024)
+
+
+@pytest.mark.parametrize("bound", [1, 2, 5, 2.7])
+def test02_marching_sees_the_kernels_bits(tmp_path, bound):
+    rng = np.random.default_rng(4)
+    state = reference.nerf_state(bound, rng, filled=0.02)
+    field, _ = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns)
+    p = rng.uniform(-bound, bound, (20000, 3)).astype(np.float32)
+    k = field.occupancy.empty_cells(field.box.to_unit(ns.Array3f(p.T))).numpy()
+    # Points within rounding of a cell's face may fall on either side of it: 128 is the finest, 0.5 b the largest cell.
+    cells = (p[:, :, None] / np.minimum(2.0 ** np.arange(4), bound) + 1) * 64
+    clear = np.abs(cells - np.round(cells)).min((1, 2)) > 1e-4
+    assert clear.mean() > 0.95
+    assert np.array_equal((k == 0)[clear], reference.occupied(state["density_bitfield"], bound, p)[clear])
+    assert np.isclose(field.occupancy.fraction, 0.02, rtol=0.05)
+
+
+@pytest.mark.parametrize("bound", [2, 5])
+def test03_what_may_be_leapt_over_is_empty(tmp_path, bound):
+    # Cells less than k away, of the grid that marching sees, hold nothing.
+    rng = np.random.default_rng(5)
+    state = reference.nerf_state(bound, rng, filled=2e-6)
+    grid = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns)[0].occupancy
+    p = rng.uniform(-bound, bound, (3000, 3)).astype(np.float32)
+    u = ((p + bound) / (2 * bound)).astype(np.float32)
+    k, n = grid.empty_cells(ns.Array3f(u.T)).numpy().astype(int), grid.cells[0]
+    assert (k > 20).mean() > 0.3 and n == 128 * bound
+    low = np.floor(u.astype(np.float64) * n) - (k[:, None] - 1)
+    for _ in range(40):
+        inside = (low + rng.random((len(p), 3)) * (2 * k[:, None] - 1)) / n
+        inside = np.clip(inside, 1e-6, 1 - 1e-6)
+        q = ((inside * 2 - 1) * bound).astype(np.float32)
+        assert not reference.occupied(state["density_bitfield"], bound, q)[k > 0].any()
+
+
+def test04_morton_order():
+    z, y, x = np.indices((128, 128, 128)).reshape(3, -1)
+    assert np.array_equal(morton_order(), reference.morton(x, y, z))
+
+
+def test05_there_and_back_is_exact(tmp_path, torch):
+    for bound, behind in ((1, False), (2.7, True)):
+        state = reference.nerf_state(bound, np.random.default_rng(6), behind)
+        first = save(tmp_path / "ngp.pth", state)
+        field, origin = read_torch_ngp(first, ns, given=Given(background_radius=10.0))
+        save_radiance(field, tmp_path / "f.safetensors", origin)
+        again, meta = load_radiance(tmp_path / "f.safetensors", ns)
+        assert meta["provenance"]["imported_from"] == "ngp.pth" and again.box == field.box
+        write_torch_ngp(again, tmp_path / "back.pth")
+        back = torch.load(tmp_path / "back.pth", weights_only=True)
+        assert set(back["model"]) == set(state)
+        for name, value in state.items():
+            assert np.array_equal(back["model"][name].numpy(), value), name
+            assert back["model"][name].numpy().dtype == value.dtype
+
+
+def test06_moving_averages(tmp_path, torch):
+    # As torch itself writes it: with an optimiser, parameters, half-precision and numpy numbers in the statistics.
+    state = reference.nerf_state(1, np.random.default_rng(7))
+    weights = [k for k in state if k.endswith(("embeddings", "weight"))]
+    shadow = [torch.tensor(state[k]) * 2 for k in weights]
+    adam = torch.optim.Adam([torch.nn.Parameter(torch.ones(3))])
+    adam.param_groups[0]["params"][0].sum().backward()
+    adam.step()
+    torch.save({
+        "epoch": 3, "global_step": 30, "stats": {"loss": [np.float64(0.5)], "best_result": None}, "mean_count": 0,
+        "model": {k: torch.tensor(v) for k, v in state.items()}, "optimizer": adam.state_dict(),
+        "ema": {"decay": 0.95, "num_updates": 3, "shadow_params": shadow, "collected_params": None},
+    }, tmp_path / "ngp_ep0003.pth")  # fmt: skip
+    for ema, factor, said in ((None, 2, "moving averages"), (True, 2, "moving averages"), (False, 1, "raw")):
+        field, origin = read_torch_ngp(tmp_path / "ngp_ep0003.pth", ns, ema)
+        assert np.array_equal(field.color_net.weights[2].numpy(), factor * state["color_net.2.weight"])
+        assert np.array_equal(field.grid.table.numpy()[:100], factor * state["encoder.embeddings"].ravel()[:100])
+        assert origin["weights"] == said and origin["global_step"] == 30
+    with pytest.raises(ValueError, match="holds no moving averages.*--no-ema"):
+        read_torch_ngp(save(tmp_path / "raw.pth", state), ns, ema=True)
+    bad = {"shadow_params": [np.zeros((2, 2), np.float32)]}
+    with pytest.raises(ValueError, match="1 moving averages .* do not fit its 6 weights"):
+        read_torch_ngp(save(tmp_path / "bad.pth", state, ema=bad), ns)
+
+
+def test07_a_density_grid_without_its_bits(tmp_path):
+    rng = np.random.default_rng(8)
+    state = reference.nerf_state(1, rng)
+    bits = np.unpackbits(state["density_bitfield"], bitorder="little").astype(bool)
+    state["density_grid"] = np.where(bits, 5 + rng.random(bits.size), rng.random(bits.size) - 0.5).astype(np.float32)[None]
+    expected = read_torch_ngp(save(tmp_path / "a.pth", state), ns)[0].occupancy
+    assert 0.49 < expected.threshold <= 0.5
+    del state["density_bitfield"]
+    got = read_torch_ngp(save(tmp_path / "b.pth", state), ns)[0].occupancy
+    # min(mean, 10): the mean of the grid, which lies between both kinds of cells here.
+    assert np.array_equal(got.bits, expected.bits)
+    del state["density_grid"]
+    assert read_torch_ngp(save(tmp_path / "c.pth", state), ns)[0].occupancy is None
+
+
+def test08_a_bare_state_dictionary_and_a_smaller_box(tmp_path):
+    state = reference.nerf_state(2, np.random.default_rng(9))
+    state["aabb_infer"] = np.array([-1, -2, -0.5, 2, 1.5, 2], np.float32)
+    write_torch(tmp_path / "bare.pth", state)
+    field, _ = read_torch_ngp(tmp_path / "bare.pth", ns)
+    assert field.box == Box((-1, -2, -0.5), (2, 1.5, 2), 2.0)
+    p = np.array([[-0.9, 0.3, 0.4], [-1.1, 0.3, 0.4]], np.float32)
+    sigma, _, _ = reference.nerf(state, 2, p, np.array([[0, 0, 1.0]] * 2))
+    assert np.allclose(field.density(ns.Array3f(p.T)).numpy(), [sigma[0], 0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("change, words", [
+    (lambda s: s.pop("sigma_net.1.weight"), "numbers, so it is not spherical harmonics"),
+    (lambda s: s.pop("aabb_train"), 'lacks "aabb_train"'),
+    (lambda s: s.update({"aabb_train": s["aabb_train"] / 2}), "not those of a bound"),
+    (lambda s: s.update({"encoder.offsets": s["encoder.offsets"] + 8}), "begin at rows .*--finest"),
+    (lambda s: s.update({"color_net.0.bias": np.zeros(64, np.float32)}), "layers without biases"),
+    (lambda s: s.update({"color_net.0.weight": np.zeros((64, 30), np.float32)}), "not spherical harmonics"),
+    (lambda s: s.update({"color_net.2.weight": np.full((3, 64), np.nan, np.float32)}), "not finite.*diverged"),
+    (lambda s: s.update({"density_bitfield": np.zeros(5, np.uint8)}), "40 density bits"),
+    (lambda s: s.update({"encoder.params": np.zeros(5, np.float32)}), "--tcnn"),
+    (lambda s: s.update({"bg_net.0.weight": np.zeros((64, 24), np.float32)}), "--bg-radius"),
+])  # fmt: skip
+def test09_what_does_not_fit_is_said(tmp_path, change, words):
+    state = small_state()
+    change(state)
+    with pytest.raises(ValueError, match=words) as e:
+        read_torch_ngp(save(tmp_path / "wrong.pth", state), ns)
+    assert "\n" not in str(e.value)
+
+
+def small_state():
+    """A state dictionary of the right names, with a grid of two levels only."""
+    rng = np.random.default_rng(0)
+    where = reference.offsets(2, 2048)
+    return {
+        "aabb_train": np.array([-1, -1, -1, 1, 1, 1], np.float32),
+        "encoder.embeddings": reference.table(where[-1], rng), "encoder.offsets": where,
+        "sigma_net.0.weight": reference.matrix(rng, 64, 4), "sigma_net.1.weight": reference.matrix(rng, 16, 64),
+        "color_net.0.weight": reference.matrix(rng, 64, 31), "color_net.1.weight": reference.matrix(rng, 64, 64),
+        "color_net.2.weight": reference.matrix(rng, 3, 64),
+    }  # fmt: skip
+
+
+def test10_a_grid_of_another_resolution(tmp_path):
+    state = small_state()
+    where = reference.offsets(2, 4096)
+    state["encoder.offsets"] = where
+    # 2 levels: 17^3 and a hashed one, whatever the finest resolution is.
+    field, _ = read_torch_ngp(save(tmp_path / "a.pth", state), ns, given=Given(finest=4096))
+    assert field.config.grid == HashGridConfig(levels=2, finest=4096)
+
+
+def test11_fields_without_a_torch_ngp_form(tmp_path):
+    config = RadianceConfig(HashGridConfig(levels=2, log2_rows=8, base=4, finest=16), width=16)
+    field = RadianceField.random(config, Box((0, 0, 0), (1, 2, 3)), ns)
+    with pytest.raises(ValueError, match="no torch-ngp form: its unit cube must be .*; its grid .*; its networks"):
+        write_torch_ngp(field, tmp_path / "x.pth")
+    assert not list(tmp_path.iterdir())
+
+
+def test12_a_plain_grid_becomes_cascades(tmp_path):
+    # Every cell of a cascade that overlaps an occupied one is set, and no other.
+    from nerg_mi.field.occupancy import OccupancyGrid
+    from nerg_mi.formats.torch_ngp.fields import _bitfield
+
+    bits = np.zeros((6, 6, 6), bool)
+    bits[1, 2, 3] = bits[5, 5, 0] = True
+    packed = _bitfield(OccupancyGrid(bits, ns, 0.1), 2.0)
+    p = np.random.default_rng(1).uniform(-2, 2, (20000, 3)).astype(np.float32)
+    cell = np.clip((p / 4 + 0.5) * 6, 0, 5).astype(int)
+    true = bits[cell[:, 2], cell[:, 1], cell[:, 0]]
+    got = reference.occupied(packed, 2, p)
+    assert np.all(got[true]) and true.any() and (got & ~true).mean() < 0.02

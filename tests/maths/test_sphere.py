@@ -1,0 +1,77 @@
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.maths import sphere
+
+
+def test_fibonacci_is_equal_area():
+    x = sphere.fibonacci_directions(4096)
+    assert np.allclose(np.linalg.norm(x, axis=1), 1, atol=1e-15)
+    # Spherical harmonics up to degree 2 integrate to zero.
+    a, b, c = x.T
+    for y in (a, b, c, a * b, b * c, a * c, 3 * c * c - 1, a * a - b * b):
+        assert abs(y.mean()) < 1e-3
+    # No hole and no crowd: the nearest neighbour is where equal areas put it.
+    near = np.sort(x[:200] @ x.T, axis=1)[:, -2]
+    assert np.all(np.abs(np.arccos(near) / np.sqrt(4 * np.pi / 4096) - 1) < 0.3)
+    with pytest.raises(ValueError, match="at least one"):
+        sphere.fibonacci_directions(0)
+
+
+def test_uniform_directions_have_no_preference():
+    x = sphere.uniform_directions(100_000, np.random.default_rng(1))
+    assert np.abs(x.mean(axis=0)).max() < 0.01
+    assert np.allclose(np.cov(x.T), np.eye(3) / 3, atol=0.01)
+
+
+def test_latlong_grid_covers_the_sphere():
+    x, w = sphere.latlong_grid(48, 24)
+    assert np.isclose(w.sum(), 4 * np.pi, rtol=1e-14)
+    u, v = sphere.direction_to_latlong(x)
+    assert np.allclose(sphere.latlong_to_direction(u, v), x, atol=1e-14)
+    assert np.isclose(np.sum(w * x[:, 1] ** 2), 4 * np.pi / 3, rtol=5e-3)
+    up, _ = sphere.latlong_grid(48, 24, sphere.Z_UP)
+    assert up[0, 2] > 0.99 and up[-1, 2] < -0.99
+
+
+def test_latlong_is_the_mapping_of_mitsubas_envmap(rgb):
+    mi = rgb
+    # A map that stores its own directions: what the emitter shows is where we looked.
+    width, height = 64, 33
+    u = (np.arange(width) + 0.5) / width
+    v = np.arange(height) / (height - 1)  # an envmap's rows reach the poles
+    V, U = np.meshgrid(v, u, indexing="ij")
+    stored = 0.5 + 0.5 * sphere.latlong_to_direction(U, V)
+    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(stored.astype(np.float32))})
+    x, _ = sphere.latlong_grid(16, 8)
+    si = dr.zeros(mi.SurfaceInteraction3f, len(x))
+    si.wi = -mi.Vector3f(x.T.astype(np.float32))
+    shown = 2 * np.array(emitter.eval(si)).T - 1
+    assert np.abs(shown - x).max() < 0.01  # bilinear interpolation of 64 columns
+
+
+@pytest.mark.parametrize("offset", [0, 1e4, -1e4, 700, -800])
+def test_logsumexp_of_any_logits(offset):
+    directions, area = sphere.latlong_grid(64, 32)
+    f = 20 * directions[:, 2]
+    # ∫ exp(k z) dω = 4π sinh(k) / k
+    want = np.log(4 * np.pi * np.sinh(20) / 20) + offset
+    assert np.isclose(sphere.logsumexp(f + offset, area), want, rtol=0, atol=0.01)
+    exact = np.log(sum(w * np.exp(np.longdouble(v)) for v, w in zip(f, area))) + offset
+    assert np.isclose(sphere.logsumexp(f + offset, area), float(exact), rtol=1e-15, atol=1e-12)
+    assert np.isclose(np.sum(np.exp(f + offset - sphere.logsumexp(f + offset, area)) * area), 1, rtol=1e-11)
+
+
+def test_logsumexp_at_its_ends():
+    _, area = sphere.latlong_grid(16, 8)
+    f = np.full((3, area.size), -1e4)
+    f[0, 17], f[1], f[2, 1:] = 1e4, 1e4, -np.inf
+    want = [1e4 + np.log(area[17]), 1e4 + np.log(4 * np.pi), -1e4 + np.log(area[0])]
+    assert np.allclose(sphere.logsumexp(f, area), want, rtol=1e-15)
+    assert sphere.logsumexp(np.full(9, -np.inf), 1.0) == -np.inf
+    # A logit that no direction stands for does not count, and NaN is not hidden.
+    assert np.isclose(sphere.logsumexp([1e4, -1e4], [0.0, 2.0]), -1e4 + np.log(2))
+    assert np.isnan(sphere.logsumexp([np.nan, 0.0], 1.0))
+    with pytest.raises(ValueError, match="negative"):
+        sphere.logsumexp([0.0], [-1.0])

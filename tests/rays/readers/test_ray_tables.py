@@ -1,0 +1,146 @@
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays.readers import ray_tables
+from nerg_mi.rays.readers.ray_tables import iterate_table, table_columns
+
+
+def read(path, numbers, texts=()):
+    return list(iterate_table(path, numbers, texts))
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_columns_gaps_and_lines(tmp_path, separator):
+    path = tmp_path / "t.csv"
+    rows = ["name,b,a,c", '"Ann, B",1,2,3', "", "bo,,,", "cy,7,NaN,null"]
+    path.write_text("\n".join(r if '"' in r and separator == "," else r.replace('"Ann, B"', "Ann").replace(",", separator) for r in rows))
+    (block,) = read(path, ["a", "b", "c"], ["name"])
+    assert np.array_equal(block.numbers, [[2, 1, 3], [np.nan] * 3, [np.nan, 7, np.nan]], equal_nan=True)
+    assert list(block.texts[:, 0]) == ["Ann, B" if separator == "," else "Ann", "bo", "cy"]
+    assert list(block.lines) == [2, 4, 5]
+
+
+def test_blocks_keep_line_numbers(tmp_path, monkeypatch):
+    monkeypatch.setattr(ray_tables, "BLOCK", 4)
+    path = tmp_path / "t.csv"
+    path.write_text("a,b\n" + "".join(f"{i},{-i}\n" for i in range(10)))
+    blocks = read(path, ["a"])
+    assert [len(b.lines) for b in blocks] == [3, 4, 3] and blocks[-1].lines[-1] == 11
+    assert np.array_equal(np.concatenate([b.numbers for b in blocks])[:, 0], np.arange(10))
+
+
+def test_errors_name_line_and_column(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("a,b\n1,2\n3,four\n")
+    with pytest.raises(ValueError, match="line 3, column 'b': 'four'"):
+        read(path, ["a", "b"])
+    path.write_text("a,b\n1,2\n3\n")
+    with pytest.raises(ValueError, match="line 3: 1 cells"):
+        read(path, ["a", "b"])
+    with pytest.raises(ValueError, match="no column q; its columns are a, b"):
+        read(path, ["a", "q"])
+
+
+def test_parquet(tmp_path):
+    pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
+    import pyarrow.parquet as pq
+
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.table({"a": [1.0, None, 3.0], "who": ["x", "y", "z"], "n": [1, 2, 3]}), path)
+    (block,) = read(path, ["n", "a"], ["who"])
+    assert np.array_equal(block.numbers, [[1, 1], [2, np.nan], [3, 3]], equal_nan=True)
+    assert list(block.texts[:, 0]) == ["x", "y", "z"]
+
+
+def test_table_without_a_header_and_its_columns(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("1,2,3\n4,,6\n")
+    (block,) = list(iterate_table(path, ["c", "b"], header=["a", "b", "c"]))
+    assert np.array_equal(block.numbers, [[3, 2], [6, np.nan]], equal_nan=True) and list(block.lines) == [1, 2]
+    path.write_text("\ufeffx; y ;z\n")
+    assert table_columns(path) == ["x", "y", "z"]
+
+
+def test_with_and_without_pyarrow(tmp_path, monkeypatch):
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
+    rng = np.random.default_rng(0)
+    path = tmp_path / "t.csv"
+    values = rng.normal(size=(50, 3)) * 10.0 ** rng.integers(-12, 12, (50, 3))
+    cells = [[repr(float(v)) for v in row] for row in values]
+    cells[3][1], cells[7][0], cells[9][2], cells[11][1] = "", "NaN", "null", "inf"
+    path.write_text("a,who,b,a\n" + "\n".join(f'{a},"p {i % 3}",{b},{c}' + ("\n" if i == 20 else "") for i, (a, b, c) in enumerate(cells)))
+    fast = read(path, ["b", "a"], ["who"])
+    used = []
+    monkeypatch.setattr(ray_tables, "_fast_reader", lambda *a: used.append(1))
+    slow = read(path, ["b", "a"], ["who"])
+    assert used and np.array_equal(fast[0].numbers, slow[0].numbers, equal_nan=True) and np.isinf(fast[0].numbers[11, 0])
+    assert np.array_equal(fast[0].texts, slow[0].texts) and np.array_equal(fast[0].lines, slow[0].lines) and fast[0].lines[21] == 24
+
+
+BAD = ["1,x\n", "1\n", "nonsense\n", '"1,2\n', "1,2e\n", "\x00\n", "1,1 2\n"]
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("fast", [True, False])
+def test_bad_lines_are_told_and_left_out(tmp_path, monkeypatch, bad, fast):
+    if not fast:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda *a: None)
+    path, told = tmp_path / "t.csv", []
+    path.write_text("a,b\n" + "".join(f"{i},{i}\n" for i in range(5)) + bad + "7,7\n")
+    (block,) = iterate_table(path, ["a", "b"], on_bad=lambda line, why: told.append((line, why)))
+    assert block.numbers[:, 0].tolist() == [0, 1, 2, 3, 4, 7] and block.lines.tolist() == [2, 3, 4, 5, 6, 8]
+    assert [line for line, _ in told] == [7]
+    with pytest.raises(NergError, match="t.csv, line 7[:,].*--skip-bad-lines"):
+        read(path, ["a", "b"])
+
+
+def test_a_bad_line_among_texts(tmp_path):
+    """Texts and numbers of the other lines stay beside each other."""
+    path, told = tmp_path / "t.csv", []
+    path.write_text("who,a\nann,1\nbo\ncy,3\n")
+    (block,) = iterate_table(path, ["a"], ["who"], on_bad=lambda line, why: told.append(line))
+    assert block.texts[:, 0].tolist() == ["ann", "cy"] and block.numbers[:, 0].tolist() == [1, 3] and told == [3]
+    path.write_text("a,who\n1,ann\n2\n3,cy\n")
+    with pytest.raises(NergError, match="line 3: 1 cells"):
+        read(path, ["a"], ["who"])
+
+
+def test_damaged_tables_are_one_sentence(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("")
+    with pytest.raises(NergError, match="no column a; its columns are none"):
+        read(path, ["a"])
+    path.write_text("," * (ray_tables.COLUMNS + 1) + "\n")
+    with pytest.raises(NergError, match="columns that are read"):
+        table_columns(path)
+    path.write_text("a" * 200_000 + ",b\n1,2\n")
+    with pytest.raises(NergError, match="no header"):
+        read(path, ["b"])
+    for name in ("absent.csv", "absent.parquet"):
+        with pytest.raises(NergError, match=name):
+            read(tmp_path / name, ["a"])
+
+
+def test_damaged_parquet_tables(tmp_path):
+    pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
+    import pyarrow.parquet as pq
+
+    path = tmp_path / "t.parquet"
+    pq.write_table(pa.table({"a": np.arange(500.0), "who": ["x"] * 500}), path)
+    data, rng = path.read_bytes(), np.random.default_rng(0)
+    with pytest.raises(NergError, match="'who'.* holds no numbers"):
+        read(path, ["who"])
+    for at in rng.integers(0, len(data), 60).tolist():
+        for hurt in (data[:at], data[:at] + bytes([data[at] ^ 0x10]) + data[at + 1 :]):
+            path.write_bytes(hurt)
+            try:
+                read(path, ["a"], ["who"])
+            except NergError as error:
+                assert "t.parquet" in str(error)
+    pq.write_table(pa.Table.from_arrays([pa.array([1.0]), pa.array([2.0])], names=["a", "a"]), path)
+    with pytest.raises(NergError, match="several columns called 'a'"):
+        read(path, ["a"])
+    pq.write_table(pa.table({"a": pa.array(np.zeros(20_000_000, np.int8))}), path)
+    with pytest.raises(NergError, match="20,000,000 rows, which its .* bytes do not warrant"):
+        read(path, ["a"])

@@ -1,0 +1,40 @@
+"""The manual of rays: what it names is there, and its example runs."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.rays.readers.presets import PRESETS
+from nerg_mi.rays.rays import Rays
+from nerg_mi.maths.sphere import fibonacci_directions
+
+MANUAL = Path(__file__).resolve().parents[2] / "docs" / "rays.md"
+
+
+def test_every_preset_is_there():
+    assert set(re.findall(r"^\| `(\w+)` \|.*(?:Unity|right|OpenCV)", MANUAL.read_text(), re.M)) == set(PRESETS)
+
+
+def test_options_and_commands_exist():
+    import typer.main
+
+    from nerg_mi.cli.rays import app
+
+    commands = typer.main.get_command(app).commands
+    known = {option for c in commands.values() for p in c.params for option in p.opts}
+    text = MANUAL.read_text()
+    assert set(re.findall(r"(?<![-\w])--[a-z][a-z-]*", text.split("## What it costs")[0])) <= known
+    assert set(re.findall(r"^nerg rays (\w+)", text, re.M)) <= set(commands)
+
+
+def test_example_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    d = rng.normal(size=(3000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    Rays(np.arange(3000) * 0.1, np.arange(3000) % 3, tuple("abc"), rng.uniform([0, 0, 1.5], [1, 1, 1.7], (3000, 3)), d, np.ones(3000)).save("day.npz")
+    names = {"directions": fibonacci_directions(500), "observer": np.array([0.5, 0.5, 1.6]), "position": rng.uniform(2, 3, (6, 8, 3))}
+    (example,) = re.findall(r"```python\n(.*?)```", MANUAL.read_text(), re.S)
+    exec(compile(example, str(MANUAL), "exec"), names)
+    assert np.allclose(names["density"].mean(axis=1) * 4 * np.pi, 1, atol=0.05) and names["picture"].shape == (6, 8)

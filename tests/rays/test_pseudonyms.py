@@ -1,0 +1,95 @@
+"""Names of people leave the rays, their files' names and their metadata; what the rays say stays."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.tables import rays_from_table
+from nerg_mi.errors import NergError
+
+SALT = bytes(range(16))
+NAMES = ("Zoe Ames", "anna", "anna2", "bo")
+
+
+@pytest.fixture
+def rays(tmp_path):
+    """Four people, a file each that has their name, with a row that is dropped in each."""
+    for i, name in enumerate(NAMES):
+        (tmp_path / f"{name}.csv").write_text("t,x,y,z,a,b,c\n" + f"{i},0,0,{i},0,1,0\n{i + .5},0,0,{i},0,0,1\n9,,0,0,1,0,0\n")
+    found = rays_from_table([tmp_path / f"{n}.csv" for n in NAMES], "origin=x,y,z direction=a,b,c t=t", recorded_by="ANNA, of /data/Zoe Ames/raw")
+    return found.noting(step="filter", kept=8, of=8, persons=["anna", "bo"]).noting(
+        step="split", kept=8, of=8, by={"person": {"test": ["anna2"]}}
+    )
+
+
+def test_no_name_is_left_anywhere(rays, tmp_path):
+    hidden = pseudonymise(rays)
+    hidden.save(tmp_path / "out.npz")
+    back = Rays.load(tmp_path / "out.npz")
+    text = json.dumps([back.metadata, back.persons]).lower()
+    for name in ("zoe", "ames", "anna", '"bo"', "bo.csv"):
+        assert name not in text
+    assert all(len(p) == 17 and p.startswith("p") for p in back.persons) and len(set(back.persons)) == 4
+    assert "salt, not kept" in back.metadata["pseudonyms"]
+    # Endings tell what the files were, and each dropped row is still that of one of them.
+    sources = [s["file"] for s in back.metadata["sources"]]
+    assert all(s.endswith(".csv") for s in sources) and sources == sorted(sources)
+    assert {d["file"] for d in back.metadata["dropped"]} == set(sources)
+    for digest in (s["sha256"] for s in rays.metadata["sources"]):
+        assert digest not in text
+    step, split = back.metadata["steps"]
+    assert step["step"] == "filter" and set(step["persons"]) <= set(back.persons) and split["by"]["person"]["test"][0] in back.persons
+
+
+def test_rays_stay_those_of_the_same_people(rays):
+    hidden = pseudonymise(rays, SALT)
+    assert list(hidden.persons) == sorted(hidden.persons) and (np.diff(hidden.person) >= 0).all()
+    # Each person stands at a height of their own.
+    by_name = {rays.origin[rays.person == p, 2][0]: np.sort(rays.t[rays.person == p]) for p in range(4)}
+    for p in range(4):
+        mine = hidden.person == p
+        assert len(set(hidden.origin[mine, 2])) == 1
+        assert np.array_equal(hidden.t[mine], by_name[hidden.origin[mine, 2][0]])
+    assert hidden.metadata["rows_read"] == rays.metadata["rows_read"] and hidden.metadata["transform"] == rays.metadata["transform"]
+
+
+def test_the_salt_decides(rays):
+    one, again, other = pseudonymise(rays, SALT), pseudonymise(rays, SALT), pseudonymise(rays, SALT[::-1])
+    assert one.persons == again.persons and not set(one.persons) & set(other.persons)
+    assert one.metadata["sources"] == again.metadata["sources"]
+    assert not set(pseudonymise(rays).persons) & set(pseudonymise(rays).persons)
+    # The same person in another import, among others.
+    some = pseudonymise(rays.select(rays.person == 2), SALT)
+    at = {h: p for h, p in zip(one.origin[:, 2], one.person)}
+    assert some.persons[some.person[0]] == one.persons[at[some.origin[0, 2]]]
+
+
+def test_a_letter_or_two_are_no_word_to_look_for():
+    """A person called "a" does not change the words of the metadata."""
+    rays = Rays([0.0], [0], ("a",), np.zeros((1, 3)), [[1.0, 0, 0]], [1.0], metadata={"frame": {"units": "m", "up": "z", "handedness": "right"}, "note": "a draft"})
+    hidden = pseudonymise(rays, SALT)
+    assert hidden.metadata["note"] == "a draft" and hidden.metadata["frame"] == rays.metadata["frame"]
+
+
+def test_letters_of_other_alphabets():
+    rays = Rays([0.0], [0], ("Straße",), np.zeros((1, 3)), [[1.0, 0, 0]], [1.0])
+    rays = replace(rays, metadata={**rays.metadata, "note": "STRAßE and \u017ftra\u00dfe"})
+    assert "stra" not in json.dumps(pseudonymise(rays, SALT).metadata, ensure_ascii=False).lower()
+
+
+def test_salts(tmp_path):
+    (tmp_path / "salt").write_bytes(SALT)
+    assert read_salt(tmp_path / "salt") == SALT
+    (tmp_path / "short").write_bytes(b"secret")
+    with pytest.raises(NergError, match="short.* 6 bytes.*urandom"):
+        read_salt(tmp_path / "short")
+    with pytest.raises(NergError, match="absent"):
+        read_salt(tmp_path / "absent")
+    with pytest.raises(NergError, match="at least 16"):
+        pseudonymise(Rays([0.0], [0], ("a",), np.zeros((1, 3)), [[1.0, 0, 0]], [1.0]), b"x")

@@ -1,0 +1,169 @@
+"""Gaze fields that learn on a radiance field's features, and such that begin as its trunk."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.rays.rays import Rays
+from nerg_mi.field.backend import namespace
+from nerg_mi.maths.box import Box
+from nerg_mi.field.gaze.product import GazeField
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
+from nerg_mi.training.gaze.trainer import GazeTrainer
+from nerg_mi.training.gaze.product_model import gaze_density
+from nerg_mi.training.gaze.semantics import config_like, semantic_features, trunk_of
+from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+from nerg_mi.training.gaze.supervision import supervise_rays
+from nerg_mi.transport.media.media import FieldMedium
+from nerg_mi.transport.trace import default_settings
+
+BOX = Box((-2, -2, 0), (2, 2, 3))
+PROBES = ProbeSettings(radius=0.5, count=12, cap=64, min_rays=8, kappa=20.0, directions=64)
+
+
+@pytest.fixture
+def place(rgb):
+    """A random radiance field, dense enough to have surfaces."""
+    ns = namespace("llvm")
+    config = RadianceConfig(HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=5, sh_degree=2, density_scale=6.0)
+    field = RadianceField.random(config, BOX, ns, 0, march_step=0.1)
+    table = np.random.default_rng(0).normal(size=len(field.grid.table)).astype(np.float32)
+    field.set_parameters({"grid.table": ns.Float(table)})
+    return field
+
+
+@pytest.fixture
+def rays():
+    rng = np.random.default_rng(1)
+    origin = rng.uniform([-1, -1, 1.5], [1, 1, 1.7], (300, 3))
+    direction = np.array([1.5, 0.4, 1.2]) + rng.normal(0, 0.15, (300, 3)) - origin
+    return Rays(np.arange(300), np.arange(300) % 2, ("a", "b"), origin, direction / np.linalg.norm(direction, axis=1, keepdims=True), np.ones(300))
+
+
+def test01_the_trunk_gives_the_fields_features(place):
+    ns = namespace("llvm")
+    gaze = GazeField.random(config_like(place.config, "emit_capture", "softplus"), BOX, ns, 3)
+    gaze.set_parameters(trunk_of(place, gaze.config))
+    p = ns.Array3f(np.random.default_rng(2).uniform(BOX.lower, BOX.upper, (50, 3)).astype(np.float32).T)
+    expected = place.density_features(p)[1]
+    got = gaze.position_net(gaze.grid(gaze.box.to_unit(p)))
+    assert len(got) == 5
+    for a, b in zip(got, expected):
+        assert np.allclose(np.array(a), np.array(b), atol=1e-6)
+    with pytest.raises(ValueError, match="must have its sizes"):
+        trunk_of(place, replace(gaze.config, geometry=6))
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test02_the_fast_path_is_the_field(place, own):
+    ns, rng = namespace("llvm"), np.random.default_rng(3)
+    config = config_like(place.config, "emit_capture", "softplus", semantic="snapshot", semantic_own=own)
+    gaze = GazeField.random(config, BOX, ns, 3)
+    gaze.set_parameters({"grid.table": ns.Float(rng.normal(size=len(gaze.grid.table)).astype(np.float32))})
+    B, D = 3, 32
+    p_o, p_od = (ns.Array3f(rng.uniform(BOX.lower, BOX.upper, (n, 3)).astype(np.float32).T) for n in (B, B * D))
+    d = rng.normal(size=(B * D, 3))
+    r_o = ns.Array3f((d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32).T)
+    features = [ns.Float(rng.normal(size=B * D).astype(np.float32)) for _ in range(5)]
+    fast = gaze_density(config, BOX, gaze.parameters(), p_od, p_o, r_o, ns, features)
+    at = dr.arange(ns.UInt32, B * D) // D
+    slow = gaze.evaluate(p_od, dr.gather(ns.Array3f, p_o, at), r_o, True, features)[0]
+    assert np.allclose(np.array(fast), np.array(slow), rtol=1e-5) and np.ptp(np.array(slow)) > 0
+
+
+def test03_snapshots_and_accumulations(rgb, place):
+    """A snapshot is the field at the point; in a single dense slab of equal features both agree."""
+    medium = FieldMedium(place)
+    o = np.tile([0.0, 0.0, 1.5], (20, 1))
+    d = np.random.default_rng(4).normal(size=(20, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    t = np.full(20, 0.5)
+    got = semantic_features(medium, o, d, t, "snapshot")
+    p = rgb.Point3f((o + d * 0.5).astype(np.float32).T)
+    expected = np.stack([np.array(f) for f in place.density_features(p)[1]], -1)
+    assert got.dtype == np.float16 and np.allclose(got, expected, atol=2e-3 * np.abs(expected).max())
+
+    # The same everywhere: what is accumulated is the opacity times it.
+    uniform = namespace("llvm").Float(np.full(len(place.grid.table), 0.3, np.float32))
+    place.set_parameters({"grid.table": uniform})
+    medium = FieldMedium(place)
+    from nerg_mi.transport.trace import trace_depth
+
+    _, opacity = trace_depth(medium, o, d)
+    here = semantic_features(medium, o, d, t, "snapshot").astype(float)
+    along = semantic_features(medium, o, d, t, "accumulated").astype(float)
+    assert opacity.min() > 0.2
+    assert np.allclose(along, here * opacity[:, None], atol=3e-3 * np.abs(here).max())
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test04_frozen_trunks_stay_and_others_move(rgb, place, rays, frozen):
+    ns, medium = namespace("llvm"), FieldMedium(place)
+    config = config_like(place.config, "emit_capture", "softplus", semantic="accumulated", semantic_own=True)
+    data = supervise_rays(rays, medium, BOX, PROBES, semantic="accumulated")
+    assert data.semantic.shape == (*data.truth.shape, 5)
+    trainer = GazeTrainer(data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial=trunk_of(place, config))
+    before = trainer.measure(data).loss
+    while trainer.progress < 1:
+        trainer.step()
+    field, start = trainer.field().parameters(), trunk_of(place, config)
+    for name, value in start.items():
+        assert np.array_equal(np.array(field[name]), np.array(value)) == frozen, name
+    assert trainer.measure(data).loss < 0.9 * before
+
+
+def test05_the_command(rgb, place, rays, tmp_path, capsys):
+    from nerg_mi.cli import main
+
+    save_radiance(place, tmp_path / "field.safetensors", {"test": 0})
+    rays.save(tmp_path / "rays.npz")
+    arguments = ["train", "gaze", str(tmp_path / "rays.npz"), "-o", str(tmp_path / "gaze.safetensors"), "--field", str(tmp_path / "field.safetensors"),
+                 "--semantic", "snapshot", "--begin", "field", "--freeze", "--steps", "4", "--probes", "6", "--radius", "0.5", "--min-rays", "8",
+                 "--directions", "32", "--zones", "0", "--recipe", "small"]
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert not end.value.code, capsys.readouterr().err
+    gaze, about = load_gaze(tmp_path / "gaze.safetensors", namespace("llvm"))
+    assert gaze.config.semantic == "snapshot" and about["provenance"]["begins_as"] == "field.safetensors"
+    assert np.array_equal(np.array(gaze.grid.table), np.array(place.grid.table))
+    for wrong, said in ((["--freeze"], "add it, or leave --freeze out"), (["--begin", "nerf"], 'must be "random" or "field"')):
+        with pytest.raises(SystemExit) as end:
+            main([a for a in arguments if a not in ("--freeze", "--begin", "field")] + wrong)
+        assert end.value.code == 1 and said in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("cutoff", [None, 0.0, 0.05])
+@pytest.mark.parametrize("kind", ["snapshot", "accumulated"])
+def test_features_of_training_are_those_of_rendering(rgb, place, tmp_path, monkeypatch, kind, cutoff):
+    """Whatever the picture's colours are cut off at: a field must be shown what it was trained on."""
+    save_radiance(place, tmp_path / "field.safetensors", {})
+    config = config_like(place.config, "emit", "softplus", semantic=kind)
+    save_gaze(GazeField.random(config, BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
+    integrator = {"type": "nerg", "aovs": "opacity,position,gaze", "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
+                  "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")}}  # fmt: skip
+    if cutoff is not None:
+        integrator["color_cutoff"] = cutoff
+    eye = np.array([0.1, -1.9, 1.6])
+    sensor = {"type": "perspective", "to_world": rgb.ScalarTransform4f().look_at(eye.tolist(), [0, 0, 1.4], [0, 0, 1]), "near_clip": 1e-4,
+              "film": {"type": "hdrfilm", "width": 8, "height": 8, "component_format": "float32", "rfilter": {"type": "box"}}}  # fmt: skip
+    scene, given = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor}), []
+    made = scene.integrator()
+    if cutoff is None:
+        assert made.settings == default_settings(made.medium)
+    evaluate = made.gaze.evaluate
+    # Kept as the render hands them over, and evaluated with the picture.
+    monkeypatch.setattr(made.gaze, "evaluate", lambda *a: (given.append([rgb.Float(f) for f in a[4]]), evaluate(*a))[1])
+    picture = np.array(rgb.render(scene, spp=1)).reshape(64, -1)[:, -5:]
+    rendered = np.stack([np.array(f) for f in given[0]], axis=-1)
+    met = picture[:, 0] >= 0.5
+    way = picture[:, 1:4] - eye
+    distance = np.linalg.norm(way, axis=1)
+    trained = semantic_features(made.medium, np.broadcast_to(eye, way.shape)[met], (way / distance[:, None])[met], distance[met], kind)
+    assert met.sum() > 30 and np.ptp(rendered[met]) > 0.1
+    # Half precision, and directions that were read back from positions.
+    np.testing.assert_allclose(rendered[met], trained, atol=2e-3 * np.abs(trained).max())

@@ -1,0 +1,53 @@
+"""The forward pass that trains: what was looked up already changes no value and no derivative, and heads are the field's."""
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+
+from nerg_mi.field.radiance import RadianceField
+from nerg_mi.training.radiance.model import density, density_color, density_of, stack, unstack
+
+from .test_trainer import BOX, TINY
+
+
+def field():
+    out, rng = RadianceField.random(TINY, BOX, ns, 0), np.random.default_rng(1)
+    out.set_parameters({"grid.table": ns.Float(rng.normal(size=len(out.grid.table)).astype(np.float32))})
+    return out
+
+
+def points():
+    rng = np.random.default_rng(2)
+    p = ns.Array3f(rng.uniform(-0.9, 0.9, (3, 40)).astype(np.float32))
+    return p, dr.normalize(ns.Array3f(rng.normal(size=(3, 40)).astype(np.float32)))
+
+
+def test_known_features_change_no_value_and_no_derivative():
+    f, (p, d), found = field(), points(), []
+    known = [dr.detach(x) for x in f.grid(BOX.to_unit(p))]
+    for features in (None, known):
+        parameters = {k: type(v)(v) for k, v in f.parameters().items()}
+        dr.enable_grad(parameters)
+        sigma, rgb = density_color(TINY, BOX, parameters, p, d, ns, features)
+        dr.backward(dr.sum(sigma + rgb[0] - 2 * rgb[1] * rgb[2]))
+        found.append([dr.detach(sigma).numpy()] + [dr.grad(v).numpy() for v in parameters.values()])
+    for a, b in zip(*found):
+        assert np.abs(b).max() > 0 and np.allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_density_alone_is_that_of_the_field():
+    f, (p, _) = field(), points()
+    want = f.density(p).numpy()
+    assert np.allclose(density(TINY, BOX, f.parameters(), p, ns).numpy(), want, rtol=1e-4)
+    features = [ns.Float(x) for x in f.grid(BOX.to_unit(p))]
+    assert np.allclose(density_of(TINY, f.parameters(), features).numpy(), want, rtol=1e-4)
+
+
+def test_rows_are_stacked_and_taken_apart():
+    rows = [ns.Float([1, 2, 3]), ns.Float([4, 5, 6])]
+    x = stack(rows, ns)
+    assert x.shape == (2, 3) and np.array_equal(x.numpy(), [[1, 2, 3], [4, 5, 6]])
+    assert np.array_equal([r.numpy() for r in unstack(x, ns)], [[1, 2, 3], [4, 5, 6]])
+    dr.enable_grad(x)
+    a, b = unstack(x, ns)
+    dr.backward(dr.sum(a * ns.Float([1, 10, 100]) + 2 * b))
+    assert np.array_equal(dr.grad(x).numpy(), [[1, 10, 100], [2, 2, 2]])

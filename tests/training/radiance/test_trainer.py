@@ -1,0 +1,361 @@
+"""The radiance trainer on a tiny place: it learns, repeats itself, and its gradients are right."""
+from dataclasses import replace
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.capture.cameras import Camera, pixel_directions
+from nerg_mi.capture.dataset import Dataset
+from nerg_mi.capture.images import View
+from nerg_mi.maths.box import Box
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.fields import load_radiance
+from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.training.radiance.compositing import damp_near, ray_sum
+from nerg_mi.training.radiance.losses import color_loss, composite, depth_loss, feature_decay
+from nerg_mi.training.radiance.model import density_color
+from nerg_mi.training.radiance.pixels import PixelBank
+from nerg_mi.training.radiance.preview import render_view
+from nerg_mi.training.radiance.trainer import RadianceTrainer
+from nerg_mi.training.radiance.run import save_trained, train_radiance
+from nerg_mi.training.radiance.sampling import StepTable, Thinning, rays_in_box, visible_samples
+from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+
+BOX = Box((-1, -1, -1), (1, 1, 1))
+RADIUS = 0.6
+TINY = RadianceConfig(
+    grid=HashGridConfig(levels=4, log2_rows=12, base=8, finest=64), width=16, color_hidden=1, density_scale=0.5
+)
+LENS = Intrinsics(24, 24, 30.0, 30.0, 12.0, 12.0)
+
+
+def looking_at_origin(center):
+    z = center / np.linalg.norm(center)
+    x = np.cross([0, 0, 1.0], z)
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), center
+    return pose
+
+
+def ball(pose, depth=True):
+    """A ball of radius RADIUS, coloured by its normal, before nothing (alpha 0)."""
+    d = (pixel_directions(LENS) @ pose[:3, :3].T).reshape(-1, 3)
+    o = pose[:3, 3]
+    b, c = d @ o, o @ o - RADIUS**2
+    hit = b * b - c > 0
+    t = np.where(hit, -b - np.sqrt(np.where(hit, b * b - c, 0)), 0)
+    rgb = 0.5 + 0.4 * (o + d * t[:, None]) / RADIUS
+    color = np.concatenate([np.where(hit[:, None], rgb, 0), hit[:, None]], axis=1)
+    return View("ball", Camera(LENS, pose), color.reshape(24, 24, 4).astype(np.float32),
+                t.reshape(24, 24).astype(np.float32) if depth else None)
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    rng = np.random.default_rng(0)
+    centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
+    views = [ball(looking_at_origin(2 * c / np.linalg.norm(c))) for c in centers]
+    return Dataset(views[4:], views[:4], BOX, "as given", [], {"dataset": "ball"})
+
+
+def settings(**changes):
+    given = {"steps": 300, "batch": 2**12, "resolution": 32, "march_step": 1 / 64, "stride_share": 0.2, "seed": 1,
+             "depth_weight": 2e-3, "grid_decay": 1e-3, **changes}
+    return RadianceSettings(**given)
+
+
+@pytest.mark.slow
+def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
+    """20 dB on held-out views after 300 small steps; the checkpoint says how."""
+    seen = []
+    field, provenance = train_radiance(dataset, TINY, settings(), ns, on_progress=seen.append)
+    assert provenance["psnr_held_out"]["mean"] > 20
+    assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].done == 1
+    save_trained(field, provenance, tmp_path / "ball.safetensors", half=True)
+    loaded, meta = load_radiance(tmp_path / "ball.safetensors", ns)
+    assert meta["provenance"]["settings"]["seed"] == 1
+    assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
+
+
+@pytest.mark.slow
+def test_learns_without_depth(dataset):
+    _, provenance = train_radiance(dataset, TINY, settings(), ns, depth=False)
+    assert provenance["psnr_held_out"]["mean"] > 19 and not provenance["depth_supervision"]
+
+
+def test_equal_seeds_give_equal_fields_to_rounding(dataset):
+    """The sums of several threads come in no fixed order; a few steps differ by rounding alone."""
+    def weights(seed):
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(seed=seed), ns)
+        for _ in range(4):
+            trainer.step()
+        return trainer.optimiser["density_net.0"].numpy()
+
+    assert np.allclose(weights(3), weights(3), atol=1e-4)
+    assert not np.allclose(weights(3), weights(4), atol=1e-2)
+
+
+@pytest.mark.parametrize("average", [0.0, 0.5, 0.999])
+def test_what_is_kept_is_the_average_of_every_fourth_steps_weights(dataset, average):
+    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) a step after k steps, of ``average`` later."""
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(average=average), ns)
+    expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
+    for k in range(1, 13):
+        trainer.step()
+        memory = min(average, (k + 1) / (k + 10)) ** 4
+        if k % 4 == 0:
+            for name, value in trainer.optimiser.items():
+                expected[name] = memory * expected[name] + (1 - memory) * value.numpy()
+    for name, value in trainer.averaged.items():
+        assert np.allclose(value.numpy(), expected[name], atol=1e-6)
+    assert average == 0 or np.abs(expected["density_net.0"] - trainer.optimiser["density_net.0"].numpy()).max() > 1e-4
+
+
+@pytest.mark.slow
+def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
+    """Held-out views through the occupied cells and through the whole box; free space is empty."""
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns)
+    while trainer.progress < 1:
+        trainer.step()
+    field = trainer.field()
+    assert 0 < field.occupancy.fraction < 0.5
+    bounded = lambda p, active: active & (field.occupancy.empty_cells(BOX.to_unit(p)) == 0)
+    for view in dataset.held_out:
+        with_grid, without = (render_view(field, occupied, trainer.table(), view, 0.01)
+                              for occupied in (bounded, lambda p, active: active))
+        assert np.mean(np.abs(with_grid.opacity - without.opacity)) < 0.02
+        assert np.mean(np.abs(with_grid.color - without.color)) < 0.02
+
+
+def test_tensor_products_equal_the_fields_own_evaluation():
+    rng = np.random.default_rng(2)
+    field = RadianceField.random(TINY, BOX, ns, 0)
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    p = ns.Array3f(rng.uniform(-0.99, 0.99, (3, 200)).astype(np.float32))
+    d = dr.normalize(ns.Array3f(rng.normal(size=(3, 200)).astype(np.float32)))
+    sigma, rgb = density_color(TINY, BOX, field.parameters(), p, d, ns)
+    expected, features = field.density_features(p)
+    assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4)
+    assert np.allclose(np.array([c.numpy() for c in rgb]), field.color(features, d).numpy(), atol=1e-5)
+
+
+def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
+    """Fixed samples, all loss terms, a direction through all weights: central differences to 1 %."""
+    rng = np.random.default_rng(6)
+    field = RadianceField.random(TINY, BOX, ns, 0)
+    table = rng.normal(size=len(field.grid.table)).astype(np.float32)
+    field.set_parameters({"grid.table": ns.Float(table)})
+    pixels = PixelBank(ns, dataset.train).batch(ns.UInt32(rng.integers(0, 24 * 24, 64).astype(np.uint32)))
+    rays = rays_in_box(pixels.o, pixels.d, BOX, 0.01)
+    offset = ns.Float(rng.random(64).astype(np.float32))
+    background = ns.Array3f(rng.random((3, 64)).astype(np.float32))
+    with dr.suspend_grad():
+        samples, covered = visible_samples(rays, StepTable(ns, 0.01, 4, 0.03, 0), offset, lambda p, a: a, field.density,
+                                           2e-3, pad=2**13)
+    assert covered == 64
+    start = {k: dr.detach(v) for k, v in field.parameters().items()}
+
+    def loss(parameters):
+        d = dr.gather(ns.Array3f, pixels.d, samples.ray)
+        sigma, rgb = density_color(TINY, BOX, parameters, samples.p, d, ns)
+        weight, tau, color, opacity = composite(sigma, rgb, samples)
+        terms = color_loss(color, opacity, pixels, background, 0.1)
+        terms += 0.1 * depth_loss(weight, tau, samples, pixels, 0.1, 0.1)
+        return dr.sum(ns.Float64(terms))
+
+    parameters = {k: type(v)(v) for k, v in start.items()}
+    dr.enable_grad(parameters)
+    dr.backward(loss(parameters))
+    # Along the signs of the gradient the parts of the slope do not cancel.
+    direction = {k: type(v)(dr.sign(dr.grad(v))) * type(v)(rng.random(v.shape).astype(np.float32))
+                 for k, v in parameters.items()}
+    slope = sum(float(np.sum(dr.grad(parameters[k]).numpy() * direction[k].numpy())) for k in parameters)
+    h = 3e-4
+    up, down = (loss({k: v + s * h * direction[k] for k, v in start.items()}).numpy()[0] for s in (1, -1))
+    assert slope == pytest.approx((up - down) / (2 * h), rel=0.01)
+
+
+def test_thinned_samples_stand_for_all():
+    """Opacity is exact, colours (a ratio) nearly and derivatives wholly those of all samples on the mean over many choices."""
+    rng = np.random.default_rng(8)
+    o = ns.Array3f(np.tile([[0.0], [0.0], [-2.0]], 16).astype(np.float32))
+    d = dr.normalize(ns.Array3f(*[ns.Float(rng.normal(size=16).astype(np.float32) * 0.3) for _ in range(2)], ns.Float(np.ones(16))))
+    rays, table = rays_in_box(o, d, BOX, 0.01), StepTable(ns, 0.01, 4, 0.03, 0)
+    offset, per_ray = ns.Float(rng.random(16).astype(np.float32)), ns.Float(rng.normal(size=16).astype(np.float32))
+    density = lambda p, active=True: 0.3 + 20 * dr.exp(-40 * dr.square(p.z - 0.3 * p.x))
+
+    def render(thinning):
+        samples, _ = visible_samples(rays, table, offset, lambda p, a: a, density, 1e-9, thinning=thinning)
+        gain = ns.Float(1)
+        dr.enable_grad(gain)
+        rgb = [0.5 + 0.4 * dr.sin(4 * samples.p.z + k) for k in range(3)]
+        weight, _, color, opacity = composite(gain * density(samples.p), rgb, samples)
+        plain = sum(ray_sum(weight * c, samples.segments) for c in rgb)
+        dr.backward(dr.sum((plain + opacity) * per_ray))
+        return (samples.count, np.array([c.numpy() for c in color]), opacity.numpy(), dr.grad(gain).numpy()[0])
+
+    count, color, opacity, slope = render(None)
+    found = [render(Thinning(1 / 16, 1 / 32, k)) for k in range(400)]
+    assert max(f[0] for f in found) < 0.5 * count
+    for f in found[::40]:
+        assert np.allclose(f[2], opacity, atol=1e-6)
+    assert np.allclose(np.mean([f[1] for f in found], 0), color, atol=0.03)
+    slopes = [f[3] for f in found]
+    assert abs(np.mean(slopes) - slope) < 4 * np.std(slopes) / 20 and np.std(slopes) > 0
+
+
+def test_settings_and_sizes_are_checked():
+    for wrong in ({}, {"steps": 5, "minutes": 1.0}, {"steps": 0}, {"steps": 5, "resolution": 100}, {"steps": 5, "thin_least": 0},
+                  {"steps": 5, "reach_share": 0}):
+        with pytest.raises(ValueError):
+            RadianceSettings(**wrong)
+    with pytest.raises(ValueError, match="small, medium, paper"):
+        sized_config("huge", BOX)
+    assert sized_config("paper", BOX).grid.log2_rows == 19
+
+
+def test_damping_near_cameras_ends_when_surfaces_stand():
+    s = RadianceSettings(steps=5, reach=0.4, reach_share=0.5)
+    assert [s.damped_within(p) for p in (0, 0.25, 0.5, 1)] == pytest.approx([0.4, 0.2, 0, 0])
+
+
+def test_damping_near_cameras(dataset):
+    """Derivatives nearer than the reach fall with the square of the distance, values stay; a trainer's step follows."""
+    t, x = ns.Float([0.1, 0.2, 0.4, 3]), ns.Float([1, 2, 3, 4])
+    dr.enable_grad(x)
+    y, = damp_near([x], t, 0.4)
+    dr.backward(dr.sum(2 * y))
+    assert np.array_equal(y.numpy(), x.numpy()) and np.allclose(dr.grad(x).numpy(), [2 / 16, 2 / 4, 2, 2])
+
+    def first_step(reach):
+        # All samples are nearer than a reach of a thousand sides: nothing of the pictures reaches the weights.
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(reach=reach, empty_weight=0.0), ns, depth=False)
+        trainer.step()
+        return max(np.abs(state[3][1].numpy()).max() for state in trainer.optimiser.state.values())
+
+    assert first_step(1000.0) < 1e-4 * first_step(0.0)
+
+
+def test_what_a_mask_hides_does_not_count_in_the_progress(dataset):
+    view = dataset.held_out[0]
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns, depth=False)
+    mask = np.arange(24)[:, None] < np.full(24, 12)
+    spoilt = view.pixels.copy()
+    spoilt[~mask] = 1 - spoilt[~mask]
+    whole, other, masked, same = trainer.measure([view, replace(view, pixels=spoilt), *(
+        replace(view, pixels=pixels, mask=mask) for pixels in (view.pixels, spoilt))], 2)
+    assert masked == same and whole != other and masked != whole
+
+
+def test_a_box_that_no_camera_sees_is_refused(dataset):
+    with pytest.raises(ValueError, match="--aabb"):
+        RadianceTrainer(dataset.train, Box((50, 50, 50), (51, 51, 51)), TINY, settings(), ns)
+
+
+def test_features_that_no_ray_shapes_are_let_go(dataset):
+    x = ns.Float([1, -2, 0, 4])
+    dr.enable_grad(x)
+    y = feature_decay(x)
+    dr.backward(y)
+    assert float(y[0]) == pytest.approx(21 / 4) and np.allclose(dr.grad(x).numpy(), [0.5, -1, 0, 2])
+
+    def left(weight):
+        # Nearer than a reach of a thousand sides: nothing of the pictures reaches the features.
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(reach=1000.0, empty_weight=0.0, grid_decay=weight), ns, depth=False)
+        trainer.optimiser["grid.table"] = dr.full(ns.Float, 0.5, len(trainer.live.parameters()["grid.table"]))
+        for _ in range(10):
+            trainer.step()
+        return float(dr.mean(dr.abs(trainer.optimiser["grid.table"]))[0])
+
+    assert left(0.1) < 0.4 < left(0.0)
+    with pytest.raises(ValueError, match="must be 0 or more"):
+        settings(grid_decay=-1.0)
+
+
+def test_a_march_takes_1024_steps_through_the_box():
+    """From corner to corner of a cube, as the paper's."""
+    assert RadianceSettings(steps=1).march_step * BOX.side * 1024 == pytest.approx(BOX.diagonal)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_free_space_is_carved_where_all_depth_is_known(dataset, depth):
+    """Cells far in front of the surface are then empty from the start; without depth nothing is known of them."""
+    views = [replace(v, depth=np.where(v.depth > 0, v.depth, 9).astype(np.float32)) for v in dataset.train]
+    trainer = RadianceTrainer(views, BOX, TINY, settings(), ns, depth=depth)
+    assert trainer.carved == depth and trainer.pixels.depth_everywhere
+    # Where the cameras are looking from to the ball: nearer to them than its surface by four cells and more.
+    p = dr.normalize(ns.Array3f(*np.random.default_rng(0).normal(size=(3, 500)).astype(np.float32))) * 0.9
+    seen = trainer.grid.occupied(p, dr.full(ns.Bool, True, 500)).numpy()
+    assert (seen.mean() < 0.2) == depth
+
+
+def test_places_count_first_and_colours_later(dataset, monkeypatch):
+    """The loss of depth alone, of one a ray: its weight, which falls by ``final_depth`` over the run."""
+    from nerg_mi.training.radiance import trainer as radiance
+
+    monkeypatch.setattr(radiance, "color_loss", lambda *given: 0 * color_loss(*given))
+    monkeypatch.setattr(radiance, "depth_loss", lambda *given: 0 * depth_loss(*given) + 1)
+    for steps in (0, 49, 99):
+        given = settings(steps=100, depth_weight=0.3, final_depth=0.04, distortion_weight=0.0)
+        trainer = RadianceTrainer(dataset.train, BOX, TINY, given, ns)
+        trainer.steps = steps
+        trainer.step()
+        assert float(trainer.loss[0]) == pytest.approx(0.3 * 0.04 ** ((steps + 1) / 100), rel=1e-4)
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.4])
+def test_damping_reaches_a_share_of_the_box_from_the_camera(dataset, monkeypatch, reach):
+    from nerg_mi.training.radiance import trainer as radiance
+
+    reaches = []
+    noted = lambda values, t, width: reaches.append(float(width[0])) or damp_near(values, t, width)
+    monkeypatch.setattr(radiance, "damp_near", noted)
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(steps=100, reach=reach, reach_share=0.5), ns)
+    trainer.step()
+    # The first of a hundred steps, of which half are damped.
+    assert reaches == ([pytest.approx(reach * BOX.side * 0.98)] if reach else [])
+
+
+def test_weights_move_however_faint_their_gradient(dataset):
+    """Entries of the grid that few rays see are not left behind: steps do not depend on the gradient's scale."""
+    moved = []
+    for scale in (1.0, 1e-13):
+        optimiser = RadianceTrainer(dataset.train, BOX, TINY, settings(), ns).optimiser
+        name = "grid.table"
+        before = optimiser[name].numpy().astype(float)
+        dr.set_grad(optimiser[name], dr.full(type(optimiser[name]), scale, dr.width(optimiser[name])))
+        optimiser.step()
+        moved.append(np.abs(optimiser[name].numpy() - before))
+    assert moved[0].min() > 0 and np.allclose(moved[1], moved[0], rtol=0.05)
+
+
+def test_a_preview_shows_colours_within_their_range_beside_the_truth(dataset, tmp_path, rgb):
+    """What is brighter than white is white, and not dark again."""
+    from types import SimpleNamespace
+
+    from nerg_mi.training.radiance.run import _write_preview
+
+    seen = np.zeros((12, 12, 3), np.float32)
+    seen[:, :4], seen[:, 4:8], seen[:, 8:] = 1.7, -0.4, 0.5
+    found = SimpleNamespace(color=seen)
+    trainer = SimpleNamespace(pixels_within=lambda views, most: 2, render=lambda view, every: found)
+    _write_preview(trainer, dataset.held_out[0], tmp_path / "a.png")
+    picture = np.array(rgb.Bitmap(str(tmp_path / "a.png")))
+    assert picture.shape == (12, 24, 3)
+    assert (picture[:, :4] == 255).all() and (picture[:, 4:8] == 0).all() and (picture[:, 8:12] == 128).all()
+    truth = 255 * dataset.held_out[0].over(0)[1::2, 1::2]
+    assert np.abs(picture[:, 12:] - truth).max() <= 1
+
+
+def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
+    from nerg_mi.training.radiance import run as radiance_run
+
+    shown = []
+    monkeypatch.setattr(radiance_run, "_write_preview", lambda trainer, view, path: shown.append(view))
+    monkeypatch.setattr(radiance_run, "_LOOK_GAP", 1)
+    train_radiance(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
+    assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)

@@ -1,0 +1,138 @@
+"""Expected and median depth against closed forms, for opaque and for semi-transparent matter."""
+import math
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.transport.march.depth import KINDS, surface_depth, way_out
+from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.media.media import VolumeMedium
+
+from tests.reference import march_numpy as reference
+
+
+def depth(mi, medium, kind, settings, o=(0.5, 0.5, 0), d=(0, 0, 1)):
+    o, d = np.atleast_2d(np.asarray(o, np.float32)), np.atleast_2d(np.asarray(d, np.float32))
+    ray = medium.local(mi.Point3f(o.T), mi.Vector3f(d.T))
+    t0, t1, active = dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True)
+    result = march(medium, ray, t0, t1, active, settings)
+    return surface_depth(kind, result, medium, ray, t0, t1, active, settings).numpy()
+
+
+def slab(mi, sigma, near=1.0):
+    to_world = mi.ScalarTransform4f().translate([0, 0, near])
+    return VolumeMedium(mi.load_dict({"type": "constvolume", "value": float(sigma), "to_world": to_world}))
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 1e-3, 0.1, 0.69, 0.7, 1, 3, 10, 13.8, 13.9, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("kind", ["expected", "median"])
+def test01_slab(rgb, kind, sigma):
+    # The median of a thin slab is its middle: half of *this ray's own* opacity.
+    expected = reference.slab(sigma, 1, 2)[1 if kind == "expected" else 2]
+    assert np.isclose(depth(rgb, slab(rgb, sigma), kind, MarchSettings(0.01))[0], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["expected", "median"])
+def test02_nothing_met_is_zero(rgb, kind):
+    assert depth(rgb, slab(rgb, 0), kind, MarchSettings(0.01)).tolist() == [0]
+    assert depth(rgb, slab(rgb, 5), kind, MarchSettings(0.01), o=(3, 3, 0)).tolist() == [0]
+
+
+def two_slabs(mi, front, back):
+    """Matter in [0.2, 0.4] and [0.7, 0.9] of the unit cube, as steps of a nearest-neighbour grid."""
+    data = np.zeros((10, 1, 1), np.float32)
+    data[2:4], data[7:9] = front, back
+    return VolumeMedium(mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(data), "filter_type": "nearest"}))
+
+
+@pytest.mark.parametrize("front, back", [(1, 1), (2, 1e4), (0.1, 50), (5, 5), (100, 1)])
+def test03_a_window_and_a_wall(rgb, front, back):
+    medium = two_slabs(rgb, front, back)
+    settings = MarchSettings(0.1 / 64)
+    a, b = 0.2 * front, 0.2 * back
+    w1, w2 = -math.expm1(-a), math.exp(-a) * -math.expm1(-b)
+    mean = lambda s, near: reference.slab(s, near, near + 0.2)[1]  # noqa: E731
+    expected = (w1 * mean(front, 1.2) + w2 * mean(back, 1.7)) / (w1 + w2)
+    goal = -math.log1p(-(w1 + w2) / 2)
+    median = 1.2 + goal / front if goal <= a else 1.7 + (goal - a) / back
+    got = [depth(rgb, medium, kind, settings, o=(0.5, 0.5, -1))[0] for kind in ("expected", "median")]
+    assert np.allclose(got, [expected, median], rtol=2e-5)
+
+
+@pytest.mark.parametrize("stop", [0, 1e-6, 1e-2, 0.3, 0.5, 0.6, 0.9, 1.0])
+@pytest.mark.parametrize("kind", ["expected", "median"])
+def test04_depth_is_inside_for_every_stop(rgb, kind, stop):
+    # A march that stops early has seen less, but what it saw lies in the box.
+    got = depth(rgb, slab(rgb, [20.0][0]), kind, MarchSettings(0.01, stop=stop))[0]
+    assert 1 <= got <= 1.06
+
+
+def test05_median_gradient_equals_central_differences(rgb):
+    # d/dσ of -log((1 + e^-σ) / 2) / σ
+    for sigma in (0.1, 1.0, 5.0, 50.0):
+        data = rgb.TensorXf(np.full((2, 2, 2, 1), sigma, np.float32))
+        volume = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.full((2, 2, 2), sigma, np.float32))})
+        params = rgb.traverse(volume)
+        key = next(k for k in params.keys() if k.endswith("data"))
+        s = rgb.Float(sigma)
+        dr.enable_grad(s)
+        params[key] = data * 0 + s
+        params.update()
+        medium = VolumeMedium(volume)
+        for kind, form in (("median", 2), ("expected", 1)):
+            ray = medium.local(rgb.Point3f(0.5, 0.5, -1), rgb.Vector3f(0, 0, 1))
+            settings = MarchSettings(1 / 32)
+            result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
+            d = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+            dr.set_grad(s, 0)
+            dr.backward(d, dr.ADFlag.ClearInterior)
+            h = 1e-5 * sigma
+            difference = (reference.slab(sigma + h, 1, 2)[form] - reference.slab(sigma - h, 1, 2)[form]) / (2 * h)
+            assert np.isclose(dr.grad(s).numpy()[0], difference, rtol=2e-3, atol=1e-5), (kind, sigma)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test06_the_way_out_ends_at_the_face(rgb, kind):
+    # The surface of thick matter lies as deep in it as light goes; in fog the way is kept short.
+    for sigma, near in ((200, 1), (1e3, 1), (1e6, 2), (20, 1), (0.5, 1)):
+        medium = slab(rgb, sigma, near)
+        ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+        result = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64))
+        d = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), MarchSettings(1 / 64))
+        out, d = way_out(kind, result, d).numpy()[0], d.numpy()[0]
+        if sigma >= 200:
+            assert abs(d - out - near) < 1e-5
+        else:
+            assert math.isclose(out, d / 64 if sigma == 20 else 0, rel_tol=1e-6)
+
+
+@pytest.mark.parametrize("sigma", [0.4, 60.0])
+def test07_evaluations_that_a_depth_takes_are_added(rgb, sigma):
+    medium, settings = slab(rgb, sigma), MarchSettings(0.01, stop=1e-3)
+    ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+    counts = {}
+    for kind in KINDS:
+        result = march(medium, ray, ray.t_near, ray.t_far, True, settings, count=True)
+        first = result.density_evals[0]
+        surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
+        counts[kind] = result.density_evals[0] - first
+    # Thin matter is marched again to where half of its own opacity is reached; a refined depth takes sixteen steps at most in one.
+    again = 0 if sigma > 1 else -math.log1p(0.5 * math.expm1(-sigma)) / sigma * 100
+    assert counts["expected"] == 0 and abs(counts["median"] - again) <= 1
+    assert counts["median"] < counts["refined"] <= counts["median"] + 17
+
+
+def test08_a_refined_depth_finds_what_a_step_hides(rgb):
+    """A wall that starts within a step: the step's own rule spreads it over all of it, a finer look does not."""
+    back = 40.0
+    data = np.zeros((64, 1, 1), np.float32)
+    data[27:37] = 3.0
+    data[44:] = back
+    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "filter_type": "nearest"}))
+    total = 3 * 10 / 64 + back * 20 / 64
+    goal = -math.log1p(0.5 * math.expm1(-total))
+    want = 27 / 64 + goal / 3 if goal < 30 / 64 else 44 / 64 + (goal - 30 / 64) / back
+    steps = MarchSettings(1 / 9, stop=1e-6)
+    median, refined = (abs(depth(rgb, medium, kind, steps, (0.5, 0.5, 0))[0] - want) for kind in ("median", "refined"))
+    assert refined < 0.25 * median and median > 4e-3

@@ -1,0 +1,243 @@
+"""The quadrature rules: what each is exact for, and that every march ends."""
+import math
+import subprocess
+import sys
+
+import drjit as dr
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.transport.media.cells import VoxelCells
+from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.media.media import LocalRay, VolumeMedium
+from nerg_mi.transport.march.rules import KINDS, color_share, linear_crossing, linear_share, rule
+
+from tests.reference import march_numpy as reference
+
+
+def linear_moments(first, last, n=4000):
+    """``(mean absorption distance, distance of half of the optical depth)`` of a linear density over [0, 1]."""
+    borders = np.linspace(0, 1, n + 1)
+    density = lambda p: first + (last - first) * p[:, 2]  # noqa: E731
+    tau, expected, _, _, _ = reference.march(density, (0, 0, 0), (0, 0, 1), borders)
+    return tau, expected
+
+
+@pytest.mark.parametrize("first, last", [(1, 1), (0, 2), (2, 0), (0.1, 5), (30, 1), (1e-5, 3e-5), (0, 200)])
+def test01_linear_share(first, last):
+    tau, expected = linear_moments(first, last)
+    assert np.isclose(tau, (first + last) / 2, rtol=1e-6)
+    got = linear_share(ns.Float(first), ns.Float(last)).numpy()[0]
+    assert abs(got - expected) < 1e-5
+
+
+@pytest.mark.parametrize("first, last, length", [(1, 1, 1), (0, 2, 1), (2, 0, 3), (1, 9, 0.1), (5, 1e-3, 1)])
+def test02_linear_crossing(first, last, length):
+    total = (first + last) / 2 * length
+    for share in (0.01, 0.5, 0.99):
+        s = linear_crossing(ns.Float(first), ns.Float(last), length, ns.Float(share * total)).numpy()[0]
+        assert 0 <= s <= length
+        assert np.isclose(first * s + (last - first) * s * s / (2 * length), share * total, rtol=1e-4)
+
+
+def ramp(mi, n=8, gain=4.0):
+    """Density that rises linearly with z between the first and the last voxel centre."""
+    data = np.broadcast_to(gain * (np.arange(n) + 0.5)[:, None, None] / n, (n, 2, 2)).astype(np.float32).copy()
+    return VolumeMedium(mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(data)}))
+
+
+def gather(mi, medium, o, d, settings, **kwargs):
+    ray = medium.local(mi.Point3f(*map(float, o)), mi.Vector3f(*map(float, d)))
+    return march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings, **kwargs)
+
+
+@pytest.mark.parametrize("kind", ["linear", "cells"])
+@pytest.mark.parametrize("step", [0.5, 0.1])
+def test03_exact_in_opacity_for_linear_densities(rgb, kind, step):
+    # From inside the ramp, where the interpolant is one line.
+    medium = ramp(rgb)
+    ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+    r = march(medium, ray, rgb.Float(0.0625), rgb.Float(0.9375), True, MarchSettings(step, quadrature=kind, stop=0))
+    assert np.isclose(r.tau.numpy()[0], 2 * (0.9375**2 - 0.0625**2), rtol=1e-5)
+
+
+def test04_cells_are_exact_in_opacity_for_any_grid(rgb):
+    data = np.random.default_rng(0).exponential(1, (5, 4, 6)).astype(np.float32)
+    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data)}))
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        o = rng.uniform(-1, 0, 3)
+        d = rng.uniform(0.2, 0.8, 3) - o
+        d /= np.linalg.norm(d)
+        near, far = reference.box(o, d, (0, 0, 0), (1, 1, 1))
+        tau = reference.march(lambda p: reference.trilinear(data, p), o, d, np.linspace(near, far, 8001))[0]
+        assert np.isclose(gather(rgb, medium, o, d, MarchSettings(1.0, quadrature="cells", stop=0)).tau.numpy()[0], tau, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test05_homogeneous_matter_is_exact_for_every_rule(rgb, kind):
+    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.full((4, 4, 4), 3, np.float32))}))
+    r = gather(rgb, medium, (0.5, 0.5, -1), (0, 0, 1), MarchSettings(0.05, quadrature=kind))
+    opacity, expected, median = reference.slab(3, 1, 2)
+    assert np.isclose(r.opacity.numpy()[0], opacity, rtol=1e-5)
+    assert np.isclose(r.expected_depth.numpy()[0], expected, rtol=1e-4)
+    assert np.isclose(r.half.numpy()[0], 1 + math.log(2) / 3, rtol=1e-4)
+
+
+def test06_wrong_rules(rgb):
+    medium = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}))
+    with pytest.raises(ValueError, match='axis-aligned "gridvolume"'):
+        rule("cells", medium)
+    with pytest.raises(ValueError, match='"quadrature" must be one of constant, linear, cells, got "simpson"'):
+        rule("simpson", medium)
+
+
+class Colored:
+    """Density and colour that depend on z only: ``density(z, x)``, ``color(z)``; ``x`` is what derivatives are asked of."""
+
+    occupancy = cells = step = None
+
+    def __init__(self, density, color, x):
+        self._density, self._color, self.x = density, color, x
+
+    def parameters(self):
+        return [self.x]
+
+    def density(self, p, active):
+        return dr.select(active, self._density(p.z, self.x), 0)
+
+    def density_features(self, p, active):
+        return self.density(p, active), [p.z]
+
+    def color(self, features, p, w, active):
+        return ns.Array3f(self._color(features[0]))
+
+
+def along_z(medium, n, **controls):
+    z, t0, t1 = ns.Array3f(0, 0, 1), dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 1)
+    ray = LocalRay(ns.Array3f(0), z, z, t0, t1)
+    return march(medium, ray, t0, t1, True, MarchSettings(1 / n, stop=0, color_cutoff=0, **controls), color=ns.Array3f)
+
+
+@pytest.mark.parametrize("n", [1, 3, 10, 64])
+def test08_the_colour_of_a_wall_is_not_that_of_the_air_before_it(n):
+    wall = lambda z, x: dr.select((z > 0.487) & (z < 0.513 + 1 / n), 1e4 * x, 1e-6)  # noqa: E731
+    tint = lambda z: dr.select((z > 0.48) & (z < 0.52 + 1 / n), 0.25, -9)  # noqa: E731
+    r = along_z(Colored(wall, tint, ns.Float(1)), n, quadrature="linear")
+    if r.opacity.numpy()[0] > 0.5:
+        assert np.isclose(np.array(r.color)[0, 0], 0.25, rtol=1e-3)
+    assert n < 3 or r.opacity.numpy()[0] > 0.5
+
+
+def smooth(z, x, exp=dr.exp, sin=dr.sin):
+    return x * 4 * exp(-2 * z) * (1.2 + sin(9 * z))
+
+
+def test09_colour_is_of_second_order_in_smooth_matter():
+    tint = lambda z, exp=dr.exp: exp(-z) * z  # noqa: E731
+    total = reference.march(lambda p: smooth(p[:, 2], 1, np.exp, np.sin), (0, 0, 0), (0, 0, 1), np.linspace(0, 1, 20001),
+                            lambda p: tint(p[:, 2:], np.exp))[3][0]  # fmt: skip
+    errors = [
+        abs(np.array(along_z(Colored(smooth, tint, ns.Float(1)), n, quadrature="linear").color)[0, 0] - total)
+        for n in (8, 16, 32, 64)
+    ]
+    assert errors[3] < errors[0] / 40, errors
+
+
+def test10_derivatives_are_those_of_the_colour_that_is_shown():
+    # The place where a step takes its colour moves with the density, and the colour with it.
+    tint = lambda z: dr.sin(7 * z)  # noqa: E731
+    for density in (smooth, lambda z, x: x * dr.select(z > 0.43, 30.0, 0.5)):
+        x = ns.Float(1)
+        dr.enable_grad(x)
+        dr.backward(dr.sum(along_z(Colored(density, tint, x), 6, quadrature="linear").color.x))
+        shown = [
+            along_z(Colored(density, tint, ns.Float(1 + h)), 6, quadrature="linear").color.x[0] for h in (-4e-3, 4e-3)
+        ]
+        assert np.isclose(dr.grad(x)[0], (shown[1] - shown[0]) / 8e-3, rtol=3e-3)
+
+
+@pytest.mark.parametrize("gain", [1, 100, 1e4])
+def test11_cells_step_from_wall_to_wall_of_voxels(rgb, gain):
+    data = (gain * np.random.default_rng(0).exponential(1, (8, 8, 8))).astype(np.float32)
+    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True}))
+    o, d = np.array((0.21, 0.34, -1)), np.array((0.1, 0.17, 1)) / math.sqrt(1 + 0.1**2 + 0.17**2)
+    near, far = reference.box(o, d, (0, 0, 0), (1, 1, 1))
+    borders = np.unique(np.concatenate([np.linspace(near, far, 20001), np.linspace(near, min(far, near + 100 / gain), 20001)]))
+    tau, expected, _, _, _ = reference.march(lambda p: reference.trilinear(data, p), o, d, borders)
+    r = gather(rgb, medium, o, d, MarchSettings(1e-3, quadrature="cells", stop=0), count=True)
+    assert np.isclose(r.tau.numpy()[0], tau, rtol=1e-5)
+    # The density between is a line through two samples of a cubic: good to a hundredth of a voxel or so.
+    assert abs(r.expected_depth.numpy()[0] - expected) < 0.015 / 8
+    assert r.density_evals.numpy()[0] <= 2 * (9 + 3 + 3)
+    short = gather(rgb, medium, o, d, MarchSettings(1e-3, quadrature="cells", stop=0, cell_step=1 / 80), count=True)
+    assert short.density_evals.numpy()[0] > 2 * 80 and abs(short.expected_depth.numpy()[0] - expected) < 2e-4 / 8
+
+
+@pytest.mark.parametrize("offset", [None, 0.4])
+def test12_a_leap_forgets_the_density_before_it(offset):
+    # Matter everywhere, and growing; the steps whose middle lies in an empty cell are left out, the others are trapezia.
+    rise = lambda z, x: 1 + 6 * z * z  # noqa: E731
+    medium, n, occupied = Colored(rise, lambda z: z, ns.Float(1)), 32, np.array([1, 0, 1, 1, 0, 0, 0, 1], bool)
+    bits = np.broadcast_to(occupied[:, None, None], (8, 2, 2))
+    medium.occupancy, medium.to_unit, medium.vector_to_unit = OccupancyGrid(bits, ns, 0), lambda p: p, lambda d: d
+    z, t0, t1 = ns.Array3f(0, 0, 1), dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 1)
+    ray = LocalRay(ns.Array3f(0.3, 0.3, 0), z, z, t0, t1)
+    share = None if offset is None else ns.Float(offset)
+    got = march(medium, ray, t0, t1, True, MarchSettings(1 / n, stop=0, quadrature="linear"), offset=share, count=True)
+    first = 1 if offset is None else offset
+    borders = np.minimum(np.concatenate([[0], (first + np.arange(n + 1)) / n]), 1)
+    a, b = borders[:-1], borders[1:]
+    kept = (b > a) & occupied[np.minimum((4 * (a + b)).astype(int), 7)]
+    ends = 1 + 6 * np.stack([a, b]) ** 2
+    assert np.isclose(got.tau[0], (ends.mean(0) * (b - a))[kept].sum(), rtol=1e-5)
+    # An end that two steps share is evaluated once.
+    assert got.density_evals[0] == kept.sum() + np.count_nonzero(kept & ~np.concatenate([[False], kept[:-1]]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test07_every_march_ends(kind):
+    # Far away the voxels are as small as the spacing of floats. In a process of its own, which can be ended.
+    code = f"""
+import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
+mi.set_variant("llvm_ad_rgb")
+from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.media.media import LocalRay, VolumeMedium
+data = np.full((64, 64, 64), 1.5, np.float32)
+data[::2] = 0.5
+medium = VolumeMedium(mi.load_dict({{"type": "gridvolume", "grid": mi.VolumeGrid(data)}}))
+rng = np.random.default_rng(0)
+for distance in (3, 30, 300, 3e4):
+    o = (distance * rng.normal(size=(3, 500))).astype(np.float32)
+    d = rng.random((3, 500)) - o
+    d = (d / np.linalg.norm(d, axis=0)).astype(np.float32)
+    ray = medium.local(mi.Point3f(o), mi.Vector3f(d))
+    r = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, MarchSettings(1 / 64, quadrature="{kind}", stop=0))
+    length = np.maximum(ray.t_far.numpy() - ray.t_near.numpy(), 0)
+    mean = r.tau.numpy().sum() / length.sum()
+    assert 0.95 < mean < 1.05, (distance, mean)
+"""
+    try:
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=25)
+    except subprocess.TimeoutExpired:
+        pytest.fail("the march does not end")
+    assert run.returncode == 0, run.stderr[-1500:]
+
+
+def test13_where_a_step_takes_its_colour():
+    # At the mean absorption for equal ends, at the denser end where the other is empty, in between by the square of (b - a) / (a + b).
+    first, last = ns.Float([2, 0, 5, 1, 3, 1, 0]), ns.Float([2, 5, 0, 3, 1, 4, 0])
+    got = color_share(first, last, ns.Float(0.4)).numpy()
+    assert np.allclose(got, [0.4, 1, 0, 0.4 + 0.6 / 4, 0.4 - 0.4 / 4, 0.4 + 0.6 * 0.36, 0.4], rtol=1e-5)
+
+
+def test14_cells_show_the_features_colour(rgb):
+    """Of homogeneous matter whose colour is linear in depth, which steps of any length integrate exactly."""
+    medium = Colored(lambda z, x: 3 * x + 0 * z, lambda z: z, ns.Float(1))
+    medium.cells = VoxelCells((0, 0, 0), (1, 1, 1), (4, 4, 4), 0.5)
+    shown = np.array(along_z(medium, 8, quadrature="cells").color)[0, 0]
+    # ∫ z σ exp(-σ z) dz over [0, 1]
+    assert np.isclose(shown, (1 - np.exp(-3) * (1 + 3)) / 3, rtol=1e-5)

@@ -1,0 +1,56 @@
+"""Features that a gaze field may ask for: of the point itself, or gathered on the way there."""
+import drjit.llvm.ad as ns
+import numpy as np
+import pytest
+
+from nerg_mi.maths.box import Box
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.transport.media.features import what_gaze_wants
+from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.media.media import FieldMedium, Similarity
+from nerg_mi.transport.place import Place
+
+O, D = np.array([0.1, -0.2, -3.0]), np.array([0.0, 0.1, 1.0]) / np.hypot(0.1, 1)
+
+
+@pytest.fixture
+def place(rgb):
+    """A field of the cube [-1, 1]³, at twice the size."""
+    config = RadianceConfig(HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=3, sh_degree=2)
+    field, rng = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0), np.random.default_rng(0)
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    return Place(FieldMedium(field, Similarity(np.diag([2.0, 2, 2, 1])))), field
+
+
+def asked(rgb, place, kind, p, active=True):
+    vector = lambda of, v: of(*map(float, v))  # noqa: E731
+    settings = MarchSettings(1 / 128, stop=0.0, color_cutoff=1e-2)
+    found = what_gaze_wants(kind, place, vector(rgb.Point3f, p), vector(rgb.Point3f, O), vector(rgb.Vector3f, D), rgb.Bool(active), settings)
+    return None if found is None else np.array([f[0] for f in found])
+
+
+def features(field, p):
+    """Density and features of points (N, 3) of the scene, whose unit is half of the field's."""
+    sigma, f = field.density_features(ns.Array3f(np.ascontiguousarray((p / 2).T, np.float32)))
+    return sigma.numpy() / 2, np.stack([x.numpy() for x in f], axis=1)
+
+
+def test_a_snapshot_is_of_the_point(rgb, place):
+    place, field = place
+    p = np.array([0.3, 0.5, 0.2])
+    assert np.allclose(asked(rgb, place, "snapshot", p), features(field, p[None])[1][0], atol=1e-5)
+    assert not asked(rgb, place, "snapshot", p, active=False).any() and asked(rgb, place, "", p) is None
+
+
+def test_accumulated_ones_are_weighted_by_what_reaches_the_eye(rgb, place):
+    place, field = place
+    t = np.linspace(0, 6, 6001)
+    p = O + D * (0.5 * (t[:-1] + t[1:]))[:, None]
+    sigma, f = features(field, p)
+    tau = sigma * np.diff(t) * (np.abs(p).max(axis=1) < 2)
+    weight = np.exp(-(np.cumsum(tau) - tau)) * -np.expm1(-tau)
+    found = asked(rgb, place, "accumulated", (0.3, 0.5, 0.2))
+    assert found.shape == (3,) and np.allclose(found, weight @ f, atol=5e-3 * np.abs(f).max())
+    assert not asked(rgb, place, "accumulated", (0.3, 0.5, 0.2), active=False).any()
+    assert np.abs(found - asked(rgb, place, "snapshot", (0.3, 0.5, 0.2))).max() > 0.01

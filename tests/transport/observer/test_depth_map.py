@@ -1,0 +1,97 @@
+"""The map around an observer: depths and gaze between its entries, across the seam of azimuth 0 and at the poles."""
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.observer.depth_map import ObserverMap
+from nerg_mi.transport.place import Place
+
+HEIGHT = 32
+
+
+@pytest.fixture
+def around(rgb):
+    """The map of an observer in the middle of a ball of radius 2."""
+    ball = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
+    return ObserverMap(Place(None, ball), rgb.Point3f(0.0), HEIGHT, MarchSettings(0.1), "expected", 0.5)
+
+
+def unit(phi, theta):
+    phi, theta = np.broadcast_arrays(np.asarray(phi, float), theta)
+    return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]).astype(np.float32)
+
+
+def directions():
+    """Azimuths all around, many of them beside 0 and pi, from pole to pole."""
+    rng, width = np.random.default_rng(0), np.pi / HEIGHT
+    seams = np.concatenate([c + width * np.linspace(-1.3, 1.3, 27) for c in (0, np.pi, -np.pi, 2 * np.pi)])
+    phi = np.concatenate([seams, rng.uniform(-np.pi, np.pi, 500)])
+    return phi, np.concatenate([rng.uniform(0.2, np.pi - 0.2, len(phi) - 40), np.geomspace(1e-3, 0.2, 20), np.pi - np.geomspace(1e-3, 0.2, 20)])
+
+
+def interpolated(table, phi, theta):
+    """Bilinear in NumPy: rows from pole to pole with centres at half spacings, columns around and around."""
+    width = np.pi / HEIGHT
+    x, y = (phi / width - 0.5) % (2 * HEIGHT), np.clip(theta / width - 0.5, 0, HEIGHT - 1)
+    i, j = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), HEIGHT - 2)
+    fx, fy = x - i, y - j
+    at = lambda column, row: table[row, column % (2 * HEIGHT)]  # noqa: E731
+    rows = [(1 - fx) * at(i, j + k) + fx * at(i + 1, j + k) for k in (0, 1)]
+    return (1 - fy) * rows[0] + fy * rows[1]
+
+
+def test_depths_are_those_of_the_directions(rgb, around):
+    assert np.allclose(around.depth.numpy(), 2, rtol=1e-5) and around.spacing == pytest.approx(np.pi / HEIGHT)
+    around.center = rgb.Point3f(0.0)
+    width = np.pi / HEIGHT
+    theta, phi = np.meshgrid((np.arange(HEIGHT) + 0.5) * width, (np.arange(2 * HEIGHT) + 0.5) * width, indexing="ij")
+    assert np.allclose(np.array(around._directions()), unit(phi.ravel(), theta.ravel()), atol=1e-6)
+
+
+def test_visibility_is_interpolated_between_entries_and_across_the_seam(rgb, around):
+    table = np.random.default_rng(1).uniform(0, 4, (HEIGHT, 2 * HEIGHT)).astype(np.float32)
+    around.depth = rgb.Float(table.ravel())
+    phi, theta = directions()
+    nearest, seen = around.look_up(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.5, True)
+    # A point is hidden by what is nearer than it by more than the tolerance.
+    assert np.allclose(seen.numpy(), interpolated((table >= 1.5).astype(float), phi, theta), atol=2e-4)
+    width = np.pi / HEIGHT
+    column, row = np.floor(phi / width).astype(int) % (2 * HEIGHT), np.clip(np.floor(theta / width).astype(int), 0, HEIGHT - 1)
+    inside = np.maximum(np.abs(phi / width % 1 - 0.5), np.abs(theta / width % 1 - 0.5)) < 0.49  # no tie between two entries
+    assert np.allclose(nearest.numpy()[inside], table[row, column][inside])
+
+
+def test_visibility_falls_off_softly(rgb, around):
+    around.depth = dr.full(rgb.Float, 2.0, 2 * HEIGHT**2)
+    d = rgb.Vector3f(unit(np.full(5, 1.0), 1.0))
+    for falloff, want in ((0.5, [1, 1, 0.8, 0.4, 0]), (0.0, [1, 1, 0, 0, 0])):
+        seen = around.look_up(d, rgb.Float([1.9, 2.1, 2.2, 2.4, 2.9]), falloff, 0.1, True)[1].numpy()
+        assert np.allclose(seen, want, atol=1e-5)
+
+
+def test_gaze_is_that_of_the_entries_that_see_the_point(rgb, around):
+    rng = np.random.default_rng(2)
+    gaze = rng.uniform(0, 1, (HEIGHT, 2 * HEIGHT)).astype(np.float32)
+    # At 2 is the surface that is asked for; at 1 stands something in front of it, and at 3 lies what is behind an edge.
+    depth = rng.choice(np.float32([1, 2, 2, 3]), (HEIGHT, 2 * HEIGHT))
+    around.depth, around.gaze = rgb.Float(depth.ravel()), rgb.Float(gaze.ravel())
+    phi, theta = directions()
+    found = around.gaze_along(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.1, True).numpy()
+    known = (depth == 2).astype(float)
+    share = interpolated(known, phi, theta)
+    sure = share > 0.02
+    assert np.allclose(found[sure], (interpolated(known * gaze, phi, theta) / np.where(sure, share, 1))[sure], rtol=2e-2, atol=2e-3)
+    around.depth = dr.full(rgb.Float, 3.0, 2 * HEIGHT**2)
+    assert (around.gaze_along(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.1, True).numpy() == -1).all()
+
+
+def test_a_map_serves_until_a_shape_moves(rgb):
+    scene = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
+    place, params = Place(None, scene), rgb.traverse(scene)
+    known = ObserverMap(place, rgb.Point3f(0.0), HEIGHT, MarchSettings(0.1), "expected", 0.5)
+    assert known.serves(place) and known.serves(Place(None, scene))
+    params[next(k for k in params.keys() if k.endswith("to_world"))] = rgb.Transform4f().translate([0, 0, 0.5])
+    params.update()
+    assert not known.serves(place) and not known.serves(Place(None))
+    assert ObserverMap(place, rgb.Point3f(0.0), HEIGHT, MarchSettings(0.1), "expected", 0.5).serves(place)
