@@ -2,12 +2,13 @@
 
     python benchmarks/fox_radiance.py [--minutes 1,2,4,7,10] [--width 135] [--validate] [--set hold=0.5] [--size small]
 
-One training of the last of the ``--minutes``, with the learning rate's schedule over all of it; at each of them the weights so far
-are written, the clock stopping, and scored as `nerg eval radiance` does, after training. A row for a shorter time is thus what
-a longer run has come to, not what a run of that length ends with: give a single number for that.
-``--validate`` never opens the held-out photos: every 8th of the *training* photos takes their place; choices are made with it.
-``--data DIR``: another posed image set. A CSV is written beside the printed table.
+One training of the last of the ``--minutes``, with the learning rate's schedule over all of it; at each of them the
+weights so far are written, the clock stopping, and scored as `nerg eval radiance` does, after training. A row for a
+shorter time is thus what a longer run has come to, not what a run of that length ends with: give a single number for
+that. ``--validate`` never opens the held-out photos: every 8th of the *training* photos takes their place; choices are
+made with it. ``--data DIR``: another posed image set. A CSV is written beside the printed table.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -66,8 +67,8 @@ def main(argv=None) -> None:
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.training.radiance.trainer import RadianceTrainer
     from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
     from nerg_mi.training.radiance.warm_up import warm_up
 
     ns = namespace("llvm_ad_rgb")
@@ -78,7 +79,9 @@ def main(argv=None) -> None:
     stops = sorted(float(m) for m in args.minutes.split(","))
     settings = RadianceSettings(minutes=stops[-1], seed=args.seed, **parse_settings(args.set))
     args.out.mkdir(parents=True, exist_ok=True)
-    print(f"{len(data.train)} views to train on, {len(data.held_out)} to score, width {args.width}; load {os.getloadavg()[0]:.1f}")
+    print(
+        f"{len(data.train)} views to train on, {len(data.held_out)} to score, width {args.width}; load {os.getloadavg()[0]:.1f}"
+    )
     begin = time.perf_counter()
     trainer = RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
     warm_up(trainer)
@@ -92,15 +95,29 @@ def main(argv=None) -> None:
         train = float(np.mean(trainer.measure(data.train[::8], 2)))
         # What was spent on looking is no training.
         trainer.restore(seconds, trainer.hard)
-        rows.append({"minutes": stop, "steps": trainer.steps, "ms_a_step": round(1e3 * seconds / trainer.steps, 1),
-                     "psnr_train": round(train, 2), "load": round(os.getloadavg()[0], 1), "file": path})
-        print(f"{stop:g} min: {trainer.steps} steps, training views {train:.2f} dB, load {os.getloadavg()[0]:.1f}", flush=True)
+        rows.append(
+            {
+                "minutes": stop,
+                "steps": trainer.steps,
+                "ms_a_step": round(1e3 * seconds / trainer.steps, 1),
+                "psnr_train": round(train, 2),
+                "load": round(os.getloadavg()[0], 1),
+                "file": path,
+            }
+        )
+        print(
+            f"{stop:g} min: {trainer.steps} steps, training views {train:.2f} dB, load {os.getloadavg()[0]:.1f}",
+            flush=True,
+        )
     print(f"{'minutes':>8s} {'steps':>7s} {'ms/step':>8s} {'PSNR dB':>8s} {'SSIM':>7s} {'training dB':>12s}")
     for row in rows:
         scores = score_views(row["file"], data.held_out, args.spp, args.out / f"{args.width}_{row['minutes']:g}")
         row |= {"psnr": round(scores["psnr_mean"], 3), "ssim": round(scores["ssim_mean"], 4), "file": row["file"].name}
-        print(f"{row['minutes']:8g} {row['steps']:7d} {row['ms_a_step']:8.1f} {row['psnr']:8.2f} {row['ssim']:7.4f} "
-              f"{row['psnr_train']:12.2f}", flush=True)
+        print(
+            f"{row['minutes']:8g} {row['steps']:7d} {row['ms_a_step']:8.1f} {row['psnr']:8.2f} {row['ssim']:7.4f} "
+            f"{row['psnr_train']:12.2f}",
+            flush=True,
+        )
     table = args.out / f"fox_radiance_{args.width}.csv"
     write_rows(table, rows)
     speed = trainer.clock.summary()

@@ -1,9 +1,12 @@
-"""Whether a normalised gaze field integrates to one: the integrator's integral against a finer one, at random positions.
+"""Whether a normalised gaze field integrates to one: the integrator's integral against a finer one, at random
+positions.
 
-    python benchmarks/gaze_integrals.py GAZE PLACE.vol|FIELD.safetensors [--positions 1000] [--out out/benchmarks/gaze_integrals.csv]
+    python benchmarks/gaze_integrals.py GAZE PLACE.vol|FIELD.safetensors [--positions 1000] [--out
+    out/benchmarks/gaze_integrals.csv]
 
-Positions are uniform in the box of the heads that the field was trained on. The finer integral has twice as many directions,
-others. Prints the largest and the mean difference from one, the share within 1e-3, and what an integral costs.
+Positions are uniform in the box of the heads that the field was trained on. The finer integral has twice as many
+directions, others. Prints the largest and the mean difference from one, the share within 1e-3, and what an integral
+costs.
 """
 
 from __future__ import annotations
@@ -12,21 +15,21 @@ import argparse
 import time
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 
 
 def main(argv=None) -> None:
-    from output import write_rows
-
     import mitsuba as mi
+    from output import write_rows
 
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.training.geometry.places import place_of_field, place_of_volume
-    from nerg_mi.transport.observer.integral import COUNT, GazeIntegral
     from nerg_mi.transport.media.media import GazeMedium
+    from nerg_mi.transport.observer.integral import COUNT, GazeIntegral
     from nerg_mi.transport.place import Place
     from nerg_mi.transport.trace import default_settings
 
@@ -46,12 +49,16 @@ def main(argv=None) -> None:
         started = time.perf_counter()
         ours = float(GazeIntegral(gaze, place, mi.Point3f(*p), settings, "median", 0.5).value()[0])
         seconds = time.perf_counter() - started
-        fine = float(GazeIntegral(gaze, place, mi.Point3f(*p), settings, "median", 0.5, count=2 * COUNT + 13).value()[0])
+        fine = float(
+            GazeIntegral(gaze, place, mi.Point3f(*p), settings, "median", 0.5, count=2 * COUNT + 13).value()[0]
+        )
         rows.append({"x": p[0], "y": p[1], "z": p[2], "integral": fine / ours, "seconds": seconds})
     off = np.abs([r["integral"] - 1 for r in rows])
-    print(f"{len(rows)} positions: off by {off.mean():.1e} in the mean, {np.quantile(off, 0.99):.1e} for 99 %, {off.max():.1e} at most; "
-          f"{np.mean(off <= 1e-3):.1%} within 1e-3; "
-          f"{np.median([r['seconds'] for r in rows]):.3f} s an integral of {COUNT:,} directions (median)")
+    print(
+        f"{len(rows)} positions: off by {off.mean():.1e} in the mean, {np.quantile(off, 0.99):.1e} for 99 %, {off.max():.1e} at most; "
+        f"{np.mean(off <= 1e-3):.1%} within 1e-3; "
+        f"{np.median([r['seconds'] for r in rows]):.3f} s an integral of {COUNT:,} directions (median)"
+    )
     write_rows(args.out, rows)
 
 

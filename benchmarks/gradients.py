@@ -2,10 +2,10 @@
 
     python benchmarks/gradients.py [--depth median] [--case NAME] [--update docs/gradients.md]
 
-One number moves each parameter along a fixed line (``gradients_cases.py``). Forward: derivatives of all pixels at once, as
-``mi.render`` gives them. Reverse: derivative of one weighted sum of the pixels of one quantity. Both against central differences
-of pictures at two distances, extrapolated (Richardson); reverse also against the weighted sum of the forward derivatives, which
-is the dot-product test and holds to rounding. Prints markdown; nothing passes or fails here.
+One number moves each parameter along a fixed line (``gradients_cases.py``). Forward: derivatives of all pixels at once,
+as ``mi.render`` gives them. Reverse: derivative of one weighted sum of the pixels of one quantity. Both against central
+differences of pictures at two distances, extrapolated (Richardson); reverse also against the weighted sum of the
+forward derivatives, which is the dot-product test and holds to rounding. Prints markdown; nothing passes or fails here.
 """
 
 from __future__ import annotations
@@ -16,24 +16,33 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
-
 from numerics import replaced, table
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
 QUANTITIES = {
-    "colour": "RGB", "depth": ["depth.T"], "opacity": ["opacity.Y"], "position": ["position.X", "position.Y", "position.Z"],
-    "gaze": ["gaze.Y"], "emit": ["emit.Y"], "capture": ["capture.Y"], "visibility": ["visibility.Y"],
-    "observer depth": ["observer_depth.T"], "features": ["features.0", "features.1"],
-    "features at": ["features_at.0", "features_at.1"], "spread of gaze": ["gaze_std.Y"],
-}  # fmt: skip
+    "colour": "RGB",
+    "depth": ["depth.T"],
+    "opacity": ["opacity.Y"],
+    "position": ["position.X", "position.Y", "position.Z"],
+    "gaze": ["gaze.Y"],
+    "emit": ["emit.Y"],
+    "capture": ["capture.Y"],
+    "visibility": ["visibility.Y"],
+    "observer depth": ["observer_depth.T"],
+    "features": ["features.0", "features.1"],
+    "features at": ["features_at.0", "features_at.1"],
+    "spread of gaze": ["gaze_std.Y"],
+}
 
 
 @dataclass
 class Entry:
-    """Relative errors of one quantity's derivative with respect to one parameter: ``forward`` (over pixels, L2) and ``reverse``
-    against central differences, ``dot`` of one against the other. ``share``: numbers of the picture that have no kink within
-    the differences' reach, which are those that count; ``doubt``: how far differences at both distances are apart."""
+    """Relative errors of one quantity's derivative with respect to one parameter: ``forward`` (over pixels, L2) and
+    ``reverse`` against central differences, ``dot`` of one against the other. ``share``: numbers of the picture that
+    have no kink within the differences' reach, which are those that count; ``doubt``: how far differences at both
+    distances are apart."""
 
     forward: float
     reverse: float
@@ -68,7 +77,8 @@ def measure(mi, scene, case, quantities=QUANTITIES) -> dict:
     ends = {s: picture(s * h) for s in (1, -1, 0.5, -0.5)}
     wide, near = (ends[1] - ends[-1]) / (2 * h), (ends[0.5] - ends[-0.5]) / h
     difference = (4 * near - wide) / 3
-    # A kink within reach shows in the differences themselves: their two sides disagree by more than a smooth bend would.
+    # A kink within reach shows in the differences themselves: their two sides disagree by more than a smooth bend
+    # would.
     bend, bend_near = np.abs(ends[1] + ends[-1] - 2 * middle) / h, np.abs(ends[0.5] + ends[-0.5] - 2 * middle) * 2 / h
     result = {}
     for name, channels in quantities.items():
@@ -93,8 +103,13 @@ def measure(mi, scene, case, quantities=QUANTITIES) -> dict:
         reverse = float(np.array(dr.grad(x)).item())
         # Relative to the sum of magnitudes: terms of both signs may cancel.
         size = np.abs(w * fd).sum()
-        result[name] = Entry(norm((ad - fd)[smooth]) / norm(fd[smooth]), abs(reverse - (w * fd).sum()) / size,
-                             abs(reverse - (w * ad).sum()) / size, float(smooth.mean()), doubt)  # fmt: skip
+        result[name] = Entry(
+            norm((ad - fd)[smooth]) / norm(fd[smooth]),
+            abs(reverse - (w * fd).sum()) / size,
+            abs(reverse - (w * ad).sum()) / size,
+            float(smooth.mean()),
+            doubt,
+        )
     image(mi.Float(0))
     return result
 
@@ -127,7 +142,12 @@ def summary(found: dict) -> list[str]:
     text = lambda e: f"{e.forward:.0e} / {e.reverse:.0e}" if e else "none"
     cells = [text(found[quantity]) if quantity in found else "" for quantity in QUANTITIES]
     known = [e for e in found.values() if e]
-    return [*cells, f"{max(e.dot for e in known):.0e}", f"{max(e.doubt for e in known):.0e}", f"{1 - min(e.share for e in known):.0%}"]
+    return [
+        *cells,
+        f"{max(e.dot for e in known):.0e}",
+        f"{max(e.doubt for e in known):.0e}",
+        f"{1 - min(e.share for e in known):.0%}",
+    ]
 
 
 def main(argv=None) -> None:

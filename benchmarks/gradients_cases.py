@@ -5,21 +5,21 @@ Every parameter moves along one fixed line, so that a single number stands for i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import drjit as dr
 import numpy as np
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.field.backend import namespace
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
+from nerg_mi.maths.box import Box
 
 AOVS = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth"
 SIZE = 12
@@ -29,8 +29,8 @@ BOX, AROUND = Box((-1, -1, -1), (1, 1, 1)), Box((-3.7, -3.7, -3.7), (3.7, 3.7, 3
 
 @dataclass
 class Case:
-    """A parameter that moves. ``scene``: a key of ``SCENES``; ``keys``: of ``mi.traverse``, all moved together; ``line``: value
-    of a parameter at x from its ``(mi, key, base, x)``; ``h``: how far the differences reach."""
+    """A parameter that moves. ``scene``: a key of ``SCENES``; ``keys``: of ``mi.traverse``, all moved together;
+    ``line``: value of a parameter at x from its ``(mi, key, base, x)``; ``h``: how far the differences reach."""
 
     name: str
     scene: str
@@ -40,16 +40,19 @@ class Case:
 
 
 def write_fields(mi, folder: Path) -> None:
-    """A radiance field over the cube of side 2, a gaze field over a larger one, and an ensemble of that one with another.
+    """A radiance field over the cube of side 2, a gaze field over a larger one, and an ensemble of that one with
+    another.
 
-    Features are positive, and each neuron's weights have one sign: some ReLUs pass and some block, and none changes over while a
-    parameter moves, so that differences are those of a smooth function.
+    Features are positive, and each neuron's weights have one sign: some ReLUs pass and some block, and none changes
+    over while a parameter moves, so that differences are those of a smooth function.
     """
     ns = namespace(mi.variant())
     rng = np.random.default_rng(0)
     config = RadianceConfig(GRID, width=16, geometry=7, sh_degree=2, density_scale=0.4)
     radiance = RadianceField.random(config, BOX, ns, 0, march_step=0.1)
-    gaze, other = (GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2), AROUND, ns, seed) for seed in (1, 2))
+    gaze, other = (
+        GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2), AROUND, ns, seed) for seed in (1, 2)
+    )
     for one in (radiance, gaze, other):
         values = {"grid.table": ns.Float(rng.uniform(0.2, 1.8, len(one.grid.table)).astype(np.float32))}
         for name, w in one.parameters().items():
@@ -85,17 +88,31 @@ def look_at(mi, origin, target=(0, 0, 0)):
 def camera(mi, origin=(0.3, 0.2, -3), fov=20, size=SIZE):
     """One ray through the centre of every pixel, whatever the seed: mi.render gives a derivative another one."""
     film = {"type": "hdrfilm", "width": size, "height": size, "component_format": "float32", "rfilter": {"type": "box"}}
-    return {"type": "perspective", "fov": fov, "to_world": look_at(mi, origin), "film": film,
-            "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}  # fmt: skip
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "to_world": look_at(mi, origin),
+        "film": film,
+        "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+    }
 
 
 def integrator(mi, folder, observer=(-2, 0.5, 2), **more):
     eye = {} if observer is None else {"observer": {"type": "perspective", "to_world": look_at(mi, observer)}}
     return {
-        "type": "nerg", "gaze": {"type": "gazefield", "filename": str(folder / "gaze.safetensors")}, "aovs": AOVS, "step": 0.1,
-        "stop": 1e-12, "color_cutoff": 0.0, "surface_opacity": 0.0, "background": 0.3, "falloff": 4.0, "tolerance": 0.05,
-        **eye, **more,
-    }  # fmt: skip
+        "type": "nerg",
+        "gaze": {"type": "gazefield", "filename": str(folder / "gaze.safetensors")},
+        "aovs": AOVS,
+        "step": 0.1,
+        "stop": 1e-12,
+        "color_cutoff": 0.0,
+        "surface_opacity": 0.0,
+        "background": 0.3,
+        "falloff": 4.0,
+        "tolerance": 0.05,
+        **eye,
+        **more,
+    }
 
 
 def field_scene(mi, folder, **more):
@@ -116,35 +133,47 @@ def constant_scene(mi, folder, **more):
 def grid_scene(mi, folder, **more):
     rng = np.random.default_rng(2)
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
-    volume = lambda data: {"type": "gridvolume", "grid": mi.VolumeGrid(data.astype(np.float32)), "to_world": place, "raw": True}
+    volume = lambda data: {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(data.astype(np.float32)),
+        "to_world": place,
+        "raw": True,
+    }
     density, color = volume(0.1 + rng.exponential(1.2, (4, 5, 6))), volume(rng.uniform(0.1, 0.9, (4, 5, 6, 3)))
     return {"integrator": integrator(mi, folder, density=density, color=color, **more), "sensor": camera(mi)}
 
 
 def shapes_scene(mi, folder, **more):
-    """A tilted slab that every ray of the camera meets, and a larger one between it and the observer: no silhouette is seen."""
-    slab = lambda z, size, tilt: mi.ScalarTransform4f().translate([0, 0, z]).rotate([0.6, 1, 0], tilt).scale([size, size, 0.05])
+    """A tilted slab that every ray of the camera meets, and a larger one between it and the observer: no silhouette is
+    seen."""
+    slab = lambda z, size, tilt: (
+        mi.ScalarTransform4f().translate([0, 0, z]).rotate([0.6, 1, 0], tilt).scale([size, size, 0.05])
+    )
     paint = lambda *rgb: {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(rgb)}}
     return {
-        "integrator": integrator(mi, folder, observer=(-0.9, 0.4, 2.8), **more), "sensor": camera(mi),
+        "integrator": integrator(mi, folder, observer=(-0.9, 0.4, 2.8), **more),
+        "sensor": camera(mi),
         "slab": {"type": "cube", "to_world": slab(-0.3, 0.8, 20), "bsdf": paint(0.8, 0.5, 0.2)},
         "lid": {"type": "cube", "to_world": slab(1.5, 2.5, -15)},
-    }  # fmt: skip
+    }
 
 
 def ball_scene(mi, folder, **more):
     paint = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
     return {
-        "integrator": integrator(mi, folder, observer=(-2, 0.5, -2.5), **more), "sensor": camera(mi, fov=12),
+        "integrator": integrator(mi, folder, observer=(-2, 0.5, -2.5), **more),
+        "sensor": camera(mi, fov=12),
         "ball": {"type": "sphere", "radius": 0.8, "bsdf": paint},
-    }  # fmt: skip
+    }
 
 
 def both_scene(mi, folder, **more):
     """A slab that light reaches through a haze."""
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.2, 0.3, 0.9]}}
-    return shapes_scene(mi, folder, density={"type": "constvolume", "value": 0.25, "to_world": place}, color=color, **more)
+    return shapes_scene(
+        mi, folder, density={"type": "constvolume", "value": 0.25, "to_world": place}, color=color, **more
+    )
 
 
 def alone(make):
@@ -153,10 +182,15 @@ def alone(make):
 
 
 SCENES = {
-    "field": field_scene, "constant": constant_scene, "grid": grid_scene, "shapes": shapes_scene, "ball": ball_scene,
-    "both": both_scene, "field, own camera": alone(field_scene),
+    "field": field_scene,
+    "constant": constant_scene,
+    "grid": grid_scene,
+    "shapes": shapes_scene,
+    "ball": ball_scene,
+    "both": both_scene,
+    "field, own camera": alone(field_scene),
     "field, transmittance": lambda mi, folder, **more: field_scene(mi, folder, visibility="transmittance", **more),
-}  # fmt: skip
+}
 
 
 # ----------------------------------------------------------------------------
@@ -202,9 +236,11 @@ def nets(prefix, *names):
     return [f"integrator.{prefix}.{n}" for n in names]
 
 
-
 def cases() -> list[Case]:
-    density, paint = nets("field", "density_net.0", "density_net.1"), nets("field", "color_net.0", "color_net.1", "color_net.2")
+    density, paint = (
+        nets("field", "density_net.0", "density_net.1"),
+        nets("field", "color_net.0", "color_net.1", "color_net.2"),
+    )
     heads = "position_net.0", "position_net.1", "direction_net.0", "direction_net.1", "emit_head.0", "capture_head.0"
     both = lambda *names: [key for member in (0, 1) for key in nets(f"gaze.{member}", *names)]
     return [
@@ -232,15 +268,17 @@ def cases() -> list[Case]:
         Case("mesh in a haze: vertices", "both", ["slab.vertex_positions"], vertices, 4e-3),
         Case("sphere: to_world", "ball", ["ball.to_world"], walk, 4e-3),
         Case("shape: colour", "shapes", ["slab.bsdf.reflectance.value"], color, 2e-2),
-    ]  # fmt: skip
+    ]
 
 
 # Where derivatives miss what moves: (1), (2), ... stand below the table in docs/gradients.md.
 EXCLUDED = {
-    "shape: its silhouette": {q: "excluded (1)" for q in
-                              ("colour", "depth", "opacity", "position", "gaze", "emit", "capture", "visibility", "observer depth")},
-    "silhouette of what hides": {q: "excluded (2)" for q in ("gaze", "emit", "visibility", "observer depth")},
-    "anything, falloff 0": {q: "excluded (3)" for q in ("gaze", "visibility")},
-    "field and observer, map": {q: "excluded (4)" for q in ("visibility", "observer depth")},
+    "shape: its silhouette": dict.fromkeys(
+        ("colour", "depth", "opacity", "position", "gaze", "emit", "capture", "visibility", "observer depth"),
+        "excluded (1)",
+    ),
+    "silhouette of what hides": dict.fromkeys(("gaze", "emit", "visibility", "observer depth"), "excluded (2)"),
+    "anything, falloff 0": dict.fromkeys(("gaze", "visibility"), "excluded (3)"),
+    "field and observer, map": dict.fromkeys(("visibility", "observer depth"), "excluded (4)"),
     "shape lit by path": {"colour": "excluded (5)"},
-}  # fmt: skip
+}

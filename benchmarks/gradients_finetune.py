@@ -1,11 +1,12 @@
-"""Gaze weights trained further through ``mi.render``, from pictures of gaze and from batches of rays: errors before and after.
+"""Gaze weights trained further through ``mi.render``, from pictures of gaze and from batches of rays: errors before and
+after.
 
     python benchmarks/gradients_finetune.py [--steps 40] [--size 32x24] [--update docs/gradients.md]
 
-The demo store's shoppers come to look at one shelf up to three times as much (Gaussian, 0.6 m): that is the gaze to be learnt,
-known only as pictures of four observers from two cameras each. Errors are relative (L2 over pixels): of these pictures, of
-another camera's pictures of the same observers, and of its picture of another observer. Both ways start from the store's own
-gaze field and see as many pixels a step. Nothing passes or fails here.
+The demo store's shoppers come to look at one shelf up to three times as much (Gaussian, 0.6 m): that is the gaze to be
+learnt, known only as pictures of four observers from two cameras each. Errors are relative (L2 over pixels): of these
+pictures, of another camera's pictures of the same observers, and of its picture of another observer. Both ways start
+from the store's own gaze field and see as many pixels a step. Nothing passes or fails here.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-
 from numerics import replaced, table
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 
 STORE = Path(__file__).parents[1] / "scenes" / "store" / "scene.xml"
 SHELF, WIDTH = (4.8, 5.5, 1.4), 0.6
@@ -85,7 +86,8 @@ class Store:
         return out
 
     def train(self, batches, steps: int, lr: float) -> None:
-        """Adam over all gaze weights, from the store's own on. ``batches(i)``: eye, sensor, target (Float, one a pixel)."""
+        """Adam over all gaze weights, from the store's own on. ``batches(i)``: eye, sensor, target (Float, one a
+        pixel)."""
         self.params.update(self.start)
         opt = mi.ad.Adam(lr=lr, params=self.start)
         scale = 1 / float(np.mean([np.square(view.target).mean() for view in self.seen]))
@@ -113,9 +115,15 @@ class Store:
         for eye in OBSERVERS:
             views = [view for view in self.seen if view.eye == eye]
             colors = [mi.TensorXf(np.repeat(view.target[..., None], 3, axis=-1).astype(np.float32)) for view in views]
-            loaders.append(mi.ad.loaders.RayDataLoader(
-                [view.sensor for view in views], colors, pixels_per_batch=size[0] * size[1], regular_reshuffle=True, tile_size=1
-            ))  # fmt: skip
+            loaders.append(
+                mi.ad.loaders.RayDataLoader(
+                    [view.sensor for view in views],
+                    colors,
+                    pixels_per_batch=size[0] * size[1],
+                    regular_reshuffle=True,
+                    tile_size=1,
+                )
+            )
 
         def batch(i):
             target, rays = loaders[i % len(OBSERVERS)].next()
@@ -125,12 +133,23 @@ class Store:
 
 
 def camera(pose, size):
-    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "component_format": "float32", "rfilter": {"type": "box"}}
-    return mi.load_dict({
-        "type": "perspective", "fov": 78, "near_clip": 0.01, "film": film,
-        "to_world": mi.ScalarTransform4f().look_at(*map(list, pose), [0, 0, 1]),
-        "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
-    })  # fmt: skip
+    film = {
+        "type": "hdrfilm",
+        "width": size[0],
+        "height": size[1],
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 78,
+            "near_clip": 0.01,
+            "film": film,
+            "to_world": mi.ScalarTransform4f().look_at(*map(list, pose), [0, 0, 1]),
+            "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+        }
+    )
 
 
 def main(argv=None) -> None:

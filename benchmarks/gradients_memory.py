@@ -2,13 +2,13 @@
 
     python benchmarks/gradients_memory.py [--samples 16,64,256,1024] [--update docs/gradients.md]
 
-64 x 64 rays through the small fields of ``gradients_cases.py``; each figure is of a process of its own and says how many MB of
-arrays Dr.Jit held at most during the derivative, beyond what it held before (``malloc_watermark``). A first derivative over
-4 x 4 rays has compiled the kernels. Nothing passes or fails here.
+64 x 64 rays through the small fields of ``gradients_cases.py``; each figure is of a process of its own and says how
+many MB of arrays Dr.Jit held at most during the derivative, beyond what it held before (``malloc_watermark``). A first
+derivative over 4 x 4 rays has compiled the kernels. Nothing passes or fails here.
 
-``field``: ``mi.render`` of colour, depth and opacity with respect to all weights of the radiance field. ``everything``: all AOVs,
-an observer who marches the field, with respect to all weights of both fields. ``stored``: colour and opacity from as many
-samples of the radiance field, all at once, differentiated by Dr.Jit in one piece.
+``field``: ``mi.render`` of colour, depth and opacity with respect to all weights of the radiance field. ``everything``:
+all AOVs, an observer who marches the field, with respect to all weights of both fields. ``stored``: colour and opacity
+from as many samples of the radiance field, all at once, differentiated by Dr.Jit in one piece.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 import drjit as dr
 import mitsuba as mi
-
 from numerics import replaced, table
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 
 SIZE, WARM = 64, 4
 COLUMNS = {"field": "field, MB", "everything": "everything, MB", "stored": "stored samples, MB"}
@@ -72,7 +72,9 @@ def scene_of(g, folder: Path, how: str, samples: int):
     }
     for sensor in sensors.values():
         del sensor["fov"]
-    return mi.load_dict({"type": "scene", "integrator": {k: v for k, v in integrator.items() if v is not None}, **sensors})
+    return mi.load_dict(
+        {"type": "scene", "integrator": {k: v for k, v in integrator.items() if v is not None}, **sensors}
+    )
 
 
 def peak(how: str, samples: int) -> float:

@@ -1,9 +1,11 @@
-"""How right a place made of hit points is (`--geometry hits`): a room with a window in closed form, and recorded people.
+"""How right a place made of hit points is (`--geometry hits`): a room with a window in closed form, and recorded
+people.
 
     python benchmarks/hit_places.py [--rays 200000]
 
-Depths along rays that the place was not made of (the room) or all rays (recorded) are compared with where those rays ended: of looks
-that stay near, and of those that go far. The supermarket (../shared/data, or $NERG_DATA) is left out where it is not there.
+Depths along rays that the place was not made of (the room) or all rays (recorded) are compared with where those rays
+ended: of looks that stay near, and of those that go far. The supermarket (../shared/data, or $NERG_DATA) is left out
+where it is not there.
 """
 
 from __future__ import annotations
@@ -38,9 +40,18 @@ def row(name: str, rays, seen, far: np.ndarray) -> str:
     nearer = f"{-np.median(off[met & far]):.1f}" if far.any() else "-"
     share = f"{100 * met[far].mean():.1f}" if far.any() else "-"
     cells = [
-        name, " x ".join(map(str, made["shape"])), f"{made['voxel']:.3g}", f"{100 * made['beyond']:.1f}", f"{100 * met[~far].mean():.1f}",
-        f"{np.median(near):.3f}", f"{np.quantile(near, 0.9):.3f}", f"{np.quantile(near, 0.99):.3f}", share, nearer, f"{seconds:.1f}",
-    ]  # fmt: skip
+        name,
+        " x ".join(map(str, made["shape"])),
+        f"{made['voxel']:.3g}",
+        f"{100 * made['beyond']:.1f}",
+        f"{100 * met[~far].mean():.1f}",
+        f"{np.median(near):.3f}",
+        f"{np.quantile(near, 0.9):.3f}",
+        f"{np.quantile(near, 0.99):.3f}",
+        share,
+        nearer,
+        f"{seconds:.1f}",
+    ]
     return "| " + " | ".join(cells) + " |"
 
 
@@ -66,11 +77,25 @@ def main(arguments: list[str] | None = None) -> None:
     from tests.reference.office import looks_out, office
 
     mi.set_variant("llvm_ad_rgb")
-    head = ("place", "voxels", "edge, m", "hits on the shell, %", "near looks that meet something, %", "off by, median m", "90 %", "99 %",
-            "far looks that meet something, %", "too near, median m", "made in, s")  # fmt: skip
+    head = (
+        "place",
+        "voxels",
+        "edge, m",
+        "hits on the shell, %",
+        "near looks that meet something, %",
+        "off by, median m",
+        "90 %",
+        "99 %",
+        "far looks that meet something, %",
+        "too near, median m",
+        "made in, s",
+    )
     print("| " + " | ".join(head) + " |\n|" + " --- |" * len(head))
     seen = office(20_000, seed=1)
-    print(row("room of 8 x 6 x 3 m, window", office(options.rays), seen, looks_out(seen.origin, seen.direction)), flush=True)
+    print(
+        row("room of 8 x 6 x 3 m, window", office(options.rays), seen, looks_out(seen.origin, seen.direction)),
+        flush=True,
+    )
     rays = supermarket(options.rays)
     if rays is not None:
         print(row("supermarket, recorded", rays, rays, np.zeros(len(rays), bool)))

@@ -7,6 +7,7 @@ range, quantity, largest error found, reference. Prints markdown; `--update` put
 into a document in place of those that stand there under the same headings. Errors are relative unless
 the row says otherwise. Nothing passes or fails here: bounds are kept by the tests.
 """
+
 from __future__ import annotations
 
 import argparse

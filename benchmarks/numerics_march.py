@@ -1,19 +1,20 @@
 """Numerical errors of a march through simple matter: slabs, single steps, sheets, profiles."""
+
 from __future__ import annotations
 
 import math
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import drjit as dr
 import numpy as np
+from numerics import Row
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.field.radiance import density_from_log
 from nerg_mi.transport.march.depth import surface_depth
 from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.media.media import LocalRay, VolumeMedium
 from nerg_mi.transport.march.quadrature import absorbed_share, mean_depth_share
 from nerg_mi.transport.march.rules import linear_crossing, linear_share
-from numerics import Row
+from nerg_mi.transport.media.media import LocalRay, VolumeMedium
 
 HEAD = ["case", "range", "quantity", "largest error", "reference"]
 # With nothing set, a 1024th of the diagonal of a unit cube.
@@ -74,13 +75,15 @@ def half(x):
     passed = np.exp(-safe)
     value = -np.log1p(0.5 * np.expm1(-safe)) / safe
     slope = (passed / (1 + passed) - value) / safe
-    return (np.where(x < 0.05, 0.5 - x / 8 + x**3 / 192 - x**5 / 2880, value),
-            np.where(x < 0.05, -1 / 8 + x**2 / 64 - x**4 / 576, slope))  # fmt: skip
+    return (
+        np.where(x < 0.05, 0.5 - x / 8 + x**3 / 192 - x**5 / 2880, value),
+        np.where(x < 0.05, -1 / 8 + x**2 / 64 - x**4 / 576, slope),
+    )
 
 
 def smooth(tau, length=1.0, panels=2000):
-    """``(opacity, expected depth)`` of a smooth optical depth ``tau(z)`` on [0, length], by Gauss-Legendre quadrature of
-    ∫ (T(z) - T(length)) dz / opacity."""
+    """``(opacity, expected depth)`` of a smooth optical depth ``tau(z)`` on [0, length], by Gauss-Legendre quadrature
+    of ∫ (T(z) - T(length)) dz / opacity."""
     x, w = np.polynomial.legendre.leggauss(8)
     z = ((np.arange(panels)[:, None] + 0.5 + 0.5 * x) / panels * length).ravel()
     opacity = -np.expm1(-tau(length))
@@ -110,8 +113,12 @@ class Profile:
 def along_z(mi, medium, settings, start=0.0, **options):
     """A march along +z from the points z = ``start``."""
     start = mi.Float(start)
-    ray = LocalRay(mi.Point3f(0, 0, start), mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Float(0), medium.length - start)
-    return ray, march(medium, ray, dr.zeros(mi.Float, dr.width(start)), medium.length - start, True, settings, **options)
+    ray = LocalRay(
+        mi.Point3f(0, 0, start), mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Float(0), medium.length - start
+    )
+    return ray, march(
+        medium, ray, dr.zeros(mi.Float, dr.width(start)), medium.length - start, True, settings, **options
+    )
 
 
 def box(mi, sigma, near=0.0, length=1.0):
@@ -120,8 +127,9 @@ def box(mi, sigma, near=0.0, length=1.0):
 
 
 def grid(mi, data, **more):
-    return VolumeMedium(mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(np.asarray(data, np.float32)), "raw": True,
-                                      **more}))  # fmt: skip
+    return VolumeMedium(
+        mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(np.asarray(data, np.float32)), "raw": True, **more})
+    )
 
 
 def through(mi, medium, o, d, settings):
@@ -140,8 +148,8 @@ SIGMAS = (1e-6, 1e-3, 0.1, 1.0, 10.0, 100.0, 1e3, 1e6, 1e9)
 
 
 def slab_errors(mi, volume: str, sigma: float, ahead: float, kind: str) -> dict[str, float]:
-    """Errors of opacity and depth (of ``kind``) of a unit slab whose face lies ``ahead`` of the ray's origin, and of their
-    derivatives with respect to the density."""
+    """Errors of opacity and depth (of ``kind``) of a unit slab whose face lies ``ahead`` of the ray's origin, and of
+    their derivatives with respect to the density."""
     if volume == "constvolume":
         density = {"type": "constvolume", "value": float(sigma)}
     else:
@@ -149,9 +157,21 @@ def slab_errors(mi, volume: str, sigma: float, ahead: float, kind: str) -> dict[
     # Mitsuba starts the rays of this sensor a hair in front of it.
     z = -ahead - float(mi.math.RayEpsilon)
     film = {"type": "hdrfilm", "width": 1, "height": 1, "component_format": "float32", "rfilter": {"type": "box"}}
-    sensor = {"type": "radiancemeter", "origin": [0.5, 0.5, z], "direction": [0, 0, 1],
-              "sampler": {"type": "independent", "sample_count": 1}, "film": film}  # fmt: skip
-    integrator = {"type": "nerg", "id": "integrator", "density": density, "depth": kind, "radiance": False, "aovs": "depth,opacity"}
+    sensor = {
+        "type": "radiancemeter",
+        "origin": [0.5, 0.5, z],
+        "direction": [0, 0, 1],
+        "sampler": {"type": "independent", "sample_count": 1},
+        "film": film,
+    }
+    integrator = {
+        "type": "nerg",
+        "id": "integrator",
+        "density": density,
+        "depth": kind,
+        "radiance": False,
+        "aovs": "depth,opacity",
+    }
     scene = mi.load_dict({"type": "scene", "sensor": sensor, "integrator": integrator})
     depth, opacity = values(mi.render(scene, spp=1)).ravel()[3:]
     x = float(np.float32(sigma))
@@ -171,8 +191,16 @@ def slab_errors(mi, volume: str, sigma: float, ahead: float, kind: str) -> dict[
 
 
 def slabs(mi):
-    head = ["opacity", "expected", "expected, face at the origin", "median", "median, face at the origin", "∂ opacity / ∂σ", "∂ expected / ∂σ",
-            "∂ median / ∂σ"]  # fmt: skip
+    head = [
+        "opacity",
+        "expected",
+        "expected, face at the origin",
+        "median",
+        "median, face at the origin",
+        "∂ opacity / ∂σ",
+        "∂ expected / ∂σ",
+        "∂ median / ∂σ",
+    ]
     rows = []
     for sigma in SIGMAS:
         errors: dict[str, float] = {}
@@ -204,7 +232,9 @@ def one_step(mi):
     yield Row("", ends, "mean depth in the step", worst(y, share(x64)), reference)
     yield Row("", ends, "its derivative", worst(dy, share_slope(x64)), reference)
     y, dy = gradient(mi.Float(x), lambda v: linear_share(v, v))
-    yield Row("", ends, "mean depth, linear rule, equal ends (absolute, in steps)", worst(y, share(x64), False), reference)
+    yield Row(
+        "", ends, "mean depth, linear rule, equal ends (absolute, in steps)", worst(y, share(x64), False), reference
+    )
     errors, slopes = [], []
     for a in (1e-6, 1e-2, 1.0, 30.0):
         for b in (0.0, 1e-3, 1.0, 100.0):
@@ -246,11 +276,24 @@ def million_rays(mi):
     r, ray, *_ = through(mi, box(mi, 2), o, d, MarchSettings(1 / 16))
     near, far = exact_box(o.astype(float), d.astype(float))
     length = np.maximum(far - np.maximum(near, 0), 0)
-    yield Row("a million rays", "σ = 2, 16 steps", "opacity (absolute)", worst(r.opacity, -np.expm1(-2 * length), False),
-              "closed form of the float64 ray")  # fmt: skip
-    yield Row("", "", "depth where length > 1e-3 (absolute)",
-              worst(values(r.expected_depth)[length > 1e-3], (np.maximum(near, 0) + length * share(2 * length))[length > 1e-3],
-                    False), "closed form of the float64 ray")  # fmt: skip
+    yield Row(
+        "a million rays",
+        "σ = 2, 16 steps",
+        "opacity (absolute)",
+        worst(r.opacity, -np.expm1(-2 * length), False),
+        "closed form of the float64 ray",
+    )
+    yield Row(
+        "",
+        "",
+        "depth where length > 1e-3 (absolute)",
+        worst(
+            values(r.expected_depth)[length > 1e-3],
+            (np.maximum(near, 0) + length * share(2 * length))[length > 1e-3],
+            False,
+        ),
+        "closed form of the float64 ray",
+    )
 
 
 # ----------------------------------------------------------------------------
@@ -269,7 +312,7 @@ def sheets_in_a_grid(mi):
     o = np.concatenate([rng.uniform(0.2, 0.8, (64, 2)), rng.uniform(-1, -0.5, (64, 1))], -1).astype(np.float32)
     d = np.concatenate([rng.uniform(-0.1, 0.1, (64, 2)), np.ones((64, 1))], -1)
     d = (d / np.linalg.norm(d, axis=-1, keepdims=True)).astype(np.float32)
-    to = lambda z: (z - o[:, 2].astype(float)) / d[:, 2]  # noqa: E731
+    to = lambda z: (z - o[:, 2].astype(float)) / d[:, 2]
     a = -np.expm1(-1e3 * THIN / d[:, 2].astype(float))
     front = to(0.3) + THIN / d[:, 2] * share(1e3 * THIN / d[:, 2].astype(float))
     expected = a * front + (1 - a) * to(0.7)
@@ -278,8 +321,13 @@ def sheets_in_a_grid(mi):
         r, *_ = through(mi, medium, o, d, settings)
         error = worst(r.expected_depth, expected, False)
         found = np.mean(values(r.opacity) > 0.999)
-        yield Row("thin sheets in near-vacuum" if kind == "constant" else "", f"σ 1e-8, 1e3, 1e9; 1e-4 thick; {kind}",
-                  f"depth (absolute); {found:.0%} of the rays end at the sheet", error, "closed form")  # fmt: skip
+        yield Row(
+            "thin sheets in near-vacuum" if kind == "constant" else "",
+            f"σ 1e-8, 1e3, 1e9; 1e-4 thick; {kind}",
+            f"depth (absolute); {found:.0%} of the rays end at the sheet",
+            error,
+            "closed form",
+        )
 
 
 def sheets_and_steps(mi):
@@ -291,7 +339,13 @@ def sheets_and_steps(mi):
     for step in (0.5, 1, 2, 10):
         _, r = along_z(mi, medium, MarchSettings(step * THIN), z0)
         found.append(f"{step:g}: {np.mean(values(r.opacity) > 0.5):.1%}")
-    yield Row("the same sheet, a volume without bounds", "step / thickness 0.5 .. 10", "rays that meet it", ", ".join(found), "all")
+    yield Row(
+        "the same sheet, a volume without bounds",
+        "step / thickness 0.5 .. 10",
+        "rays that meet it",
+        ", ".join(found),
+        "all",
+    )
 
 
 def jump(mi):
@@ -303,7 +357,13 @@ def jump(mi):
             medium = Profile(lambda z, w: dr.select(z >= w, 1e9, 1e-8), mi.Float(wall))
             _, r = along_z(mi, medium, MarchSettings(STEP, quadrature=kind))
             errors.append(abs(values(r.expected_depth)[0] - wall) / STEP)
-        yield Row("discontinuity" if kind == "constant" else "", f"σ 1e-8 to 1e9; {kind}", "depth (in steps)", max(errors), "closed form")
+        yield Row(
+            "discontinuity" if kind == "constant" else "",
+            f"σ 1e-8 to 1e9; {kind}",
+            "depth (in steps)",
+            max(errors),
+            "closed form",
+        )
 
 
 def exponential(mi):
@@ -311,7 +371,7 @@ def exponential(mi):
     for kind in ("constant", "linear"):
         errors = np.zeros(4)
         for s0, k in ((1e-8, 1.0), (1e-3, 30.0), (50.0, -20.0), (1e3, -5.0)):
-            exact = lambda a, b: smooth(lambda z: a * np.expm1(b * z) / b)  # noqa: E731
+            exact = lambda a, b: smooth(lambda z: a * np.expm1(b * z) / b)
             alpha, depth = exact(s0, k)
             h = 1e-4
             slope = [(np.array(exact(s0, k + h)) - np.array(exact(s0, k - h))) / (2 * h)]
@@ -325,20 +385,40 @@ def exponential(mi):
                 dr.backward(y, flags=dr.ADFlag.ClearVertices)
                 got.append(values(dr.grad(k_))[0])
             expected = [alpha, depth, slope[0][0], slope[0][1]]
-            new = [worst(got[0], expected[0]), worst(got[1], expected[1]), worst(got[2], expected[2], abs(expected[2]) > 1e-6),
-                   worst(got[3], expected[3], abs(expected[3]) > 1e-6)]  # fmt: skip
+            new = [
+                worst(got[0], expected[0]),
+                worst(got[1], expected[1]),
+                worst(got[2], expected[2], abs(expected[2]) > 1e-6),
+                worst(got[3], expected[3], abs(expected[3]) > 1e-6),
+            ]
             errors = np.maximum(errors, new)
         for i, name in enumerate(("opacity", "depth", "∂ opacity / ∂k", "∂ depth / ∂k")):
-            yield Row("exponential profiles" if i == 0 else "", f"1e-8 .. 1e10, falling and rising; {kind}" if i == 0 else "", name,
-                      errors[i], "closed τ, float64 quadrature, 577 steps")  # fmt: skip
+            yield Row(
+                "exponential profiles" if i == 0 else "",
+                f"1e-8 .. 1e10, falling and rising; {kind}" if i == 0 else "",
+                name,
+                errors[i],
+                "closed τ, float64 quadrature, 577 steps",
+            )
 
 
 def odd_densities(mi):
-    for name, sigma, alpha in (("0", 0.0, 0), ("-1", -1.0, 0), ("NaN", math.nan, 0), ("inf", math.inf, 1), ("3e38", 3e38, 1)):
+    for name, sigma, alpha in (
+        ("0", 0.0, 0),
+        ("-1", -1.0, 0),
+        ("NaN", math.nan, 0),
+        ("inf", math.inf, 1),
+        ("3e38", 3e38, 1),
+    ):
         r, ray, t0, t1 = through(mi, box(mi, sigma, 1), (0.5, 0.5, 0), (0, 0, 1), MarchSettings(STEP))
         got = values(r.opacity)[0], values(r.expected_depth)[0]
-        yield Row("densities that are none" if name == "0" else "", name, "opacity; depth (absolute)",
-                  f"{abs(got[0] - alpha):.0e}; {abs(got[1] - alpha):.0e}", "masked: vacuum, or opaque from 1 on")  # fmt: skip
+        yield Row(
+            "densities that are none" if name == "0" else "",
+            name,
+            "opacity; depth (absolute)",
+            f"{abs(got[0] - alpha):.0e}; {abs(got[1] - alpha):.0e}",
+            "masked: vacuum, or opaque from 1 on",
+        )
     data = np.ones((2, 2, 2), np.float32)
     data[1, 0, 1] = np.nan
     try:
@@ -348,7 +428,9 @@ def odd_densities(mi):
         outcome = f'refused: "{error}"'
     yield Row("", "NaN in a grid", "", outcome, "an error that names the voxel")
     y, dy = gradient(mi.Float([-1e4, -200, 29.9, 30.1, 88, 89, 1e4, np.inf]), lambda h: density_from_log(h, 1.0))
-    yield Row("exponential activation", "log σ -1e4 .. inf", "density and derivative (at most exp 30)", said(y, dy), "finite")
+    yield Row(
+        "exponential activation", "log σ -1e4 .. inf", "density and derivative (at most exp 30)", said(y, dy), "finite"
+    )
 
 
 def all_opacities(mi):
@@ -362,8 +444,13 @@ def all_opacities(mi):
     truth = {"expected": share(x64), "median": -np.log1p(-alpha / 2) / x64, "refined": -np.log1p(-alpha / 2) / x64}
     for kind, expected in truth.items():
         got = surface_depth(kind, r, medium, ray, mi.Float(0), mi.Float(1), mi.Mask(True), settings)
-        yield Row("depth at any opacity" if kind == "expected" else "", "1e-6 .. 1" if kind == "expected" else "",
-                  f"{kind} depth", worst(got, expected), "closed form")  # fmt: skip
+        yield Row(
+            "depth at any opacity" if kind == "expected" else "",
+            "1e-6 .. 1" if kind == "expected" else "",
+            f"{kind} depth",
+            worst(got, expected),
+            "closed form",
+        )
 
 
 # ----------------------------------------------------------------------------

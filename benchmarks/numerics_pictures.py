@@ -1,25 +1,26 @@
 """Numerical errors of pictures: observers in odd places, shadow acne, silhouettes, samples, films."""
+
 from __future__ import annotations
 
 import math
 import tempfile
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import drjit as dr
 import numpy as np
+from numerics import Row
+from numerics_march import HEAD, gradient, said, share, values, worst
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.field.backend import namespace
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
+from nerg_mi.maths.box import Box
 from nerg_mi.maths.color import composite_to_linear
 from nerg_mi.transport.observer.sight import towards
 from nerg_mi.transport.observer.visibility import visibility
-from numerics import Row
-from numerics_march import HEAD, gradient, said, share, values, worst
 
 AOVS = "depth,opacity,position,gaze,visibility,observer_depth"
 
@@ -35,11 +36,21 @@ def look_at(mi, origin, target, up=(0, 1, 0)):
 
 def camera(mi, origin, target, size=12, fov=35, film=(), **more):
     return {
-        "type": "perspective", "fov": fov, "to_world": look_at(mi, origin, target), "near_clip": 1e-3,
+        "type": "perspective",
+        "fov": fov,
+        "to_world": look_at(mi, origin, target),
+        "near_clip": 1e-3,
         "sampler": {"type": "independent", "sample_count": 1},
-        "film": {"type": "hdrfilm", "width": size, "height": size, "component_format": "float32", "rfilter": {"type": "box"},
-                 **dict(film)}, **more,
-    }  # fmt: skip
+        "film": {
+            "type": "hdrfilm",
+            "width": size,
+            "height": size,
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+            **dict(film),
+        },
+        **more,
+    }
 
 
 def channels(mi, integrator, sensor, spp=1):
@@ -47,7 +58,7 @@ def channels(mi, integrator, sensor, spp=1):
     scene = mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
     image = values(mi.render(scene, spp=spp))
     names = scene.integrator().aov_names()
-    return dict(zip(names, np.moveaxis(image[..., image.shape[-1] - len(names):], -1, 0))) | {"rgb": image[..., :3]}
+    return dict(zip(names, np.moveaxis(image[..., image.shape[-1] - len(names) :], -1, 0))) | {"rgb": image[..., :3]}
 
 
 def cube(mi, sigma, low=(-1, -1, -1), size=(2, 2, 2)):
@@ -81,10 +92,20 @@ def observers(mi):
     sensor = camera(mi, here, (0, 0, 0), fov=25)
     alone = channels(mi, base, sensor)
     same = channels(mi, base | {"observer": eye(mi, here)}, sensor)
-    yield Row("observer at the camera", "", "all channels against no observer (absolute)",
-              max(worst(same[k], alone[k], False) for k in alone), "the picture without")  # fmt: skip
-    places = {"on the surface": (0, 0, -1), "inside solid matter": (0, 0, 0), "behind the camera": (0.6, 0.4, -6),
-              "1e6 units away": (1e6, 0, -1e6), "at a pixel's surface point": None}  # fmt: skip
+    yield Row(
+        "observer at the camera",
+        "",
+        "all channels against no observer (absolute)",
+        max(worst(same[k], alone[k], False) for k in alone),
+        "the picture without",
+    )
+    places = {
+        "on the surface": (0, 0, -1),
+        "inside solid matter": (0, 0, 0),
+        "behind the camera": (0.6, 0.4, -6),
+        "1e6 units away": (1e6, 0, -1e6),
+        "at a pixel's surface point": None,
+    }
     finite, share_seen = [], {}
     for name, at in places.items():
         if at is None:
@@ -93,7 +114,9 @@ def observers(mi):
             out = channels(mi, base | {"observer": eye(mi, at), "visibility": kind, "map_height": 64}, sensor)
             finite.append(np.stack([out[k] for k in out if k != "rgb"]))
             share_seen[name, kind] = f"{out['visibility.Y'].mean():.0%}"
-    yield Row("observer elsewhere", ", ".join(places), "all channels, every kind of visibility", said(*finite), "finite")
+    yield Row(
+        "observer elsewhere", ", ".join(places), "all channels, every kind of visibility", said(*finite), "finite"
+    )
     for name, expected in (("inside solid matter", "0 %"), ("behind the camera", "100 %"), ("on the surface", "100 %")):
         got = ", ".join(f"{k} {share_seen[name, k]}" for k in ("depth", "transmittance", "map"))
         yield Row("", name, "share of the surface that is seen", got, expected)
@@ -109,7 +132,13 @@ def observers(mi):
     dr.enable_grad(v)
     distance, r_o = towards(mi.Point3f(0), v)
     dr.backward(distance + dr.sum(r_o))
-    yield Row("norm at zero", "d_o* = 0, 1e-18, 1e-9", "distance, direction and their derivatives", said(values(distance), values(r_o), values(dr.grad(v))), "finite")
+    yield Row(
+        "norm at zero",
+        "d_o* = 0, 1e-18, 1e-9",
+        "distance, direction and their derivatives",
+        said(values(distance), values(r_o), values(dr.grad(v))),
+        "finite",
+    )
 
 
 def falloffs(mi):
@@ -137,14 +166,25 @@ def acne(mi):
             for angle in (0, 60, 80, 85, 88, 89):
                 a = math.radians(angle)
                 integrator = {
-                    "type": "nerg", "density": cube(mi, sigma, (-10, -10, 2), (20, 20, 0.5)), "step": 0.01, "visibility": kind,
-                    "falloff": 0.0, "radiance": False, "aovs": "visibility", "map_height": 256,
+                    "type": "nerg",
+                    "density": cube(mi, sigma, (-10, -10, 2), (20, 20, 0.5)),
+                    "step": 0.01,
+                    "visibility": kind,
+                    "falloff": 0.0,
+                    "radiance": False,
+                    "aovs": "visibility",
+                    "map_height": 256,
                     "observer": eye(mi, (2 * math.sin(a), 0, 2 - 2 * math.cos(a))),
-                }  # fmt: skip
+                }
                 out = channels(mi, integrator, camera(mi, (0, 0.1, 0), (0, 0, 2), fov=20))
                 hidden.append(1 - out["visibility.Y"].mean())
-        yield Row("shadow acne" if kind == "depth" else "", f"0 .. 89°, σ 50 .. 1e6, falloff 0, {kind}", "share hidden of a wall in full view",
-                  max(hidden), "0")  # fmt: skip
+        yield Row(
+            "shadow acne" if kind == "depth" else "",
+            f"0 .. 89°, σ 50 .. 1e6, falloff 0, {kind}",
+            "share hidden of a wall in full view",
+            max(hidden),
+            "0",
+        )
 
 
 def silhouettes(mi):
@@ -153,8 +193,12 @@ def silhouettes(mi):
     z, y, x = np.meshgrid(*[(np.arange(n) + 0.5) / n * 2 - 1] * 3, indexing="ij")
     radius = np.sqrt((x / 0.5) ** 2 + (y / 0.5) ** 2 + ((z + 0.4) / 0.5) ** 2)
     data = np.where(z > 0.8, 1e3, 200 * np.clip((1.05 - radius) / 0.1, 0, 1)).astype(np.float32)
-    volume = {"type": "gridvolume", "grid": mi.VolumeGrid(data), "raw": True,
-              "to_world": mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)}  # fmt: skip
+    volume = {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(data),
+        "raw": True,
+        "to_world": mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
+    }
     for depth in ("expected", "median", "refined"):
         integrator = {"type": "nerg", "density": volume, "depth": depth, "radiance": False, "aovs": "opacity,position"}
         out = channels(mi, integrator, camera(mi, (0, 0, -6), (0, 0, 0), size=96, fov=16))
@@ -162,8 +206,13 @@ def silhouettes(mi):
         solid = out["opacity.Y"] > 0.5
         off_ball = np.linalg.norm((p - (0, 0, -0.4)) / 0.5, axis=-1) > 1.2
         flying = solid & off_ball & (p[..., 2] < 0.7)
-        yield Row("flying pixels" if depth == "expected" else "", "a soft ball before a wall, 96 x 96", f"{depth}: surfaces in mid-air",
-                  f"{flying.sum() / solid.sum():.2%}", "0 %")  # fmt: skip
+        yield Row(
+            "flying pixels" if depth == "expected" else "",
+            "a soft ball before a wall, 96 x 96",
+            f"{depth}: surfaces in mid-air",
+            f"{flying.sum() / solid.sum():.2%}",
+            "0 %",
+        )
 
 
 # ----------------------------------------------------------------------------
@@ -173,7 +222,11 @@ def silhouettes(mi):
 
 def films(mi):
     to_world = mi.ScalarTransform4f().translate([0, 0, -3]).scale([0.5, 0.5, 1])
-    sensor = lambda size, film=(): {**camera(mi, (0, 0, -3), (0, 0, 0), size, film=film), "type": "orthographic", "to_world": to_world}  # noqa: E731
+    sensor = lambda size, film=(): {
+        **camera(mi, (0, 0, -3), (0, 0, 0), size, film=film),
+        "type": "orthographic",
+        "to_world": to_world,
+    }
     plain = {"type": "nerg", "density": cube(mi, 1.0), "depth": "expected", "aovs": "depth,opacity", "step": 0.02}
 
     def strip(s):
@@ -182,11 +235,21 @@ def films(mi):
         return s
 
     expected = {"opacity.Y": -math.expm1(-2), "depth.T": 2 - 1e-3 + 2 * float(share(2.0))}
-    for name, size, spp in (("1 sample a pixel", 2, 1), ("4096 samples a pixel", 2, 4096), ("1000 x 1000 pixels", 1000, 1)):
+    for name, size, spp in (
+        ("1 sample a pixel", 2, 1),
+        ("4096 samples a pixel", 2, 4096),
+        ("1000 x 1000 pixels", 1000, 1),
+    ):
         out = channels(mi, plain, strip(sensor(size)), spp)
         errors = [worst(out[k], np.full_like(out[k], e)) for k, e in expected.items()]
-        yield Row("films" if spp == 1 and size == 2 else "", name, "opacity; depth", f"{errors[0]:.1e}; {errors[1]:.1e}", "closed form")
-    view = lambda film: camera(mi, (0.3, 0.2, -3), (0, 0, 0), 12, film=film)  # noqa: E731
+        yield Row(
+            "films" if spp == 1 and size == 2 else "",
+            name,
+            "opacity; depth",
+            f"{errors[0]:.1e}; {errors[1]:.1e}",
+            "closed form",
+        )
+    view = lambda film: camera(mi, (0.3, 0.2, -3), (0, 0, 0), 12, film=film)
     soft = {"type": "nerg", "density": cube(mi, 1.0), "aovs": "depth,opacity"}
     pixel_centres = {"sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
     whole = channels(mi, soft, view(()) | pixel_centres)
@@ -194,7 +257,7 @@ def films(mi):
     for x, y, w, h in ((3, 4, 5, 6), (11, 0, 1, 1), (0, 11, 12, 1)):
         crop = {"crop_offset_x": x, "crop_offset_y": y, "crop_width": w, "crop_height": h}
         part = channels(mi, soft, view(crop) | pixel_centres)
-        errors += [worst(part[k], whole[k][y:y + h, x:x + w], False) for k in expected]
+        errors += [worst(part[k], whole[k][y : y + h, x : x + w], False) for k in expected]
     yield Row("", "crops down to a pixel", "opacity, depth (absolute)", max(errors), "the crop of the whole")
     try:
         channels(mi, soft, view({"crop_width": 0, "crop_height": 0, "crop_offset_x": 0, "crop_offset_y": 0}))
@@ -212,8 +275,20 @@ def colours(mi):
 
     y, dy = gradient(mi.Float(alpha), composed)
     linear = ((0.25 + 0.055) / 1.055) ** 2.4
-    yield Row("colour at any opacity", "α 0 .. 1", "radiance (absolute)", worst(y, linear * alpha.astype(float), False), "closed form")
-    yield Row("", "α 1e-36 .. 1", "derivative with respect to α", worst(dy[1:], np.full(100, linear)) if said(dy) == "finite" else math.inf, "closed form")
+    yield Row(
+        "colour at any opacity",
+        "α 0 .. 1",
+        "radiance (absolute)",
+        worst(y, linear * alpha.astype(float), False),
+        "closed form",
+    )
+    yield Row(
+        "",
+        "α 1e-36 .. 1",
+        "derivative with respect to α",
+        worst(dy[1:], np.full(100, linear)) if said(dy) == "finite" else math.inf,
+        "closed form",
+    )
 
 
 def harmonics(mi):
@@ -221,4 +296,10 @@ def harmonics(mi):
     dr.enable_grad(d)
     total = sum(encode_direction(d, 4))
     dr.backward(total)
-    yield Row("directions along the axes", "poles and equator", "harmonics and their derivatives", said(values(total), values(dr.grad(d))), "finite")
+    yield Row(
+        "directions along the axes",
+        "poles and equator",
+        "harmonics and their derivatives",
+        said(values(total), values(dr.grad(d))),
+        "finite",
+    )

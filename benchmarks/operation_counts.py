@@ -5,6 +5,7 @@
 Prints a markdown table (docs/leave-out.md) and writes out/operation_counts.csv. Counts do not depend on the machine;
 seconds are medians of several runs, and only their ratios mean anything.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -13,10 +14,10 @@ import statistics
 import time
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import mitsuba as mi
-
 import nerg_mi.scenes.store
+
+import nerg_mi
 from nerg_mi.evaluation.study.operations import traced_operations
 
 STORE = Path(nerg_mi.scenes.store.__file__).parent
@@ -66,8 +67,13 @@ def scene(width: int, options: dict):
     }
     shapes = integrator.pop("shapes", {})
     integrator = {k: v for k, v in integrator.items() if v is not None}
-    film = {"type": "hdrfilm", "width": width, "height": width * 3 // 4, "component_format": "float32",
-            "rfilter": {"type": "box"}}
+    film = {
+        "type": "hdrfilm",
+        "width": width,
+        "height": width * 3 // 4,
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
     sensor = {"type": "perspective", "fov": 75, "to_world": look_at(CAMERA), "film": film}
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **shapes})
 
@@ -79,7 +85,7 @@ def evaluations(width: int, options: dict) -> list[float]:
         return [0.0, 0.0, 0.0]
     counts = ["density_evals", "color_evals"] + (["gaze_evals"] if "gaze" in asked else [])
     image = mi.render(scene(width, options | {"aovs": ",".join(asked + counts)}), spp=1).numpy()
-    means = image[..., 3 + len(asked):].mean((0, 1)).tolist()
+    means = image[..., 3 + len(asked) :].mean((0, 1)).tolist()
     return means + [0.0] * (3 - len(means))
 
 
@@ -106,7 +112,9 @@ def main() -> None:
             seconds.append(time.perf_counter() - start)
         rows.append([name, operations, *evaluations(args.width, options), statistics.median(seconds)])
 
-    print("| what | operations traced | density evals | colour evals | gaze evals | seconds |\n|---|---|---|---|---|---|")
+    print(
+        "| what | operations traced | density evals | colour evals | gaze evals | seconds |\n|---|---|---|---|---|---|"
+    )
     for name, operations, density, color, gaze, seconds in rows:
         print(f"| {name} | {operations:,} | {density:.1f} | {color:.1f} | {gaze:.2f} | {seconds:.3f} |")
     out = Path("out/operation_counts.csv")

@@ -1,4 +1,5 @@
 """What every benchmark writes beside the table that it prints."""
+
 from __future__ import annotations
 
 from pathlib import Path

@@ -3,11 +3,12 @@
     python benchmarks/radiance_robustness.py [--rows 1,2,40s,400s] [--threads 1,2] [--busy 0,2] [--validate] [--new]
                                              [--update docs/radiance-training.md]
 
-``--rows``: minutes, or steps with an "s". Each is run once for each number of ``--threads`` and of ``--busy`` loops beside
-it, in a process of its own, by ``train_radiance`` as the command runs it; held-out photos are rendered by the trainer.
-``--validate`` never opens them: every 8th of the training photos takes their place. The CSV keeps the rows of earlier calls
-(``--new``: drops them), so that the table can be measured in parts, and the table of all is printed.
+``--rows``: minutes, or steps with an "s". Each is run once for each number of ``--threads`` and of ``--busy`` loops
+beside it, in a process of its own, by ``train_radiance`` as the command runs it; held-out photos are rendered by the
+trainer. ``--validate`` never opens them: every 8th of the training photos takes their place. The CSV keeps the rows of
+earlier calls (``--new``: drops them), so that the table can be measured in parts, and the table of all is printed.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -74,20 +75,33 @@ def length(row: str) -> dict:
 def measure(row: str, threads: int, loops: int, args) -> dict:
     out = args.out / f"{row}_{threads}_{loops}.safetensors"
     job = length(row) | {
-        "benchmarks": str(HERE), "threads": threads, "data": str(args.data), "width": args.width,
-        "validate": args.validate, "seed": args.seed, "set": parse_settings(args.set), "out": str(out),
-    }  # fmt: skip
+        "benchmarks": str(HERE),
+        "threads": threads,
+        "data": str(args.data),
+        "width": args.width,
+        "validate": args.validate,
+        "seed": args.seed,
+        "set": parse_settings(args.set),
+        "out": str(out),
+    }
     with busy(loops):
         subprocess.run([sys.executable, "-c", _RUN, json.dumps(job)], check=True)
     about = json.loads(out.with_suffix(".json").read_text())
     ms = about["step_ms"]
     return {
         "length": f"{row[:-1]} steps" if row.endswith("s") else f"{row} min",
-        "threads": threads, "beside": f"{loops} loops" if loops else "nothing",
-        "steps": about["steps"], "seconds": about["seconds"], "evaluations_a_second": about["evaluations_a_second"],
-        "ms_min": ms["min"], "ms_median": ms["median"], "ms_max": ms["max"], "max_by_median": round(ms["max"] / ms["median"], 1),
-        "psnr": about["psnr_held_out"]["mean"], "warnings": len(about["complaints"]),
-    }  # fmt: skip
+        "threads": threads,
+        "beside": f"{loops} loops" if loops else "nothing",
+        "steps": about["steps"],
+        "seconds": about["seconds"],
+        "evaluations_a_second": about["evaluations_a_second"],
+        "ms_min": ms["min"],
+        "ms_median": ms["median"],
+        "ms_max": ms["max"],
+        "max_by_median": round(ms["max"] / ms["median"], 1),
+        "psnr": about["psnr_held_out"]["mean"],
+        "warnings": len(about["complaints"]),
+    }
 
 
 def _order(row: dict) -> tuple:
@@ -97,14 +111,36 @@ def _order(row: dict) -> tuple:
 
 def printed(rows: list[dict]) -> str:
     """The table of ``rows`` in Markdown."""
-    head = ("run", "threads", "beside", "steps", "seconds", "million evaluations a second", "least, median, most ms a step",
-            "most / median", "PSNR, dB", "warnings")  # fmt: skip
-    return table(head, [
-        (r["length"], r["threads"], r["beside"], f"{int(r['steps']):,}", f"{float(r['seconds']):.0f}",
-         f"{float(r['evaluations_a_second']) / 1e6:.2f}", f"{r['ms_min']}, {r['ms_median']}, {r['ms_max']}", r["max_by_median"],
-         f"{float(r['psnr']):.2f}", r["warnings"])
-        for r in sorted(rows, key=_order)
-    ])  # fmt: skip
+    head = (
+        "run",
+        "threads",
+        "beside",
+        "steps",
+        "seconds",
+        "million evaluations a second",
+        "least, median, most ms a step",
+        "most / median",
+        "PSNR, dB",
+        "warnings",
+    )
+    return table(
+        head,
+        [
+            (
+                r["length"],
+                r["threads"],
+                r["beside"],
+                f"{int(r['steps']):,}",
+                f"{float(r['seconds']):.0f}",
+                f"{float(r['evaluations_a_second']) / 1e6:.2f}",
+                f"{r['ms_min']}, {r['ms_median']}, {r['ms_max']}",
+                r["max_by_median"],
+                f"{float(r['psnr']):.2f}",
+                r["warnings"],
+            )
+            for r in sorted(rows, key=_order)
+        ],
+    )
 
 
 def main(argv=None) -> None:

@@ -2,11 +2,11 @@
 
     python benchmarks/rays.py [--rays 2600000] [--data FOLDER] [--out out/benchmarks/rays.csv]
 
-The rays are those of the VR supermarket, resampled: every copy of a recording is shifted by some decimetres and jittered by a
-centimetre and a degree. They are written as a CSV of nine columns, imported through a column map, saved, and asked for
-4,096 probes (R 0.1 m and 0.25 m, at most 1,024 rays) and for the kernel density of a picture of 1280 x 720 pixels (70 degrees wide)
-around an observer. `seconds` is wall-clock time, `cpu` processor time of all threads: on a machine that does other things
-besides, the second says more. Peak memory is that of the whole process.
+The rays are those of the VR supermarket, resampled: every copy of a recording is shifted by some decimetres and
+jittered by a centimetre and a degree. They are written as a CSV of nine columns, imported through a column map, saved,
+and asked for 4,096 probes (R 0.1 m and 0.25 m, at most 1,024 rays) and for the kernel density of a picture of 1280 x
+720 pixels (70 degrees wide) around an observer. `seconds` is wall-clock time, `cpu` processor time of all threads: on a
+machine that does other things besides, the second says more. Peak memory is that of the whole process.
 """
 
 from __future__ import annotations
@@ -35,9 +35,13 @@ def write_resampled(source, count: int, path: Path) -> None:
             origin = source.origin[:n] + shift + rng.normal(0, 0.01, (n, 3))
             d = source.direction[:n] + rng.normal(0, 0.02, (n, 3))
             d /= np.linalg.norm(d, axis=1, keepdims=True)
-            rows = zip(source.t[:n] + 1000 * copy, source.person[:n], origin.tolist(), d.tolist(), source.confidence[:n])
+            rows = zip(
+                source.t[:n] + 1000 * copy, source.person[:n], origin.tolist(), d.tolist(), source.confidence[:n]
+            )
             for t, person, o, v, c in rows:
-                out.write("%.3f,%s_%d,%.5f,%.5f,%.5f,%.6f,%.6f,%.6f,%.2f\n" % (t, source.persons[person], copy, *o, *v, c))
+                out.write(
+                    "%.3f,%s_%d,%.5f,%.5f,%.5f,%.6f,%.6f,%.6f,%.2f\n" % (t, source.persons[person], copy, *o, *v, c)
+                )
 
 
 def picture(width: int = 1280, height: int = 720, degrees: float = 70.0):
@@ -63,13 +67,13 @@ def main() -> None:
     import numpy as np
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.rays.index import RayIndex
     from nerg_mi.density.kde.frame import kde_frame, probe_at
-    from nerg_mi.rays.readers.presets import vr_supermarket
     from nerg_mi.density.probes import place_probes
+    from nerg_mi.rays.index import RayIndex
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.summary import summarise
+    from nerg_mi.rays.readers.presets import vr_supermarket
     from nerg_mi.rays.readers.tables import rays_from_table
+    from nerg_mi.rays.summary import summarise
 
     table = []
 
@@ -102,7 +106,11 @@ def main() -> None:
     queries = rays.origin[np.random.default_rng(1).choice(len(rays), min(4096, len(rays)), replace=False)]
     for radius in (0.1, 0.25):
         timed(f"index: 4,096 queries, R {radius} m, 1,024 rays", lambda: index.nearest(queries, 1024, radius), 3)
-        timed(f"4,096 probes, R {radius} m", lambda: place_probes(rays, radius, queries=queries, index=index, kappa_rule="fixed"), 3)
+        timed(
+            f"4,096 probes, R {radius} m",
+            lambda: place_probes(rays, radius, queries=queries, index=index, kappa_rule="fixed"),
+            3,
+        )
     directions = picture()
     observer = np.median(rays.origin[np.abs(rays.origin[:, 0] + 4.8) < 0.2], axis=0)
     for cap in (256, 1024, 4096):

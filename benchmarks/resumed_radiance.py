@@ -2,10 +2,11 @@
 
     python benchmarks/resumed_radiance.py [--data DIR] [--steps 300] [--width 60]
 
-At one thread and at two, on a posed image set (default: the fox). The killed run is a process of its own that gets SIGKILL
-once it has written a state after a third of its steps; a second process resumes from that file. Sums over threads come in no fixed
-order, so at two threads a second uninterrupted run gives the scale of that difference.
+At one thread and at two, on a posed image set (default: the fox). The killed run is a process of its own that gets
+SIGKILL once it has written a state after a third of its steps; a second process resumes from that file. Sums over
+threads come in no fixed order, so at two threads a second uninterrupted run gives the scale of that difference.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -19,9 +20,10 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import numpy as np
+from fox_radiance import default_data
+
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-import numpy as np  # noqa: E402
-from fox_radiance import default_data  # noqa: E402
 
 _RUN = """
 import sys
@@ -95,7 +97,10 @@ def main(argv=None) -> None:
             finish(start(args, threads, again))
         at = kill_after(start(args, threads, killed), killed.with_suffix(".run"), args.steps // 3)
         finish(start(args, threads, killed, resume=True))
-        print(f"{threads} thread(s): killed after step {at} of {args.steps}, resumed: {compare(whole, killed)}", flush=True)
+        print(
+            f"{threads} thread(s): killed after step {at} of {args.steps}, resumed: {compare(whole, killed)}",
+            flush=True,
+        )
         if threads > 1:
             print(f"{threads} threads: two runs without interruption: {compare(whole, again)}", flush=True)
 

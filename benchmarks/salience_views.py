@@ -1,16 +1,17 @@
 """Gaze learnt from salience images against gaze learnt from rays, where the law behind both is known: the demo store.
 
-    python benchmarks/salience_views.py [--places 150] [--turns 2] [--rays 150] [--out out/benchmarks/salience_views.csv]
+    python benchmarks/salience_views.py [--places 150] [--turns 2] [--rays 150] [--out
+    out/benchmarks/salience_views.csv]
 
-Cameras stand at random places of the floor at eye height and look about, level to 25 degrees down. What each sees of the
-store's attention law becomes a salience image of 64 x 48 pixels (82 x 66 degrees; what a model would say: gaze a pixel),
-written with its pose as transforms.json and read back, as `nerg train gaze --views --salience` reads it. Rays are drawn from
-the same law at the same places. The geometry is the store's shapes; the recipe is the default one, unchanged, or that of
-`--recipe`. Test positions are at least 2R from every camera; truth is the law in closed form in 2,048 directions of equal
-area, over the whole sphere, of which a view shows 12 %.
+Cameras stand at random places of the floor at eye height and look about, level to 25 degrees down. What each sees of
+the store's attention law becomes a salience image of 64 x 48 pixels (82 x 66 degrees; what a model would say: gaze a
+pixel), written with its pose as transforms.json and read back, as `nerg train gaze --views --salience` reads it. Rays
+are drawn from the same law at the same places. The geometry is the store's shapes; the recipe is the default one,
+unchanged, or that of `--recipe`. Test positions are at least 2R from every camera; truth is the law in closed form in
+2,048 directions of equal area, over the whole sphere, of which a view shows 12 %.
 
-`blind, of the views`: the density that the views agree on whatever the position. `blind, of the law`: the mean of the law
-over the places themselves, the best of that kind.
+`blind, of the views`: the density that the views agree on whatever the position. `blind, of the law`: the mean of the
+law over the places themselves, the best of that kind.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 37.0
 DIRECTIONS = 2048
@@ -35,7 +37,9 @@ def places(count: int, away: np.ndarray, rng) -> np.ndarray:
     from nerg_mi.scenes.store.layout import ROOM, build
     from nerg_mi.scenes.store.shoppers import BODY, EYE_HEIGHT, floor_clearance
 
-    at = np.stack([rng.uniform(0, ROOM[0], 20000), rng.uniform(0, ROOM[1], 20000), rng.uniform(*EYE_HEIGHT, 20000)], axis=1)
+    at = np.stack(
+        [rng.uniform(0, ROOM[0], 20000), rng.uniform(0, ROOM[1], 20000), rng.uniform(*EYE_HEIGHT, 20000)], axis=1
+    )
     at = at[floor_clearance(build(), at[:, :2]) > BODY]
     if len(away):
         at = at[np.linalg.norm(at[:, None] - away, axis=2).min(axis=1) > 2 * RADIUS]
@@ -56,8 +60,8 @@ def write_views(folder: Path, law, positions: np.ndarray, rng) -> None:
     import mitsuba as mi
 
     from nerg_mi.capture.cameras import pixel_directions
-    from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
     from nerg_mi.capture.intrinsics import Intrinsics
+    from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
 
     lens = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     local, solid = pixel_directions(lens).reshape(-1, 3), pixel_solid_angles(lens)
@@ -79,28 +83,30 @@ def draw_rays(law, positions: np.ndarray, count: int, rng):
 
     origin = np.repeat(positions, count, axis=0)
     n = len(origin)
-    return Rays(np.arange(n) / 5.0, np.arange(n) % 10, tuple("abcdefghij"), origin, law.sample(origin, rng), np.ones(n), None)
+    return Rays(
+        np.arange(n) / 5.0, np.arange(n) % 10, tuple("abcdefghij"), origin, law.sample(origin, rng), np.ones(n), None
+    )
 
 
 def main(argv=None) -> list[dict]:
+    import mitsuba as mi
     from output import write_rows
 
-    import mitsuba as mi
-
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.maths.sphere import fibonacci_directions
+    from nerg_mi.scenes import store
+    from nerg_mi.scenes.store.attention_law import AttentionLaw
+
     from nerg_mi.capture.salience.views import open_salience
     from nerg_mi.evaluation.gaze import baselines
     from nerg_mi.evaluation.gaze.scores import gaze_field, print_scores, score_rows
     from nerg_mi.field.backend import namespace
     from nerg_mi.field.gaze.log_density import look_up
-    from nerg_mi.scenes import store
-    from nerg_mi.scenes.store.attention_law import AttentionLaw
-    from nerg_mi.training.geometry.places import place_of_scene
+    from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.training.gaze.recipes import gaze_recipe
     from nerg_mi.training.gaze.run import train_gaze
-    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
     from nerg_mi.training.gaze.salience import blind_of_views
+    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+    from nerg_mi.training.geometry.places import place_of_scene
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--places", type=int, default=150)
@@ -130,15 +136,21 @@ def main(argv=None) -> list[dict]:
     of_views = lambda p, d: np.tile(np.exp(np.array(look_up(seen, 64, vectors(d)))), (len(p), 1))
     of_law = law.density(stood, directions).mean(axis=0)
     methods = {
-        "uniform": baselines.uniform(), "blind, of the views": of_views,
-        "blind, of the law": lambda p, d: np.tile(of_law, (len(p), 1)), "4,096 nearest rays": baselines.nearest_rays(rays, 4096),
-    }  # fmt: skip
+        "uniform": baselines.uniform(),
+        "blind, of the views": of_views,
+        "blind, of the law": lambda p, d: np.tile(of_law, (len(p), 1)),
+        "4,096 nearest rays": baselines.nearest_rays(rays, 4096),
+    }
     recipe = gaze_recipe(args.recipe)
     # As the command does where there are no rays; and the scores of the others then compare.
     config = place.told(recipe.config if args.recipe == "default" else replace(recipe.config, normalized=True))
     given = {"seed": args.seed} | ({"steps": args.steps} if args.steps else {})
     how, spent = ProbeSettings(**recipe.probes | {"radius": RADIUS}), {}
-    for label, r, v in ((f"rays, {len(rays):,}", rays, ()), (f"views, {len(views)}", None, views), ("both", rays, views)):
+    for label, r, v in (
+        (f"rays, {len(rays):,}", rays, ()),
+        (f"views, {len(views)}", None, views),
+        ("both", rays, views),
+    ):
         started = time.process_time()
         controls = GazeSettings(**recipe.settings | (recipe.views_alone if r is None else {}) | given)
         field, about = train_gaze(r, place.medium, place.box, config, controls, how, ns, views=v)
@@ -146,7 +158,9 @@ def main(argv=None) -> list[dict]:
         print(f"{label}: {about['steps']} steps, {spent[label]:.0f} s of CPU")
         methods[label] = gaze_field(field, place.medium)
     rows = score_rows(truth, tests, directions, methods)
-    print_scores(rows, f"{len(tests)} held-out positions against the law, over the sphere ({len(stood)} places trained on)")
+    print_scores(
+        rows, f"{len(tests)} held-out positions against the law, over the sphere ({len(stood)} places trained on)"
+    )
     write_rows(args.out, rows)
     return rows
 

@@ -2,15 +2,15 @@
 
     python benchmarks/store_gaze.py [--gaze FILE] [--field FILE] [--rays FILE] [--out out/benchmarks/store_gaze.csv]
 
-The test positions are those that the gaze checkpoint says were held out (`nerg train gaze --test-zones`): shoppers stood
-there, and every ray within 2R of one was left out of the training. Truth is the attention law in closed form, in 2,048
-directions of equal area. Baselines see the rays that the field was trained on: the density of all rays whatever the
-position, the densities of the nearest probes, and that of the 4,096 nearest rays; each with two kernels, the training's
-and a wider one.
+The test positions are those that the gaze checkpoint says were held out (`nerg train gaze --test-zones`): shoppers
+stood there, and every ray within 2R of one was left out of the training. Truth is the attention law in closed form, in
+2,048 directions of equal area. Baselines see the rays that the field was trained on: the density of all rays whatever
+the position, the densities of the nearest probes, and that of the 4,096 nearest rays; each with two kernels, the
+training's and a wider one.
 
-KLD is of densities normalised over the sphere, with 1e-6 of the uniform density added to both; MAE and `integral` are of
-the densities as they are. `law, seen by as many rays` is the kernel density of fresh draws from the law itself at the test
-position, as many as a probe holds: what a probe of perfect data would score.
+KLD is of densities normalised over the sphere, with 1e-6 of the uniform density added to both; MAE and `integral` are
+of the densities as they are. `law, seen by as many rays` is the kernel density of fresh draws from the law itself at
+the test position, as many as a probe holds: what a probe of perfect data would score.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 
 DIRECTIONS = 2048
 
@@ -37,21 +38,21 @@ def fresh_draws(law, count: int, kappa: float):
 
 
 def main(argv=None) -> None:
+    import mitsuba as mi
     from output import write_rows
 
-    import mitsuba as mi
-
     mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.scenes import store
+    from nerg_mi.scenes.store.attention_law import AttentionLaw
+
     from nerg_mi.density.probes import place_probes
-    from nerg_mi.rays.rays import Rays
-    from nerg_mi.maths.sphere import fibonacci_directions
-    from nerg_mi.rays.splits import purge
     from nerg_mi.evaluation.gaze import baselines
     from nerg_mi.evaluation.gaze.scores import EPS, gaze_field, print_scores, score_rows
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_gaze, load_radiance
-    from nerg_mi.scenes import store
-    from nerg_mi.scenes.store.attention_law import AttentionLaw
+    from nerg_mi.maths.sphere import fibonacci_directions
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.rays.splits import purge
     from nerg_mi.transport.media.media import FieldMedium
 
     here = Path(store.__file__).resolve().parent
@@ -77,19 +78,35 @@ def main(argv=None) -> None:
     how = about["probes"]
     # Of the silverman and loo rules there is no single kappa; the default stands for them.
     narrow = how["kappa"]
-    methods = {"gaze field": gaze_field(gaze, medium, kind=how["depth"]),
-               "position-blind, kappa 50": baselines.position_blind(train, kappa=50)}  # fmt: skip
+    methods = {
+        "gaze field": gaze_field(gaze, medium, kind=how["depth"]),
+        "position-blind, kappa 50": baselines.position_blind(train, kappa=50),
+    }
     for kappa in (narrow, args.wide):
-        probes = place_probes(train, radius, count=how["count"], cap=how["cap"], min_rays=how["min_rays"],
-                              kappa_rule="fixed", kappa=kappa, seed=0)  # fmt: skip
-        methods |= {f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": baselines.nearest_probes(probes, k) for k in (1, 16)}
+        probes = place_probes(
+            train,
+            radius,
+            count=how["count"],
+            cap=how["cap"],
+            min_rays=how["min_rays"],
+            kappa_rule="fixed",
+            kappa=kappa,
+            seed=0,
+        )
+        methods |= {
+            f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": baselines.nearest_probes(probes, k) for k in (1, 16)
+        }
         methods[f"4,096 nearest rays, kappa {kappa:g}"] = baselines.nearest_rays(train, 4096, kappa=kappa)
     methods[f"law, seen by {how['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(law, how["cap"], narrow)
     rows = score_rows(truth, positions, directions, methods)
-    print_scores(rows, f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)")
+    print_scores(
+        rows, f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)"
+    )
     integral = 4 * np.pi * methods["gaze field"](positions, directions).mean(axis=1)
-    print(f"integral of the gaze field over the sphere: mean {integral.mean():.3f}, "
-          f"{integral.min():.3f} to {integral.max():.3f}; KLD with eps {EPS:g} of the uniform density")
+    print(
+        f"integral of the gaze field over the sphere: mean {integral.mean():.3f}, "
+        f"{integral.min():.3f} to {integral.max():.3f}; KLD with eps {EPS:g} of the uniform density"
+    )
     write_rows(args.out, rows)
 
 

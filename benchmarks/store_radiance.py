@@ -1,11 +1,15 @@
-"""The store, a room seen from inside, trained from its pictures alone and with their depth: PSNR, depth, opacity of its walls.
+"""The store, a room seen from inside, trained from its pictures alone and with their depth: PSNR, depth, opacity of its
+walls.
 
     python -m nerg_mi.scenes.store.make --stage views          # the pictures, rendered from the twin
-    python benchmarks/store_radiance.py [--minutes 10] [--size small] [--views DIR] [--only images|depth] [--set hold=0.5]
+    python benchmarks/store_radiance.py [--minutes 10] [--size small] [--views DIR] [--only images|depth] [--set
+    hold=0.5]
 
-Scores are those of `nerg eval radiance` on the held-out views (the `nerg` integrator at its defaults, median depth), against exact
-ray casts to the twin. ``--validate`` leaves the held-out views alone: every 8th of the training views takes their place.
+Scores are those of `nerg eval radiance` on the held-out views (the `nerg` integrator at its defaults, median depth),
+against exact ray casts to the twin. ``--validate`` leaves the held-out views alone: every 8th of the training views
+takes their place.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -48,23 +52,35 @@ def main(argv=None) -> None:
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.training.radiance.trainer import RadianceTrainer
     from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
     from nerg_mi.training.radiance.warm_up import warm_up
 
     if not args.views.exists():
-        raise SystemExit(f"{args.views} does not exist; make the pictures with: python -m nerg_mi.scenes.store.make --stage views")
+        raise SystemExit(
+            f"{args.views} does not exist; make the pictures with: python -m nerg_mi.scenes.store.make --stage views"
+        )
     data = open_dataset(args.views)
     data = validation(data) if args.validate else data
     settings = RadianceSettings(minutes=args.minutes, seed=args.seed, **parse_settings(args.set))
     args.out.mkdir(parents=True, exist_ok=True)
-    print(f"{len(data.train)} views to train on, {len(data.held_out)} to score, {data.source['width']} x {data.source['height']}")
-    print(f"{'from':>7s} {'minutes':>8s} {'steps':>6s} {'PSNR dB':>8s} {'SSIM':>6s} {'median cm':>10s} {'mean cm':>8s} "
-          f"{'> 10 %':>7s} {'opacity':>8s} {'< 0.9':>6s} {'load':>5s}")
+    print(
+        f"{len(data.train)} views to train on, {len(data.held_out)} to score, {data.source['width']} x {data.source['height']}"
+    )
+    print(
+        f"{'from':>7s} {'minutes':>8s} {'steps':>6s} {'PSNR dB':>8s} {'SSIM':>6s} {'median cm':>10s} {'mean cm':>8s} "
+        f"{'> 10 %':>7s} {'opacity':>8s} {'< 0.9':>6s} {'load':>5s}"
+    )
     rows = []
     for source in ("images", "depth") if args.only is None else (args.only,):
-        trainer = RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, namespace("llvm_ad_rgb"),
-                                  depth=source == "depth")
+        trainer = RadianceTrainer(
+            data.train,
+            data.box,
+            sized_config(args.size, data.box),
+            settings,
+            namespace("llvm_ad_rgb"),
+            depth=source == "depth",
+        )
         warm_up(trainer)
         begin = time.process_time()
         while trainer.progress < 1:
@@ -74,14 +90,29 @@ def main(argv=None) -> None:
         save_radiance(trainer.field(), path, {"minutes": minutes, "settings": settings.to_dict()})
         scores = score_views(path, data.held_out, args.spp, args.out / source)
         depth = scores["depth"]
-        rows.append({
-            "from": source, "size": args.size, "minutes": minutes, "cpu_minutes": cpu / 60, "steps": trainer.steps,
-            "psnr": scores["psnr_mean"], "ssim": scores["ssim_mean"], "depth_median": depth["median"], "depth_mean": depth["mean"],
-            "depth_off": depth["off"], "opacity": depth["opacity"], "translucent": depth["translucent"], "load": load,
-        })  # fmt: skip
-        print(f"{source:>7s} {minutes:8.1f} {trainer.steps:6d} {scores['psnr_mean']:8.2f} {scores['ssim_mean']:6.3f} "
-              f"{100 * depth['median']:10.2f} {100 * depth['mean']:8.2f} {depth['off']:7.2%} {depth['opacity']:8.4f} "
-              f"{depth['translucent']:6.2%} {load:5.1f}", flush=True)
+        rows.append(
+            {
+                "from": source,
+                "size": args.size,
+                "minutes": minutes,
+                "cpu_minutes": cpu / 60,
+                "steps": trainer.steps,
+                "psnr": scores["psnr_mean"],
+                "ssim": scores["ssim_mean"],
+                "depth_median": depth["median"],
+                "depth_mean": depth["mean"],
+                "depth_off": depth["off"],
+                "opacity": depth["opacity"],
+                "translucent": depth["translucent"],
+                "load": load,
+            }
+        )
+        print(
+            f"{source:>7s} {minutes:8.1f} {trainer.steps:6d} {scores['psnr_mean']:8.2f} {scores['ssim_mean']:6.3f} "
+            f"{100 * depth['median']:10.2f} {100 * depth['mean']:8.2f} {depth['off']:7.2%} {depth['opacity']:8.4f} "
+            f"{depth['translucent']:6.2%} {load:5.1f}",
+            flush=True,
+        )
     table = args.out / "store_radiance.csv"
     write_rows(table, rows)
 

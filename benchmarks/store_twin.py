@@ -1,21 +1,22 @@
 """The store as shapes against the store as a field, and a new display put into the field.
 
-    python benchmarks/store_twin.py [--pair NAME] [--width 120] [--out out/benchmarks/store_twin.csv] [--picture FILE.png]
+    python benchmarks/store_twin.py [--pair NAME] [--width 120] [--out out/benchmarks/store_twin.csv] [--picture
+    FILE.png]
 
 First table: `scenes/store/scene.xml` (a trained field) and `scenes/store/shapes.xml` (no field: the triangles that its
-training pictures were taken of) with the same camera, observer, gaze field and rays (one a pixel). Depth in cm along the
-ray; `agree` is the share of pixels with the same visibility (over or under 1/2); gaze as the mean absolute difference over
-the mean gaze of the shapes, over all pixels, over those away from silhouettes (as in store_visibility.py) and, of these,
-over those where visibility agrees; `colour dB` is the PSNR of the linear picture, clipped to 0..1, against path
-tracing, whose noise is taken out.
-`shapes cm` and `shapes agree`: the shapes' own depth, and visibility with a fall-off of 0, against ray casts made outside of
-the integrator.
+training pictures were taken of) with the same camera, observer, gaze field and rays (one a pixel). Depth in cm along
+the ray; `agree` is the share of pixels with the same visibility (over or under 1/2); gaze as the mean absolute
+difference over the mean gaze of the shapes, over all pixels, over those away from silhouettes (as in
+store_visibility.py) and, of these, over those where visibility agrees; `colour dB` is the PSNR of the linear picture,
+clipped to 0..1, against path tracing, whose noise is taken out.
+`shapes cm` and `shapes agree`: the shapes' own depth, and visibility with a fall-off of 0, against ray casts made
+outside of the integrator.
 
 Second table: `scenes/store/display.xml` against the same scene with the display moved out of the room. What must be
 hidden is computed by float64 intersections with the display's boxes: by the camera's rays, and by the segments from the
 observer to the field's surface. Boxes 3 cm smaller decide what must be dark, boxes 3 cm larger what must not change.
-Then the same with the display in the store of shapes (`-D place=shapes.xml`), with a fall-off of 0, against `shapes.xml`: there
-boxes are 2 mm smaller and larger, and what is hidden lies 2 mm behind the display or more.
+Then the same with the display in the store of shapes (`-D place=shapes.xml`), with a fall-off of 0, against
+`shapes.xml`: there boxes are 2 mm smaller and larger, and what is hidden lies 2 mm behind the display or more.
 """
 
 from __future__ import annotations
@@ -24,19 +25,20 @@ import argparse
 import sys
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.store_visibility import PAIRS, near_edges  # noqa: E402
+from benchmarks.store_visibility import PAIRS, near_edges
 
 AOVS = "opacity,position,visibility,gaze"
 BOXES = np.array([[(4.40, 4.65, 0.00), (4.90, 5.00, 0.95)], [(4.40, 4.96, 0.95), (4.90, 5.00, 1.45)]])
 """The display of display.xml, lower and upper corners in metres."""
 EYE, CAMERA, TARGET = "4.4, 2.8, 1.6", "5.75, 4.2, 2.1", "4.7, 4.95, 0.8"
-# How far a surface must lie behind the display to be dark (fall-off, tolerance, and what light goes into it), and by how much
-# boxes are smaller and larger; for shapes without a fall-off only the tolerance of 1 mm counts.
+# How far a surface must lie behind the display to be dark (fall-off, tolerance, and what light goes into it), and by
+# how much boxes are smaller and larger; for shapes without a fall-off only the tolerance of 1 mm counts.
 BEHIND, MARGIN = 0.15, 0.03
 SHARP = 0.002
 
@@ -71,8 +73,14 @@ def look(scene, spp=1, seed=1) -> dict:
 
     image = np.array(mi.render(scene, sensor=0, spp=spp, seed=seed), np.float64)
     opacity, visibility, gaze = image[..., 3], image[..., 7], image[..., 8]
-    return {"color": image[..., :3], "opacity": opacity, "surface": opacity >= 0.5, "p": image[..., 4:7],
-            "visibility": visibility, "gaze": gaze}  # fmt: skip
+    return {
+        "color": image[..., :3],
+        "opacity": opacity,
+        "surface": opacity >= 0.5,
+        "p": image[..., 4:7],
+        "visibility": visibility,
+        "gaze": gaze,
+    }
 
 
 def load(scene: Path, width: int, **values):
@@ -92,8 +100,10 @@ def measure(folder: Path, pair: str, width: int, files: dict, color_spp: int) ->
 
     camera, target, eye = PAIRS[pair]
     values = {"camera": camera, "target": target, "eye": eye} | {k: v for k, v in files.items() if k == "gaze"}
-    field, shapes = (look(load(folder / name, width, radiance="false", **values | extra))
-                     for name, extra in (("scene.xml", files), ("shapes.xml", {})))  # fmt: skip
+    field, shapes = (
+        look(load(folder / name, width, radiance="false", **values | extra))
+        for name, extra in (("scene.xml", files), ("shapes.xml", {}))
+    )
     both = field["surface"] & shapes["surface"]
     o, e = vector(camera), vector(eye)
     z, exact = (np.linalg.norm(v["p"] - o, axis=-1) for v in (field, shapes))
@@ -109,12 +119,20 @@ def measure(folder: Path, pair: str, width: int, files: dict, color_spp: int) ->
     gaze = np.abs(field["gaze"] - shapes["gaze"])
     mean = shapes["gaze"][both].mean()
     row = {
-        "pair": pair, "median cm": np.median(error[both]), "p90 cm": np.percentile(error[both], 90),
-        "p90 cm away": np.percentile(error[away], 90), "agree": (shown == seen)[both].mean(),
-        "agree away": (shown == seen)[away].mean(), "gaze mean": mean, "gaze": gaze[both].mean() / mean,
-        "gaze away": gaze[away].mean() / mean, "gaze away, agreeing": gaze[away & (shown == seen)].mean() / mean,
-        "shapes cm": 100 * np.abs(exact[both] - cast).max(), "shapes agree": (sharp == truth)[both].mean(), "away": away.mean(),
-    }  # fmt: skip
+        "pair": pair,
+        "median cm": np.median(error[both]),
+        "p90 cm": np.percentile(error[both], 90),
+        "p90 cm away": np.percentile(error[away], 90),
+        "agree": (shown == seen)[both].mean(),
+        "agree away": (shown == seen)[away].mean(),
+        "gaze mean": mean,
+        "gaze": gaze[both].mean() / mean,
+        "gaze away": gaze[away].mean() / mean,
+        "gaze away, agreeing": gaze[away & (shown == seen)].mean() / mean,
+        "shapes cm": 100 * np.abs(exact[both] - cast).max(),
+        "shapes agree": (sharp == truth)[both].mean(),
+        "away": away.mean(),
+    }
     if color_spp:
         values["width"] = width // 2
         scene = load(folder / "shapes.xml", **values)
@@ -143,8 +161,8 @@ def move_away(scene) -> None:
 
 
 def measure_display(folder: Path, width: int, files: dict, shapes: bool = False) -> dict:
-    """What the display hides: counts of pixels and the shares of them that are as they must be. ``shapes``: of the store
-    without a field."""
+    """What the display hides: counts of pixels and the shares of them that are as they must be. ``shapes``: of the
+    store without a field."""
     from nerg_mi.scenes.store import twin
 
     place, behind, margin = "scene.xml", BEHIND, MARGIN
@@ -157,8 +175,7 @@ def measure_display(folder: Path, width: int, files: dict, shapes: bool = False)
     if not shapes:
         move_away(scene)
         bare = look(scene)
-    plain = look(load(folder / place, width, radiance="false", eye=EYE, camera=CAMERA,
-                      target=TARGET, **files))  # fmt: skip
+    plain = look(load(folder / place, width, radiance="false", eye=EYE, camera=CAMERA, target=TARGET, **files))
     if shapes:
         # A display a kilometre away would make the scene, and with it the tolerance, larger.
         bare = plain
@@ -174,7 +191,9 @@ def measure_display(folder: Path, width: int, files: dict, shapes: bool = False)
     was_seen = off & (bare["visibility"] > 0)
     dark = was_seen & shadowed(eye, bare["p"], -margin, behind)
     free = off & ~shadowed(eye, bare["p"], margin, -margin)
-    same = np.all([there[k] == bare[k] for k in ("opacity", "visibility", "gaze")], axis=0) & (there["p"] == bare["p"]).all(-1)
+    same = np.all([there[k] == bare[k] for k in ("opacity", "visibility", "gaze")], axis=0) & (
+        there["p"] == bare["p"]
+    ).all(-1)
 
     # On the display itself: what of it the observer sees, by the boxes and by the rest of the store.
     # The point lies in front of it, as far as the tolerance of shapes is, or by a little more than rounding.
@@ -184,17 +203,26 @@ def measure_display(folder: Path, width: int, files: dict, shapes: bool = False)
     # Faces turned away from the observer fade over the tolerance and the fall-off from their edge on.
     faded = ~seen & ~shadowed(eye, q, 0.0, SHARP if shapes else 0.1) & twin.visible(eye, q)
     return {
-        "on": on.sum(), "display_depth_cm": 100 * np.abs(depth - entry)[on].max(),
-        "display_depth_right": (np.abs(depth - entry)[on] < 1e-3).mean(), "display_faded": faded.mean(),
+        "on": on.sum(),
+        "display_depth_cm": 100 * np.abs(depth - entry)[on].max(),
+        "display_depth_right": (np.abs(depth - entry)[on] < 1e-3).mean(),
+        "display_faded": faded.mean(),
         "display_visibility": (shown == seen)[~faded].mean(),
-        "display_gaze": there["gaze"][on][shown].mean(), "behind_gaze": bare["gaze"][on].mean(),
-        "off": off.sum(), "off_depth_same": (there["p"] == bare["p"])[off].mean(),
-        "dark": dark.sum(), "dark_gaze_0": (there["gaze"][dark] == 0).mean(), "dark_gaze_before": bare["gaze"][dark].mean(),
-        "free": free.sum(), "free_same": same[free].mean(),
+        "display_gaze": there["gaze"][on][shown].mean(),
+        "behind_gaze": bare["gaze"][on].mean(),
+        "off": off.sum(),
+        "off_depth_same": (there["p"] == bare["p"])[off].mean(),
+        "dark": dark.sum(),
+        "dark_gaze_0": (there["gaze"][dark] == 0).mean(),
+        "dark_gaze_before": bare["gaze"][dark].mean(),
+        "free": free.sum(),
+        "free_same": same[free].mean(),
         "undecided": (off & ~free & ~dark & (bare["visibility"] > 0)).sum(),
-        "bare_is_scene": np.abs(bare["p"] - plain["p"]).max(), "bare_gaze_is_scene": np.abs(bare["gaze"] - plain["gaze"]).max(),
-        "attention_before": bare["gaze"][met].sum(), "attention_after": there["gaze"][met].sum(),
-    }  # fmt: skip
+        "bare_is_scene": np.abs(bare["p"] - plain["p"]).max(),
+        "bare_gaze_is_scene": np.abs(bare["gaze"] - plain["gaze"]).max(),
+        "attention_before": bare["gaze"][met].sum(),
+        "attention_after": there["gaze"][met].sum(),
+    }
 
 
 def picture(folder: Path, path: Path, width: int, spp: int, files: dict) -> None:
@@ -219,9 +247,15 @@ def main(argv=None) -> None:
     parser.add_argument("--field", type=Path, help="checkpoint (default: that of the store)")
     parser.add_argument("--gaze", type=Path, help="checkpoint of the gaze field (default: the store's)")
     parser.add_argument("--width", type=int, default=120, help="width of a picture in pixels (3:2)")
-    parser.add_argument("--color-spp", type=int, default=64,
-                        help="paths a pixel for the colours of the shapes, at half the width; 0: no colours")  # fmt: skip
-    parser.add_argument("--pair", action="append", choices=list(PAIRS), help="only this one; may be given several times")
+    parser.add_argument(
+        "--color-spp",
+        type=int,
+        default=64,
+        help="paths a pixel for the colours of the shapes, at half the width; 0: no colours",
+    )
+    parser.add_argument(
+        "--pair", action="append", choices=list(PAIRS), help="only this one; may be given several times"
+    )
     parser.add_argument("--no-display", action="store_true", help="the first table only")
     parser.add_argument("--display-only", action="store_true", help="the second table only")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/store_twin.csv"), help="CSV file to write")

@@ -2,17 +2,17 @@
 
     python benchmarks/store_visibility.py [--field FILE] [--width 240] [--out out/benchmarks/store_visibility.csv]
 
-For several pairs of a camera and an observer, the integrator `nerg` renders depth, position and visibility (falloff 0, one
-ray a pixel). The same rays are cast at the twin. A pixel agrees when visibility is 1 where the twin lets the observer see
-the surface that this pixel's ray meets in the twin, and 0 where it does not.
+For several pairs of a camera and an observer, the integrator `nerg` renders depth, position and visibility (falloff 0,
+one ray a pixel). The same rays are cast at the twin. A pixel agrees when visibility is 1 where the twin lets the
+observer see the surface that this pixel's ray meets in the twin, and 0 where it does not.
 
-Away from silhouettes: pixels within `--margin` pixels of a discontinuity of the exact depth or of the exact visibility are
-left out; there a centimetre decides, and a field has no edges finer than its grid. How many that are is a column.
+Away from silhouettes: pixels within `--margin` pixels of a discontinuity of the exact depth or of the exact visibility
+are left out; there a centimetre decides, and a field has no edges finer than its grid. How many that are is a column.
 
-Columns: `agree` away from silhouettes, of it the share `wrongly seen` and `wrongly hidden`; `agree all` with silhouettes;
-`agree own`: the exact test is made at the field's own surface point instead of the twin's (5 cm before it are not tested);
-`kept` share of pixels away from silhouettes; `visible` share of pixels that are exactly visible; errors of depth in cm over
-all pixels with a surface, `p90 cm away` over those away from silhouettes.
+Columns: `agree` away from silhouettes, of it the share `wrongly seen` and `wrongly hidden`; `agree all` with
+silhouettes; `agree own`: the exact test is made at the field's own surface point instead of the twin's (5 cm before it
+are not tested); `kept` share of pixels away from silhouettes; `visible` share of pixels that are exactly visible;
+errors of depth in cm over all pixels with a surface, `p90 cm away` over those away from silhouettes.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ import argparse
 import time
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 
 # name: (camera, target, eye). Cameras see over or around shelves; eyes are a shopper's.
 PAIRS = {
@@ -58,13 +59,22 @@ def near_edges(depth: np.ndarray, visible: np.ndarray, margin: int) -> np.ndarra
 def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, width: int, margin: int) -> dict:
     """One row of the table."""
     import mitsuba as mi
-
     from nerg_mi.scenes.store import twin
 
     camera, target, eye = PAIRS[pair]
-    values = {"camera": camera, "target": target, "eye": eye, "width": str(width), "height": str(2 * width // 3),
-              "depth": kind, "visibility": visibility, "falloff": "0", "radiance": "false",
-              "aovs": "opacity,position,visibility", **files}  # fmt: skip
+    values = {
+        "camera": camera,
+        "target": target,
+        "eye": eye,
+        "width": str(width),
+        "height": str(2 * width // 3),
+        "depth": kind,
+        "visibility": visibility,
+        "falloff": "0",
+        "radiance": "false",
+        "aovs": "opacity,position,visibility",
+        **files,
+    }
     loaded = mi.load_file(str(scene), **values)
     start = time.perf_counter()
     picture = np.array(mi.render(loaded, sensor=0, spp=1, seed=1), np.float64)[..., 3:]
@@ -88,14 +98,24 @@ def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, wid
     shown = seen > 0.5
     error = 100 * np.abs(depth - exact)[surface]
     return {
-        "pair": pair, "depth": kind, "visibility": visibility,
-        "agree": (shown == truth)[far].mean(), "wrongly seen": (shown & ~truth)[far].mean(),
-        "wrongly hidden": (~shown & truth)[far].mean(), "agree all": (shown == truth)[surface].mean(),
-        "agree own": (shown == own)[far].mean(), "kept": far.mean(), "visible": truth[surface].mean(),
-        "no surface": 1 - surface.mean(), "median cm": np.median(error), "p90 cm": np.percentile(error, 90),
-        "within 5 cm": (error < 5).mean(), "within 10 cm": (error < 10).mean(),
-        "p90 cm away": np.percentile(100 * np.abs(depth - exact)[far], 90), "seconds": seconds,
-    }  # fmt: skip
+        "pair": pair,
+        "depth": kind,
+        "visibility": visibility,
+        "agree": (shown == truth)[far].mean(),
+        "wrongly seen": (shown & ~truth)[far].mean(),
+        "wrongly hidden": (~shown & truth)[far].mean(),
+        "agree all": (shown == truth)[surface].mean(),
+        "agree own": (shown == own)[far].mean(),
+        "kept": far.mean(),
+        "visible": truth[surface].mean(),
+        "no surface": 1 - surface.mean(),
+        "median cm": np.median(error),
+        "p90 cm": np.percentile(error, 90),
+        "within 5 cm": (error < 5).mean(),
+        "within 10 cm": (error < 10).mean(),
+        "p90 cm away": np.percentile(100 * np.abs(depth - exact)[far], 90),
+        "seconds": seconds,
+    }
 
 
 def table(rows: list[dict]) -> None:
@@ -109,16 +129,20 @@ def table(rows: list[dict]) -> None:
         out.add_column(k, justify="left" if isinstance(rows[0][k], str) else "right", no_wrap=k == "pair")
 
     def cells(row):
-        return [v if isinstance(v, str) else f"{v:.2f}" if k in CENTIMETRES else f"{100 * v:.2f}"
-                for k, v in ((k, row[k]) for k in names)]  # fmt: skip
+        return [
+            v if isinstance(v, str) else f"{v:.2f}" if k in CENTIMETRES else f"{100 * v:.2f}"
+            for k, v in ((k, row[k]) for k in names)
+        ]
 
     for row in rows:
         out.add_row(*cells(row))
     out.add_section()
     for key in dict.fromkeys((r["depth"], r["visibility"]) for r in rows):
         mine = [r for r in rows if (r["depth"], r["visibility"]) == key]
-        mean = {k: "mean" if k == "pair" else v if isinstance(v, str) else float(np.mean([r[k] for r in mine]))
-                for k, v in mine[0].items()}  # fmt: skip
+        mean = {
+            k: "mean" if k == "pair" else v if isinstance(v, str) else float(np.mean([r[k] for r in mine]))
+            for k, v in mine[0].items()
+        }
         out.add_row(*cells(mean), style="bold")
     Console(width=max(180, Console().width)).print(out)
     print("Shares in percent, depth errors in cm.")
@@ -129,13 +153,19 @@ def main(argv=None) -> None:
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--field", type=Path, help="checkpoint (default: that of the store)")
-    parser.add_argument("--gaze", type=Path, help="checkpoint of the scene's gaze field (default: the store's; not evaluated)")
+    parser.add_argument(
+        "--gaze", type=Path, help="checkpoint of the scene's gaze field (default: the store's; not evaluated)"
+    )
     parser.add_argument("--width", type=int, default=240, help="width of a picture in pixels (3:2)")
     parser.add_argument("--margin", type=int, default=2, help="pixels left out around silhouettes")
     parser.add_argument("--kinds", default="expected,median", help=f"kinds of depth, of {', '.join(KINDS)}")
     parser.add_argument("--visibility", default="depth", help="kinds of visibility: depth, transmittance, map")
-    parser.add_argument("--pair", action="append", choices=list(PAIRS), help="only this one; may be given several times")
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/store_visibility.csv"), help="CSV file to write")
+    parser.add_argument(
+        "--pair", action="append", choices=list(PAIRS), help="only this one; may be given several times"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/benchmarks/store_visibility.csv"), help="CSV file to write"
+    )
     args = parser.parse_args(argv)
 
     import mitsuba as mi

@@ -1,4 +1,5 @@
-"""What it costs to render in strips, between which Ctrl-C is looked for: the demo store in strips, in one, and by mi.render.
+"""What it costs to render in strips, between which Ctrl-C is looked for: the demo store in strips, in one, and by
+mi.render.
 
     python benchmarks/strips.py [--width 1280] [--rounds 5]
 
@@ -37,7 +38,9 @@ def main(arguments: list[str] | None = None) -> None:
 
     def strips(samples: int) -> int:
         calls = []
-        for band in render_bands(scene, sensor, spp=1, seed=0, strip=samples, on_strip=lambda *done: calls.append(done)):
+        for band in render_bands(
+            scene, sensor, spp=1, seed=0, strip=samples, on_strip=lambda *done: calls.append(done)
+        ):
             np.array(band.film.bitmap())
         return len(calls)
 

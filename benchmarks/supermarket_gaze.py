@@ -1,12 +1,15 @@
-"""Gaze of real people in a VR supermarket, end to end: tracking files, rays, a place of hit points, a gaze field, scores.
+"""Gaze of real people in a VR supermarket, end to end: tracking files, rays, a place of hit points, a gaze field,
+scores.
 
-    python benchmarks/supermarket_gaze.py [--data FOLDER] [--recipe default] [--folds 5] [--first 0] [--out out/benchmarks/supermarket_gaze]
+    python benchmarks/supermarket_gaze.py [--data FOLDER] [--recipe default] [--folds 5] [--first 0] [--out
+    out/benchmarks/supermarket_gaze]
 
-Runs, as a user would, `nerg rays import --preset vr_supermarket` and for each fold `nerg train gaze --geometry hits --test-zones 3
---test-people 0.5` and `nerg eval gaze` for each split. Half of the people train, and the other half are scored at 60 positions in
-three zones; every ray within 2R of a test position is left out of training, of the place and of the baselines. Splits: `both`,
-people and positions are new; `pos`, the training people at new positions; `people`, new people elsewhere. What the columns mean is in
-each fold's `gaze.md`. Rows are means over folds. The recipe's settings were chosen on the 24 folds from `--first 100`, other halves of the
+Runs, as a user would, `nerg rays import --preset vr_supermarket` and for each fold
+`nerg train gaze --geometry hits --test-zones 3 --test-people 0.5` and `nerg eval gaze` for each split. Half of the
+people train, and the other half are scored at 60 positions in three zones; every ray within 2R of a test position is
+left out of training, of the place and of the baselines. Splits: `both`, people and positions are new; `pos`, the
+training people at new positions; `people`, new people elsewhere. What the columns mean is in each fold's `gaze.md`.
+Rows are means over folds. The recipe's settings were chosen on the 24 folds from `--first 100`, other halves of the
 people at other zones, and on none of the first five.
 """
 
@@ -35,11 +38,32 @@ def run_fold(rays: Path, seed: int, args) -> list[dict]:
     """Train one fold, and score it in every split."""
     file, rows = args.out / f"fold_{seed}.safetensors", []
     threads = ["--threads", args.threads] if args.threads else []
-    nerg("train", "gaze", rays, "--geometry", "hits", "-o", file, "--recipe", args.recipe, "--test-zones", 3, "--test-positions", 60,
-         "--test-people", 0.5, "--seed", seed, *(["--steps", args.steps] if args.steps else []), *threads)  # fmt: skip
+    nerg(
+        "train",
+        "gaze",
+        rays,
+        "--geometry",
+        "hits",
+        "-o",
+        file,
+        "--recipe",
+        args.recipe,
+        "--test-zones",
+        3,
+        "--test-positions",
+        60,
+        "--test-people",
+        0.5,
+        "--seed",
+        seed,
+        *(["--steps", args.steps] if args.steps else []),
+        *threads,
+    )
     for split in args.splits.split(","):
         folder = args.out / f"fold_{seed}_{split}"
-        nerg("eval", "gaze", file, rays, "--split", split, "-o", folder, "--kappa", args.kappa, "--seed", seed, *threads)
+        nerg(
+            "eval", "gaze", file, rays, "--split", split, "-o", folder, "--kappa", args.kappa, "--seed", seed, *threads
+        )
         rows += [{"fold": seed, "split": split, **r} for r in json.loads((folder / "gaze.json").read_text())["methods"]]
     return rows
 
@@ -50,7 +74,14 @@ def means(rows: list[dict], split: str) -> list[dict]:
     out = []
     for name in dict.fromkeys(r["method"] for r in rows):
         found = [r for r in rows if r["method"] == name]
-        out.append({"split": split, "method": name, **{k: sum(r[k] for r in found) / len(found) for k in SCORES}, "folds": len(found)})
+        out.append(
+            {
+                "split": split,
+                "method": name,
+                **{k: sum(r[k] for r in found) / len(found) for k in SCORES},
+                "folds": len(found),
+            }
+        )
     return out
 
 
@@ -85,8 +116,12 @@ def main(argv=None) -> None:
                 print(f"{r['method']:28s}" + "".join(f"{r[k]:9.4f}" if k == "MAE" else f"{r[k]:9.3f}" for k in SCORES))
         print(f"fold by fold, {OURS} less {BAR}:")
         for seed in seeds:
-            ours, bar = (next(r for r in rows if (r["fold"], r["split"], r["method"]) == (seed, split, m)) for m in (OURS, BAR))
-            print(f"  {seed}: KLD {ours['KLD'] - bar['KLD']:+.3f}, CC {ours['CC'] - bar['CC']:+.3f}, bits {ours['bits'] - bar['bits']:+.3f}")
+            ours, bar = (
+                next(r for r in rows if (r["fold"], r["split"], r["method"]) == (seed, split, m)) for m in (OURS, BAR)
+            )
+            print(
+                f"  {seed}: KLD {ours['KLD'] - bar['KLD']:+.3f}, CC {ours['CC'] - bar['CC']:+.3f}, bits {ours['bits'] - bar['bits']:+.3f}"
+            )
     for name, content in (("folds.csv", rows), ("means.csv", table)):
         with open(args.out / name, "w", newline="") as file:
             writer = csv.DictWriter(file, list(dict.fromkeys(k for r in content for k in r)), restval="")

@@ -2,12 +2,13 @@
 
     python benchmarks/torch_radiance.py [--minutes 2] [--width 135] [--validate] [--data DIR]
 
-Same grid, networks, initial weights, rays, step table, occupancy grid, density pass, losses, optimiser and schedule, on the same
-machine in the same run, one after the other; the peer is eager PyTorch, gathers and sums, autograd. Before they start, both
-evaluate the same random points, and the program stops if they differ. Without our trainer's extras: thinned samples, damped
-derivatives near cameras, cleared cells, and the settling of the grid, which are switched off in both. Both fields are scored by
-the integrator, under the occupancy found in the same way.
+Same grid, networks, initial weights, rays, step table, occupancy grid, density pass, losses, optimiser and schedule, on
+the same machine in the same run, one after the other; the peer is eager PyTorch, gathers and sums, autograd. Before
+they start, both evaluate the same random points, and the program stops if they differ. Without our trainer's extras:
+thinned samples, damped derivatives near cameras, cleared cells, and the settling of the grid, which are switched off in
+both. Both fields are scored by the integrator, under the occupancy found in the same way.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -19,9 +20,10 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import numpy as np
+from fox_radiance import default_data, validation
+
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-import numpy as np  # noqa: E402
-from fox_radiance import default_data, validation  # noqa: E402
 
 _PRIMES = (1, 2654435761, 805459861)
 
@@ -33,7 +35,9 @@ class TorchModel:
         import torch
 
         self.torch, self.config, self.box = torch, field.config, field.box
-        self.weights = {k: torch.from_numpy(np.array(v.numpy())).requires_grad_() for k, v in field.parameters().items()}
+        self.weights = {
+            k: torch.from_numpy(np.array(v.numpy())).requires_grad_() for k, v in field.parameters().items()
+        }
         g = field.config.grid
         self.scales, self.rows, self.offsets = g.level_scales(), g.level_rows(), g.offsets()
         self.hashed = [(int(np.ceil(s)) + 2) ** 3 > r for s, r in zip(self.scales, self.rows)]
@@ -80,16 +84,32 @@ def harmonics(d):
 
     x, y, z = d.unbind(1)
     xx, yy, zz = x * x, y * y, z * z
-    return torch.stack([
-        torch.full_like(x, 0.28209479), -0.48860251 * y, 0.48860251 * z, -0.48860251 * x,
-        1.09254843 * x * y, -1.09254843 * y * z, 0.94617470 * zz - 0.31539157, -1.09254843 * x * z, 0.54627422 * (xx - yy),
-        0.59004359 * y * (yy - 3 * xx), 2.89061144 * x * y * z, 0.45704580 * y * (1 - 5 * zz),
-        0.37317633 * z * (5 * zz - 3), 0.45704580 * x * (1 - 5 * zz), 1.44530572 * z * (xx - yy), 0.59004359 * x * (3 * yy - xx),
-    ], 1)
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479),
+            -0.48860251 * y,
+            0.48860251 * z,
+            -0.48860251 * x,
+            1.09254843 * x * y,
+            -1.09254843 * y * z,
+            0.94617470 * zz - 0.31539157,
+            -1.09254843 * x * z,
+            0.54627422 * (xx - yy),
+            0.59004359 * y * (yy - 3 * xx),
+            2.89061144 * x * y * z,
+            0.45704580 * y * (1 - 5 * zz),
+            0.37317633 * z * (5 * zz - 3),
+            0.45704580 * x * (1 - 5 * zz),
+            1.44530572 * z * (xx - yy),
+            0.59004359 * x * (3 * yy - xx),
+        ],
+        1,
+    )
 
 
 class TorchTrainer:
-    """The scheme of ``nerg_mi.training``, in eager PyTorch. ``ours``: a trainer that has made no step, to start as it does."""
+    """The scheme of ``nerg_mi.training``, in eager PyTorch. ``ours``: a trainer that has made no step, to start as it
+    does."""
 
     def __init__(self, ours, views):
         import torch
@@ -97,7 +117,9 @@ class TorchTrainer:
         self.torch, self.s, self.ours = torch, ours.settings, ours
         self.model = TorchModel(ours.live)
         self.averaged = {k: v.detach().clone() for k, v in self.model.weights.items()}
-        self.optimiser = torch.optim.Adam(self.model.weights.values(), lr=self.s.learning_rate, betas=(0.9, 0.99), eps=1e-15)
+        self.optimiser = torch.optim.Adam(
+            self.model.weights.values(), lr=self.s.learning_rate, betas=(0.9, 0.99), eps=1e-15
+        )
         from nerg_mi.capture.cameras import pixel_directions
 
         o, d, c = [], [], []
@@ -213,6 +235,7 @@ def same_model(trainer, peer) -> float:
     """Largest relative difference of densities, and of colours, at random points."""
     import drjit as dr
     import torch
+
     from nerg_mi.training.radiance.model import density_color
 
     rng = np.random.default_rng(0)
@@ -255,15 +278,17 @@ def main(argv=None) -> None:
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
-    from nerg_mi.training.radiance.trainer import RadianceTrainer
     from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
 
     ns = namespace("llvm_ad_rgb")
     data = open_dataset(args.data, None, args.width)
     data = validation(data) if args.validate else data
     if any(v.has_alpha or v.mask is not None for v in data.train):
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
-    settings = RadianceSettings(minutes=args.minutes, settle=2.0, empty_weight=0.0, grid_decay=0.0, thin_least=1.0, reach=0.0)
+    settings = RadianceSettings(
+        minutes=args.minutes, settle=2.0, empty_weight=0.0, grid_decay=0.0, thin_least=1.0, reach=0.0
+    )
     make = lambda: RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
     args.out.mkdir(parents=True, exist_ok=True)
     ours, judge = make(), make()
@@ -286,8 +311,17 @@ def main(argv=None) -> None:
         path = args.out / f"{name}.safetensors"
         save_radiance((judge if trainer is peer else ours).field(), path, {"trainer": name})
         scores = score_views(path, data.held_out, 4)
-        rows.append({"trainer": name, "minutes": args.minutes, "steps": steps, "steps_per_s": round(steps / seconds, 2),
-                     "psnr": round(scores["psnr_mean"], 2), "ssim": round(scores["ssim_mean"], 4), "load_before": round(load, 1)})
+        rows.append(
+            {
+                "trainer": name,
+                "minutes": args.minutes,
+                "steps": steps,
+                "steps_per_s": round(steps / seconds, 2),
+                "psnr": round(scores["psnr_mean"], 2),
+                "ssim": round(scores["ssim_mean"], 4),
+                "load_before": round(load, 1),
+            }
+        )
         print(rows[-1], flush=True)
     print(f"steps a second: {rows[0]['steps_per_s'] / rows[1]['steps_per_s']:.1f} times PyTorch's")
     write_rows(args.out / "torch_radiance.csv", rows)

@@ -2,12 +2,12 @@
 
     python examples/place_product.py [--shelf gondola_1_west] [--seed 0] [--out place-product.png] [--quick]
 
-A box stands at the front edge of a shelf of the demo store. Synthetic shoppers pass; the gaze field says where they look.
-The expected share of their looks that lands on the box is an integral over the box's own points
+A box stands at the front edge of a shelf of the demo store. Synthetic shoppers pass; the gaze field says where they
+look. The expected share of their looks that lands on the box is an integral over the box's own points
 (``nerg_mi.density.received``), so that its derivative with respect to the box's position comes from automatic
-differentiation through distance, direction, gaze networks and fall-off. The box climbs from several starts; a brute-force
-sweep along the whole shelf checks where it arrives, and central differences check its derivatives. Not differentiated: the
-moving edges of what else hides the box. What that leaves out is measured.
+differentiation through distance, direction, gaze networks and fall-off. The box climbs from several starts; a
+brute-force sweep along the whole shelf checks where it arrives, and central differences check its derivatives. Not
+differentiated: the moving edges of what else hides the box. What that leaves out is measured.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 
 SIZE = (0.24, 0.12, 0.25)  # along, into and above the shelf, metres
 JUTS_OUT = 0.06  # metres that the box stands in front of the shelf's edge
@@ -28,8 +29,8 @@ SWITCH = 0.25  # relative change of a seen solid angle over two such steps that 
 @dataclass(frozen=True)
 class Settings:
     """``observers`` of the stream; ``divisions`` of each triangle of the box; ``spacing`` of the sweep in metres;
-    ``starts`` and ``steps`` of the ascent; ``checks``: positions at which derivatives are compared; ``pixels``: metres a
-    pixel of the picture."""
+    ``starts`` and ``steps`` of the ascent; ``checks``: positions at which derivatives are compared; ``pixels``: metres
+    a pixel of the picture."""
 
     observers: int = 256
     divisions: int = 4
@@ -86,9 +87,10 @@ class Shelf:
         half[[self.along, self.axis, 2]] = np.array(SIZE) / 2
         center[self.along] = at
         return {
-            "type": "cube", "to_world": mi.ScalarTransform4f().translate(center.tolist()).scale(half.tolist()),
+            "type": "cube",
+            "to_world": mi.ScalarTransform4f().translate(center.tolist()).scale(half.tolist()),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.9, 0.9, 0.9]}},
-        }  # fmt: skip
+        }
 
 
 class Attention:
@@ -96,9 +98,9 @@ class Attention:
 
     def __init__(self, shelf: Shelf, heads: np.ndarray, settings: Settings, falloff: float = 0.05):
         import mitsuba as mi
+        from nerg_mi.scenes.store.attention_law import HERE
 
         from nerg_mi.density.received import patches
-        from nerg_mi.scenes.store.attention_law import HERE
         from nerg_mi.transport.place import Place
 
         self.shelf, self.falloff = shelf, falloff
@@ -132,7 +134,8 @@ class Attention:
         return float(self.expected(dr.opaque(mi.Float, at))[0])
 
     def climb(self, start: float, steps: int, rate: float = 0.04) -> np.ndarray:
-        """Positions (steps + 1,) of gradient ascent from ``start`` with Adam, whose rate falls to 0, inside of the shelf."""
+        """Positions (steps + 1,) of gradient ascent from ``start`` with Adam, whose rate falls to 0, inside of the
+        shelf."""
         import drjit as dr
         import mitsuba as mi
 
@@ -148,8 +151,8 @@ class Attention:
         return np.array(path)
 
     def derivatives(self, at: float) -> np.ndarray:
-        """At ``at``: by automatic differentiation and by central differences, of the whole integral; and both again without
-        the pairs of observer and patch between which an edge passes; and the share of such pairs. (5,)"""
+        """At ``at``: by automatic differentiation and by central differences, of the whole integral; and both again
+        without the pairs of observer and patch between which an edge passes; and the share of such pairs. (5,)"""
         import drjit as dr
         import mitsuba as mi
 
@@ -171,7 +174,8 @@ class Attention:
 
 
 def uphill(values: np.ndarray, start: int, window: int = 2) -> int:
-    """Index of the local maximum that is reached from ``start`` by going to the best of ``window`` neighbours a side."""
+    """Index of the local maximum that is reached from ``start`` by going to the best of ``window`` neighbours a
+    side."""
     while True:
         low = max(start - window, 0)
         best = low + int(np.argmax(values[low : start + window + 1]))
@@ -181,17 +185,22 @@ def uphill(values: np.ndarray, start: int, window: int = 2) -> int:
 
 
 def elevation(attention: Attention, at: float, spacing: float):
-    """The shelf seen from the front with the box at ``at``: albedo (h, w, 3), attention (h, w) in 1/m², extent in metres."""
+    """The shelf seen from the front with the box at ``at``: albedo (h, w, 3), attention (h, w) in 1/m², extent in
+    metres."""
     import drjit as dr
     import mitsuba as mi
+    from nerg_mi.scenes.store.attention_law import HERE
 
     from nerg_mi.density.received import Patches, contributions
-    from nerg_mi.scenes.store.attention_law import HERE
     from nerg_mi.transport.place import Place
 
     shelf = attention.shelf
-    store = {"type": "ply", "filename": str(HERE / "twin.ply"), "face_normals": True,
-             "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_color"}}}  # fmt: skip
+    store = {
+        "type": "ply",
+        "filename": str(HERE / "twin.ply"),
+        "face_normals": True,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_color"}},
+    }
     scene = mi.load_dict({"type": "scene", "store": store, "box": shelf.box(at)})
     low, high = shelf.low[shelf.along], shelf.high[shelf.along]
     u, z = np.arange(low + spacing / 2, high, spacing), np.arange(spacing / 2, shelf.high[2] + 0.2, spacing)[::-1]
@@ -205,7 +214,11 @@ def elevation(attention: Attention, at: float, spacing: float):
     albedo = si.bsdf(ray).eval_diffuse_reflectance(si)
     points = Patches(dr.detach(si.p), mi.Vector3f(si.n), mi.Float(1))
     dr.eval(points.p, points.n)
-    total, place, count = dr.zeros(mi.Float, len(grid.reshape(-1, 3))), Place(None, scene), dr.width(attention.observers)
+    total, place, count = (
+        dr.zeros(mi.Float, len(grid.reshape(-1, 3))),
+        Place(None, scene),
+        dr.width(attention.observers),
+    )
     for a in range(0, count, 16):
         some = dr.arange(mi.UInt32, min(16, count - a)) + dr.opaque(mi.UInt32, a)
         people = dr.gather(mi.Point3f, attention.observers, some)
@@ -244,7 +257,9 @@ def figure(attention: Attention, sweep, paths, checks, settings: Settings):
     axes[2].set_ylabel("attention [% of looks]")
     axes[2].legend(["sweep", "ascent", "its start", "its end"], fontsize=7)
     axes[3].axhline(0, color="0.8", lw=0.8)
-    axes[3].plot(at[1:-1], 100 * (values[2:] - values[:-2]) / (at[2:] - at[:-2]), color="0.6", lw=2, label="of the sweep")
+    axes[3].plot(
+        at[1:-1], 100 * (values[2:] - values[:-2]) / (at[2:] - at[:-2]), color="0.6", lw=2, label="of the sweep"
+    )
     axes[3].plot(checks[:, 0], 100 * checks[:, 1], "x", color="C3", label="automatic")
     axes[3].set_ylabel("derivative [% / m]")
     axes[3].set_xlabel(f"position along the shelf, {'xy'[attention.shelf.along]} [m]")
@@ -273,8 +288,12 @@ def main(argv=None) -> dict:
     values = np.array([attention.value(x) for x in at])
     top = at[values.argmax()]
     if values.max() == 0:
-        raise SystemExit(f"not one of {settings.observers} observers sees a place on {args.shelf}; take another --seed or shelf")
-    print(f"sweep of {len(at)} positions: {100 * values.min():.3f} to {100 * values.max():.3f} % of looks, most at {top:.2f} m")
+        raise SystemExit(
+            f"not one of {settings.observers} observers sees a place on {args.shelf}; take another --seed or shelf"
+        )
+    print(
+        f"sweep of {len(at)} positions: {100 * values.min():.3f} to {100 * values.max():.3f} % of looks, most at {top:.2f} m"
+    )
 
     starts = shelf.range[0] + (np.arange(settings.starts) + 0.5) / settings.starts * (shelf.range[1] - shelf.range[0])
     paths, rows = [], []
@@ -285,13 +304,17 @@ def main(argv=None) -> dict:
         a, b = attention.value(path[0]), attention.value(path[-1])
         paths.append(path)
         rows.append((path[0], path[-1], a, b, at[goal], b / values[goal]))
-        print(f"{path[0]:9.3f}  {path[-1]:7.3f}  {100 * a:.3f} -> {100 * b:.3f}  {at[goal]:27.2f}  "
-              f"{100 * abs(path[-1] - at[goal]):10.1f}  {b / values[goal]:12.4f}")  # fmt: skip
+        print(
+            f"{path[0]:9.3f}  {path[-1]:7.3f}  {100 * a:.3f} -> {100 * b:.3f}  {at[goal]:27.2f}  "
+            f"{100 * abs(path[-1] - at[goal]):10.1f}  {b / values[goal]:12.4f}"
+        )
 
     where = np.linspace(*shelf.range, settings.checks + 2)[1:-1]
     checks = np.array([[x, *attention.derivatives(float(x))] for x in where])
     off = [_rms(checks[:, k] - checks[:, k + 1]) / _rms(checks[:, k + 1]) for k in (1, 3)]
-    print(f"derivatives at {len(where)} positions, automatic against central differences (rms of the difference / rms):")
+    print(
+        f"derivatives at {len(where)} positions, automatic against central differences (rms of the difference / rms):"
+    )
     print(f"  all pairs of observer and patch               {100 * off[0]:6.2f} %")
     print(f"  without pairs that an edge passes ({100 * checks[:, 5].mean():.2f} %)   {100 * off[1]:6.2f} %")
 

@@ -1,14 +1,16 @@
 """Who looked like that? The position of an observer, from pictures of where they look.
 
-    python examples/recover_observer.py [--observers 8 | --eye 4.4,2.8,1.6] [--seed 0] [--out recover-observer.png] [--quick]
+    python examples/recover_observer.py [--observers 8 | --eye 4.4,2.8,1.6] [--seed 0] [--out recover-observer.png]
+    [--quick]
 
-The integrator renders the gaze of an observer on what four cameras see. Here the pictures are given and the observer is not.
-First the pictures of observers on a grid over the floor are compared with the given ones; from the best of them
+The integrator renders the gaze of an observer on what four cameras see. Here the pictures are given and the observer is
+not. First the pictures of observers on a grid over the floor are compared with the given ones; from the best of them
 Gauss-Newton steps follow, whose derivatives are those of ``mi.render`` in forward mode: three unknowns, three passes.
 
-The edges of the observer's shadows are no part of these derivatives. A step therefore counts only pixels that are looked at
-in both the given picture and the present one, where no edge has passed, and counts those less that fit badly. Which answer to
-believe is decided on all pixels. The given pictures have noise of their own; the truth serves to say how far off an answer is.
+The edges of the observer's shadows are no part of these derivatives. A step therefore counts only pixels that are
+looked at in both the given picture and the present one, where no edge has passed, and counts those less that fit badly.
+Which answer to believe is decided on all pixels. The given pictures have noise of their own; the truth serves to say
+how far off an answer is.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 import numpy as np
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 
 OBSERVER = "integrator.observer.to_world"
 CAMERAS = [(x, y, 2.7) for x in (0.5, 7.5) for y in (0.8, 5.2)]
@@ -34,8 +37,8 @@ ENOUGH = 5e-4  # metres of a step after which the descent is over
 
 @dataclass(frozen=True)
 class Settings:
-    """``size`` of a picture (width, height), multiples of 8; ``spacing`` of the grid of first guesses in metres; ``starts``
-    of them that are improved, by ``steps`` steps at most; ``observers`` to be found."""
+    """``size`` of a picture (width, height), multiples of 8; ``spacing`` of the grid of first guesses in metres;
+    ``starts`` of them that are improved, by ``steps`` steps at most; ``observers`` to be found."""
 
     size: tuple = (48, 32)
     spacing: float = 0.4
@@ -52,7 +55,6 @@ class Pictures:
 
     def __init__(self, size, cameras=CAMERAS, file="shapes.xml"):
         import mitsuba as mi
-
         from nerg_mi.scenes.store.attention_law import HERE
 
         self.scene = mi.load_file(str(HERE / file), aovs="gaze", radiance="false")
@@ -65,8 +67,14 @@ class Pictures:
     def _sensors(self, sampler: dict) -> list:
         import mitsuba as mi
 
-        film = {"type": "hdrfilm", "width": self.size[0], "height": self.size[1], "rfilter": {"type": "box"},
-                "component_format": "float32", "pixel_format": "rgb"}  # fmt: skip
+        film = {
+            "type": "hdrfilm",
+            "width": self.size[0],
+            "height": self.size[1],
+            "rfilter": {"type": "box"},
+            "component_format": "float32",
+            "pixel_format": "rgb",
+        }
         look = [mi.ScalarTransform4f().look_at(list(c), list(TARGET), [0, 0, 1]) for c in self.cameras]
         common = {"type": "perspective", "fov": 84.0, "near_clip": 0.01, "film": film, "sampler": sampler}
         return [mi.load_dict({**common, "to_world": t}) for t in look]
@@ -118,8 +126,9 @@ def pooled(pictures, factor: int) -> np.ndarray:
 
 
 def distance(a, b, levels=(2, 4, 8)) -> np.ndarray:
-    """Squared Hellinger distances of pictures (..., cameras, h, w), summed over blocks of 2, 4 and 8 pixels: bright pixels do not
-    drown the others, and a detail that lies elsewhere than it should is still close to where it belongs."""
+    """Squared Hellinger distances of pictures (..., cameras, h, w), summed over blocks of 2, 4 and 8 pixels: bright
+    pixels do not drown the others, and a detail that lies elsewhere than it should is still close to where it
+    belongs."""
     return sum(((np.sqrt(pooled(a, k)) - np.sqrt(pooled(b, k))) ** 2).mean((-3, -2, -1)) for k in levels)
 
 
@@ -199,7 +208,8 @@ def true_observers(count: int, seed: int) -> np.ndarray:
 
 
 def search(pictures: Pictures, given, guesses, known, settings: Settings) -> list:
-    """Descents from the guesses (N, 3) whose pictures ``known`` (N, cameras, h, w) are nearest to the given ones, best first."""
+    """Descents from the guesses (N, 3) whose pictures ``known`` (N, cameras, h, w) are nearest to the given ones, best
+    first."""
     order = np.argsort(distance(known, given))[: settings.starts]
     found = [descend(pictures, given, guesses[k], settings.steps) for k in order]
     return sorted(found, key=lambda d: d.answer()[1])
@@ -211,18 +221,23 @@ def search(pictures: Pictures, given, guesses, known, settings: Settings) -> lis
 
 
 def figure(shown, truths, searches):
-    """The first observer's given pictures, those of the best descent before and after, and a floor plan with all of them."""
+    """The first observer's given pictures, those of the best descent before and after, and a floor plan with all of
+    them."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
-
     from nerg_mi.scenes.store import layout
 
     sheet = Figure(figsize=(9, 6.4), layout="constrained")
-    axes = sheet.subplot_mosaic([["given"] * 2, ["before"] * 2, ["after"] * 2, ["plan", "off"]],
-                                height_ratios=(1, 1, 1, 3), width_ratios=(1.25, 1))  # fmt: skip
+    axes = sheet.subplot_mosaic(
+        [["given"] * 2, ["before"] * 2, ["after"] * 2, ["plan", "off"]],
+        height_ratios=(1, 1, 1, 3),
+        width_ratios=(1.25, 1),
+    )
     top = float(np.percentile(shown["given"], 99))
     for name, title in (("given", "given"), ("before", "best first guess"), ("after", "answer")):
-        axes[name].imshow(np.concatenate(shown[name], axis=1), cmap="inferno", vmin=0, vmax=top, interpolation="nearest")
+        axes[name].imshow(
+            np.concatenate(shown[name], axis=1), cmap="inferno", vmin=0, vmax=top, interpolation="nearest"
+        )
         axes[name].set_ylabel(title, fontsize=8)
         axes[name].set(xticks=[], yticks=[])
     plan, off = axes["plan"], axes["off"]
@@ -250,7 +265,9 @@ def main(argv=None) -> dict:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--observers", type=int, help="how many to find, at random places (default: 8)")
     parser.add_argument("--eye", help="where one observer truly is, in metres, in place of random ones")
-    parser.add_argument("--seed", type=int, default=0, help="of the random places and of the noise of the given pictures")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of the random places and of the noise of the given pictures"
+    )
     parser.add_argument("--out", type=Path, default=Path("recover-observer.png"))
     parser.add_argument("--quick", action="store_true", help="small pictures, two observers: a try in seconds")
     args = parser.parse_args(argv)
@@ -275,11 +292,16 @@ def main(argv=None) -> dict:
         searches.append(found)
         off.append([100 * np.linalg.norm(p - truth) for p in (best.path[0], end)])
         shown = shown or {"given": given, "before": pictures.at(best.path[0]), "after": pictures.at(end)}
-        print(f"{_text(truth)}  {off[-1][0]:12.1f}  ->  {_text(end)}  {off[-1][1]:8.2f}  {least:.4f}  {len(best.path) - 1:5}"
-              f"  {time.process_time() - began:7.0f}", flush=True)  # fmt: skip
+        print(
+            f"{_text(truth)}  {off[-1][0]:12.1f}  ->  {_text(end)}  {off[-1][1]:8.2f}  {least:.4f}  {len(best.path) - 1:5}"
+            f"  {time.process_time() - began:7.0f}",
+            flush=True,
+        )
     off = np.array(off)
-    print(f"median {np.median(off[:, 1]):.2f} cm, worst {off[:, 1].max():.2f} cm "
-          f"(first guesses: median {np.median(off[:, 0]):.1f} cm); {np.sum(off[:, 1] < 10)} of {len(off)} within 10 cm")  # fmt: skip
+    print(
+        f"median {np.median(off[:, 1]):.2f} cm, worst {off[:, 1].max():.2f} cm "
+        f"(first guesses: median {np.median(off[:, 0]):.1f} cm); {np.sum(off[:, 1] < 10)} of {len(off)} within 10 cm"
+    )
 
     from nerg_mi.view.figures import save
 

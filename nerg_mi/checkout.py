@@ -26,7 +26,11 @@ class Beside:
 
 
 def find_folders(package: str, folder: Path) -> None:
-    """Have `FOLDERS` found as part of `package`, which lies in `folder`, where nothing else finds them and they lie beside it."""
-    if importlib.util.find_spec(f"{package}.{FOLDERS[0]}") is None and (folder.parent / FOLDERS[0] / "__init__.py").is_file():
+    """Have `FOLDERS` found as part of `package`, which lies in `folder`, where nothing else finds them and they lie
+    beside it."""
+    if (
+        importlib.util.find_spec(f"{package}.{FOLDERS[0]}") is None
+        and (folder.parent / FOLDERS[0] / "__init__.py").is_file()
+    ):
         # Last: whatever an installation has to say comes first.
         sys.meta_path.append(Beside(package, folder.parent))

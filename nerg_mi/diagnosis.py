@@ -78,8 +78,8 @@ class Diagnosis:
 def try_backend(backend: str) -> dict:
     """Run a small kernel in every variant of `backend` ("scalar", "llvm" or "cuda"), in a process of its own.
 
-    Gives `variants` (those that worked), `failed` (message of each that did not), and where one worked `threads` and the
-    `version` of the backend. A process that died gives no variants and, as `failed[backend]`, its last words.
+    Gives `variants` (those that worked), `failed` (message of each that did not), and where one worked `threads` and
+    the `version` of the backend. A process that died gives no variants and, as `failed[backend]`, its last words.
     """
     trial = subprocess.run([sys.executable, "-c", _TRIAL, backend], capture_output=True, text=True)
     if trial.returncode == 0:

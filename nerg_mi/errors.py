@@ -25,7 +25,8 @@ class UnusableLLVM(ImportError):
 
 @contextmanager
 def chosen(options: str) -> Iterator[None]:
-    """A block whose values a user gave by ``options`` ("--aabb"): a `ValueError` of it is theirs to mend, as a `NergError`.
+    """A block whose values a user gave by ``options`` ("--aabb"): a `ValueError` of it is theirs to mend, as a
+    `NergError`.
 
     Functions among themselves refuse wrong values by `ValueError`, since they do not know who gave them.
     """
@@ -40,9 +41,9 @@ def chosen(options: str) -> Iterator[None]:
 def expected(error: BaseException) -> bool:
     """Whether ``error`` is one that the user can mend, or the machine's, and not a mistake in the program.
 
-    The former are `NergError`, a library that is missing or cannot be used, what the system says of files and devices, and
-    memory that does not suffice. The rest is the program's: a `ValueError`, too, says that one function of it called another
-    one with wrong values.
+    The former are `NergError`, a library that is missing or cannot be used, what the system says of files and devices,
+    and memory that does not suffice. The rest is the program's: a `ValueError`, too, says that one function of it
+    called another one with wrong values.
     """
     if isinstance(error, ImportError):
         # Modules of our own are always there.
@@ -53,16 +54,27 @@ def expected(error: BaseException) -> bool:
 
 
 _TRACEBACK = "Traceback (most recent call last):"
-_MENDABLE = ("NergError", "MissingFile", "UnusableLLVM", "ValueError", "ImportError", "ModuleNotFoundError", "OSError", "FileNotFoundError",
-             "PermissionError", "IsADirectoryError", "MemoryError")  # fmt: skip
+_MENDABLE = (
+    "NergError",
+    "MissingFile",
+    "UnusableLLVM",
+    "ValueError",
+    "ImportError",
+    "ModuleNotFoundError",
+    "OSError",
+    "FileNotFoundError",
+    "PermissionError",
+    "IsADirectoryError",
+    "MemoryError",
+)
 
 
 @contextmanager
 def mitsuba_says() -> Iterator[None]:
     """A block whose `RuntimeError`s are Mitsuba's, about a scene, as `NergError`.
 
-    It makes one of whatever a plugin's constructor raises, with the traceback as text. Where that ends in an exception that
-    only a mistake of the program raises (a `TypeError`, say), the error is left as it is.
+    It makes one of whatever a plugin's constructor raises, with the traceback as text. Where that ends in an exception
+    that only a mistake of the program raises (a `TypeError`, say), the error is left as it is.
     """
     try:
         yield
@@ -87,7 +99,11 @@ def sentence(error: BaseException) -> str:
     elif isinstance(error, OSError) and error.strerror:
         said = f"{error.strerror[:1].lower()}{error.strerror[1:]}."
         if error.filename is not None:
-            said = f'there is no file "{error.filename}".' if error.errno == errno.ENOENT else f'"{error.filename}": {said}'
+            said = (
+                f'there is no file "{error.filename}".'
+                if error.errno == errno.ENOENT
+                else f'"{error.filename}": {said}'
+            )
         text = said
     before, marker, trace = text.partition(_TRACEBACK)
     if marker:

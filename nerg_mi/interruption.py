@@ -9,14 +9,15 @@ import threading
 class Interruption:
     """A context in which Ctrl-C is noted, and raised by ``check``.
 
-    In the middle of a step it would leave weights and random numbers of different steps, and Mitsuba and Dr.Jit would carry
-    on with what they have begun. Whoever works inside calls ``check`` after every step. The second Ctrl-C is raised at once.
+    In the middle of a step it would leave weights and random numbers of different steps, and Mitsuba and Dr.Jit would
+    carry on with what they have begun. Whoever works inside calls ``check`` after every step. The second Ctrl-C is
+    raised at once.
     """
 
     def __enter__(self) -> Interruption:
         self.asked = False
-        # Signals can only be dealt with in the main thread; a handler that is not Python's could not be put back; and where
-        # the signal is ignored, as for what a script runs in the background, it is meant for somebody else.
+        # Signals can only be dealt with in the main thread; a handler that is not Python's could not be put back; and
+        # where the signal is ignored, as for what a script runs in the background, it is meant for somebody else.
         main = threading.current_thread() is threading.main_thread()
         self._mine = main and signal.getsignal(signal.SIGINT) not in (None, signal.SIG_IGN)
         if self._mine:
@@ -41,9 +42,9 @@ class Interruption:
 def give_back_ctrl_c() -> None:
     """Let Python hear Ctrl-C again, where Mitsuba has taken it.
 
-    Mitsuba takes the signal while a picture is rendered and remembers one handler to put back. An integrator in Python that
-    calls the render of its base class makes it do so twice, and the second time it remembers its own: from the first picture
-    on nobody would hear Ctrl-C. Called between the two, this makes the second one remember Python's.
+    Mitsuba takes the signal while a picture is rendered and remembers one handler to put back. An integrator in Python
+    that calls the render of its base class makes it do so twice, and the second time it remembers its own: from the
+    first picture on nobody would hear Ctrl-C. Called between the two, this makes the second one remember Python's.
     """
     handler = signal.getsignal(signal.SIGINT)
     if handler is not None and threading.current_thread() is threading.main_thread():

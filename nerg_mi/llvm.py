@@ -27,11 +27,20 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 
 _FOLDERS = {
     "linux": (
-        "/usr/lib/*-linux-gnu", "/usr/lib/llvm-*/lib", "/usr/lib64", "/usr/lib", "/usr/lib64/llvm*/lib*",
-        "/usr/lib/wsl/lib", "/usr/local/lib", "/usr/local/llvm*/lib",
+        "/usr/lib/*-linux-gnu",
+        "/usr/lib/llvm-*/lib",
+        "/usr/lib64",
+        "/usr/lib",
+        "/usr/lib64/llvm*/lib*",
+        "/usr/lib/wsl/lib",
+        "/usr/local/lib",
+        "/usr/local/llvm*/lib",
     ),
     "darwin": (
-        "/opt/homebrew/opt/llvm*/lib", "/usr/local/opt/llvm*/lib", "/opt/local/libexec/llvm-*/lib", "/usr/local/lib",
+        "/opt/homebrew/opt/llvm*/lib",
+        "/usr/local/opt/llvm*/lib",
+        "/opt/local/libexec/llvm-*/lib",
+        "/usr/local/lib",
     ),
 }
 
@@ -45,7 +54,8 @@ print(*(n.value for n in numbers))
 
 @dataclass(frozen=True)
 class Library:
-    """A libLLVM: `path` as found ("" if Dr.Jit chose it by itself), `version` a tuple starting with the major number."""
+    """A libLLVM: `path` as found ("" if Dr.Jit chose it by itself), `version` a tuple starting with the major
+    number."""
 
     path: str
     version: tuple[int, ...]

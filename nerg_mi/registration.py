@@ -1,8 +1,8 @@
 """Makes the plugins of this package known to Mitsuba, for every variant that is switched to.
 
-A Mitsuba plugin written in Python is bound to the variant that was active when its class was made, and is registered for
-that variant alone. So each plugin module is imported again after every change of variant. Mitsuba itself is not imported
-from here: where it is not loaded yet, registration waits until somebody imports it.
+A Mitsuba plugin written in Python is bound to the variant that was active when its class was made, and is registered
+for that variant alone. So each plugin module is imported again after every change of variant. Mitsuba itself is not
+imported from here: where it is not loaded yet, registration waits until somebody imports it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ PLUGINS = (
     ("gazekde", "volume"),
     ("nerg", "integrator"),
 )
-"""Name and kind of each plugin; the module `nerg_mi.plugins.<name>` registers it. Order: a plugin follows those it uses."""
+"""Name and kind of each plugin; the module `nerg_mi.plugins.<name>` registers it. Order: a plugin follows those it
+uses."""
 
 # Mitsuba 3.9 has no register_volume. It checks the type of the object that is made, not where its maker is registered.
 _REGISTRY = {"volume": "texture"}

@@ -28,19 +28,19 @@ Trained gaze field (:monosp:`gazefield`)
 
  * - grid.table, emit_net.0, ..., capture_net.0, ..., escaped, prior
    - |tensor|
-   - Of a log density: hash grid features, the weight matrices of its two networks, the logit where no surface is met, and the
-     table of the log of the density that does not depend on the position.
+   - Of a log density: hash grid features, the weight matrices of its two networks, the logit where no surface is met,
+     and the table of the log of the density that does not depend on the position.
    - |exposed|, |differentiable|
 
 How much surfaces attract an observer: equation 1 of the paper,
 :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o) \cdot \mathrm{sigmoid}(F_c(p_o, r_o))`, a density in 1/sr over the directions
 around the observer. It is the ``gaze`` of the integrator :ref:`nerg <integrator-nerg>`; having two positions for an
-argument, it cannot be evaluated as a plain volume. A field that was trained on a radiance field's features (``nerg train
-gaze --semantic``) needs that radiance field beside it, as the integrator's ``field``.
+argument, it cannot be evaluated as a plain volume. A field that was trained on a radiance field's features
+(``nerg train gaze --semantic``) needs that radiance field beside it, as the integrator's ``field``.
 
 Of an ensemble (``nerg train gaze --ensemble``) gaze is the mean of the members, each normalised by itself where it is
-normalised, and the integrator knows their standard deviation (its AOV ``gaze_std``). The checkpoint also says how many rays
-there were around a position (``support``).
+normalised, and the integrator knows their standard deviation (its AOV ``gaze_std``). The checkpoint also says how many
+rays there were around a position (``support``).
 
 .. tabs::
     .. code-tab:: xml
@@ -66,8 +66,8 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.properties import text
 from nerg_mi.registration import register
-from nerg_mi.transport.observer.ensemble import EnsembleMedium
 from nerg_mi.transport.media.media import GazeMedium, Similarity
+from nerg_mi.transport.observer.ensemble import EnsembleMedium
 
 
 class GazeFieldVolume(mi.Volume):

@@ -8,7 +8,8 @@ Kernel density of tracked rays (:monosp:`gazekde`)
 
  * - filename
    - |string|
-   - Rays file (``.npz`` or ``.parquet``) as ``nerg rays import`` writes it. Relative names are looked up beside the scene file.
+   - Rays file (``.npz`` or ``.parquet``) as ``nerg rays import`` writes it. Relative names are looked up beside the
+     scene file.
 
  * - count
    - |int|
@@ -20,13 +21,14 @@ Kernel density of tracked rays (:monosp:`gazekde`)
 
  * - to_world
    - |transform|
-   - A rotation, a uniform scale and a translation from the rays' frame to the scene's. For rays that a gaze field was trained
-     on: the field's own ``to_world`` after the similarity of ``nerg train gaze --align``. (Default: none)
+   - A rotation, a uniform scale and a translation from the rays' frame to the scene's. For rays that a gaze field was
+     trained on: the field's own ``to_world`` after the similarity of ``nerg train gaze --align``. (Default: none)
 
-Where people around the observer really looked, as a density in 1/sr: the ground truth beside a gaze field (NeRG, Section 5.3).
-It is the ``kde`` of the integrator :ref:`nerg <integrator-nerg>`, whose AOV ``kde`` shows it on the surfaces that the camera
-sees; it cannot be evaluated as a plain volume. Rays are gathered once an observer. Pictures of 4,096 pixels or more (and of 165 kappa or more) look
-the density up in a table (within 1e-4 of the highest density of one ray's kernel), smaller ones sum all rays at each pixel.
+Where people around the observer really looked, as a density in 1/sr: the ground truth beside a gaze field (NeRG,
+Section 5.3). It is the ``kde`` of the integrator :ref:`nerg <integrator-nerg>`, whose AOV ``kde`` shows it on the
+surfaces that the camera sees; it cannot be evaluated as a plain volume. Rays are gathered once an observer. Pictures of
+4,096 pixels or more (and of 165 kappa or more) look the density up in a table (within 1e-4 of the highest density of
+one ray's kernel), smaller ones sum all rays at each pixel.
 
 .. tabs::
     .. code-tab:: xml
@@ -52,9 +54,9 @@ from __future__ import annotations
 import mitsuba as mi
 
 from nerg_mi.density.kde.view import KdeView
-from nerg_mi.rays.rays import Rays
 from nerg_mi.field.backend import namespace
 from nerg_mi.properties import integer, number, text
+from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import register
 from nerg_mi.transport.media.media import Similarity
 

@@ -29,8 +29,10 @@ Trained radiance field (:monosp:`nerf`)
 
 Density and view-dependent colour of a place, as a multiresolution hash grid with two small networks. It is meant as the
 ``field`` of the integrator :ref:`nerg <integrator-nerg>`. As a plain volume it returns the density, in 1 / scene unit,
-through ``eval_1``: 0 outside of ``bbox()``, and in the cells that the checkpoint's occupancy grid calls empty, which are
-vacuum by definition: training has left them unsampled, and whatever the networks say there is skipped when marching. With ``max_density`` it serves as ``sigma_t`` of a ``heterogeneous`` medium. (A plain volume is not told the direction that its colour depends on.)
+through ``eval_1``: 0 outside of ``bbox()``, and in the cells that the checkpoint's occupancy grid calls empty, which
+are vacuum by definition: training has left them unsampled, and whatever the networks say there is skipped when
+marching. With ``max_density`` it serves as ``sigma_t`` of a ``heterogeneous`` medium. (A plain volume is not told the
+direction that its colour depends on.)
 
 .. tabs::
     .. code-tab:: xml
@@ -96,7 +98,9 @@ class NerfVolume(mi.Volume):
 
     def max(self):
         if not self.max_density:
-            raise NergError(f'a medium needs a bound on the density of "{self.filename}": give the volume a "max_density"')
+            raise NergError(
+                f'a medium needs a bound on the density of "{self.filename}": give the volume a "max_density"'
+            )
         return self.max_density
 
     def resolution(self):

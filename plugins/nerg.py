@@ -65,8 +65,8 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - map_height
    - |int|
-   - Rows of the ``map``; it has twice as many columns. (Default: 512; store: 3.0 % of the pixels are wrong, 3.5 % at 256,
-     2.83 % at 1,024 for 4 times the rays)
+   - Rows of the ``map``; it has twice as many columns. (Default: 512; store: 3.0 % of the pixels are wrong, 3.5 % at
+     256, 2.83 % at 1,024 for 4 times the rays)
 
  * - depth
    - |string|
@@ -95,32 +95,33 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - step
    - |float|
    - March step in scene units; 0 stands for the one that the field was trained with, or for a 1024th of the medium's
-     diagonal. (Default: 0; store: depth is then 2.3 mm off its limit, which is 19 mm off the walls; sheets of 4e-3 in a unit
-     cube: 5e-4 off, a third of them lost at 256 steps)
+     diagonal. (Default: 0; store: depth is then 2.3 mm off its limit, which is 19 mm off the walls; sheets of 4e-3 in a
+     unit cube: 5e-4 off, a third of them lost at 256 steps)
 
  * - quadrature
    - |string|
    - ``constant``: density is constant over a step, sampled at its middle. ``linear``: linear between samples at the
-     steps' ends. ``cells``: for an axis-aligned ``gridvolume`` as density, steps end at voxel boundaries only, where two
-     samples integrate its interpolant exactly (opacity to rounding, depth to a hundredth of a voxel); a ``step`` that is
-     given bounds them, ``dt_gamma``, ``coarse`` and ``jitter`` do not apply. (Default: ``constant``; store,
+     steps' ends. ``cells``: for an axis-aligned ``gridvolume`` as density, steps end at voxel boundaries only, where
+     two samples integrate its interpolant exactly (opacity to rounding, depth to a hundredth of a voxel); a ``step``
+     that is given bounds them, ``dt_gamma``, ``coarse`` and ``jitter`` do not apply. (Default: ``constant``; store,
      1,024 steps: depth 1.25 mm off, ``linear`` 2.33 mm)
 
  * - coarse
    - |float|
-   - Steps in front of all matter are this many times longer; a first, density-only march finds where matter begins. What
-     is thinner than such a step may be missed. 1 does without. (Default: 1; 4 saves 10 % of the store's
+   - Steps in front of all matter are this many times longer; a first, density-only march finds where matter begins.
+     What is thinner than such a step may be missed. 1 does without. (Default: 1; 4 saves 10 % of the store's
      evaluations and loses 32 % of thin sheets)
 
  * - dt_gamma
    - |float|
-   - Steps are at least this share of the distance travelled. (Default: 0, i.e. uniform steps; store: 1/128 saves 19 % of
-     the evaluations and errs 2.5 times more in depth)
+   - Steps are at least this share of the distance travelled. (Default: 0, i.e. uniform steps; store: 1/128 saves 19 %
+     of the evaluations and errs 2.5 times more in depth)
 
  * - stop
    - |float|
-   - Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times that, in mean
-     free paths. (Default: 1e-7; store: 33.8 evaluations a pixel for 32.8 at 1e-4; fog: 1e-3 has 33 times its depth error)
+   - Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times that, in
+     mean free paths. (Default: 1e-7; store: 33.8 evaluations a pixel for 32.8 at 1e-4; fog: 1e-3 has 33 times its depth
+     error)
 
  * - color_cutoff
    - |float|
@@ -132,12 +133,12 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - Shift the steps of each sample by a random share of a step. (Default: false; store: depth 2.31 mm off with
      it, 2.30 mm without)
 
-This integrator marches a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that each ray
-meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper), with
+This integrator marches a radiance field, or any pair of volumes, and evaluates a gaze field on the surface that each
+ray meets: :math:`G(p_{od}, p_o) = F_e(p_{od}, -r_o)\,\mathrm{sigmoid}(F_c(p_o, r_o))` (equation 1 of the paper), with
 :math:`p_o` the observer, :math:`r_o` the direction to the surface and :math:`p_{od}` the surface that the *observer*
 meets along it. For an observer who is not the camera, a second, density-only march from :math:`p_o` finds
-:math:`p_{od}` and the visibility :math:`1 - \mathrm{clip}((d_{o*} - d_o - \mathrm{tolerance}) / d_f, 0, 1)` that gaze is
-multiplied with.
+:math:`p_{od}` and the visibility :math:`1 - \mathrm{clip}((d_{o*} - d_o - \mathrm{tolerance}) / d_f, 0, 1)` that gaze
+is multiplied with.
 
 AOVs (0 where nothing is met):
 
@@ -158,8 +159,8 @@ AOVs (0 where nothing is met):
 
 Colours are composited in the colour space that the field was trained in, then converted to linear:
 :math:`L = \alpha\,\mathrm{lin}(C / \alpha) + (1 - \alpha) L_{behind}`. Mono variants receive the luminance. The film's
-alpha is 1 wherever opacity > 0 or an environment emitter shows (not with ``hide_emitters``), as in other integrators; use the
-``opacity`` AOV for the fractional one.
+alpha is 1 wherever opacity > 0 or an environment emitter shows (not with ``hide_emitters``), as in other integrators;
+use the ``opacity`` AOV for the fractional one.
 
 Use a box filter and ``component_format`` ``float32`` for AOVs: other filters blend depths across edges, and fp16 rounds
 them. With a box filter equal seeds give equal pictures to the bit.
@@ -169,17 +170,19 @@ refused when it is loaded; weights set later are not looked at).
 
 Derivatives reach field and gaze weights, volumes, ``falloff``, camera and observer positions, in forward and in reverse
 mode, with memory that does not grow with the number of steps. They do not see the edges of visibility, nor where
-marching stops. In a ``batch`` of cameras, those of poses exist in reverse mode only. Empty voxels of a ``gridvolume`` are
-skipped: change its data through the scene's or the integrator's
+marching stops. In a ``batch`` of cameras, those of poses exist in reverse mode only. Empty voxels of a ``gridvolume``
+are skipped: change its data through the scene's or the integrator's
 parameters (``mi.traverse``), whose ``update()`` refreshes what is known to be empty.
 
 Shapes of the scene hide the field behind them, from the camera and from the observer, and the field in front of them
-attenuates them. Depth on a shape is that of the exact ray cast, and gaze is evaluated there as on any surface. Light does
-not pass between the two: a shape casts no shadow on the field, whose light is baked in, nor the field on a shape. The
-radiance of the default ``path`` carries no derivatives (nest ``direct``); distances to shapes do, except over silhouettes.
+attenuates them. Depth on a shape is that of the exact ray cast, and gaze is evaluated there as on any surface. Light
+does not pass between the two: a shape casts no shadow on the field, whose light is baked in, nor the field on a shape.
+The radiance of the default ``path`` carries no derivatives (nest ``direct``); distances to shapes do, except over
+silhouettes.
 
-Inside of another integrator (``aov``, ``moment``) the camera is looked for among the scene's sensors; give ``mi.render`` one
-of these, or the integrator an explicit ``observer``. Spectral and polarized variants are not supported.
+Inside of another integrator (``aov``, ``moment``) the camera is looked for among the scene's sensors; give
+``mi.render`` one of these, or the integrator an explicit ``observer``. Spectral and polarized variants are not
+supported.
 
 .. tabs::
     .. code-tab:: xml
@@ -219,26 +222,38 @@ import mitsuba as mi
 
 from nerg_mi.errors import NergError
 from nerg_mi.interruption import give_back_ctrl_c
+from nerg_mi.maths.color import composite_to_linear
 from nerg_mi.properties import boolean, choice, color, integer, number, text
 from nerg_mi.registration import register
-from nerg_mi.transport.observer import viewpoint
-from nerg_mi.maths.color import composite_to_linear
-from nerg_mi.transport.march.depth import KINDS
-from nerg_mi.transport.media.features import Featured, snapshot, what_gaze_wants
-from nerg_mi.transport.observer.ensemble import SupportView
 from nerg_mi.transport.freezing import no_collection, recording
+from nerg_mi.transport.march.depth import KINDS
 from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.march.rules import KINDS as QUADRATURES
+from nerg_mi.transport.march.rules import rule
+from nerg_mi.transport.media.features import Featured, snapshot, what_gaze_wants
 from nerg_mi.transport.media.media import KnownEmpty, VolumeMedium
+from nerg_mi.transport.observer import viewpoint
+from nerg_mi.transport.observer.ensemble import SupportView
 from nerg_mi.transport.observer.sight import KINDS as VISIBILITIES
 from nerg_mi.transport.observer.sight import ObserverPass, Sight, towards
 from nerg_mi.transport.place import Place
-from nerg_mi.transport.march.rules import KINDS as QUADRATURES
-from nerg_mi.transport.march.rules import rule
 from nerg_mi.transport.shading import Shading
 
 CHANNELS = {
-    "depth": "T", "opacity": "Y", "position": "XYZ", "gaze": "Y", "emit": "Y", "capture": "Y", "gaze_std": "Y", "support": "Y",
-    "kde": "Y", "visibility": "Y", "observer_depth": "T", "density_evals": "Y", "color_evals": "Y", "gaze_evals": "Y",
+    "depth": "T",
+    "opacity": "Y",
+    "position": "XYZ",
+    "gaze": "Y",
+    "emit": "Y",
+    "capture": "Y",
+    "gaze_std": "Y",
+    "support": "Y",
+    "kde": "Y",
+    "visibility": "Y",
+    "observer_depth": "T",
+    "density_evals": "Y",
+    "color_evals": "Y",
+    "gaze_evals": "Y",
 }
 _FEATURES = ("features", "features_at")
 _GAZE_AOVS = {"gaze", "emit", "capture", "gaze_evals", "gaze_std"}
@@ -269,7 +284,14 @@ class NergIntegrator(mi.SamplingIntegrator):
             raise NergError('"kde" must be a volume of type "gazekde"')
         if observer is not None and not isinstance(observer, mi.Sensor):
             raise NergError('"observer" must be a sensor; its to_world places the observer')
-        self._given = {"field": field, "density": density, "color": paint, "gaze": gaze, "kde": kde, "observer": observer}
+        self._given = {
+            "field": field,
+            "density": density,
+            "color": paint,
+            "gaze": gaze,
+            "kde": kde,
+            "observer": observer,
+        }
         self.gaze = None if gaze is None else gaze.gaze_medium()
         _check_semantics(self.gaze, field, self.medium)
         self.observer = observer
@@ -301,8 +323,11 @@ class NergIntegrator(mi.SamplingIntegrator):
         if self.medium is not None:
             rule(self.settings.quadrature, self.medium)
         self.observer_pass = ObserverPass(
-            self.settings, choice(props, "visibility", "depth", VISIBILITIES), self.depth_kind,
-            self.surface_opacity, number(props, "tolerance", 0, low=0),
+            self.settings,
+            choice(props, "visibility", "depth", VISIBILITIES),
+            self.depth_kind,
+            self.surface_opacity,
+            number(props, "tolerance", 0, low=0),
             integer(props, "map_height", 512, low=2, high=16384),
         )
         # The sensors of the render in progress; None when another integrator drives ours.
@@ -342,8 +367,8 @@ class NergIntegrator(mi.SamplingIntegrator):
             self._sensors = None
 
     def render_forward(self, scene, params, sensor, seed=0, spp=0):
-        # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a table
-        # of all sensors, the observer among them.
+        # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a
+        # table of all sensors, the observer among them.
         if viewpoint.is_batch(sensor) and any(dr.grad_enabled(c) for c in self._eyes(sensor)):
             raise NergError(
                 'a "batch" of cameras has no forward derivatives with respect to the pose of an observer or a camera; '
@@ -463,15 +488,27 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def to_string(self):
         s = self.settings
-        body = {k: str(v).replace("\n", "\n  ") for k, v in self.children.items() if k not in ("observer", "integrator")}
+        body = {
+            k: str(v).replace("\n", "\n  ") for k, v in self.children.items() if k not in ("observer", "integrator")
+        }
         if self.observer is not None:
             body["observer"] = viewpoint.center(self.observer)
         body |= {
-            "occlusion": self.occlusion, "visibility": self.observer_pass.kind, "falloff": self.falloff,
+            "occlusion": self.occlusion,
+            "visibility": self.observer_pass.kind,
+            "falloff": self.falloff,
             "tolerance": self.observer_pass.tolerance or "2 steps",
-            "depth": self.depth_kind, "surface_opacity": self.surface_opacity, "radiance": self.radiance,
-            "aovs": ",".join(self.aovs), "quadrature": s.quadrature, "step": s.step, "coarse": s.coarse, "dt_gamma": s.dt_gamma, "stop": s.stop,
-            "color_cutoff": s.color_cutoff, "jitter": self.jitter,
+            "depth": self.depth_kind,
+            "surface_opacity": self.surface_opacity,
+            "radiance": self.radiance,
+            "aovs": ",".join(self.aovs),
+            "quadrature": s.quadrature,
+            "step": s.step,
+            "coarse": s.coarse,
+            "dt_gamma": s.dt_gamma,
+            "stop": s.stop,
+            "color_cutoff": s.color_cutoff,
+            "jitter": self.jitter,
         }
         return "NergIntegrator[\n" + "".join(f"  {k} = {v},\n" for k, v in body.items()) + "]"
 
@@ -480,7 +517,8 @@ class NergIntegrator(mi.SamplingIntegrator):
     # ------------------------------------------------------------------------
 
     def _gaze(self, scene, place, ray, p_d, fuzz, surface, asked, count, out):
-        """Add the AOVs that depend on the observer to ``out``; returns the density evaluations made (None: not counted)."""
+        """Add the AOVs that depend on the observer to ``out``; returns the density evaluations made (None: not
+        counted)."""
         sensors = self._sensors or scene.sensors()
         if self.observer is None:
             p_o = viewpoint.center_of_ray(sensors, ray)
@@ -514,15 +552,19 @@ class NergIntegrator(mi.SamplingIntegrator):
             if sight.gaze is not None:
                 unknown = attended & (sight.gaze < 0)
                 gaze = dr.if_stmt(
-                    (unknown, sight.gaze), unknown,
+                    (unknown, sight.gaze),
+                    unknown,
                     lambda unknown, gaze: self.gaze.evaluate(sight.p_od, p_o, r_o, unknown)[0],
-                    lambda unknown, gaze: gaze, label="gaze",
+                    lambda unknown, gaze: gaze,
+                    label="gaze",
                 )
                 out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
                 out["gaze_evals"] = dr.select(unknown, networks, 0)
                 return sight.density_evals
             needed = surface if asked & {"emit", "capture"} else attended
-            semantic = what_gaze_wants(self.gaze.field.config.semantic, place, sight.p_od, p_o, r_o, needed, self.settings)
+            semantic = what_gaze_wants(
+                self.gaze.field.config.semantic, place, sight.p_od, p_o, r_o, needed, self.settings
+            )
             evaluate = self.gaze.spread if "gaze_std" in asked else self.gaze.evaluate
             gaze, emit, capture, *spread = evaluate(sight.p_od, p_o, r_o, needed, semantic)
             out["gaze"] = dr.select(attended, gaze * sight.visibility, 0)
@@ -599,7 +641,9 @@ def _aovs(value, gaze, field, kde):
         if name == "kde" and kde is None:
             raise NergError('"aovs" asks for "kde", which needs a "kde" volume of type "gazekde"')
         if name == "gaze_std" and not hasattr(gaze, "spread"):
-            raise NergError('"aovs" asks for "gaze_std", which needs a "gaze" of several members; train it with --ensemble 5')
+            raise NergError(
+                '"aovs" asks for "gaze_std", which needs a "gaze" of several members; train it with --ensemble 5'
+            )
         if name == "support" and getattr(gaze.field, "support", None) is None:
             raise NergError('"aovs" asks for "support", which the checkpoint of "gaze" does not hold; train it again')
     if len(set(names)) < len(names):

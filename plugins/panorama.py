@@ -21,10 +21,10 @@ Full-sphere panorama (:monosp:`panorama`)
    - The film may have any size from 1 x 2 pixels on; 2 : 1 gives square pixels at the horizon. Crop windows and
      sample borders are honoured.
 
-This sensor sees all directions around a point: the gaze sphere of an observer who stands there, for example. Its mapping
-is the exact inverse of that of the emitter :ref:`envmap <emitter-envmap>` with the same ``to_world``: a film as large as
-the environment map, sampled at the centres of its pixels, returns the map's pixels, and what this sensor has rendered can
-be used as an ``envmap``.
+This sensor sees all directions around a point: the gaze sphere of an observer who stands there, for example. Its
+mapping is the exact inverse of that of the emitter :ref:`envmap <emitter-envmap>` with the same ``to_world``: a film as
+large as the environment map, sampled at the centres of its pixels, returns the map's pixels, and what this sensor has
+rendered can be used as an ``envmap``.
 
 In the sensor's frame +Y points up. Pixel coordinates :math:`(x, y)` on a film of :math:`W \times H` pixels belong to
 
@@ -33,9 +33,9 @@ In the sensor's frame +Y points up. Pixel coordinates :math:`(x, y)` on a film o
     v = (\sin\varphi\,\sin\theta,\; \cos\theta,\; -\cos\varphi\,\sin\theta), \qquad
     \varphi = \frac{2\pi x}{W}, \qquad \theta = \frac{\pi\,(y - 1/2)}{H - 1}
 
-so that the middle column looks along +Z, the way of Mitsuba's cameras, and the centres of the first and the last row lie
-*at* the poles, where ``envmap`` has them. What a sample of these two rows draws beyond the pole is seen over the pole, on
-the opposite meridian.
+so that the middle column looks along +Z, the way of Mitsuba's cameras, and the centres of the first and the last row
+lie *at* the poles, where ``envmap`` has them. What a sample of these two rows draws beyond the pole is seen over the
+pole, on the opposite meridian.
 
 The solid angle of a pixel is :math:`2\pi/W\,(\cos\theta_0 - \cos\theta_1)` between the borders of its row, clipped to
 the sphere; the sum is :math:`4\pi`. ``nerg_mi.transport.panorama.pixel_solid_angles(W, H)`` gives it without a variant,

@@ -1,4 +1,5 @@
-"""What all tests share: variants, free memory between files, optional torch, and recorded data that may not be there."""
+"""What all tests share: variants, free memory between files, optional torch, and recorded data that may not be
+there."""
 
 from __future__ import annotations
 
@@ -9,8 +10,6 @@ import signal
 from pathlib import Path
 
 import pytest
-
-import nerg_mi  # chooses the libLLVM, so it comes before drjit and mitsuba
 
 ROOT = Path(__file__).resolve().parents[1]
 TORCH_REQUIRED = os.environ.get("NERG_REQUIRE_TORCH", "0") not in ("", "0")
@@ -87,11 +86,18 @@ def pytest_configure(config):
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if TORCH_REQUIRED and importlib.util.find_spec("torch") is None:
-        pytest.exit("NERG_REQUIRE_TORCH is set and torch is not installed: pip install torch, or unset it.", returncode=1)
+        pytest.exit(
+            "NERG_REQUIRE_TORCH is set and torch is not installed: pip install torch, or unset it.", returncode=1
+        )
 
 
 def _fail_if_skipped_for_torch(report):
-    if TORCH_REQUIRED and report.skipped and isinstance(report.longrepr, tuple) and "torch" in report.longrepr[2].lower():
+    if (
+        TORCH_REQUIRED
+        and report.skipped
+        and isinstance(report.longrepr, tuple)
+        and "torch" in report.longrepr[2].lower()
+    ):
         report.outcome = "failed"
         report.longrepr = f"NERG_REQUIRE_TORCH is set, and this was skipped: {report.longrepr[2]}"
     return report

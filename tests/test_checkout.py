@@ -14,7 +14,8 @@ import pytest
 from nerg_mi import checkout
 from tests.conftest import ROOT
 
-# Where the dependencies are: without the site module nothing of that folder's .pth files, and so no editable installation, counts.
+# Where the dependencies are: without the site module nothing of that folder's .pth files, and so no editable
+# installation, counts.
 SITE = Path(numpy.__file__).parents[1]
 
 
@@ -22,8 +23,14 @@ def uninstalled(code: str, folder: Path, **environment):
     """Run ``code`` in ``folder`` by a Python that knows the dependencies, and no installation of the package."""
     begin = f"import sys\nsys.path.append({str(SITE)!r})\nassert not any('editable' in repr(f).lower() for f in sys.meta_path)\n"
     kept = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    return subprocess.run([sys.executable, "-S", "-c", begin + textwrap.dedent(code)], cwd=folder, env=kept | environment,
-                          capture_output=True, text=True, timeout=300)  # fmt: skip
+    return subprocess.run(
+        [sys.executable, "-S", "-c", begin + textwrap.dedent(code)],
+        cwd=folder,
+        env=kept | environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
 
 
 USE = """
@@ -48,7 +55,9 @@ def test01_plugins_and_scenes_are_found(tmp_path, elsewhere):
 
 
 def test02_nothing_else_becomes_part_of_the_package():
-    done = uninstalled("import nerg_mi\ntry:\n    import nerg_mi.tests\nexcept ModuleNotFoundError as e:\n    print(e)", ROOT)
+    done = uninstalled(
+        "import nerg_mi\ntry:\n    import nerg_mi.tests\nexcept ModuleNotFoundError as e:\n    print(e)", ROOT
+    )
     assert "No module named 'nerg_mi.tests'" in done.stdout, done.stderr
 
 

@@ -13,8 +13,8 @@ import nerg_mi.cli
 from nerg_mi.evaluation.study import subject as study_subject
 from nerg_mi.formats.torch_ngp import unpickling
 from nerg_mi.training.gaze.recipes import gaze_recipe
-from nerg_mi.transport.observer.integral import COUNT
 from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.observer.integral import COUNT
 from tests.conftest import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -54,12 +54,17 @@ def test03_defaults_of_the_march_are_the_integrators(rgb):
 
 
 def test04_the_default_recipe_is_as_described():
-    row = next(line for line in (ROOT / "docs" / "gaze-training.md").read_text().splitlines() if line.startswith("| `default`"))
+    row = next(
+        line for line in (ROOT / "docs" / "gaze-training.md").read_text().splitlines() if line.startswith("| `default`")
+    )
     plan = gaze_recipe()
     c, s, p = plan.config, plan.settings, plan.probes
     assert f"{NUMBERS[c.grid.levels].capitalize()} levels of a grid ({c.grid.base} to {c.grid.finest})" in row
     assert f"up to degree {c.sh_degree - 1}, two networks {c.width} wide" in row and c.layers == 2
-    assert f"weight decay {s['weight_decay']:g}, {s['steps']} steps, kernels of kappa {p['kappa']:g}, a share of {c.mix:g} of the blind" in row
+    assert (
+        f"weight decay {s['weight_decay']:g}, {s['steps']} steps, kernels of kappa {p['kappa']:g}, a share of {c.mix:g} of the blind"
+        in row
+    )
 
 
 def test05_numbers_that_are_constants():
@@ -67,7 +72,9 @@ def test05_numbers_that_are_constants():
     assert f"a sum over {COUNT:,} directions" in page("gaze-evaluation.md")
     assert f"allow-list of {NUMBERS[len(unpickling._ALLOWED)]} names" in page("interchange.md")
     assert f"{study_subject.FINER} times shorter" in page("error-and-time.md")
-    spp = inspect.signature(__import__("nerg_mi.evaluation.images", fromlist=["x"]).score_views).parameters["spp"].default
+    spp = (
+        inspect.signature(__import__("nerg_mi.evaluation.images", fromlist=["x"]).score_views).parameters["spp"].default
+    )
     assert f"{spp} rays a pixel (`--spp`)" in page("radiance-training.md")
     for script in ("fox_radiance.py", "store_radiance.py"):
         assert f'"--spp", type=int, default={spp}' in (ROOT / "benchmarks" / script).read_text(), script
@@ -76,5 +83,9 @@ def test05_numbers_that_are_constants():
 def test06_tests_that_are_named_exist():
     named = {m for page in PAGES for m in re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", page.read_text(encoding="utf-8"))}
     assert len(named) > 20
-    missing = [f"{file}::{name}" for file, name in sorted(named) if f"\ndef {name}(" not in (ROOT / file).read_text(encoding="utf-8")]
+    missing = [
+        f"{file}::{name}"
+        for file, name in sorted(named)
+        if f"\ndef {name}(" not in (ROOT / file).read_text(encoding="utf-8")
+    ]
     assert not missing

@@ -1,4 +1,5 @@
-"""The blocks of docs/gradients.md run as they stand there, one after the other, only smaller and on untrained fields."""
+"""The blocks of docs/gradients.md run as they stand there, one after the other, only smaller and on untrained
+fields."""
 
 import re
 import shutil
@@ -25,7 +26,8 @@ def test01_blocks(rgb, tmp_path, monkeypatch):
         exec(compile(small, PAGE.name, "exec"), names)
     assert np.isfinite(np.array(names["change"])).all() and np.any(np.array(names["change"]) != 0)
     losses, errors = ([x.numpy().item() for x in names[name]] for name in ("losses", "errors"))
-    # From whole views, then frozen; and of a camera that nothing was trained on, before and after, then with batches of rays.
+    # From whole views, then frozen; and of a camera that nothing was trained on, before and after, then with batches of
+    # rays.
     assert len(losses) == 14 and max(losses[9:]) < losses[0] and losses[-1] < losses[9]
     assert len(errors) == 4 and errors[1] < errors[0] and errors[3] < errors[2], errors
 

@@ -48,10 +48,17 @@ def test_an_ignored_ctrl_c_stays_ignored():
 def scene(rgb, tmp_path):
     fields.radiance(tmp_path / "f.safetensors")
     film = {"type": "hdrfilm", "width": 4, "height": 4}
-    return rgb.load_dict({
-        "type": "scene", "integrator": {"type": "nerg", "field": {"type": "nerf", "filename": str(tmp_path / "f.safetensors")}},
-        "sensor": {"type": "perspective", "film": film, "to_world": rgb.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0])},
-    })  # fmt: skip
+    return rgb.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "nerg", "field": {"type": "nerf", "filename": str(tmp_path / "f.safetensors")}},
+            "sensor": {
+                "type": "perspective",
+                "film": film,
+                "to_world": rgb.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0]),
+            },
+        }
+    )
 
 
 def test_python_hears_ctrl_c_after_a_picture(rgb, scene):

@@ -34,8 +34,10 @@ def clone(rgb, tmp_path, monkeypatch):
 
 
 def smaller(text: str) -> str:
-    small, count = re.subn(r'width=480, height=320', "width=36, height=24", text)
-    small, more = re.subn(r'(name="(?:width|height)" value=")(480|320)"', lambda m: f'{m[1]}{int(m[2]) // 20 + 12}"', small)
+    small, count = re.subn(r"width=480, height=320", "width=36, height=24", text)
+    small, more = re.subn(
+        r'(name="(?:width|height)" value=")(480|320)"', lambda m: f'{m[1]}{int(m[2]) // 20 + 12}"', small
+    )
     assert count + more, "the example has no resolution to make smaller"
     return small
 

@@ -1,11 +1,12 @@
-"""Plugins are there in every order of imports and after every change of variant. Each order needs a process of its own."""
+"""Plugins are there in every order of imports and after every change of variant. Each order needs a process of its
+own."""
 
 import importlib
 import importlib.metadata
 import subprocess
 import sys
-from pathlib import Path
 import textwrap
+from pathlib import Path
 
 import pytest
 
@@ -58,7 +59,12 @@ def test03_import_loads_nothing():
 
 
 def test04_mitsuba_without_torch():
-    assert "torch" not in run("import nerg_mi, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import sys; print(*sys.modules)").split()
+    assert (
+        "torch"
+        not in run(
+            "import nerg_mi, mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import sys; print(*sys.modules)"
+        ).split()
+    )
 
 
 @pytest.mark.parametrize("name, kind", [p for p in PLUGINS if p[1] != "volume"])
@@ -80,7 +86,9 @@ def test05b_scalar_variants_are_warned_of_and_forgotten():
         "except RuntimeError as e: print(e)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert '"nerf", "gazefield", "gazekde", "nerg") needs a variant that compiles its kernels' in done.stdout + done.stderr
+    assert (
+        '"nerf", "gazefield", "gazekde", "nerg") needs a variant that compiles its kernels' in done.stdout + done.stderr
+    )
     assert '"nowhere" does not exist' in done.stdout.replace(str(Path.cwd()) + "/", "")
 
 
@@ -95,7 +103,13 @@ def test06_entry_points():
 
 def test07_broken_plugin_is_not_hidden():
     done = subprocess.run(
-        [sys.executable, "-c", "import nerg_mi.registration as r; r.PLUGINS += (('missing', 'sensor'),)\n"
-         "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')"], capture_output=True, text=True,
-    )  # fmt: skip
+        [
+            sys.executable,
+            "-c",
+            "import nerg_mi.registration as r; r.PLUGINS += (('missing', 'sensor'),)\n"
+            "import mitsuba as mi; mi.set_variant('llvm_ad_rgb')",
+        ],
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 1 and "nerg_mi.plugins.missing" in done.stderr

@@ -16,7 +16,9 @@ def test_the_list_is_up_to_date():
         if name not in functions[path]:
             gone.append(entry)
     # A test that got another name is at worst run by make check.
-    assert len(listed) > 20 and len(gone) <= len(listed) / 10, f"tests/slow.txt is out of date; it names {', '.join(gone)}"
+    assert len(listed) > 20 and len(gone) <= len(listed) / 10, (
+        f"tests/slow.txt is out of date; it names {', '.join(gone)}"
+    )
 
 
 def test_they_are_marked(request):

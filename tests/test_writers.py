@@ -1,4 +1,5 @@
-"""Nothing in the package writes a file but through `nerg_mi.files.atomic`: found in the source, so that none comes back."""
+"""Nothing in the package writes a file but through `nerg_mi.files.atomic`: found in the source, so that none comes
+back."""
 
 from __future__ import annotations
 
@@ -11,9 +12,28 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted(p for room in ("nerg_mi", "plugins", "scenes") for p in (ROOT / room).rglob("*.py"))
 
 METHODS = {
-    "write", "write_async", "write_bitmap", "savefig", "savez", "savez_compressed", "tofile", "savetxt", "to_csv", "to_parquet",
-    "to_file", "write_table", "export", "imsave", "mkdir", "makedirs", "rename", "touch", "writelines", "copyfile", "dump",
-}  # fmt: skip
+    "write",
+    "write_async",
+    "write_bitmap",
+    "savefig",
+    "savez",
+    "savez_compressed",
+    "tofile",
+    "savetxt",
+    "to_csv",
+    "to_parquet",
+    "to_file",
+    "write_table",
+    "export",
+    "imsave",
+    "mkdir",
+    "makedirs",
+    "rename",
+    "touch",
+    "writelines",
+    "copyfile",
+    "dump",
+}
 """Methods and functions of modules that write, or make something, where they are given a name."""
 OPENERS = {"open", "ZipFile", "GzipFile", "fdopen", "TarFile"}
 
@@ -77,15 +97,37 @@ def test_exceptions_are_still_needed():
         assert [f for f in found if not function or f[0] == function], f"{name} writes nothing any more"
 
 
-@pytest.mark.parametrize("text", [
-    'open(path, "w")', 'path.open("ab")', "path.write_text(text)", "np.save(path, x)", "figure.savefig(path)", "bitmap.write(str(path))",
-    'zipfile.ZipFile(path, mode="w")', "os.replace(a, b)", "mesh.export(path)", "folder.mkdir()", 'gzip.open(path, "wt")',
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        'open(path, "w")',
+        'path.open("ab")',
+        "path.write_text(text)",
+        "np.save(path, x)",
+        "figure.savefig(path)",
+        "bitmap.write(str(path))",
+        'zipfile.ZipFile(path, mode="w")',
+        "os.replace(a, b)",
+        "mesh.export(path)",
+        "folder.mkdir()",
+        'gzip.open(path, "wt")',
+    ],
+)
 def test_what_writes_is_found(text):
     assert direct_writers(text)
     assert not direct_writers(f"with replacing(path) as temporary:\n    {text}")
 
 
-@pytest.mark.parametrize("text", ["open(path)", 'path.open("rb")', "write_text(path, text)", "rays.save(path)", "text.replace(a, b)", "sys.stdout.write(x)"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "open(path)",
+        'path.open("rb")',
+        "write_text(path, text)",
+        "rays.save(path)",
+        "text.replace(a, b)",
+        "sys.stdout.write(x)",
+    ],
+)
 def test_what_does_not_is_left_alone(text):
     assert not direct_writers(text)

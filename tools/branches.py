@@ -2,9 +2,9 @@
 
     python tools/branches.py [--update docs/trust.md] [-- ARGUMENTS OF PYTEST]
 
-Runs the tests under coverage.py, those that start processes of their own included, and prints lines and branches of each
-part, and the files that are reached least. What Dr.Jit traces counts as reached when Python has recorded it, whatever its
-kernels did.
+Runs the tests under coverage.py, those that start processes of their own included, and prints lines and branches of
+each part, and the files that are reached least. What Dr.Jit traces counts as reached when Python has recorded it,
+whatever its kernels did.
 """
 
 from __future__ import annotations
@@ -43,9 +43,13 @@ def _row(name: str, s: dict[str, int]) -> list[str]:
     both, reached = s["num_statements"] + s["num_branches"], s["covered_lines"] + s["covered_branches"]
     share = lambda part, whole: f"{100 * part / whole:.1f} %" if whole else "-"
     return [
-        name, f"{s['num_statements']:,}", share(s["covered_lines"], s["num_statements"]), f"{s['num_branches']:,}",
-        share(s["covered_branches"], s["num_branches"]), share(reached, both),
-    ]  # fmt: skip
+        name,
+        f"{s['num_statements']:,}",
+        share(s["covered_lines"], s["num_statements"]),
+        f"{s['num_branches']:,}",
+        share(s["covered_branches"], s["num_branches"]),
+        share(reached, both),
+    ]
 
 
 def least(report: dict) -> list[str]:
@@ -53,8 +57,9 @@ def least(report: dict) -> list[str]:
     files = sorted(report["files"].items(), key=lambda item: item[1]["summary"]["percent_covered"])
     return [
         f"{path}: {entry['summary']['percent_covered']:.1f} %, lines {', '.join(map(str, entry['missing_lines'][:12]))}"
-        for path, entry in files[:_LEAST] if entry["missing_lines"]
-    ]  # fmt: skip
+        for path, entry in files[:_LEAST]
+        if entry["missing_lines"]
+    ]
 
 
 def measure(arguments: list[str]) -> tuple[int, dict]:
@@ -64,7 +69,9 @@ def measure(arguments: list[str]) -> tuple[int, dict]:
         coverage = [sys.executable, "-m", "coverage"]
         tests = subprocess.run([*coverage, "run", "-m", "pytest", "-q", *arguments], cwd=ROOT, env=env)
         subprocess.run([*coverage, "combine", "-q"], cwd=ROOT, env=env, check=True)
-        subprocess.run([*coverage, "json", "-q", "-o", str(Path(folder) / "report.json")], cwd=ROOT, env=env, check=True)
+        subprocess.run(
+            [*coverage, "json", "-q", "-o", str(Path(folder) / "report.json")], cwd=ROOT, env=env, check=True
+        )
         return tests.returncode, json.loads((Path(folder) / "report.json").read_text())
 
 

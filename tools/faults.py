@@ -2,11 +2,11 @@
 
     python tools/faults.py [--tries 100] [--only WORD] [--update docs/trust.md]
 
-Commands run in a folder with an earlier result of each. Every second try is killed (SIGKILL) at a moment of its usual run,
-spread from its begin to its end; the others are killed as soon as a file is being written. After each, every file of the
-folder must be as it was, byte for byte, or another that its reader reads whole; and the next start, which resumes where
-there is a state, must not fail. Then each command meets a disk without room, a folder that is not its user's to write, a
-parent that is missing and one that is a file. Exit code 1 where a file is lost or a start fails.
+Commands run in a folder with an earlier result of each. Every second try is killed (SIGKILL) at a moment of its usual
+run, spread from its begin to its end; the others are killed as soon as a file is being written. After each, every file
+of the folder must be as it was, byte for byte, or another that its reader reads whole; and the next start, which
+resumes where there is a state, must not fail. Then each command meets a disk without room, a folder that is not its
+user's to write, a parent that is missing and one that is a file. Exit code 1 where a file is lost or a start fails.
 """
 
 from __future__ import annotations
@@ -46,26 +46,58 @@ class Command:
 
 _GAZE = "--geometry none --zones 0 --radius 0.5 --probes 16 --min-rays 8 --directions 64"
 COMMANDS = (
-    Command("train radiance", "train radiance IN/photos -o OUT --steps 25 --save-every 0.5 --holdout 0", "field.safetensors",
-            ("field.safetensors",), 6, "field.run"),
-    Command("train gaze", f"train gaze IN/rays.npz -o OUT --steps 200 --save-every 0.02 {_GAZE}", "gaze.safetensors",
-            ("gaze.safetensors",), 14, "gaze.run"),
-    Command("rays import", "rays import IN/track.csv -o OUT --map origin=x,y,z~direction=dx,dy,dz~t=t~person=person", "imported.npz",
-            ("imported.npz",), 18),
+    Command(
+        "train radiance",
+        "train radiance IN/photos -o OUT --steps 25 --save-every 0.5 --holdout 0",
+        "field.safetensors",
+        ("field.safetensors",),
+        6,
+        "field.run",
+    ),
+    Command(
+        "train gaze",
+        f"train gaze IN/rays.npz -o OUT --steps 200 --save-every 0.02 {_GAZE}",
+        "gaze.safetensors",
+        ("gaze.safetensors",),
+        14,
+        "gaze.run",
+    ),
+    Command(
+        "rays import",
+        "rays import IN/track.csv -o OUT --map origin=x,y,z~direction=dx,dy,dz~t=t~person=person",
+        "imported.npz",
+        ("imported.npz",),
+        18,
+    ),
     Command("rays filter, in place", "rays filter OUT -o OUT --min-confidence 0.1", "place.npz", ("place.npz",), 22),
     Command("export mesh", "export mesh IN/store.safetensors -o OUT --resolution 48", "mesh.ply", ("mesh.ply",), 8),
-    Command("export points", "export points IN/store.safetensors -o OUT --resolution 48", "points.ply", ("points.ply",), 8),
-    Command("export volume", "export volume IN/store.safetensors -o OUT --resolution 48", "density.vol", ("density.vol",), 8),
-    Command("render", "render IN/scene.xml -o OUT --spp 1 -m llvm_ad_rgb -D width=96 -D height=64", "scene.exr", ("scene.exr",), 10),
-    Command("study", "study sphere -o OUT --quick --width 24 --height 16 -m llvm_ad_rgb --only coarse", "study",
-            ("study/study.csv", "study/study.md", "study/study.json"), 6),
-)  # fmt: skip
+    Command(
+        "export points", "export points IN/store.safetensors -o OUT --resolution 48", "points.ply", ("points.ply",), 8
+    ),
+    Command(
+        "export volume", "export volume IN/store.safetensors -o OUT --resolution 48", "density.vol", ("density.vol",), 8
+    ),
+    Command(
+        "render",
+        "render IN/scene.xml -o OUT --spp 1 -m llvm_ad_rgb -D width=96 -D height=64",
+        "scene.exr",
+        ("scene.exr",),
+        10,
+    ),
+    Command(
+        "study",
+        "study sphere -o OUT --quick --width 24 --height 16 -m llvm_ad_rgb --only coarse",
+        "study",
+        ("study/study.csv", "study/study.md", "study/study.json"),
+        6,
+    ),
+)
 
 
 @dataclass
 class Tally:
-    """What became of the tries of a command: of ``tried``, ``landed`` met it while it ran; ``lost``: files that were neither
-    the old ones nor whole; ``started``: starts that did not fail; ``left``: hidden files of killed writers."""
+    """What became of the tries of a command: of ``tried``, ``landed`` met it while it ran; ``lost``: files that were
+    neither the old ones nor whole; ``started``: starts that did not fail; ``left``: hidden files of killed writers."""
 
     tried: int = 0
     landed: int = 0
@@ -103,7 +135,8 @@ def begin(command: Command, inputs: Path, out: Path) -> list[str]:
 
 
 def try_kills(command: Command, inputs: Path, out: Path, tries: int, seed: int = 0) -> Tally:
-    """Kill ``command`` ``tries`` times, and let it come to its end after that; raises `AssertionError` for a failing start."""
+    """Kill ``command`` ``tries`` times, and let it come to its end after that; raises `AssertionError` for a failing
+    start."""
     tally, turn, log = Tally(), random.Random(seed), out.parent / "log.txt"
     if "place" in command.output:
         (out / command.output).write_bytes((inputs / "rays.npz").read_bytes())
@@ -113,7 +146,11 @@ def try_kills(command: Command, inputs: Path, out: Path, tries: int, seed: int =
     for k in range(tries):
         before = contents(inputs, out)
         pid = start(begin(command, inputs, out), log)
-        code = kill_at(pid, usual * (k + 0.5) / tries) if k % 2 else kill_while_writing(pid, out, turn, turn.randrange(4) if command.state else 0)
+        code = (
+            kill_at(pid, usual * (k + 0.5) / tries)
+            if k % 2
+            else kill_while_writing(pid, out, turn, turn.randrange(4) if command.state else 0)
+        )
         tally.tried += 1
         tally.landed += code == -signal.SIGKILL
         if code != -signal.SIGKILL:
@@ -134,7 +171,8 @@ def _require_success(command: Command, code: int, log: Path) -> None:
 
 
 def refused(command: Command, inputs: Path, output: Path, log: Path, said: str, before=lambda: None) -> str:
-    """What is wrong with how ``command`` is refused at ``output``; empty where it ends with 1 and one sentence with ``said``."""
+    """What is wrong with how ``command`` is refused at ``output``; empty where it ends with 1 and one sentence with
+    ``said``."""
     code = wait(start(command.arguments(inputs, output), log, before))
     text = log.read_text(errors="replace")
     sentences = [line for line in text.splitlines() if line.startswith("nerg: ")]
@@ -225,7 +263,10 @@ def refusals(work: Path, inputs: Path, only: str) -> tuple[list[list[object]], l
             return None  # its input is where its output is
         output = work / "new" / command.output.partition(".")[0] / "below" / command.output
         code = wait(start(command.arguments(inputs, output), log))
-        return "" if code == 0 and output.exists() else f"nerg {command.name} ended with {code}: {log.read_text()[-300:]}", 0
+        return (
+            "" if code == 0 and output.exists() else f"nerg {command.name} ended with {code}: {log.read_text()[-300:]}",
+            0,
+        )
 
     def blocked(command: Command):
         if "place" in command.output:
@@ -236,7 +277,9 @@ def refusals(work: Path, inputs: Path, only: str) -> tuple[list[list[object]], l
         row("A disk without room", full)
         row("A folder that is another user's", forbidden)
     else:
-        rows.append(["A disk without room; another user's folder", 0, "-", "-", "skipped: root alone can make them", "-"])
+        rows.append(
+            ["A disk without room; another user's folder", 0, "-", "-", "skipped: root alone can make them", "-"]
+        )
     row("A parent that is missing is made", missing)
     row("A parent that is a file", blocked)
     return rows, wrong
@@ -249,7 +292,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--update", type=Path, help="page whose table is exchanged")
     options = parser.parse_args(arguments)
     # Children have what is loaded here; nothing may be begun with it.
-    import matplotlib, mitsuba, scipy, trimesh, typer  # noqa: E401, F401
+    import matplotlib  # noqa: F401
 
     from tools.page import table, update
 

@@ -20,15 +20,26 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 
-import nerg_mi  # noqa: E402, F401  (chooses the libLLVM, so it comes before mitsuba)
 from page import table, update  # noqa: E402
+
+import nerg_mi  # noqa: E402, F401  (chooses the libLLVM, so it comes before mitsuba)
 from tests.fuzz.cases import draw_cases, make_inputs  # noqa: E402
 from tests.fuzz.keeping import CORPUS, kept  # noqa: E402
 from tests.fuzz.readers import READERS  # noqa: E402
 from tests.fuzz.watch import BREACHES, run_cases  # noqa: E402
 
-HEAD = ("reader", "cases", "results", "refusals in one sentence", "other exceptions", "crashes, hangs",
-        "run, left behind", "over 5 s or 1 GB", "slowest, s", "most memory, MB")  # fmt: skip
+HEAD = (
+    "reader",
+    "cases",
+    "results",
+    "refusals in one sentence",
+    "other exceptions",
+    "crashes, hangs",
+    "run, left behind",
+    "over 5 s or 1 GB",
+    "slowest, s",
+    "most memory, MB",
+)
 _GROUPS = (("other exception", "no sentence"), ("crash", "hang"), ("executed", "left a file"), ("slow", "memory"))
 
 

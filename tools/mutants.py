@@ -29,10 +29,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import page  # noqa: E402
-from mutation.bench import BUILD, ROOT, Bench  # noqa: E402
-from mutation.reach import Reach, digest  # noqa: E402
-from mutation.sites import Mutant, compiles, find  # noqa: E402
+import page
+from mutation.bench import BUILD, ROOT, Bench
+from mutation.reach import Reach, digest
+from mutation.sites import Mutant, compiles, find
 
 SEED = "nerg"
 QUOTAS = {
@@ -239,20 +239,29 @@ def run(packages: list[str], results: dict[str, dict], arguments) -> None:
             results[mutant.key] = {**entry, "bound": arguments.bound}
             keep(mutant.key, results[mutant.key])
             outcome = "survived" if entry["outcome"] not in KILLED else entry["outcome"]
-            print(f"{k}/{len(todo)} {outcome:8} {entry['seconds']:6.1f} s  {mutant.place}  {entry['by'] or ''}", flush=True)
+            print(
+                f"{k}/{len(todo)} {outcome:8} {entry['seconds']:6.1f} s  {mutant.place}  {entry['by'] or ''}",
+                flush=True,
+            )
             if arguments.only:
                 print(describe(mutant), flush=True)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--package", action="append", choices=list(QUOTAS), metavar="FOLDER", help="only this part of the sample")
+    parser.add_argument(
+        "--package", action="append", choices=list(QUOTAS), metavar="FOLDER", help="only this part of the sample"
+    )
     parser.add_argument("--only", action="append", metavar="FILE:LINE[:KIND]", help="every mutant of this line")
     parser.add_argument("--survivors", action="store_true", help="print the survivors of the sample, run nothing")
     parser.add_argument("--update", metavar="PAGE", help="put the table on this page, run nothing")
-    parser.add_argument("--survived", action="store_true", help="judge only what was not killed when it was last judged")
+    parser.add_argument(
+        "--survived", action="store_true", help="judge only what was not killed when it was last judged"
+    )
     parser.add_argument("--again", action="store_true", help="judge also what is known")
-    parser.add_argument("--tests", action="append", metavar="PREFIX", help="judge by the files of tests that begin so (default: all)")
+    parser.add_argument(
+        "--tests", action="append", metavar="PREFIX", help="judge by the files of tests that begin so (default: all)"
+    )
     parser.add_argument("--bound", type=float, default=45.0, help="seconds of tests at most for a mutant (default: 45)")
     arguments = parser.parse_args()
     packages = arguments.package or list(QUOTAS)

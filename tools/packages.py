@@ -3,8 +3,8 @@
     python tools/packages.py [--row PYTHON/DEPENDENCIES/FROM ...] [--work FOLDER] [--update docs/trust.md]
 
 Each row is one empty environment: PYTHON such as 3.12, DEPENDENCIES `oldest` (the floors that the package names) or
-`newest`, FROM `wheel` or `sdist`. Tried in it from `/`: the version, the demo, a render of the installed scene, the sentence
-of each extra that is missing, and then, with the test extra, the quick tests as the source archive holds them.
+`newest`, FROM `wheel` or `sdist`. Tried in it from `/`: the version, the demo, a render of the installed scene, the
+sentence of each extra that is missing, and then, with the test extra, the quick tests as the source archive holds them.
 Interpreters are those of PATH and of pyenv; a row whose interpreter is missing says so. Exit code 1 where a row fails.
 """
 
@@ -29,13 +29,34 @@ ROWS = ("3.10/oldest/wheel", "3.10/newest/sdist", "3.11/newest/wheel", "3.12/new
 EXTRAS = ("parquet", "mesh")
 """Extras that the tests of a row run with. torch is none of them: its oldest version is a download of gigabytes."""
 TESTS = (
-    "rays", "density", "maths", "field/gaze", "field/test_radiance.py", "files", "formats/test_checkpoint.py",
-    "formats/test_fields.py", "formats/test_surfaces.py", "formats/torch_ngp/test_unpickling.py", "capture/test_colmap.py",
-    "capture/test_transforms.py", "interop", "plugins/test_gazefield.py", "plugins/test_nerf.py",
-    "plugins/test_nerg_gradients.py", "plugins/test_nerg_observer.py", "plugins/test_panorama.py", "renders",
-    "test_registration.py", "training/gaze/test_losses.py", "transport/observer/test_integral.py",
-    "transport/march/test_quadrature.py", "view", "cli/test_demo.py", "cli/test_rays.py", "cli/test_render.py",
-)  # fmt: skip
+    "rays",
+    "density",
+    "maths",
+    "field/gaze",
+    "field/test_radiance.py",
+    "files",
+    "formats/test_checkpoint.py",
+    "formats/test_fields.py",
+    "formats/test_surfaces.py",
+    "formats/torch_ngp/test_unpickling.py",
+    "capture/test_colmap.py",
+    "capture/test_transforms.py",
+    "interop",
+    "plugins/test_gazefield.py",
+    "plugins/test_nerf.py",
+    "plugins/test_nerg_gradients.py",
+    "plugins/test_nerg_observer.py",
+    "plugins/test_panorama.py",
+    "renders",
+    "test_registration.py",
+    "training/gaze/test_losses.py",
+    "transport/observer/test_integral.py",
+    "transport/march/test_quadrature.py",
+    "view",
+    "cli/test_demo.py",
+    "cli/test_rays.py",
+    "cli/test_render.py",
+)
 """Tests of an installed package, below tests/: they ask for nothing of the checkout but themselves."""
 # Folder of the checkout -> folder in the wheel
 _INSTALLED = {"nerg_mi": "nerg_mi", "plugins": "nerg_mi/plugins", "scenes": "nerg_mi/scenes"}
@@ -67,9 +88,19 @@ class Row:
         return Row(*match.groups())
 
     def cells(self) -> list[str]:
-        shown = ", ".join(f"{name} {self.versions[name]}" for name in ("mitsuba", "numpy", "scipy") if name in self.versions)
+        shown = ", ".join(
+            f"{name} {self.versions[name]}" for name in ("mitsuba", "numpy", "scipy") if name in self.versions
+        )
         given = f"{self.dependencies}: {shown}" if shown else self.dependencies
-        return [self.versions.get("python", self.python), given, self.source, self.demo, self.extras, self.tests, self.result]
+        return [
+            self.versions.get("python", self.python),
+            given,
+            self.source,
+            self.demo,
+            self.extras,
+            self.tests,
+            self.result,
+        ]
 
 
 HEAD = ("Python", "Dependencies", "Built from", "Demo and render", "Missing extras told", "Tests", "Result")
@@ -97,7 +128,8 @@ def interpreters(wanted: set[str]) -> dict[str, Path]:
 
 
 def floors(metadata: str) -> list[str]:
-    """pip constraints that hold every requirement of a wheel's METADATA to its lowest version, those of `EXTRAS` included."""
+    """pip constraints that hold every requirement of a wheel's METADATA to its lowest version, those of `EXTRAS`
+    included."""
     pinned = []
     for requirement in message_from_string(metadata).get_all("Requires-Dist", []):
         name, _, marker = (part.strip() for part in requirement.partition(";"))
@@ -118,7 +150,8 @@ def missing_from_wheel(tracked: list[str], names: list[str]) -> list[str]:
 
 
 def missing_from_sdist(tracked: list[str], names: list[str]) -> list[str]:
-    """Files of the checkout (``tracked``) that the source archive lacks, except those that only git and its server use."""
+    """Files of the checkout (``tracked``) that the source archive lacks, except those that only git and its server
+    use."""
     there = {name.split("/", 1)[1] for name in names if "/" in name}
     return [path for path in tracked if not path.startswith(".") and path not in there]
 
@@ -129,12 +162,21 @@ def missing_from_sdist(tracked: list[str], names: list[str]) -> list[str]:
 
 
 def run(command: list, cwd: Path | str = "/", *, env: dict | None = None, code: int = 0) -> str:
-    """Standard output and error of ``command``, which has to end with ``code``; raises `Failure` with its last lines."""
+    """Standard output and error of ``command``, which has to end with ``code``; raises `Failure` with its last
+    lines."""
     words = [str(c) for c in command]
     shown = " ".join(Path(w).name if w.startswith("/") else w for w in words)[:160]
     try:
-        done = subprocess.run(words, cwd=cwd, env=env, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                              stderr=subprocess.STDOUT, text=True, timeout=_LIMIT)  # fmt: skip
+        done = subprocess.run(
+            words,
+            cwd=cwd,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            timeout=_LIMIT,
+        )
     except subprocess.TimeoutExpired:
         raise Failure(f"{shown}: no end after {_LIMIT} s") from None
     if done.returncode != code:
@@ -163,7 +205,9 @@ def build(work: Path) -> tuple[Path, Path]:
     (sdist,), (wheel,) = out.glob("*.tar.gz"), out.glob("*.whl")
     with tarfile.open(sdist) as archive:
         lost = missing_from_sdist(tracked, archive.getnames())
-        archive.extractall(work / "unpacked", filter="data") if hasattr(tarfile, "data_filter") else archive.extractall(work / "unpacked")
+        archive.extractall(work / "unpacked", filter="data") if hasattr(tarfile, "data_filter") else archive.extractall(
+            work / "unpacked"
+        )
     lost += missing_from_wheel(tracked, zipfile.ZipFile(wheel).namelist())
     if lost:
         raise Failure(f"the packages lack {len(lost)} files of the checkout: {', '.join(lost[:8])}")
@@ -214,7 +258,9 @@ def try_commands(there: Environment, out: Path) -> str:
     scene = there.python("from nerg_mi.view.demo import store_scene; print(store_scene())")
     sizes = ("-D", "width=36", "-D", "height=24", "-D", "aovs=depth,gaze,visibility")
     there.run("nerg", "render", scene, "-o", out / "scene.exr", "--spp", 1, "-m", "llvm_ad_rgb", *sizes)
-    probe = "import nerg_mi, mitsuba as mi, sys; mi.set_variant('llvm_ad_rgb'); b = mi.Bitmap(%r); print(b.channel_count())"
+    probe = (
+        "import nerg_mi, mitsuba as mi, sys; mi.set_variant('llvm_ad_rgb'); b = mi.Bitmap(%r); print(b.channel_count())"
+    )
     if there.python(probe % str(out / "scene.exr")) != "6":
         raise Failure("the rendered picture does not have the six channels that were asked for")
     return f"{len(list((out / 'demo').iterdir())) + 1} files"
@@ -243,11 +289,26 @@ def try_tests(there: Environment, unpacked: Path, out: Path) -> str:
     # Only the tests: next to the sources these would be imported in place of what is installed.
     for read in ("tests", "docs"):
         shutil.copytree(unpacked / read, out / "outside" / read)
-    (out / "outside" / "pytest.ini").write_text("[pytest]\naddopts = --import-mode=importlib\nmarkers = slow: takes seconds\n")
+    (out / "outside" / "pytest.ini").write_text(
+        "[pytest]\naddopts = --import-mode=importlib\nmarkers = slow: takes seconds\n"
+    )
     report = out / "tests.xml"
     paths = [f"tests/{path}" for path in TESTS]
-    there.run("python", "-m", "pytest", "-q", "-m", "not slow", "-o", "faulthandler_timeout=600", "-p", "no:cacheprovider",
-              f"--junitxml={report}", *paths, cwd=out / "outside")  # fmt: skip
+    there.run(
+        "python",
+        "-m",
+        "pytest",
+        "-q",
+        "-m",
+        "not slow",
+        "-o",
+        "faulthandler_timeout=600",
+        "-p",
+        "no:cacheprovider",
+        f"--junitxml={report}",
+        *paths,
+        cwd=out / "outside",
+    )
     counts = ElementTree.parse(report).getroot().find("testsuite").attrib
     skipped = int(counts["skipped"])
     return f"{int(counts['tests']) - skipped} passed" + (f", {skipped} skipped" if skipped else "")
@@ -263,7 +324,9 @@ def try_row(row: Row, interpreter: Path | None, wheel: Path, sdist: Path, unpack
     (work / "home").mkdir(exist_ok=True)
     pinned = floors(metadata_of(wheel)) if row.dependencies == "oldest" else []
     try:
-        there = Environment(folder / "env", interpreter, wheel if row.source == "wheel" else sdist, pinned, work / "home")
+        there = Environment(
+            folder / "env", interpreter, wheel if row.source == "wheel" else sdist, pinned, work / "home"
+        )
         listed = "import importlib.metadata as m; print(' '.join(d.metadata['Name'] + '=' + d.version for d in m.distributions()))"
         row.versions = {k.lower(): v for k, v in (pair.split("=") for pair in there.python(listed).split())}
         row.versions["python"] = there.python("import platform; print(platform.python_version())")
@@ -288,7 +351,9 @@ def main(arguments: list[str] | None = None) -> int:
         sdist, wheel = build(work)
         (unpacked,) = (work / "unpacked").iterdir()
         for row in rows:
-            print(f"{row.python}, {row.dependencies} dependencies, from the {row.source} ...", file=sys.stderr, flush=True)
+            print(
+                f"{row.python}, {row.dependencies} dependencies, from the {row.source} ...", file=sys.stderr, flush=True
+            )
             try_row(row, found.get(row.python), wheel, sdist, unpacked, work)
             print(" | ".join(row.cells()), file=sys.stderr, flush=True)
     sys.path.insert(0, str(ROOT))

@@ -2,8 +2,8 @@
 
     python tools/ray_sizes.py [--rays 10000000] [--folder FOLDER] [--update docs/trust.md]
 
-The rays are those of 500 people who walk about for as long as it takes at 50 Hz, with hit points. Each command runs in a process
-of its own, whose peak memory is compared with the columns of its input: 92 bytes a ray.
+The rays are those of 500 people who walk about for as long as it takes at 50 Hz, with hit points. Each command runs in
+a process of its own, whose peak memory is compared with the columns of its input: 92 bytes a ray.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ def measured(command: list[str], says: str) -> tuple[float, int]:
     """Seconds and bytes of memory at the peak of a command, which must succeed, and say what it should."""
     start = time.perf_counter()
     with tempfile.TemporaryFile("w+") as said:
-        process = subprocess.Popen([sys.executable, "-c", "from nerg_command import main; main()", *command], stdout=said)
+        process = subprocess.Popen(
+            [sys.executable, "-c", "from nerg_command import main; main()", *command], stdout=said
+        )
         _, status, used = os.wait4(process.pid, 0)
         said.seek(0)
         if status or says not in said.read():
@@ -60,7 +62,9 @@ def measured(command: list[str], says: str) -> tuple[float, int]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rays", type=int, default=10_000_000)
-    parser.add_argument("--folder", type=Path, help="where the rays are kept, and found again; default: a temporary one")
+    parser.add_argument(
+        "--folder", type=Path, help="where the rays are kept, and found again; default: a temporary one"
+    )
     parser.add_argument("--update", type=Path, metavar="PAGE")
     options = parser.parse_args()
 
@@ -75,16 +79,41 @@ def main() -> None:
         columns = 92 * options.rays
         commands = {
             "rays show": ["rays", "show", str(source)],
-            "rays filter, half of them": ["rays", "filter", str(source), "-o", str(folder / "half.npz"), "--min-confidence", "0.5"],
-            "rays filter, all but a few": ["rays", "filter", str(source), "-o", str(folder / "most.npz"), "--min-confidence", "0.001"],
+            "rays filter, half of them": [
+                "rays",
+                "filter",
+                str(source),
+                "-o",
+                str(folder / "half.npz"),
+                "--min-confidence",
+                "0.5",
+            ],
+            "rays filter, all but a few": [
+                "rays",
+                "filter",
+                str(source),
+                "-o",
+                str(folder / "most.npz"),
+                "--min-confidence",
+                "0.001",
+            ],
         }
         rows = []
         for name, command in commands.items():
-            seconds, memory = measured(command, "wrote" if "filter" in command else f"{options.rays:,} of {options.rays:,} rows")
+            seconds, memory = measured(
+                command, "wrote" if "filter" in command else f"{options.rays:,} of {options.rays:,} rows"
+            )
             rows.append(
-                [name, f"{options.rays:,}", f"{source.stat().st_size / 1e6:,.0f}", f"{columns / 1e6:,.0f}", f"{seconds:.1f}",
-                 f"{memory / 1e6:,.0f}", f"{memory / columns:.2f}"]
-            )  # fmt: skip
+                [
+                    name,
+                    f"{options.rays:,}",
+                    f"{source.stat().st_size / 1e6:,.0f}",
+                    f"{columns / 1e6:,.0f}",
+                    f"{seconds:.1f}",
+                    f"{memory / 1e6:,.0f}",
+                    f"{memory / columns:.2f}",
+                ]
+            )
             print(rows[-1], file=sys.stderr, flush=True)
     head = ["command", "rays", "file (MB)", "columns (MB)", "seconds", "peak memory (MB)", "of the columns"]
     update(options.update, "Millions of rays", table(head, rows))

@@ -57,7 +57,8 @@ def administrator() -> list[str] | None:
 
 def provide_llvm() -> None:
     """Have a libLLVM on which Dr.Jit's kernels run, installing one with apt if need be and allowed."""
-    # With the command's module loaded, an unusable libLLVM is ours to mend and no reason for nerg_mi to refuse its import.
+    # With the command's module loaded, an unusable libLLVM is ours to mend and no reason for nerg_mi to refuse its
+    # import.
     sys.path.insert(0, str(ROOT))
     import nerg_command  # noqa: F401
     from nerg_mi import llvm
@@ -108,7 +109,9 @@ def provide_venv() -> Path:
     if python.exists() and subprocess.run([python, "-m", "pip", "--version"], capture_output=True).returncode == 0:
         return python
     if importlib.util.find_spec("ensurepip") is None or importlib.util.find_spec("venv") is None:
-        raise Stop("Python's venv module is missing: type\n\n    sudo apt-get install python3-venv\n\nand run this again.")
+        raise Stop(
+            "Python's venv module is missing: type\n\n    sudo apt-get install python3-venv\n\nand run this again."
+        )
     print(f"Making {VENV.name} ...", flush=True)
     subprocess.run([sys.executable, "-m", "venv", "--clear", VENV], check=True)
     return python
@@ -132,7 +135,9 @@ def main(extras: list[str]) -> int:
     try:
         if sys.version_info < (3, 10):
             version = sys.version.split()[0]
-            raise Stop(f"Python 3.10 or newer is needed and this is {version}: name another with make PYTHON=python3.12.")
+            raise Stop(
+                f"Python 3.10 or newer is needed and this is {version}: name another with make PYTHON=python3.12."
+            )
         provide_llvm()
         provide_package(provide_venv(), set(extras))
     except Stop as stop:

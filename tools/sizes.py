@@ -1,6 +1,6 @@
 """What memory pictures of the demo store take: peak of a process that renders one, from 1080p to 8K.
 
-    python -m tools.sizes [--memory GB] [--update docs/trust.md]      (8K takes about ten minutes on two cores)
+python -m tools.sizes [--memory GB] [--update docs/trust.md]      (8K takes about ten minutes on two cores)
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ print(json.dumps({"bands": len(counted), "peak": peak, "seconds": time.perf_coun
 
 
 def measure(width: int, height: int, memory: float) -> dict:
-    """``bands``, ``peak`` (bytes) and ``seconds`` of a process that renders the store, one sample a pixel, to an EXR file."""
+    """``bands``, ``peak`` (bytes) and ``seconds`` of a process that renders the store, one sample a pixel, to an EXR
+    file."""
     with tempfile.TemporaryDirectory() as folder:
         arguments = [sys.executable, "-c", _CHILD, str(Path(folder) / "a.exr"), str(width), str(height), str(memory)]
         done = subprocess.run(arguments, check=True, capture_output=True, text=True)
@@ -51,9 +52,12 @@ def row(name: str, width: int, height: int, memory: float) -> tuple[str, ...]:
     """A line of the table."""
     found = measure(width, height, memory)
     return (
-        f"{name} ({width} x {height})", f"{memory:g} GB", str(found["bands"]), f"{found['peak'] / 1e6:,.0f} MB",
+        f"{name} ({width} x {height})",
+        f"{memory:g} GB",
+        str(found["bands"]),
+        f"{found['peak'] / 1e6:,.0f} MB",
         f"{found['file'] / 1e6:,.0f} MB",
-    )  # fmt: skip
+    )
 
 
 def main(arguments: list[str] | None = None) -> None:

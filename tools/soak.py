@@ -2,9 +2,9 @@
 
     python tools/soak.py [--part NAME ...] [--share 1.0] [--update docs/trust.md]
 
-Each part runs in a process of its own. Its resident memory is sampled between units of work, the first third is let pass
-(kernels are compiled and caches filled), and a line is fitted to the rest by least squares. A part fails, and the exit code
-is 1, where the line climbs by more than the part's bound. ``--share`` shortens every part.
+Each part runs in a process of its own. Its resident memory is sampled between units of work, the first third is let
+pass (kernels are compiled and caches filled), and a line is fitted to the rest by least squares. A part fails, and the
+exit code is 1, where the line climbs by more than the part's bound. ``--share`` shortens every part.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _SIZES = {"width": "36", "height": "24"}
 
 @dataclass(frozen=True)
 class Course:
-    """What became of a part: ``count`` units of work (``unit``), resident memory in MiB when the line begins and at the end,
-    its ``slope`` and the ``bound`` on it in KiB a unit."""
+    """What became of a part: ``count`` units of work (``unit``), resident memory in MiB when the line begins and at the
+    end, its ``slope`` and the ``bound`` on it in KiB a unit."""
 
     unit: str
     count: int
@@ -56,7 +56,8 @@ HEAD = ("What", "Units", "After the warm-up", "At the end", "Slope a unit", "Bou
 
 
 def resident() -> float:
-    """Memory of this process that is in RAM, in KiB, once what nothing refers to any more has gone back to the system."""
+    """Memory of this process that is in RAM, in KiB, once what nothing refers to any more has gone back to the
+    system."""
     import drjit as dr
 
     gc.collect()
@@ -68,7 +69,8 @@ def resident() -> float:
 
 
 def watch(unit: Callable[[int], object], count: int, bound: float, name: str = "units") -> Course:
-    """Do ``unit(k)`` for k in 0 .. ``count``, sampling memory in between, and fit a line to what follows the first third."""
+    """Do ``unit(k)`` for k in 0 .. ``count``, sampling memory in between, and fit a line to what follows the first
+    third."""
     every = max(1, count // _SAMPLES)
     at, memory = [], []
     for k in range(count):
@@ -103,7 +105,9 @@ def _store(mi, **values: str):
 
 def _eye(mi, k: int):
     """Where the observer stands in the store at frame ``k``: up and down an aisle."""
-    return mi.ScalarTransform4f().look_at([4.4 + 0.3 * np.sin(0.1 * k), 2.8 + 0.5 * np.cos(0.07 * k), 1.6], [4.8, 4.4, 1.2], [0, 0, 1])
+    return mi.ScalarTransform4f().look_at(
+        [4.4 + 0.3 * np.sin(0.1 * k), 2.8 + 0.5 * np.cos(0.07 * k), 1.6], [4.8, 4.4, 1.2], [0, 0, 1]
+    )
 
 
 def frames() -> Callable[[int], None]:
@@ -129,12 +133,12 @@ def radiance_steps() -> Callable[[int], None]:
 
     from nerg_mi.capture.cameras import Camera
     from nerg_mi.capture.images import View
-    from nerg_mi.maths.box import Box
+    from nerg_mi.capture.intrinsics import Intrinsics
     from nerg_mi.field.encoding.hashgrid import HashGridConfig
     from nerg_mi.field.radiance import RadianceConfig
-    from nerg_mi.capture.intrinsics import Intrinsics
-    from nerg_mi.training.radiance.trainer import RadianceTrainer
+    from nerg_mi.maths.box import Box
     from nerg_mi.training.radiance.settings import RadianceSettings
+    from nerg_mi.training.radiance.trainer import RadianceTrainer
     from tools import tiny
 
     assert mi.variant()
@@ -163,12 +167,12 @@ def gaze_steps() -> Callable[[int], None]:
     import drjit as dr
     import drjit.llvm.ad as ns
 
-    from nerg_mi.field.gaze.product import GazeConfig
     from nerg_mi.field.encoding.hashgrid import HashGridConfig
-    from nerg_mi.training.gaze.trainer import GazeTrainer
-    from nerg_mi.training.geometry.places import place_of_nothing
+    from nerg_mi.field.gaze.product import GazeConfig
     from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
     from nerg_mi.training.gaze.supervision import supervise_rays
+    from nerg_mi.training.gaze.trainer import GazeTrainer
+    from nerg_mi.training.geometry.places import place_of_nothing
     from tools import tiny
 
     rays = tiny.looks()
@@ -176,7 +180,9 @@ def gaze_steps() -> Callable[[int], None]:
     probes = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
     config = GazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=4)
     supervision = supervise_rays(rays, place.medium, place.box, probes)
-    trainer = GazeTrainer(supervision, place.box, config, GazeSettings(steps=20_000, probes=4, directions=32, zones=0), ns)
+    trainer = GazeTrainer(
+        supervision, place.box, config, GazeSettings(steps=20_000, probes=4, directions=32, zones=0), ns
+    )
 
     def step(k: int) -> None:
         trainer.step()
@@ -197,7 +203,8 @@ def variants() -> Callable[[int], None]:
 
 
 def threads() -> Callable[[int], None]:
-    """A frame of each of two scenes, rendered at the same time by two threads; pictures must be those of one thread alone."""
+    """A frame of each of two scenes, rendered at the same time by two threads; pictures must be those of one thread
+    alone."""
     mi = _variant()
     scenes = _store(mi), _store(mi, eye="6.3, 3.0, 1.6")
     alone = [np.array(mi.render(scene, spp=1, seed=1)) for scene in scenes]
@@ -215,7 +222,9 @@ def threads() -> Callable[[int], None]:
         for worker in workers:
             worker.join()
         for which in range(2):
-            assert seen[which] is not None and np.array_equal(seen[which], alone[which]), f"frame {k} of scene {which} differs"
+            assert seen[which] is not None and np.array_equal(seen[which], alone[which]), (
+                f"frame {k} of scene {which} differs"
+            )
 
     return frame
 

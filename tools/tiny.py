@@ -1,4 +1,5 @@
-"""Places that are small enough to be worked on thousands of times: what the tools that try the package out begin with."""
+"""Places that are small enough to be worked on thousands of times: what the tools that try the package out begin
+with."""
 
 from __future__ import annotations
 
@@ -60,7 +61,9 @@ def looks(count: int = 400):
     from nerg_mi.rays.rays import Rays
 
     rng = np.random.default_rng(0)
-    origin = np.stack([rng.uniform(-1.2, 0, count), rng.uniform(-1.2, 1.2, count), rng.uniform(1.5, 1.7, count)], axis=1)
+    origin = np.stack(
+        [rng.uniform(-1.2, 0, count), rng.uniform(-1.2, 1.2, count), rng.uniform(1.5, 1.7, count)], axis=1
+    )
     direction = np.array([1.5, 0.4, 1.2]) + rng.normal(0, 0.15, (count, 3)) - origin
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     hit = origin + direction * ((1.5 - origin[:, :1]) / direction[:, :1])
@@ -73,7 +76,10 @@ def write_tracking(path: Path, count: int) -> Path:
     rows = np.column_stack([rays.t, rays.origin, rays.direction])
     with open(path, "w", encoding="utf-8") as out:
         out.write("t,person,x,y,z,dx,dy,dz\n")
-        out.writelines(f"{row[0]:g},{person}," + ",".join(f"{v:.6f}" for v in row[1:]) + "\n" for row, person in zip(rows, rays.person))
+        out.writelines(
+            f"{row[0]:g},{person}," + ",".join(f"{v:.6f}" for v in row[1:]) + "\n"
+            for row, person in zip(rows, rays.person)
+        )
     return path
 
 

@@ -1,10 +1,12 @@
 """The box around a place that cameras looked at: from points on its surfaces, or from the cameras alone."""
+
 from __future__ import annotations
 
 import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
+
 from .cameras import Camera, project
 
 # Cameras whose axes miss their common point by less than this look at one thing.

@@ -3,6 +3,7 @@
 Frames: image x right, y down, pixel centres at half-integers; camera OpenGL (x right,
 y up, looking along -z); world the data set's own.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -10,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
-from .intrinsics import Intrinsics
+
 from . import lens
+from .intrinsics import Intrinsics
 
 # OpenGL cameras look along -z with x to the right, Mitsuba's along +z with x to the left.
 _OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
@@ -102,8 +104,12 @@ def sensor_dict(camera: Camera) -> dict:
         "near_clip": 1e-3,
         "far_clip": 1e5,
         "film": {
-            "type": "hdrfilm", "width": i.width, "height": i.height, "rfilter": {"type": "box"},
-            "pixel_format": "rgb", "component_format": "float32",
+            "type": "hdrfilm",
+            "width": i.width,
+            "height": i.height,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            "component_format": "float32",
         },
         "sampler": {"type": "independent", "sample_count": 1},
     }

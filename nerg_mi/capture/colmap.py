@@ -3,6 +3,7 @@
 The layout of both is COLMAP's (src/colmap/scene/reconstruction_io): little-endian; world-to-camera poses as a
 quaternion (w, x, y, z) and a translation; cameras look along +z with y down; the first pixel's centre is (0.5, 0.5).
 """
+
 from __future__ import annotations
 
 import hashlib
@@ -14,19 +15,34 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, sentence
 from nerg_mi.files.bounded import plain, read_bytes, text_lines
+
 from .posed import FARTHEST, Frame, MaskFile, PosedImages, Unused, drop_repeated, inside, none_usable
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
 _MODELS = {
-    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
 # Their parameters in COLMAP's order, as far as the mapping is known here; "f" is both focal lengths.
 _PARAMETERS = {
-    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fl_x fl_y cx cy", "SIMPLE_RADIAL": "f cx cy k1", "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2", "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4", "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fl_x fl_y cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "OPENCV_FISHEYE": "fl_x fl_y cx cy k1 k2 k3 k4",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
     "RADIAL_FISHEYE": "f cx cy k1 k2",
 }
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -46,8 +62,10 @@ class _Camera:
     def lens(self) -> dict:
         names = _PARAMETERS.get(self.model)
         if names is None:
-            raise NergError(f'its camera model "{self.model}" is not supported; run "colmap image_undistorter" and train on '
-                             f"its result, or use one of {', '.join(_PARAMETERS)}")
+            raise NergError(
+                f'its camera model "{self.model}" is not supported; run "colmap image_undistorter" and train on '
+                f"its result, or use one of {', '.join(_PARAMETERS)}"
+            )
         names = names.split()
         if len(names) != len(self.parameters) or not np.all(np.isfinite(self.parameters)):
             raise NergError(f"its camera needs {len(names)} finite parameters for {self.model}, not {self.parameters}")
@@ -60,21 +78,25 @@ class _Camera:
 
 
 def model_files(folder: str | Path) -> dict[str, Path] | None:
-    """The files "cameras", "images" and, where it exists, "points3D" of a model in ``folder``; None if there is none."""
+    """The files "cameras", "images" and, where it exists, "points3D" of a model in ``folder``; None if there is
+    none."""
     folder = Path(folder)
     for suffix in (".bin", ".txt"):
         if all((folder / (n + suffix)).is_file() for n in ("cameras", "images")):
-            return {n: folder / (n + suffix) for n in ("cameras", "images", "points3D") if (folder / (n + suffix)).is_file()}
+            return {
+                n: folder / (n + suffix) for n in ("cameras", "images", "points3D") if (folder / (n + suffix)).is_file()
+            }
     return None
 
 
-def read_colmap(folder: str | Path, images: str | Path, masks: str | Path | None = None,
-                allow_outside: bool = False) -> PosedImages:
+def read_colmap(
+    folder: str | Path, images: str | Path, masks: str | Path | None = None, allow_outside: bool = False
+) -> PosedImages:
     """Read the model in ``folder``; its image names are relative to ``images``, its masks' to ``masks`` (``NAME.png``).
 
-    Images and masks that lie outside of the capture, the folder that holds ``images``, links followed, are not used unless
-    ``allow_outside``. In COLMAP's own world. Frames that cannot be used are listed; `NergError` names file and record for
-    what cannot be parsed, and when no frame can be used.
+    Images and masks that lie outside of the capture, the folder that holds ``images``, links followed, are not used
+    unless ``allow_outside``. In COLMAP's own world. Frames that cannot be used are listed; `NergError` names file and
+    record for what cannot be parsed, and when no frame can be used.
     """
     folder, images = Path(folder), Path(images)
     files = model_files(folder)
@@ -150,7 +172,9 @@ class _Reader:
 
     def need(self, size: int, what: str) -> None:
         if self.at + size > len(self.data):
-            raise NergError(f'"{self.path}" ends in the middle of {what} (byte {self.at} of {len(self.data)}); copy it again')
+            raise NergError(
+                f'"{self.path}" ends in the middle of {what} (byte {self.at} of {len(self.data)}); copy it again'
+            )
 
     def skip(self, size: int, what: str) -> None:
         self.need(size, what)
@@ -160,7 +184,7 @@ class _Reader:
         end = self.data.find(b"\0", self.at)
         if end < 0:
             raise NergError(f'"{self.path}" ends in the middle of the name of {what}; copy it again')
-        out, self.at = self.data[self.at:end], end + 1
+        out, self.at = self.data[self.at : end], end + 1
         return out.decode("utf-8", errors="surrogateescape")
 
 
@@ -169,8 +193,10 @@ def _cameras_bin(path: Path) -> dict[int, _Camera]:
     for k in range(r.take("Q", "its header")[0]):
         number, model, width, height = r.take("iiQQ", f"camera record {k + 1}")
         if model not in _MODELS:
-            raise NergError(f'camera {number} of "{path}" has the unknown model number {model}, so that the file cannot be '
-                             'read on; convert it with "colmap model_converter --output_type TXT"')
+            raise NergError(
+                f'camera {number} of "{path}" has the unknown model number {model}, so that the file cannot be '
+                'read on; convert it with "colmap model_converter --output_type TXT"'
+            )
         name, count = _MODELS[model]
         out[number] = _Camera(name, width, height, r.take(f"{count}d", f"camera record {k + 1}"))
     return out
@@ -209,8 +235,10 @@ def _rows(path: Path):
     """Numbers and words of the lines that are not empty."""
     for number, line in _lines(path):
         if len(line) > _LONGEST:
-            raise NergError(f'line {number} of "{path}" has {len(line):,} characters, and at most {_LONGEST:,} are read; '
-                            "is it a COLMAP file?")
+            raise NergError(
+                f'line {number} of "{path}" has {len(line):,} characters, and at most {_LONGEST:,} are read; '
+                "is it a COLMAP file?"
+            )
         if line.strip():
             yield number, line.split()
 

@@ -1,4 +1,5 @@
 """A posed image set made ready: training views, held-out views and the scene box."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -8,13 +9,15 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
-from .posed import PosedImages, Unused
+
 from .bounds import lonely, scene_box
 from .cameras import pixel_directions
 from .images import View, load_usable
+from .posed import PosedImages, Unused
 from .sources import read_split
 
-# A surface on a face of the box needs cells behind it: rays end at the box, and a half step before it nothing can absorb.
+# A surface on a face of the box needs cells behind it: rays end at the box, and a half step before it nothing can
+# absorb.
 _PAD = 1 / 80
 # Of each view's depth, at most so many points help to find the box.
 _DEPTH_POINTS = 2000
@@ -24,7 +27,8 @@ _DEPTH_POINTS = 2000
 class Dataset:
     """``train``, ``held_out``: views in the coordinates asked for; ``box``: where density may be, and ``box_from``
     how that was found; ``unused``: frames that were left out, each with its reason; ``source``: for provenance;
-    ``notes``: sentences about frames that are used with something missing; ``unit``: a sentence on the length of a unit."""
+    ``notes``: sentences about frames that are used with something missing; ``unit``: a sentence on the length of a
+    unit."""
 
     train: list[View]
     held_out: list[View]
@@ -37,23 +41,32 @@ class Dataset:
 
 
 def open_dataset(
-    path: str | Path, holdout: int | None = None, width: int | None = None, downscale: float | None = None,
-    aabb: tuple | None = None, depth: bool = True, scale: float = 1.0, coordinates: str = "file", allow_outside: bool = False,
+    path: str | Path,
+    holdout: int | None = None,
+    width: int | None = None,
+    downscale: float | None = None,
+    aabb: tuple | None = None,
+    depth: bool = True,
+    scale: float = 1.0,
+    coordinates: str = "file",
+    allow_outside: bool = False,
 ) -> Dataset:
     """Read the data set ``path``: a folder with a transforms file or a COLMAP model, or one of these itself.
 
-    ``holdout``, ``coordinates``, ``scale``, ``allow_outside``: as `read_split` has them. ``width``, ``downscale``: size of the
-    pictures. ``aabb``: six numbers x0, y0, z0, x1, y1, z1 bounding what is seen, in the coordinates asked for; else "aabb"
-    of the file, else a guess from points on surfaces (COLMAP's, or from depth) or from the cameras. ``depth``: read
-    the depth files that the frames name.
+    ``holdout``, ``coordinates``, ``scale``, ``allow_outside``: as `read_split` has them. ``width``, ``downscale``: size
+    of the pictures. ``aabb``: six numbers x0, y0, z0, x1, y1, z1 bounding what is seen, in the coordinates asked for;
+    else "aabb" of the file, else a guess from points on surfaces (COLMAP's, or from depth) or from the cameras.
+    ``depth``: read the depth files that the frames name.
 
     Frames that cannot be used are left out and listed; `NergError`, naming file and frame, when none can.
     """
     split = read_split(path, holdout, coordinates, scale, allow_outside)
     train, bad = load_usable(split.posed.frames, width, downscale, depth)
     if not train:
-        raise NergError(f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '
-                         f'"{bad[0].name}": {bad[0].reason}')
+        raise NergError(
+            f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '
+            f'"{bad[0].name}": {bad[0].reason}'
+        )
     held_out, bad_held = load_usable(split.held_out, width, downscale, depth)
     box, box_from = _box(split.posed, train, aabb)
     alone = lonely([v.camera for v in train], box) if len(train) > 1 else []
@@ -78,7 +91,9 @@ def open_dataset(
         "height": train[0].shape[0],
         "to_file": split.posed.to_file.tolist(),
     }
-    return Dataset(train, held_out, box, box_from, unused, source, split.posed.notes, _unit(split.posed, train, box, scale))
+    return Dataset(
+        train, held_out, box, box_from, unused, source, split.posed.notes, _unit(split.posed, train, box, scale)
+    )
 
 
 def _box(posed: PosedImages, views: list[View], aabb) -> tuple[Box, str]:

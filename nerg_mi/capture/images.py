@@ -1,4 +1,5 @@
 """Posed image sets, loaded at a chosen size and split into training and held-out views."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -6,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
-from .posed import Frame, Unused
+
 from . import lens
 from .cameras import Camera, pixel_directions, pixel_grid, view_tangents
+from .posed import Frame, Unused
 from .reading import read_depth, read_image, read_mask
 from .resize import all_used, area_average, nearest
 
@@ -128,8 +130,10 @@ def _distances(frame: Frame, shape: tuple[int, int], intrinsics) -> np.ndarray:
     """Distances along the rays of the resized picture; depth cameras may have fewer pixels than the photo."""
     out, (h, w) = read_depth(frame.depth), shape
     if abs(out.shape[1] * h - out.shape[0] * w) > 0.01 * w * out.shape[0]:
-        raise NergError(f'the depth file "{frame.depth.path}" has {out.shape[1]} x {out.shape[0]} pixels, which is not the '
-                         f"shape of its image, {w} x {h}")
+        raise NergError(
+            f'the depth file "{frame.depth.path}" has {out.shape[1]} x {out.shape[0]} pixels, which is not the '
+            f"shape of its image, {w} x {h}"
+        )
     out = nearest(out, intrinsics.width, intrinsics.height)
     if frame.depth.along_axis:
         ahead = -pixel_directions(intrinsics)[..., 2]

@@ -1,4 +1,5 @@
 """How a photo's lens maps directions to pixels: OpenCV's pinhole and fisheye models."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -43,5 +44,6 @@ class Intrinsics:
     def resized(self, width: int, height: int) -> Intrinsics:
         """The same lens on an image of another size."""
         sx, sy = width / self.width, height / self.height
-        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy,
-                       cx=self.cx * sx, cy=self.cy * sy)
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )

@@ -5,11 +5,13 @@ principal point, over the focal length. Pinhole model: OpenCV's ``projectPoints`
 (radial over radial, tangential); fisheye: ``cv::fisheye``, image radius θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)
 at the angle θ from the axis.
 """
+
 from __future__ import annotations
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .intrinsics import Intrinsics
 
 _NEWTON = 20
@@ -22,10 +24,13 @@ def distort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     radial = _ratio(r2, lens)[0]
-    return np.stack([
-        x * radial + 2 * lens.p1 * x * y + lens.p2 * (r2 + 2 * x * x),
-        y * radial + lens.p1 * (r2 + 2 * y * y) + 2 * lens.p2 * x * y,
-    ], axis=-1)
+    return np.stack(
+        [
+            x * radial + 2 * lens.p1 * x * y + lens.p2 * (r2 + 2 * x * x),
+            y * radial + lens.p1 * (r2 + 2 * y * y) + 2 * lens.p2 * x * y,
+        ],
+        axis=-1,
+    )
 
 
 def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
@@ -46,16 +51,23 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
             a, b, d = _jacobian(u, lens)
             det = a * d - b * b
             det = np.where(np.abs(det) > 1e-6, det, 1e-6)
-            u = u - np.stack([d * residual[..., 0] - b * residual[..., 1],
-                              a * residual[..., 1] - b * residual[..., 0]], axis=-1) / det[..., None]
+            u = (
+                u
+                - np.stack(
+                    [d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - b * residual[..., 0]], axis=-1
+                )
+                / det[..., None]
+            )
         a, b, d = _jacobian(u, lens)
         # Past the fold the picture runs backwards: another point with the same image, that the lens does not show.
         good = np.all(np.abs(distort(u, lens) - goal) < 1e-6) and np.all(a * d - b * b > 0) and np.all(a + d > 0)
     if not good:
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
         said = ", ".join(f"{k}={v:g}" for k, v in zip(names, lens.distortion) if v)
-        raise NergError(f"the distortion {said} cannot be inverted over the whole image; undistort the images beforehand, "
-                         "or crop them")
+        raise NergError(
+            f"the distortion {said} cannot be inverted over the whole image; undistort the images beforehand, "
+            "or crop them"
+        )
     return u
 
 
@@ -86,16 +98,20 @@ def _jacobian(xy, lens: Intrinsics):
     """∂x'/∂x, ∂x'/∂y = ∂y'/∂x and ∂y'/∂y of `distort`."""
     x, y = xy[..., 0], xy[..., 1]
     radial, slope = _ratio(x * x + y * y, lens)
-    return (radial + 2 * x * x * slope + 2 * lens.p1 * y + 6 * lens.p2 * x,
-            2 * x * y * slope + 2 * lens.p1 * x + 2 * lens.p2 * y,
-            radial + 2 * y * y * slope + 6 * lens.p1 * y + 2 * lens.p2 * x)
+    return (
+        radial + 2 * x * x * slope + 2 * lens.p1 * y + 6 * lens.p2 * x,
+        2 * x * y * slope + 2 * lens.p1 * x + 2 * lens.p2 * y,
+        radial + 2 * y * y * slope + 6 * lens.p1 * y + 2 * lens.p2 * x,
+    )
 
 
 def _fisheye_radius(theta, lens: Intrinsics):
     """Image radius at the angle θ, and its derivative."""
     t = theta * theta
-    return (theta * (1 + t * (lens.k1 + t * (lens.k2 + t * (lens.k3 + t * lens.k4)))),
-            1 + t * (3 * lens.k1 + t * (5 * lens.k2 + t * (7 * lens.k3 + t * 9 * lens.k4))))
+    return (
+        theta * (1 + t * (lens.k1 + t * (lens.k2 + t * (lens.k3 + t * lens.k4)))),
+        1 + t * (3 * lens.k1 + t * (5 * lens.k2 + t * (7 * lens.k3 + t * 9 * lens.k4))),
+    )
 
 
 def fisheye_limit(lens: Intrinsics) -> tuple[float, float]:
@@ -132,7 +148,8 @@ def rays(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
 
 
 def image(d: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Image coordinates (..., 2) of directions ``d`` (..., 3) of any length, and a mask of those that the lens can show."""
+    """Image coordinates (..., 2) of directions ``d`` (..., 3) of any length, and a mask of those that the lens can
+    show."""
     d = np.asarray(d, np.float64)
     if not lens.fisheye:
         front = d[..., 2] > 1e-9

@@ -3,6 +3,7 @@
 Poses are OpenGL camera-to-world matrices (x right, y up, z back) in the data set's own
 coordinates and units; readers do not re-centre, scale or turn them.
 """
+
 from __future__ import annotations
 
 import os
@@ -13,11 +14,29 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
+
 from .intrinsics import Intrinsics
 
 # Keys of `Frame.lens`, all floats; "fisheye" is 1 for fisheye lenses.
-LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6",
-             "camera_angle_x", "camera_angle_y", "fisheye")
+LENS_KEYS = (
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "k1",
+    "k2",
+    "p1",
+    "p2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+    "camera_angle_x",
+    "camera_angle_y",
+    "fisheye",
+)
 
 
 FARTHEST = 1e12
@@ -96,15 +115,18 @@ class Frame:
                 f'frame "{plain(self.name)}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in radians'
             )
         if not (abs(lens.get("cx", 0)) <= 100 * w and abs(lens.get("cy", 0)) <= 100 * h):
-            raise NergError(f'the principal point ("cx", "cy") of frame "{plain(self.name)}" is not near its picture; correct it')
+            raise NergError(
+                f'the principal point ("cx", "cy") of frame "{plain(self.name)}" is not near its picture; correct it'
+            )
         bent = [lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
         if not all(abs(k) <= _BENT for k in bent):
-            raise NergError(f'the distortion of frame "{plain(self.name)}" has coefficients beyond {_BENT:g}; correct them')
+            raise NergError(
+                f'the distortion of frame "{plain(self.name)}" has coefficients beyond {_BENT:g}; correct them'
+            )
         # One that bends nothing would still be divided by where a lens is asked for its fold.
         bent = [k if abs(k) >= _UNBENT else 0.0 for k in bent]
         stated = Intrinsics(
-            w, h, float(fx), float(fy), lens.get("cx", w / 2), lens.get("cy", h / 2),
-            *bent, bool(lens.get("fisheye")),
+            w, h, float(fx), float(fy), lens.get("cx", w / 2), lens.get("cy", h / 2), *bent, bool(lens.get("fisheye"))
         )
         return stated.resized(width, height)
 
@@ -126,8 +148,8 @@ class PosedImages:
 
     ``unused``: frames that cannot be used; ``notes``: sentences about frames that can, with something missing;
     ``aabb``: (2, 3) scene box from the file, or None; ``points``: (N, 3) points on surfaces, or None;
-    ``held_out``: names of the frames that the file itself holds out, or None; ``spare``: of frames that it sets apart from
-    both; ``original``: (4, 4) similarity from these coordinates to those before the writer turned them
+    ``held_out``: names of the frames that the file itself holds out, or None; ``spare``: of frames that it sets apart
+    from both; ``original``: (4, 4) similarity from these coordinates to those before the writer turned them
     (``applied_transform``), or None; ``to_file``: (4, 4) similarity from these coordinates to those of the file;
     ``sha256``: of the file, for provenance.
     """
@@ -156,9 +178,12 @@ class PosedImages:
             depth = None if f.depth is None else replace(f.depth, unit=f.depth.unit * scale)
             frames.append(replace(f, to_world=pose, depth=depth))
         return replace(
-            self, frames=frames, aabb=_moved_box(self.aabb, similarity),
+            self,
+            frames=frames,
+            aabb=_moved_box(self.aabb, similarity),
             points=None if self.points is None else self.points @ similarity[:3, :3].T + similarity[:3, 3],
-            original=None if self.original is None else self.original @ back, to_file=self.to_file @ back,
+            original=None if self.original is None else self.original @ back,
+            to_file=self.to_file @ back,
         )
 
 
@@ -167,7 +192,9 @@ def _parts(similarity: np.ndarray) -> tuple[float, np.ndarray]:
     m = np.asarray(similarity, np.float64)
     scale = np.cbrt(np.linalg.det(m[:3, :3])) if m.shape == (4, 4) and np.all(np.isfinite(m)) else 0.0
     if not scale > 0 or not np.abs(m[:3, :3] @ m[:3, :3].T / scale**2 - np.eye(3)).max() <= 1e-3:
-        raise NergError("a change of coordinates must be a uniform scale, a rotation and a translation, without mirroring")
+        raise NergError(
+            "a change of coordinates must be a uniform scale, a rotation and a translation, without mirroring"
+        )
     return float(scale), m[:3, :3] / scale
 
 
@@ -225,5 +252,7 @@ def none_usable(path: Path, unused: list[Unused]) -> NergError:
     """The error of a set without a single usable frame."""
     if not unused:
         return NergError(f'"{path}" lists no frames; name the file of a posed image set')
-    return NergError(f'none of the {len(unused)} frames of "{path}" can be used; the first, "{plain(unused[0].name)}": '
-                     f"{plain(unused[0].reason, 1000)}")
+    return NergError(
+        f'none of the {len(unused)} frames of "{path}" can be used; the first, "{plain(unused[0].name)}": '
+        f"{plain(unused[0].reason, 1000)}"
+    )

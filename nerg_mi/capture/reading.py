@@ -1,4 +1,5 @@
 """Pictures, depth and masks from files."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -10,6 +11,7 @@ from nerg_mi.files.bounded import plain, reading
 from nerg_mi.files.exr import read_exr
 from nerg_mi.files.image_header import check_image
 from nerg_mi.files.npy import read_npy
+
 from .posed import DepthFile, MaskFile
 
 
@@ -31,12 +33,15 @@ def read_image(path: str | Path) -> np.ndarray:
         if pixels in (formats.RGB, formats.RGBA):
             return out
         if pixels in (formats.Y, formats.YA):
-            return np.ascontiguousarray(out[..., [0, 0, 0, 1][:3 if pixels == formats.Y else 4]])
+            return np.ascontiguousarray(out[..., [0, 0, 0, 1][: 3 if pixels == formats.Y else 4]])
     if pixels == formats.MultiChannel:
         bitmap = _layer(bitmap, path)
     alpha = bitmap.has_alpha()
-    straight = mi.Bitmap.AlphaTransform.Unpremultiply if alpha and bitmap.premultiplied_alpha() else \
-        mi.Bitmap.AlphaTransform.Empty
+    straight = (
+        mi.Bitmap.AlphaTransform.Unpremultiply
+        if alpha and bitmap.premultiplied_alpha()
+        else mi.Bitmap.AlphaTransform.Empty
+    )
     wanted = formats.RGBA if alpha else formats.RGB
     with reading(path, "image", also=(RuntimeError,)):
         linear = bitmap.convert(wanted, kinds.Float32, srgb_gamma=False, alpha_transform=straight)
@@ -51,7 +56,8 @@ def read_image(path: str | Path) -> np.ndarray:
 
 
 def open_bitmap(path: str | Path, what: str):
-    """The picture ``path`` as a Mitsuba bitmap, as Mitsuba itself opens it; `NergError` for one that is damaged or too large.
+    """The picture ``path`` as a Mitsuba bitmap, as Mitsuba itself opens it; `NergError` for one that is damaged or too
+    large.
 
     The size is checked in the header first. EXR is read by the OpenEXR library.
     """
@@ -73,7 +79,9 @@ def _exr_bitmap(channels: dict[str, np.ndarray]):
         values = values.astype(np.float32)
     found = "".join(n.rpartition(".")[2].lower() for n in names)
     known = {"rgb": "RGB", "rgba": "RGBA", "y": "Y", "ya": "YA", "xyz": "XYZ", "xyza": "XYZA"}
-    format = getattr(mi.Bitmap.PixelFormat, known.get(found, "MultiChannel") if len(found) == len(names) else "MultiChannel")
+    format = getattr(
+        mi.Bitmap.PixelFormat, known.get(found, "MultiChannel") if len(found) == len(names) else "MultiChannel"
+    )
     bitmap = mi.Bitmap(values, format, names)
     bitmap.set_premultiplied_alpha(True)
     return bitmap
@@ -87,8 +95,10 @@ def _layer(bitmap, path):
     for name in ("<root>", "rgba", "color"):
         if name in layers:
             return layers[name]
-    raise NergError(f'the image "{path}" has no channels R, G and B, only the layers {plain(", ".join(sorted(layers)))}; '
-                    "save it with these")
+    raise NergError(
+        f'the image "{path}" has no channels R, G and B, only the layers {plain(", ".join(sorted(layers)))}; '
+        "save it with these"
+    )
 
 
 def _to_srgb(x: np.ndarray) -> np.ndarray:
@@ -96,7 +106,8 @@ def _to_srgb(x: np.ndarray) -> np.ndarray:
 
 
 def read_depth(source: DepthFile) -> np.ndarray:
-    """The values (h, w) of ``.npy``, ``.exr`` (first channel) or 16-bit ``.png`` in scene units, float32; 0: unknown."""
+    """The values (h, w) of ``.npy``, ``.exr`` (first channel) or 16-bit ``.png`` in scene units, float32; 0:
+    unknown."""
     path, suffix = source.path, source.path.suffix.lower()
     if suffix == ".npy":
         out = read_npy(path, "depth file")
@@ -124,8 +135,10 @@ def read_mask(source: MaskFile, shape: tuple[int, int]) -> np.ndarray:
     out = np.array(open_bitmap(source.path, "mask"))
     out = out[..., None] if out.ndim == 2 else out
     if out.shape[:2] != shape:
-        raise NergError(f'the mask "{source.path}" has {out.shape[1]} x {out.shape[0]} pixels, but its image '
-                         f"{shape[1]} x {shape[0]}")
+        raise NergError(
+            f'the mask "{source.path}" has {out.shape[1]} x {out.shape[0]} pixels, but its image '
+            f"{shape[1]} x {shape[0]}"
+        )
     # An alpha channel says nothing here; as in nerfstudio and instant-ngp, whatever is not black is white.
     white = np.any((out[..., :1] if out.shape[2] <= 2 else out[..., :3]) != 0, axis=2)
     return ~white if source.hides else white

@@ -1,4 +1,5 @@
 """Pictures, masks and depth at another size."""
+
 from __future__ import annotations
 
 import numpy as np

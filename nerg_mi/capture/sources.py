@@ -1,4 +1,5 @@
 """Which files a data set's folder consists of, and which of its frames are held out."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -7,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
+
 from .colmap import model_files, read_colmap
+from .images import split_holdout
 from .posed import Frame, PosedImages, Unused
 from .transforms import read_dataparser, read_transforms
-from .images import split_holdout
 
 _MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 COORDINATES = ("file", "original")
@@ -26,7 +28,8 @@ class Split:
 
 
 def find_source(dataset: str | Path) -> Path:
-    """The transforms file of ``dataset``, or the folder of its COLMAP model. ``dataset``: a folder, or that file itself."""
+    """The transforms file of ``dataset``, or the folder of its COLMAP model. ``dataset``: a folder, or that file
+    itself."""
     dataset = Path(dataset)
     if dataset.is_file():
         # A file of a COLMAP model stands for the model.
@@ -44,28 +47,34 @@ def find_source(dataset: str | Path) -> Path:
 
 
 def read_posed(source: Path, allow_outside: bool = False) -> PosedImages:
-    """Read what `find_source` found. ``allow_outside``: use files outside of its folder too (of a COLMAP model: of the one
-    that holds its images), to which names and links in it may lead."""
+    """Read what `find_source` found. ``allow_outside``: use files outside of its folder too (of a COLMAP model: of the
+    one that holds its images), to which names and links in it may lead."""
     if source.is_file():
         return read_transforms(source, allow_outside)
     folders = [source, *list(source.resolve().parents)[:3]]
     images = next((f / "images" for f in folders if (f / "images").is_dir()), None)
     if images is None:
-        raise MissingFile(f'there is no folder "images" beside or above the COLMAP model "{source}"; '
-                                "put the photos there")
+        raise MissingFile(
+            f'there is no folder "images" beside or above the COLMAP model "{source}"; put the photos there'
+        )
     masks = images.with_name("masks")
     return read_colmap(source, images, masks if masks.is_dir() else None, allow_outside)
 
 
-def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str = "file", scale: float = 1.0,
-               allow_outside: bool = False) -> Split:
+def read_split(
+    dataset: str | Path,
+    holdout: int | None = None,
+    coordinates: str = "file",
+    scale: float = 1.0,
+    allow_outside: bool = False,
+) -> Split:
     """Read ``dataset`` and set its held-out frames apart.
 
     ``holdout``: every so many frames, 0 none. None: the frames of a ``transforms_test.json`` or else
     ``transforms_val.json`` beside the file, or those that the file itself lists for testing, or every 8th.
     ``coordinates``: "file"; "original", before the writer applied its ``applied_transform``; or a
-    ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that. ``allow_outside``: as
-    `read_posed` has it.
+    ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that.
+    ``allow_outside``: as `read_posed` has it.
     """
     source = find_source(dataset)
     posed = read_posed(source, allow_outside)
@@ -73,8 +82,11 @@ def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str
     posed = posed.moved(similarity)
     if posed.spare:
         spare = set(posed.spare)
-        posed = replace(posed, frames=[f for f in posed.frames if f.name not in spare],
-                        notes=[*posed.notes, f"{len(spare)} frames are in no training or test list of {posed.path.name}"])
+        posed = replace(
+            posed,
+            frames=[f for f in posed.frames if f.name not in spare],
+            notes=[*posed.notes, f"{len(spare)} frames are in no training or test list of {posed.path.name}"],
+        )
     other = _test_file(source) if holdout is None else None
     if other is not None:
         test = read_transforms(other, allow_outside).moved(similarity)
@@ -82,7 +94,9 @@ def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str
         both = [f for f in posed.frames if f.image.resolve() in hidden]
         train = [f for f in posed.frames if f.image.resolve() not in hidden]
         if not train:
-            raise NergError(f'all frames of "{posed.path}" are also in "{other.name}", which holds them out; use holdout 0')
+            raise NergError(
+                f'all frames of "{posed.path}" are also in "{other.name}", which holds them out; use holdout 0'
+            )
         unused = [*posed.unused, *(Unused(f.name, f"it is held out by {other.name}") for f in both), *test.unused]
         posed = replace(posed, frames=train, unused=unused, notes=[*posed.notes, *test.notes])
         return Split(posed, test.frames, other.name)
@@ -91,8 +105,9 @@ def read_split(dataset: str | Path, holdout: int | None = None, coordinates: str
         train = [f for f in posed.frames if f.name not in names]
         if not train:
             raise NergError(f'"{posed.path}" holds out all of its frames; use holdout 0')
-        return Split(replace(posed, frames=train), [f for f in posed.frames if f.name in names],
-                     f"listed in {posed.path.name}")
+        return Split(
+            replace(posed, frames=train), [f for f in posed.frames if f.name in names], f"listed in {posed.path.name}"
+        )
     every = 8 if holdout is None else holdout
     train, held = split_holdout(posed.frames, every)
     return Split(replace(posed, frames=train), held, f"every {every}th frame" if every else "none")
@@ -117,12 +132,16 @@ def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarra
         to = np.eye(4)
     elif coordinates == "original":
         if posed.original is None:
-            raise NergError(f'"{posed.path}" has no "applied_transform", so that its original coordinates are not known; '
-                             'use the coordinates "file"')
+            raise NergError(
+                f'"{posed.path}" has no "applied_transform", so that its original coordinates are not known; '
+                'use the coordinates "file"'
+            )
         to = original
     elif coordinates.endswith(".json"):
         to = read_dataparser(coordinates) @ original
     else:
-        raise NergError(f'coordinates must be {", ".join(COORDINATES)} or the path of a dataparser_transforms.json, '
-                         f'got "{coordinates}"')
+        raise NergError(
+            f"coordinates must be {', '.join(COORDINATES)} or the path of a dataparser_transforms.json, "
+            f'got "{coordinates}"'
+        )
     return np.diag([scale, scale, scale, 1.0]) @ to

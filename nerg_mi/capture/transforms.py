@@ -4,11 +4,13 @@ What differs between the three, and how it is read:
 
 - depth: nerfstudio's ``depth_file_path`` and instant-ngp's ``depth_path``. 16-bit PNG counts millimetres
   (or ``depth_unit_scale_factor``, or ``integer_depth_scale``, scene units a step) along the viewing axis; NPY and
-  EXR hold scene units along each pixel's ray. ``is_euclidean_depth`` in the file says true (ray) or false (axis) for all.
+  EXR hold scene units along each pixel's ray. ``is_euclidean_depth`` in the file says true (ray) or false (axis) for
+  all.
 - masks: ``mask_path``, black left out; instant-ngp's ``dynamic_mask_NAME.png`` beside the image, white left out.
-- ``applied_transform``, ``applied_scale``: what the writer did to the original coordinates; `PosedImages.original` undoes
-  it. ``dataparser_transforms.json``: from there to the coordinates that nerfstudio trained in.
+- ``applied_transform``, ``applied_scale``: what the writer did to the original coordinates; `PosedImages.original`
+  undoes it. ``dataparser_transforms.json``: from there to the coordinates that nerfstudio trained in.
 """
+
 from __future__ import annotations
 
 import hashlib
@@ -18,6 +20,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, sentence
 from nerg_mi.files.bounded import JSON_BYTES, parse_json, plain, read_bytes
+
 from .posed import (
     FARTHEST,
     LENS_KEYS,
@@ -38,8 +41,15 @@ _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEY
 _MILLIMETRE = 1e-3
 _SCALES = 1e-9, 1e9
 # Keys of the file that hold for all of its frames. Others are many in some files, and would be copied for each.
-_SHARED = (*LENS_KEYS, "camera_model", "is_fisheye", "is_equirectangular", "depth_unit_scale_factor", "integer_depth_scale",
-           "is_euclidean_depth")
+_SHARED = (
+    *LENS_KEYS,
+    "camera_model",
+    "is_fisheye",
+    "is_equirectangular",
+    "depth_unit_scale_factor",
+    "integer_depth_scale",
+    "is_euclidean_depth",
+)
 
 
 def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImages:
@@ -77,8 +87,17 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
     if not frames:
         raise none_usable(path, unused)
     held_out, spare = _splits(data, frames)
-    return PosedImages(path, frames, unused, _aabb(data, path), hashlib.sha256(raw).hexdigest(), notes,
-                       held_out=held_out, spare=spare, original=original)
+    return PosedImages(
+        path,
+        frames,
+        unused,
+        _aabb(data, path),
+        hashlib.sha256(raw).hexdigest(),
+        notes,
+        held_out=held_out,
+        spare=spare,
+        original=original,
+    )
 
 
 def read_dataparser(path: str | Path) -> np.ndarray:
@@ -90,7 +109,9 @@ def read_dataparser(path: str | Path) -> np.ndarray:
     except (KeyError, TypeError, ValueError, OverflowError) as e:
         raise NergError(f'"{path}" needs "transform", 3 x 4 numbers, and "scale"') from e
     if not _rigid(m) or not _SCALES[0] <= scale <= _SCALES[1]:
-        raise NergError(f'"{path}" needs "transform", a rotation and a translation of 3 x 4 numbers, and a positive "scale"')
+        raise NergError(
+            f'"{path}" needs "transform", a rotation and a translation of 3 x 4 numbers, and a positive "scale"'
+        )
     return np.vstack([scale * m[:3], [0, 0, 0, 1]])
 
 
@@ -133,7 +154,9 @@ def _mask(entry: dict, folder: Path, image: Path, root: Path | None) -> MaskFile
     if entry.get("mask_path") is not None:
         mask = inside(root, folder / _path(entry, "mask_path"), "mask")
         if not mask.is_file():
-            raise NergError(f'its mask "{plain(entry["mask_path"])}" does not exist; restore it, or remove its "mask_path"')
+            raise NergError(
+                f'its mask "{plain(entry["mask_path"])}" does not exist; restore it, or remove its "mask_path"'
+            )
         return MaskFile(mask)
     dynamic = image.with_name(f"dynamic_mask_{image.stem}.png")
     return MaskFile(inside(root, dynamic, "mask"), hides=True) if dynamic.is_file() else None
@@ -173,15 +196,23 @@ def _number(data: dict, key: str) -> float:
 def _lens(data: dict) -> dict:
     model = data.get("camera_model", "OPENCV")
     fisheye = bool(data.get("is_fisheye")) or model in _FISHEYE
-    if model not in _PINHOLE + _FISHEYE or data.get("is_equirectangular") or any(str(k).startswith("ftheta") for k in data):
-        raise NergError(f'its lens model "{plain(model, 60)}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, p2, '
-                         'to "OPENCV_FISHEYE" with k1 to k4, or to "PINHOLE"')
+    if (
+        model not in _PINHOLE + _FISHEYE
+        or data.get("is_equirectangular")
+        or any(str(k).startswith("ftheta") for k in data)
+    ):
+        raise NergError(
+            f'its lens model "{plain(model, 60)}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, p2, '
+            'to "OPENCV_FISHEYE" with k1 to k4, or to "PINHOLE"'
+        )
     lens = {k: _number(data, k) for k in LENS_KEYS if k != "fisheye" and data.get(k) is not None}
     if not all(np.isfinite(v) for v in lens.values()):
         raise NergError("its intrinsics are not finite")
     if not fisheye and model != "FULL_OPENCV" and any(lens.get(k) for k in ("k4", "k5", "k6")):
-        raise NergError('its k4, k5, k6 mean different things to different programs; name "camera_model": "FULL_OPENCV" if '
-                         "they are OpenCV's rational model, or undistort the images")
+        raise NergError(
+            'its k4, k5, k6 mean different things to different programs; name "camera_model": "FULL_OPENCV" if '
+            "they are OpenCV's rational model, or undistort the images"
+        )
     return {**lens, "fisheye": 1.0} if fisheye else lens
 
 
@@ -196,8 +227,10 @@ def _original(data: dict, path: Path) -> np.ndarray | None:
     except (TypeError, ValueError, OverflowError):
         m, scale = np.zeros(0), 0.0
     if not _rigid(m) or not _SCALES[0] <= scale <= _SCALES[1]:
-        raise NergError(f'"applied_transform" of "{path}" must be a rotation and a translation, 3 x 4 numbers, and '
-                         '"applied_scale" positive')
+        raise NergError(
+            f'"applied_transform" of "{path}" must be a rotation and a translation, 3 x 4 numbers, and '
+            '"applied_scale" positive'
+        )
     return np.linalg.inv(np.vstack([scale * m[:3], [0, 0, 0, 1]]))
 
 
@@ -210,15 +243,19 @@ def _rigid(m: np.ndarray) -> bool:
 
 def _splits(data: dict, frames: list[Frame]) -> tuple[list[str] | None, list[str]]:
     """Held-out and spare frames by nerfstudio's lists of file names."""
-    listed = {k: {Path(x).as_posix() for x in data[f"{k}_filenames"] if isinstance(x, str)}
-              for k in ("train", "val", "test") if isinstance(data.get(f"{k}_filenames"), list)}
+    listed = {
+        k: {Path(x).as_posix() for x in data[f"{k}_filenames"] if isinstance(x, str)}
+        for k in ("train", "val", "test")
+        if isinstance(data.get(f"{k}_filenames"), list)
+    }
     if not listed:
         return None, []
     test = listed.get("test") or listed.get("val", set())
     train = listed.get("train")
     held = [f.name for f in frames if Path(f.name).as_posix() in test]
-    spare = [f.name for f in frames
-             if f.name not in held and train is not None and Path(f.name).as_posix() not in train]
+    spare = [
+        f.name for f in frames if f.name not in held and train is not None and Path(f.name).as_posix() not in train
+    ]
     return held, spare
 
 

@@ -3,6 +3,7 @@
 Two ways to compare a rendering with a distorted photo: `undistorted` turns the photo into the pinhole picture that it
 would have been; `pinhole` and `through_lens` leave the photo alone and bend the rendering to its lens.
 """
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -49,8 +50,11 @@ def undistorted(view: View) -> Undistorted:
     at = np.where(inside[..., None], at, 0.5)
     if not own.all():
         inside &= _sample(own[..., None].astype(np.float32), at, 1)[..., 0] > 0.999
-    return Undistorted(np.where(inside[..., None], _resample(color, at), 0).astype(np.float32), inside,
-                       sensor_dict(Camera(plain, view.camera.to_world)))
+    return Undistorted(
+        np.where(inside[..., None], _resample(color, at), 0).astype(np.float32),
+        inside,
+        sensor_dict(Camera(plain, view.camera.to_world)),
+    )
 
 
 def pinhole(camera: Camera, oversample: float = 1.0) -> Camera:
@@ -78,8 +82,9 @@ def through_lens(picture: np.ndarray, source: Camera, camera: Camera) -> tuple[n
         raise ValueError("both cameras must stand at the same place and look the same way")
     i = source.intrinsics
     if picture.shape[:2] != (i.height, i.width):
-        raise ValueError(f"the picture has {picture.shape[1]} x {picture.shape[0]} pixels, but its camera "
-                         f"{i.width} x {i.height}")
+        raise ValueError(
+            f"the picture has {picture.shape[1]} x {picture.shape[0]} pixels, but its camera {i.width} x {i.height}"
+        )
     xy, shown = lens.image(_forward(camera.intrinsics), i)
     at = xy * [i.fx, i.fy] + [i.cx, i.cy]
     inside = shown & np.all((at >= 0.5) & (at <= [i.width - 0.5, i.height - 0.5]), axis=-1)
@@ -119,5 +124,10 @@ def _sample(values: np.ndarray, at: np.ndarray, order: int) -> np.ndarray:
     from scipy.ndimage import map_coordinates
 
     where = [at[..., 1] - 0.5, at[..., 0] - 0.5]
-    return np.stack([map_coordinates(values[..., k].astype(np.float32), where, order=order, mode="nearest")
-                     for k in range(values.shape[2])], axis=-1)
+    return np.stack(
+        [
+            map_coordinates(values[..., k].astype(np.float32), where, order=order, mode="nearest")
+            for k in range(values.shape[2])
+        ],
+        axis=-1,
+    )

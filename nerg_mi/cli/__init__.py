@@ -43,13 +43,16 @@ FAULT = 70
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line `arguments` (default: that of the process) and end the process.
 
-    Exit codes: 0 done; 1 what the user can mend, told in one sentence; 2 a wrong command line; 70 a mistake in the program
-    itself, which is said to be one; 130 interrupted. With --debug (also: --traceback, or NERG_TRACEBACK=1) the traceback is
-    shown before. Whoever reads the output may go away at any time: nothing is said about that. A command that ends early on
-    Ctrl-C leaves its outputs whole or absent and raises `KeyboardInterrupt`, whose message, where it has one, says how to go on.
+    Exit codes: 0 done; 1 what the user can mend, told in one sentence; 2 a wrong command line; 70 a mistake in the
+    program itself, which is said to be one; 130 interrupted. With --debug (also: --traceback, or NERG_TRACEBACK=1) the
+    traceback is shown before. Whoever reads the output may go away at any time: nothing is said about that. A command
+    that ends early on Ctrl-C leaves its outputs whole or absent and raises `KeyboardInterrupt`, whose message, where it
+    has one, says how to go on.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    debug = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0") or not {"--debug", "--traceback"}.isdisjoint(arguments)
+    debug = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0") or not {"--debug", "--traceback"}.isdisjoint(
+        arguments
+    )
     # Allowed anywhere on the line: it is added after something went wrong, at the end.
     arguments = [a for a in arguments if a not in ("--debug", "--traceback")]
     with _Listening() as ctrl_c:
@@ -79,7 +82,8 @@ def _fault(error: Exception) -> str:
 
 
 def _flush() -> None:
-    """Write what is left for the standard output; where nobody reads it any more, the interpreter must not try again."""
+    """Write what is left for the standard output; where nobody reads it any more, the interpreter must not try
+    again."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -92,7 +96,10 @@ class _Listening:
     def __enter__(self) -> _Listening:
         self._heard = False
         # Only where Python's own handler is at work: elsewhere Ctrl-C is somebody else's business.
-        self._mine = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        self._mine = (
+            threading.current_thread() is threading.main_thread()
+            and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        )
         if self._mine:
             signal.signal(signal.SIGINT, self._hear)
         return self
@@ -104,8 +111,8 @@ class _Listening:
     def behind(self, end: BaseException) -> KeyboardInterrupt | None:
         """The interrupt that led to ``end``; None where it is another error, or the command was done.
 
-        Typer makes an exit with code 130 of it, which has it as its cause. Mitsuba makes an error of its own of it where it is
-        raised in a plugin, with nothing but text.
+        Typer makes an exit with code 130 of it, which has it as its cause. Mitsuba makes an error of its own of it
+        where it is raised in a plugin, with nothing but text.
         """
         link: BaseException | None = end
         while link is not None and not isinstance(link, KeyboardInterrupt):

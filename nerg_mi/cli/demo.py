@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -14,11 +14,13 @@ def command(
     spp: Annotated[int, typer.Option("--spp", help="Samples a pixel.")] = 8,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random numbers.")] = 0,
     define: Annotated[
-        Optional[list[str]],
-        typer.Option("-D", "--define", metavar="KEY=VALUE", help="Value for a <default> of the scene, such as eye or falloff."),
+        list[str] | None,
+        typer.Option(
+            "-D", "--define", metavar="KEY=VALUE", help="Value for a <default> of the scene, such as eye or falloff."
+        ),
     ] = None,
     variant: Annotated[
-        Optional[str],
+        str | None,
         typer.Option("-m", "--mode", help="Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]"),
     ] = None,
 ) -> None:
@@ -32,9 +34,14 @@ def command(
     with Progress(*columns) as progress:
         bar = progress.add_task("start", total=len(demo.STAGES))
         result = demo.run_demo(
-            out, defaults=rendering.parse_defines(define or []), width=width, spp=spp, seed=seed, variant=variant,
+            out,
+            defaults=rendering.parse_defines(define or []),
+            width=width,
+            spp=spp,
+            seed=seed,
+            variant=variant,
             on_stage=lambda name: progress.update(bar, description=name, completed=demo.STAGES.index(name)),
-        )  # fmt: skip
+        )
         progress.update(bar, description="done", completed=len(demo.STAGES))
     for path in result.files:
         print(f"wrote {path}")

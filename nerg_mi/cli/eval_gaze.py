@@ -1,8 +1,10 @@
-"""``nerg eval gaze``: a gaze field at positions and of people that it was not trained on, beside what needs no field."""
+"""``nerg eval gaze``: a gaze field at positions and of people that it was not trained on, beside what needs no
+field."""
+
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -10,13 +12,20 @@ from nerg_mi.errors import NergError
 
 
 def eval_gaze(
-    gaze: Annotated[Path, typer.Argument(help="Checkpoint of a gaze field that was trained with --test-zones (.safetensors).")],
+    gaze: Annotated[
+        Path, typer.Argument(help="Checkpoint of a gaze field that was trained with --test-zones (.safetensors).")
+    ],
     rays: Annotated[Path, typer.Argument(help="The rays file that it was trained on.")],
-    field: Annotated[Optional[Path], typer.Option(help="Radiance field that it was trained in. Default: its name, beside it.")] = None,
-    scene: Annotated[Optional[Path], typer.Option(help="Or: the Mitsuba scene.")] = None,
-    geometry: Annotated[Optional[Path], typer.Option(help="Or: the place of hit points (.vol).")] = None,
+    field: Annotated[
+        Path | None, typer.Option(help="Radiance field that it was trained in. Default: its name, beside it.")
+    ] = None,
+    scene: Annotated[Path | None, typer.Option(help="Or: the Mitsuba scene.")] = None,
+    geometry: Annotated[Path | None, typer.Option(help="Or: the place of hit points (.vol).")] = None,
     split: Annotated[
-        Optional[str], typer.Option(help="both: new positions and people; pos: new positions; people: new people. Default: both, or pos.")
+        str | None,
+        typer.Option(
+            help="both: new positions and people; pos: new positions; people: new people. Default: both, or pos."
+        ),
     ] = None,
     kappa: Annotated[float, typer.Option(help="Concentration of the kernel of truth and baselines.")] = 20.0,
     blind_kappa: Annotated[float, typer.Option(help="That of the blind density which bits are counted from.")] = 50.0,
@@ -25,15 +34,15 @@ def eval_gaze(
     resamples: Annotated[int, typer.Option(help="Of the people, for the intervals.")] = 200,
     pictures: Annotated[int, typer.Option(help="Test positions to draw.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of rays, resamples and halves.")] = 0,
-    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Folder for tables and pictures. Default: GAZE.eval")] = None,
-    threads: Annotated[Optional[int], typer.Option(help="CPU threads. Default: all.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for tables and pictures. Default: GAZE.eval")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="CPU threads. Default: all.")] = None,
     mode: Annotated[str, typer.Option("-m", "--mode", help="Mitsuba variant.")] = "llvm_ad_rgb",
 ) -> None:
     """Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the people."""
     import drjit as dr
 
-    from nerg_mi.rays.readers.collecting import file_sha256
-    from nerg_mi.rays.rays import Rays
     from nerg_mi.evaluation.gaze import evaluation
     from nerg_mi.evaluation.gaze.baselines import standard_baselines
     from nerg_mi.evaluation.gaze.report import side_by_side, write_report
@@ -41,8 +50,10 @@ def eval_gaze(
     from nerg_mi.field.backend import namespace
     from nerg_mi.files.atomic import check_folder
     from nerg_mi.formats.fields import load_gaze
-    from nerg_mi.transport.media.media import Similarity
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.rays.readers.collecting import file_sha256
     from nerg_mi.rendering.pictures import activate
+    from nerg_mi.transport.media.media import Similarity
 
     output = output or gaze.with_suffix(".eval")
     check_folder(output)
@@ -53,7 +64,9 @@ def eval_gaze(
     trained, meta = load_gaze(gaze, ns)
     about = meta["provenance"]
     if "test" not in about:
-        raise NergError(f'"{gaze}" was trained on all positions, so that none is left to score; train it with --test-zones 3')
+        raise NergError(
+            f'"{gaze}" was trained on all positions, so that none is left to score; train it with --test-zones 3'
+        )
     if about.get("rays_file", {}).get("sha256") not in (None, file_sha256(rays)):
         raise NergError(f'"{gaze}" was trained on other rays than "{rays}"; give the file {about["rays_file"]["file"]}')
     account, data = about["test"], Rays.load(rays)
@@ -63,11 +76,16 @@ def eval_gaze(
     align = None if about.get("align") is None else Similarity(about["align"])
     medium = _place(gaze, about, field, scene, geometry, ns)
     blind, others = standard_baselines(train, account["radius"], kappa, blind_kappa, seed)
-    methods = {"gaze field": gaze_field(trained, medium, align, about.get("probes", {}).get("depth", "median")), **others}
+    methods = {
+        "gaze field": gaze_field(trained, medium, align, about.get("probes", {}).get("depth", "median")),
+        **others,
+    }
     rows = evaluation.evaluate_gaze(test, methods, blind, resamples, seed)
     half = evaluation.split_half(scored, test.centres, account["radius"], kappa, blind, min_rays, seed)
     rows += [half] if half else []
-    persons = evaluation.person_rows(test, {k: methods[k] for k in ("gaze field", "4,096 nearest rays")}, blind, min_rays)
+    persons = evaluation.person_rows(
+        test, {k: methods[k] for k in ("gaze field", "4,096 nearest rays")}, blind, min_rays
+    )
     notes = (
         f"# {gaze.name}: {split}\n\n{len(test.centres)} positions, {len(test.persons)} persons; {len(train):,} of {len(data):,} rays "
         f"trained on. Truth: rays within {account['radius']:g} m, kappa {kappa:g}, {directions} directions of equal area; KLD in nats with "
@@ -75,7 +93,13 @@ def eval_gaze(
         f"beyond the position-blind density of kappa {blind_kappa:g}; loglik in nats of 1/sr. Brackets: 1.96 standard errors either way, from {resamples} resamples of the persons. "
         "Split half: half of the people predict the other half, where both have enough rays; a reference, no bound."
     )
-    files = write_report(output, rows, persons, {"gaze": gaze.name, "split": split, "kappa": kappa, "positions": len(test.centres)}, notes)
+    files = write_report(
+        output,
+        rows,
+        persons,
+        {"gaze": gaze.name, "split": split, "kappa": kappa, "positions": len(test.centres)},
+        notes,
+    )
     if pictures:
         shown = ("gaze field", "position-blind", "16 nearest probes", "4,096 nearest rays")
         files.append(output / "positions.png")
@@ -98,8 +122,11 @@ def _place(gaze: Path, about: dict, field, scene, geometry, ns):
 
     if about.get("geometry") == "none":
         return None
-    makers = {"field_file": (field, "--field", lambda p: places.place_of_field(p, ns)), "scene_file": (scene, "--scene", places.place_of_scene),
-              "geometry_file": (geometry, "--geometry", places.place_of_volume)}  # fmt: skip
+    makers = {
+        "field_file": (field, "--field", lambda p: places.place_of_field(p, ns)),
+        "scene_file": (scene, "--scene", places.place_of_scene),
+        "geometry_file": (geometry, "--geometry", places.place_of_volume),
+    }
     key = next((k for k in makers if k in about), None)
     if key is None:
         raise NergError(f'"{gaze}" does not say what it was trained in')

@@ -1,25 +1,34 @@
 """``nerg import``: fields that other programs have trained."""
+
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 
 def command(
     file: Annotated[Path, typer.Argument(help="Checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors.")],
-    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Radiance field to write (.safetensors).")] = None,
-    gaze: Annotated[Optional[Path], typer.Option("-g", "--gaze", help="Gaze field to write (.safetensors).")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Radiance field to write (.safetensors).")
+    ] = None,
+    gaze: Annotated[Path | None, typer.Option("-g", "--gaze", help="Gaze field to write (.safetensors).")] = None,
     ema: Annotated[
-        Optional[bool],
-        typer.Option("--ema/--no-ema", help="Moving averages of the weights, or the weights.  [default: averages, if there are any]"),
+        bool | None,
+        typer.Option(
+            "--ema/--no-ema",
+            help="Moving averages of the weights, or the weights.  [default: averages, if there are any]",
+        ),
     ] = None,
     color_space: Annotated[str, typer.Option(help="What --color_space was in training: srgb or linear.")] = "srgb",
     bg_radius: Annotated[
-        Optional[float], typer.Option(help="What --bg_radius was in training, where there is a background network; 0: leave it out.")
+        float | None,
+        typer.Option(help="What --bg_radius was in training, where there is a background network; 0: leave it out."),
     ] = None,
-    finest: Annotated[Optional[int], typer.Option(help="Finest resolution of the hash grid.  [default: 2048 x bound]")] = None,
+    finest: Annotated[
+        int | None, typer.Option(help="Finest resolution of the hash grid.  [default: 2048 x bound]")
+    ] = None,
     half: Annotated[bool, typer.Option("--half", help="Store the weights in fp16.")] = False,
     variant: Annotated[str, typer.Option(help="Mitsuba variant.")] = "llvm_ad_rgb",
 ) -> None:
@@ -28,8 +37,8 @@ def command(
     from nerg_mi.field.backend import namespace
     from nerg_mi.files.atomic import check_writable
     from nerg_mi.formats.fields import save_gaze, save_radiance
-    from nerg_mi.formats.torch_ngp.nerg import is_nerg, read_nerg
     from nerg_mi.formats.torch_ngp.fields import Given, open_checkpoint, read_torch_ngp
+    from nerg_mi.formats.torch_ngp.nerg import is_nerg, read_nerg
     from nerg_mi.rendering.pictures import activate
 
     if output is None and gaze is None:
@@ -53,7 +62,9 @@ def command(
         _wrote(output)
     if gaze is not None:
         save_gaze(attention, gaze, origin, half)
-        typer.echo(f"gaze: {attention.config.variant}, trunk {attention.config.trunk}, bound {attention.box.side / 2:g}")
+        typer.echo(
+            f"gaze: {attention.config.variant}, trunk {attention.config.trunk}, bound {attention.box.side / 2:g}"
+        )
         _wrote(gaze)
     elif attention is not None:
         typer.echo(f'"{file}" also holds a gaze field: --gaze NAME.safetensors writes it')

@@ -1,15 +1,17 @@
 """``nerg rays``: tracking files in, rays out, and what is in them."""
+
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, List, Optional
+from typing import Annotated
 
 import typer
 
 from nerg_mi.errors import NergError
 
 app = typer.Typer(
-    no_args_is_help=True, help="Import tracking files as rays of attention, look at them, choose among them and split them."
+    no_args_is_help=True,
+    help="Import tracking files as rays of attention, look at them, choose among them and split them.",
 )
 
 _Rays = Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet).")]
@@ -18,49 +20,75 @@ _Output = Annotated[Path, typer.Option("-o", "--output", help="Rays file to writ
 
 @app.command("import")
 def import_rays(
-    files: Annotated[List[Path], typer.Argument(help="Tracking files (CSV, CSV.gz, Parquet or skeleton files; for pupil, folders).")],
+    files: Annotated[
+        list[Path], typer.Argument(help="Tracking files (CSV, CSV.gz, Parquet or skeleton files; for pupil, folders).")
+    ],
     output: _Output,
     preset: Annotated[
-        Optional[str],
-        typer.Option(help="Known recording: skeleton22, vr_supermarket, unity, unity_local, unity_head, varjo, hololens or pupil."),
+        str | None,
+        typer.Option(
+            help="Known recording: skeleton22, vr_supermarket, unity, unity_local, unity_head, varjo, hololens or pupil."
+        ),
     ] = None,
     columns: Annotated[
-        Optional[str],
+        str | None,
         typer.Option(
             "--map",
             help='Column map: "origin=x,y,z direction=dx,dy,dz t=time person=id confidence=c hit=hx,hy,hz cohort=g"; for heads, in place '
             "of direction: xyzw=..., wxyz=..., ypr=yaw,pitch,roll or matrix=... (12 or 16 columns, instead of origin too).",
         ),
     ] = None,
-    units: Annotated[Optional[str], typer.Option(help="Unit of length of a mapped table: m, cm or mm.  [default: m]")] = None,
-    up: Annotated[Optional[str], typer.Option(help="Up axis: x, y, z, -x, -y or -z.  [default: z; pupil: y]")] = None,
-    hand: Annotated[Optional[str], typer.Option(help="Handedness of a mapped table: right, or left (Unity).  [default: right]")] = None,
+    units: Annotated[
+        str | None, typer.Option(help="Unit of length of a mapped table: m, cm or mm.  [default: m]")
+    ] = None,
+    up: Annotated[str | None, typer.Option(help="Up axis: x, y, z, -x, -y or -z.  [default: z; pupil: y]")] = None,
+    hand: Annotated[
+        str | None, typer.Option(help="Handedness of a mapped table: right, or left (Unity).  [default: right]")
+    ] = None,
     forward: Annotated[
-        Optional[str], typer.Option(help="Axis of a head's frame along which it looks.  [default: y up z (left-handed) or -z, else x]")
+        str | None,
+        typer.Option(
+            help="Axis of a head's frame along which it looks.  [default: y up z (left-handed) or -z, else x]"
+        ),
     ] = None,
     radians: Annotated[bool, typer.Option("--radians", help="Angles of a mapped table are in radians.")] = False,
-    person_from: Annotated[Optional[str], typer.Option(help="Persons of a mapped table: column or filename.  [default: column]")] = None,
-    min_confidence: Annotated[
-        Optional[float], typer.Option(help="Drop rows below this confidence.  [default: 0; pupil: 0.6]")
+    person_from: Annotated[
+        str | None, typer.Option(help="Persons of a mapped table: column or filename.  [default: column]")
     ] = None,
-    tick: Annotated[Optional[float], typer.Option(help="Seconds in one unit of the file's time.  [default: 1]")] = None,
-    keypoints: Annotated[Optional[str], typer.Option(help="skeleton22: left ear, right ear, nose.  [default: 2,13,11]")] = None,
-    pitch: Annotated[Optional[float], typer.Option(help="skeleton22: degrees by which rays are turned up.  [default: 0]")] = None,
-    marker: Annotated[Optional[float], typer.Option(help="pupil: edge of a tracking marker in metres.")] = None,
+    min_confidence: Annotated[
+        float | None, typer.Option(help="Drop rows below this confidence.  [default: 0; pupil: 0.6]")
+    ] = None,
+    tick: Annotated[float | None, typer.Option(help="Seconds in one unit of the file's time.  [default: 1]")] = None,
+    keypoints: Annotated[
+        str | None, typer.Option(help="skeleton22: left ear, right ear, nose.  [default: 2,13,11]")
+    ] = None,
+    pitch: Annotated[
+        float | None, typer.Option(help="skeleton22: degrees by which rays are turned up.  [default: 0]")
+    ] = None,
+    marker: Annotated[float | None, typer.Option(help="pupil: edge of a tracking marker in metres.")] = None,
     skip_bad_lines: Annotated[
-        bool, typer.Option("--skip-bad-lines", help="Leave out lines that cannot be read, with an account of them: at most 1 % of a file's.")
+        bool,
+        typer.Option(
+            "--skip-bad-lines",
+            help="Leave out lines that cannot be read, with an account of them: at most 1 % of a file's.",
+        ),
     ] = False,
     pseudonyms: Annotated[
-        bool, typer.Option("--pseudonyms", help="Replace the names of persons, also in the names of files, by salted hashes.")
+        bool,
+        typer.Option(
+            "--pseudonyms", help="Replace the names of persons, also in the names of files, by salted hashes."
+        ),
     ] = False,
     salt: Annotated[
-        Optional[Path],
-        typer.Option(help="--pseudonyms: file of 16 random bytes or more, so that several imports agree.  [default: random, not kept]"),
+        Path | None,
+        typer.Option(
+            help="--pseudonyms: file of 16 random bytes or more, so that several imports agree.  [default: random, not kept]"
+        ),
     ] = None,
 ) -> None:
     """Convert tracking files to rays: right-handed, z up, metres, seconds."""
-    from nerg_mi.rays.readers import presets
     from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
+    from nerg_mi.rays.readers import presets
     from nerg_mi.rays.readers.tables import rays_from_table
 
     _check(output)
@@ -70,16 +98,27 @@ def import_rays(
     if (preset is None) == (columns is None):
         raise NergError("say what the files are: either --preset NAME or --map COLUMNS")
     given = {
-        "units": units, "up": up, "hand": hand, "forward": forward, "radians": radians or None, "person_from": person_from,
-        "min_confidence": min_confidence, "tick": tick, "pitch": pitch, "marker": marker, "keypoints": keypoints,
-    }  # fmt: skip
+        "units": units,
+        "up": up,
+        "hand": hand,
+        "forward": forward,
+        "radians": radians or None,
+        "person_from": person_from,
+        "min_confidence": min_confidence,
+        "tick": tick,
+        "pitch": pitch,
+        "marker": marker,
+        "keypoints": keypoints,
+    }
     given = {name: value for name, value in given.items() if value is not None}
     if "keypoints" in given:
         given["keypoints"] = _three_numbers(given["keypoints"])
     if columns is not None:
         foreign = [name for name in ("keypoints", "pitch", "marker") if name in given]
         if foreign:
-            raise NergError(f"{_options(foreign)} belongs to a preset; leave it out, or give --preset in place of --map")
+            raise NergError(
+                f"{_options(foreign)} belongs to a preset; leave it out, or give --preset in place of --map"
+            )
         if given.pop("radians", False):
             given["degrees"] = False
         if "hand" in given:
@@ -110,24 +149,29 @@ def show_rays(rays: _Rays) -> None:
 def filter_rays(
     rays: _Rays,
     output: _Output,
-    start: Annotated[Optional[float], typer.Option("--from", help="Rays from this time on, seconds.")] = None,
-    end: Annotated[Optional[float], typer.Option("--to", help="Rays before this time, seconds.")] = None,
-    person: Annotated[Optional[List[str]], typer.Option(help="Only this person; repeatable.")] = None,
-    without_person: Annotated[Optional[List[str]], typer.Option(help="Not this person; repeatable.")] = None,
-    cohort: Annotated[Optional[List[str]], typer.Option(help="Only this cohort; repeatable.")] = None,
-    box: Annotated[Optional[str], typer.Option(help="Origins in this box: x0,x1,y0,y1,z0,z1, metres.")] = None,
-    min_confidence: Annotated[Optional[float], typer.Option(help="Only rays of at least this confidence.")] = None,
+    start: Annotated[float | None, typer.Option("--from", help="Rays from this time on, seconds.")] = None,
+    end: Annotated[float | None, typer.Option("--to", help="Rays before this time, seconds.")] = None,
+    person: Annotated[list[str] | None, typer.Option(help="Only this person; repeatable.")] = None,
+    without_person: Annotated[list[str] | None, typer.Option(help="Not this person; repeatable.")] = None,
+    cohort: Annotated[list[str] | None, typer.Option(help="Only this cohort; repeatable.")] = None,
+    box: Annotated[str | None, typer.Option(help="Origins in this box: x0,x1,y0,y1,z0,z1, metres.")] = None,
+    min_confidence: Annotated[float | None, typer.Option(help="Only rays of at least this confidence.")] = None,
     with_hit: Annotated[bool, typer.Option("--with-hit", help="Only rays whose hit point is known.")] = False,
-    fixations: Annotated[Optional[str], typer.Option(help="Only rays of fixations: ivt (by velocity) or idt (by dispersion).")] = None,
+    fixations: Annotated[
+        str | None, typer.Option(help="Only rays of fixations: ivt (by velocity) or idt (by dispersion).")
+    ] = None,
     velocity: Annotated[float, typer.Option(help="ivt: degrees a second that end a fixation.")] = 100.0,
     dispersion: Annotated[float, typer.Option(help="idt: degrees within which a fixation stays.")] = 3.0,
-    least: Annotated[Optional[float], typer.Option(help="Shortest fixation, seconds.  [default: ivt 0.06, idt 0.1]")] = None,
+    least: Annotated[
+        float | None, typer.Option(help="Shortest fixation, seconds.  [default: ivt 0.06, idt 0.1]")
+    ] = None,
     one_ray: Annotated[bool, typer.Option("--one-ray", help="One ray a fixation, its mean.")] = False,
-    thin: Annotated[Optional[float], typer.Option(help="A stop counts as at most this many seconds of rays.")] = None,
+    thin: Annotated[float | None, typer.Option(help="A stop counts as at most this many seconds of rays.")] = None,
     thin_distance: Annotated[float, typer.Option(help="--thin: a stop is a stay within this many metres.")] = 0.1,
 ) -> None:
     """Keep some rays: conditions first, then fixations, then thinning of those who stand still."""
-    from nerg_mi.rays import filters, fixations as fix
+    from nerg_mi.rays import filters
+    from nerg_mi.rays import fixations as fix
     from nerg_mi.rays.rays import Rays
 
     _check(output)
@@ -138,13 +182,18 @@ def filter_rays(
     data = Rays.load(rays)
     what = {
         "time": None if start is None and end is None else (start, end),
-        "persons": person or None, "without_persons": without_person or None,
-        "cohorts": cohort or None, "box": None if box is None else _numbers(box, "--box"), "min_confidence": min_confidence,
+        "persons": person or None,
+        "without_persons": without_person or None,
+        "cohorts": cohort or None,
+        "box": None if box is None else _numbers(box, "--box"),
+        "min_confidence": min_confidence,
         "with_hit": with_hit or None,
-    }  # fmt: skip
+    }
     what = {name: value for name, value in what.items() if value is not None}
     if not what and fixations is None and thin is None:
-        raise NergError("say which rays to keep, for instance with --from, --person, --box, --fixations or --thin (--help lists all)")
+        raise NergError(
+            "say which rays to keep, for instance with --from, --person, --box, --fixations or --thin (--help lists all)"
+        )
     if what:
         data = _step(data, filters.select_mask(data, **what), "filter", what)
     if fixations is not None:
@@ -159,7 +208,9 @@ def filter_rays(
         else:
             data = _step(data, label >= 0, "fixations", {"by": fixations, **limit})
     if thin is not None:
-        data = _step(data, filters.thin_mask(data, thin, thin_distance), "thin", {"seconds": thin, "distance": thin_distance})
+        data = _step(
+            data, filters.thin_mask(data, thin, thin_distance), "thin", {"seconds": thin, "distance": thin_distance}
+        )
     data.save(output)
     typer.echo(f"wrote {output}")
 
@@ -167,14 +218,18 @@ def filter_rays(
 @app.command("split")
 def split_rays(
     rays: _Rays,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Rays file; -train and -test are put before its ending.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Rays file; -train and -test are put before its ending.")
+    ],
     zones: Annotated[int, typer.Option(help="By position: zones held out; 0: not by position.")] = 0,
-    radius: Annotated[float, typer.Option(help="By position: R of probes, metres; rays within 2R of a test position are purged.")] = 0.25,
+    radius: Annotated[
+        float, typer.Option(help="By position: R of probes, metres; rays within 2R of a test position are purged.")
+    ] = 0.25,
     zone_radius: Annotated[float, typer.Option(help="By position: radius of a zone, metres.")] = 0.2,
     positions: Annotated[int, typer.Option(help="By position: test positions in the zones.")] = 150,
     min_rays: Annotated[int, typer.Option(help="By position: rays that a test position has within R.")] = 64,
     people: Annotated[float, typer.Option(help="By person: share held out, at random; 0: not by person.")] = 0.0,
-    person: Annotated[Optional[List[str]], typer.Option(help="By person: this one is held out; repeatable.")] = None,
+    person: Annotated[list[str] | None, typer.Option(help="By person: this one is held out; repeatable.")] = None,
     time: Annotated[float, typer.Option(help="By time: share at the end that is held out; 0: not by time.")] = 0.0,
     gap: Annotated[float, typer.Option(help="By time: seconds purged before the end part.")] = 5.0,
     clock: Annotated[str, typer.Option(help="By time: all (one clock), or person (each their own).")] = "all",
@@ -182,7 +237,8 @@ def split_rays(
 ) -> None:
     """Split into training and test rays that share none: by position, person, time, or several of them at once.
 
-    Of several, training rays are on the training side of each and test rays on the test side of each; the rest is purged.
+    Of several, training rays are on the training side of each and test rays on the test side of each; the rest is
+    purged.
     """
     from nerg_mi.rays import splits
     from nerg_mi.rays.rays import Rays
@@ -198,7 +254,12 @@ def split_rays(
             data, radius, zones=zones, zone_radius=zone_radius, test_probes=positions, min_rays=min_rays, seed=seed
         )
         parts.append(where)
-        about["position"] = {"radius": radius, "zones": zones, "zone_radius": zone_radius, "test_centres": where.test_centres.tolist()}
+        about["position"] = {
+            "radius": radius,
+            "zones": zones,
+            "zone_radius": zone_radius,
+            "test_centres": where.test_centres.tolist(),
+        }
     if people or person:
         held = splits.split_by_person(data, test_share=people or 0.5, test_persons=person or None, seed=seed)
         parts.append(held)
@@ -209,9 +270,13 @@ def split_rays(
     if not parts:
         raise NergError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
     train, test = splits.both(*parts)
-    typer.echo(f"{train.sum():,} training rays, {test.sum():,} test rays, {(~(train | test)).sum():,} purged of {len(data):,}")
+    typer.echo(
+        f"{train.sum():,} training rays, {test.sum():,} test rays, {(~(train | test)).sum():,} purged of {len(data):,}"
+    )
     for side, mask in (("train", train), ("test", test)):
-        data.select(mask).noting(step="split", side=side, seed=seed, kept=int(mask.sum()), of=len(data), by=about).save(outputs[side])
+        data.select(mask).noting(step="split", side=side, seed=seed, kept=int(mask.sum()), of=len(data), by=about).save(
+            outputs[side]
+        )
         typer.echo(f"wrote {outputs[side]}")
 
 
@@ -222,12 +287,14 @@ def plot_rays(
     kind: Annotated[
         str, typer.Option(help="density: rays/m² with mean directions; layout: each ray's place, with dimensions.")
     ] = "density",
-    cell: Annotated[Optional[float], typer.Option(help="density: edge of a cell, metres.  [default: a fiftieth of the plan]")] = None,
-    test: Annotated[Optional[Path], typer.Option(help="layout: the test rays of a split, drawn beside.")] = None,
+    cell: Annotated[
+        float | None, typer.Option(help="density: edge of a cell, metres.  [default: a fiftieth of the plan]")
+    ] = None,
+    test: Annotated[Path | None, typer.Option(help="layout: the test rays of a split, drawn beside.")] = None,
 ) -> None:
     """The floor plan: where people stood and how densely, or the layout."""
-    from nerg_mi.rays.rays import Rays
     from nerg_mi.files.atomic import check_writable
+    from nerg_mi.rays.rays import Rays
     from nerg_mi.view import ray_figures
     from nerg_mi.view.figures import save
 
@@ -241,7 +308,9 @@ def plot_rays(
     else:
         held = None if test is None else Rays.load(test)
         steps = [] if held is None else held.metadata.get("steps", [])
-        where = next((s["by"].get("position", {}) for s in steps if s["step"] == "split" and isinstance(s.get("by"), dict)), {})
+        where = next(
+            (s["by"].get("position", {}) for s in steps if s["step"] == "split" and isinstance(s.get("by"), dict)), {}
+        )
         figure = ray_figures.layout_figure(Rays.load(rays), held, where.get("test_centres"), where.get("radius"))
     save(figure, output)
     typer.echo(f"wrote {output}")
@@ -257,7 +326,8 @@ def _check(*outputs: Path) -> None:
 
 
 def _step(data, mask, step: str, what: dict):
-    """The rays of a mask, in the memory of ``data``, with a line that says how many, and a note of it in their metadata."""
+    """The rays of a mask, in the memory of ``data``, with a line that says how many, and a note of it in their
+    metadata."""
     if not mask.any():
         raise NergError(f"{step} leaves none of {len(data):,} rays; widen its conditions")
     typer.echo(f"{step}: {mask.sum():,} of {len(data):,} rays")
@@ -290,8 +360,8 @@ def _card(rays, path: Path) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from nerg_mi.rays.summary import GAP, summarise
     from nerg_mi.files.bounded import plain
+    from nerg_mi.rays.summary import GAP, summarise
 
     s = summarise(rays)
     # Names come from files: they are neither markup nor control characters of a terminal.
@@ -307,7 +377,9 @@ def _card(rays, path: Path) -> None:
     if not np.isfinite(s.rate):
         recorded = "unknown: no person has rays at two times"
     elif s.duration == 0:
-        recorded = f"none: each ray of a person comes more than {GAP:g} s after the one before ({s.rate:.4g} rays a second)"
+        recorded = (
+            f"none: each ray of a person comes more than {GAP:g} s after the one before ({s.rate:.4g} rays a second)"
+        )
     else:
         recorded = f"{s.duration:,.1f} s at {s.rate:.4g} rays a second"
     row("recorded time", recorded)

@@ -4,40 +4,55 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 
 def command(
     scene: Annotated[Path, typer.Argument(help="Mitsuba scene file (.xml).")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write: .exr (all channels) or .png (colour).")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Picture to write: .exr (all channels) or .png (colour).")
+    ],
     define: Annotated[
-        Optional[list[str]],
-        typer.Option("-D", "--define", metavar="KEY=VALUE", help="Value for $KEY or a <default> of the scene; repeatable."),
+        list[str] | None,
+        typer.Option(
+            "-D", "--define", metavar="KEY=VALUE", help="Value for $KEY or a <default> of the scene; repeatable."
+        ),
     ] = None,
     sensor: Annotated[int, typer.Option("-s", "--sensor", help="Index of the sensor, counted from 0.")] = 0,
     variant: Annotated[
-        Optional[str],
+        str | None,
         typer.Option("-m", "--mode", help="Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]"),
     ] = None,
     spp: Annotated[int, typer.Option("--spp", min=0, help="Samples a pixel; 0: as the scene says.")] = 0,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random numbers.")] = 0,
     threads: Annotated[int, typer.Option("-t", "--threads", min=0, help="Worker threads; 0: one a core.")] = 0,
-    memory: Annotated[float, typer.Option("--memory", help="GB that rendering may take; larger pictures are made in bands.")] = 1.0,
+    memory: Annotated[
+        float, typer.Option("--memory", help="GB that rendering may take; larger pictures are made in bands.")
+    ] = 1.0,
 ) -> None:
     """Render a scene file to an EXR or PNG file, with the integrator that the scene names.
 
-    An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour, tonemapped to sRGB.
+    An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour, tonemapped to
+    sRGB.
     """
     from nerg_mi.rendering import pictures as rendering
 
     defaults = rendering.parse_defines(define or [])
     with _bar() as (bar, task):
         report = rendering.render_file(
-            scene, output, defaults=defaults, sensor=sensor, variant=variant, spp=spp, seed=seed, threads=threads, memory=memory,
+            scene,
+            output,
+            defaults=defaults,
+            sensor=sensor,
+            variant=variant,
+            spp=spp,
+            seed=seed,
+            threads=threads,
+            memory=memory,
             on_progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )  # fmt: skip
+        )
     print(report)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -18,30 +18,42 @@ def command(
     quick: Annotated[bool, typer.Option("--quick", help="A few settings only, each timed once.")] = False,
     only: Annotated[str, typer.Option(metavar="REGEX", help="Only the default, and settings whose name matches.")] = "",
     define: Annotated[
-        Optional[list[str]],
-        typer.Option("-D", "--define", metavar="KEY=VALUE", help="Value for a <default> of the scene file; repeatable."),
+        list[str] | None,
+        typer.Option(
+            "-D", "--define", metavar="KEY=VALUE", help="Value for a <default> of the scene file; repeatable."
+        ),
     ] = None,
     variant: Annotated[
-        Optional[str],
+        str | None,
         typer.Option("-m", "--mode", help="Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]"),
     ] = None,
 ) -> None:
     """Measure error against run time: render a scene at many settings, compare each with what is true, and plot it.
 
-    Writes study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. A full study takes up to half an hour.
+    Writes study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. A full
+    study takes up to half an hour.
     """
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from nerg_mi.rendering import pictures as rendering
     from nerg_mi.evaluation.study.run import run_study
+    from nerg_mi.rendering import pictures as rendering
 
     defaults = rendering.parse_defines(define or [])
     with Progress(TextColumn("{task.description:<44}"), BarColumn(), TimeElapsedColumn()) as progress:
         bar = progress.add_task("start", total=1.0)
         result = run_study(
-            scene, out, kind=scene_kind, width=width, height=height, repeats=repeats, quick=quick, only=only, defaults=defaults, variant=variant,
+            scene,
+            out,
+            kind=scene_kind,
+            width=width,
+            height=height,
+            repeats=repeats,
+            quick=quick,
+            only=only,
+            defaults=defaults,
+            variant=variant,
             on_step=lambda name, share: progress.update(bar, description=name, completed=share),
-        )  # fmt: skip
+        )
         progress.update(bar, description="done", completed=1.0)
     for line in _summary(result.report):
         print(line)
@@ -58,9 +70,13 @@ def _summary(report: dict) -> list[str]:
             lines.append(_line(default))
         lines.append(_line(paper))
         if pair["equal_time"]:
-            lines.append(f"  no slower: {pair['equal_time']['setting']}, depth error {pair['equal_time']['error_ratio']:.1f} times less")
+            lines.append(
+                f"  no slower: {pair['equal_time']['setting']}, depth error {pair['equal_time']['error_ratio']:.1f} times less"
+            )
         if pair["equal_error"]:
-            lines.append(f"  no worse: {pair['equal_error']['setting']}, {pair['equal_error']['time_ratio']:.1f} times faster")
+            lines.append(
+                f"  no worse: {pair['equal_error']['setting']}, {pair['equal_error']['time_ratio']:.1f} times faster"
+            )
     return lines
 
 

@@ -1,8 +1,9 @@
 """How wide a kernel: rules for the concentration κ of a probe's density.
 
-``silverman``: the published code's rule (:func:`nerg_mi.maths.vmf.silverman_kappa`). ``loo``: the κ under which each ray
-is best predicted by the others. Each for every probe, or one for all of them.
+``silverman``: the published code's rule (:func:`nerg_mi.maths.vmf.silverman_kappa`). ``loo``: the κ under which each
+ray is best predicted by the others. Each for every probe, or one for all of them.
 """
+
 from __future__ import annotations
 
 import numpy as np
@@ -28,9 +29,9 @@ def leave_one_out_scores(
 ) -> np.ndarray:
     """Mean log-likelihood a ray at each κ of ``grid`` (K,), natural, of 1/sr: Σ_i log mean_j f(x_i; x_j, κ) / n.
 
-    j runs over rays of other ``groups`` (n,) where there are two or more, else over j ≠ i. Leaving out people and not only
-    the ray itself matters at 50 Hz: successive rays repeat each other, and the sharpest κ would win. ``directions`` (n, 3)
-    unit, at least two; of more than ``most`` a random choice is used.
+    j runs over rays of other ``groups`` (n,) where there are two or more, else over j ≠ i. Leaving out people and not
+    only the ray itself matters at 50 Hz: successive rays repeat each other, and the sharpest κ would win.
+    ``directions`` (n, 3) unit, at least two; of more than ``most`` a random choice is used.
     """
     rng = rng or np.random.default_rng(0)
     if len(directions) > most:
@@ -65,10 +66,15 @@ def leave_one_out_kappa(
 
 
 def loo_kappas(
-    directions: np.ndarray, persons: np.ndarray, offsets: np.ndarray, kappa_max: float, shared: bool, rng: np.random.Generator
+    directions: np.ndarray,
+    persons: np.ndarray,
+    offsets: np.ndarray,
+    kappa_max: float,
+    shared: bool,
+    rng: np.random.Generator,
 ) -> np.ndarray:
-    """κ (P,) of probes that hold ``directions[offsets[p]:offsets[p + 1]]`` by ``loo``. ``shared``: one for all, under which
-    the rays of 256 probes (at random) are best predicted together."""
+    """κ (P,) of probes that hold ``directions[offsets[p]:offsets[p + 1]]`` by ``loo``. ``shared``: one for all, under
+    which the rays of 256 probes (at random) are best predicted together."""
     runs = [slice(a, b) for a, b in zip(offsets[:-1], offsets[1:])]
     if not shared:
         return np.array([leave_one_out_kappa(directions[r], persons[r], kappa_max=kappa_max, rng=rng) for r in runs])
@@ -83,8 +89,9 @@ def loo_kappas(
 def silverman_kappas(
     directions: np.ndarray, weights: np.ndarray | None, offsets: np.ndarray, kappa_max: float, shared: bool
 ) -> np.ndarray:
-    """κ (P,) by the published code's rule, at most ``kappa_max``; with ``weights`` (n,) from the weighted mean resultant and
-    the effective count (Σw)²/Σw². ``shared``: one for all, 1 over the mean of the squared bandwidths 1/κ."""
+    """κ (P,) by the published code's rule, at most ``kappa_max``; with ``weights`` (n,) from the weighted mean
+    resultant and the effective count (Σw)²/Σw². ``shared``: one for all, 1 over the mean of the squared bandwidths
+    1/κ."""
     w = np.ones(len(directions)) if weights is None else weights
     total = np.add.reduceat(w, offsets[:-1])
     count = total**2 / np.add.reduceat(w**2, offsets[:-1])

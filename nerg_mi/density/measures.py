@@ -1,18 +1,22 @@
-"""What a probe's density is like: its integral, its entropy, how many rays and people it rests on, and samples of it."""
+"""What a probe's density is like: its integral, its entropy, how many rays and people it rests on, and samples of
+it."""
+
 from __future__ import annotations
 
 import numpy as np
 
 from nerg_mi.maths import vmf
-from .probes import Probes
-from nerg_mi.rays.rays import Rays
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.rays import Rays
+
+from .probes import Probes
 
 _LEAST, _MOST = 2048, 1 << 17
 
 
 def resolving_count(kappa: float) -> int:
-    """Directions of equal area that resolve kernels of ``kappa``: four in a kernel's width 1/sqrt(κ), 2,048 to 131,072."""
+    """Directions of equal area that resolve kernels of ``kappa``: four in a kernel's width 1/sqrt(κ), 2,048 to
+    131,072."""
     return int(np.clip(np.ceil(4.0 * np.pi * 16.0 * kappa), _LEAST, _MOST))
 
 
@@ -22,7 +26,8 @@ def integral(probes: Probes, count: int | None = None, backend: object = None) -
 
 
 def entropy(probes: Probes, count: int | None = None, backend: object = None) -> np.ndarray:
-    """Differential entropy -∫ p log p, (P,), natural, by quadrature; at most log 4π = 2.53, that of the uniform density."""
+    """Differential entropy -∫ p log p, (P,), natural, by quadrature; at most log 4π = 2.53, that of the uniform
+    density."""
     return -_average(probes, count, backend, lambda p: p * np.log(np.where(p > 0, p, 1.0)))
 
 
@@ -37,8 +42,8 @@ def effective_rays(probes: Probes) -> np.ndarray:
 def effective_persons(probes: Probes, rays: Rays) -> np.ndarray:
     """People who count, (P,): the same of the people's summed weights.
 
-    Successive rays of one person say the same over and over, so this, and not the rays, is what a probe's certainty rests
-    on. ``rays``: those the probes were placed on.
+    Successive rays of one person say the same over and over, so this, and not the rays, is what a probe's certainty
+    rests on. ``rays``: those the probes were placed on.
     """
     w = np.ones(len(probes.indices)) if probes.weights is None else probes.weights
     persons = rays.person[probes.indices]
@@ -50,7 +55,8 @@ def effective_persons(probes: Probes, rays: Rays) -> np.ndarray:
 
 
 def sample(probes: Probes, count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` independent directions from each probe's density, (P, count, 3): a ray by its weight, then its kernel."""
+    """``count`` independent directions from each probe's density, (P, count, 3): a ray by its weight, then its
+    kernel."""
     w = np.ones(len(probes.indices)) if probes.weights is None else probes.weights
     up_to = np.concatenate([[0.0], np.cumsum(w)])
     low, high = up_to[probes.offsets[:-1]], up_to[probes.offsets[1:]]

@@ -1,4 +1,5 @@
 """Where probes stand: on a lattice, at random, where people were, or there and evenly (blue noise)."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -14,9 +15,9 @@ def place_queries(
     """Centres (Q, 3) of probes of ``radius`` R among ray origins (N, 3), metres.
 
     ``data``: ``count`` distinct ray origins at random. ``grid``: a lattice of ``spacing`` (2R) over the origins' box.
-    ``random``: ``count`` places uniform in that box. ``blue``: at most ``count`` ray origins, none nearer to another than
-    ``spacing``; without one, than the smallest distance from R on at which they are no more. Raises `NergError` for
-    another word.
+    ``random``: ``count`` places uniform in that box. ``blue``: at most ``count`` ray origins, none nearer to another
+    than ``spacing``; without one, than the smallest distance from R on at which they are no more. Raises `NergError`
+    for another word.
     """
     if placement not in PLACEMENTS:
         raise NergError(f'placement is "{placement}"; it is one of {", ".join(PLACEMENTS)}')
@@ -36,8 +37,11 @@ def place_queries(
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def blue_noise(origin: np.ndarray, count: int, spacing: float | None, start: float, rng: np.random.Generator) -> np.ndarray:
-    """Ray origins in random order, each taken if none taken before is within ``spacing`` (Poisson discs by dart throwing).
+def blue_noise(
+    origin: np.ndarray, count: int, spacing: float | None, start: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Ray origins in random order, each taken if none taken before is within ``spacing`` (Poisson discs by dart
+    throwing).
 
     Without a ``spacing``: from ``start`` on, ever wider until no more than ``count`` are left.
     """

@@ -3,6 +3,7 @@
 A probe gathers the rays whose origins lie within R of a position and turns
 their directions into a density on the sphere (NeRG, Section 5.1).
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -11,11 +12,12 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
-from .bandwidth import loo_kappas, silverman_kappas
 from nerg_mi.rays.index import RayIndex
+from nerg_mi.rays.rays import Rays
+
+from .bandwidth import loo_kappas, silverman_kappas
 from .kde.estimate import SphericalKde
 from .placement import PLACEMENTS, place_queries
-from nerg_mi.rays.rays import Rays
 
 KAPPA_RULES = ("silverman", "loo", "fixed")
 WEIGHTS = ("equal", "distance", "person")
@@ -60,7 +62,8 @@ class Probes:
 
     def widened(self, kappa: float) -> Probes:
         """The probes seen through a von Mises-Fisher law of ``kappa`` about each ray: where eyes look, of rays that say
-        where heads point (κ about 37 was measured on people in a shop). See :func:`nerg_mi.maths.vmf.convolved_kappa`."""
+        where heads point (κ about 37 was measured on people in a shop). See
+        :func:`nerg_mi.maths.vmf.convolved_kappa`."""
         return replace(self, kappa=vmf.convolved_kappa(self.kappa, kappa))
 
 
@@ -127,10 +130,24 @@ def place_probes(
         if not ray_weights.all():
             some = np.flatnonzero(ray_weights)
             kept = place_probes(
-                rays.select(some), radius, placement=placement, count=count, queries=queries, spacing=spacing, cap=cap,
-                min_rays=min_rays, kappa_rule=kappa_rule, kappa=kappa, kappa_max=kappa_max, kappa_shared=kappa_shared,
-                widen=widen, weights=weights, ray_weights=ray_weights[some], centre=centre, seed=seed,
-            )  # fmt: skip
+                rays.select(some),
+                radius,
+                placement=placement,
+                count=count,
+                queries=queries,
+                spacing=spacing,
+                cap=cap,
+                min_rays=min_rays,
+                kappa_rule=kappa_rule,
+                kappa=kappa,
+                kappa_max=kappa_max,
+                kappa_shared=kappa_shared,
+                widen=widen,
+                weights=weights,
+                ray_weights=ray_weights[some],
+                centre=centre,
+                seed=seed,
+            )
             return replace(kept, indices=some[kept.indices])
     if queries is None:
         queries = place_queries(rays.origin, placement, count, spacing, radius, rng)
@@ -155,7 +172,9 @@ def place_probes(
         w = np.maximum(1.0 - distances / radius, 1e-6) * (1.0 if w is None else w)
     elif weights == "person":
         probe = np.repeat(np.arange(len(counts)), counts)
-        _, whose, times = np.unique(probe * (1 + rays.person.max()) + rays.person[indices], return_inverse=True, return_counts=True)
+        _, whose, times = np.unique(
+            probe * (1 + rays.person.max()) + rays.person[indices], return_inverse=True, return_counts=True
+        )
         w = (1.0 if w is None else w) / times[whose]
     share = (1.0 / counts if w is None else 1.0 / np.add.reduceat(w, offsets[:-1]))[:, None]
     means = np.add.reduceat(rays.origin[indices] * (1.0 if w is None else w[:, None]), offsets[:-1]) * share
@@ -165,7 +184,9 @@ def place_probes(
         kappas = silverman_kappas(directions, w, offsets, kappa_max, kappa_shared)
     else:
         kappas = loo_kappas(directions, rays.person[indices], offsets, kappa_max, kappa_shared, rng)
-    probes = Probes(means if centre == "mean" else queries, queries, float(radius), indices, offsets, directions, kappas, w)
+    probes = Probes(
+        means if centre == "mean" else queries, queries, float(radius), indices, offsets, directions, kappas, w
+    )
     return probes if widen is None else probes.widened(widen)
 
 

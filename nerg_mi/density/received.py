@@ -5,10 +5,10 @@ surface S is the integral of g over the directions in which S is seen. Over the 
 
     A = ∫_S g V(y, p_o) max(0, -n · ω) / |y - p_o|² dA,    ω = (y - p_o) / |y - p_o|,
 
-with the change of variables dω = |cos θ| dA / d² (Veach 1997, section 8.2.2.2, "three-point form"), n the normal at y, and
-V the visibility of ``transport.observer.sight``. Unlike pixels, the points move with the surface: A has derivatives with
-respect to where the surface is, without any edge of its own that would have to be sampled. The moving edges of what
-*else* hides it are not seen by derivatives; the fall-off behind them is.
+with the change of variables dω = |cos θ| dA / d² (Veach 1997, section 8.2.2.2, "three-point form"), n the normal at y,
+and V the visibility of ``transport.observer.sight``. Unlike pixels, the points move with the surface: A has derivatives
+with respect to where the surface is, without any edge of its own that would have to be sampled. The moving edges of
+what *else* hides it are not seen by derivatives; the fall-off behind them is.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class Patches:
 def patches(mesh, divisions: int = 4) -> Patches:
     """A Mitsuba mesh, each triangle cut into ``divisions``² congruent ones: the centroid rule, of second order.
 
-    Normals are the faces' own, to the side that sees the vertices counter-clockwise. Attached to the ``vertex_positions``
-    of the mesh. ``ValueError`` for what is not a mesh.
+    Normals are the faces' own, to the side that sees the vertices counter-clockwise. Attached to the
+    ``vertex_positions`` of the mesh. ``ValueError`` for what is not a mesh.
     """
     import mitsuba as mi
 
@@ -72,15 +72,17 @@ def _centroids(n: int) -> np.ndarray:
     return np.array(upright + turned, np.float32) / n
 
 
-def arriving(place: Place | None, density, p_o, p, n, falloff=0.0, sight: ObserverPass | None = None,
-             two_sided: bool = False):
+def arriving(
+    place: Place | None, density, p_o, p, n, falloff=0.0, sight: ObserverPass | None = None, two_sided: bool = False
+):
     """Attention per area, in 1 / square scene unit, that arrives at ``p`` with normal ``n`` from the observer ``p_o``.
 
-    ``density(p_od, p_o, r_o, active)``: gaze in 1/sr of an observer at ``p_o`` along the unit direction ``r_o``, who sees the
-    surface ``p_od`` there (``GazeMedium.evaluate(...)[0]``, or anything else). ``place``: what may stand in between
-    (shapes, a field, both; None: nothing). ``falloff`` d_f in scene units, ``sight``: as of the integrator. A closed
-    surface hides its own back, which therefore receives nothing; ``two_sided`` counts both sides of an open one. Lanes are
-    pairs; differentiable in all of them, in the density's parameters and in ``falloff``, but not over the edges of ``place``.
+    ``density(p_od, p_o, r_o, active)``: gaze in 1/sr of an observer at ``p_o`` along the unit direction ``r_o``, who
+    sees the surface ``p_od`` there (``GazeMedium.evaluate(...)[0]``, or anything else). ``place``: what may stand in
+    between (shapes, a field, both; None: nothing). ``falloff`` d_f in scene units, ``sight``: as of the integrator. A
+    closed surface hides its own back, which therefore receives nothing; ``two_sided`` counts both sides of an open one.
+    Lanes are pairs; differentiable in all of them, in the density's parameters and in ``falloff``, but not over the
+    edges of ``place``.
     """
     import mitsuba as mi
 
@@ -101,8 +103,15 @@ def arriving(place: Place | None, density, p_o, p, n, falloff=0.0, sight: Observ
     return dr.select(active, g * seen * cosine / square, 0)
 
 
-def contributions(place: Place | None, density, observers, surface: Patches, falloff=0.0, sight: ObserverPass | None = None,
-                  two_sided: bool = False):
+def contributions(
+    place: Place | None,
+    density,
+    observers,
+    surface: Patches,
+    falloff=0.0,
+    sight: ObserverPass | None = None,
+    two_sided: bool = False,
+):
     """Share of each observer's look that each patch receives: Float, all patches of the first observer first.
 
     Arguments as of ``arriving``; ``observers``: Point3f, a lane an observer.
@@ -119,12 +128,19 @@ def contributions(place: Place | None, density, observers, surface: Patches, fal
     return area * arriving(place, density, p_o, p, n, falloff, sight, two_sided)
 
 
-def received(place: Place | None, density, observers, surface: Patches, falloff=0.0, sight: ObserverPass | None = None,
-             two_sided: bool = False):
+def received(
+    place: Place | None,
+    density,
+    observers,
+    surface: Patches,
+    falloff=0.0,
+    sight: ObserverPass | None = None,
+    two_sided: bool = False,
+):
     """Probability (Float, a lane an observer) that the look of each of ``observers`` (Point3f) lands on ``surface``.
 
-    Arguments as of ``arriving``. Makes observers x patches lanes at once. Exact as patches shrink against their distance
-    from the observer: at a distance of k patch diameters the error is of the order 1 / k².
+    Arguments as of ``arriving``. Makes observers x patches lanes at once. Exact as patches shrink against their
+    distance from the observer: at a distance of k patch diameters the error is of the order 1 / k².
     """
     each = contributions(place, density, observers, surface, falloff, sight, two_sided)
     return dr.block_sum(each, dr.width(each) // dr.width(observers))

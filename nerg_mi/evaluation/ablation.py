@@ -1,43 +1,61 @@
 """The paper's ablation: every variant of a gaze field, trained alike and scored on what it saw and on what it did not.
 
-Losses are the paper's, KLD + (1 - CC) + MAE, of densities over directions of equal area, on positions of the training and on
-positions that were held out; normalised by the product of emit and capture of the same recipe. A frame is a render of the gaze
-by the integrator, observer and camera in one place.
+Losses are the paper's, KLD + (1 - CC) + MAE, of densities over directions of equal area, on positions of the training
+and on positions that were held out; normalised by the product of emit and capture of the same recipe. A frame is a
+render of the gaze by the integrator, observer and camera in one place.
 """
+
 from __future__ import annotations
 
 import hashlib
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Callable
 
 import numpy as np
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.bounded import read_json
-from nerg_mi.formats.fields import save_gaze
 from nerg_mi.files.png import write_figure
 from nerg_mi.files.tables import write_csv, write_json
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.recipes import gaze_recipe
 from nerg_mi.training.gaze.run import train_gaze
 from nerg_mi.training.gaze.semantics import config_like, trunk_of
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
 from nerg_mi.training.gaze.state import digest
+from nerg_mi.training.geometry.places import GazePlace
+
 from .gaze.evaluation import GazeTest, make_test, map_scores
 from .gaze.scores import gaze_field
 
-COLUMNS = ("recipe", "variant", "seed", "steps", "train_loss", "test_loss", "train_relative", "test_relative", "train_KLD", "test_KLD",
-           "train_CC", "test_CC", "train_MAE", "test_MAE", "train_seconds", "frame_seconds")  # fmt: skip
+COLUMNS = (
+    "recipe",
+    "variant",
+    "seed",
+    "steps",
+    "train_loss",
+    "test_loss",
+    "train_relative",
+    "test_relative",
+    "train_KLD",
+    "test_KLD",
+    "train_CC",
+    "test_CC",
+    "train_MAE",
+    "test_MAE",
+    "train_seconds",
+    "frame_seconds",
+)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """``recipe`` of ``gaze_recipes``; ``gaze``: emit, capture or emit_capture; ``more``: of ``GazeConfig``; ``begin``: whether
-    the trunk begins as the radiance field's, ``frozen``: and stays so."""
+    """``recipe`` of ``gaze_recipes``; ``gaze``: emit, capture or emit_capture; ``more``: of ``GazeConfig``; ``begin``:
+    whether the trunk begins as the radiance field's, ``frozen``: and stays so."""
 
     name: str
     recipe: str
@@ -48,39 +66,83 @@ class Variant:
 
 
 def all_variants(semantic: bool, recipes: tuple = ("default", "paper")) -> list[Variant]:
-    """Of each of ``recipes`` the three variants and, where there is a radiance field (``semantic``) and the recipe has them,
-    the semantic ones and the two initialisations."""
+    """Of each of ``recipes`` the three variants and, where there is a radiance field (``semantic``) and the recipe has
+    them, the semantic ones and the two initialisations."""
     out = []
     for recipe in recipes:
         out += [Variant(name, recipe, name) for name in ("emit", "capture", "emit_capture")]
         if semantic and recipe != "default":
             for kind in ("accumulated", "snapshot"):
-                out += [Variant(f"semantic {kind}{', own too' * own}", recipe, more=(("semantic", kind), ("semantic_own", own))) for own in (False, True)]
-            out += [Variant("begins as the field, frozen", recipe, begin=True, frozen=True), Variant("begins as the field", recipe, begin=True)]
+                out += [
+                    Variant(
+                        f"semantic {kind}{', own too' * own}", recipe, more=(("semantic", kind), ("semantic_own", own))
+                    )
+                    for own in (False, True)
+                ]
+            out += [
+                Variant("begins as the field, frozen", recipe, begin=True, frozen=True),
+                Variant("begins as the field", recipe, begin=True),
+            ]
     return out
 
 
-def ablate(rays: Rays, train: Rays, centres: np.ndarray, place: GazePlace, variants: list[Variant], folder: Path, ns, seeds: int = 3,
-           steps: dict | None = None, radius: float = 0.25, kappa: float = 20.0, min_rays: int = 64, render: Callable | None = None,
-           say: Callable = print, align=None, truth: Callable | None = None, probes: int | None = None,
-           refit: bool = True) -> list[dict]:
-    """Train and score ``variants``; one row each, seed by seed (recipe ``default``: ``seeds`` of them, others one), with ``COLUMNS``.
+def ablate(
+    rays: Rays,
+    train: Rays,
+    centres: np.ndarray,
+    place: GazePlace,
+    variants: list[Variant],
+    folder: Path,
+    ns,
+    seeds: int = 3,
+    steps: dict | None = None,
+    radius: float = 0.25,
+    kappa: float = 20.0,
+    min_rays: int = 64,
+    render: Callable | None = None,
+    say: Callable = print,
+    align=None,
+    truth: Callable | None = None,
+    probes: int | None = None,
+    refit: bool = True,
+) -> list[dict]:
+    """Train and score ``variants``; one row each, seed by seed (recipe ``default``: ``seeds`` of them, others one),
+    with ``COLUMNS``.
 
-    ``rays``: whose density at ``centres`` is the truth of the test; ``train``: what is trained on; ``truth(positions, directions)``:
-    the true density in place of theirs, where it is known. ``steps``: by recipe, in place of its own. ``render(checkpoint)``:
-    seconds a frame. ``probes``: of a training at most; ``refit``: as ``GazeSettings`` has it, of every recipe but the default one,
-    which does. Checkpoints go to ``folder``, each with its row: what an earlier run with the same rays, place, tests and
-    settings has left there is not trained again.
+    ``rays``: whose density at ``centres`` is the truth of the test; ``train``: what is trained on;
+    ``truth(positions, directions)``: the true density in place of theirs, where it is known. ``steps``: by recipe, in
+    place of its own. ``render(checkpoint)``: seconds a frame. ``probes``: of a training at most; ``refit``: as
+    ``GazeSettings`` has it, of every recipe but the default one, which does. Checkpoints go to ``folder``, each with
+    its row: what an earlier run with the same rays, place, tests and settings has left there is not trained again.
     """
     seen = train.origin[np.random.default_rng(0).permutation(len(train))[: len(centres)]]
-    sets = {"train": make_test(train, seen, radius, kappa, min_rays=min(min_rays, 16)), "test": make_test(rays, centres, radius, kappa, min_rays=min_rays)}
+    sets = {
+        "train": make_test(train, seen, radius, kappa, min_rays=min(min_rays, 16)),
+        "test": make_test(rays, centres, radius, kappa, min_rays=min_rays),
+    }
     if truth is not None:
         sets = {k: replace(s, truth=truth(s.centres, s.directions)) for k, s in sets.items()}
     rows = []
     for v in variants:
         for seed in range(seeds if v.recipe == "default" else 1):
-            row = _run(v, seed, train, sets, place, folder, ns, (steps or {}).get(v.recipe), probes, min_rays, render, align, refit)
-            say(f"{v.recipe:8s} {v.name:28s} seed {seed}: test KLD {row['test_KLD']:.3f}, CC {row['test_CC']:.3f}; {row['train_seconds']:.0f} s")
+            row = _run(
+                v,
+                seed,
+                train,
+                sets,
+                place,
+                folder,
+                ns,
+                (steps or {}).get(v.recipe),
+                probes,
+                min_rays,
+                render,
+                align,
+                refit,
+            )
+            say(
+                f"{v.recipe:8s} {v.name:28s} seed {seed}: test KLD {row['test_KLD']:.3f}, CC {row['test_CC']:.3f}; {row['train_seconds']:.0f} s"
+            )
             rows.append(row)
     for recipe in {v.recipe for v in variants}:
         whole = [r for r in rows if (r["recipe"], r["variant"]) == (recipe, "emit_capture")]
@@ -92,8 +154,21 @@ def ablate(rays: Rays, train: Rays, centres: np.ndarray, place: GazePlace, varia
     return rows
 
 
-def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: GazePlace, folder: Path, ns, steps, probes,
-         min_rays, render, align, refit) -> dict:
+def _run(
+    v: Variant,
+    seed: int,
+    train: Rays,
+    tests: dict[str, GazeTest],
+    place: GazePlace,
+    folder: Path,
+    ns,
+    steps,
+    probes,
+    min_rays,
+    render,
+    align,
+    refit,
+) -> dict:
     recipe, initial = gaze_recipe(v.recipe, v.gaze), None
     config, more = place.told(recipe.config), dict(v.more)
     if v.begin:
@@ -107,8 +182,15 @@ def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: 
     # Positions that validate are to be had wherever there are some that test.
     settings = replace(settings, watched_rays=min(settings.watched_rays or how.min_rays, min_rays))
     path = folder / f"{v.recipe}_{v.name.replace(', ', '_').replace(' ', '_')}_{seed}.safetensors"
-    same = {"architecture": config.to_dict(), "settings": settings.to_dict(), "probes": how.to_dict(), "rays": digest(train),
-            "tests": {k: hashlib.sha256(t.truth.tobytes()).hexdigest() for k, t in tests.items()}, "begin": v.begin, **place.about}
+    same = {
+        "architecture": config.to_dict(),
+        "settings": settings.to_dict(),
+        "probes": how.to_dict(),
+        "rays": digest(train),
+        "tests": {k: hashlib.sha256(t.truth.tobytes()).hexdigest() for k, t in tests.items()},
+        "begin": v.begin,
+        **place.about,
+    }
     kept = path.with_suffix(".json")
     found = read_json(kept, "kept row") if path.exists() and kept.exists() else None
     if isinstance(found, dict) and "row" in found and found.get("same") == json.loads(json.dumps(same)):
@@ -123,7 +205,8 @@ def _run(v: Variant, seed: int, train: Rays, tests: dict[str, GazeTest], place: 
 
 
 def _train(train, tests, place: GazePlace, config, settings, how, ns, align, initial, made: dict, path: Path) -> dict:
-    """Train, write the checkpoint (``made``: what it is), score on ``tests``. Raises ``KeyboardInterrupt`` after Ctrl-C."""
+    """Train, write the checkpoint (``made``: what it is), score on ``tests``. Raises ``KeyboardInterrupt`` after
+    Ctrl-C."""
     started = time.perf_counter()
     field, about = train_gaze(train, place.medium, place.box, config, settings, how, ns, align, initial=initial)
     if about["interrupted"]:
@@ -138,10 +221,19 @@ def _train(train, tests, place: GazePlace, config, settings, how, ns, align, ini
     return row
 
 
-def frame_timer(place: GazePlace, centres: np.ndarray, folder: Path, cameras: int = 4, width: int = 320, height: int = 180, seed: int = 0) -> Callable | None:
-    """``render(checkpoint)``: mean seconds a frame of ``cameras`` at random ``centres``, looking about level; None where there
-    is nothing to render, and for a scene of shapes that also has a field. The first render of each checkpoint, which compiles, does not count; the integral of a normalised
-    field does, since each camera has one of its own."""
+def frame_timer(
+    place: GazePlace,
+    centres: np.ndarray,
+    folder: Path,
+    cameras: int = 4,
+    width: int = 320,
+    height: int = 180,
+    seed: int = 0,
+) -> Callable | None:
+    """``render(checkpoint)``: mean seconds a frame of ``cameras`` at random ``centres``, looking about level; None
+    where there is nothing to render, and for a scene of shapes that also has a field. The first render of each
+    checkpoint, which compiles, does not count; the integral of a normalised field does, since each camera has one of
+    its own."""
     import mitsuba as mi
 
     if place.kind == "none" or (place.kind == "scene" and place.medium.medium is not None):
@@ -150,16 +242,31 @@ def frame_timer(place: GazePlace, centres: np.ndarray, folder: Path, cameras: in
     eyes, angles = centres[rng.integers(0, len(centres), cameras)], rng.uniform(0, 2 * np.pi, cameras)
 
     def render(path: Path) -> float:
-        scene = mi.load_dict({"type": "scene", "integrator": {
-            "type": "nerg", "aovs": "gaze", "radiance": False, "gaze": {"type": "gazefield", "filename": str(path)}, **_around(place)},
-            **_shapes(place)})  # fmt: skip
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {
+                    "type": "nerg",
+                    "aovs": "gaze",
+                    "radiance": False,
+                    "gaze": {"type": "gazefield", "filename": str(path)},
+                    **_around(place),
+                },
+                **_shapes(place),
+            }
+        )
         times = []
         for eye, angle in [(eyes[0], angles[0]), *zip(eyes, angles)]:
             target = eye + (np.cos(angle), np.sin(angle), -0.1)
-            sensor = mi.load_dict({
-                "type": "perspective", "fov": 70, "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), target.tolist(), [0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}, "sampler": {"type": "independent", "sample_count": 1},
-            })  # fmt: skip
+            sensor = mi.load_dict(
+                {
+                    "type": "perspective",
+                    "fov": 70,
+                    "to_world": mi.ScalarTransform4f().look_at(eye.tolist(), target.tolist(), [0, 0, 1]),
+                    "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
+                    "sampler": {"type": "independent", "sample_count": 1},
+                }
+            )
             started = time.perf_counter()
             np.array(mi.render(scene, sensor=sensor, spp=1))
             times.append(time.perf_counter() - started)
@@ -181,7 +288,8 @@ def frame_timer(place: GazePlace, centres: np.ndarray, folder: Path, cameras: in
 
 
 def summarise(rows: list[dict]) -> list[dict]:
-    """A row a recipe and variant: means over seeds, and the spread (standard deviation) of what differs between them."""
+    """A row a recipe and variant: means over seeds, and the spread (standard deviation) of what differs between
+    them."""
     out = []
     for key in dict.fromkeys((r["recipe"], r["variant"]) for r in rows):
         found = [r for r in rows if (r["recipe"], r["variant"]) == key]
@@ -198,15 +306,29 @@ def summarise(rows: list[dict]) -> list[dict]:
 
 def table(summary: list[dict]) -> str:
     """Markdown: losses relative to emit_capture of the same recipe, scores on held-out positions, seconds."""
-    shown = ("train_relative", "test_relative", "test_loss", "test_KLD", "test_CC", "test_MAE", "train_seconds", "frame_seconds")
-    lines = ["| recipe | variant | seeds | steps | " + " | ".join(k.replace("_", " ") for k in shown) + " |", "|---|---|" + "---:|" * (len(shown) + 2)]
+    shown = (
+        "train_relative",
+        "test_relative",
+        "test_loss",
+        "test_KLD",
+        "test_CC",
+        "test_MAE",
+        "train_seconds",
+        "frame_seconds",
+    )
+    lines = [
+        "| recipe | variant | seeds | steps | " + " | ".join(k.replace("_", " ") for k in shown) + " |",
+        "|---|---|" + "---:|" * (len(shown) + 2),
+    ]
     for r in summary:
         cells = []
         for k in shown:
             digits = 4 if k.endswith("MAE") else 3
             spread = f" ± {r[f'{k}.spread']:.{digits}f}" if f"{k}.spread" in r else ""
             cells.append(f"{r[k]:.{digits}f}{spread}" if k in r else "")
-        lines.append(f"| {r['recipe']} | {r['variant']} | {r['seeds']} | {r['steps']:.0f} | " + " | ".join(cells) + " |")
+        lines.append(
+            f"| {r['recipe']} | {r['variant']} | {r['seeds']} | {r['steps']:.0f} | " + " | ".join(cells) + " |"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -1,8 +1,9 @@
 """How well a radiance field's pictures equal posed pictures: PSNR, SSIM, depth.
 
-Pictures are rendered by the `nerg` integrator at its defaults, through ``mi.render``. A photo with lens distortion is left as
-it is; the rendering is bent to its lens.
+Pictures are rendered by the `nerg` integrator at its defaults, through ``mi.render``. A photo with lens distortion is
+left as it is; the rendering is bent to its lens.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -10,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.capture.cameras import Camera, pixel_directions, sensor_dict
 from nerg_mi.capture.images import View
 from nerg_mi.capture.undistort import pinhole, through_lens
+from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.training.radiance.preview import psnr
 from nerg_mi.view.tonemap import srgb, write_png
@@ -49,8 +50,8 @@ def ssim(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None)
 
 @dataclass(frozen=True)
 class DepthScore:
-    """Over pixels whose true depth is known: ``median``, ``mean``: of the absolute error, scene units; ``off``: share that is
-    wrong by more than a tenth (or empty); ``opacity``: mean, and ``translucent``: share below 0.9."""
+    """Over pixels whose true depth is known: ``median``, ``mean``: of the absolute error, scene units; ``off``: share
+    that is wrong by more than a tenth (or empty); ``opacity``: mean, and ``translucent``: share below 0.9."""
 
     median: float
     mean: float
@@ -60,21 +61,28 @@ class DepthScore:
 
 
 def depth_score(depth: np.ndarray, opacity: np.ndarray, truth: np.ndarray) -> DepthScore | None:
-    """Score of ``depth`` (h, w), 0 where there is none, against ``truth`` (h, w), 0 where unknown; None if it is nowhere."""
+    """Score of ``depth`` (h, w), 0 where there is none, against ``truth`` (h, w), 0 where unknown; None if it is
+    nowhere."""
     known = truth > 0
     if not known.any():
         return None
     # A hole is as wrong as its depth of 0 says.
     error = np.abs(depth[known] - truth[known])
     alpha = opacity[known]
-    return DepthScore(float(np.median(error)), float(error.mean()), float(np.mean(error > 0.1 * truth[known])),
-                      float(alpha.mean()), float(np.mean(alpha < 0.9)))
+    return DepthScore(
+        float(np.median(error)),
+        float(error.mean()),
+        float(np.mean(error > 0.1 * truth[known])),
+        float(alpha.mean()),
+        float(np.mean(alpha < 0.9)),
+    )
 
 
 @dataclass(frozen=True)
 class Rendered:
     """``color`` (h, w, 3): sRGB before black, composited as a picture with alpha is; ``depth`` (h, w): the
-    integrator's default, the median, from the camera's centre, scene units; ``opacity`` (h, w); ``mask``: pixels that could be rendered."""
+    integrator's default, the median, from the camera's centre, scene units; ``opacity`` (h, w); ``mask``: pixels that
+    could be rendered."""
 
     color: np.ndarray
     depth: np.ndarray
@@ -89,10 +97,16 @@ class Renderer:
         import mitsuba as mi
 
         self.spp = spp
-        self.scene = mi.load_dict({
-            "type": "scene",
-            "integrator": {"type": "nerg", "field": {"type": "nerf", "filename": str(field)}, "aovs": "depth,opacity"},
-        })
+        self.scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {
+                    "type": "nerg",
+                    "field": {"type": "nerf", "filename": str(field)},
+                    "aovs": "depth,opacity",
+                },
+            }
+        )
 
     def __call__(self, camera: Camera, seed: int = 0) -> Rendered:
         """``camera``'s picture, ``spp`` rays a pixel."""
@@ -124,7 +138,9 @@ class Renderer:
         return Rendered(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
 
 
-def score_views(field: str | Path, views: list[View], spp: int = 16, pictures: Path | None = None, on_view=None) -> dict:
+def score_views(
+    field: str | Path, views: list[View], spp: int = 16, pictures: Path | None = None, on_view=None
+) -> dict:
     """Scores (JSON) of the field in a checkpoint on ``views``; writes each picture beside its truth into ``pictures``.
 
     ``psnr``, ``ssim``: a list with one entry a view, in the order of ``views`` (names); ``*_mean``: their means;
@@ -146,10 +162,15 @@ def score_views(field: str | Path, views: list[View], spp: int = 16, pictures: P
         if on_view is not None:
             on_view(view.name, *rows[-1])
     out = {
-        "views": [v.name for v in views], "width": views[0].shape[1], "height": views[0].shape[0], "spp": spp,
-        "psnr": [p for p, _ in rows], "psnr_mean": float(np.mean([p for p, _ in rows])),
-        "ssim": [s for _, s in rows], "ssim_mean": float(np.mean([s for _, s in rows])),
-    }  # fmt: skip
+        "views": [v.name for v in views],
+        "width": views[0].shape[1],
+        "height": views[0].shape[0],
+        "spp": spp,
+        "psnr": [p for p, _ in rows],
+        "psnr_mean": float(np.mean([p for p, _ in rows])),
+        "ssim": [s for _, s in rows],
+        "ssim_mean": float(np.mean([s for _, s in rows])),
+    }
     depths = [d for d in depths if d is not None]
     if depths:
         out["depth"] = {k: float(np.mean([getattr(d, k) for d in depths])) for k in DepthScore.__dataclass_fields__}

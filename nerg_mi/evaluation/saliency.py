@@ -9,6 +9,7 @@ leading shape. ``weights`` (D,) or broadcastable: solid angles, in any unit;
 ``None`` says that all directions are of equal area. Everything is float64 and
 defined: maps that are constant or zero give a number, not NaN.
 """
+
 from __future__ import annotations
 
 import numpy as np
@@ -18,7 +19,9 @@ from scipy.integrate import trapezoid
 EPS = 1e-20
 
 
-def kld(truth: np.ndarray, prediction: np.ndarray, weights: np.ndarray | None = None, *, eps: float = EPS) -> np.ndarray:
+def kld(
+    truth: np.ndarray, prediction: np.ndarray, weights: np.ndarray | None = None, *, eps: float = EPS
+) -> np.ndarray:
     """Kullback-Leibler divergence KL(truth || prediction) in nats; 0 is best.
 
     Both are divided by their integral; negative values are lifted to zero by the
@@ -71,11 +74,12 @@ def nss(density: np.ndarray, at_gaze: np.ndarray, weights: np.ndarray | None = N
 def auc_judd(
     density: np.ndarray, at_gaze: np.ndarray, weights: np.ndarray | None = None, *, fixated: np.ndarray | None = None
 ) -> np.ndarray:
-    """Area under the curve of hits against false alarms, thresholds at the gazes' own values (Judd et al. 2012); 0.5 is chance.
+    """Area under the curve of hits against false alarms, thresholds at the gazes' own values (Judd et al. 2012); 0.5 is
+    chance.
 
-    ``density`` (..., D); ``at_gaze`` (..., K), the map's values where people looked. Hits: the share of gazes at or above the
-    threshold; false alarms: the share of the map that is. ``fixated`` (..., D) bool leaves pixels out of the latter, as the
-    original does on a picture; rays are no pixels, and leave out nothing.
+    ``density`` (..., D); ``at_gaze`` (..., K), the map's values where people looked. Hits: the share of gazes at or
+    above the threshold; false alarms: the share of the map that is. ``fixated`` (..., D) bool leaves pixels out of the
+    latter, as the original does on a picture; rays are no pixels, and leave out nothing.
     """
     w = _shares(density, density, weights)
     density, at_gaze = np.asarray(density, np.float64), np.asarray(at_gaze, np.float64)
@@ -96,8 +100,9 @@ def auc_judd(
 
 
 def sauc(at_gaze: np.ndarray, at_others: np.ndarray) -> np.ndarray:
-    """Shuffled AUC: how often the map is higher where people looked, ``at_gaze`` (..., K), than where they looked from other
-    positions, ``at_others`` (..., M); ties count half. 0.5 is chance, which what does not depend on the position has."""
+    """Shuffled AUC: how often the map is higher where people looked, ``at_gaze`` (..., K), than where they looked from
+    other positions, ``at_others`` (..., M); ties count half. 0.5 is chance, which what does not depend on the position
+    has."""
     a, b = np.asarray(at_gaze, np.float64), np.asarray(at_others, np.float64)
     shape = np.broadcast_shapes(a.shape[:-1], b.shape[:-1])
     a, b = (np.broadcast_to(v, (*shape, v.shape[-1])).reshape(-1, v.shape[-1]) for v in (a, b))
@@ -137,7 +142,9 @@ def _shares(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None) -> np.ndar
         return np.full(a[-1], 1.0 / a[-1])
     w = np.asarray(weights, dtype=np.float64)
     if w.shape[-1:] != a[-1:] or not (w >= 0).all() or not (w.sum(axis=-1) > 0).all():
-        raise ValueError(f"weights of shape {w.shape} must be non-negative solid angles of the {a[-1]} directions, not all zero")
+        raise ValueError(
+            f"weights of shape {w.shape} must be non-negative solid angles of the {a[-1]} directions, not all zero"
+        )
     return w / w.sum(axis=-1, keepdims=True)
 
 

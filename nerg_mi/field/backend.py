@@ -4,6 +4,7 @@ A field belongs to one backend (LLVM or CUDA): its weights are arrays of that
 backend. Nothing here depends on the Mitsuba variant in use, so that the code
 survives a change of variant; the types derive from arguments.
 """
+
 from __future__ import annotations
 
 from types import ModuleType
@@ -47,8 +48,8 @@ def is_cuda(ns: ModuleType) -> bool:
 def aligned(array: np.ndarray, dtype: type = np.float32) -> np.ndarray:
     """A copy of ``array``, of type ``dtype``, that begins at a multiple of 64 bytes.
 
-    Dr.Jit reads NumPy memory in place, and gathers several features in one load only from aligned memory. The alignment is
-    also part of a kernel: each combination of those of its inputs is compiled anew.
+    Dr.Jit reads NumPy memory in place, and gathers several features in one load only from aligned memory. The alignment
+    is also part of a kernel: each combination of those of its inputs is compiled anew.
     """
     array = np.asarray(array, dtype)
     memory = np.empty(array.nbytes + 64, np.uint8)

@@ -3,6 +3,7 @@
 The ray's far intersection with the sphere, as two angles, goes through a small 2-D hash grid; its features
 and the harmonics of the direction go through a small network to a colour.
 """
+
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field

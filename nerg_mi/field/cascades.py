@@ -1,4 +1,5 @@
 """Occupancy in nested cubes about the origin, coarser outwards, as instant-ngp and torch-ngp keep it."""
+
 from __future__ import annotations
 
 from types import ModuleType
@@ -34,7 +35,9 @@ class CascadeGrid:
         self._halves = [min(2.0**level, self.bound) for level in range(len(bits))]
         parts = [m for m in range(1, _MOST_PARTS + 1) if (self.bound * m).is_integer()]
         if not parts:
-            raise ValueError(f"the bound {bound} of cascades must be a whole number, or one of at most {_MOST_PARTS} parts")
+            raise ValueError(
+                f"the bound {bound} of cascades must be a whole number, or one of at most {_MOST_PARTS} parts"
+            )
         # Cells of the common grid along a cell of each level.
         self._ratios = [int(h * parts[0]) for h in self._halves]
         self.cells = (r * self._ratios[-1],) * 3

@@ -1,8 +1,9 @@
 """Surfaces and lattices of a radiance field, as arrays for other tools.
 
-A surface is where density crosses a threshold. It is looked for in the opacity of a lattice cell, 1 - exp(-σ h), which is
-bounded where density is not, and then found along the lattice's edges in the field itself.
+A surface is where density crosses a threshold. It is looked for in the opacity of a lattice cell, 1 - exp(-σ h), which
+is bounded where density is not, and then found along the lattice's edges in the field itself.
 """
+
 from __future__ import annotations
 
 import math
@@ -85,12 +86,15 @@ class Sampler:
                 for k in range(samples**3):
                     offsets = [(k // samples**axis % samples + 0.5) / samples for axis in range(3)]
                     offsets = [dr.opaque(ns.Float, o) for o in offsets]
-                    p = ns.Array3f(*[l + (ns.Float(c) + o) * lattice.step for l, c, o in zip(lattice.lower, cell, offsets)])
-                    out[start:start + count] += of(self._density(p)).numpy()
+                    p = ns.Array3f(
+                        *[l + (ns.Float(c) + o) * lattice.step for l, c, o in zip(lattice.lower, cell, offsets)]
+                    )
+                    out[start : start + count] += of(self._density(p)).numpy()
         return (out / samples**3).reshape(nz, ny, nx)
 
     def color(self, p: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Colour (N, 3) in the field's colour space of points (N, 3), as seen along unit ``directions`` (N, 3)."""
+
         def ask(q):
             features = self.field.density_features(self._point(q[:, :3]))[1]
             c = self.field.color(features, self._point(q[:, 3:]))
@@ -101,7 +105,8 @@ class Sampler:
             return _joined(ask, np.concatenate([p, directions], 1), 3)
 
     def diffuse(self, p: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Colour (N, 3) of surface points seen head on and at 45 degrees, averaged: the field's colour depends on direction."""
+        """Colour (N, 3) of surface points seen head on and at 45 degrees, averaged: the field's colour depends on
+        direction."""
         first = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
         u = np.cross(normals, first)
         u /= np.maximum(np.linalg.norm(u, axis=1, keepdims=True), 1e-12)
@@ -117,7 +122,7 @@ def _joined(ask, rows: np.ndarray, columns: int = 0) -> np.ndarray:
     shape = (len(rows), columns) if columns else (len(rows),)
     out = np.zeros(shape, np.float32)
     for start in range(0, len(rows), _BATCH):
-        out[start:start + _BATCH] = ask(rows[start:start + _BATCH])
+        out[start : start + _BATCH] = ask(rows[start : start + _BATCH])
     return out
 
 
@@ -132,8 +137,8 @@ def opacity(density: np.ndarray, lattice: Lattice) -> np.ndarray:
 
 
 def crossings(sampler: Sampler, lattice: Lattice, index: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-    """``index`` (N, 3), fractional on one axis, moved along that edge to where density crosses ``threshold``; and where no
-    surface is, but only the end of what the field's occupancy grid has looked at (mask (N,)).
+    """``index`` (N, 3), fractional on one axis, moved along that edge to where density crosses ``threshold``; and where
+    no surface is, but only the end of what the field's occupancy grid has looked at (mask (N,)).
 
     Points stay where they are if the field does not cross there: filled holes have put them there. Beyond an unseen
     one the networks go on with dense matter: the backs of walls and the insides of things, which no picture shows.

@@ -5,6 +5,7 @@ kernel, best for rendering) and tensor products (``W @ X`` on whole batches,
 whose weight gradient on the LLVM backend is several times cheaper than the
 atomically accumulated outer products of cooperative vectors; best for training).
 """
+
 from __future__ import annotations
 
 from types import ModuleType
@@ -14,7 +15,6 @@ import drjit.nn as nn
 import numpy as np
 
 from .backend import is_cuda, namespace
-
 
 # torch's LayerNorm adds it to the variance.
 _NORM_EPSILON = 1e-5
@@ -59,20 +59,29 @@ class MLP:
             bound = 1 / np.sqrt(fan_in)
             weights.append(ns.TensorXf(rng.uniform(-bound, bound, (fan_out, fan_in)).astype(np.float32)))
             if normalized:
-                norms.append({"gain": dr.ones(ns.TensorXf, (fan_in,)), "shift": dr.zeros(ns.TensorXf, (fan_in,)),
-                              "bias": ns.TensorXf(rng.uniform(-bound, bound, fan_out).astype(np.float32))})
+                norms.append(
+                    {
+                        "gain": dr.ones(ns.TensorXf, (fan_in,)),
+                        "shift": dr.zeros(ns.TensorXf, (fan_in,)),
+                        "bias": ns.TensorXf(rng.uniform(-bound, bound, fan_out).astype(np.float32)),
+                    }
+                )
         return MLP(weights, norms or None)
 
     def require(self, sizes: list[int], name: str, normalized: bool = False) -> None:
-        """Raise ``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs] and are ``normalized`` or not."""
+        """Raise ``ValueError`` unless the layers have ``sizes`` [inputs, ..., outputs] and are ``normalized`` or
+        not."""
         shapes, expected = [tuple(w.shape) for w in self.weights], [(o, i) for i, o in zip(sizes, sizes[1:])]
         if shapes != expected:
             raise ValueError(f'"{name}" has layers of shapes {shapes} where its architecture needs {expected}')
         if normalized != (self.norms is not None):
-            raise ValueError(f'"{name}" {"lacks" if normalized else "has"} layer normalisation, unlike its architecture')
+            raise ValueError(
+                f'"{name}" {"lacks" if normalized else "has"} layer normalisation, unlike its architecture'
+            )
 
     def named(self) -> dict:
-        """Arrays by name: ``"0"``, ``"1"``, ...: weights; ``"0.gain"``, ``"0.shift"``, ``"0.bias"`` of a normalised layer."""
+        """Arrays by name: ``"0"``, ``"1"``, ...: weights; ``"0.gain"``, ``"0.shift"``, ``"0.bias"`` of a normalised
+        layer."""
         out = {}
         for i, w in enumerate(self.weights):
             out[str(i)] = w

@@ -4,6 +4,7 @@ Marching skips a step only when its midpoint lies in an empty cell. The distance
 to the nearest occupied cell (chessboard metric) lets a ray leap over many empty
 cells with one look-up.
 """
+
 from __future__ import annotations
 
 from types import ModuleType

@@ -4,6 +4,7 @@ Architecture of instant-ngp (Müller et al. 2022) as torch-ngp and the paper use
 it: hash grid -> density net -> (log density, geometry features); spherical
 harmonics of the direction and the geometry features -> colour net -> sigmoid.
 """
+
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
@@ -12,8 +13,9 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from .background import Background
 from nerg_mi.maths.box import Box
+
+from .background import Background
 from .cascades import CascadeGrid
 from .encoding.harmonics import encode_direction
 from .encoding.hashgrid import HashGrid, HashGridConfig
@@ -101,7 +103,12 @@ class RadianceField:
     """
 
     DRJIT_STRUCT = {
-        "grid": None, "density_net": None, "color_net": None, "_head": None, "occupancy": None, "background": None,
+        "grid": None,
+        "density_net": None,
+        "color_net": None,
+        "_head": None,
+        "occupancy": None,
+        "background": None,
     }
 
     def __init__(

@@ -35,9 +35,9 @@ _REMEDIES = {
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """The name of a new, empty file to be written, which takes the place of ``path`` when the block ends.
 
-    The name keeps the suffix of ``path``, by which many writers choose a format. Parent folders are made. A link is followed,
-    and the permissions of a file that is replaced are kept. If the block raises, the new file is removed and the old one is
-    as it was; an `OSError` of the block comes out as a `NergError` that names ``path`` and the remedy.
+    The name keeps the suffix of ``path``, by which many writers choose a format. Parent folders are made. A link is
+    followed, and the permissions of a file that is replaced are kept. If the block raises, the new file is removed and
+    the old one is as it was; an `OSError` of the block comes out as a `NergError` that names ``path`` and the remedy.
     """
     with writing(path):
         target = Path(os.path.realpath(path))
@@ -85,8 +85,8 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
     """Raise `NergError` where it is plain that no file can be written to ``path``: to be asked before long work.
 
-    A folder in its place, a file in place of a parent, no permission, a suffix that is none of ``suffixes`` (where there are
-    any). Nothing is made. A disk that fills meanwhile, or permissions that change, are found by `replacing`.
+    A folder in its place, a file in place of a parent, no permission, a suffix that is none of ``suffixes`` (where
+    there are any). Nothing is made. A disk that fills meanwhile, or permissions that change, are found by `replacing`.
     """
     if suffixes and Path(path).suffix.lower() not in suffixes:
         raise NergError(f'"{path}" has no format that is written here: let its name end in {" or ".join(suffixes)}.')
@@ -99,7 +99,8 @@ def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
 
 
 def check_folder(path: str | os.PathLike) -> None:
-    """Raise `NergError` where it is plain that no files can be written into the folder ``path``, which need not be there yet."""
+    """Raise `NergError` where it is plain that no files can be written into the folder ``path``, which need not be
+    there yet."""
     with writing(path):
         _check_parents(Path(os.path.realpath(path)) / "file")
 

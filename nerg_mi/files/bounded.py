@@ -38,10 +38,25 @@ LINE_CHARACTERS = 16 << 20
 """A line of a text file may be so long: COLMAP lists all observations of an image on one."""
 
 _DAMAGED = (
-    OSError, EOFError, ValueError, KeyError, IndexError, OverflowError, MemoryError, RecursionError,
-    NotImplementedError, struct.error, zlib.error, lzma.LZMAError, gzip.BadGzipFile, zipfile.BadZipFile,
-    zipfile.LargeZipFile, tokenize.TokenError, SyntaxError, pickle.UnpicklingError,
-)  # fmt: skip
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    IndexError,
+    OverflowError,
+    MemoryError,
+    RecursionError,
+    NotImplementedError,
+    struct.error,
+    zlib.error,
+    lzma.LZMAError,
+    gzip.BadGzipFile,
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    tokenize.TokenError,
+    SyntaxError,
+    pickle.UnpicklingError,
+)
 
 
 @contextmanager

@@ -16,24 +16,41 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .atomic import replacing
 from .bounded import reading
 from .image_header import check_image
 
 
-def write_exr(path: str | os.PathLike, channels: Mapping[str, np.ndarray], attributes: Mapping[str, str] | None = None) -> None:
+def write_exr(
+    path: str | os.PathLike, channels: Mapping[str, np.ndarray], attributes: Mapping[str, str] | None = None
+) -> None:
     """Write ``channels`` as a single-part scanline file, compressed without loss, whole or not at all.
 
-    ``channels``: name, such as ``R`` or ``depth.T``, to an array (h, w) of float32, float16 or uint32; rows from the top.
+    ``channels``: name, such as ``R`` or ``depth.T``, to an array (h, w) of float32, float16 or uint32; rows from the
+    top.
     ``attributes``: text for the header. Raises `NergError` where the file cannot be written.
     """
     import OpenEXR
 
-    names = {"compression", "type", "channels", "dataWindow", "displayWindow", "lineOrder", "screenWindowCenter", "screenWindowWidth"}
+    names = {
+        "compression",
+        "type",
+        "channels",
+        "dataWindow",
+        "displayWindow",
+        "lineOrder",
+        "screenWindowCenter",
+        "screenWindowWidth",
+    }
     taken = names & set(attributes or {})
     if taken:
         raise ValueError(f"the attributes {', '.join(sorted(taken))} belong to the format; give them other names")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **{k: str(v) for k, v in (attributes or {}).items()}}
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        **{k: str(v) for k, v in (attributes or {}).items()},
+    }
     data = {name: np.ascontiguousarray(value) for name, value in channels.items()}
     rows = len(next(iter(data.values())))
     with replacing(path) as temporary:
@@ -42,9 +59,12 @@ def write_exr(path: str | os.PathLike, channels: Mapping[str, np.ndarray], attri
                 file.write(str(temporary))
         except RuntimeError as error:
             _raise_if_full(temporary)
-            raise NergError(f'"{path}" could not be written ({str(error).strip()}); choose another name or folder.') from error
+            raise NergError(
+                f'"{path}" could not be written ({str(error).strip()}); choose another name or folder.'
+            ) from error
         if not _whole(temporary, rows):
-            # The library does not look at what becomes of the last kilobytes, which leave its buffer as the file is closed.
+            # The library does not look at what becomes of the last kilobytes, which leave its buffer as the file is
+            # closed.
             _raise_if_full(temporary)
             raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
 
@@ -79,8 +99,8 @@ def _raise_if_full(path: Path) -> None:
 
 
 def read_exr(path: str | os.PathLike, what: str = "image") -> dict[str, np.ndarray]:
-    """The channels of the first part of an EXR file, arrays (h, w) by name: colours before all others of their layer (R, G,
-    B, X, Y, Z, A), the rest by name.
+    """The channels of the first part of an EXR file, arrays (h, w) by name: colours before all others of their layer
+    (R, G, B, X, Y, Z, A), the rest by name.
 
     The size is checked in the header first. Raises `NergError` for what is damaged, too large, or stores its colours as
     luminance and two differences.
@@ -92,7 +112,9 @@ def read_exr(path: str | os.PathLike, what: str = "image") -> dict[str, np.ndarr
     with reading(path, what, also=(RuntimeError, TypeError)), OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: np.ascontiguousarray(channel.pixels) for name, channel in file.channels().items()}
     if {"RY", "BY"} <= set(channels):
-        raise NergError(f'the {what} "{path}" stores luminance and colour differences (RY, BY); save it with R, G and B')
+        raise NergError(
+            f'the {what} "{path}" stores luminance and colour differences (RY, BY); save it with R, G and B'
+        )
     if len({c.shape for c in channels.values()}) != 1 or any(c.ndim != 2 for c in channels.values()):
         raise NergError(f'the {what} "{path}" has channels of different sizes; save it with one value a pixel in each')
     return {name: channels[name] for name in sorted(channels, key=_channel_order)}
@@ -109,9 +131,9 @@ def _channel_order(name: str) -> str:
 def exr_rows(path: str | os.PathLike, width: int, height: int) -> Iterator[Callable[[Mapping[str, np.ndarray]], None]]:
     """A single-part scanline file that is written from the top in pieces, so that it need not lie in memory as a whole.
 
-    Gives a function that writes the next rows, from the name of each channel to an array (rows, width) of float32; the names
-    of the first call are those of the file. The file is whole or absent; it is absent also where rows are missing at the end.
-    Raises `NergError` where it cannot be written.
+    Gives a function that writes the next rows, from the name of each channel to an array (rows, width) of float32; the
+    names of the first call are those of the file. The file is whole or absent; it is absent also where rows are missing
+    at the end. Raises `NergError` where it cannot be written.
     """
     import Imath
     import OpenEXR
@@ -125,7 +147,7 @@ def exr_rows(path: str | os.PathLike, width: int, height: int) -> Iterator[Calla
                 header = OpenEXR.Header(width, height)
                 header["compression"] = Imath.Compression(Imath.Compression.ZIP_COMPRESSION)
                 kind = Imath.Channel(Imath.PixelType(Imath.PixelType.FLOAT))
-                header["channels"] = {name: kind for name in channels}
+                header["channels"] = dict.fromkeys(channels, kind)
                 file = OpenEXR.OutputFile(str(temporary), header)
             count = len(next(iter(channels.values())))
             data = {name: np.ascontiguousarray(value, np.float32).tobytes() for name, value in channels.items()}
@@ -133,7 +155,9 @@ def exr_rows(path: str | os.PathLike, width: int, height: int) -> Iterator[Calla
                 file.writePixels(data, count)
             except (OSError, RuntimeError) as error:
                 _raise_if_full(temporary)
-                raise NergError(f'"{path}" could not be written ({str(error).strip()}); choose another name or folder.') from error
+                raise NergError(
+                    f'"{path}" could not be written ({str(error).strip()}); choose another name or folder.'
+                ) from error
             rows += count
 
         try:
@@ -150,8 +174,8 @@ def exr_rows(path: str | os.PathLike, width: int, height: int) -> Iterator[Calla
 
 @contextmanager
 def threads_for_mitsuba() -> Iterator[None]:
-    """Two threads at least, for as long as Mitsuba reads files: with one its EXR reader, too, waits for ever, and a scene may
-    hold textures and emitters in that format."""
+    """Two threads at least, for as long as Mitsuba reads files: with one its EXR reader, too, waits for ever, and a
+    scene may hold textures and emitters in that format."""
     import drjit as dr
 
     threads = dr.thread_count()

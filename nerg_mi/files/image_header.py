@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from nerg_mi.errors import NergError
+
 from .bounded import plain, reading, size_of
 
 PIXELS = 1 << 27

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from typing import IO
 
 from nerg_mi.errors import NergError
+
 from .bounded import plain, reading, size_of
 
 RATIO = 100

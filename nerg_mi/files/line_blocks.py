@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import IO
 
 from nerg_mi.errors import NergError
+
 from .bounded import reading, size_of
 from .inflating import open_gzip
 
@@ -27,8 +28,8 @@ def line_blocks(path: str | os.PathLike, what: str, most: int) -> Iterator[list[
     """Lines of the UTF-8 file ``path`` (inflated where its name ends in ``.gz``) with their ends, in blocks of at most
     ``most`` lines and some 16 million characters.
 
-    ``what``: the kind of file, for messages. Raises `NergError` for a file that is damaged or no UTF-8 text, and for a line of
-    more than `LINE_CHARACTERS`.
+    ``what``: the kind of file, for messages. Raises `NergError` for a file that is damaged or no UTF-8 text, and for a
+    line of more than `LINE_CHARACTERS`.
     """
     decoder, rest, found, count, characters = codecs.getincrementaldecoder("utf-8")(), "", [], 0, 0
     with _opened(path, what) as source:
@@ -53,7 +54,7 @@ def line_blocks(path: str | os.PathLike, what: str, most: int) -> Iterator[list[
                 )
             found += lines
             characters += len(text) - len(rest)
-            while len(found) >= most or found and (ended or characters >= _BLOCK_CHARACTERS):
+            while len(found) >= most or (found and (ended or characters >= _BLOCK_CHARACTERS)):
                 block, found = found[:most], found[most:]
                 count += len(block)
                 characters = sum(map(len, found))

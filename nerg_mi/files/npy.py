@@ -13,6 +13,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .bounded import plain, reading, size_of
 from .inflating import member_into, open_member, open_zip
 

@@ -26,5 +26,6 @@ def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], column
 
 
 def write_json(path: str | os.PathLike, value: Any, allow_nan: bool = True) -> None:
-    """Write ``value`` as JSON, indented, with a line end. ``allow_nan``: whether NaN may be in it, which JSON does not know."""
+    """Write ``value`` as JSON, indented, with a line end. ``allow_nan``: whether NaN may be in it, which JSON does not
+    know."""
     write_text(path, json.dumps(value, indent=1, allow_nan=allow_nan) + "\n")

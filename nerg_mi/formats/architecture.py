@@ -14,9 +14,20 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
 
 _MOST = {
-    "levels": 64, "features": 4, "log2_rows": 26, "base": 1 << 20, "dimensions": 3, "width": 4096, "geometry": 4096,
-    "density_hidden": 64, "color_hidden": 64, "hidden": 64, "layers": 64, "sh_degree": 10, "prior": 4096,
-}  # fmt: skip
+    "levels": 64,
+    "features": 4,
+    "log2_rows": 26,
+    "base": 1 << 20,
+    "dimensions": 3,
+    "width": 4096,
+    "geometry": 4096,
+    "density_hidden": 64,
+    "color_hidden": 64,
+    "hidden": 64,
+    "layers": 64,
+    "sh_degree": 10,
+    "prior": 4096,
+}
 """The largest whole numbers of an architecture, by name; beyond them no field is trained and no kernel compiles."""
 
 FINEST = 1 << 24
@@ -31,7 +42,8 @@ OCCUPANCY_CELLS = 1 << 26
 
 @contextmanager
 def building(path: str | os.PathLike) -> Iterator[None]:
-    """Whatever a checkpoint's contents make the block raise that builds a field of them, as a `NergError` that names it."""
+    """Whatever a checkpoint's contents make the block raise that builds a field of them, as a `NergError` that names
+    it."""
     remedy = "copy it again, or train it anew"
     try:
         yield

@@ -3,6 +3,7 @@
 Metadata is one JSON object under the key ``nerg``: the kind of field, its
 architecture, units, bounding box, colour space and provenance.
 """
+
 from __future__ import annotations
 
 import json

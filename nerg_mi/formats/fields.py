@@ -2,6 +2,7 @@
 
 Weights may be stored in fp16 (half the size); they are fp32 once loaded.
 """
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -12,18 +13,19 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.maths.box import Box
 from nerg_mi.field.cascades import CascadeGrid
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.gaze.support import RaySupport
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.field.gaze.support import RaySupport
-from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
 from nerg_mi.files.bounded import plain
+from nerg_mi.maths.box import Box
+
+from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
 from .checkpoint import read_checkpoint, write_checkpoint
 
 
@@ -36,7 +38,9 @@ def _dump(parameters: dict, half: bool) -> dict[str, np.ndarray]:
         if not np.all(np.isfinite(stored)):
             if np.all(np.isfinite(value)):
                 raise NergError(f'the weight array "{name}" exceeds what fp16 can hold; leave out --half')
-            raise NergError(f'the weight array "{name}" is not finite, so that the training has diverged; train with a lower learning rate')
+            raise NergError(
+                f'the weight array "{name}" is not finite, so that the training has diverged; train with a lower learning rate'
+            )
         out[name] = stored
     return out
 
@@ -111,18 +115,29 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
         if "background" in meta:
             behind = BackgroundConfig.from_dict(check_sizes(meta["background"], "background"))
             background = Background(
-                behind, _grid(tensors, behind.grid, ns, "background_grid"), _net(tensors, "background_net", behind.sizes, ns)
+                behind,
+                _grid(tensors, behind.grid, ns, "background_grid"),
+                _net(tensors, "background_net", behind.sizes, ns),
             )
         field = RadianceField(
-            config, Box(**meta["box"]), _grid(tensors, config.grid, ns),
-            _net(tensors, "density_net", config.density_sizes, ns), _net(tensors, "color_net", config.color_sizes, ns),
-            occupancy, meta["color_space"], step, background,
+            config,
+            Box(**meta["box"]),
+            _grid(tensors, config.grid, ns),
+            _net(tensors, "density_net", config.density_sizes, ns),
+            _net(tensors, "color_net", config.color_sizes, ns),
+            occupancy,
+            meta["color_space"],
+            step,
+            background,
         )
     return field, meta
 
 
-def save_gaze(field: GazeField | LogGazeField | GazeEnsemble, path: str | Path, provenance: dict, half: bool = False) -> None:
-    """Write ``field``, with its support where it has one; ``provenance`` (JSON) says what it was trained on and with."""
+def save_gaze(
+    field: GazeField | LogGazeField | GazeEnsemble, path: str | Path, provenance: dict, half: bool = False
+) -> None:
+    """Write ``field``, with its support where it has one; ``provenance`` (JSON) says what it was trained on and
+    with."""
     c, tensors = field.config, _dump(field.parameters(), half)
     members = [m.config.to_dict() for m in getattr(field, "members", ())]
     metadata = {
@@ -163,8 +178,10 @@ def _gaze(tensors: dict, about: dict, box: Box, ns: ModuleType) -> GazeField | L
         raise ValueError(f'it is a gaze field of the kind "{plain(kind, 40)}", which this version does not know')
     config = GazeConfig.from_dict(about)
     sizes = {
-        "position_net": config.position_sizes, "direction_net": config.direction_sizes,
-        "emit_head": [config.width, 1], "capture_head": [config.width, 1],
+        "position_net": config.position_sizes,
+        "direction_net": config.direction_sizes,
+        "emit_head": [config.width, 1],
+        "capture_head": [config.width, 1],
     }
     layernorm = lambda name: config.trunk == "layernorm" and not name.endswith("head")
     nets = {name: _net(tensors, name, size, ns, layernorm(name)) for name, size in sizes.items()}
@@ -173,7 +190,11 @@ def _gaze(tensors: dict, about: dict, box: Box, ns: ModuleType) -> GazeField | L
 
 def _log_gaze(tensors: dict, config: LogGazeConfig, box: Box, ns: ModuleType) -> LogGazeField:
     return LogGazeField(
-        config, box, _grid(tensors, config.grid, ns), _net(tensors, "emit_net", config.emit_sizes, ns),
-        _net(tensors, "capture_net", config.capture_sizes, ns), ns.Float(_finite(tensors, "escaped", (1,))),
+        config,
+        box,
+        _grid(tensors, config.grid, ns),
+        _net(tensors, "emit_net", config.emit_sizes, ns),
+        _net(tensors, "capture_net", config.capture_sizes, ns),
+        ns.Float(_finite(tensors, "escaped", (1,))),
         ns.TensorXf(_finite(tensors, "prior", (config.prior, 2 * config.prior))),
     )

@@ -1,4 +1,5 @@
 """Surfaces of a radiance field as files: a mesh by marching cubes, a point cloud (PLY, glTF)."""
+
 from __future__ import annotations
 
 import json
@@ -26,8 +27,14 @@ class Surface:
     report: dict
 
 
-def mesh(field: RadianceField, resolution: int = 256, threshold: float | None = None, fill: int = 1, keep: float = 0.001,
-         unseen: bool = False) -> Surface:
+def mesh(
+    field: RadianceField,
+    resolution: int = 256,
+    threshold: float | None = None,
+    fill: int = 1,
+    keep: float = 0.001,
+    unseen: bool = False,
+) -> Surface:
     """The surface where density crosses ``threshold`` (default: ``surface_density``), by marching cubes.
 
     ``fill``: holes and cracks of up to twice so many cells are closed first; ``keep``: connected pieces with less
@@ -56,22 +63,34 @@ def mesh(field: RadianceField, resolution: int = 256, threshold: float | None = 
     if not unseen:
         faces = faces[hidden[faces].sum(1) < 2]
         if len(faces) == 0:
-            raise NergError("no face of this surface has free space in front of it: the occupancy grid ends in it everywhere; keep all faces with --unseen")
+            raise NergError(
+                "no face of this surface has free space in front of it: the occupancy grid ends in it everywhere; keep all faces with --unseen"
+            )
     left = len(faces)
     body = trimesh.Trimesh(vertices, faces[:, ::-1] if _inside_out(vertices, faces, sampler) else faces, process=False)
     body, pieces, kept = _without_floaters(body, keep)
     normals = np.array(body.vertex_normals)
     edges, open_edges = _open_edges(body, lattice)
     report = {
-        "threshold": threshold, "cell": lattice.step, "lattice": lattice.shape, "cells_filled": int(filled),
-        "pieces": int(pieces), "pieces_kept": int(kept), "floater_faces": left - len(body.faces),
-        "unseen_faces": total - left, "edges_at_the_box": edges, "edges_of_holes": open_edges,
+        "threshold": threshold,
+        "cell": lattice.step,
+        "lattice": lattice.shape,
+        "cells_filled": int(filled),
+        "pieces": int(pieces),
+        "pieces_kept": int(kept),
+        "floater_faces": left - len(body.faces),
+        "unseen_faces": total - left,
+        "edges_at_the_box": edges,
+        "edges_of_holes": open_edges,
     }
-    return Surface(np.array(body.vertices), np.array(body.faces), normals, _srgb(field, sampler, body.vertices, normals), report)
+    return Surface(
+        np.array(body.vertices), np.array(body.faces), normals, _srgb(field, sampler, body.vertices, normals), report
+    )
 
 
 def _closed(volume: np.ndarray, level: float, cells: int) -> tuple[np.ndarray, int]:
-    """Opacities with holes of up to ``2 cells`` closed, the rest unchanged, and the number of cells that were filled."""
+    """Opacities with holes of up to ``2 cells`` closed, the rest unchanged, and the number of cells that were
+    filled."""
     if cells < 1:
         return volume, 0
     from scipy.ndimage import grey_closing
@@ -121,9 +140,11 @@ def _open_edges(body, lattice: Lattice) -> tuple[int, int]:
     return int(near.sum()), int((~near).sum())
 
 
-def points(field: RadianceField, resolution: int = 256, threshold: float | None = None, count: int | None = None,
-           seed: int = 0) -> Surface:
-    """Points where the edges of a lattice cross the surface, with normals down the density's gradient; at most ``count``."""
+def points(
+    field: RadianceField, resolution: int = 256, threshold: float | None = None, count: int | None = None, seed: int = 0
+) -> Surface:
+    """Points where the edges of a lattice cross the surface, with normals down the density's gradient; at most
+    ``count``."""
     sampler, lattice = Sampler(field), Lattice.over(field, resolution)
     threshold = surface_density(lattice) if threshold is None else threshold
     dense = sampler.on(lattice).transpose(2, 1, 0) >= threshold
@@ -135,15 +156,21 @@ def points(field: RadianceField, resolution: int = 256, threshold: float | None 
         index.append(found)
     index = np.concatenate(index)
     if len(index) == 0:
-        raise NergError(f"density crosses {threshold:g} per unit nowhere on {lattice.shape} points: choose another --density")
+        raise NergError(
+            f"density crosses {threshold:g} per unit nowhere on {lattice.shape} points: choose another --density"
+        )
     if count is not None and count < len(index):
         index = index[np.sort(np.random.default_rng(seed).choice(len(index), count, replace=False))]
     index, hidden = crossings(sampler, lattice, index, threshold)
     p = lattice.points(index[~hidden])
     h = 0.5 * lattice.step
-    slope = np.stack([
-        opacity(sampler.density(p - h * e), lattice) - opacity(sampler.density(p + h * e), lattice) for e in np.eye(3)
-    ], 1)
+    slope = np.stack(
+        [
+            opacity(sampler.density(p - h * e), lattice) - opacity(sampler.density(p + h * e), lattice)
+            for e in np.eye(3)
+        ],
+        1,
+    )
     normals = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
     report = {"threshold": threshold, "cell": lattice.step, "lattice": lattice.shape}
     return Surface(p, None, normals, _srgb(field, sampler, p, normals), report)
@@ -163,9 +190,10 @@ def _srgb(field: RadianceField, sampler: Sampler, p, normals) -> np.ndarray:
 
 def write_ply(surface: Surface, path: str | Path) -> None:
     """Binary PLY: positions, normals, 8-bit sRGB colours, and faces if there are any."""
-    v = np.zeros(len(surface.vertices), [
-        *((n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")), *((n, "u1") for n in ("red", "green", "blue")),
-    ])  # fmt: skip
+    v = np.zeros(
+        len(surface.vertices),
+        [*((n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")), *((n, "u1") for n in ("red", "green", "blue"))],
+    )
     for i, n in enumerate(v.dtype.names):
         block = (surface.vertices, surface.normals, np.rint(surface.colors * 255))[i // 3]
         v[n] = block[:, i % 3]
@@ -209,14 +237,21 @@ def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
         primitive["indices"] = 3
     node = {"mesh": 0} | ({"rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]} if up == "z" else {})
     document = {
-        "asset": {"version": "2.0", "generator": "nerg_mi"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node],
+        "asset": {"version": "2.0", "generator": "nerg_mi"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
         "meshes": [{"primitives": [primitive]}],
         "materials": [{"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicFactor": 0}}],
-        "extensionsUsed": ["KHR_materials_unlit"], "buffers": [{"byteLength": len(data)}], "bufferViews": views,
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": views,
         "accessors": accessors,
-    }  # fmt: skip
+    }
     text = json.dumps(document).encode()
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
     head = struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(data))
-    write_bytes(path, head, struct.pack("<II", len(text), 0x4E4F534A), text, struct.pack("<II", len(data), 0x004E4942), data)
+    write_bytes(
+        path, head, struct.pack("<II", len(text), 0x4E4F534A), text, struct.pack("<II", len(data), 0x004E4942), data
+    )

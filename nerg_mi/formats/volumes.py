@@ -1,4 +1,5 @@
 """A radiance field as Mitsuba grid volumes (``gridvolume``): density and colour in voxels."""
+
 from __future__ import annotations
 
 import math
@@ -28,11 +29,12 @@ def write_volume(path: str | Path, data: np.ndarray, lower, upper) -> None:
 
 
 def density_and_color(field: RadianceField, resolution: int = 256, color: bool = True, samples: int = 2):
-    """``(density (z, y, x), colour (z, y, x, 3) or None, lower, upper)`` of voxels, ``resolution`` along the longest edge.
+    """``(density (z, y, x), colour (z, y, x, 3) or None, lower, upper)`` of voxels, ``resolution`` along the longest
+    edge.
 
     Density, in 1/unit, is what gives a voxel the mean opacity of its ``samples``³ points, at most 5 mean free paths a
-    voxel: interpolation would blow up surfaces further. Colour is linear and that of the surface in or before the voxel,
-    seen head on and at 45 degrees, for a grid has no view; voxels about the dense ones have their neighbour's.
+    voxel: interpolation would blow up surfaces further. Colour is linear and that of the surface in or before the
+    voxel, seen head on and at 45 degrees, for a grid has no view; voxels about the dense ones have their neighbour's.
     """
     from scipy.ndimage import distance_transform_edt
 

@@ -6,9 +6,10 @@
     ...
     save_radiance(module.field(), "trained.safetensors", {})
 
-First derivatives only, with respect to the weights and to positions and directions. Tensors are float32, on the CPU for a
-field of the LLVM backend and on the GPU for one of the CUDA backend.
+First derivatives only, with respect to the weights and to positions and directions. Tensors are float32, on the CPU for
+a field of the LLVM backend and on the GPU for one of the CUDA backend.
 """
+
 from __future__ import annotations
 
 import copy
@@ -19,18 +20,19 @@ import numpy as np
 try:
     import torch
 except ImportError:
-    raise ImportError('fields as torch modules need torch, which is not installed: pip install "nerg-mi[torch]"') from None
+    raise ImportError(
+        'fields as torch modules need torch, which is not installed: pip install "nerg-mi[torch]"'
+    ) from None
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import is_cuda, namespace
 from nerg_mi.field.background import Background
-from nerg_mi.field.gaze.product import GazeField
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeField
+from nerg_mi.field.gaze.product import GazeField
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceField
-
 
 _FIXED = ("prior",)
 """Arrays that no training changes: parameters without gradients."""
@@ -45,7 +47,9 @@ class _FieldModule(torch.nn.Module):
         self.device_type = "cuda" if is_cuda(self._ns) else "cpu"
         for name, value in field.parameters().items():
             tensor = torch.tensor(value.numpy(), device=self.device_type)
-            self.register_parameter(name.replace(".", "__"), torch.nn.Parameter(tensor, requires_grad=name not in _FIXED))
+            self.register_parameter(
+                name.replace(".", "__"), torch.nn.Parameter(tensor, requires_grad=name not in _FIXED)
+            )
 
     def _values(self) -> dict:
         return {name: self.get_parameter(name.replace(".", "__")) for name in self._field.parameters()}
@@ -81,20 +85,25 @@ class _FieldModule(torch.nn.Module):
             here = _with(field, arrays)
             columns = [_columns(ns, p) for p in points]
             out = function(here, *columns)
-            return ns.TensorXf(dr.ravel(ns.ArrayXf([ns.Float(c) for c in out]), order="C"), (len(out), dr.width(columns[0])))
+            return ns.TensorXf(
+                dr.ravel(ns.ArrayXf([ns.Float(c) for c in out]), order="C"), (len(out), dr.width(columns[0]))
+            )
 
         # dr.wrap knows tensors, and passes by their subclass for parameters.
         return evaluate({k: v.view_as(v) for k, v in self._values().items()}, *inputs)
 
 
 class RadianceModule(_FieldModule):
-    """Density and colour of a radiance field. Its occupancy grid is not applied: training in torch may fill empty cells."""
+    """Density and colour of a radiance field. Its occupancy grid is not applied: training in torch may fill empty
+    cells."""
 
     def __init__(self, field: RadianceField):
         super().__init__(field)
 
     def forward(self, p: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Density (N,) in 1/unit and colour (N, 3) in the field's colour space at ``p`` (N, 3) seen along unit ``d`` (N, 3)."""
+        """Density (N,) in 1/unit and colour (N, 3) in the field's colour space at ``p`` (N, 3) seen along unit ``d``
+        (N, 3)."""
+
         def both(field, p, d):
             sigma, features = field.density_features(p)
             return [sigma, *field.color(features, d)]
@@ -116,53 +125,76 @@ class RadianceModule(_FieldModule):
 class GazeModule(_FieldModule):
     """The gaze density of a gaze field, be it normalised over the observer's sphere or not.
 
-        around = GazeIntegral(GazeMedium(field), place, p_o, settings, "median", 0.5)      # directions, their depths, what escapes
-        Z = module.integral(p_od, p_o, r_o, escaped)                                       # at all of its directions
-        gaze = module(p_od, p_o, r_o, Z)
+        around = GazeIntegral(GazeMedium(field), place, p_o, settings, "median", 0.5)      # directions, their depths,
+        what escapes Z = module.integral(p_od, p_o, r_o, escaped)                                       # at all of its
+        directions gaze = module(p_od, p_o, r_o, Z)
 
     Raises `NergError` for an ensemble, whose members are modules each.
     """
 
     def __init__(self, field: GazeField | LogGazeField):
         if isinstance(field, GazeEnsemble):
-            raise NergError(f"an ensemble of {len(field.members)} gaze fields is no module: make one of each of its members, and average what they return")
+            raise NergError(
+                f"an ensemble of {len(field.members)} gaze fields is no module: make one of each of its members, and average what they return"
+            )
         super().__init__(field)
 
-    def forward(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, integral: torch.Tensor | float | None = None,
-                escaped: torch.Tensor | None = None) -> torch.Tensor:
+    def forward(
+        self,
+        p_od: torch.Tensor,
+        p_o: torch.Tensor,
+        r_o: torch.Tensor,
+        integral: torch.Tensor | float | None = None,
+        escaped: torch.Tensor | None = None,
+    ) -> torch.Tensor:
         """Gaze (N,) in 1/sr of observers ``p_o`` (N, 3) who see ``p_od`` (N, 3) along unit ``r_o`` (N, 3).
 
-        ``integral``: of a normalised field over the sphere around each observer, (N,) or one number for all (see ``integral``);
-        ``escaped`` (N,) bool: where no surface is met (default: nowhere). Raises ``ValueError`` for a normalised field without
-        its integral, and for tensors that do not fit.
+        ``integral``: of a normalised field over the sphere around each observer, (N,) or one number for all (see
+        ``integral``); ``escaped`` (N,) bool: where no surface is met (default: nowhere). Raises ``ValueError`` for a
+        normalised field without its integral, and for tensors that do not fit.
         """
         if self._field.config.normalized and integral is None:
-            raise ValueError('this gaze field is normalised over the observer\'s sphere: give its "integral" there, which the method integral finds')
+            raise ValueError(
+                'this gaze field is normalised over the observer\'s sphere: give its "integral" there, which the method integral finds'
+            )
         extra = self._extra(len(p_od), 1.0 if integral is None else integral, escaped)
         evaluate = lambda field, p, o, r, e: [field.evaluate(p, o, r, integral=e.x, escaped=e.y > 0.5)[0]]
         return self._evaluate(evaluate, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), extra)[0]
 
-    def unnormalized(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None) -> torch.Tensor:
+    def unnormalized(
+        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None
+    ) -> torch.Tensor:
         """Emit times capture (N,) before any division: what the integral is one of. Arguments as for ``forward``."""
 
         def product(field, p, o, r, e):
             emit, capture = field.unnormalized(p, o, r, escaped=e.y > 0.5)
             return [emit * capture + dr.zeros(type(e.x), dr.width(e))]
 
-        return self._evaluate(product, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), self._extra(len(p_od), 1.0, escaped))[0]
+        return self._evaluate(product, *self._rows(p_od=p_od, p_o=p_o, r_o=r_o), self._extra(len(p_od), 1.0, escaped))[
+            0
+        ]
 
-    def integral(self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None) -> torch.Tensor:
-        """The integral over the sphere (one number) of one observer, who is ``p_o`` in every row, from N directions ``r_o`` of
-        equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's (``transport.observer.integral``)."""
+    def integral(
+        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """The integral over the sphere (one number) of one observer, who is ``p_o`` in every row, from N directions
+        ``r_o`` of equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's
+        (``transport.observer.integral``)."""
         return 4 * torch.pi * self.unnormalized(p_od, p_o, r_o, escaped).mean()
 
     def _extra(self, count: int, integral, escaped) -> torch.Tensor:
         """Integrals and what escapes as rows (N, 3)."""
         number = torch.as_tensor(integral, dtype=torch.float32, device=self.device_type)
-        gone = torch.zeros(count, dtype=torch.float32, device=self.device_type) if escaped is None else escaped.to(torch.float32)
+        gone = (
+            torch.zeros(count, dtype=torch.float32, device=self.device_type)
+            if escaped is None
+            else escaped.to(torch.float32)
+        )
         for name, t in (("integral", number), ("escaped", gone)):
             if t.numel() != 1 and tuple(t.shape) != (count,):
-                raise ValueError(f"{name} must be one number or a tensor of {count}, one for each row, got {tuple(t.shape)}")
+                raise ValueError(
+                    f"{name} must be one number or a tensor of {count}, one for each row, got {tuple(t.shape)}"
+                )
         columns = [number.reshape(-1).expand(count), gone.reshape(-1).expand(count)]
         return torch.stack([*columns, torch.zeros_like(columns[0])], 1).contiguous()
 

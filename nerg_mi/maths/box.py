@@ -1,4 +1,5 @@
 """The axis-aligned box in which a field lives, and its map to the unit cube."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass

@@ -1,4 +1,5 @@
 """From composited samples to linear radiance."""
+
 from __future__ import annotations
 
 import drjit as dr

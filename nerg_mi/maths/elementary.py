@@ -1,4 +1,5 @@
 """1 - exp(-x) and log(1 + x) without cancellation, quotients of tiny numbers: what Dr.Jit lacks."""
+
 from __future__ import annotations
 
 import drjit as dr

@@ -1,4 +1,5 @@
 """Where a ray is inside an axis-aligned box (slab method)."""
+
 from __future__ import annotations
 
 import drjit as dr

@@ -3,6 +3,7 @@
 Directions are (N, 3) float64, unit. Solid angles are in steradian and sum to
 4π, so that ``sum(density * solid_angle)`` is the integral of a density.
 """
+
 from __future__ import annotations
 
 import numpy as np
@@ -50,9 +51,7 @@ def direction_to_latlong(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.arctan2(x, -z) / (2.0 * np.pi) % 1.0, np.arctan2(np.hypot(x, z), y) / np.pi
 
 
-def latlong_grid(
-    width: int, height: int, to_world: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def latlong_grid(width: int, height: int, to_world: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Pixel-centre directions and exact pixel solid angles of a panorama.
 
     Pixel (row j, column i) is at u = (i + 1/2)/width, v = (j + 1/2)/height of

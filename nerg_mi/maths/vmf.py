@@ -4,6 +4,7 @@ f(x; μ, κ) = C(κ) exp(κ (x·μ - 1)) in 1/sr, C(κ) = κ / (2π (1 - exp(-2�
 the normaliser of NeRG, Section 5.1, with exp(κ) taken out of both factors, so
 that neither overflows. Stable for κ from 1e-8 to 1e8.
 """
+
 from __future__ import annotations
 
 import numpy as np

@@ -1,11 +1,13 @@
 """Choosing among rays: by time, person, cohort, place and confidence; and fewer of those who stand still."""
+
 from __future__ import annotations
 
-from typing import Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .rays import Rays
 
 
@@ -23,7 +25,8 @@ def select_mask(
     """Rays (N,) bool that meet every condition given.
 
     ``time``: from (inclusive) and to (exclusive), seconds, either may be ``None``. ``persons``, ``without_persons``,
-    ``cohorts``: names. ``box``: x0, x1, y0, y1, z0, z1 in metres that hold the origin. ``min_confidence``: at least this.
+    ``cohorts``: names. ``box``: x0, x1, y0, y1, z0, z1 in metres that hold the origin. ``min_confidence``: at least
+    this.
     ``with_hit``: a hit point is known. Raises `NergError` for an unknown name or a box that is none.
     """
     keep = np.ones(len(rays), bool)
@@ -41,7 +44,9 @@ def select_mask(
     if box is not None:
         box = np.asarray(box, dtype=np.float64)
         if box.shape != (6,) or not (box[0::2] < box[1::2]).all():
-            raise NergError(f"a box is x0, x1, y0, y1, z0, z1 in metres with each first below its second, got {box.tolist()}")
+            raise NergError(
+                f"a box is x0, x1, y0, y1, z0, z1 in metres with each first below its second, got {box.tolist()}"
+            )
         keep &= ((rays.origin >= box[0::2]) & (rays.origin <= box[1::2])).all(axis=1)
     if min_confidence is not None:
         keep &= rays.confidence >= min_confidence
@@ -59,7 +64,9 @@ def _codes(names: Sequence[str], known: tuple[str, ...], what: str) -> list[int]
 
 def time_order(rays: Rays) -> np.ndarray | None:
     """The rays' order by person and time (N,); None where they are in that order already."""
-    earlier = (rays.person[1:] < rays.person[:-1]) | ((rays.person[1:] == rays.person[:-1]) & (rays.t[1:] < rays.t[:-1]))
+    earlier = (rays.person[1:] < rays.person[:-1]) | (
+        (rays.person[1:] == rays.person[:-1]) & (rays.t[1:] < rays.t[:-1])
+    )
     return np.lexsort((rays.t, rays.person)) if earlier.any() else None
 
 
@@ -86,7 +93,9 @@ def stays(rays: Rays, distance: float = 0.1, gap: float = 1.0) -> np.ndarray:
             number += 1
             end, step = a + 1, 64
             while end < b:
-                away = np.flatnonzero(((origin[end : end + step] - origin[a]) ** 2).sum(axis=1)[: b - end] > distance**2)
+                away = np.flatnonzero(
+                    ((origin[end : end + step] - origin[a]) ** 2).sum(axis=1)[: b - end] > distance**2
+                )
                 end = min(end + (int(away[0]) if away.size else step), b)
                 if away.size:
                     break
@@ -102,8 +111,8 @@ def thin_mask(rays: Rays, seconds: float = 2.0, distance: float = 0.1, gap: floa
     """Rays (N,) bool that stay where people stand still: of a stay (:func:`stays`) longer than ``seconds``, as many as
     ``seconds`` hold at its own rate, evenly over all of it.
 
-    Somebody who waits at a counter for ten minutes then counts as much as somebody who stops there for ``seconds``, and what
-    they looked at keeps its shares. Walking is left as it is.
+    Somebody who waits at a counter for ten minutes then counts as much as somebody who stops there for ``seconds``, and
+    what they looked at keeps its shares. Walking is left as it is.
     """
     if not (seconds > 0 and distance > 0):
         raise NergError(f"seconds {seconds} and distance {distance} must be positive")

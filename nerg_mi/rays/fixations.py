@@ -1,8 +1,9 @@
 """Fixations: when gaze rests. I-VT and I-DT of Salvucci and Goldberg (2000), on directions in the world.
 
-Angles are in degrees, times in seconds. A pause of a person longer than ``gap`` ends a fixation. Both return for each ray
-the number of its fixation, or -1; numbers run person after person in time.
+Angles are in degrees, times in seconds. A pause of a person longer than ``gap`` ends a fixation. Both return for each
+ray the number of its fixation, or -1; numbers run person after person in time.
 """
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -11,6 +12,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
+
 from .filters import person_order
 from .rays import Rays
 
@@ -18,10 +20,11 @@ _GAP = 0.1
 
 
 def ivt(rays: Rays, velocity: float = 100.0, least: float = 0.06, gap: float = _GAP) -> np.ndarray:
-    """By velocity (I-VT): runs of rays that turn no faster than ``velocity`` degrees a second, of ``least`` seconds or more.
+    """By velocity (I-VT): runs of rays that turn no faster than ``velocity`` degrees a second, of ``least`` seconds or
+    more.
 
-    The velocity of a ray is that from the one before it (of the first of a run, to the one after). 100 degrees a second is
-    for gaze in the world of people who walk and turn, 30 is usual where the head rests. Returns (N,) int64.
+    The velocity of a ray is that from the one before it (of the first of a run, to the one after). 100 degrees a second
+    is for gaze in the world of people who walk and turn, 30 is usual where the head rests. Returns (N,) int64.
     """
     _positive(velocity=velocity, least=least, gap=gap)
     order, starts = person_order(rays)
@@ -37,11 +40,11 @@ def ivt(rays: Rays, velocity: float = 100.0, least: float = 0.06, gap: float = _
 
 
 def idt(rays: Rays, dispersion: float = 3.0, least: float = 0.1, gap: float = _GAP) -> np.ndarray:
-    """By dispersion (I-DT): a window of ``least`` seconds whose directions lie within ``dispersion`` degrees grows as long
-    as they do; otherwise it starts one ray later.
+    """By dispersion (I-DT): a window of ``least`` seconds whose directions lie within ``dispersion`` degrees grows as
+    long as they do; otherwise it starts one ray later.
 
-    Dispersion is the spread of the angle sideways plus the spread upwards, max - min each, in the plane that touches the
-    sphere at the window's first direction (azimuthal equidistant, its axes level and upright). Returns (N,) int64.
+    Dispersion is the spread of the angle sideways plus the spread upwards, max - min each, in the plane that touches
+    the sphere at the window's first direction (azimuthal equidistant, its axes level and upright). Returns (N,) int64.
     """
     _positive(dispersion=dispersion, least=least, gap=gap)
     order, starts = person_order(rays)
@@ -68,12 +71,14 @@ def idt(rays: Rays, dispersion: float = 3.0, least: float = 0.1, gap: float = _G
 def fixation_rays(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
     """One ray a fixation, and how long each lasted (F,), seconds.
 
-    Time of the middle, mean origin, mean direction, mean confidence and mean hit point (of those known) of the rays with
-    the same number in ``label`` (N,), -1 left out. Raises `NergError` when there is no fixation.
+    Time of the middle, mean origin, mean direction, mean confidence and mean hit point (of those known) of the rays
+    with the same number in ``label`` (N,), -1 left out. Raises `NergError` when there is no fixation.
     """
     kept = np.flatnonzero(label >= 0)
     if not kept.size:
-        raise NergError("there is no fixation among these rays; raise the velocity or the dispersion, or lower the duration")
+        raise NergError(
+            "there is no fixation among these rays; raise the velocity or the dispersion, or lower the duration"
+        )
     _, index, number = np.unique(label[kept], return_index=True, return_inverse=True)
     n = np.bincount(number).astype(np.float64)
     mean = lambda v: np.stack([np.bincount(number, weights=c) for c in v[kept].T], axis=1) / n[:, None]
@@ -86,12 +91,18 @@ def fixation_rays(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
         known = np.isfinite(rays.hit[kept]).all(axis=1)
         weight = np.bincount(number, weights=known.astype(float))
         with np.errstate(invalid="ignore"):
-            hit = np.stack([np.bincount(number, weights=np.where(known, c, 0.0)) for c in rays.hit[kept].T], axis=1) / weight[:, None]
+            hit = (
+                np.stack([np.bincount(number, weights=np.where(known, c, 0.0)) for c in rays.hit[kept].T], axis=1)
+                / weight[:, None]
+            )
     one = replace(
-        rays.select(kept[index]), t=0.5 * (first + last), origin=mean(rays.origin), hit=hit,
+        rays.select(kept[index]),
+        t=0.5 * (first + last),
+        origin=mean(rays.origin),
+        hit=hit,
         direction=direction / np.linalg.norm(direction, axis=1, keepdims=True),
         confidence=np.clip(np.bincount(number, weights=rays.confidence[kept]) / n, 0.0, 1.0),
-    )  # fmt: skip
+    )
     return one, last - first
 
 
@@ -111,10 +122,13 @@ def _numbered(run: np.ndarray, t: np.ndarray, order: np.ndarray, least: float) -
 
 
 def _plane(d: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Degrees sideways and upwards (..., 2) of directions (..., 3), seen from ``first`` (..., 3): azimuthal equidistant."""
+    """Degrees sideways and upwards (..., 2) of directions (..., 3), seen from ``first`` (..., 3): azimuthal
+    equidistant."""
     level = np.hypot(first[..., 0], first[..., 1])
     steep = level < 1e-9  # who looks straight up has no level of their own
-    side = np.stack([np.where(steep, 1.0, first[..., 1]), np.where(steep, 0.0, -first[..., 0]), np.zeros_like(level)], axis=-1)
+    side = np.stack(
+        [np.where(steep, 1.0, first[..., 1]), np.where(steep, 0.0, -first[..., 0]), np.zeros_like(level)], axis=-1
+    )
     side = side / np.where(steep, 1.0, level)[..., None]
     upright = np.cross(side, first)
     dot = lambda u: np.sum(d * u, axis=-1)

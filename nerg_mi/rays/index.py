@@ -1,4 +1,5 @@
 """Which rays start near a place: a spatial index of millions of origins."""
+
 from __future__ import annotations
 
 from typing import NamedTuple
@@ -11,8 +12,8 @@ _BLOCK = 1 << 21  # neighbours held at a time: memory stays bounded
 
 
 class Neighbours(NamedTuple):
-    """Of Q places: ``indices`` (n,) of rays, place after place, nearest first, ``distances`` (n,) metres, and ``offsets``
-    (Q + 1,): place q has ``indices[offsets[q]:offsets[q + 1]]``."""
+    """Of Q places: ``indices`` (n,) of rays, place after place, nearest first, ``distances`` (n,) metres, and
+    ``offsets`` (Q + 1,): place q has ``indices[offsets[q]:offsets[q + 1]]``."""
 
     indices: np.ndarray
     distances: np.ndarray
@@ -34,7 +35,8 @@ class RayIndex:
         self._tree = cKDTree(origin, balanced_tree=False)
 
     def nearest(self, places: np.ndarray, most: int, radius: float = np.inf) -> Neighbours:
-        """The ``most`` nearest rays of each of ``places`` (Q, 3), within ``radius`` metres (those at exactly R count)."""
+        """The ``most`` nearest rays of each of ``places`` (Q, 3), within ``radius`` metres (those at exactly R
+        count)."""
         places = np.asarray(places, dtype=np.float64).reshape(-1, 3)
         if most < 1 or not radius > 0:
             raise ValueError(f"most {most}, radius {radius}: ask for at least one ray within a positive radius")
@@ -44,7 +46,9 @@ class RayIndex:
         step = max(1, _BLOCK // most)
         indices, distances, counts = [], [], []
         for start in range(0, len(places), step):
-            d, i = self._tree.query(places[start : start + step], k=np.arange(1, most + 1), distance_upper_bound=bound, workers=-1)
+            d, i = self._tree.query(
+                places[start : start + step], k=np.arange(1, most + 1), distance_upper_bound=bound, workers=-1
+            )
             found = np.isfinite(d)
             indices.append(i[found])
             distances.append(d[found])

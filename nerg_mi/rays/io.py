@@ -4,6 +4,7 @@ Both hold the same columns and one JSON document of metadata. Vectors are
 (N, 3) arrays in the ``.npz`` and three columns ``name_x, name_y, name_z`` in
 the Parquet table, where other tools expect them.
 """
+
 from __future__ import annotations
 
 import json
@@ -20,6 +21,7 @@ from nerg_mi.files.atomic import replacing
 from nerg_mi.files.bounded import JSON_BYTES, reading, size_of
 from nerg_mi.files.inflating import inflated_limit
 from nerg_mi.files.npy import open_npz
+
 from .metadata import VERSION, not_rays, read_metadata
 
 SUFFIXES = (".npz", ".parquet")
@@ -38,7 +40,8 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
     """Write columns of N rows (``t``, ``person``, ``origin``, ``direction``,
     ``confidence``, optionally ``hit`` and ``cohort``) and JSON-serialisable metadata, whole or not at all.
 
-    Raises `NergError` for another suffix and for metadata that `read_rays_file` would refuse, and ``ImportError`` with the remedy where Parquet is asked for without pyarrow.
+    Raises `NergError` for another suffix and for metadata that `read_rays_file` would refuse, and ``ImportError`` with
+    the remedy where Parquet is asked for without pyarrow.
     """
     document = json.dumps({"version": VERSION, **metadata})
     try:
@@ -47,7 +50,8 @@ def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], met
         # What is written can be read again.
         raise NergError(f"these rays cannot be kept: {error}") from error
     if _suffix(path) == ".npz":
-        # What savez_compressed writes, with a faster level of zlib, and stored what hardly shrinks: millions of rays in seconds.
+        # What savez_compressed writes, with a faster level of zlib, and stored what hardly shrinks: millions of rays in
+        # seconds.
         with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", compresslevel=1) as archive:
             for name, value in {"metadata": np.array(document), **columns}.items():
                 archive.compression = zipfile.ZIP_DEFLATED if _shrinks(value) else zipfile.ZIP_STORED
@@ -76,8 +80,8 @@ def _shrinks(value: np.ndarray) -> bool:
 def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Columns and metadata as :func:`write_rays_file` took them.
 
-    Numbers of any width are read; other columns are not. Room is made for what the file's bytes warrant, column by column.
-    Raises `NergError` when the file is damaged, is not one of ours, or lacks a column.
+    Numbers of any width are read; other columns are not. Room is made for what the file's bytes warrant, column by
+    column. Raises `NergError` when the file is damaged, is not one of ours, or lacks a column.
     """
     if _suffix(path) == ".npz":
         columns, document = _read_npz(path)
@@ -118,7 +122,9 @@ def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes
         document = (schema.metadata or {}).get(b"nerg_mi")
         if document is None:
             raise not_rays(path, "it lacks the metadata")
-        columns = {name: np.empty(shape, np.int64 if name in _CODES else np.float64) for name, (shape, _) in there.items()}
+        columns = {
+            name: np.empty(shape, np.int64 if name in _CODES else np.float64) for name, (shape, _) in there.items()
+        }
         at = 0
         for batch in table.iter_batches(batch_size=1 << 17, columns=[part for name in there for part in _parts(name)]):
             for name, column in columns.items():
@@ -144,8 +150,8 @@ def _arrow_kind(pa: Any, kind: Any) -> str:
 
 
 def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ...], str]]) -> None:
-    """Raise `NergError` where columns of these shapes and kinds (NumPy's letters) do not make rays, or are more than the
-    file's bytes warrant."""
+    """Raise `NergError` where columns of these shapes and kinds (NumPy's letters) do not make rays, or are more than
+    the file's bytes warrant."""
     missing = [name for name in _REQUIRED if name not in there]
     if missing:
         raise not_rays(path, f"it lacks {', '.join(missing)}")
@@ -163,7 +169,9 @@ def _check_columns(path: str | os.PathLike, there: dict[str, tuple[tuple[int, ..
 
 
 def _not_warranted(path: str | os.PathLike, rays: int, size: int) -> NergError:
-    return NergError(f'the rays file "{path}" claims {rays:,} rays, which its {size:,} bytes do not warrant; copy it again')
+    return NergError(
+        f'the rays file "{path}" claims {rays:,} rays, which its {size:,} bytes do not warrant; copy it again'
+    )
 
 
 def _suffix(path: str | os.PathLike) -> str:

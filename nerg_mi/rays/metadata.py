@@ -38,7 +38,7 @@ def read_metadata(document: str | bytes, path: str | os.PathLike) -> dict[str, A
 
 def not_rays(path: str | os.PathLike, why: str) -> NergError:
     """The error of a file ``path`` that is not one of rays, and ``why`` not."""
-    return NergError(f'"{path}" is not a rays file ({why}); make one with \'nerg rays import\'')
+    return NergError(f"\"{path}\" is not a rays file ({why}); make one with 'nerg rays import'")
 
 
 def _names(value: object) -> bool:
@@ -46,7 +46,8 @@ def _names(value: object) -> bool:
 
 
 def _objects(value: object, **keys) -> bool:
-    """Whether it is a list of objects that have all of ``keys``, each passing its test; those that end in _ may be missing."""
+    """Whether it is a list of objects that have all of ``keys``, each passing its test; those that end in _ may be
+    missing."""
     return isinstance(value, list) and all(
         isinstance(v, dict)
         and all(test(v[k.rstrip("_")]) if k.rstrip("_") in v else k.endswith("_") for k, test in keys.items())
@@ -69,7 +70,11 @@ def _by(value: object) -> bool:
     if not isinstance(value, dict):
         return False
     position = value.get("position", {})
-    return isinstance(position, dict) and _number(position.get("radius", 1.0)) and _points(position.get("test_centres", []))
+    return (
+        isinstance(position, dict)
+        and _number(position.get("radius", 1.0))
+        and _points(position.get("test_centres", []))
+    )
 
 
 def _number(value: object) -> bool:
@@ -103,7 +108,13 @@ _KNOWN = {
     "transform": (_transform, "4 x 4 matrix that can be inverted"),
     "rows_read": (is_count, "number of rows"),
     "sources": (lambda v: _objects(v, file=_text, sha256_=_text), "list of files"),
-    "dropped": (lambda v: _objects(v, reason=_text, count=is_count, file_=_text, rows_=_runs), "list of reasons and counts"),
-    "steps": (lambda v: _objects(v, step=_text, kept=is_count, of=is_count, by_=_by), "list of steps with their counts"),
+    "dropped": (
+        lambda v: _objects(v, reason=_text, count=is_count, file_=_text, rows_=_runs),
+        "list of reasons and counts",
+    ),
+    "steps": (
+        lambda v: _objects(v, step=_text, kept=is_count, of=is_count, by_=_by),
+        "list of steps with their counts",
+    ),
     "tick": (lambda v: _number(v) and v > 0, "time in seconds"),
 }

@@ -1,9 +1,10 @@
 """What is implausible about a set of rays, and the mistake that is likely behind it.
 
-Units and axes show in the heights and the extent. A mirrored or reversed direction shows where it disagrees with the hit
-point, or with where people walk: people look ahead. A frame mirrored as a whole, positions with directions, contradicts
-nothing and cannot be seen without the place itself.
+Units and axes show in the heights and the extent. A mirrored or reversed direction shows where it disagrees with the
+hit point, or with where people walk: people look ahead. A frame mirrored as a whole, positions with directions,
+contradicts nothing and cannot be seen without the place itself.
 """
+
 from __future__ import annotations
 
 import itertools
@@ -23,9 +24,11 @@ _USUAL = 5.0, 2100.0  # rays a second of devices that there are
 def warnings(
     rays: Rays, height: np.ndarray, extent: np.ndarray, speed: float, step: float | None, order: np.ndarray | None
 ) -> list[str]:
-    """Sentences about rays in our frame. ``height``: 5, 50 and 95 % of the origins' heights; ``extent`` (3,) of their box;
+    """Sentences about rays in our frame. ``height``: 5, 50 and 95 % of the origins' heights; ``extent`` (3,) of their
+    box;
     ``speed``: 95 % of the speeds; ``step``: median of
-    the times between a person's rays that are positive, NaN if none is, None without any; ``order``: `filters.time_order` of them."""
+    the times between a person's rays that are positive, NaN if none is, None without any; ``order``:
+    `filters.time_order` of them."""
     return [*_lengths(rays, height, extent), *_times(rays, speed, step), *_directions(rays, order)]
 
 
@@ -40,12 +43,16 @@ def _lengths(rays: Rays, height: np.ndarray, extent: np.ndarray) -> list[str]:
     if 100 <= median <= 230:
         out.append(f"the median height is {median:.0f} m: is the unit centimetres? (--units cm)")
     elif extent.max() > 1000 or 1000 <= median <= 2300:
-        out.append(f"the origins span {extent.max():.0f} m, at a median height of {median:.0f} m: is the unit millimetres? (--units mm)")
+        out.append(
+            f"the origins span {extent.max():.0f} m, at a median height of {median:.0f} m: is the unit millimetres? (--units mm)"
+        )
     elif extent.max() < 0.05:
         out.append(f"the origins span {extent.max():.3f} m: is the unit larger than declared?")
-    elif extent[2] > 2.0 and extent[2] > min(extent[0], extent[1]) or not 0.4 <= median <= 2.3:
+    elif (extent[2] > 2.0 and extent[2] > min(extent[0], extent[1])) or not 0.4 <= median <= 2.3:
         what = (
-            "the origins vary more in height than sideways" if 0.4 <= median <= 2.3 else f"the median eye height is {median:.2f} m"
+            "the origins vary more in height than sideways"
+            if 0.4 <= median <= 2.3
+            else f"the median eye height is {median:.2f} m"
         )
         axis = _standing_axis(rays)
         remedy = (
@@ -70,10 +77,14 @@ def _standing_axis(rays: Rays) -> str | None:
 def _times(rays: Rays, speed: float, step: float | None) -> list[str]:
     out = []
     if speed > 5:
-        out.append(f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: check the unit of time (--tick) or length")
+        out.append(
+            f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: check the unit of time (--tick) or length"
+        )
     if step is None or np.isnan(step):
         if step is not None:
-            out.append("all rays of a person have the same time: is it the column of times that was named? (--map t=...)")
+            out.append(
+                "all rays of a person have the same time: is it the column of times that was named? (--map t=...)"
+            )
         return out
     # Where most rays come more than a second apart hardly anything counts as recorded time.
     if not 1e-4 <= step <= 1.0:
@@ -123,7 +134,9 @@ def _directions(rays: Rays, order: np.ndarray | None) -> list[str]:
         against = [i for i in range(3) if agree[i] < -_AHEAD]
         along = [i for i in range(3) if agree[i] > _AHEAD]
         if against and not along:
-            out.append("people look back to where they came from: are the directions reversed? (--forward, or the sign of the direction)")
+            out.append(
+                "people look back to where they came from: are the directions reversed? (--forward, or the sign of the direction)"
+            )
         elif against:
             axis = " and ".join("xyz"[i] for i in against)
             out.append(
@@ -134,10 +147,12 @@ def _directions(rays: Rays, order: np.ndarray | None) -> list[str]:
 
 
 def walking_agreement(rays: Rays, order: np.ndarray | None = None) -> np.ndarray | None:
-    """Correlation of gaze with walking along each axis of the file, (3,), 0 along the up axis; ``None`` where nobody walks.
+    """Correlation of gaze with walking along each axis of the file, (3,), 0 along the up axis; ``None`` where nobody
+    walks.
 
-    Steps of half a second, at 0.3 to 3 m/s. People look ahead: far above zero along each axis on which they walk. ``order``:
-    `filters.time_order` of the rays, if it is known. Of millions of rays, runs of some thousands are looked at.
+    Steps of half a second, at 0.3 to 3 m/s. People look ahead: far above zero along each axis on which they walk.
+    ``order``: `filters.time_order` of the rays, if it is known. Of millions of rays, runs of some thousands are looked
+    at.
     """
     from .filters import time_order
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import read_bytes
+
 from .rays import Rays
 
 SALT_BYTES = 16
@@ -45,16 +46,18 @@ def read_salt(path: str | os.PathLike) -> bytes:
 def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
     """``rays`` with a pseudonym (``p`` and 16 hexadecimal digits) for each person.
 
-    ``salt``: at least `SALT_BYTES` bytes; rays that were given the same have the same pseudonym for the same name. Default:
-    a random one, which nobody keeps. Rays are put into the order of the pseudonyms, since that of the names can be
-    guessed. In the metadata, files have names that are made alike (``f`` and digits, endings kept) and HMACs in place of
-    their checksums, and names of people are replaced wherever they stand, also as parts of other words. Cohorts, times,
-    origins, directions and hit points are left as they are.
+    ``salt``: at least `SALT_BYTES` bytes; rays that were given the same have the same pseudonym for the same name.
+    Default: a random one, which nobody keeps. Rays are put into the order of the pseudonyms, since that of the names
+    can be guessed. In the metadata, files have names that are made alike (``f`` and digits, endings kept) and HMACs in
+    place of their checksums, and names of people are replaced wherever they stand, also as parts of other words.
+    Cohorts, times, origins, directions and hit points are left as they are.
     """
     if salt is not None and len(salt) < SALT_BYTES:
         raise NergError(f"a salt of {len(salt)} bytes can be guessed; give at least {SALT_BYTES}")
     key = secrets.token_bytes(32) if salt is None else salt
-    digest = lambda kind, text: hmac.new(key, f"{kind}:{text}".encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()
+    digest = lambda kind, text: hmac.new(
+        key, f"{kind}:{text}".encode("utf-8", "surrogatepass"), hashlib.sha256
+    ).hexdigest()
     person = lambda name: "p" + digest("person", name)[:_DIGITS]
     names = [person(name) for name in rays.persons]
     order = sorted(range(len(names)), key=lambda i: names[i])

@@ -4,6 +4,7 @@ Frame of every :class:`Rays`: right-handed, z up, metres, seconds. Readers
 convert into it and record the transform they applied in the metadata
 (:mod:`nerg_mi.rays.readers.collecting`).
 """
+
 from __future__ import annotations
 
 import os
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .io import read_rays_file, write_rays_file
 
 # Rows moved at a time.
@@ -33,8 +35,8 @@ class Rays:
     and ``dropped`` (reason, count, and rows of each source); ``cohort`` (N,)
     int32 index into ``cohorts``, the names of groups of people, or ``None``.
 
-    Raises `NergError` naming the first offending ray for NaN, zero or non-unit directions, non-finite origins or times, and
-    persons out of range; ``ValueError`` for arrays of different lengths.
+    Raises `NergError` naming the first offending ray for NaN, zero or non-unit directions, non-finite origins or times,
+    and persons out of range; ``ValueError`` for arrays of different lengths.
     """
 
     t: np.ndarray
@@ -61,13 +63,22 @@ class Rays:
                 put(name, np.ascontiguousarray(getattr(self, name), dtype=np.float64))
 
         n = len(self.t)
-        shapes = {"person": (n,), "origin": (n, 3), "direction": (n, 3), "confidence": (n,), "hit": (n, 3), "cohort": (n,)}
+        shapes = {
+            "person": (n,),
+            "origin": (n, 3),
+            "direction": (n, 3),
+            "confidence": (n,),
+            "hit": (n, 3),
+            "cohort": (n,),
+        }
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise ValueError(f"{name} has shape {value.shape}, expected {shape}: one row for each of {n} times")
         if "frame" not in self.metadata:
-            raise ValueError('metadata lacks "frame"; state units, up axis and handedness (see nerg_mi.rays.rays.FRAME)')
+            raise ValueError(
+                'metadata lacks "frame"; state units, up axis and handedness (see nerg_mi.rays.rays.FRAME)'
+            )
 
         # Summed without arrays of squares: of ten million rays these alone take a quarter of a gigabyte.
         length = np.sqrt(np.einsum("ij,ij->i", self.direction, self.direction))
@@ -118,7 +129,8 @@ class Rays:
         return replace(self, **columns)
 
     def noting(self, **what: Any) -> Rays:
-        """The same rays with a step added to the list ``steps`` of the metadata: what was done to them since the import."""
+        """The same rays with a step added to the list ``steps`` of the metadata: what was done to them since the
+        import."""
         return replace(self, metadata={**self.metadata, "steps": [*self.metadata.get("steps", []), what]})
 
     def save(self, path: str | os.PathLike) -> None:
@@ -137,7 +149,9 @@ class Rays:
             return cls(**columns, persons=persons, metadata=metadata, cohorts=cohorts)
         except NergError as error:
             why = str(error).split(";")[0]
-            raise NergError(f"\"{path}\" is damaged ({why}); copy it again, or make it anew with 'nerg rays import'") from error
+            raise NergError(
+                f"\"{path}\" is damaged ({why}); copy it again, or make it anew with 'nerg rays import'"
+            ) from error
 
 
 def _refuse(bad: np.ndarray, what: str, remedy: str) -> None:

@@ -4,14 +4,16 @@ Neighbouring probes hold the same rays: a random choice of test probes is tested
 on what it was trained on. So positions are held out in zones, with every ray
 within reach of a test probe purged, and people are held out whole.
 """
+
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Sequence
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .index import RayIndex
 from .rays import Rays
 
@@ -116,7 +118,9 @@ def split_by_person(
     if test_persons is not None:
         unknown = [p for p in test_persons if p not in rays.persons]
         if unknown:
-            raise NergError(f"no person is called {', '.join(map(repr, unknown))}; the persons are {', '.join(rays.persons)}")
+            raise NergError(
+                f"no person is called {', '.join(map(repr, unknown))}; the persons are {', '.join(rays.persons)}"
+            )
         held = np.array([rays.persons.index(p) for p in test_persons])
     else:
         count = int(np.clip(round(test_share * len(present)), 1, max(1, len(present) - 1)))
@@ -138,7 +142,9 @@ def split_by_time(
     `NergError` when a side is empty.
     """
     if of not in ("all", "person") or not 0 < test_share < 1 or not gap >= 0:
-        raise NergError(f'of "{of}", test_share {test_share}, gap {gap}: need "all" or "person", a share in (0, 1), a gap >= 0')
+        raise NergError(
+            f'of "{of}", test_share {test_share}, gap {gap}: need "all" or "person", a share in (0, 1), a gap >= 0'
+        )
     group = np.zeros(len(rays), np.int64) if of == "all" else rays.person
     first, last = np.full(group.max(initial=0) + 1, np.inf), np.full(group.max(initial=0) + 1, -np.inf)
     np.minimum.at(first, group, rays.t)
@@ -146,13 +152,16 @@ def split_by_time(
     cut = (last - test_share * (last - first))[group]
     train, test = rays.t < cut - gap, rays.t >= cut
     if not train.any() or not test.any():
-        raise NergError(f"{train.sum()} rays are left to train on and {test.sum()} to test; choose a smaller gap or another share")
+        raise NergError(
+            f"{train.sum()} rays are left to train on and {test.sum()} to test; choose a smaller gap or another share"
+        )
     return train, test
 
 
 def both(*splits: PositionSplit | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Several splits at once: training rays are those of every training side, test rays those of every test side (unseen
-    people at unseen places, say). What is on the training side of one and the test side of another is used on neither.
+    """Several splits at once: training rays are those of every training side, test rays those of every test side
+    (unseen people at unseen places, say). What is on the training side of one and the test side of another is used on
+    neither.
 
     Raises `NergError` when a side is empty.
     """

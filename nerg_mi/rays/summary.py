@@ -1,4 +1,5 @@
 """The sanity card of a set of rays: what came in, and whether it is plausible."""
+
 from __future__ import annotations
 
 from collections import defaultdict
@@ -7,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .filters import time_order
 from .plausibility import warnings
 from .rays import Rays
@@ -21,8 +23,8 @@ class RaysSummary:
 
     ``duration``: recorded time over all persons, without pauses above one
     second. ``rate``: rays a second of a person (one over the median step; over that of
-    pauses where there is nothing else), NaN when no person has two times. ``eye_height``: 5, 50 and 95 % of the origins'
-    heights. ``speed_p95``: 95 % of the origins' speeds. ``duplicates``: rays with
+    pauses where there is nothing else), NaN when no person has two times. ``eye_height``: 5, 50 and 95 % of the
+    origins' heights. ``speed_p95``: 95 % of the origins' speeds. ``duplicates``: rays with
     person and time of another. ``dropped``: rows by reason; ``cohorts``: rays
     by cohort. ``warnings``: sentences about figures that people cannot produce
     (:mod:`nerg_mi.rays.plausibility`).
@@ -87,7 +89,9 @@ def summarise(rays: Rays) -> RaysSummary:
         duplicates=duplicates,
         rows_read=int(rays.metadata.get("rows_read", len(rays))),
         dropped=dict(dropped),
-        cohorts={} if rays.cohort is None else dict(zip(rays.cohorts, np.bincount(rays.cohort, minlength=len(rays.cohorts)).tolist())),
+        cohorts={}
+        if rays.cohort is None
+        else dict(zip(rays.cohorts, np.bincount(rays.cohort, minlength=len(rays.cohorts)).tolist())),
         warnings=tuple(warnings(rays, height, high - low, speed_p95, median_step if some else None, order)),
     )
 

@@ -1,10 +1,11 @@
-"""A picture rendered in pieces: bands of rows, which bound the memory, in strips of samples, which bound the time of one step.
+"""A picture rendered in pieces: bands of rows, which bound the memory, in strips of samples, which bound the time of
+one step.
 
-A picture does not depend on how it is divided. Every sample keeps the position, the ray and the random numbers that it has in
-the whole picture (`pixel_sampler`), and the samples of a pixel are added in the same groups, so that with a box filter the
-pixels are those of ``mi.render``, bit by bit, also where a pixel's samples fall into two strips. With a wider filter the samples
-of the rows around a band are rendered again for it; what is added up is the same, in another order, and pixels differ by
-the rounding of single precision.
+A picture does not depend on how it is divided. Every sample keeps the position, the ray and the random numbers that it
+has in the whole picture (`pixel_sampler`), and the samples of a pixel are added in the same groups, so that with a box
+filter the pixels are those of ``mi.render``, bit by bit, also where a pixel's samples fall into two strips. With a
+wider filter the samples of the rows around a band are rendered again for it; what is added up is the same, in another
+order, and pixels differ by the rounding of single precision.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ STRIP_SECONDS = 0.5
 """A strip that took longer than this is followed by shorter ones, one that took less than half of it by longer ones."""
 
 BYTES_PER_VALUE = 22
-"""Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the others in
-the copies on the way to the file."""
+"""Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the
+others in the copies on the way to the file."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """Rows ``top``, ..., ``top + rows - 1`` of the film's crop window. ``film`` holds them (``bitmap()``, ``develop()``) until the
-    next band is asked for, perhaps followed by empty rows."""
+    """Rows ``top``, ..., ``top + rows - 1`` of the film's crop window. ``film`` holds them (``bitmap()``,
+    ``develop()``) until the next band is asked for, perhaps followed by empty rows."""
 
     top: int
     rows: int
@@ -72,8 +73,8 @@ def _renders_itself(kind: type, base: type) -> bool:
 
 
 def rows_for(scene, sensor, memory: float) -> int:
-    """Rows of a band that needs at most ``memory`` bytes; at least 1, and of a filter that is wider than a pixel so many
-    that the rows around a band, which are rendered again for it, are a quarter of it at most."""
+    """Rows of a band that needs at most ``memory`` bytes; at least 1, and of a filter that is wider than a pixel so
+    many that the rows around a band, which are rendered again for it, are a quarter of it at most."""
     width, height = sensor.film().crop_size()
     values = 5 + len(scene.integrator().aov_names())
     return int(min(max(memory // (width * values * BYTES_PER_VALUE), 8 * _reach(sensor.film()), 1), height))
@@ -85,13 +86,21 @@ def _reach(film) -> int:
 
 
 def render_bands(
-    scene, sensor, *, spp: int = 0, seed: int = 0, rows: int = 0, strip: int = 0, on_strip: Callable[[int, int], None] | None = None
+    scene,
+    sensor,
+    *,
+    spp: int = 0,
+    seed: int = 0,
+    rows: int = 0,
+    strip: int = 0,
+    on_strip: Callable[[int, int], None] | None = None,
 ) -> Iterator[Band]:
     """Render the picture of ``sensor`` band by band, from the top; in one piece where `why_whole` has a reason.
 
-    ``spp``: samples a pixel, 0 for those of the sampler. ``rows`` of a band; 0: all. ``strip``: samples of a strip, 0: as many as
-    take about `STRIP_SECONDS`. ``on_strip`` is told the number of samples done and that of all after every strip, and may raise.
-    Raises ``KeyboardInterrupt`` after a picture in one piece that was to be stopped: there Mitsuba itself takes the signal.
+    ``spp``: samples a pixel, 0 for those of the sampler. ``rows`` of a band; 0: all. ``strip``: samples of a strip, 0:
+    as many as take about `STRIP_SECONDS`. ``on_strip`` is told the number of samples done and that of all after every
+    strip, and may raise. Raises ``KeyboardInterrupt`` after a picture in one piece that was to be stopped: there
+    Mitsuba itself takes the signal.
     """
     if why_whole(scene, sensor):
         yield _whole(scene, sensor, spp, seed, on_strip)
@@ -141,8 +150,9 @@ def _evaluate(block):
 
 
 def _trace(scene, sensor, grid: _Grid, base, seed, top, first, count, start):
-    """Trace samples ``first``, ..., of which those before ``start`` are of no account: where they lie in the block of the band at
-    ``top``, their values and who counts. Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by operation."""
+    """Trace samples ``first``, ..., of which those before ``start`` are of no account: where they lie in the block of
+    the band at ``top``, their values and who counts. Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9,
+    operation by operation."""
     import drjit as dr
     import mitsuba as mi
 
@@ -195,7 +205,8 @@ class _Grid:
         self.total = sum(b - a for a, b in map(self.samples, range(0, self.height, self.rows)))
 
     def samples(self, top: int) -> tuple[int, int]:
-        """The samples, of those of the whole picture, that reach the band at ``top``: the first, and the one after the last."""
+        """The samples, of those of the whole picture, that reach the band at ``top``: the first, and the one after the
+        last."""
         first = max(top - self._reach + self.border, 0)
         last = min(top + self.rows + self._reach + self.border, self.height + 2 * self.border)
         if not self.divided:
@@ -213,8 +224,8 @@ class _Grid:
 
     @contextmanager
     def as_whole(self, block):
-        """Add samples to ``block`` in the way in which Dr.Jit would add them to the whole picture, which is another for more
-        than a million values (`dr.set_expand_threshold`) and rounds differently."""
+        """Add samples to ``block`` in the way in which Dr.Jit would add them to the whole picture, which is another for
+        more than a million values (`dr.set_expand_threshold`) and rounds differently."""
         import drjit as dr
 
         threshold = dr.expand_threshold()
@@ -233,8 +244,8 @@ class _Grid:
 
     @contextmanager
     def _cropped(self):
-        # Only for as long as no ray is made: sensors see the whole film. All bands lie at the film's corner, so that the place of
-        # a band is not part of the kernel.
+        # Only for as long as no ray is made: sensors see the whole film. All bands lie at the film's corner, so that
+        # the place of a band is not part of the kernel.
         if not self.divided:
             yield
             return

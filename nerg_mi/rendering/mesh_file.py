@@ -1,5 +1,5 @@
-"""Meshes and volumes that Mitsuba is going to read, looked at before: its readers believe the counts and indices in a file, and
-fill the memory or end the process where these are wrong."""
+"""Meshes and volumes that Mitsuba is going to read, looked at before: its readers believe the counts and indices in a
+file, and fill the memory or end the process where these are wrong."""
 
 from __future__ import annotations
 
@@ -18,9 +18,23 @@ HEADER_BYTES = 1 << 20
 """The header of a PLY file may be so long."""
 
 _KINDS = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _ROWS = 1 << 18
 
 
@@ -34,8 +48,8 @@ class _Element:
 
 
 def check_ply(path: str | os.PathLike, faces: bool = True) -> None:
-    """Raise `NergError` for a PLY file that holds less than its header says, no vertices, no faces (unless ``faces`` is false),
-    faces that are no triangles, or corners that are none of its vertices."""
+    """Raise `NergError` for a PLY file that holds less than its header says, no vertices, no faces (unless ``faces`` is
+    false), faces that are no triangles, or corners that are none of its vertices."""
     path = Path(path)
     with reading(path, "mesh", "export it again, as triangles"), path.open("rb") as file:
         order, elements = _ply_header(file)
@@ -49,7 +63,9 @@ def check_ply(path: str | os.PathLike, faces: bool = True) -> None:
         # In text every value takes a character and a separator at least.
         needed = sum(e.count * (2 * len(e.fields) if not order else d.itemsize) for e, d in zip(elements, dtypes))
         if needed > length - start + (1 if not order else 0):
-            raise NergError(f'the mesh "{path}" ends before the {sum(count.values()):,} rows that it announces; export it again.')
+            raise NergError(
+                f'the mesh "{path}" ends before the {sum(count.values()):,} rows that it announces; export it again.'
+            )
         tables = _text_tables(file, elements) if not order else _binary_tables(path, start, elements, dtypes)
         for element, rows in zip(elements, tables):
             if element.name == "face":
@@ -75,7 +91,9 @@ def _ply_header(file) -> tuple[str, list[_Element]]:
                 raise ValueError(f"it has {elements[-1].count} rows of {words[1]}")
         elif words[0] == "property" and words[1] == "list":
             name = words[4]
-            elements[-1].fields += [(f"{name}.count", _KINDS[words[2]])] + [(f"{name}.{k}", _KINDS[words[3]]) for k in range(3)]
+            elements[-1].fields += [(f"{name}.count", _KINDS[words[2]])] + [
+                (f"{name}.{k}", _KINDS[words[3]]) for k in range(3)
+            ]
         elif words[0] == "property":
             elements[-1].fields.append((words[2], _KINDS[words[1]]))
         else:
@@ -121,11 +139,15 @@ def _check_faces(path: Path, element: _Element, rows, vertices: int) -> None:
         for first in range(0, len(rows), _ROWS):
             part = rows[first : first + _ROWS]
             if np.any(part[f"{name}.count"] != 3):
-                raise NergError(f'the mesh "{path}" has faces of more or fewer than three corners; export it as triangles.')
+                raise NergError(
+                    f'the mesh "{path}" has faces of more or fewer than three corners; export it as triangles.'
+                )
             for k in range(3):
                 corner = part[f"{name}.{k}"]
                 if np.any(corner < 0) or np.any(corner >= vertices):
-                    raise NergError(f'the mesh "{path}" has a face with a corner that is none of its {vertices:,} vertices; export it again.')
+                    raise NergError(
+                        f'the mesh "{path}" has a face with a corner that is none of its {vertices:,} vertices; export it again.'
+                    )
 
 
 def check_obj(path: str | os.PathLike) -> None:

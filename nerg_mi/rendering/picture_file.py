@@ -22,7 +22,8 @@ _DITHER = 256
 def picture_rows(path: str | Path, width: int, height: int) -> Iterator[Callable[[object, int], None]]:
     """A picture file of ``width`` x ``height`` pixels, whole or absent.
 
-    Gives a function that writes the next rows: the first ``rows`` of a Mitsuba bitmap. Float32 in .exr, tonemapped to sRGB in .png.
+    Gives a function that writes the next rows: the first ``rows`` of a Mitsuba bitmap. Float32 in .exr, tonemapped to
+    sRGB in .png.
     """
     check_writable(path, *FORMATS)
     if Path(path).suffix.lower() == ".exr":
@@ -59,7 +60,9 @@ class _Png:
     def _convert(self, values: np.ndarray) -> None:
         import mitsuba as mi
 
-        bitmap = mi.Bitmap(values, pixel_format=self._format).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True)
+        bitmap = mi.Bitmap(values, pixel_format=self._format).convert(
+            mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True
+        )
         self._pixels[self._done : self._done + len(values)] = np.array(bitmap)
         self._done += len(values)
 

@@ -8,11 +8,12 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-from . import bands
 from nerg_mi.errors import NergError, UnusableLLVM, mitsuba_says, sentence
-from nerg_mi.files.exr import threads_for_mitsuba
 from nerg_mi.files.atomic import check_writable
+from nerg_mi.files.exr import threads_for_mitsuba
 from nerg_mi.interruption import Interruption
+
+from . import bands
 from .picture_file import FORMATS, picture_rows
 from .scene_file import check_samples, check_scene, check_scene_file
 
@@ -72,13 +73,19 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
         try:
             loaded = mi.load_file(str(path), **(defaults or {}))
         except RuntimeError as error:
-            unused = re.findall(r"^\s*- \$(\w+)=", str(error), re.MULTILINE) if "unused parameters" in str(error) else []
+            unused = (
+                re.findall(r"^\s*- \$(\w+)=", str(error), re.MULTILINE) if "unused parameters" in str(error) else []
+            )
             if unused:
-                raise NergError(f'the scene "{path}" asks for no "${unused[0]}": correct the name that is given a value.') from error
+                raise NergError(
+                    f'the scene "{path}" asks for no "${unused[0]}": correct the name that is given a value.'
+                ) from error
             raise
         except UnicodeDecodeError as error:
             # Mitsuba quotes what it cannot read, and that is no text.
-            raise NergError(f'a mesh or another file that the scene "{path}" names is damaged: make it anew.') from error
+            raise NergError(
+                f'a mesh or another file that the scene "{path}" names is damaged: make it anew.'
+            ) from error
     check_scene(path, loaded)
     return loaded
 
@@ -102,13 +109,15 @@ def render_file(
     sRGB); its folder is made. `defaults`: values for the `<default>` and `$key` of the scene. `sensor`: index. `spp`:
     samples a pixel, 0 for those of the scene's sampler. `threads`: 0 for one a core.
 
-    `memory`: what the process may take, in GB. A picture that needs more is rendered in bands of rows, as large as fit beside
-    what the scene itself takes. Its pixels do not depend on that where the film has a box filter; with wider filters they
-    differ by the rounding of single precision (`bands`). Samplers other than `independent`, films other than `hdrfilm`, scalar
-    and spectral variants and Mitsuba's differentiable integrators are rendered in one piece, and the sentence says so where
-    that is more than `memory`. `on_progress` is told the samples done and the samples of all.
+    `memory`: what the process may take, in GB. A picture that needs more is rendered in bands of rows, as large as fit
+    beside what the scene itself takes. Its pixels do not depend on that where the film has a box filter; with wider
+    filters they differ by the rounding of single precision (`bands`). Samplers other than `independent`, films other
+    than `hdrfilm`, scalar and spectral variants and Mitsuba's differentiable integrators are rendered in one piece, and
+    the sentence says so where that is more than `memory`. `on_progress` is told the samples done and the samples of
+    all.
 
-    Raises NergError for what the user can mend, and KeyboardInterrupt, between two steps of less than a second, after Ctrl-C.
+    Raises NergError for what the user can mend, and KeyboardInterrupt, between two steps of less than a second, after
+    Ctrl-C.
     """
     scene, output = Path(scene), Path(output)
     check_writable(output, *FORMATS)
@@ -150,7 +159,9 @@ def render_file(
         # The picture is there, and yet whoever called this does not go on.
         stop.check()
     seconds = time.perf_counter() - start
-    note = f" It was rendered in one piece, beyond {memory:g} GB, because of {whole}." if whole and rows < height else ""
+    note = (
+        f" It was rendered in one piece, beyond {memory:g} GB, because of {whole}." if whole and rows < height else ""
+    )
     return f"Wrote {output} ({width} x {height}, {channels} channels, {active}, {seconds:.1f} s).{note}"
 
 

@@ -1,8 +1,8 @@
 """The random numbers of some pixels of a picture, without those of all others.
 
-Mitsuba's ``independent`` sampler gives every sample of a picture its own PCG32 generator, whose state and stream are the seed and
-the number of the sample, scrambled (Tiny Encryption Algorithm). Thus the numbers of any range of samples can be had alone, and
-are those that they have in the whole picture.
+Mitsuba's ``independent`` sampler gives every sample of a picture its own PCG32 generator, whose state and stream are
+the seed and the number of the sample, scrambled (Tiny Encryption Algorithm). Thus the numbers of any range of samples
+can be had alone, and are those that they have in the whole picture.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import re
 
 
 def base_seed(sampler) -> int | None:
-    """The ``seed`` of an ``independent`` sampler of Mitsuba; None for another kind, or for one that draws in another way."""
+    """The ``seed`` of an ``independent`` sampler of Mitsuba; None for another kind, or for one that draws in another
+    way."""
     import drjit as dr
 
     found = re.search(r"base_seed = (\d+)", str(sampler))
@@ -21,13 +22,14 @@ def base_seed(sampler) -> int | None:
     base, theirs, count = int(found[1]), sampler.clone(), 64
     theirs.seed(7, count)
     ours = for_samples(1, base, 7, 0, count)
-    # Another release of Mitsuba may seed differently: its pictures are then rendered in one piece, and stay what they are.
+    # Another release of Mitsuba may seed differently: its pictures are then rendered in one piece, and stay what they
+    # are.
     return base if dr.all(theirs.next_2d() == ours.next_2d(), axis=None) else None
 
 
 def for_samples(spp: int, base: int, seed: int, first: int, count: int):
-    """A sampler for the samples ``first``, ..., ``first + count - 1`` of a picture with ``spp`` samples a pixel, which are
-    counted pixel by pixel. ``base`` is the sampler's own seed and ``seed`` that of the render.
+    """A sampler for the samples ``first``, ..., ``first + count - 1`` of a picture with ``spp`` samples a pixel, which
+    are counted pixel by pixel. ``base`` is the sampler's own seed and ``seed`` that of the render.
 
     Mitsuba renders at most 2^32 samples at once; beyond that the sequences are those of other seeds.
     """

@@ -1,7 +1,8 @@
-"""A scene file looked at before Mitsuba reads it: what would end the process or fill the memory is refused in a sentence.
+"""A scene file looked at before Mitsuba reads it: what would end the process or fill the memory is refused in a
+sentence.
 
-The XML is read as a stream of tags, without recursion and without entities; the files that it includes are followed, and the
-meshes, volumes and pictures that it names are looked at by their headers.
+The XML is read as a stream of tags, without recursion and without entities; the files that it includes are followed,
+and the meshes, volumes and pictures that it names are looked at by their headers.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from xml.parsers import expat
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.image_header import check_image
+
 from .mesh_file import check_obj, check_ply, check_vol
 
 DEPTH = 256
@@ -35,9 +37,13 @@ PIXELS = 1 << 28
 
 _PICTURES = {".png", ".jpg", ".jpeg", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".bmp"}
 _CHECKS = {
-    "ply": check_ply, "obj": check_obj, "gridvolume": check_vol, "sdfgrid": check_vol,
-    "ellipsoids": lambda path: check_ply(path, faces=False), "ellipsoidsmesh": lambda path: check_ply(path, faces=False),
-}  # fmt: skip
+    "ply": check_ply,
+    "obj": check_obj,
+    "gridvolume": check_vol,
+    "sdfgrid": check_vol,
+    "ellipsoids": lambda path: check_ply(path, faces=False),
+    "ellipsoidsmesh": lambda path: check_ply(path, faces=False),
+}
 
 
 def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None) -> None:
@@ -55,7 +61,9 @@ def check_scene(path: str | Path, scene) -> None:
         film, count = sensor.film(), sensor.sampler().sample_count()
         width, height = map(int, film.crop_size())
         if not 0 < width * height <= PIXELS:
-            raise NergError(f'the film of sensor {index} of "{path}" has {width:,} x {height:,} pixels: give it 1 to {PIXELS:,}.')
+            raise NergError(
+                f'the film of sensor {index} of "{path}" has {width:,} x {height:,} pixels: give it 1 to {PIXELS:,}.'
+            )
         check_samples(count, f'the sampler of sensor {index} of "{path}"')
 
 
@@ -79,7 +87,9 @@ class _Scene:
             raise NergError(f'the scene file "{path}" is included more than {INCLUDES} files deep; include fewer.')
         parser = expat.ParserCreate()
         # The parser itself would grow the text of entities without bound.
-        parser.EntityDeclHandler = lambda *_: self._refuse(path, parser, "declares an entity; write out what it stands for")
+        parser.EntityDeclHandler = lambda *_: self._refuse(
+            path, parser, "declares an entity; write out what it stands for"
+        )
         parser.SetParamEntityParsing(expat.XML_PARAM_ENTITY_PARSING_NEVER)
         stack: list[tuple[str, str]] = []
 
@@ -105,7 +115,9 @@ class _Scene:
         except expat.ExpatError as error:
             raise NergError(f'the scene file "{path}" is no well-formed XML ({error}); correct it.') from error
         except OSError as error:
-            raise NergError(f'the scene file "{path}" could not be read ({error.strerror}); check its name and permissions.') from error
+            raise NergError(
+                f'the scene file "{path}" could not be read ({error.strerror}); check its name and permissions.'
+            ) from error
 
     def _refuse(self, path, parser, why):
         raise NergError(f'the scene file "{path}" (line {parser.CurrentLineNumber}) {why}.')

@@ -10,8 +10,8 @@ import drjit as dr
 class Fingerprint(list):
     """Of ``values`` (Dr.Jit arrays, or anything that holds some): equal as long as these are.
 
-    Copies are held, so that no later variable can take the place of one: the objects that ``mi.traverse`` gives are assigned to,
-    and hold other variables then."""
+    Copies are held, so that no later variable can take the place of one: the objects that ``mi.traverse`` gives are
+    assigned to, and hold other variables then."""
 
     def __init__(self, values: Iterable):
         held = [dr.copy(v) for v in values]

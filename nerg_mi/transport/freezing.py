@@ -1,4 +1,6 @@
-"""What to mind while ``dr.freeze`` records a function: it will be replayed with other values, and nothing is decided by them."""
+"""What to mind while ``dr.freeze`` records a function: it will be replayed with other values, and nothing is decided by
+them."""
+
 from __future__ import annotations
 
 import gc
@@ -14,8 +16,8 @@ def recording() -> bool:
 
 @contextmanager
 def no_collection():
-    """Keep Python's garbage while a function is recorded: Dr.Jit 1.5 ends the process where an array that lies in NumPy's
-    memory is freed."""
+    """Keep Python's garbage while a function is recorded: Dr.Jit 1.5 ends the process where an array that lies in
+    NumPy's memory is freed."""
     paused = recording() and gc.isenabled()
     if paused:
         gc.disable()

@@ -4,6 +4,7 @@ A shape hides the medium behind it; the medium in front attenuates the shape. Wh
 absorbed there, all of it, at the exact distance of the ray cast: a shape is a jump of the optical depth
 to infinity, and every kind of depth means the same with and without one.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .march.depth import surface_depth, way_out
 from .march.primal import MarchResult, scouted_march
 
@@ -45,8 +47,8 @@ class View:
 
 
 class Place:
-    """``medium``: a ``media`` medium or None; ``scene``: the Mitsuba scene whose shapes are met, or None. Raises ``NergError`` for
-    meshes that have no faces."""
+    """``medium``: a ``media`` medium or None; ``scene``: the Mitsuba scene whose shapes are met, or None. Raises
+    ``NergError`` for meshes that have no faces."""
 
     def __init__(self, medium, scene=None):
         self.medium = medium
@@ -82,16 +84,24 @@ class Place:
             distance = dr.select(hit, distance, dr.inf)
         if self.medium is None:
             opacity = dr.select(hit, Float(1), 0)
-            return View(None, hit, distance, opacity, Float(0), cast,
-                        lambda kind, active: dr.select(active & hit, distance, 0))
+            return View(
+                None, hit, distance, opacity, Float(0), cast, lambda kind, active: dr.select(active & hit, distance, 0)
+            )
 
         local = self.medium.local(ray.o, ray.d)
         t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(dr.minimum(local.t_far, end), distance)
         result = scouted_march(self.medium, local, t0, t1, active, settings, **options)
         front = result.opacity
         if self.scene is None:
-            return View(result, hit, distance, front, front, None,
-                        lambda kind, active: surface_depth(kind, result, self.medium, local, t0, t1, active, settings))
+            return View(
+                result,
+                hit,
+                distance,
+                front,
+                front,
+                None,
+                lambda kind, active: surface_depth(kind, result, self.medium, local, t0, t1, active, settings),
+            )
 
         def depth(kind, active):
             inside = surface_depth(kind, result, self.medium, local, t0, t1, active & (front > 0), settings, backed=hit)

@@ -1,5 +1,6 @@
 """What light comes from behind a field: from shapes, lit by a nested integrator or in their plain albedo, or from the
 background."""
+
 from __future__ import annotations
 
 import drjit as dr

@@ -1,10 +1,12 @@
 """Depths along many rays at once, outside of any render: where the surfaces are that people look at."""
+
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.field.backend import namespace
+
 from .march.depth import KINDS, surface_depth
 from .march.primal import MarchSettings, march
 from .place import Place
@@ -19,16 +21,19 @@ def default_settings(medium) -> MarchSettings:
     return MarchSettings(step=medium.step or medium.length_scale / 1024)
 
 
-def trace_depth(medium, origins, directions, settings: MarchSettings | None = None, kind: str = "median",
-                batch: int = BATCH):
+def trace_depth(
+    medium, origins, directions, settings: MarchSettings | None = None, kind: str = "median", batch: int = BATCH
+):
     """Depth of the surface along rays through a medium, and the opacity that they meet: a density-only march.
 
-    ``medium``: a ``FieldMedium`` or ``VolumeMedium``, or a ``Place`` (of shapes, whose rays are cast exactly, or of both). ``origins``, ``directions``: N rays in the scene's frame, directions
-    unit, either as NumPy arrays (N, 3) or as Dr.Jit 3-arrays of N lanes. ``settings``: see ``default_settings``.
-    ``kind``: ``median``, ``expected`` or ``refined`` (``transport.march.depth``). Returns ``(depth, opacity)`` of the kind that
-    the rays came in (float32 (N,), or Dr.Jit Floats, evaluated): depth is the distance from the origin in scene units, 0
-    where nothing absorbs; which opacity makes a surface is the caller's to say. At most ``batch`` rays are marched in one
-    launch. Carries no derivatives. Raises ``ValueError`` for an unknown kind and for shapes that do not fit.
+    ``medium``: a ``FieldMedium`` or ``VolumeMedium``, or a ``Place`` (of shapes, whose rays are cast exactly, or of
+    both). ``origins``, ``directions``: N rays in the scene's frame, directions unit, either as NumPy arrays (N, 3) or
+    as Dr.Jit 3-arrays of N lanes. ``settings``: see ``default_settings``.
+    ``kind``: ``median``, ``expected`` or ``refined`` (``transport.march.depth``). Returns ``(depth, opacity)`` of the
+    kind that the rays came in (float32 (N,), or Dr.Jit Floats, evaluated): depth is the distance from the origin in
+    scene units, 0 where nothing absorbs; which opacity makes a surface is the caller's to say. At most ``batch`` rays
+    are marched in one launch. Carries no derivatives. Raises ``ValueError`` for an unknown kind and for shapes that do
+    not fit.
     """
     if kind not in KINDS:
         raise ValueError(f'the depth must be one of {", ".join(KINDS)}, got "{kind}"')
@@ -44,7 +49,9 @@ def trace_depth(medium, origins, directions, settings: MarchSettings | None = No
     depth, opacity = np.empty((2, len(o)), np.float32)
     for a in range(0, len(o), batch):
         part = slice(a, a + batch)
-        found = _trace(medium, array(np.ascontiguousarray(o[part].T)), array(np.ascontiguousarray(d[part].T)), settings, kind)
+        found = _trace(
+            medium, array(np.ascontiguousarray(o[part].T)), array(np.ascontiguousarray(d[part].T)), settings, kind
+        )
         depth[part], opacity[part] = (np.asarray(ns.Float(x)) for x in found)
     return depth, opacity
 

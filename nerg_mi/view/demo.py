@@ -1,7 +1,7 @@
 """The demo: every picture that shows what a gaze field is, rendered from a scene with an observer.
 
-The scene has three sensors: 0 a camera that sees behind what hides it from the observer, 1 the observer's own view, 2 the
-observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field, and it has the `<default>`s of
+The scene has three sensors: 0 a camera that sees behind what hides it from the observer, 1 the observer's own view, 2
+the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field, and it has the `<default>`s of
 ``scenes/store/scene.xml``. Equal seeds give equal pictures, byte for byte.
 """
 
@@ -19,13 +19,14 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi import __version__, llvm
-from nerg_mi.rendering.bands import render_bands
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.files.tables import write_json
 from nerg_mi.interruption import Interruption
+from nerg_mi.rendering.bands import render_bands
 from nerg_mi.rendering.pictures import activate, load_scene
+
 from . import figures
 from .overlay import Heat, top_of
 from .tonemap import srgb, write_png
@@ -64,15 +65,22 @@ class DemoResult:
 
 
 def run_demo(
-    out: str | Path, *, scene: str | Path | None = None, defaults: Mapping[str, str] | None = None, width: int = 600,
-    spp: int = 8, seed: int = 0, variant: str | None = None, on_stage: Callable[[str], None] | None = None,
+    out: str | Path,
+    *,
+    scene: str | Path | None = None,
+    defaults: Mapping[str, str] | None = None,
+    width: int = 600,
+    spp: int = 8,
+    seed: int = 0,
+    variant: str | None = None,
+    on_stage: Callable[[str], None] | None = None,
 ) -> DemoResult:
     """Render all pictures of the demo into the folder ``out``, which is made.
 
-    ``scene``: another file than the store's scene.xml; ``defaults``: values for its `<default>`s; ``width`` in pixels of a
-    picture (3:2; the sphere's is 2:1 and as wide); ``spp``: samples a pixel; ``variant`` None: the best that works;
-    ``on_stage`` is told the name of each of `STAGES` as it begins. Raises NergError where a checkpoint is missing, and
-    KeyboardInterrupt, between two steps of less than a second, after Ctrl-C.
+    ``scene``: another file than the store's scene.xml; ``defaults``: values for its `<default>`s; ``width`` in pixels
+    of a picture (3:2; the sphere's is 2:1 and as wide); ``spp``: samples a pixel; ``variant`` None: the best that
+    works; ``on_stage`` is told the name of each of `STAGES` as it begins. Raises NergError where a checkpoint is
+    missing, and KeyboardInterrupt, between two steps of less than a second, after Ctrl-C.
     """
     if width < 12 or spp < 1:
         raise NergError(f"the demo needs pictures of at least 12 pixels and 1 sample a pixel, got {width} and {spp}.")
@@ -93,7 +101,9 @@ def run_demo(
         seen = load_scene(scene, values)
         unhidden = load_scene(scene, values | {"occlusion": "false", "radiance": "false", "aovs": "opacity,gaze"})
         if len(seen.sensors()) < 3:
-            raise NergError(f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama.')
+            raise NergError(
+                f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama.'
+            )
         clock.start("camera")
         camera = _render(mi, seen, CAMERA, spp, seed, stop.check)
         clock.start("own view")
@@ -110,7 +120,9 @@ def run_demo(
     # One scale for all pictures of gaze, so that a colour means the same in each of them.
     tops = [top_of(r.aovs["gaze"], r.mask) for r in (own, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)]
     if not tops:
-        raise NergError(f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer.')
+        raise NergError(
+            f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer.'
+        )
     heat = Heat(max(tops))
     marker = _pixel_of_observer(mi, seen)
     files = _write_pictures(out, camera, own, sphere, without, heat, marker, header)
@@ -120,11 +132,19 @@ def run_demo(
     clock.stop()
 
     report = {
-        "command": "nerg demo", "versions": versions, "variant": active, "seed": seed, "spp": spp, **sizes,
-        "defaults": dict(defaults or {}), "gaze_scale_top_per_sr": heat.top, "gaze_sphere_integral": _integral(sphere),
+        "command": "nerg demo",
+        "versions": versions,
+        "variant": active,
+        "seed": seed,
+        "spp": spp,
+        **sizes,
+        "defaults": dict(defaults or {}),
+        "gaze_scale_top_per_sr": heat.top,
+        "gaze_sphere_integral": _integral(sphere),
         "seconds": {k: round(v, 2) for k, v in clock.seconds.items()},
-        "inputs": {p.name: checksum(p) for p in inputs}, "outputs": {p.name: checksum(p) for p in files},
-    }  # fmt: skip
+        "inputs": {p.name: checksum(p) for p in inputs},
+        "outputs": {p.name: checksum(p) for p in files},
+    }
     write_json(out / "run.json", report)
     return DemoResult([*files, out / "run.json"], clock.seconds, report)
 
@@ -205,17 +225,25 @@ def _write_pictures(out: Path, camera, own, sphere, without, heat: Heat, marker,
     total = _integral(sphere)
     drawn = {
         "occlusion": lambda: figures.occlusion_figure(
-            (own.color, own.aovs["gaze"], own.mask), (camera.color, without.aovs["gaze"], without.mask),
-            (camera.color, camera.aovs["gaze"], camera.mask), heat, marker,
+            (own.color, own.aovs["gaze"], own.mask),
+            (camera.color, without.aovs["gaze"], without.mask),
+            (camera.color, camera.aovs["gaze"], camera.mask),
+            heat,
+            marker,
         ),
-        "gaze": lambda: figures.gaze_figure(camera.color, camera.aovs["gaze"], camera.mask, heat, "Where the observer looks"),
+        "gaze": lambda: figures.gaze_figure(
+            camera.color, camera.aovs["gaze"], camera.mask, heat, "Where the observer looks"
+        ),
         "gaze_sphere": lambda: figures.sphere_figure(
-            sphere.color, sphere.aovs["gaze"], sphere.mask, heat,
+            sphere.color,
+            sphere.aovs["gaze"],
+            sphere.mask,
+            heat,
             f"The gaze sphere of the observer; its integral is {total:.3f}",
         ),
         "depth": lambda: figures.depth_figure(camera.aovs["depth"], camera.mask),
         "visibility": lambda: figures.visibility_figure(camera.color, camera.aovs["visibility"], camera.mask),
-    }  # fmt: skip
+    }
     files = []
     for name, draw in drawn.items():
         files.append(out / f"{name}.png")
@@ -230,9 +258,12 @@ def _versions(variant: str) -> dict[str, str]:
     import mitsuba
 
     versions = {
-        "nerg_mi": __version__, "mitsuba": mitsuba.__version__, "drjit": drjit.__version__, "numpy": np.__version__,
+        "nerg_mi": __version__,
+        "mitsuba": mitsuba.__version__,
+        "drjit": drjit.__version__,
+        "numpy": np.__version__,
         "python": platform.python_version(),
-    }  # fmt: skip
+    }
     library = llvm.current()
     if variant.startswith("llvm") and library is not None:
         versions["libLLVM"] = ".".join(map(str, library.version))

@@ -1,8 +1,8 @@
 """Figures with scales and labels: depth, gaze, visibility, the gaze sphere and the paper's occlusion figure.
 
-Each function takes arrays as the integrator gives them (rows from the top) and returns a matplotlib ``Figure`` in which a
-pixel of the render is a pixel of the figure; `save` writes it, byte for byte the same for the same input. pyplot, and with
-it any window, stays out of it.
+Each function takes arrays as the integrator gives them (rows from the top) and returns a matplotlib ``Figure`` in which
+a pixel of the render is a pixel of the figure; `save` writes it, byte for byte the same for the same input. pyplot, and
+with it any window, stays out of it.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.files.png import write_figure
+
 from .overlay import Heat, overlay, scale_strip
 from .tonemap import LUMINANCE, srgb
 
@@ -21,8 +22,16 @@ _BAR, _GAP, _LABELS, _HEAD, _FOOT = 14, 10, 66, 26, 10  # pixels
 
 
 def save(figure, path, text: dict[str, str] | None = None) -> None:
-    """Write a figure as PNG. ``text``: what its header says; no time, no program version, so equal figures are equal files."""
-    write_figure(path, figure, dpi=DPI, facecolor=PAPER, metadata={"Software": None, **(text or {})}, pil_kwargs={"optimize": True})
+    """Write a figure as PNG. ``text``: what its header says; no time, no program version, so equal figures are equal
+    files."""
+    write_figure(
+        path,
+        figure,
+        dpi=DPI,
+        facecolor=PAPER,
+        metadata={"Software": None, **(text or {})},
+        pil_kwargs={"optimize": True},
+    )
 
 
 def depth_figure(depth, mask, title: str = "Depth", unit: str = "m"):
@@ -63,8 +72,8 @@ def visibility_figure(color, visibility, mask, title: str = "Visible to the obse
 def sphere_figure(color, gaze, mask, heat: Heat, title: str = "All that the observer could turn to"):
     """The observer's sphere as latitude and longitude, in degrees: pictures (h, w, ...) of a `panorama` sensor.
 
-    Azimuth 0 is the sensor's front, positive to the right; elevation 0 the horizon. The first and last row of a panorama
-    lie at the poles, so that the picture reaches half a row beyond 90 degrees.
+    Azimuth 0 is the sensor's front, positive to the right; elevation 0 the horizon. The first and last row of a
+    panorama lie at the poles, so that the picture reaches half a row beyond 90 degrees.
     """
     shown = overlay(color, gaze, heat, mask)
     sheet = _Sheet([shown], [title], scale=True, axes=True)
@@ -85,16 +94,23 @@ def sphere_figure(color, gaze, mask, heat: Heat, title: str = "All that the obse
 def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None):
     """The paper's occlusion figure: three pictures with one scale.
 
-    ``own``, ``moved_without``, ``moved_with``: tuples (color (h, w, 3) linear, gaze (h, w) in 1/sr, mask (h, w)): what the
-    observer sees; a camera behind a shelf, gaze without occlusion; the same with it. ``marker``: pixel (x, y) at which the
-    observer stands in the two pictures of the moved camera.
+    ``own``, ``moved_without``, ``moved_with``: tuples (color (h, w, 3) linear, gaze (h, w) in 1/sr, mask (h, w)): what
+    the observer sees; a camera behind a shelf, gaze without occlusion; the same with it. ``marker``: pixel (x, y) at
+    which the observer stands in the two pictures of the moved camera.
     """
     pictures = [overlay(c, g, heat, m) for c, g, m in (own, moved_without, moved_with)]
     titles = ["The observer's own view", "From behind a shelf, without occlusion", "The same with occlusion"]
     sheet = _Sheet(pictures, titles, scale=True)
     if marker is not None:
         for axes in sheet.panels[1:]:
-            axes.plot(*marker, marker="o", markersize=6, markerfacecolor="#35c2ff", markeredgecolor="white", markeredgewidth=1.2)
+            axes.plot(
+                *marker,
+                marker="o",
+                markersize=6,
+                markerfacecolor="#35c2ff",
+                markeredgecolor="white",
+                markeredgewidth=1.2,
+            )
             axes.annotate("observer", marker, xytext=(6, 5), textcoords="offset points", fontsize=7, color="white")
     above = _exceeds(heat, [gaze for _, gaze, _ in (own, moved_without, moved_with)])
     sheet.bar(scale_strip(heat), 0.0, heat.top, "gaze density [1/sr]", above=above)
@@ -136,7 +152,13 @@ class _Sheet:
         """The scale: ``strip`` (n, 3) display colours from ``low`` to ``high``; ``above``: some values exceed it."""
         x, y, h = self._bar_at
         axes = self.figure.add_axes((x / self.width, y / self.height, _BAR / self.width, h / self.height))
-        axes.imshow(np.asarray(strip)[:, None], origin="lower", aspect="auto", extent=(0, 1, low, high), interpolation="bilinear")
+        axes.imshow(
+            np.asarray(strip)[:, None],
+            origin="lower",
+            aspect="auto",
+            extent=(0, 1, low, high),
+            interpolation="bilinear",
+        )
         axes.set_xticks([])
         axes.yaxis.tick_right()
         axes.yaxis.set_label_position("right")

@@ -1,8 +1,8 @@
 """Attention over colour: a heat map that stays readable on a picture, with a scale that can be read off.
 
-Values are densities in 1/sr. Colours come from one of matplotlib's perceptually uniform maps; the heat grows more opaque
-with the value, over a picture that is dimmed and greyed, so that goods stay recognisable and their colours are not
-mistaken for heat. Where there is no surface nothing is coloured.
+Values are densities in 1/sr. Colours come from one of matplotlib's perceptually uniform maps; the heat grows more
+opaque with the value, over a picture that is dimmed and greyed, so that goods stay recognisable and their colours are
+not mistaken for heat. Where there is no surface nothing is coloured.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
+
 from .tonemap import LUMINANCE, srgb
 
 MAPS = ("inferno", "magma", "plasma", "viridis", "cividis")
@@ -22,9 +23,9 @@ MAPS = ("inferno", "magma", "plasma", "viridis", "cividis")
 class Heat:
     """How values become colour.
 
-    ``top``: the value, in 1/sr, at the upper end of the scale, which starts at 0; ``colors``: one of `MAPS`; ``opacity``:
-    of the hottest pixel; ``ramp``: share of the scale over which opacity rises from 0; ``dim``: brightness of the picture
-    below; ``grey``: how much of its colour is taken away. Raises NergError for what cannot be shown.
+    ``top``: the value, in 1/sr, at the upper end of the scale, which starts at 0; ``colors``: one of `MAPS`;
+    ``opacity``: of the hottest pixel; ``ramp``: share of the scale over which opacity rises from 0; ``dim``: brightness
+    of the picture below; ``grey``: how much of its colour is taken away. Raises NergError for what cannot be shown.
     """
 
     top: float

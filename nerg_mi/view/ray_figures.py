@@ -1,7 +1,7 @@
 """Rays from above: how densely a floor is walked, and the layout with every ray's place.
 
-Both return a matplotlib ``Figure`` with axes in metres, x to the right and y up; ``figures.save`` writes it. pyplot stays
-out of it.
+Both return a matplotlib ``Figure`` with axes in metres, x to the right and y up; ``figures.save`` writes it. pyplot
+stays out of it.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ _SIDE = 640  # pixels of the plan's longer side
 def floor_plan(rays, cell: float | None = None, title: str = "Where people stood"):
     """Density of the rays' origins on the floor, in rays/m², on a logarithmic scale; cells without a ray stay white.
 
-    ``cell``: edge of a cell in metres (default: a fiftieth of the plan's shorter side, 5 cm at least). Short lines show where
-    the people of a coarser cell look on average; the longer, the more they agree.
+    ``cell``: edge of a cell in metres (default: a fiftieth of the plan's shorter side, 5 cm at least). Short lines show
+    where the people of a coarser cell look on average; the longer, the more they agree.
     """
     from matplotlib.colors import LogNorm
 
@@ -32,7 +32,9 @@ def floor_plan(rays, cell: float | None = None, title: str = "Where people stood
     figure, axes = _sheet(low, high, f"{title}: {_of(rays)}", bar=True)
     top = float(density.max())
     bottom = max(float(density.min()), top * 1e-4)
-    image = axes.pcolormesh(*edges, density, cmap="viridis", norm=LogNorm(bottom, max(top, bottom * 1.01)), rasterized=True)
+    image = axes.pcolormesh(
+        *edges, density, cmap="viridis", norm=LogNorm(bottom, max(top, bottom * 1.01)), rasterized=True
+    )
     _arrows(axes, rays, low, high)
     bar = figure.colorbar(image, cax=figure.bar_axes)
     bar.set_label(f"rays/m² in cells of {cell:g} m", fontsize=7, color=INK)
@@ -54,7 +56,9 @@ def layout_figure(rays, test=None, centres=None, radius: float | None = None, ti
         axes.plot(*_some(walls).T, ",", color=_SURFACES, rasterized=True, zorder=1)
     for xy, color in zip(points, (_POINTS, "#d9730d")):
         size = 3.5 - 0.5 * np.log10(max(len(xy), 10))  # few points are drawn larger
-        axes.plot(*_some(xy).T, ".", markersize=max(size, 1.1), markeredgewidth=0, color=color, rasterized=True, zorder=2)
+        axes.plot(
+            *_some(xy).T, ".", markersize=max(size, 1.1), markeredgewidth=0, color=color, rasterized=True, zorder=2
+        )
     if centres is not None and radius is not None:
         from matplotlib.collections import PatchCollection
         from matplotlib.patches import Circle
@@ -64,12 +68,20 @@ def layout_figure(rays, test=None, centres=None, radius: float | None = None, ti
     first, last = _box(np.concatenate(points), margin=0.0)
     _dimension(axes, first, last)
     names = [(_POINTS, "rays" if test is None else "training rays")]
-    names += ([] if test is None else [("#d9730d", "test rays")]) + ([] if walls is None else [(_SURFACES, "what was looked at")])
+    names += ([] if test is None else [("#d9730d", "test rays")]) + (
+        [] if walls is None else [(_SURFACES, "what was looked at")]
+    )
     handles = [axes.plot([], [], "s", markersize=5, color=color, label=name)[0] for color, name in names]
     axes.legend(
-        handles=handles, fontsize=7, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3,
-        borderaxespad=0.2, handletextpad=0.1,
-    )  # fmt: skip
+        handles=handles,
+        fontsize=7,
+        frameon=False,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=3,
+        borderaxespad=0.2,
+        handletextpad=0.1,
+    )
     return figure
 
 
@@ -96,7 +108,9 @@ def _some(xy: np.ndarray) -> np.ndarray:
 
 
 def _of(rays, test=None) -> str:
-    people = np.unique(np.concatenate([np.asarray(rays.persons)[np.unique(r.person)] for r in (rays, test) if r is not None])).size
+    people = np.unique(
+        np.concatenate([np.asarray(rays.persons)[np.unique(r.person)] for r in (rays, test) if r is not None])
+    ).size
     count = f"{len(rays):,} rays" if test is None else f"{len(rays):,} + {len(test):,} rays"
     return f"{count} of {people} {'person' if people == 1 else 'people'}"
 
@@ -111,16 +125,29 @@ def _arrows(axes, rays, low, high) -> None:
     enough = count >= max(20, len(rays) * 1e-4)
     place, level = place[enough], level[enough]
     axes.quiver(
-        *place.T, *(level.T * step), angles="xy", scale_units="xy", scale=1.0, width=0.0028, color="white", edgecolor=INK,
-        linewidth=0.4, headwidth=4, headlength=4, headaxislength=3.5, zorder=3,
-    )  # fmt: skip
+        *place.T,
+        *(level.T * step),
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        width=0.0028,
+        color="white",
+        edgecolor=INK,
+        linewidth=0.4,
+        headwidth=4,
+        headlength=4,
+        headaxislength=3.5,
+        zorder=3,
+    )
 
 
 def _dimension(axes, low, high) -> None:
     """Lines along two sides that say how far the rays reach."""
     x0, x1 = axes.get_xlim()
     y0, y1 = axes.get_ylim()
-    line = dict(arrowprops=dict(arrowstyle="|-|, widthA=0.25, widthB=0.25", color=INK, linewidth=0.8, shrinkA=0, shrinkB=0))
+    line = dict(
+        arrowprops=dict(arrowstyle="|-|, widthA=0.25, widthB=0.25", color=INK, linewidth=0.8, shrinkA=0, shrinkB=0)
+    )
     y, x = y0 + 0.045 * (y1 - y0), x1 - 0.045 * (x1 - x0)
     axes.annotate("", (low[0], y), (high[0], y), **line)
     axes.annotate("", (x, low[1]), (x, high[1]), **line)
@@ -130,7 +157,8 @@ def _dimension(axes, low, high) -> None:
 
 
 def _sheet(low, high, title: str, bar: bool = False, pad: float = 0.0):
-    """A figure with axes in metres, of equal scale: so large that the plan's longer side has a fixed number of pixels."""
+    """A figure with axes in metres, of equal scale: so large that the plan's longer side has a fixed number of
+    pixels."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,7 +1,7 @@
 """From linear radiance to the bytes of a picture.
 
-The sRGB transfer function of IEC 61966-2-1; nothing is scaled or compressed, so that equal radiance has equal bytes in every
-picture. What is brighter than white is clipped.
+The sRGB transfer function of IEC 61966-2-1; nothing is scaled or compressed, so that equal radiance has equal bytes in
+every picture. What is brighter than white is clipped.
 """
 
 from __future__ import annotations

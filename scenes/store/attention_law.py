@@ -30,19 +30,31 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.special import ndtr, ndtri
-
 from nerg_mi.scenes.store import twin
+from scipy.special import ndtr, ndtri
 
 HERE = Path(__file__).resolve().parent
 REGIONS = HERE / "regions.json"
 
 # a_k: what draws eyes in a convenience store
 ATTRACTIVENESS = {
-    "offers": 2.2, "drinks": 1.6, "sweets": 1.4, "snacks": 1.3, "meals": 1.3, "magazines": 1.1, "coffee": 1.2, "till": 1.0,
-    "bread": 0.9, "dairy": 0.8, "noodles": 0.8, "counter_goods": 0.6, "cosmetics": 0.6, "stationery": 0.4, "household": 0.35,
+    "offers": 2.2,
+    "drinks": 1.6,
+    "sweets": 1.4,
+    "snacks": 1.3,
+    "meals": 1.3,
+    "magazines": 1.1,
+    "coffee": 1.2,
+    "till": 1.0,
+    "bread": 0.9,
+    "dairy": 0.8,
+    "noodles": 0.8,
+    "counter_goods": 0.6,
+    "cosmetics": 0.6,
+    "stationery": 0.4,
+    "household": 0.35,
     "poster": 0.7,
-}  # fmt: skip
+}
 
 BACKGROUND = 0.2  # A_0
 FALLOFF = 1.2  # d_0, metres
@@ -85,7 +97,7 @@ class AttentionLaw:
         self.names = [r["name"] for r in regions]
         unknown = sorted({r["category"] for r in regions} - set(ATTRACTIVENESS))
         if unknown:
-            raise ValueError(f'The categories {unknown} have no attractiveness; add them to ATTRACTIVENESS.')
+            raise ValueError(f"The categories {unknown} have no attractiveness; add them to ATTRACTIVENESS.")
         # a factor of its own for each target: the golden ratio's multiples are spread evenly over [0, 1)
         spread = 0.5 + np.arange(1, len(regions) + 1) * 0.6180339887498949 % 1.0
         self.attractiveness = np.array([ATTRACTIVENESS[r["category"]] for r in regions]) * spread

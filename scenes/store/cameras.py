@@ -1,8 +1,8 @@
 """Where the cameras of the demo store stand: a plan that lets every visible surface be seen often and from many sides.
 
-Rooms seen from inside are hard for radiance fields because most views see most surfaces from afar and from one side. So the
-views are chosen greedily among many candidates by exact ray casts. Poses are camera-to-world matrices with OpenGL axes
-(x right, y up, z back), metres, z up.
+Rooms seen from inside are hard for radiance fields because most views see most surfaces from afar and from one side. So
+the views are chosen greedily among many candidates by exact ray casts. Poses are camera-to-world matrices with OpenGL
+axes (x right, y up, z back), metres, z up.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
 from nerg_mi.scenes.store import twin
 from nerg_mi.scenes.store.layout import ROOM, Layout
 
@@ -50,7 +49,8 @@ class Pinhole:
 
 
 def pose_from_angles(position, yaw: float, pitch: float) -> np.ndarray:
-    """Camera-to-world (4, 4) at a position, looking along azimuth ``yaw`` and elevation ``pitch`` (radians), upright."""
+    """Camera-to-world (4, 4) at a position, looking along azimuth ``yaw`` and elevation ``pitch`` (radians),
+    upright."""
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     pose = np.eye(4)
@@ -121,8 +121,9 @@ def views_of(camera: Pinhole, poses, points, normals, scene=None):
 def choose_views(layout: Layout, camera: Pinhole, count: int, held_out: int, seed: int = 0, scene=None):
     """Training poses (count, 4, 4) and held-out poses (held_out, 4, 4).
 
-    Greedy: each next view is the candidate that sees most of what was seen seldom, or from one side only, until now; views
-    from near and face on count for more. Held-out views are a shopper's: at eye height, nearly level, looking into the open.
+    Greedy: each next view is the candidate that sees most of what was seen seldom, or from one side only, until now;
+    views from near and face on count for more. Held-out views are a shopper's: at eye height, nearly level, looking
+    into the open.
     """
     rng = np.random.default_rng([seed, 0xCA])
     candidates = 30 * (count + held_out)
@@ -151,7 +152,8 @@ def choose_views(layout: Layout, camera: Pinhole, count: int, held_out: int, see
 
 
 def _held_out_views(layout: Layout, rng, count: int, scene) -> np.ndarray:
-    """Poses (count, 4, 4) far from each other in place and direction; a picture of one good from 40 cm would test little."""
+    """Poses (count, 4, 4) far from each other in place and direction; a picture of one good from 40 cm would test
+    little."""
     positions = free_positions(layout, rng, 400, (1.2, 1.9))
     yaw, pitch = rng.uniform(0, 2 * np.pi, 400), np.radians(rng.uniform(-18, 8, 400))
     poses = np.stack([pose_from_angles(*v) for v in zip(positions, yaw, pitch)])

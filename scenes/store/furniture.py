@@ -7,7 +7,6 @@ boards are solid and closed, so that nobody sees through a shelf and a field has
 from __future__ import annotations
 
 import numpy as np
-
 from nerg_mi.scenes.store.layout import EAST, NORTH, SOUTH, WEST, Place, Region, srgb
 
 # What a category's goods look like (sRGB), and the colour of its special offer.
@@ -94,8 +93,18 @@ def _stock(place: Place, rng, frame: Frame, u, depth: float, z0: float, room: fl
 
 
 def shelf_unit(
-    place: Place, rng, frame: Frame, width: float, depth: float, boards, top: float, bays, trim: str, prefix: str,
-    kick: float = 0.12, focus_level: int = 2,
+    place: Place,
+    rng,
+    frame: Frame,
+    width: float,
+    depth: float,
+    boards,
+    top: float,
+    bays,
+    trim: str,
+    prefix: str,
+    kick: float = 0.12,
+    focus_level: int = 2,
 ) -> None:
     """A one-sided shelf: a solid back, ends, a plinth, boards with price strips, goods, and one region for each bay.
 
@@ -144,26 +153,54 @@ def _gondola(place, rng, number: int, x: float, west, east, cap: str, trim: str)
     boards = (0.12, 0.50, 0.82, 1.14, 1.44)
     for facing, bays, side in ((WEST, west, "west"), (EAST, east, "east")):
         shelf_unit(
-            place, rng, Frame((x, y0), facing), y1 - y0, 0.35, boards, top, bays, trim, f"gondola_{number}_{side}",
+            place,
+            rng,
+            Frame((x, y0), facing),
+            y1 - y0,
+            0.35,
+            boards,
+            top,
+            bays,
+            trim,
+            f"gondola_{number}_{side}",
             focus_level=3 if side == "west" else 2,
         )
     end = Frame((x - 0.35, y0), SOUTH)
     shelf_unit(place, rng, end, 0.7, 0.3, (0.12, 0.55, 0.95, 1.30), top, (cap,), trim, f"endcap_{number}")
     ground, light = srgb(trim), srgb("f4efe2")
-    place.box((x - 0.35, y1, 0), (x + 0.35, y1 + 0.03, top), ground, skip={(1, -1), (2, -1)},
-              fronts={(1, 1): ((4, 8), lambda i, j: light if (i * 3 + j * 2) % 7 < 2 else ground * (0.6 + 0.08 * j))})  # fmt: skip
-    place.box((x - 0.04, 2.0, top), (x + 0.04, 3.8, top + 0.32), ground, skip={(2, -1)},
-              fronts={(0, s): ((9, 2), lambda i, j: light if j == 1 and i % 3 else ground) for s in (-1, 1)})  # fmt: skip
+    place.box(
+        (x - 0.35, y1, 0),
+        (x + 0.35, y1 + 0.03, top),
+        ground,
+        skip={(1, -1), (2, -1)},
+        fronts={(1, 1): ((4, 8), lambda i, j: light if (i * 3 + j * 2) % 7 < 2 else ground * (0.6 + 0.08 * j))},
+    )
+    place.box(
+        (x - 0.04, 2.0, top),
+        (x + 0.04, 3.8, top + 0.32),
+        ground,
+        skip={(2, -1)},
+        fronts={(0, s): ((9, 2), lambda i, j: light if j == 1 and i % 3 else ground) for s in (-1, 1)},
+    )
 
 
 def _counter(place: Place, rng) -> None:
     """The counter with till and impulse goods, the cabinet behind it, the coffee corner."""
     wood, top, steel = srgb("8a5a3c"), srgb("ded5c4"), srgb("5b6670")
     red = srgb("c8402f")
-    place.box((6.85, 1.0, 0), (7.35, 3.4, 0.9), wood, skip={(2, -1)},
-              fronts={(0, -1): ((8, 3), lambda i, j: red if j == 1 else wood * (0.8 + 0.4 * (i % 2)))})  # fmt: skip
-    place.box((6.8, 0.95, 0.9), (7.4, 3.45, 0.95), top,
-              fronts={(2, 1): ((2, 8), lambda i, j: top * (0.8 + 0.25 * ((i + j) % 2)))})  # fmt: skip
+    place.box(
+        (6.85, 1.0, 0),
+        (7.35, 3.4, 0.9),
+        wood,
+        skip={(2, -1)},
+        fronts={(0, -1): ((8, 3), lambda i, j: red if j == 1 else wood * (0.8 + 0.4 * (i % 2)))},
+    )
+    place.box(
+        (6.8, 0.95, 0.9),
+        (7.4, 3.45, 0.95),
+        top,
+        fronts={(2, 1): ((2, 8), lambda i, j: top * (0.8 + 0.25 * ((i + j) % 2)))},
+    )
     till = (6.95, 2.75, 0.95), (7.3, 3.15, 1.3)
     place.box(*till, steel, skip={(2, -1)}, fronts={(0, -1): ((2, 2), lambda i, j: srgb("9fd3c7") if j else steel)})
     place.regions.append(Region("counter_till", "till", (6.8, 2.6, 0.0), (7.4, 3.45, 1.35), WEST, till))
@@ -176,14 +213,31 @@ def _counter(place: Place, rng) -> None:
     place.regions.append(Region("counter_sweets", "sweets", (6.8, 1.0, 0.9), (7.2, 2.1, 1.45), WEST, rack))
     cabinet = Frame((8.0, 0.8), WEST)
     boards = (0.12, 0.6, 1.0, 1.3, 1.6)
-    shelf_unit(place, rng, cabinet, 2.8, 0.25, boards, 1.95, ("counter_goods",), "7a2b2b", "counter_wall", focus_level=3)
+    shelf_unit(
+        place, rng, cabinet, 2.8, 0.25, boards, 1.95, ("counter_goods",), "7a2b2b", "counter_wall", focus_level=3
+    )
     # coffee corner in the north-east
-    place.box((7.05, 5.35, 0), (8.0, 6.0, 0.92), srgb("4a3428"), skip={(2, -1), (1, 1), (0, 1)},
-              fronts={(1, -1): ((4, 4), lambda i, j: srgb("d9a066") if (i + j) % 3 == 0 else srgb("6b4a36"))})  # fmt: skip
-    place.box((7.15, 5.55, 0.92), (7.55, 5.95, 1.5), srgb("26292b"), skip={(2, -1)},
-              fronts={(1, -1): ((3, 4), lambda i, j: (srgb("ff7a1a"), srgb("26292b"), srgb("a9b4b8"))[(i + j) % 3])})  # fmt: skip
-    place.box((7.62, 5.6, 0.92), (7.92, 5.9, 1.25), srgb("e8dcc8"), skip={(2, -1)},
-              fronts={(1, -1): ((2, 3), lambda i, j: srgb("b5493b") if j == 1 else srgb("e8dcc8"))})  # fmt: skip
+    place.box(
+        (7.05, 5.35, 0),
+        (8.0, 6.0, 0.92),
+        srgb("4a3428"),
+        skip={(2, -1), (1, 1), (0, 1)},
+        fronts={(1, -1): ((4, 4), lambda i, j: srgb("d9a066") if (i + j) % 3 == 0 else srgb("6b4a36"))},
+    )
+    place.box(
+        (7.15, 5.55, 0.92),
+        (7.55, 5.95, 1.5),
+        srgb("26292b"),
+        skip={(2, -1)},
+        fronts={(1, -1): ((3, 4), lambda i, j: (srgb("ff7a1a"), srgb("26292b"), srgb("a9b4b8"))[(i + j) % 3])},
+    )
+    place.box(
+        (7.62, 5.6, 0.92),
+        (7.92, 5.9, 1.25),
+        srgb("e8dcc8"),
+        skip={(2, -1)},
+        fronts={(1, -1): ((2, 3), lambda i, j: srgb("b5493b") if j == 1 else srgb("e8dcc8"))},
+    )
     machine = (7.15, 5.55, 0.95), (7.55, 5.95, 1.5)
     place.regions.append(Region("coffee", "coffee", (7.05, 5.35, 0.0), (8.0, 6.0, 1.5), SOUTH, machine))
 
@@ -194,7 +248,9 @@ def furnish(place: Place, rng) -> None:
     _gondola(place, rng, 2, 3.65, ("household", "cosmetics"), ("stationery", "household"), "offers", "2d6a8f")
     _gondola(place, rng, 3, 5.45, ("noodles", "bread"), ("bread", "sweets"), "offers", "4d7c3a")
     bays = ("cosmetics", "stationery", "household")
-    shelf_unit(place, rng, Frame((0.0, 0.7), EAST), 4.2, 0.35, (0.12, 0.55, 0.92, 1.26, 1.6), 2.0, bays, "a8792c", "wall")
+    shelf_unit(
+        place, rng, Frame((0.0, 0.7), EAST), 4.2, 0.35, (0.12, 0.55, 0.92, 1.26, 1.6), 2.0, bays, "a8792c", "wall"
+    )
     # coolers: deeper, taller, dark inside frames, with a bright header
     for k, category in enumerate(("dairy", "meals", "drinks", "drinks")):
         x = 0.55 + 1.6 * k
@@ -202,8 +258,12 @@ def furnish(place: Place, rng) -> None:
         boards = (0.25, 0.70, 1.10, 1.48)
         shelf_unit(place, rng, frame, 1.6, 0.6, boards, 1.9, (category,), "dfe7ea", f"cooler_{k + 1}", kick=0.25)
         sign = (srgb("2fa4d9"), srgb("ffffff"))
-        place.box(*frame.box((0, 1.6), (0, 0.6), (1.9, 2.2)), sign[0], skip={frame.back},
-                  fronts={frame.front: ((8, 2), lambda i, j, k=k: sign[(i // 2 + j + k) % 2])})  # fmt: skip
+        place.box(
+            *frame.box((0, 1.6), (0, 0.6), (1.9, 2.2)),
+            sign[0],
+            skip={frame.back},
+            fronts={frame.front: ((8, 2), lambda i, j, k=k: sign[(i // 2 + j + k) % 2])},
+        )
     rack = Frame((1.1, 0.0), NORTH)
     shelf_unit(place, rng, rack, 2.2, 0.28, (0.12, 0.55, 0.95), 1.35, ("magazines", "magazines"), "5a5f66", "rack")
     _counter(place, rng)

@@ -1,11 +1,11 @@
 """The layout of the demo store: one deterministic place made of axis-aligned boxes.
 
-The store is a convenience store of 8 x 6 x 3 m. Frame: x east, y north, z up, metres, the origin in the south-west corner
-of the floor. Three gondolas run north-south and make four aisles; coolers fill the north wall, a wall shelf the west wall,
-the counter stands in the east, the door is in the south wall.
+The store is a convenience store of 8 x 6 x 3 m. Frame: x east, y north, z up, metres, the origin in the south-west
+corner of the floor. Three gondolas run north-south and make four aisles; coolers fill the north wall, a wall shelf the
+west wall, the counter stands in the east, the door is in the south wall.
 
-Everything is opaque, diffuse and textured with colour patches of 10 to 50 cm: what a radiance field can learn from small
-pictures, and what exact ray casts answer without ambiguity.
+Everything is opaque, diffuse and textured with colour patches of 10 to 50 cm: what a radiance field can learn from
+small pictures, and what exact ray casts answer without ambiguity.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Region:
     focus: tuple
 
     def as_json(self) -> dict:
-        r = lambda v: [round(float(x), 4) for x in v]  # noqa: E731
+        r = lambda v: [round(float(x), 4) for x in v]
         return {
             "name": self.name,
             "category": self.category,
@@ -68,7 +68,8 @@ class Place:
     regions: list = field(default_factory=list)
 
     def patch(self, axis: int, sign: int, at: float, lo2, hi2, color) -> None:
-        """One rectangle in the plane ``axis = at``, facing ``sign``; lo2, hi2 in the two other axes in ascending order."""
+        """One rectangle in the plane ``axis = at``, facing ``sign``; lo2, hi2 in the two other axes in ascending
+        order."""
         a, b = [k for k in range(3) if k != axis]
         corners = np.empty((4, 3))
         corners[:, axis] = at
@@ -81,7 +82,8 @@ class Place:
         self.colors.append(np.asarray(color, float))
 
     def grid(self, axis: int, sign: int, at: float, lo2, hi2, cells, color_of) -> None:
-        """A rectangle cut into ``cells`` (n, m) patches; ``color_of(i, j)`` gives a colour, or None for a light panel."""
+        """A rectangle cut into ``cells`` (n, m) patches; ``color_of(i, j)`` gives a colour, or None for a light
+        panel."""
         us, vs = np.linspace(lo2[0], hi2[0], cells[0] + 1), np.linspace(lo2[1], hi2[1], cells[1] + 1)
         for i in range(cells[0]):
             for j in range(cells[1]):
@@ -140,14 +142,26 @@ def _shell(place: Place, rng) -> None:
     warm, grey, mat = srgb("d8cfc0"), srgb("b3aca2"), srgb("7f95a8")
     gain = 1.0 + 0.10 * rng.uniform(-1, 1, (16, 12))
     place.grid(
-        2, 1, 0.0, (0, 0), (X, Y), (16, 12),
+        2,
+        1,
+        0.0,
+        (0, 0),
+        (X, Y),
+        (16, 12),
         lambda i, j: gain[i, j] * (mat if j < 2 and 11 <= i <= 14 else (warm, grey)[(i + j) % 2]),
-    )  # fmt: skip
+    )
     tile = 1.0 + 0.08 * rng.uniform(-1, 1, (16, 12))
     place.grid(
-        2, -1, Z, (0, 0), (X, Y), (16, 12),
-        lambda i, j: None if i % 4 in (1, 2) and j % 3 == 1 else tile[i, j] * srgb("dedede" if (i + j) % 2 else "cfd3d8"),
-    )  # fmt: skip
+        2,
+        -1,
+        Z,
+        (0, 0),
+        (X, Y),
+        (16, 12),
+        lambda i, j: (
+            None if i % 4 in (1, 2) and j % 3 == 1 else tile[i, j] * srgb("dedede" if (i + j) % 2 else "cfd3d8")
+        ),
+    )
 
     # Walls in cells of 25 cm: a dado, a stripe in the colour of the wall, a light field with vertical bands above.
     walls = {
@@ -161,7 +175,9 @@ def _shell(place: Place, rng) -> None:
         gain = 1.0 + 0.10 * rng.uniform(-1, 1, (n, 12))
         wide = rng.random(n) < 0.35
 
-        def color_of(i, j, n=n, gain=gain, wide=wide, base=field_, stripe=stripe, band=band, south=(axis, sign) == (1, 1)):
+        def color_of(
+            i, j, n=n, gain=gain, wide=wide, base=field_, stripe=stripe, band=band, south=(axis, sign) == (1, 1)
+        ):
             x = (i + 0.5) * 0.25
             if south and 6.0 < x < 7.25 and j < 8:  # the door
                 return srgb("3c4a57" if j in (0, 7) or i in (24, 28) else "7fa6b8") * gain[i, j]

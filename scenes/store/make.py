@@ -79,13 +79,14 @@ def make_rays(job: Job) -> list[Path]:
 
 
 def make_gaze(job: Job) -> list[Path]:
-    """The gaze field, trained on the rays in the store's radiance field; 64 positions are held out and recorded in it."""
+    """The gaze field, trained on the rays in the store's radiance field; 64 positions are held out and recorded in
+    it."""
     import mitsuba as mi
 
-    from nerg_mi.rays.readers.collecting import file_sha256
-    from nerg_mi.rays.rays import Rays
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_radiance, save_gaze
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.rays.readers.collecting import file_sha256
     from nerg_mi.training.gaze.run import hold_out, train_gaze
     from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings, sized_gaze_config
     from nerg_mi.transport.media.media import FieldMedium
@@ -98,8 +99,9 @@ def make_gaze(job: Job) -> list[Path]:
     # Heads are drawn from the law at 5 Hz, so rays are independent and a narrow kernel is not noise.
     probes = ProbeSettings(kappa=100.0)
     rays, test = hold_out(Rays.load(source), probes.radius, zones=8, positions=64, seed=job.seed)
-    gaze, about = train_gaze(rays, FieldMedium(field), field.box, sized_gaze_config(),
-                             GazeSettings(steps=800, seed=job.seed), probes, ns)
+    gaze, about = train_gaze(
+        rays, FieldMedium(field), field.box, sized_gaze_config(), GazeSettings(steps=800, seed=job.seed), probes, ns
+    )
     if about["interrupted"]:
         raise KeyboardInterrupt
     files = {"rays_file": source, "field_file": place}
@@ -111,7 +113,9 @@ def make_gaze(job: Job) -> list[Path]:
 
 def _require(path: Path, stage: str) -> None:
     if not path.exists():
-        raise FileNotFoundError(f'"{path}" is missing; make it with: python -m nerg_mi.scenes.store.make --stage {stage}')
+        raise FileNotFoundError(
+            f'"{path}" is missing; make it with: python -m nerg_mi.scenes.store.make --stage {stage}'
+        )
 
 
 # Name and function, in order. A stage returns the files that it wrote.
@@ -128,7 +132,9 @@ STAGES = {
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(prog="python -m nerg_mi.scenes.store.make", description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0, help="everything is made from it (default: 0)")
-    parser.add_argument("--stage", action="append", choices=list(STAGES), help="only this one; may be given several times")
+    parser.add_argument(
+        "--stage", action="append", choices=list(STAGES), help="only this one; may be given several times"
+    )
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
     args = parser.parse_args(argv)
 

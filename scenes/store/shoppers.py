@@ -1,9 +1,9 @@
 """Shoppers: smooth walks through the demo store, and heads that follow the attention law.
 
-Each shopper enters at the door, visits areas of interest in an order of their own, pays and leaves. Walks follow a graph of
-waypoints through the aisles, with corners cut and lanes of their own; they never touch furniture. At 5 Hz the head's
-position is noted and its direction drawn from the law at that very position, independently of all others: the gaze field
-that is trained on these data has a known truth.
+Each shopper enters at the door, visits areas of interest in an order of their own, pays and leaves. Walks follow a
+graph of waypoints through the aisles, with corners cut and lanes of their own; they never touch furniture. At 5 Hz the
+head's position is noted and its direction drawn from the law at that very position, independently of all others: the
+gaze field that is trained on these data has a known truth.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from heapq import heappop, heappush
 from pathlib import Path
 
 import numpy as np
-
 from nerg_mi.scenes.store.attention_law import AttentionLaw
 from nerg_mi.scenes.store.layout import ROOM, Layout
 
@@ -27,7 +26,8 @@ ROWS = (0.8, 1.9, 2.9, 3.9, 4.8)  # y of the waypoints along them; the first and
 
 @dataclass(frozen=True)
 class Walk:
-    """One shopper's way: ``time`` (T,) in seconds since they entered, ``head`` (T, 3) in metres, ``standing`` (T,) bool."""
+    """One shopper's way: ``time`` (T,) in seconds since they entered, ``head`` (T, 3) in metres, ``standing`` (T,)
+    bool."""
 
     time: np.ndarray
     head: np.ndarray
@@ -86,7 +86,9 @@ def _cut_corners(line: np.ndarray, rounds: int = 4) -> np.ndarray:
     """Chaikin's smoothing with fixed ends: stays inside of the hull of each corner, so it never leaves an aisle."""
     for _ in range(rounds):
         a, b = line[:-1], line[1:]
-        line = np.concatenate([line[:1], np.stack([0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b], 1).reshape(-1, 2), line[-1:]])
+        line = np.concatenate(
+            [line[:1], np.stack([0.75 * a + 0.25 * b, 0.25 * a + 0.75 * b], 1).reshape(-1, 2), line[-1:]]
+        )
     return line
 
 

@@ -1,7 +1,7 @@
 """The digital twin of the demo store: ``twin.xml`` with two small meshes, and exact ray casts against them.
 
-``twin.ply`` carries one linear reflectance for each face (mesh attribute ``face_color``), ``twin_lights.ply`` the ceiling
-panels. Any stock Mitsuba renders ``twin.xml`` with its ``path`` integrator; units are metres, z up.
+``twin.ply`` carries one linear reflectance for each face (mesh attribute ``face_color``), ``twin_lights.ply`` the
+ceiling panels. Any stock Mitsuba renders ``twin.xml`` with its ``path`` integrator; units are metres, z up.
 """
 
 from __future__ import annotations
@@ -92,7 +92,9 @@ def _write_ply(path: Path, quads: np.ndarray, colors: np.ndarray | None) -> None
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     # Mitsuba groups the face properties color_0..2 into the attribute face_color
     header += [f"property float color_{k}" for k in range(3)] if colors is not None else []
-    write_bytes(path, "\n".join([*header, "end_header", ""]).encode(), vertices.astype("<f4").tobytes(), faces.tobytes())
+    write_bytes(
+        path, "\n".join([*header, "end_header", ""]).encode(), vertices.astype("<f4").tobytes(), faces.tobytes()
+    )
 
 
 def write_twin(layout, folder=HERE) -> list[Path]:
@@ -166,6 +168,8 @@ def visible(origins, points, scene=None, tolerance: float = 1e-3) -> np.ndarray:
     for a in range(0, len(o), CHUNK):
         offset = (p[a : a + CHUNK] - o[a : a + CHUNK]).astype(np.float64)
         length = np.linalg.norm(offset, axis=1)
-        ray, n = _rays(o[a : a + CHUNK], offset / np.maximum(length, 1e-12)[:, None], np.maximum(length - tolerance, 0.0))
+        ray, n = _rays(
+            o[a : a + CHUNK], offset / np.maximum(length, 1e-12)[:, None], np.maximum(length - tolerance, 0.0)
+        )
         out[a : a + n] = ~np.asarray(scene.ray_test(ray), bool)
     return out

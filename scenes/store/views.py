@@ -1,9 +1,9 @@
 """The posed pictures of the demo store: what a photographer with a depth camera would bring home.
 
-Writes into a folder: ``images/*.png`` (8-bit sRGB), ``depth/*.npy`` (float32 (h, w), metres along the ray from the camera's
-centre through each pixel's centre, exact; 0 where nothing is hit), ``transforms.json`` and ``transforms_test.json``
-(held-out views) with the conventions of instant-ngp and nerfstudio: OpenGL camera-to-world (x right, y up, z back), in the
-store's own metric frame with z up. ``aabb`` are the bounds of the store.
+Writes into a folder: ``images/*.png`` (8-bit sRGB), ``depth/*.npy`` (float32 (h, w), metres along the ray from the
+camera's centre through each pixel's centre, exact; 0 where nothing is hit), ``transforms.json`` and
+``transforms_test.json`` (held-out views) with the conventions of instant-ngp and nerfstudio: OpenGL camera-to-world (x
+right, y up, z back), in the store's own metric frame with z up. ``aabb`` are the bounds of the store.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import time
 from pathlib import Path
 
 import numpy as np
+from nerg_mi.scenes.store import cameras, twin
+from nerg_mi.scenes.store.layout import Layout
 
 from nerg_mi.files.atomic import replacing
 from nerg_mi.files.png import write_png
 from nerg_mi.files.tables import write_json
-from nerg_mi.scenes.store import cameras, twin
-from nerg_mi.scenes.store.layout import Layout
 
 BUILD = Path(__file__).resolve().parent / "build"
 
@@ -106,13 +106,22 @@ def transforms(camera: cameras.Pinhole, layout: Layout, frames: list) -> dict:
 
 
 def write_views(
-    layout: Layout, folder=BUILD, *, camera=None, train: int = 168, test: int = 12, spp: int = 64, seed: int = 0,
-    scene=None, say=print,
+    layout: Layout,
+    folder=BUILD,
+    *,
+    camera=None,
+    train: int = 168,
+    test: int = 12,
+    spp: int = 64,
+    seed: int = 0,
+    scene=None,
+    say=print,
 ) -> dict:
-    """Choose, render and write the picture set into ``folder``; returns the coverage figures, also in ``coverage.json``.
+    """Choose, render and write the picture set into ``folder``; returns the coverage figures, also in
+    ``coverage.json``.
 
-    ``train``, ``test``: numbers of views; ``spp``: samples a pixel of a training view; a held-out view gets four times as
-    many, so that its noise does not limit what it can measure; ``say``: where progress goes.
+    ``train``, ``test``: numbers of views; ``spp``: samples a pixel of a training view; a held-out view gets four times
+    as many, so that its noise does not limit what it can measure; ``say``: where progress goes.
     """
     camera = camera or cameras.Pinhole()
     folder = Path(folder)

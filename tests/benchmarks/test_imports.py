@@ -1,4 +1,5 @@
-"""Every script imports nerg_mi before Dr.Jit and Mitsuba: it chooses the libLLVM, and refuses one that would abort the process."""
+"""Every script imports nerg_mi before Dr.Jit and Mitsuba: it chooses the libLLVM, and refuses one that would abort the
+process."""
 
 from __future__ import annotations
 
@@ -14,7 +15,12 @@ SCRIPTS = sorted(p for folder in ("benchmarks", "examples", "tools") for p in (R
 def packages(tree: ast.Module, everywhere: bool) -> list[tuple[int, int, str]]:
     """Line, place in it, and first name of what is imported; ``everywhere``: inside of functions too."""
     nodes = ast.walk(tree) if everywhere else tree.body
-    found = [(n.lineno, n.col_offset + k, a.name.split(".")[0]) for n in nodes if isinstance(n, ast.Import) for k, a in enumerate(n.names)]
+    found = [
+        (n.lineno, n.col_offset + k, a.name.split(".")[0])
+        for n in nodes
+        if isinstance(n, ast.Import)
+        for k, a in enumerate(n.names)
+    ]
     found += [(n.lineno, n.col_offset, (n.module or "").split(".")[0]) for n in nodes_from(tree, everywhere)]
     return sorted(found)
 
@@ -32,7 +38,11 @@ def late(source: str) -> str | None:
         return f"line {needing[0][0]}: {needing[0][2]}"
     for node in ast.walk(tree):
         # Programs that are run in a process of their own.
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and "import mitsuba" in node.value.replace("drjit as dr, ", ""):
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and "import mitsuba" in node.value.replace("drjit as dr, ", "")
+        ):
             try:
                 inner = late(node.value)
             except SyntaxError:  # prose
@@ -53,7 +63,10 @@ def test01_libllvm_is_chosen_first(path):
         ("import mitsuba as mi\nimport nerg_mi", "line 1: mitsuba"),
         ("def main():\n    import drjit as dr\n    import nerg_mi", "line 2: drjit"),
         ("from drjit import auto\n", "line 1: drjit"),
-        ("import nerg_mi\nRUN = 'import drjit as dr, mitsuba as mi; import nerg_mi'", "in the program at line 2, line 1: drjit"),
+        (
+            "import nerg_mi\nRUN = 'import drjit as dr, mitsuba as mi; import nerg_mi'",
+            "in the program at line 2, line 1: drjit",
+        ),
         ("import nerg_mi, mitsuba as mi", None),
         ("import nerg_mi.scenes\nimport mitsuba", None),
         ("'''An import mitsuba in prose.'''", None),

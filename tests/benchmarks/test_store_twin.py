@@ -1,5 +1,5 @@
-"""The measurement of the inserted display, on a field that stands in for the store's: what it must find there, and that it
-can tell a display in the wrong place."""
+"""The measurement of the inserted display, on a field that stands in for the store's: what it must find there, and that
+it can tell a display in the wrong place."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,8 @@ def test01_distances_to_boxes():
 
 def test02_a_display_hides_what_it_must_and_nothing_else(files):
     got = store_twin.measure_display(store_scene().parent, 48, files)
-    # The stand-in is marched in steps of 5 cm: tolerances are 10 cm, and more than the margins for the store's are undecided.
+    # The stand-in is marched in steps of 5 cm: tolerances are 10 cm, and more than the margins for the store's are
+    # undecided.
     assert got["on"] > 20 and got["display_depth_right"] == 1 and got["display_visibility"] > 0.8
     assert got["off_depth_same"] == 1 and got["free"] > 500 and got["free_same"] > 0.99
     assert got["dark"] > 10 and got["dark_gaze_0"] > 0.9 and got["dark_gaze_before"] > 0

@@ -1,11 +1,12 @@
 """The scene box around an object, in a room and around points; and cameras that see what no other does."""
+
 import numpy as np
 import pytest
 
 from nerg_mi.capture.bounds import lonely, scene_box
 from nerg_mi.capture.cameras import Camera
-from nerg_mi.maths.box import Box
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.maths.box import Box
 
 LENS = Intrinsics(10, 10, 10.0, 10.0, 5.0, 5.0)
 

@@ -1,4 +1,5 @@
 """Rays of cameras: distortion, projection, and agreement with Mitsuba's own camera."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -40,7 +41,9 @@ def test_view_tangents_hold_every_pixel(fisheye):
     for limit, reached in ((left, -x.min()), (right, x.max()), (up, -y.min()), (down, y.max())):
         assert reached < limit < reached + 0.01
     assert view_tangents(Intrinsics(10, 20, 10.0, 10.0, 4.0, 9.0)) == pytest.approx((0.4, 0.6, 0.9, 1.1))
-    assert max(view_tangents(Intrinsics(10, 10, 2.0, 2.0, 5.0, 5.0, fisheye=True))) == pytest.approx(np.tan(np.radians(85)))
+    assert max(view_tangents(Intrinsics(10, 10, 2.0, 2.0, 5.0, 5.0, fisheye=True))) == pytest.approx(
+        np.tan(np.radians(85))
+    )
 
 
 def test_points_behind_a_camera_are_not_in_front():

@@ -1,12 +1,13 @@
 """COLMAP models, built byte by byte and line by line here: cameras, poses, points, and what cannot be read."""
+
 import struct
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import NergError
 from nerg_mi.capture.colmap import model_files, read_colmap
+from nerg_mi.errors import NergError
 
 # COLMAP's camera models: number, name, parameters.
 CAMERAS = {
@@ -23,11 +24,15 @@ CAMERAS = {
 }
 # fx, fy, k1, k2, p1, p2, k3, k4, k5, k6, fisheye of the first nine.
 EXPECTED = {
-    1: (50, 50, 0, 0, 0, 0, 0, 0, 0, 0, False), 2: (50, 51, 0, 0, 0, 0, 0, 0, 0, 0, False),
-    3: (50, 50, 0.1, 0, 0, 0, 0, 0, 0, 0, False), 4: (50, 50, 0.1, 0.02, 0, 0, 0, 0, 0, 0, False),
-    5: (50, 51, 0.1, 0.02, 0.003, 0.004, 0, 0, 0, 0, False), 6: (50, 51, 0.1, 0.02, 0, 0, 0.003, 0.004, 0, 0, True),
+    1: (50, 50, 0, 0, 0, 0, 0, 0, 0, 0, False),
+    2: (50, 51, 0, 0, 0, 0, 0, 0, 0, 0, False),
+    3: (50, 50, 0.1, 0, 0, 0, 0, 0, 0, 0, False),
+    4: (50, 50, 0.1, 0.02, 0, 0, 0, 0, 0, 0, False),
+    5: (50, 51, 0.1, 0.02, 0.003, 0.004, 0, 0, 0, 0, False),
+    6: (50, 51, 0.1, 0.02, 0, 0, 0.003, 0.004, 0, 0, True),
     7: (50, 51, 0.1, 0.02, 0.003, 0.004, 0.05, 0.06, 0.07, 0.08, False),
-    8: (50, 50, 0.1, 0, 0, 0, 0, 0, 0, 0, True), 9: (50, 50, 0.1, 0.02, 0, 0, 0, 0, 0, 0, True),
+    8: (50, 50, 0.1, 0, 0, 0, 0, 0, 0, 0, True),
+    9: (50, 50, 0.1, 0.02, 0, 0, 0, 0, 0, 0, True),
 }
 
 
@@ -69,13 +74,15 @@ def write_bin(folder, names, cameras=CAMERAS):
 
 def write_txt(folder, names, cameras=CAMERAS):
     rotations, translations = poses(len(names))
-    show = lambda values: " ".join(repr(float(v)) for v in values)  # noqa: E731
+    show = lambda values: " ".join(repr(float(v)) for v in values)
     lines = ["# Camera list", *(f"{n} {m} {w} {h} {show(p)}" for n, (_, m, w, h, p) in cameras.items())]
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
     lines = ["# Image list"]
     for k, name in enumerate(names):
-        lines += [f"{k + 1} {show(quaternion(rotations[k]))} {show(translations[k])} {k + 1} {name}",
-                  " ".join("1.5 2.5 -1" for _ in range(k))]
+        lines += [
+            f"{k + 1} {show(quaternion(rotations[k]))} {show(translations[k])} {k + 1} {name}",
+            " ".join("1.5 2.5 -1" for _ in range(k)),
+        ]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     lines = ["# 3D point list"]
     for k, p in enumerate(POINTS):
@@ -149,8 +156,9 @@ def test_a_zero_quaternion_is_listed(tmp_path):
     assert [f.name for f in posed.frames] == ["b.png"] and "quaternion" in posed.unused[0].reason
 
 
-@pytest.mark.parametrize("name, record", [("cameras", "camera record"), ("images", "image record"),
-                                          ("points3D", "point record")])
+@pytest.mark.parametrize(
+    "name, record", [("cameras", "camera record"), ("images", "image record"), ("points3D", "point record")]
+)
 def test_a_binary_file_cut_short_is_told_with_its_place(tmp_path, name, record):
     (tmp_path / "a.png").write_bytes(b"")
     write_bin(tmp_path, ["a.png"])

@@ -1,4 +1,5 @@
 """One set of known cameras and pictures, written in every format and read back ray by ray."""
+
 import json
 import struct
 from dataclasses import replace
@@ -10,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.dataset import open_dataset
 from nerg_mi.capture.intrinsics import Intrinsics
-
 from tests.reference import opencv
 
 W, H = 14, 10
@@ -40,7 +40,9 @@ def expected_rays(lens, pose):
     """Origin and unit directions (H, W, 3) by the restated models."""
     inverse = opencv.fisheye_undistort if lens.fisheye else opencv.undistort
     k = (lens.k1, lens.k2, lens.k3, lens.k4) if lens.fisheye else lens.distortion
-    d = np.array([[inverse(u, v, lens.fx, lens.fy, lens.cx - 0.5, lens.cy - 0.5, k) for u in range(W)] for v in range(H)])
+    d = np.array(
+        [[inverse(u, v, lens.fx, lens.fy, lens.cx - 0.5, lens.cy - 0.5, k) for u in range(W)] for v in range(H)]
+    )
     d = d @ pose[:, :3].T
     return pose[:, 3], d / np.linalg.norm(d, axis=-1, keepdims=True)
 
@@ -50,7 +52,16 @@ def opengl(pose):
 
 
 def lens_keys(lens):
-    keys = {"w": W, "h": H, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "k1": lens.k1, "k2": lens.k2}
+    keys = {
+        "w": W,
+        "h": H,
+        "fl_x": lens.fx,
+        "fl_y": lens.fy,
+        "cx": lens.cx,
+        "cy": lens.cy,
+        "k1": lens.k1,
+        "k2": lens.k2,
+    }
     return {**keys, "k3": lens.k3, "k4": lens.k4} if lens.fisheye else {**keys, "p1": lens.p1, "p2": lens.p2}
 
 
@@ -71,7 +82,13 @@ def nerfstudio(folder, mi, lens):
         m[:3, 3] *= s
         frames.append({"file_path": f"images/{k}.png", "transform_matrix": m.tolist()})
     model = {"camera_model": "OPENCV_FISHEYE"} if lens.fisheye else {"camera_model": "OPENCV"}
-    content = {**model, **lens_keys(lens), "applied_transform": applied[:3].tolist(), "applied_scale": s, "frames": frames}
+    content = {
+        **model,
+        **lens_keys(lens),
+        "applied_transform": applied[:3].tolist(),
+        "applied_scale": s,
+        "frames": frames,
+    }
     (folder / "transforms.json").write_text(json.dumps(content))
     return "original"
 
@@ -79,8 +96,10 @@ def nerfstudio(folder, mi, lens):
 def instant_ngp(folder, mi, lens):
     """Lens in every frame, frames in no order."""
     save_pictures(folder, mi, [f"images/{k}.png" for k in range(COUNT)])
-    frames = [{"file_path": f"./images/{k}.png", "transform_matrix": opengl(p).tolist(), "sharpness": 3.0, **lens_keys(lens)}
-              for k, p in enumerate(cameras())]
+    frames = [
+        {"file_path": f"./images/{k}.png", "transform_matrix": opengl(p).tolist(), "sharpness": 3.0, **lens_keys(lens)}
+        for k, p in enumerate(cameras())
+    ]
     content = {"aabb_scale": 4, "frames": frames[::-1], **({"is_fisheye": True} if lens.fisheye else {})}
     (folder / "transforms.json").write_text(json.dumps(content))
     return "file"
@@ -103,7 +122,8 @@ def colmap_bin(folder, mi, lens):
     (folder / "sparse/0").mkdir(parents=True)
     model, _, names = COLMAP_LENS[lens.fisheye]
     (folder / "sparse/0/cameras.bin").write_bytes(
-        struct.pack("<QiiQQ8d", 1, 7, model, W, H, *(getattr(lens, n) for n in names)))
+        struct.pack("<QiiQQ8d", 1, 7, model, W, H, *(getattr(lens, n) for n in names))
+    )
     out = struct.pack("<Q", COUNT)
     for k, pose in enumerate(cameras()):
         q, t = world_to_camera(pose)
@@ -141,7 +161,7 @@ def test_every_format_gives_the_same_rays_and_pixels(tmp_path, rgb, write, lens)
 
 def test_blender_style_folders_keep_their_split(tmp_path, rgb):
     """Suffixes left out, RGBA, an angle for a lens, and three files that name the parts."""
-    parts = {"train": range(0, 5), "val": range(5, 6), "test": range(6, 9)}
+    parts = {"train": range(5), "val": range(5, 6), "test": range(6, 9)}
     angle = 0.9
     for part, numbers in parts.items():
         (tmp_path / part).mkdir()
@@ -149,12 +169,16 @@ def test_blender_style_folders_keep_their_split(tmp_path, rgb):
         for k in numbers:
             rgba = np.dstack([picture(k), np.full((H, W), 40 * (k % 6), np.uint8)])
             rgb.Bitmap(rgba, rgb.Bitmap.PixelFormat.RGBA).write(str(tmp_path / part / f"r_{k}.png"))
-            frames.append({"file_path": f"./{part}/r_{k}", "rotation": 0.1, "transform_matrix": opengl(cameras()[k]).tolist()})
+            frames.append(
+                {"file_path": f"./{part}/r_{k}", "rotation": 0.1, "transform_matrix": opengl(cameras()[k]).tolist()}
+            )
         (tmp_path / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     data = open_dataset(tmp_path)
     assert [v.name for v in data.train] == [f"./train/r_{k}" for k in range(5)]
     assert [v.name for v in data.held_out] == [f"./test/r_{k}" for k in range(6, 9)]
-    assert data.source["held_out"]["how"] == "transforms_test.json" and data.box_from == "the region that the views share"
+    assert (
+        data.source["held_out"]["how"] == "transforms_test.json" and data.box_from == "the region that the views share"
+    )
     plain = Intrinsics(W, H, *2 * [W / 2 / np.tan(angle / 2)], W / 2, H / 2)
     for view, k in zip(data.train, parts["train"]):
         _, d = expected_rays(plain, cameras()[k])
@@ -192,8 +216,15 @@ def test_frames_that_cannot_be_used_are_left_out_and_listed(ring, rgb):
     data = open_dataset(ring, holdout=0)
     assert [v.name for v in data.train] == [f"./images/{k}.png" for k in (6, 7, 8)]
     reasons = {u.name: u.reason for u in data.unused}
-    for k, part in {0: "does not exist", 1: "singular", 2: "14 x 10", 3: "3.png", 4: "inverted", 5: "no other frame",
-                    6: "twice"}.items():
+    for k, part in {
+        0: "does not exist",
+        1: "singular",
+        2: "14 x 10",
+        3: "3.png",
+        4: "inverted",
+        5: "no other frame",
+        6: "twice",
+    }.items():
         assert part in reasons[f"./images/{k}.png"]
     assert data.source["unused"] == reasons and data.source["training_frames"] == 3
     assert str(data.unused[0]).startswith('left out "./images/')
@@ -235,14 +266,17 @@ def test_frames_held_out_are_never_trained_on(ring):
 
 
 def test_lists_of_file_names_split(ring):
-    rewrite(ring, lambda c: c.update(train_filenames=[f"images/{k}.png" for k in range(5)], test_filenames=["images/8.png"]))
+    rewrite(
+        ring, lambda c: c.update(train_filenames=[f"images/{k}.png" for k in range(5)], test_filenames=["images/8.png"])
+    )
     data = open_dataset(ring)
     assert (len(data.train), [v.name for v in data.held_out]) == (5, ["./images/8.png"])
     assert "3 frames" in data.notes[0]
 
 
 def test_masks_and_depth_arrive_at_the_chosen_size(ring, rgb):
-    """A mask's border leaves out every pixel that it touches; millimetres along the axis become distances along rays."""
+    """A mask's border leaves out every pixel that it touches; millimetres along the axis become distances along
+    rays."""
     mask = np.full((H, W), 255, np.uint8)
     mask[:, 5:] = 0
     rgb.Bitmap(mask).write(str(ring / "mask.png"))

@@ -1,13 +1,14 @@
 """Loading pictures, masks and depth at a size, and splitting them."""
+
 import json
 
 import numpy as np
 import pytest
 
-from nerg_mi.capture.images import View, load_usable, load_view, split_holdout
+from nerg_mi.capture.images import load_usable, load_view, split_holdout
 from nerg_mi.capture.reading import read_image
-from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.capture.transforms import read_transforms
+from nerg_mi.files.exr import write_bitmap_exr
 
 
 @pytest.fixture
@@ -21,7 +22,9 @@ def dataset(tmp_path, rgb):
         np.save(tmp_path / f"{k:02d}.npy", np.full((8, 12), k + 1.0, np.float32))
         pose = np.eye(4)
         pose[0, 3] = k
-        frames.append({"file_path": f"{k:02d}.png", "transform_matrix": pose.tolist(), "depth_file_path": f"{k:02d}.npy"})
+        frames.append(
+            {"file_path": f"{k:02d}.png", "transform_matrix": pose.tolist(), "depth_file_path": f"{k:02d}.npy"}
+        )
         pictures.append(picture)
     content = {"w": 12.0, "h": 8.0, "fl_x": 10.0, "aabb": [[0, 0, 0], [8, 4, 2]], "frames": frames[::-1]}
     (tmp_path / "transforms.json").write_text(json.dumps(content))

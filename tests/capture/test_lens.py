@@ -1,4 +1,5 @@
 """Lens models against OpenCV's, restated; and their inverses."""
+
 from dataclasses import replace
 
 import numpy as np

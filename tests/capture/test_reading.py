@@ -1,10 +1,11 @@
 """Pictures, depth and masks of every kind of file, written here with known numbers."""
+
 import numpy as np
 import pytest
 
+from nerg_mi.capture.posed import DepthFile, MaskFile
 from nerg_mi.capture.reading import read_depth, read_image, read_mask
 from nerg_mi.files.exr import write_bitmap_exr
-from nerg_mi.capture.posed import DepthFile, MaskFile
 
 
 def to_srgb(x):

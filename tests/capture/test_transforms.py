@@ -1,12 +1,13 @@
 """Reading transforms files: what is understood, what is listed, what is refused."""
+
 import json
 
 import numpy as np
 import pytest
 
-from nerg_mi.errors import NergError
 from nerg_mi.capture.posed import DepthFile, MaskFile
 from nerg_mi.capture.transforms import read_dataparser, read_transforms
+from nerg_mi.errors import NergError
 
 POSE = np.eye(4).tolist()
 
@@ -30,8 +31,19 @@ def frame(name, **keys):
 
 
 def test_shared_intrinsics_prefer_the_focal_length(write):
-    t = read_transforms(write({"w": 20.0, "h": 10.0, "fl_x": 30.0, "camera_angle_x": 1.0, "cx": 9.0, "k1": 0.1,
-                               "frames": [frame("b.png"), frame("a.png")]}))
+    t = read_transforms(
+        write(
+            {
+                "w": 20.0,
+                "h": 10.0,
+                "fl_x": 30.0,
+                "camera_angle_x": 1.0,
+                "cx": 9.0,
+                "k1": 0.1,
+                "frames": [frame("b.png"), frame("a.png")],
+            }
+        )
+    )
     assert [f.name for f in t.frames] == ["a.png", "b.png"]
     i = t.frames[0].intrinsics(20, 10)
     assert (i.fx, i.fy, i.cx, i.cy, i.distortion[:4]) == (30.0, 30.0, 9.0, 5.0, (0.1, 0, 0, 0))
@@ -60,7 +72,9 @@ def test_rational_lens_only_where_it_is_named(write):
 
 
 def test_blender_style(write):
-    path = write({"camera_angle_x": np.pi / 2, "frames": [frame("./train/r_0")]}, ["train/r_0.png"], "transforms_train.json")
+    path = write(
+        {"camera_angle_x": np.pi / 2, "frames": [frame("./train/r_0")]}, ["train/r_0.png"], "transforms_train.json"
+    )
     t = read_transforms(path)
     assert t.frames[0].image.name == "r_0.png"
     assert np.isclose(t.frames[0].intrinsics(800, 800).fx, 400)
@@ -72,11 +86,16 @@ def test_scene_box(write):
 
 
 def test_masks_of_nerfstudio_and_instant_ngp(write):
-    path = write({"fl_x": 1.0, "frames": [frame("a.png", mask_path="m/a.png"), frame("b.jpg"), frame("c.png")]},
-                 ["a.png", "m/a.png", "b.jpg", "dynamic_mask_b.png", "c.png"])
+    path = write(
+        {"fl_x": 1.0, "frames": [frame("a.png", mask_path="m/a.png"), frame("b.jpg"), frame("c.png")]},
+        ["a.png", "m/a.png", "b.jpg", "dynamic_mask_b.png", "c.png"],
+    )
     folder = path.parent
-    assert [f.mask for f in read_transforms(path).frames] == \
-        [MaskFile(folder / "m/a.png"), MaskFile(folder / "dynamic_mask_b.png", hides=True), None]
+    assert [f.mask for f in read_transforms(path).frames] == [
+        MaskFile(folder / "m/a.png"),
+        MaskFile(folder / "dynamic_mask_b.png", hides=True),
+        None,
+    ]
 
 
 def test_units_and_kinds_of_depth(write):
@@ -98,30 +117,45 @@ def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
     mirrored, sheared, transposed = np.diag([-1.0, 1, 1, 1]), np.eye(4), np.eye(4)
     sheared[0, 1], transposed[3, :3] = 0.3, [1, 2, 3]
     names = [f"{c}.png" for c in "abcdefghijk"]
-    path = write({"fl_x": 1.0, "frames": [
-        frame("a.png"),
-        frame("b.png", transform_matrix=mirrored.tolist()),
-        frame("c.png", transform_matrix=sheared.tolist()),
-        frame("d.png", transform_matrix=transposed.tolist()),
-        frame("e.png", transform_matrix=[[float("nan")] * 4] * 4),
-        frame("f.png", mask_path="none.png"),
-        frame("./a.png"),
-        frame("g.png", camera_model="EQUIRECTANGULAR"),
-        {"file_path": "h.png"},
-        {"transform_matrix": POSE},
-        frame("gone.png"),
-        frame("i.png", fl_x="wide"),
-        frame("j.png", transform_matrix=[[1, 2], [3]]),
-        frame("k.png", mask_path=5),
-    ]}, names)
+    path = write(
+        {
+            "fl_x": 1.0,
+            "frames": [
+                frame("a.png"),
+                frame("b.png", transform_matrix=mirrored.tolist()),
+                frame("c.png", transform_matrix=sheared.tolist()),
+                frame("d.png", transform_matrix=transposed.tolist()),
+                frame("e.png", transform_matrix=[[float("nan")] * 4] * 4),
+                frame("f.png", mask_path="none.png"),
+                frame("./a.png"),
+                frame("g.png", camera_model="EQUIRECTANGULAR"),
+                {"file_path": "h.png"},
+                {"transform_matrix": POSE},
+                frame("gone.png"),
+                frame("i.png", fl_x="wide"),
+                frame("j.png", transform_matrix=[[1, 2], [3]]),
+                frame("k.png", mask_path=5),
+            ],
+        },
+        names,
+    )
     t = read_transforms(path)
     # The name that sorts first of the two spellings of one file is the one kept.
     assert [f.name for f in t.frames] == ["./a.png"]
     reasons = {u.name: u.reason for u in t.unused}
     for name, part in {
-        "b.png": "mirrored", "c.png": "sheared", "d.png": "transposed", "e.png": "finite", "f.png": "none.png",
-        "a.png": "twice", "g.png": "EQUIRECTANGULAR", "h.png": "transform_matrix", "frame 9": "file_path",
-        "gone.png": "does not exist", "i.png": "fl_x", "j.png": "4 x 4",
+        "b.png": "mirrored",
+        "c.png": "sheared",
+        "d.png": "transposed",
+        "e.png": "finite",
+        "f.png": "none.png",
+        "a.png": "twice",
+        "g.png": "EQUIRECTANGULAR",
+        "h.png": "transform_matrix",
+        "frame 9": "file_path",
+        "gone.png": "does not exist",
+        "i.png": "fl_x",
+        "j.png": "4 x 4",
         "k.png": "mask_path",
     }.items():
         assert part in reasons.pop(name), name
@@ -180,9 +214,17 @@ def test_original_coordinates_undo_what_was_applied(write):
     pose[:3, 3] = [4, 5, 6]
     applied = np.eye(4)
     applied[:3, :3], applied[:3, 3] = turn, s * (turn @ pose[:3, 3] + shift)
-    t = read_transforms(write({"fl_x": 1.0, "applied_transform": np.column_stack([turn, shift]).tolist(), "applied_scale": s,
-                               "aabb": [[0, 0, 0], [1, 2, 3]],
-                               "frames": [frame("a.png", transform_matrix=applied.tolist())]}))
+    t = read_transforms(
+        write(
+            {
+                "fl_x": 1.0,
+                "applied_transform": np.column_stack([turn, shift]).tolist(),
+                "applied_scale": s,
+                "aabb": [[0, 0, 0], [1, 2, 3]],
+                "frames": [frame("a.png", transform_matrix=applied.tolist())],
+            }
+        )
+    )
     back = t.moved(t.original)
     assert np.allclose(back.frames[0].to_world, pose)
     assert np.allclose(back.original, np.eye(4)) and np.allclose(back.to_file @ t.original, np.eye(4))
@@ -206,8 +248,17 @@ def test_a_mirroring_change_of_coordinates_is_refused(write):
 
 def test_nerfstudios_lists_of_files_split(write):
     names = ["a.png", "b.png", "c.png", "d.png"]
-    t = read_transforms(write({"fl_x": 1.0, "frames": [frame(n) for n in names], "train_filenames": ["a.png", "./b.png"],
-                               "test_filenames": ["d.png"]}, names))
+    t = read_transforms(
+        write(
+            {
+                "fl_x": 1.0,
+                "frames": [frame(n) for n in names],
+                "train_filenames": ["a.png", "./b.png"],
+                "test_filenames": ["d.png"],
+            },
+            names,
+        )
+    )
     assert (t.held_out, t.spare) == (["d.png"], ["c.png"])
 
 
@@ -220,8 +271,17 @@ def test_the_fox(recorded):
     assert (i.fx, i.fy, i.k2) == (1375.52, 1374.49, -0.0805099)
 
 
-@pytest.mark.parametrize("keys", [{"file_path": "../out/x.png"}, {"mask_path": "../out/x.png"}, {"depth_file_path": "../out/x.png"},
-                                  {"file_path": "linked/x.png"}, {"mask_path": "linked/x.png"}, {"depth_path": "link.png"}])
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"file_path": "../out/x.png"},
+        {"mask_path": "../out/x.png"},
+        {"depth_file_path": "../out/x.png"},
+        {"file_path": "linked/x.png"},
+        {"mask_path": "linked/x.png"},
+        {"depth_path": "link.png"},
+    ],
+)
 def test_files_outside_of_the_folder_are_used_only_if_allowed(tmp_path, keys):
     home, out = tmp_path / "set", tmp_path / "out"
     home.mkdir()
@@ -230,7 +290,9 @@ def test_files_outside_of_the_folder_are_used_only_if_allowed(tmp_path, keys):
         path.write_bytes(b"")
     (home / "linked").symlink_to(out)
     (home / "link.png").symlink_to(out / "x.png")
-    (home / "transforms.json").write_text(json.dumps({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]}))
+    (home / "transforms.json").write_text(
+        json.dumps({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]})
+    )
     t = read_transforms(home / "transforms.json")
     assert [f.name for f in t.frames] == ["b.png"]
     assert "outside of the data set's folder" in t.unused[0].reason and "--allow-outside" in t.unused[0].reason
@@ -253,12 +315,21 @@ def test_links_within_the_folder_are_followed(tmp_path, write):
     assert len(read_transforms(path).frames) == len(read_transforms(outer / "transforms.json").frames) == 1
 
 
-@pytest.mark.parametrize("keys", [
-    {"transform_matrix": [[1e300, 0, 0, 0], [0, 1e300, 0, 0], [0, 0, 1e300, 0], [0, 0, 0, 1]]}, {"transform_matrix": [[10**400] * 4] * 4},
-    {"transform_matrix": [[1, 0, 0, 1e13], [0, 1, 0, 0], [0, 0, 1, 0]]}, {"fl_x": 10**400}, {"k1": [1]}, {"file_path": "a\0b"},
-    {"file_path": "x" * 5000}, {"camera_model": ["OPENCV"]}, {"mask_path": "y" * 5000},
-    {"depth_file_path": "a.png", "depth_unit_scale_factor": float("inf")},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"transform_matrix": [[1e300, 0, 0, 0], [0, 1e300, 0, 0], [0, 0, 1e300, 0], [0, 0, 0, 1]]},
+        {"transform_matrix": [[10**400] * 4] * 4},
+        {"transform_matrix": [[1, 0, 0, 1e13], [0, 1, 0, 0], [0, 0, 1, 0]]},
+        {"fl_x": 10**400},
+        {"k1": [1]},
+        {"file_path": "a\0b"},
+        {"file_path": "x" * 5000},
+        {"camera_model": ["OPENCV"]},
+        {"mask_path": "y" * 5000},
+        {"depth_file_path": "a.png", "depth_unit_scale_factor": float("inf")},
+    ],
+)
 def test_numbers_and_names_that_nothing_can_hold_cost_their_frame(write, keys):
     t = read_transforms(write({"fl_x": 30.0, "frames": [frame("b.png"), {**frame("a.png"), **keys}]}))
     assert len(t.frames) == len(t.unused) == 1 and str(t.unused[0]).isprintable()
@@ -271,8 +342,16 @@ def test_lenses_that_no_camera_has_are_refused(write, keys):
         t.frames[0].intrinsics(8, 8)
 
 
-@pytest.mark.parametrize("content", [{"applied_scale": 1e-320}, {"applied_scale": 10**400}, {"applied_transform": [[1e300] * 4] * 3},
-                                     {"aabb": [[10**400] * 3, [0, 0, 0]]}, {"aabb": [[-1e300] * 3, [1e300] * 3]}])
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"applied_scale": 1e-320},
+        {"applied_scale": 10**400},
+        {"applied_transform": [[1e300] * 4] * 3},
+        {"aabb": [[10**400] * 3, [0, 0, 0]]},
+        {"aabb": [[-1e300] * 3, [1e300] * 3]},
+    ],
+)
 def test_numbers_of_the_file_are_bounded(write, content):
     with pytest.raises(NergError, match="transforms.json"):
         read_transforms(write({"fl_x": 30.0, **content, "frames": [frame("a.png")]}))

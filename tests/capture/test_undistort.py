@@ -1,4 +1,5 @@
 """Photos made pinhole and renderings bent to a lens, against a smooth picture of the sky known in every direction."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -6,8 +7,8 @@ import pytest
 
 from nerg_mi.capture.cameras import Camera, pixel_directions
 from nerg_mi.capture.images import View
-from nerg_mi.capture.undistort import pinhole, through_lens, undistorted
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.capture.undistort import pinhole, through_lens, undistorted
 
 PLAIN = Intrinsics(90, 70, 80.0, 80.0, 44.0, 36.5)
 LENSES = {
@@ -21,8 +22,14 @@ POSE = np.array([[0, 0, 1.0, 1], [1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
 
 def sky(d):
     """Smooth colours of world directions."""
-    return np.stack([0.5 + 0.3 * np.sin(4 * d[..., 0] + 2 * d[..., 1]), 0.5 + 0.4 * np.cos(3 * d[..., 2] - d[..., 0]),
-                     0.5 + 0.3 * np.sin(5 * d[..., 1] * d[..., 2])], axis=-1)
+    return np.stack(
+        [
+            0.5 + 0.3 * np.sin(4 * d[..., 0] + 2 * d[..., 1]),
+            0.5 + 0.4 * np.cos(3 * d[..., 2] - d[..., 0]),
+            0.5 + 0.3 * np.sin(5 * d[..., 1] * d[..., 2]),
+        ],
+        axis=-1,
+    )
 
 
 def picture(intrinsics):

@@ -9,12 +9,19 @@ import pytest
 import nerg_mi.cli
 from nerg_mi.view import demo
 from tests.cli.test_render import NERG, interrupt
-from tests.view.standins import write_standins
 from tests.pictures import mitsuba_bitmap
+from tests.view.standins import write_standins
 
 NAMES = {
-    "occlusion.png", "gaze.png", "gaze_sphere.png", "depth.png", "visibility.png", "color.png", "scene.exr", "run.json",
-}  # fmt: skip
+    "occlusion.png",
+    "gaze.png",
+    "gaze_sphere.png",
+    "depth.png",
+    "visibility.png",
+    "color.png",
+    "scene.exr",
+    "run.json",
+}
 TINY = ("--width", 48, "--spp", 1, "-m", "llvm_ad_rgb")
 
 
@@ -60,7 +67,9 @@ def test01_writes_and_names_everything(rgb, standins, tmp_path, capsys):
 def test02_equal_seeds_equal_files(rgb, standins, tmp_path):
     def outputs(name, seed):
         sizes = {"width": 36, "spp": 1}
-        return demo.run_demo(tmp_path / name, defaults=standins, seed=seed, variant="llvm_ad_rgb", **sizes).report["outputs"]
+        return demo.run_demo(tmp_path / name, defaults=standins, seed=seed, variant="llvm_ad_rgb", **sizes).report[
+            "outputs"
+        ]
 
     first, second, other = outputs("a", 3), outputs("b", 3), outputs("c", 4)
     assert first == second
@@ -72,7 +81,7 @@ def test03_missing_checkpoint_names_the_command(standins, tmp_path, capsys, name
     files = {**standins, name: str(tmp_path / "nowhere.safetensors")}
     assert nerg("demo", "--out", tmp_path / "out", *TINY, *defines(files)) == 1
     said = capsys.readouterr().err
-    assert f'the {name} checkpoint' in said and "python -m nerg_mi.scenes.store.make" in said
+    assert f"the {name} checkpoint" in said and "python -m nerg_mi.scenes.store.make" in said
     assert not (tmp_path / "out").exists()
 
 
@@ -96,12 +105,26 @@ def test05_the_store_itself(rgb, tmp_path):
     assert np.all(hidden.aovs["gaze"][seen == 0] == 0) and plain.aovs["gaze"][seen == 0].max() > 0
     x, y = demo._pixel_of_observer(rgb, scene)
     assert 0 < x < 60 and 0 < y < 40
-    sphere = demo._render(rgb, rgb.load_file(str(demo.store_scene()), sphere_width="64", sphere_height="32"), demo.SPHERE, 1, 0)
+    sphere = demo._render(
+        rgb, rgb.load_file(str(demo.store_scene()), sphere_width="64", sphere_height="32"), demo.SPHERE, 1, 0
+    )
     assert 0.7 < demo._integral(sphere) < 1.3  # a density over the sphere
 
 
 def test06_ctrl_c_ends_it_and_leaves_nothing(standins, tmp_path):
-    arguments = [*NERG, "demo", "--out", tmp_path / "out", "--width", "2000", "--spp", "1000", "-m", "llvm_ad_rgb", *defines(standins)]
+    arguments = [
+        *NERG,
+        "demo",
+        "--out",
+        tmp_path / "out",
+        "--width",
+        "2000",
+        "--spp",
+        "1000",
+        "-m",
+        "llvm_ad_rgb",
+        *defines(standins),
+    ]
     said, code = interrupt(arguments, b"camera")
     assert code == 130 and b"Interrupted." in said
     assert not (tmp_path / "out").exists()

@@ -11,8 +11,10 @@ from nerg_mi import diagnosis, llvm
 def doctor(**environment):
     return subprocess.run(
         [sys.executable, "-c", "import sys; sys.argv[1:] = ['doctor']\nfrom nerg_command import main; main()"],
-        env={**os.environ, **environment}, capture_output=True, text=True,
-    )  # fmt: skip
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+    )
 
 
 def test01_this_machine():
@@ -34,10 +36,14 @@ def test02_unusable_llvm(tmp_path):
 
 
 def test03_a_dying_backend_is_reported(monkeypatch):
-    monkeypatch.setattr(diagnosis, "_TRIAL", "import os, sys; print('LLVM ERROR: no', file=sys.stderr, flush=True); os.abort()")
+    monkeypatch.setattr(
+        diagnosis, "_TRIAL", "import os, sys; print('LLVM ERROR: no', file=sys.stderr, flush=True); os.abort()"
+    )
     assert diagnosis.try_backend("llvm") == {"variants": [], "failed": {"llvm": "LLVM ERROR: no"}}
 
+
 def test04_extras_by_their_names(monkeypatch):
-    """The names are those of distributions, as pyproject.toml has them: that of scikit-image is not that of its module."""
+    """The names are those of distributions, as pyproject.toml has them: that of scikit-image is not that of its
+    module."""
     project = (Path(__file__).parents[2] / "pyproject.toml").read_text()
     assert all(f'["{name}>=' in project for name in diagnosis.EXTRAS)

@@ -1,4 +1,5 @@
 """`nerg export`: each form of a small field, and its errors."""
+
 import sys
 
 import pytest
@@ -6,7 +7,6 @@ import trimesh
 from typer.testing import CliRunner
 
 from nerg_mi.cli import _app, main
-
 from tests.plugins import fields
 
 
@@ -36,14 +36,17 @@ def test02_volumes(tmp_path, field):
     assert (tmp_path / "c.vol").stat().st_size == 48 + 8**3 * 3 * 4 == 3 * (tmp_path / "d.vol").stat().st_size - 2 * 48
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (["mesh", "f.safetensors", "-o", "m.obj"], "end in .ply or .glb"),
-    (["points", "f.safetensors", "-o", "p.ply", "--resolution", "8", "--density", "1e9"], "nowhere"),
-    (["points", "f.safetensors", "-o", "p.glb", "--up", "x"], "--up must be z or y"),
-    (["volume", "f.safetensors", "-o", "d.exr"], "end in .vol"),
-    (["torch-ngp", "f.safetensors", "-o", "x.pth"], "no torch-ngp form"),
-    (["volume", "none.safetensors", "-o", "d.vol"], "does not exist"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["mesh", "f.safetensors", "-o", "m.obj"], "end in .ply or .glb"),
+        (["points", "f.safetensors", "-o", "p.ply", "--resolution", "8", "--density", "1e9"], "nowhere"),
+        (["points", "f.safetensors", "-o", "p.glb", "--up", "x"], "--up must be z or y"),
+        (["volume", "f.safetensors", "-o", "d.exr"], "end in .vol"),
+        (["torch-ngp", "f.safetensors", "-o", "x.pth"], "no torch-ngp form"),
+        (["volume", "none.safetensors", "-o", "d.vol"], "does not exist"),
+    ],
+)
 def test03_errors_take_a_sentence(field, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(field.parent)
     with pytest.raises(SystemExit) as e:

@@ -1,13 +1,13 @@
 """`nerg import`: both kinds of checkpoints, and its errors."""
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from nerg_mi.cli import _app, main
 from nerg_mi.formats.torch_ngp.pickling import write_torch
-
-from tests.formats.torch_ngp.test_nerg import save, small_gaze
 from tests.formats.torch_ngp.test_fields import small_state
+from tests.formats.torch_ngp.test_nerg import save, small_gaze
 
 
 def run(*arguments):
@@ -36,14 +36,17 @@ def test02_a_nerf_and_its_gaze(tmp_path):
     assert (tmp_path / "g.safetensors").stat().st_size < 0.6 * small_gaze()["encoder.embeddings"].nbytes + 1e5
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (["ngp.pth"], "nothing is asked for"),
-    (["ngp.pth", "-g", "g.safetensors"], "holds no gaze field"),
-    (["nerg.pth", "-o", "f.safetensors"], "without its NeRF"),
-    (["ngp.pth", "-o", "f.safetensors", "--ema"], "no moving averages"),
-    (["ngp.pth", "-o", "f.safetensors", "--color-space", "xyz"], "color_space"),
-    (["none.pth", "-o", "f.safetensors"], "no file"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["ngp.pth"], "nothing is asked for"),
+        (["ngp.pth", "-g", "g.safetensors"], "holds no gaze field"),
+        (["nerg.pth", "-o", "f.safetensors"], "without its NeRF"),
+        (["ngp.pth", "-o", "f.safetensors", "--ema"], "no moving averages"),
+        (["ngp.pth", "-o", "f.safetensors", "--color-space", "xyz"], "color_space"),
+        (["none.pth", "-o", "f.safetensors"], "no file"),
+    ],
+)
 def test03_errors_take_a_sentence(tmp_path, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(tmp_path)
     write_torch("ngp.pth", {"model": small_state()})

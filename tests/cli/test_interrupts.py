@@ -35,7 +35,9 @@ nerg_mi.cli.main(arguments)
 def interrupted(name: str, calls: int, *arguments) -> subprocess.CompletedProcess:
     """`nerg` in a process that gets SIGINT as a function is called for the so-many-th time."""
     command = [sys.executable, "-c", _CHILD, f"nerg_mi.{name}", str(calls), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, env={**os.environ, "PYTHONPATH": os.getcwd()})
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env={**os.environ, "PYTHONPATH": os.getcwd()}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,17 @@ WARM_UP = 4
 
 
 def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
-    done = interrupted("training.gaze_likelihood.LikelihoodTrainer.step", 4, "train", "gaze", inputs / "rays.npz", "-o", tmp_path / "a.safetensors", *GAZE, *ENDLESS)
+    done = interrupted(
+        "training.gaze_likelihood.LikelihoodTrainer.step",
+        4,
+        "train",
+        "gaze",
+        inputs / "rays.npz",
+        "-o",
+        tmp_path / "a.safetensors",
+        *GAZE,
+        *ENDLESS,
+    )
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.run", "a.safetensors"]
     # The step during which it came is finished.
@@ -64,7 +76,16 @@ def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
 
 
 def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
-    done = interrupted("training.radiance.RadianceTrainer.step", WARM_UP + 4, "train", "radiance", inputs / "photos", "-o", tmp_path / "a.safetensors", *ENDLESS)
+    done = interrupted(
+        "training.radiance.RadianceTrainer.step",
+        WARM_UP + 4,
+        "train",
+        "radiance",
+        inputs / "photos",
+        "-o",
+        tmp_path / "a.safetensors",
+        *ENDLESS,
+    )
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.preview.png", "a.run", "a.safetensors"]
     assert read_checkpoint(tmp_path / "a.run", "radiance run")[1]["steps"] == 4
@@ -73,20 +94,97 @@ def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
 
 def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
     some = ["--steps", 3, "--ensemble", 2, "--save-every", 0]
-    done = interrupted("training.gaze_likelihood.LikelihoodTrainer.step", 5, "train", "gaze", inputs / "rays.npz", "-o", tmp_path / "a.safetensors", *GAZE, *some)
+    done = interrupted(
+        "training.gaze_likelihood.LikelihoodTrainer.step",
+        5,
+        "train",
+        "gaze",
+        inputs / "rays.npz",
+        "-o",
+        tmp_path / "a.safetensors",
+        *GAZE,
+        *some,
+    )
     assert done.returncode == 130 and "member 2 of 2; go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.member0.safetensors", "a.run"]
 
 
-@pytest.mark.parametrize("name, calls, arguments", [
-    ("evaluation.radiance_scores.Renderer.__call__", 2, lambda i, o: ["eval", "radiance", i / "field.safetensors", i / "photos", "--holdout", 2, "-o", o]),
-    ("evaluation.study_measure.measure", 1, lambda i, o: ["study", "slab", "-o", o, "--quick", "--width", 12, "--height", 8, "--only", "jitter", "-m", "llvm_ad_rgb"]),
-    ("training.gaze_likelihood.LikelihoodTrainer.step", 3, lambda i, o: [
-        "ablate", i / "rays.npz", "-o", o, "--geometry", "none", "--recipes", "default", "--variant", "emit", "--zones", 1, "--positions", 4, "--min-rays", 8,
-        "--radius", 0.5, "--cameras", 0, "--probes", 8]),
-    ("attention.tables.rays_from_table", 1, lambda i, o: ["rays", "import", i / "day.csv", "-o", o / "a.npz", "--map", "origin=x,y,z direction=a,b,c t=t person=p"]),
-    ("field.extraction.Sampler.on", 1, lambda i, o: ["export", "points", i / "field.safetensors", "-o", o / "a.ply", "--resolution", 16]),
-], ids=["eval", "study", "ablate", "rays import", "export"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, calls, arguments",
+    [
+        (
+            "evaluation.radiance_scores.Renderer.__call__",
+            2,
+            lambda i, o: ["eval", "radiance", i / "field.safetensors", i / "photos", "--holdout", 2, "-o", o],
+        ),
+        (
+            "evaluation.study_measure.measure",
+            1,
+            lambda i, o: [
+                "study",
+                "slab",
+                "-o",
+                o,
+                "--quick",
+                "--width",
+                12,
+                "--height",
+                8,
+                "--only",
+                "jitter",
+                "-m",
+                "llvm_ad_rgb",
+            ],
+        ),
+        (
+            "training.gaze_likelihood.LikelihoodTrainer.step",
+            3,
+            lambda i, o: [
+                "ablate",
+                i / "rays.npz",
+                "-o",
+                o,
+                "--geometry",
+                "none",
+                "--recipes",
+                "default",
+                "--variant",
+                "emit",
+                "--zones",
+                1,
+                "--positions",
+                4,
+                "--min-rays",
+                8,
+                "--radius",
+                0.5,
+                "--cameras",
+                0,
+                "--probes",
+                8,
+            ],
+        ),
+        (
+            "attention.tables.rays_from_table",
+            1,
+            lambda i, o: [
+                "rays",
+                "import",
+                i / "day.csv",
+                "-o",
+                o / "a.npz",
+                "--map",
+                "origin=x,y,z direction=a,b,c t=t person=p",
+            ],
+        ),
+        (
+            "field.extraction.Sampler.on",
+            1,
+            lambda i, o: ["export", "points", i / "field.safetensors", "-o", o / "a.ply", "--resolution", 16],
+        ),
+    ],
+    ids=["eval", "study", "ablate", "rays import", "export"],
+)
 def test_a_command_ends_at_once(name, calls, arguments, inputs, tmp_path):
     done = interrupted(name, calls, *arguments(inputs, tmp_path / "out"))
     assert done.returncode == 130 and "Interrupted." in done.stderr and "Traceback" not in done.stderr, done.stderr

@@ -64,7 +64,10 @@ def failing(monkeypatch, error):
         (OSError(28, "No space left on device"), "nerg: no space left on device."),
         (UnusableLLVM("LLVM 15 cannot run."), "nerg: LLVM 15 cannot run."),
         (ModuleNotFoundError("No module named 'torch'", name="torch"), "nerg: No module named 'torch'"),
-        (MemoryError("Unable to allocate 9 GiB"), "nerg: there is not enough memory: Unable to allocate 9 GiB; ask for less, or close other programs."),
+        (
+            MemoryError("Unable to allocate 9 GiB"),
+            "nerg: there is not enough memory: Unable to allocate 9 GiB; ask for less, or close other programs.",
+        ),
     ],
 )
 def test05_expected_error_is_one_sentence(monkeypatch, capsys, error, said):
@@ -91,12 +94,18 @@ def test06_traceback_on_request(monkeypatch, capsys, error, code, ask):
 @pytest.mark.parametrize(
     "error, said",
     [
-        (TypeError("a\n  bug"), "TypeError: a bug"), (ValueError("of one function by another"), "ValueError: of one function by another"),
-        (KeyError("x"), "KeyError: 'x'"), (RuntimeError(), "RuntimeError"),
-        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"), (OSError("of nothing"), "OSError: of nothing"),
-        (ImportError("cannot import name 'x' from 'nerg_mi.field'", name="nerg_mi.field"), "ImportError: cannot import name 'x' from 'nerg_mi.field'"),
+        (TypeError("a\n  bug"), "TypeError: a bug"),
+        (ValueError("of one function by another"), "ValueError: of one function by another"),
+        (KeyError("x"), "KeyError: 'x'"),
+        (RuntimeError(), "RuntimeError"),
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero"),
+        (OSError("of nothing"), "OSError: of nothing"),
+        (
+            ImportError("cannot import name 'x' from 'nerg_mi.field'", name="nerg_mi.field"),
+            "ImportError: cannot import name 'x' from 'nerg_mi.field'",
+        ),
     ],
-)  # fmt: skip
+)
 def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, capsys, error, said):
     failing(monkeypatch, error)
     with pytest.raises(SystemExit) as end:
@@ -140,14 +149,29 @@ def test07c_what_a_contract_refuses_is_the_users_where_they_chose_it():
 QUOTED = '[parser.cpp:1718] At string: failed to instantiate: Traceback (most recent call last):\n  File "a.py", line 15, in f\n    g()\n'
 
 
-@pytest.mark.parametrize("said", ["[scene.cpp:3] no plugin of that name", QUOTED + "nerg_mi.errors.NergError: write y", QUOTED + 'ValueError: "x" must\n be 3'])
+@pytest.mark.parametrize(
+    "said",
+    [
+        "[scene.cpp:3] no plugin of that name",
+        QUOTED + "nerg_mi.errors.NergError: write y",
+        QUOTED + 'ValueError: "x" must\n be 3',
+    ],
+)
 def test07d_what_mitsuba_says_of_a_scene_is_the_users(said):
     with pytest.raises(NergError):
         with mitsuba_says():
             raise RuntimeError(said)
 
 
-@pytest.mark.parametrize("said", [QUOTED + "TypeError: f() takes no arguments", QUOTED + "KeyError: 'x'", QUOTED + "AssertionError", QUOTED + "a.b.Odd: x"])
+@pytest.mark.parametrize(
+    "said",
+    [
+        QUOTED + "TypeError: f() takes no arguments",
+        QUOTED + "KeyError: 'x'",
+        QUOTED + "AssertionError",
+        QUOTED + "a.b.Odd: x",
+    ],
+)
 def test07e_a_mistake_in_a_plugin_is_not(said):
     with pytest.raises(RuntimeError) as raised:
         with mitsuba_says():

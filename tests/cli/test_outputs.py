@@ -1,5 +1,5 @@
-"""Every output of every command: parents are made, what stands in the way is told before work, and neither a full disk nor
-Ctrl-C loses anything."""
+"""Every output of every command: parents are made, what stands in the way is told before work, and neither a full disk
+nor Ctrl-C loses anything."""
 
 from __future__ import annotations
 
@@ -32,8 +32,31 @@ def inputs(tmp_path_factory):
 
     mi.set_variant("llvm_ad_rgb")
     folder = make_inputs(tmp_path_factory.mktemp("inputs"))
-    arguments = ["train", "gaze", folder / "rays.npz", "-o", folder / "gaze.safetensors", "--geometry", "hits", "--radius", 0.5, "--probes", 8,
-                 "--steps", 2, "--directions", 64, "--zones", 0, "--min-rays", 8, "--test-zones", 1, "--test-positions", 3]  # fmt: skip
+    arguments = [
+        "train",
+        "gaze",
+        folder / "rays.npz",
+        "-o",
+        folder / "gaze.safetensors",
+        "--geometry",
+        "hits",
+        "--radius",
+        0.5,
+        "--probes",
+        8,
+        "--steps",
+        2,
+        "--directions",
+        64,
+        "--zones",
+        0,
+        "--min-rays",
+        8,
+        "--test-zones",
+        1,
+        "--test-positions",
+        3,
+    ]
     with pytest.raises(SystemExit) as end:
         nerg_mi.cli.main(list(map(str, arguments)))
     assert not end.value.code
@@ -77,7 +100,9 @@ def remember(monkeypatch, name: str) -> None:
     """A function is called once, and later gives what it gave then: what a command computes is not the matter here."""
     found = []
     original = pkgutil.resolve_name(name)
-    monkeypatch.setattr(name, lambda *given, **more: found[0] if found else found.append(original(*given, **more)) or found[0])
+    monkeypatch.setattr(
+        name, lambda *given, **more: found[0] if found else found.append(original(*given, **more)) or found[0]
+    )
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda c: f"{c.name} {Path(c.files[0]).suffix}")
@@ -178,8 +203,14 @@ def path_options(command) -> dict[str, tuple]:
     for name, hint in get_type_hints(command, include_extras=True).items():
         kind, *more = get_args(hint) or (hint,)
         if Path in (kind, *get_args(kind)):
-            given = [d for info in more for d in (getattr(info, "default", None), *(getattr(info, "param_decls", None) or ()))]
-            out[name] = tuple(d for d in given if isinstance(d, str) and d.startswith("-")) or ("--" + name.replace("_", "-"),)
+            given = [
+                d
+                for info in more
+                for d in (getattr(info, "default", None), *(getattr(info, "param_decls", None) or ()))
+            ]
+            out[name] = tuple(d for d in given if isinstance(d, str) and d.startswith("-")) or (
+                "--" + name.replace("_", "-"),
+            )
     return out
 
 
@@ -193,4 +224,6 @@ def test_every_command_and_every_output_is_tried(tmp_path):
         options = path_options(command)
         assert INPUTS.get(name, set()) <= set(options), f"{name} has no such parameter"
         for parameter in set(options) - INPUTS.get(name, set()):
-            assert any(option in line for line in given for option in options[parameter]), f"{name}: {options[parameter]}"
+            assert any(option in line for line in given for option in options[parameter]), (
+                f"{name}: {options[parameter]}"
+            )

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.skeleton import keypoints_from_head
 from nerg_mi.cli.rays import app
 from nerg_mi.errors import NergError
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.skeleton import keypoints_from_head
 from nerg_mi.rays.readers.skeleton_file import write_skeleton
 
 
@@ -20,7 +20,11 @@ def test_import_and_show_skeletons(tmp_path):
     write_skeleton(tmp_path / "day.csv", ["ann"] * 20, np.arange(20), body)
     done = run("import", tmp_path / "day.csv", "-o", tmp_path / "rays.npz", "--preset", "skeleton22", "--tick", 0.1)
     assert done.exit_code == 0, done.output
-    assert "19 of 20 rows" in done.output and "wrote" in done.output and "lines 5 of day.csv" in " ".join(done.output.split())
+    assert (
+        "19 of 20 rows" in done.output
+        and "wrote" in done.output
+        and "lines 5 of day.csv" in " ".join(done.output.split())
+    )
     assert len(Rays.load(tmp_path / "rays.npz")) == 19
     shown = run("show", tmp_path / "rays.npz")
     assert shown.exit_code == 0 and "eye height" in shown.output and "1.65 m" in shown.output
@@ -29,17 +33,34 @@ def test_import_and_show_skeletons(tmp_path):
 def test_import_by_map(tmp_path):
     (tmp_path / "ann.csv").write_text("t,x,y,z,a,b,c\n0,1,1.6,2,0,0,1\n1,1,1.6,2,0,0,1\n")
     done = run(
-        "import", tmp_path / "ann.csv", "-o", tmp_path / "r.npz", "--map", "origin=x,y,z direction=a,b,c t=t",
-        "--up", "y", "--hand", "left", "--person-from", "filename",
-    )  # fmt: skip
+        "import",
+        tmp_path / "ann.csv",
+        "-o",
+        tmp_path / "r.npz",
+        "--map",
+        "origin=x,y,z direction=a,b,c t=t",
+        "--up",
+        "y",
+        "--hand",
+        "left",
+        "--person-from",
+        "filename",
+    )
     assert done.exit_code == 0, done.output
     rays = Rays.load(tmp_path / "r.npz")
-    assert rays.persons == ("ann",) and np.allclose(rays.origin[0], [1, 2, 1.6]) and np.allclose(rays.direction[0], [0, 1, 0])
+    assert (
+        rays.persons == ("ann",)
+        and np.allclose(rays.origin[0], [1, 2, 1.6])
+        and np.allclose(rays.direction[0], [0, 1, 0])
+    )
 
 
 def test_contradictions(tmp_path):
     (tmp_path / "a.csv").write_text("x\n")
-    for extra, message in [([], "either --preset NAME or --map"), (["--preset", "vr_supermarket", "--up", "y"], "leave out --up")]:
+    for extra, message in [
+        ([], "either --preset NAME or --map"),
+        (["--preset", "vr_supermarket", "--up", "y"], "leave out --up"),
+    ]:
         done = run("import", tmp_path / "a.csv", "-o", tmp_path / "r.npz", *extra)
         assert done.exit_code != 0 and message in str(done.exception)
 
@@ -49,7 +70,9 @@ def walk(tmp_path):
     """Four people on a 4 x 3 m floor, a minute each, who look at something two metres away; a stop at the end."""
     rng = np.random.default_rng(0)
     n = 3000
-    origin = np.concatenate([np.cumsum(rng.normal(0, 0.02, (n, 3)) * (1, 1, 0.1), axis=0) % [4, 3, 9] + [0, 0, 1.6] for _ in range(4)])
+    origin = np.concatenate(
+        [np.cumsum(rng.normal(0, 0.02, (n, 3)) * (1, 1, 0.1), axis=0) % [4, 3, 9] + [0, 0, 1.6] for _ in range(4)]
+    )
     d = rng.normal(size=(4 * n, 3)) * 0.02 + np.repeat(np.eye(3)[[0, 1, 0, 1]], n, axis=0)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     t = np.tile(np.arange(n) * 0.02, 4) + np.repeat(np.arange(4) * 1e-5, n)  # no two times alike: a ray is known by it
@@ -60,13 +83,27 @@ def walk(tmp_path):
 
 def test_filter(walk, tmp_path):
     out = tmp_path / "some.npz"
-    done = run("filter", walk, "-o", out, "--person", "a", "--person", "c", "--from", 10, "--to", 30, "--box=0,3,0,3,0,3")
+    done = run(
+        "filter", walk, "-o", out, "--person", "a", "--person", "c", "--from", 10, "--to", 30, "--box=0,3,0,3,0,3"
+    )
     assert done.exit_code == 0, done.output
     some = Rays.load(out)
-    assert {some.persons[p] for p in some.person} == {"a", "c"} and some.t.min() >= 10 and some.t.max() < 30 and some.origin[:, 0].max() <= 3
+    assert (
+        {some.persons[p] for p in some.person} == {"a", "c"}
+        and some.t.min() >= 10
+        and some.t.max() < 30
+        and some.origin[:, 0].max() <= 3
+    )
     (step,) = some.metadata["steps"]
-    assert step["step"] == "filter" and step["kept"] == len(some) and step["of"] == 12_000 and step["persons"] == ["a", "c"]
-    done = run("filter", out, "-o", tmp_path / "few.npz", "--fixations", "idt", "--dispersion", 30, "--one-ray", "--thin", 1)
+    assert (
+        step["step"] == "filter"
+        and step["kept"] == len(some)
+        and step["of"] == 12_000
+        and step["persons"] == ["a", "c"]
+    )
+    done = run(
+        "filter", out, "-o", tmp_path / "few.npz", "--fixations", "idt", "--dispersion", 30, "--one-ray", "--thin", 1
+    )
     assert done.exit_code == 0, done.output
     few = Rays.load(tmp_path / "few.npz")
     assert [s["step"] for s in few.metadata["steps"]] == ["filter", "fixations", "thin"] and 0 < len(few) < len(some)
@@ -75,16 +112,30 @@ def test_filter(walk, tmp_path):
 
 @pytest.mark.parametrize(
     "arguments, message",
-    [([], "say which rays"), (["--one-ray"], "add --fixations"), (["--fixations", "magic"], "ivt or idt"), (["--person", "zoe"], "no person is called"),
-     (["--from", "1e9"], "leaves none"), (["--box", "1,2"], "a box is"), (["--box", "a,b"], "numbers with commas")],
-)  # fmt: skip
+    [
+        ([], "say which rays"),
+        (["--one-ray"], "add --fixations"),
+        (["--fixations", "magic"], "ivt or idt"),
+        (["--person", "zoe"], "no person is called"),
+        (["--from", "1e9"], "leaves none"),
+        (["--box", "1,2"], "a box is"),
+        (["--box", "a,b"], "numbers with commas"),
+    ],
+)
 def test_filter_refuses(walk, tmp_path, arguments, message):
     done = run("filter", walk, "-o", tmp_path / "x.npz", *arguments)
     assert done.exit_code != 0 and message in str(done.exception) and not (tmp_path / "x.npz").exists()
 
 
-@pytest.mark.parametrize("how", [["--zones", 2, "--positions", 10, "--min-rays", 8], ["--people", 0.5], ["--time", 0.3, "--gap", 1],
-                                 ["--zones", 2, "--min-rays", 8, "--person", "b", "--time", 0.5, "--clock", "person"]])  # fmt: skip
+@pytest.mark.parametrize(
+    "how",
+    [
+        ["--zones", 2, "--positions", 10, "--min-rays", 8],
+        ["--people", 0.5],
+        ["--time", 0.3, "--gap", 1],
+        ["--zones", 2, "--min-rays", 8, "--person", "b", "--time", 0.5, "--clock", "person"],
+    ],
+)
 def test_split_shares_no_ray(walk, tmp_path, how):
     done = run("split", walk, "-o", tmp_path / "s.npz", *how)
     assert done.exit_code == 0, done.output
@@ -96,7 +147,16 @@ def test_split_shares_no_ray(walk, tmp_path, how):
     if "--zones" in how:
         centres = np.array(step["by"]["position"]["test_centres"])
         assert np.linalg.norm(train.origin[:, None] - centres[None], axis=2).min() > 0.5
-        done = run("plot", tmp_path / "s-train.npz", "-o", tmp_path / "s.png", "--kind", "layout", "--test", tmp_path / "s-test.npz")
+        done = run(
+            "plot",
+            tmp_path / "s-train.npz",
+            "-o",
+            tmp_path / "s.png",
+            "--kind",
+            "layout",
+            "--test",
+            tmp_path / "s-test.npz",
+        )
         assert done.exit_code == 0 and (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG"), done.output
 
 
@@ -121,14 +181,25 @@ def test_plot_density(walk, tmp_path):
 def test_import_of_heads_and_their_options(tmp_path):
     (tmp_path / "h.csv").write_text("x,y,z,yaw,pitch,g\n0,1.6,0,1.5707963,0,new\n0,1.6,0,0,0,old\n")
     done = run(
-        "import", tmp_path / "h.csv", "-o", tmp_path / "h.npz", "--map", "origin=x,y,z ypr=yaw,pitch cohort=g",
-        "--up", "y", "--hand", "left", "--radians",
-    )  # fmt: skip
+        "import",
+        tmp_path / "h.csv",
+        "-o",
+        tmp_path / "h.npz",
+        "--map",
+        "origin=x,y,z ypr=yaw,pitch cohort=g",
+        "--up",
+        "y",
+        "--hand",
+        "left",
+        "--radians",
+    )
     assert done.exit_code == 0, done.output
     rays = Rays.load(tmp_path / "h.npz")
     assert np.allclose(rays.direction, [[1, 0, 0], [0, 1, 0]], atol=1e-6) and rays.cohorts == ("new", "old")
     assert "new 1, old 1" in " ".join(done.output.split())
-    done = run("import", tmp_path / "h.csv", "-o", tmp_path / "h.npz", "--map", "origin=x,y,z ypr=yaw,pitch", "--marker", 0.05)
+    done = run(
+        "import", tmp_path / "h.csv", "-o", tmp_path / "h.npz", "--map", "origin=x,y,z ypr=yaw,pitch", "--marker", 0.05
+    )
     assert "--marker belongs to a preset" in str(done.exception)
     done = run("import", tmp_path / "h.csv", "-o", tmp_path / "h.npz", "--preset", "skeleton22", "--keypoints", "1,2")
     assert "--keypoints is three numbers" in str(done.exception)
@@ -143,7 +214,16 @@ def test_pseudonyms(tmp_path):
     (tmp_path / "salt").write_bytes(bytes(range(32)))
     hidden = []
     for files in (["anna", "bo"], ["bo"]):
-        done = run("import", *(tmp_path / f"{n}.csv" for n in files), "-o", tmp_path / "r.npz", *about, "--pseudonyms", "--salt", tmp_path / "salt")
+        done = run(
+            "import",
+            *(tmp_path / f"{n}.csv" for n in files),
+            "-o",
+            tmp_path / "r.npz",
+            *about,
+            "--pseudonyms",
+            "--salt",
+            tmp_path / "salt",
+        )
         assert done.exit_code == 0, done.output
         hidden.append(Rays.load(tmp_path / "r.npz"))
         assert "anna" not in done.output.replace(str(tmp_path), "") and "anna" not in str(hidden[-1].metadata)
@@ -155,7 +235,9 @@ def test_pseudonyms(tmp_path):
 def test_one_line_that_was_cut_off_among_many_files(tmp_path):
     row = "{},1,1.6,2,0,0,1\n"
     for i in range(4):
-        (tmp_path / f"p{i}.csv").write_text("t,x,y,z,a,b,c\n" + "".join(row.format(k * 0.02) for k in range(150)) + ("3,1,1." if i == 2 else ""))
+        (tmp_path / f"p{i}.csv").write_text(
+            "t,x,y,z,a,b,c\n" + "".join(row.format(k * 0.02) for k in range(150)) + ("3,1,1." if i == 2 else "")
+        )
     about = ["--map", "origin=x,y,z direction=a,b,c t=t", "--up", "y", "--hand", "left"]
     files = [tmp_path / f"p{i}.csv" for i in range(4)]
     done = run("import", *files, "-o", tmp_path / "r.npz", *about)
@@ -176,7 +258,11 @@ def test_one_line_that_was_cut_off_among_many_files(tmp_path):
     # Two of 152 lines are more than one in a hundred; one is always allowed.
     files[2].write_text(files[2].read_text() + "\n3,x,1,1,1,1,1\n")
     done = run("import", *files, "-o", tmp_path / "s.npz", *about, "--skip-bad-lines")
-    assert isinstance(done.exception, NergError) and "p2.csv: 2 of 152 lines" in str(done.exception) and "1 %" in str(done.exception)
+    assert (
+        isinstance(done.exception, NergError)
+        and "p2.csv: 2 of 152 lines" in str(done.exception)
+        and "1 %" in str(done.exception)
+    )
     assert not (tmp_path / "s.npz").exists()
     (tmp_path / "two.csv").write_text("t,x,y,z,a,b,c\n0,1,1.6,2,0,0,1\n0,1")
     assert run("import", tmp_path / "two.csv", "-o", tmp_path / "t.npz", *about, "--skip-bad-lines").exit_code == 0
@@ -195,14 +281,27 @@ def test_bad_lines_of_presets(tmp_path):
         assert "--tick" in str(run(*arguments[:-1], tick, "--skip-bad-lines").exception)
 
 
-@pytest.mark.parametrize("tick, words", [
-    (1, "a ray comes every 20 s; were a unit of the file's time 0.001 s, it would be 50 a second (--tick 0.001)"),
-    (1e-6, "(--tick 0.001)"), (0.001, ""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "tick, words",
+    [
+        (1, "a ray comes every 20 s; were a unit of the file's time 0.001 s, it would be 50 a second (--tick 0.001)"),
+        (1e-6, "(--tick 0.001)"),
+        (0.001, ""),
+    ],
+)
 def test_a_wrong_tick_is_told_and_nothing_is_nan(tmp_path, tick, words):
     rows = "".join(f"{20 * i},{0.01 * i},0,1.6,1,0,0\n" for i in range(300))
     (tmp_path / "ms.csv").write_text("t,x,y,z,a,b,c\n" + rows)
-    done = run("import", tmp_path / "ms.csv", "-o", tmp_path / "r.npz", "--map", "origin=x,y,z direction=a,b,c t=t", "--tick", tick)
+    done = run(
+        "import",
+        tmp_path / "ms.csv",
+        "-o",
+        tmp_path / "r.npz",
+        "--map",
+        "origin=x,y,z direction=a,b,c t=t",
+        "--tick",
+        tick,
+    )
     said = " ".join(done.output.split())
     assert done.exit_code == 0 and "nan" not in said and words in said, said
     assert ("implausible" in said) == bool(words)
@@ -218,5 +317,7 @@ def test_times_that_do_not_change(tmp_path):
 def test_names_are_not_markup(tmp_path):
     """Somebody's name is not a command to the terminal, and none of the table's."""
     (tmp_path / "m.csv").write_text("t,x,y,z,a,b,c,who\n0,0,0,1.6,1,0,0,[/bold]\n1,0,0,1.6,1,0,0,x\x1b[31m\n")
-    done = run("import", tmp_path / "m.csv", "-o", tmp_path / "r.npz", "--map", "origin=x,y,z direction=a,b,c t=t person=who")
+    done = run(
+        "import", tmp_path / "m.csv", "-o", tmp_path / "r.npz", "--map", "origin=x,y,z direction=a,b,c t=t person=who"
+    )
     assert done.exit_code == 0 and "[/bold]" in done.output and "\x1b[31m" not in done.output, done.output

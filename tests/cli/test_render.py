@@ -105,7 +105,9 @@ def test05_one_sentence(scene, tmp_path, monkeypatch, capsys, options, said):
 
 def test05b_a_mistake_of_the_program_while_it_renders_is_told_as_one(scene, tmp_path, monkeypatch, capsys):
     def broken(*args, **options):
-        raise RuntimeError("in a plugin:\nTraceback (most recent call last):\n  File \"x.py\", line 1, in f\nTypeError: no len()")
+        raise RuntimeError(
+            'in a plugin:\nTraceback (most recent call last):\n  File "x.py", line 1, in f\nTypeError: no len()'
+        )
 
     monkeypatch.setattr("nerg_mi.rendering.pictures.bands.render_bands", broken)
     assert nerg("render", scene, "-o", tmp_path / "out.exr") == 70
@@ -193,7 +195,10 @@ def test11_one_piece_beyond_the_memory_is_said(rgb, scene, tmp_path, capsys):
     other = tmp_path / "other.xml"
     other.write_text(SCENE.replace('type="independent"', 'type="multijitter"'))
     assert nerg("render", other, "-o", tmp_path / "a.exr", "-m", "llvm_ad_rgb", "--memory", 1e-3) == 0
-    assert "in one piece, beyond 0.001 GB, because of the sampler MultijitterSampler" in capsys.readouterr().out.replace("\n", " ")
+    assert (
+        "in one piece, beyond 0.001 GB, because of the sampler MultijitterSampler"
+        in capsys.readouterr().out.replace("\n", " ")
+    )
 
 
 def test12_memory_of_nothing(scene, tmp_path, capsys):

@@ -1,4 +1,5 @@
 """`nerg train gaze --views --salience`: a field from images alone, and what is refused."""
+
 import json
 
 import numpy as np
@@ -45,18 +46,25 @@ def test_a_field_from_images(recipe, folder, capsys, rgb):
     assert code in (0, None), said.err
     assert "5 views with salience; without: p0.png" in said.out and "0 probes and 5 views" in said.out
     field, meta = load_gaze(out, namespace("llvm"))
-    assert field.config.normalized and meta["provenance"]["salience"]["used"] == 5 and "rays_file" not in meta["provenance"]
+    assert (
+        field.config.normalized
+        and meta["provenance"]["salience"]["used"] == 5
+        and "rays_file" not in meta["provenance"]
+    )
 
 
-@pytest.mark.parametrize("given, said", [
-    ([], "say what to learn from"),
-    (["--views", "{}"], "both: --views"),
-    (["--views", "{}", "--salience", "{}/maps", "--geometry", "hits"], "--geometry hits, .* belong to rays"),
-    (["--views", "{}", "--salience", "{}/maps", "--test-zones", "2"], "belong to rays"),
-    (["--views", "{}", "--salience", "{}/no"], "no folder"),
-    (["--views", "{}", "--salience", "{}"], "in colours"),
-    (["--views", "{}", "--salience", "{}/maps", "--salience-per", "degree"], "not per \"degree\""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "given, said",
+    [
+        ([], "say what to learn from"),
+        (["--views", "{}"], "both: --views"),
+        (["--views", "{}", "--salience", "{}/maps", "--geometry", "hits"], "--geometry hits, .* belong to rays"),
+        (["--views", "{}", "--salience", "{}/maps", "--test-zones", "2"], "belong to rays"),
+        (["--views", "{}", "--salience", "{}/no"], "no folder"),
+        (["--views", "{}", "--salience", "{}"], "in colours"),
+        (["--views", "{}", "--salience", "{}/maps", "--salience-per", "degree"], 'not per "degree"'),
+    ],
+)
 def test_wrong_options_are_told_in_a_sentence(given, said, folder, capsys):
     import re
 

@@ -1,8 +1,8 @@
 """The width of a kernel: what is chosen from, the leave-one-out score by its definition, and whose chance it is."""
+
 import numpy as np
 import pytest
 
-from nerg_mi.maths import vmf
 from nerg_mi.density.bandwidth import (
     kappa_grid,
     leave_one_out_kappa,
@@ -10,7 +10,7 @@ from nerg_mi.density.bandwidth import (
     loo_kappas,
     silverman_kappas,
 )
-from nerg_mi.maths.sphere import uniform_directions
+from nerg_mi.maths import vmf
 
 
 def gazes(n, kappa=30.0, seed=0):
@@ -56,9 +56,13 @@ def test_one_width_for_all_is_that_of_the_sum_of_the_scores():
     person, grid = np.arange(261), kappa_grid(500.0)
     each = loo_kappas(x, person, offsets, 500.0, False, np.random.default_rng(0))
     runs = [(0, 60), (61, 261)]
-    assert [each[0], each[2]] == [leave_one_out_kappa(x[a:b], person[a:b], kappa_max=500.0) for a, b in runs] and each[1] == 1
+    assert [each[0], each[2]] == [leave_one_out_kappa(x[a:b], person[a:b], kappa_max=500.0) for a, b in runs] and each[
+        1
+    ] == 1
     total = sum(leave_one_out_scores(x[a:b], person[a:b], grid) for a, b in runs)
-    assert loo_kappas(x, person, offsets, 500.0, True, np.random.default_rng(0)).tolist() == [grid[np.argmax(total)]] * 3
+    assert (
+        loo_kappas(x, person, offsets, 500.0, True, np.random.default_rng(0)).tolist() == [grid[np.argmax(total)]] * 3
+    )
     assert loo_kappas(x[:2], person[:2], np.array([0, 1, 2]), 500.0, True, np.random.default_rng(0)).tolist() == [1, 1]
 
 

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from nerg_mi.maths import vmf
 from nerg_mi.density.bandwidth import kappa_grid, leave_one_out_scores
 from nerg_mi.density.measures import effective_persons, effective_rays, entropy, integral, sample
 from nerg_mi.density.probes import person_weights, place_probes
+from nerg_mi.maths import vmf
 from nerg_mi.rays.rays import Rays
 
 
@@ -16,11 +16,20 @@ def rays():
     origin = rng.uniform([0, 0, 1.5], [3, 2, 1.7], (n, 3))
     to = np.array([1.5, 4, 1]) - origin
     mu = to / np.linalg.norm(to, axis=1, keepdims=True)
-    return Rays(np.arange(n) * 0.1, np.maximum(rng.integers(-1, 4, n), 0), tuple("abcd"), origin, vmf.sample(mu, 60.0, rng), np.ones(n))
+    return Rays(
+        np.arange(n) * 0.1,
+        np.maximum(rng.integers(-1, 4, n), 0),
+        tuple("abcd"),
+        origin,
+        vmf.sample(mu, 60.0, rng),
+        np.ones(n),
+    )
 
 
 def test_integral_is_one_at_a_thousand_random_positions(rays):
-    probes = place_probes(rays, 0.2, placement="random", count=1100, cap=64, min_rays=4, kappa_max=100.0, weights="distance")
+    probes = place_probes(
+        rays, 0.2, placement="random", count=1100, cap=64, min_rays=4, kappa_max=100.0, weights="distance"
+    )
     assert len(probes) > 1000
     assert np.abs(integral(probes, 8192, "llvm") - 1).max() < 1e-3
 
@@ -56,7 +65,10 @@ def test_effective_numbers(rays):
     assert (effective_rays(even) < even.counts).all() and effective_persons(even, rays).mean() > people.mean() + 0.1
     assert np.isclose(person_weights(rays).mean(), 1)
     counts = np.bincount(rays.person)
-    assert np.allclose(np.bincount(rays.person, weights=person_weights(rays)), len(rays) / 4) and counts[0] > 1.5 * counts[1]
+    assert (
+        np.allclose(np.bincount(rays.person, weights=person_weights(rays)), len(rays) / 4)
+        and counts[0] > 1.5 * counts[1]
+    )
 
 
 def test_weights_of_rays_and_distance(rays):
@@ -66,7 +78,9 @@ def test_weights_of_rays_and_distance(rays):
     d = np.linalg.norm(rays.origin[near.indices] - q, axis=1)
     assert np.array_equal(near.indices, plain.indices) and np.allclose(near.weights, 1 - d / 0.3, atol=1e-6)
     only = place_probes(rays, 0.3, queries=q, cap=5000, ray_weights=(rays.person == 2).astype(float))
-    assert (rays.person[only.indices] == 2).all() and np.array_equal(np.sort(only.indices), np.sort(plain.indices[rays.person[plain.indices] == 2]))
+    assert (rays.person[only.indices] == 2).all() and np.array_equal(
+        np.sort(only.indices), np.sort(plain.indices[rays.person[plain.indices] == 2])
+    )
     assert np.array_equal(only.directions, rays.direction[only.indices])
     with pytest.raises(ValueError, match="ray_weights"):
         place_probes(rays, 0.3, ray_weights=np.ones(3))
@@ -76,11 +90,16 @@ def test_one_kappa_for_all(rays):
     for rule in ("silverman", "loo"):
         each = place_probes(rays, 0.25, count=12, kappa_rule=rule)
         shared = place_probes(rays, 0.25, count=12, kappa_rule=rule, kappa_shared=True)
-        assert len(set(shared.kappa)) == 1 and each.kappa.min() <= shared.kappa[0] <= each.kappa.max() and len(set(each.kappa)) > 1
+        assert (
+            len(set(shared.kappa)) == 1
+            and each.kappa.min() <= shared.kappa[0] <= each.kappa.max()
+            and len(set(each.kappa)) > 1
+        )
 
 
 def test_leave_one_out_finds_the_true_width():
-    # Many groups, one ray each: the best kernel is narrower than the law, and the likelihood near that of the law itself.
+    # Many groups, one ray each: the best kernel is narrower than the law, and the likelihood near that of the law
+    # itself.
     rng = np.random.default_rng(0)
     x = vmf.sample(np.tile([0, 0, 1.0], (256, 1)), 60.0, rng)
     scores = leave_one_out_scores(x, None, kappa_grid(1000.0))

@@ -8,7 +8,9 @@ from nerg_mi.density.placement import place_queries
 def origin():
     """A walk, most of it standing in one corner."""
     rng = np.random.default_rng(0)
-    return np.concatenate([rng.uniform([0, 0, 1.5], [4, 3, 1.7], (3000, 3)), rng.normal([1, 1, 1.6], 0.02, (20_000, 3))])
+    return np.concatenate(
+        [rng.uniform([0, 0, 1.5], [4, 3, 1.7], (3000, 3)), rng.normal([1, 1, 1.6], 0.02, (20_000, 3))]
+    )
 
 
 def test_blue_noise_is_even_and_covers(origin):

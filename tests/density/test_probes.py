@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from nerg_mi.maths import vmf
 from nerg_mi.density.bandwidth import leave_one_out_kappa
 from nerg_mi.density.probes import person_weights, place_probes
-from nerg_mi.rays.rays import Rays
+from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.rays import Rays
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,10 @@ def test_centre_seed_and_queries(rays):
 
 def test_kappa_rules(rays):
     silverman = place_probes(rays, 0.25, count=8)
-    R = [np.linalg.norm(rays.direction[silverman.indices[a:b]].mean(axis=0)) for a, b in zip(silverman.offsets, silverman.offsets[1:])]
+    R = [
+        np.linalg.norm(rays.direction[silverman.indices[a:b]].mean(axis=0))
+        for a, b in zip(silverman.offsets, silverman.offsets[1:])
+    ]
     assert np.allclose(silverman.kappa, vmf.silverman_kappa(R, silverman.counts))
     loo = place_probes(rays, 0.25, count=8, kappa_rule="loo")
     assert ((loo.kappa > 20) & (loo.kappa < 1000)).all()
@@ -82,9 +85,12 @@ def test_refusals(rays):
 
 
 def test_people_of_a_probe_can_count_alike():
-    """One who stayed a hundred times as long weighs as much as the other; times the rays' own weights, within a person."""
+    """One who stayed a hundred times as long weighs as much as the other; times the rays' own weights, within a
+    person."""
     toward = np.array([[1.0, 0, 0]] * 100 + [[0, 1.0, 0]])
-    rays = Rays(np.arange(101.0), np.array([0] * 100 + [1]), ("stays", "passes"), np.zeros((101, 3)), toward, np.ones(101))
+    rays = Rays(
+        np.arange(101.0), np.array([0] * 100 + [1]), ("stays", "passes"), np.zeros((101, 3)), toward, np.ones(101)
+    )
     both = np.array([[[1.0, 0, 0], [0, 1.0, 0]]])
     about = dict(queries=np.zeros((1, 3)), min_rays=1, kappa_rule="fixed", kappa=50.0)
     stays, passes = place_probes(rays, 0.2, weights="person", **about).density(both)[0]

@@ -16,7 +16,9 @@ def uniform(p_od, p_o, r_o, active):
 
 def rectangle(mi, a=0.6, b=0.4, at=(0, 0, 0), **kwargs):
     """2a x 2b, facing +z."""
-    return mi.load_dict({"type": "rectangle", "to_world": mi.ScalarTransform4f().translate(list(at)).scale([a, b, 1]), **kwargs})
+    return mi.load_dict(
+        {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate(list(at)).scale([a, b, 1]), **kwargs}
+    )
 
 
 def mesh(mi, corners, faces):
@@ -55,7 +57,10 @@ def test01_patches_tile_the_mesh(rgb):
 
 def test13_one_piece_is_the_triangle_itself(rgb):
     corners = np.array([(0.3, 0.1, -0.2), (1.1, 0.2, 0.4), (0.2, 1.7, 0.6)])
-    whole, across = patches(mesh(rgb, corners, [(0, 1, 2)]), 1), np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    whole, across = (
+        patches(mesh(rgb, corners, [(0, 1, 2)]), 1),
+        np.cross(corners[1] - corners[0], corners[2] - corners[0]),
+    )
     assert np.allclose(np.array(whole.p).T, [corners.mean(0)], atol=1e-6)
     assert np.allclose(whole.area.numpy(), [np.linalg.norm(across) / 2], rtol=1e-6)
     assert np.allclose(np.array(whole.n).T, [across / np.linalg.norm(across)], atol=1e-6)
@@ -96,7 +101,9 @@ def test06_what_stands_in_between_hides(rgb):
     # A plate over x < 0 halfway to the eye: what lies under x < 0 at z = 0 is hidden.
     plate = sheet(rgb, 10, 10, 0.5)
     vertices = rgb.traverse(plate)
-    vertices["vertex_positions"] = np.ravel([(-10, -10, 0.5), (0, -10, 0.5), (0, 10, 0.5), (-10, 10, 0.5)]).astype(np.float32)
+    vertices["vertex_positions"] = np.ravel([(-10, -10, 0.5), (0, -10, 0.5), (0, 10, 0.5), (-10, 10, 0.5)]).astype(
+        np.float32
+    )
     vertices.update()
     place = Place(None, rgb.load_dict({"type": "scene", "plate": plate}))
     eye, surface = rgb.Point3f(0, 0, 1), patches(sheet(rgb), 8)
@@ -120,13 +127,17 @@ def test08_a_surface_in_the_place_does_not_hide_itself(rgb):
     place = Place(None, rgb.load_dict({"type": "scene", "box": {"type": "cube"}}))
     eyes = rgb.Point3f(np.array([(3, 2, 1.5), (1.001, 4, 0), (0, 0, 1.2)], np.float32).T)
     surface = patches(box, 6)
-    assert np.allclose(received(place, uniform, eyes, surface).numpy(), received(None, uniform, eyes, surface).numpy(), rtol=1e-5)
+    assert np.allclose(
+        received(place, uniform, eyes, surface).numpy(), received(None, uniform, eyes, surface).numpy(), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("z", [0.9, -0.9])
 def test14_neither_side_of_an_open_sheet_hides_itself(rgb, z):
     surface, eye = patches(sheet(rgb), 8), rgb.Point3f(0.2, -0.1, z)
-    each = contributions(Place(None, rgb.load_dict({"type": "scene", "sheet": sheet(rgb)})), uniform, eye, surface, two_sided=True)
+    each = contributions(
+        Place(None, rgb.load_dict({"type": "scene", "sheet": sheet(rgb)})), uniform, eye, surface, two_sided=True
+    )
     free = contributions(None, uniform, eye, surface, two_sided=True).numpy()
     assert (free > 0).all() and np.allclose(each.numpy(), free, rtol=1e-5)
 
@@ -180,15 +191,34 @@ def test12_the_integrator_sees_the_same_attention(rgb, tmp_path):
     fields.gaze(tmp_path / "gaze.safetensors")
     eye, h = (-0.2, 0.3, 0.8), 96
     hidden = {"type": "sphere", "center": [0.1, 0.25, 0.3], "radius": 0.12}
-    scene = rgb.load_dict({
-        "type": "scene", "hidden": hidden,
-        "box": {"type": "cube", "to_world": rgb.ScalarTransform4f().translate([0.3, 0.1, -0.2]).scale([0.3, 0.2, 0.25])},
-        "integrator": {"type": "nerg", "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")},
-                       "aovs": "gaze,position", "radiance": False},
-        "sensor": {"type": "panorama", "to_world": rgb.ScalarTransform4f().translate(list(eye)),
-                   "sampler": {"type": "independent", "sample_count": 1},
-                   "film": {"type": "hdrfilm", "width": 2 * h, "height": h, "rfilter": {"type": "box"}, "component_format": "float32"}},
-    })  # fmt: skip
+    scene = rgb.load_dict(
+        {
+            "type": "scene",
+            "hidden": hidden,
+            "box": {
+                "type": "cube",
+                "to_world": rgb.ScalarTransform4f().translate([0.3, 0.1, -0.2]).scale([0.3, 0.2, 0.25]),
+            },
+            "integrator": {
+                "type": "nerg",
+                "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")},
+                "aovs": "gaze,position",
+                "radiance": False,
+            },
+            "sensor": {
+                "type": "panorama",
+                "to_world": rgb.ScalarTransform4f().translate(list(eye)),
+                "sampler": {"type": "independent", "sample_count": 1},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": 2 * h,
+                    "height": h,
+                    "rfilter": {"type": "box"},
+                    "component_format": "float32",
+                },
+            },
+        }
+    )
     picture = np.array(rgb.render(scene, spp=1, sensor=0))
     gaze, p = picture[..., -4], picture[..., -3:]
     inside = np.all(np.abs(p - (0.3, 0.1, -0.2)) < np.array([0.3, 0.2, 0.25]) + 1e-3, axis=-1)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField, blind_table
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.sphere import fibonacci_directions
 
 KINDS = ("linear", "normalised", "default recipe", "ensemble")
 GRID = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
@@ -26,9 +26,13 @@ def made(kind: str, box: Box, seed: int = 4, **more):
         config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=(box.lower, box.upper), mix=0.2, **more)
         blind = blind_table(np.exp(0.5 * rng.normal(size=512)) / 14.2, 16, ns, fibonacci_directions(1 << 14))
         field = LogGazeField.random(config, box, ns, seed, blind)
-        steep = {k: 8 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")} | {"escaped": ns.Float(0.4)}
+        steep = {k: 8 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")} | {
+            "escaped": ns.Float(0.4)
+        }
     else:
-        field = GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=kind == "normalised", **more), box, ns, seed)
+        field = GazeField.random(
+            GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=kind == "normalised", **more), box, ns, seed
+        )
         steep = {k: 30 * v for k, v in field.parameters().items() if k in ("emit_head.0", "capture_head.0")}
     table = 2 * rng.normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table), **steep})

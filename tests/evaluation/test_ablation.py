@@ -1,4 +1,5 @@
 """The ablation: every variant, losses relative to the product, spreads over seeds, files."""
+
 from __future__ import annotations
 
 import csv
@@ -14,10 +15,28 @@ from .gaze.test_evaluation import crowd
 
 def rows():
     out = []
-    for recipe, variant, seed, loss in (("default", "emit", 0, 2.0), ("default", "emit_capture", 0, 1.0), ("default", "emit_capture", 1, 1.2),
-                                        ("paper", "emit_capture", 0, 3.0)):
-        out.append({"recipe": recipe, "variant": variant, "seed": seed, "steps": 5, "train_seconds": 1.0, "test_loss": loss, "train_loss": loss,
-                    "test_KLD": loss, "test_CC": 0.5, "test_MAE": 0.01, "test_relative": loss / 1.1, "train_relative": loss})
+    for recipe, variant, seed, loss in (
+        ("default", "emit", 0, 2.0),
+        ("default", "emit_capture", 0, 1.0),
+        ("default", "emit_capture", 1, 1.2),
+        ("paper", "emit_capture", 0, 3.0),
+    ):
+        out.append(
+            {
+                "recipe": recipe,
+                "variant": variant,
+                "seed": seed,
+                "steps": 5,
+                "train_seconds": 1.0,
+                "test_loss": loss,
+                "train_loss": loss,
+                "test_KLD": loss,
+                "test_CC": 0.5,
+                "test_MAE": 0.01,
+                "test_relative": loss / 1.1,
+                "train_relative": loss,
+            }
+        )
     return out
 
 
@@ -31,7 +50,9 @@ def test_variants():
 
 def test_spreads_are_over_seeds():
     emit, both, paper = summarise(rows())
-    assert both["test_loss"] == pytest.approx(1.1) and both["test_loss.spread"] == pytest.approx(np.std([1, 1.2], ddof=1))
+    assert both["test_loss"] == pytest.approx(1.1) and both["test_loss.spread"] == pytest.approx(
+        np.std([1, 1.2], ddof=1)
+    )
     assert "test_loss.spread" not in emit and both["seeds"] == 2 and paper["recipe"] == "paper"
     assert "1.100 ± 0.141" in table([emit, both]) and len(table([emit, both]).splitlines()) == 4
     assert len({line.count("|") for line in table([emit, both]).splitlines()}) == 1
@@ -68,11 +89,43 @@ def test_the_command(rgb, tmp_path, capsys, monkeypatch):
     from nerg_mi.cli import main
     from nerg_mi.evaluation import ablation
 
-    monkeypatch.setattr(ablation, "all_variants", lambda semantic, recipes: [v for v in all_variants(semantic, recipes) if v.gaze != "emit"])
+    monkeypatch.setattr(
+        ablation,
+        "all_variants",
+        lambda semantic, recipes: [v for v in all_variants(semantic, recipes) if v.gaze != "emit"],
+    )
     crowd(3000).save(tmp_path / "rays.npz")
-    command = [str(a) for a in ("ablate", tmp_path / "rays.npz", "-o", tmp_path / "out", "--geometry", "hits", "--recipes", "default", "--seeds", 2,
-                                "--default-steps", 2, "--zones", 2, "--positions", 6, "--min-rays", 8, "--radius", 0.5, "--cameras", 1,
-                                "--size", "16x8", "--probes", 12)]
+    command = [
+        str(a)
+        for a in (
+            "ablate",
+            tmp_path / "rays.npz",
+            "-o",
+            tmp_path / "out",
+            "--geometry",
+            "hits",
+            "--recipes",
+            "default",
+            "--seeds",
+            2,
+            "--default-steps",
+            2,
+            "--zones",
+            2,
+            "--positions",
+            6,
+            "--min-rays",
+            8,
+            "--radius",
+            0.5,
+            "--cameras",
+            1,
+            "--size",
+            "16x8",
+            "--probes",
+            12,
+        )
+    ]
     with pytest.raises(SystemExit) as end:
         main(command)
     assert not end.value.code, capsys.readouterr().err
@@ -91,7 +144,10 @@ def test_the_command(rgb, tmp_path, capsys, monkeypatch):
             main(command + more)
         assert not end.value.code, capsys.readouterr().err
         assert trained == (["default_capture_0"] if more else [])
-    for more, words in ((["--law", "nowhere"], "MODULE:CLASS"), (["--variant", "emitt"], 'emit_capture here, got "emitt"')):
+    for more, words in (
+        (["--law", "nowhere"], "MODULE:CLASS"),
+        (["--variant", "emitt"], 'emit_capture here, got "emitt"'),
+    ):
         with pytest.raises(SystemExit) as end:
             main([*command, *more])
         assert end.value.code and words in " ".join(capsys.readouterr().err.split())

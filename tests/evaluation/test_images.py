@@ -1,4 +1,6 @@
-"""Scores of pictures against plain restatements and closed forms, and the command on a field whose pictures are known."""
+"""Scores of pictures against plain restatements and closed forms, and the command on a field whose pictures are
+known."""
+
 import json
 
 import drjit.llvm.ad as ns
@@ -7,12 +9,12 @@ import pytest
 
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.images import View
+from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.evaluation.images import Renderer, depth_score, psnr, score_views, ssim
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
-from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.maths.box import Box
 
 
 def noisy():
@@ -32,7 +34,8 @@ def test_psnr_of_a_known_error():
 
 
 def test_ssim_equals_scikit_image_and_its_definition():
-    """scikit-image 0.26, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1; and window by window."""
+    """scikit-image 0.26, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1; and window by
+    window."""
     picture, truth = noisy()
     assert ssim(picture, truth) == pytest.approx(0.8290167933876192, abs=1e-12)
     x = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
@@ -41,7 +44,7 @@ def test_ssim_equals_scikit_image_and_its_definition():
     for i in range(30):
         for j in range(20):
             for c in range(3):
-                a, b = picture[i:i + 11, j:j + 11, c], truth[i:i + 11, j:j + 11, c]
+                a, b = picture[i : i + 11, j : j + 11, c], truth[i : i + 11, j : j + 11, c]
                 ma, mb = np.sum(w * a), np.sum(w * b)
                 va, vb, cov = np.sum(w * (a - ma) ** 2), np.sum(w * (b - mb) ** 2), np.sum(w * (a - ma) * (b - mb))
                 scores.append((2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
@@ -61,7 +64,9 @@ def test_depth_is_scored_where_it_is_known():
 @pytest.fixture
 def fog(tmp_path):
     """A field of density 1.5 and colour (0.5, 0.5, 0.5) in the cube [-1, 1]³; without weights it has no more to say."""
-    config = RadianceConfig(grid=HashGridConfig(levels=2, log2_rows=8, base=4, finest=8), width=16, color_hidden=1, density_scale=1.5)
+    config = RadianceConfig(
+        grid=HashGridConfig(levels=2, log2_rows=8, base=4, finest=8), width=16, color_hidden=1, density_scale=1.5
+    )
     field = RadianceField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 0, march_step=0.05)
     field.set_parameters({k: type(v)(np.zeros(v.shape, np.float32)) for k, v in field.parameters().items()})
     path = tmp_path / "fog.safetensors"

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions, latlong_grid
-from nerg_mi.evaluation import saliency as metrics
 
 y, x = np.mgrid[0:40, 0:40]
 MODEL = np.exp(-0.5 * ((x - 20.0) ** 2 + (y - 20.0) ** 2) / np.sqrt(40**2 + 40**2)).ravel()
@@ -23,7 +23,16 @@ def test_pysaliency_constants():
     assert np.isclose(metrics.sim(GOLD, MODEL), 0.3700539657911494, rtol=1e-12)
     assert np.isclose(metrics.cc(GOLD, MODEL), 0.23097615739142985, rtol=1e-12)
     nss = metrics.nss(MODEL, AT_GAZE)
-    want = [-.821596006113, -.789526121554, -.740616174533, -.740616174533, -.740616174533, -.707322347863, -.433094498355, -.800070419267]  # fmt: skip
+    want = [
+        -0.821596006113,
+        -0.789526121554,
+        -0.740616174533,
+        -0.740616174533,
+        -0.740616174533,
+        -0.707322347863,
+        -0.433094498355,
+        -0.800070419267,
+    ]
     assert np.allclose(nss, want, atol=1e-11)
     assert np.isclose(nss.mean(), -0.721682239594, atol=1e-11)
     assert np.isclose(0.5 * (nss[:5].mean() + nss[5:].mean()), -0.706711609374, atol=1e-11)
@@ -48,7 +57,12 @@ def test_sphere_needs_solid_angles():
     p, q, w = sphere_pair(1024, 512)
     assert np.isclose(metrics.kld(p, q, w), truth, atol=3e-6)
     A = vmf.mean_resultant_length
-    closed = vmf.log_normaliser(30.0) - vmf.log_normaliser(10.0) + 30 * (A(30.0) - 1) - 10 * (A(30.0) * np.cos(np.radians(20)) - 1)
+    closed = (
+        vmf.log_normaliser(30.0)
+        - vmf.log_normaliser(10.0)
+        + 30 * (A(30.0) - 1)
+        - 10 * (A(30.0) * np.cos(np.radians(20)) - 1)
+    )
     assert np.isclose(closed, truth, rtol=1e-12)
 
 
@@ -68,8 +82,13 @@ def test_identity_scale_and_batches():
 @pytest.mark.parametrize("a", ["zeros", "ones", "peak", "tiny", "negative"])
 @pytest.mark.parametrize("b", ["zeros", "ones", "peak", "tiny", "negative"])
 def test_defined_everywhere(a, b):
-    maps = {"zeros": np.zeros(64), "ones": np.full(64, 0.1), "peak": np.eye(64)[5], "tiny": np.eye(64)[9] * 1e-300,
-            "negative": np.linspace(-1, 1, 64)}  # fmt: skip
+    maps = {
+        "zeros": np.zeros(64),
+        "ones": np.full(64, 0.1),
+        "peak": np.eye(64)[5],
+        "tiny": np.eye(64)[9] * 1e-300,
+        "negative": np.linspace(-1, 1, 64),
+    }
     p, q = maps[a], maps[b]
     for score in (metrics.kld, metrics.cc, metrics.sim, metrics.mae):
         assert np.isfinite(score(p, q))

@@ -1,4 +1,5 @@
 """What lies behind a field: where a ray leaves the sphere about it, whatever it comes from, and sizes that must fit."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -66,6 +67,8 @@ def test_what_does_not_belong_together_is_refused():
     grid, net = HashGrid.random(GRID, ns, rng), MLP.random(CONFIG.sizes, ns, rng)
     Background(CONFIG, grid, net)
     with pytest.raises(ValueError, match="grid"):
-        Background(CONFIG, HashGrid.random(HashGridConfig(levels=2, log2_rows=9, base=4, finest=8, dimensions=2), ns, rng), net)
+        Background(
+            CONFIG, HashGrid.random(HashGridConfig(levels=2, log2_rows=9, base=4, finest=8, dimensions=2), ns, rng), net
+        )
     with pytest.raises(ValueError, match="background_net"):
         Background(CONFIG, grid, MLP.random([CONFIG.sizes[0], 32, 3], ns, rng))

@@ -1,4 +1,5 @@
 """Cascades of occupancy against all cells of the finest size, one by one."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
 """Lattices and surfaces of a field whose density and colour are formulas."""
+
 import math
 from types import SimpleNamespace
 
@@ -8,9 +9,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.field import extraction
-from nerg_mi.maths.box import Box
 from nerg_mi.field.extraction import Lattice, Sampler, crossings, opacity, surface_density
 from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.maths.box import Box
 
 
 class Ramp:
@@ -38,7 +39,9 @@ def test_a_lattice_fills_the_box_evenly():
     assert lattice.step == pytest.approx(0.4) and lattice.shape == (10, 5, 3)
     # Three cells of 0.4 overhang the height of 1 by 0.1 on either side.
     assert np.allclose(lattice.lower, (-1, 0, 0.4))
-    assert np.allclose(lattice.points([[0, 0, 0], [9, 4, 2], [0.5, 1, 0]]), [[-0.8, 0.2, 0.6], [2.8, 1.8, 1.4], [-0.6, 0.6, 0.6]])
+    assert np.allclose(
+        lattice.points([[0, 0, 0], [9, 4, 2], [0.5, 1, 0]]), [[-0.8, 0.2, 0.6], [2.8, 1.8, 1.4], [-0.6, 0.6, 0.6]]
+    )
     assert Lattice.over(SimpleNamespace(box=Box((0, 0, 0), (1, 1, 0.01))), 2).shape == (2, 2, 2)
     with pytest.raises(ValueError, match="at least 2 cells"):
         Lattice.over(Ramp(), 1)
@@ -68,7 +71,9 @@ def test_empty_cells_have_no_density_unless_asked():
     bits[:, :, 1] = True  # the half of larger x
     field.occupancy = OccupancyGrid(bits, ns, 0.0)
     p = np.array([[-0.5, 1, 1], [2.5, 1, 1]])
-    assert np.allclose(Sampler(field).density(p), [0, sigma(p[1])]) and np.allclose(Sampler(field).density(p, masked=False), sigma(p))
+    assert np.allclose(Sampler(field).density(p), [0, sigma(p[1])]) and np.allclose(
+        Sampler(field).density(p, masked=False), sigma(p)
+    )
 
 
 def test_colours_are_those_from_in_front_and_aslant():

@@ -1,11 +1,11 @@
 """Networks: cooperative vectors, tensor products and NumPy agree, with their gradients."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 from nerg_mi.field.mlp import MLP
-
 from tests.reference import fields_numpy as reference
 
 SIZES = [[3, 1], [8, 16, 5], [6, 16, 16, 3]]
@@ -119,4 +119,6 @@ def test07_layer_normalisation(mode):
         direction, ends = rng.normal(size=array.shape), []
         for h in (1e-6, -1e-6):
             ends.append((restated({**arrays, name: arrays[name] + h * direction}) * mix).sum())
-        assert np.isclose((dr.grad(array).numpy() * direction).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-3, atol=1e-4), name
+        assert np.isclose(
+            (dr.grad(array).numpy() * direction).sum(), (ends[0] - ends[1]) / 2e-6, rtol=1e-3, atol=1e-4
+        ), name

@@ -1,4 +1,5 @@
 """Occupancy: distances against brute force, look-ups, and the packed form."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -25,9 +26,9 @@ def test02_lookup_is_indexed_zyx_and_clamped():
     bits = np.zeros((4, 4, 4), bool)
     bits[3, 1, 0] = True  # z = 3, y = 1, x = 0
     grid = OccupancyGrid(bits, ns, 0.1)
-    points = np.array([
-        [0.1, 0.4, 0.9], [0.3, 0.4, 0.9], [0.9, 0.4, 0.9], [0, 0.25, 0.75], [0.1, 0.4, 1.0], [-5, 0.4, 9], [1, 1, 0],
-    ])  # fmt: skip
+    points = np.array(
+        [[0.1, 0.4, 0.9], [0.3, 0.4, 0.9], [0.9, 0.4, 0.9], [0, 0.25, 0.75], [0.1, 0.4, 1.0], [-5, 0.4, 9], [1, 1, 0]]
+    )
     assert grid.empty_cells(ns.Array3f(points.T)).numpy().tolist() == [0, 1, 3, 0, 0, 0, 3]
 
 

@@ -1,13 +1,13 @@
 """The radiance field against its NumPy version, and its handling of parameters."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField, density_from_log, sigmoid
-
+from nerg_mi.maths.box import Box
 from tests.reference import fields_numpy as reference
 
 GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)
@@ -47,7 +47,9 @@ def test01_equals_numpy():
 
 def test02_density_head_equals_the_full_net():
     field, (p, _) = make(), points()
-    assert np.allclose(field.density(ns.Array3f(p.T)).numpy(), field.density_features(ns.Array3f(p.T))[0].numpy(), rtol=1e-6)
+    assert np.allclose(
+        field.density(ns.Array3f(p.T)).numpy(), field.density_features(ns.Array3f(p.T))[0].numpy(), rtol=1e-6
+    )
 
 
 def test03_the_mask_is_honoured():
@@ -96,7 +98,9 @@ def test06_set_parameters_changes_every_output():
     assert np.allclose(after[0], s, rtol=2e-5) and np.allclose(after[1], s, rtol=2e-5)
 
 
-@pytest.mark.parametrize("name", ["grid", "density_net.2", "density_net", "density_net.x", "emit_head.0", "density_net.-1"])
+@pytest.mark.parametrize(
+    "name", ["grid", "density_net.2", "density_net", "density_net.x", "emit_head.0", "density_net.-1"]
+)
 def test07_unknown_parameters_are_named(name):
     field = make()
     with pytest.raises(ValueError, match=f'no parameter "{name}"; it has grid.table, density_net.0'):
@@ -142,10 +146,16 @@ def test10_defaults_are_the_papers():
     assert RadianceConfig.from_dict(CONFIG.to_dict()) == CONFIG
 
 
-@pytest.mark.parametrize("wrong, words", [
-    (dict(width=0), "at least 1"), (dict(density_hidden=0), "at least 1"), (dict(density_scale=0), "density_scale"),
-    (dict(density_scale=float("nan")), "density_scale"), (dict(density_scale=float("inf")), "density_scale"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (dict(width=0), "at least 1"),
+        (dict(density_hidden=0), "at least 1"),
+        (dict(density_scale=0), "density_scale"),
+        (dict(density_scale=float("nan")), "density_scale"),
+        (dict(density_scale=float("inf")), "density_scale"),
+    ],
+)
 def test11_wrong_sizes(wrong, words):
     with pytest.raises(ValueError, match=words):
         RadianceConfig(**wrong)

@@ -1,13 +1,14 @@
 """The networks, their gradients and one gaze field against torch, an autograd that shares no code with ours."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.encoding.harmonics import encode_direction
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.mlp import MLP
+from nerg_mi.maths.box import Box
 
 RNG = np.random.default_rng(0)
 

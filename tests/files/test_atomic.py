@@ -91,7 +91,11 @@ def test_what_cannot_be_written_is_found_before_and_nothing_is_made(tmp_path, mo
     check_folder(tmp_path / "a" / "b")
     with pytest.raises(NergError, match="end in .npz or .parquet"):
         check_writable(tmp_path / "b.txt", ".npz", ".parquet")
-    for path, said in ((tmp_path, "is a folder"), (tmp_path / "file" / "x" / "y", "parents is a file"), (tmp_path / ("x" * 300), "too long")):
+    for path, said in (
+        (tmp_path, "is a folder"),
+        (tmp_path / "file" / "x" / "y", "parents is a file"),
+        (tmp_path / ("x" * 300), "too long"),
+    ):
         with pytest.raises(NergError, match=said):
             check_writable(path)
     with pytest.raises(NergError, match="parents is a file"):

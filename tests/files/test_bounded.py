@@ -13,11 +13,21 @@ from nerg_mi.files import bounded
 from nerg_mi.files.bounded import parse_json, plain, read_bytes, read_json, reading, size_of, text_lines
 
 
-@pytest.mark.parametrize("error", [
-    EOFError(), KeyError("frames"), OverflowError("too large"), RecursionError(), MemoryError(), 
-    struct.error("4 bytes needed"), zlib.error("incorrect header"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"),
-    OSError(5, "Input/output error"), ValueError("two\nlines \x1b[31m"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "error",
+    [
+        EOFError(),
+        KeyError("frames"),
+        OverflowError("too large"),
+        RecursionError(),
+        MemoryError(),
+        struct.error("4 bytes needed"),
+        zlib.error("incorrect header"),
+        UnicodeDecodeError("utf-8", b"\xff", 0, 1, "bad"),
+        OSError(5, "Input/output error"),
+        ValueError("two\nlines \x1b[31m"),
+    ],
+)
 def test_what_a_damaged_file_raises_becomes_one_sentence(error):
     with pytest.raises(NergError) as told, reading("a.bin", "depth file", "copy it again"):
         raise error

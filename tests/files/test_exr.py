@@ -62,7 +62,9 @@ def test_a_file_that_is_cut_off_is_not_taken_for_a_picture(tmp_path, shape):
                 write_exr(path, channels, {"seed": "3"})
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
-        assert path.stat().st_size == (3 if size < whole else whole) and [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+        assert path.stat().st_size == (3 if size < whole else whole) and [p.name for p in tmp_path.iterdir()] == [
+            "a.exr"
+        ]
 
 
 _ONE_THREAD = """
@@ -101,10 +103,26 @@ def test_one_thread_is_enough(tmp_path):
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float16])
-@pytest.mark.parametrize("names", [
-    "R G B", "R G B A", "Y", "Y A", "Z", "depth.T", "R G B depth.T", "A B C", "rgba.R rgba.G rgba.B rgba.A", "r g b",
-    "albedo.R albedo.G albedo.B nn.X nn.Y nn.Z", "X Y Z", "Z Y X A B", "Blue Aqua Cat", "left.R right.R left.G B",
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "names",
+    [
+        "R G B",
+        "R G B A",
+        "Y",
+        "Y A",
+        "Z",
+        "depth.T",
+        "R G B depth.T",
+        "A B C",
+        "rgba.R rgba.G rgba.B rgba.A",
+        "r g b",
+        "albedo.R albedo.G albedo.B nn.X nn.Y nn.Z",
+        "X Y Z",
+        "Z Y X A B",
+        "Blue Aqua Cat",
+        "left.R right.R left.G B",
+    ],
+)
 def test_pictures_are_read_as_mitsuba_reads_them(rgb, tmp_path, names, kind):
     from nerg_mi.capture.reading import open_bitmap
 

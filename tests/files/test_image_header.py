@@ -28,7 +28,7 @@ def test_sizes_of_what_mitsuba_writes(rgb, tmp_path, name):
     if name in ("a.png", "a.jpg", "a.bmp", "a.ppm"):
         bitmap = rgb.Bitmap((values * 255).astype(np.uint8))
     if name == "a.exr":
-        write_exr(tmp_path / name, {c: values[..., 0] for c in "RGB"})
+        write_exr(tmp_path / name, dict.fromkeys("RGB", values[..., 0]))
     elif name == "a.bmp":
         head = struct.pack("<2sIIIIiiHHIIiiII", b"BM", 174, 0, 54, 40, 7, 5, 1, 24, 0, 120, 0, 0, 0, 0)
         (tmp_path / name).write_bytes(head + bytes(120))
@@ -96,11 +96,24 @@ def test_scans_of_a_jpeg_are_counted(rgb, tmp_path):
         check_image(tmp_path / "b.jpg")
 
 
-@pytest.mark.parametrize("raw", [
-    b"", b"hello", b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"\xff\xd8\xff\xe0\0\0" * 3, b"\xff\xd8" + b"\xff\xda\0\2" * 101,
-    b"\x76\x2f\x31\x01\2\0\0\0", b"\x76\x2f\x31\x01\2\0\0\0abc\0int\0\xff\xff\xff\x7f", b"\x76\x2f\x31\x01\2\x08\0\0",
-    b"BM", b"P6 x y", b"#?RADIANCE\n", png(0, 3),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"",
+        b"hello",
+        b"\x89PNG\r\n\x1a\n",
+        b"\xff\xd8",
+        b"\xff\xd8\xff\xe0\0\0" * 3,
+        b"\xff\xd8" + b"\xff\xda\0\2" * 101,
+        b"\x76\x2f\x31\x01\2\0\0\0",
+        b"\x76\x2f\x31\x01\2\0\0\0abc\0int\0\xff\xff\xff\x7f",
+        b"\x76\x2f\x31\x01\2\x08\0\0",
+        b"BM",
+        b"P6 x y",
+        b"#?RADIANCE\n",
+        png(0, 3),
+    ],
+)
 def test_damaged_headers_are_told_with_the_file(tmp_path, raw):
     (tmp_path / "picture").write_bytes(raw)
     with pytest.raises(NergError, match="picture"):

@@ -16,7 +16,9 @@ def lines(path, most=1000):
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 7, 1 << 20])
-@pytest.mark.parametrize("text", ["", "a", "a\nb", "a\r\nb\r\n", "\n\n", "a\rb\r", "\u20ac\r\n\u2028x\x0by\n", "a\n\r\nb"])
+@pytest.mark.parametrize(
+    "text", ["", "a", "a\nb", "a\r\nb\r\n", "\n\n", "a\rb\r", "\u20ac\r\n\u2028x\x0by\n", "a\n\r\nb"]
+)
 def test_lines_are_those_of_python(tmp_path, monkeypatch, text, chunk):
     """Wherever the file is cut into pieces: within characters, and between the two that end a line."""
     monkeypatch.setattr(module, "_CHUNK", chunk)

@@ -13,10 +13,16 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.npy import open_npz, read_npy, read_npz
 
 _ARRAYS = [
-    np.arange(12.0).reshape(3, 4), np.asfortranarray(np.arange(12, dtype="<u2").reshape(3, 4)), np.zeros((0, 3)),
-    np.array(2.5), np.array(["a", "bcd"]), np.array([True, False]), np.zeros(3, [("x", "<f4"), ("n", "<i8")]), 
-    np.arange(3, dtype=">f4"), np.array([1, 2], "M8[s]"),
-]  # fmt: skip
+    np.arange(12.0).reshape(3, 4),
+    np.asfortranarray(np.arange(12, dtype="<u2").reshape(3, 4)),
+    np.zeros((0, 3)),
+    np.array(2.5),
+    np.array(["a", "bcd"]),
+    np.array([True, False]),
+    np.zeros(3, [("x", "<f4"), ("n", "<i8")]),
+    np.arange(3, dtype=">f4"),
+    np.array([1, 2], "M8[s]"),
+]
 
 
 def npy(shape, descr="<f8", data=b"", version=(1, 0)) -> bytes:

@@ -20,10 +20,16 @@ def test_rows_come_back_and_what_they_lack_is_empty(tmp_path):
 
 
 def test_a_table_that_cannot_be_made_leaves_the_old_one(tmp_path):
-    for name, write in (("a.csv", lambda p: write_csv(p, [{"a": 1}, {"b": 1}], ("a",))), ("a.json", lambda p: write_json(p, math.nan, allow_nan=False))):
+    for name, write in (
+        ("a.csv", lambda p: write_csv(p, [{"a": 1}, {"b": 1}], ("a",))),
+        ("a.json", lambda p: write_json(p, math.nan, allow_nan=False)),
+    ):
         (tmp_path / name).write_bytes(b"old")
         with pytest.raises(ValueError):
             write(tmp_path / name)
         assert (tmp_path / name).read_bytes() == b"old"
     write_json(tmp_path / "a.json", {"a": [1, math.nan]})
-    assert math.isnan(json.loads((tmp_path / "a.json").read_text())["a"][1]) and sorted(os.listdir(tmp_path)) == ["a.csv", "a.json"]
+    assert math.isnan(json.loads((tmp_path / "a.json").read_text())["a"][1]) and sorted(os.listdir(tmp_path)) == [
+        "a.csv",
+        "a.json",
+    ]

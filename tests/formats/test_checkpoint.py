@@ -1,4 +1,5 @@
 """Checkpoint files: round trips, atomic writes, and a sentence for every kind of wrong file."""
+
 import json
 import os
 import stat
@@ -13,9 +14,11 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import FORMAT, read_checkpoint, write_checkpoint
 
 TENSORS = {
-    "a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.array([1, 255], np.uint8), "c.0": np.ones(3, np.float16),
+    "a": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "b": np.array([1, 255], np.uint8),
+    "c.0": np.ones(3, np.float16),
     "t": np.arange(6, dtype=np.float32).reshape(2, 3).T,
-}  # fmt: skip
+}
 
 
 def test01_round_trip(tmp_path):
@@ -117,10 +120,18 @@ def test10_torch_is_not_imported(tmp_path):
     assert run.stdout.strip() == "False"
 
 
-@pytest.mark.parametrize("raw", [
-    b"", b"\1\2", (10**12).to_bytes(8, "little") + b"{}", (2).to_bytes(8, "little") + b"[]", (1 << 63).to_bytes(8, "little"),
-    (200).to_bytes(8, "little") + b'{"x":{"dtype":"F32","shape":[1152921504606846976],"data_offsets":[0,0]}}'.ljust(200),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"",
+        b"\1\2",
+        (10**12).to_bytes(8, "little") + b"{}",
+        (2).to_bytes(8, "little") + b"[]",
+        (1 << 63).to_bytes(8, "little"),
+        (200).to_bytes(8, "little")
+        + b'{"x":{"dtype":"F32","shape":[1152921504606846976],"data_offsets":[0,0]}}'.ljust(200),
+    ],
+)
 def test_headers_are_bounded(tmp_path, raw):
     (tmp_path / "f.safetensors").write_bytes(raw)
     with pytest.raises(NergError, match="f.safetensors"):

@@ -1,4 +1,5 @@
 """Fields in and out of files: exact in fp32, rounded in fp16, and a sentence for what does not fit."""
+
 import json
 
 import drjit.llvm.ad as ns
@@ -8,12 +9,12 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
+from nerg_mi.maths.box import Box
 
 GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
 BOX = Box((-1, 0, 2), (3, 2, 4))
@@ -22,9 +23,14 @@ BOX = Box((-1, 0, 2), (3, 2, 4))
 def radiance(resolution=5):
     bits = np.random.default_rng(0).random((resolution,) * 3) < 0.2
     return RadianceField.random(
-        RadianceConfig(GRID, width=16, color_hidden=1, geometry=3, sh_degree=2, density_scale=7.0), BOX, ns, 1,
-        occupancy=OccupancyGrid(bits, ns, 0.25), color_space="linear", march_step=0.01,
-    )  # fmt: skip
+        RadianceConfig(GRID, width=16, color_hidden=1, geometry=3, sh_degree=2, density_scale=7.0),
+        BOX,
+        ns,
+        1,
+        occupancy=OccupancyGrid(bits, ns, 0.25),
+        color_space="linear",
+        march_step=0.01,
+    )
 
 
 def gaze():
@@ -145,14 +151,31 @@ def test10_weights_that_are_not_finite_are_refused(tmp_path):
         save_radiance(field, tmp_path / "f", {}, half=True)
 
 
-@pytest.mark.parametrize("path, value", [
-    (("architecture", "grid", "levels"), 10**9), (("architecture", "width"), 10**9), (("architecture", "color_hidden"), 10**9),
-    (("architecture", "grid", "log2_rows"), 60), (("architecture", "grid", "finest"), 1e300), (("architecture", "sh_degree"), 2.5),
-    (("architecture", "grid", "base"), True), (("architecture", "geometry"), "15"), (("architecture", "grid"), [1]),
-    (("architecture",), 3), (("box", "lower"), "here"), (("box",), None), (("occupancy", "resolution"), 10**6),
-    (("occupancy", "resolution"), -1), (("occupancy", "bound"), 1e300), (("march_step",), 0), (("march_step",), "x"),
-    (("march_step",), float("nan")), (("provenance",), [1]), (("color_space",), {}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "path, value",
+    [
+        (("architecture", "grid", "levels"), 10**9),
+        (("architecture", "width"), 10**9),
+        (("architecture", "color_hidden"), 10**9),
+        (("architecture", "grid", "log2_rows"), 60),
+        (("architecture", "grid", "finest"), 1e300),
+        (("architecture", "sh_degree"), 2.5),
+        (("architecture", "grid", "base"), True),
+        (("architecture", "geometry"), "15"),
+        (("architecture", "grid"), [1]),
+        (("architecture",), 3),
+        (("box", "lower"), "here"),
+        (("box",), None),
+        (("occupancy", "resolution"), 10**6),
+        (("occupancy", "resolution"), -1),
+        (("occupancy", "bound"), 1e300),
+        (("march_step",), 0),
+        (("march_step",), "x"),
+        (("march_step",), float("nan")),
+        (("provenance",), [1]),
+        (("color_space",), {}),
+    ],
+)
 def test_sizes_are_checked_before_anything_is_built(tmp_path, path, value):
     save_radiance(radiance(), tmp_path / "f", {})
 
@@ -167,7 +190,9 @@ def test_sizes_are_checked_before_anything_is_built(tmp_path, path, value):
         load_radiance(tmp_path / "f", ns)
 
 
-@pytest.mark.parametrize("name, shape", [("grid.table", (4,)), ("density_net.0", (3, 5)), ("color_net.0", (7,)), ("color_net.1", ())])
+@pytest.mark.parametrize(
+    "name, shape", [("grid.table", (4,)), ("density_net.0", (3, 5)), ("color_net.0", (7,)), ("color_net.1", ())]
+)
 def test_arrays_must_have_the_shapes_of_the_architecture(tmp_path, name, shape):
     save_radiance(radiance(), tmp_path / "f", {})
     rewrite(tmp_path / "f", lambda tensors, meta: tensors.update({name: np.zeros(shape, np.float32)}))

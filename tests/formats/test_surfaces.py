@@ -1,4 +1,5 @@
 """Meshes, points and voxels of a field whose surface is known: a ball, in front of what nobody has looked at."""
+
 import json
 import math
 import struct
@@ -9,12 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.maths.box import Box
-from nerg_mi.field.extraction import Lattice, Sampler, surface_density
 from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
+from nerg_mi.field.extraction import Lattice, Sampler, surface_density
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.formats.surfaces import mesh, points, write_glb, write_ply
 from nerg_mi.formats.volumes import density_and_color, write_volume
+from nerg_mi.maths.box import Box
 
 CENTER, RADIUS = np.array([1.2, 1.0, 0.9]), 0.6
 
@@ -24,7 +25,9 @@ class Ball:
 
     def __init__(self, occupancy=None, speck=False, hole=False, color_space="srgb", sharp=200.0):
         self.box, self.occupancy, self.color_space = Box((0, 0, 0), (2.4, 2, 1.8)), occupancy, color_space
-        self.grid = HashGrid.random(HashGridConfig(levels=1, log2_rows=6, base=2, finest=2), ns, np.random.default_rng(0))
+        self.grid = HashGrid.random(
+            HashGridConfig(levels=1, log2_rows=6, base=2, finest=2), ns, np.random.default_rng(0)
+        )
         self.speck, self.hole, self.sharp = speck, hole, sharp
 
     def density(self, p, active=True):
@@ -34,7 +37,7 @@ class Ball:
             sigma += 1e3 * dr.exp(200 * (0.1 - to([0.2, 0.2, 0.2])))
         if self.hole:
             # A shaft along z about one line of lattice points.
-            sigma = dr.select(dr.sqrt((p.x - 1.225)**2 + (p.y - 1.025)**2) < 0.02, 0, sigma)
+            sigma = dr.select(dr.sqrt((p.x - 1.225) ** 2 + (p.y - 1.025) ** 2) < 0.02, 0, sigma)
         return dr.select(active & self.box.contains(p), dr.minimum(sigma, 1e4), 0)
 
     def density_features(self, p, active=True):
@@ -112,7 +115,9 @@ def test04_points_and_the_box():
 
 def test05_files(tmp_path):
     cloud = points(Ball(color_space="linear"), 24)
-    triangles = cloud.__class__(cloud.vertices[:30], np.arange(30).reshape(10, 3), cloud.normals[:30], cloud.colors[:30], {})
+    triangles = cloud.__class__(
+        cloud.vertices[:30], np.arange(30).reshape(10, 3), cloud.normals[:30], cloud.colors[:30], {}
+    )
     write_ply(triangles, tmp_path / "m.ply")
     body = trimesh.load(tmp_path / "m.ply", process=False)
     assert np.allclose(body.vertices, triangles.vertices, atol=1e-6) and np.array_equal(body.faces, triangles.faces)
@@ -126,11 +131,14 @@ def test05_files(tmp_path):
         assert np.allclose(shown.vertices, v if up == "y" else np.stack([v[:, 0], v[:, 2], -v[:, 1]], 1), atol=1e-6)
     raw = (tmp_path / "m.glb").read_bytes()
     size = struct.unpack("<I", raw[12:16])[0]
-    document = json.loads(raw[20:20 + size])
+    document = json.loads(raw[20 : 20 + size])
     view = document["bufferViews"][2]
     rgba = np.frombuffer(raw, "<u2", view["byteLength"] // 2, 28 + size + view["byteOffset"]).reshape(-1, 4) / 65535
     # The stand-in's colours are linear; glTF's are too.
-    assert np.allclose(rgba[:, 0], triangles.vertices[:, 0] / 2.4, atol=1e-4) and len(raw) == struct.unpack("<I", raw[8:12])[0]
+    assert (
+        np.allclose(rgba[:, 0], triangles.vertices[:, 0] / 2.4, atol=1e-4)
+        and len(raw) == struct.unpack("<I", raw[8:12])[0]
+    )
 
 
 def test06_voxels_render_as_the_field(rgb, tmp_path):
@@ -138,7 +146,9 @@ def test06_voxels_render_as_the_field(rgb, tmp_path):
     density, color, lower, upper = density_and_color(ball, 24, samples=3)
     assert density.shape == (18, 20, 24) and np.allclose(lower, 0) and np.allclose(upper, ball.box.upper)
     cell = 0.1
-    points_of = lambda x, y, z: (np.stack(np.meshgrid(*[(np.arange(3) + 0.5) / 3] * 3), -1).reshape(-1, 3) + [x, y, z]) * cell
+    points_of = lambda x, y, z: (
+        (np.stack(np.meshgrid(*[(np.arange(3) + 0.5) / 3] * 3), -1).reshape(-1, 3) + [x, y, z]) * cell
+    )
     for x, y, z in ((6, 9, 8), (5, 9, 8), (5, 8, 8), (8, 9, 8)):
         share = np.mean(-np.expm1(-Sampler(ball).density(points_of(x, y, z)) * cell))
         assert np.isclose(density[z, y, x], min(-math.log(max(1 - share, 1e-9)), 5) / cell, rtol=1e-3)
@@ -149,7 +159,9 @@ def test06_voxels_render_as_the_field(rgb, tmp_path):
     write_volume(tmp_path / "d.vol", density, lower, upper)
     write_volume(tmp_path / "c.vol", color, lower, upper)
     for name, data in (("d", density), ("c", color)):
-        volume = rgb.load_dict({"type": "gridvolume", "filename": str(tmp_path / f"{name}.vol"), "use_grid_bbox": True, "raw": True})
+        volume = rgb.load_dict(
+            {"type": "gridvolume", "filename": str(tmp_path / f"{name}.vol"), "use_grid_bbox": True, "raw": True}
+        )
         assert np.allclose(volume.bbox().max, upper)
         it = dr.zeros(rgb.Interaction3f)
         it.p = rgb.Point3f(*((np.array([6, 9, 8]) + 0.5) * cell).tolist())

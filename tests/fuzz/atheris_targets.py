@@ -20,18 +20,18 @@ sys.path.insert(0, str(ROOT))
 import atheris  # noqa: E402
 
 # Libraries are instrumented as they are imported, so that these come first and what is tried afterwards.
-import mitsuba as mi  # noqa: E402, F401
+import mitsuba as mi  # noqa: E402
 import numpy as np  # noqa: E402, F401
 
 with atheris.instrument_imports(include=["nerg_mi.formats", "nerg_mi.capture", "zipfile", "gzip"]):
     import nerg_mi  # noqa: F401
+    from nerg_mi.capture.colmap import read_colmap
     from nerg_mi.capture.reading import read_image
     from nerg_mi.errors import NergError
     from nerg_mi.files.bounded import parse_json
-    from nerg_mi.capture.colmap import read_colmap
-    from nerg_mi.formats.fields import load_radiance
     from nerg_mi.files.image_header import check_image
     from nerg_mi.files.npy import read_npy, read_npz
+    from nerg_mi.formats.fields import load_radiance
     from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
     from nerg_mi.formats.torch_ngp.unpickling import _Machine
 

@@ -130,10 +130,10 @@ def _picture(name: str):
 
 def _read_picture(name: str):
     def read(folder: Path) -> object:
+        from nerg_mi.capture.posed import DepthFile, MaskFile
         from nerg_mi.capture.reading import read_depth, read_image, read_mask
         from nerg_mi.capture.salience.views import read_salience
         from nerg_mi.errors import NergError
-        from nerg_mi.capture.posed import DepthFile, MaskFile
 
         path, out = folder / name, []
         ways = [

@@ -15,8 +15,8 @@ _ABOUT = {"sha": 1, "width": 24}
 def _parts():
     from drjit.llvm import ad as ns
 
-    from nerg_mi.maths.box import Box
     from nerg_mi.field.encoding.hashgrid import HashGridConfig
+    from nerg_mi.maths.box import Box
 
     return ns, Box((-1, 0, 2), (3, 2, 4)), HashGridConfig(levels=2, log2_rows=3, base=2, finest=4)
 
@@ -50,9 +50,9 @@ def _read_radiance(folder: Path) -> object:
 
 
 def _gaze(kind: str):
-    from nerg_mi.field.gaze.product import GazeConfig, GazeField
     from nerg_mi.field.gaze.ensemble import GazeEnsemble
     from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+    from nerg_mi.field.gaze.product import GazeConfig, GazeField
     from nerg_mi.field.gaze.support import RaySupport
 
     ns, box, grid = _parts()
@@ -225,8 +225,8 @@ def _make_nerg(folder: Path) -> None:
 
 
 def _read_nerg(folder: Path) -> object:
-    from nerg_mi.formats.torch_ngp.nerg import read_nerg
     from nerg_mi.formats.torch_ngp.fields import Given
+    from nerg_mi.formats.torch_ngp.nerg import read_nerg
 
     return read_nerg(folder / "nerg.pth", _parts()[0], given=Given(finest=32))
 

@@ -24,18 +24,51 @@ SECONDS = 5.0
 """So much time of the processor."""
 
 _FORBIDDEN = (
-    "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "subprocess.Popen", "pty.spawn",
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.spawn",
+    "os.fork",
+    "subprocess.Popen",
+    "pty.spawn",
     "pickle.find_class",
-    "shutil.", "os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.chmod", "os.chown",
-    "os.truncate", "os.putenv", "os.kill", "socket.", "ctypes.dlopen", "code.__new__", "webbrowser.", "urllib.",
+    "shutil.",
+    "os.remove",
+    "os.rename",
+    "os.mkdir",
+    "os.rmdir",
+    "os.link",
+    "os.symlink",
+    "os.chmod",
+    "os.chown",
+    "os.truncate",
+    "os.putenv",
+    "os.kill",
+    "socket.",
+    "ctypes.dlopen",
+    "code.__new__",
+    "webbrowser.",
+    "urllib.",
     "ftplib.",
-    "smtplib.", "tempfile.",
-)  # fmt: skip
+    "smtplib.",
+    "tempfile.",
+)
 # What may be imported late, besides the standard library.
-_LIBRARIES = frozenset((
-    "nerg_mi", "tests", "numpy", "scipy", "drjit", "mitsuba", "OpenEXR", "safetensors", "trimesh", "pyarrow",
-    "matplotlib",
-))  # fmt: skip
+_LIBRARIES = frozenset(
+    (
+        "nerg_mi",
+        "tests",
+        "numpy",
+        "scipy",
+        "drjit",
+        "mitsuba",
+        "OpenEXR",
+        "safetensors",
+        "trimesh",
+        "pyarrow",
+        "matplotlib",
+    )
+)
 
 watched = False
 violations: list[str] = []

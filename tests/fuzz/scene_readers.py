@@ -58,5 +58,9 @@ def _reader(name: str, *kinds: str) -> Reader:
 
 
 SCENES = [
-    _reader("scene.xml", "text"), _reader("binary.ply"), _reader("text.ply", "text"), _reader("a.obj", "text"), _reader("fog.vol"),
-]  # fmt: skip
+    _reader("scene.xml", "text"),
+    _reader("binary.ply"),
+    _reader("text.ply", "text"),
+    _reader("a.obj", "text"),
+    _reader("fog.vol"),
+]

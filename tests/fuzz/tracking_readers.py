@@ -22,22 +22,37 @@ def _rays():
     origin = rng.random((40, 3)) + [0, 0, 1.4]
     cohort = np.arange(40) % 2
     # A wide character: what shows it is imported before anything is damaged.
-    rays = Rays(np.arange(40) * 0.02, np.arange(40) % 3, ("a", "b", "\u540d"), origin, d, np.ones(40), origin + 2 * d, cohort=cohort, cohorts=("x", "y"))
+    rays = Rays(
+        np.arange(40) * 0.02,
+        np.arange(40) % 3,
+        ("a", "b", "\u540d"),
+        origin,
+        d,
+        np.ones(40),
+        origin + 2 * d,
+        cohort=cohort,
+        cohorts=("x", "y"),
+    )
     about = {
-        "transform": np.eye(4).tolist(), "sources": [{"file": "a.csv", "sha256": "00" * 32}], "rows_read": 42, "tick": 1.0,
+        "transform": np.eye(4).tolist(),
+        "sources": [{"file": "a.csv", "sha256": "00" * 32}],
+        "rows_read": 42,
+        "tick": 1.0,
         "dropped": [{"reason": "blink", "file": "a.csv", "count": 2, "rows": [[3, 4]]}],
         "source_frame": {"up": "y", "handedness": "left", "units": "m"},
-    }  # fmt: skip
+    }
     rays.metadata.update(about)
     where = {"position": {"radius": 0.25, "zones": 1, "zone_radius": 0.2, "test_centres": [[0.0, 0.0, 1.5]]}}
-    return rays.noting(step="filter", kept=40, of=41, persons=["a"]).noting(step="split", side="test", kept=40, of=40, by=where)
+    return rays.noting(step="filter", kept=40, of=41, persons=["a"]).noting(
+        step="split", side="test", kept=40, of=40, by=where
+    )
 
 
 def _shown(rays) -> None:
     """What the commands ask of rays: the card, a selection, pseudonyms."""
+    from nerg_mi.cli.rays import _card
     from nerg_mi.rays.filters import select_mask
     from nerg_mi.rays.pseudonyms import pseudonymise
-    from nerg_mi.cli.rays import _card
 
     with contextlib.redirect_stdout(io.StringIO()):
         _card(rays, Path("rays.npz"))
@@ -74,7 +89,9 @@ _MAP = "origin=x,y,z direction=a,b,c t=t person=who confidence=conf hit=h,i,j"
 
 
 def _table() -> str:
-    rows = [f"{0.02 * k},{'ann' if k % 2 else 'bo'},0.{k},1,1.6,1,0.{k},0,1,{k},2,{'' if k % 3 else k}" for k in range(20)]
+    rows = [
+        f"{0.02 * k},{'ann' if k % 2 else 'bo'},0.{k},1,1.6,1,0.{k},0,1,{k},2,{'' if k % 3 else k}" for k in range(20)
+    ]
     return "\n".join(["t,who,x,y,z,a,b,c,conf,h,i,j", *rows]) + "\n"
 
 
@@ -114,13 +131,20 @@ def _skeletons(name: str, *kinds: str, skip: bool = False) -> Reader:
         if not skip:
             read_skeleton(folder / name)
 
-    return Reader(f"skeleton {name}{' skipping' if skip else ''}", lambda folder: _make_skeleton(folder / name), {name: kinds}, read)
+    return Reader(
+        f"skeleton {name}{' skipping' if skip else ''}",
+        lambda folder: _make_skeleton(folder / name),
+        {name: kinds},
+        read,
+    )
 
 
 def _recording(preset: str, files: dict[str, str], **options) -> Reader:
     def make(folder: Path) -> None:
         for name, text in files.items():
-            (folder / name).write_bytes(gzip.compress(text.encode(), mtime=0) if name.endswith(".gz") else text.encode())
+            (folder / name).write_bytes(
+                gzip.compress(text.encode(), mtime=0) if name.endswith(".gz") else text.encode()
+            )
 
     def read(folder: Path) -> None:
         from nerg_mi.rays.readers.presets import PRESETS
@@ -136,27 +160,67 @@ def _lines(head: list[str] | None, row, separator: str = ",") -> str:
     return "\n".join([*([separator.join(head)] if head else []), *lines]) + "\n"
 
 
-_VR = [f"ctw_{i}{j}" for i in range(3) for j in range(4)] + "ray_x ray_y ray_z eye_x eye_y eye_z xc yc zc opennessl opennessr time".split()
+_VR = [
+    f"ctw_{i}{j}" for i in range(3) for j in range(4)
+] + "ray_x ray_y ray_z eye_x eye_y eye_z xc yc zc opennessl opennessr time".split()
 _UNITY = "time id gaze_origin_x gaze_origin_y gaze_origin_z gaze_dir_x gaze_dir_y gaze_dir_z status".split()
-_LOCAL = ["time", *(f"head_pos_{a}" for a in "xyz"), *(f"head_rot_{a}" for a in "xyzw"), *(f"gaze_dir_{a}" for a in "xyz")]
+_LOCAL = [
+    "time",
+    *(f"head_pos_{a}" for a in "xyz"),
+    *(f"head_rot_{a}" for a in "xyzw"),
+    *(f"gaze_dir_{a}" for a in "xyz"),
+]
 _POSES = ["timestamp", *(f"{what}_{axis}" for what in ("rotation", "translation") for axis in "xyz")]
-_GAZE = ["gaze_timestamp", "confidence", *(f"gaze_normal{e}_{a}" for e in "01" for a in "xyz"), *(f"eye_center{e}_3d_{a}" for e in "01" for a in "xyz")]
+_GAZE = [
+    "gaze_timestamp",
+    "confidence",
+    *(f"gaze_normal{e}_{a}" for e in "01" for a in "xyz"),
+    *(f"eye_center{e}_3d_{a}" for e in "01" for a in "xyz"),
+]
 
 _PRESETS = [
-    _recording("vr_supermarket", {"user1.csv.gz": _lines(_VR, lambda k: [1, 0, 0, k, 0, 1, 0, 1.6, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 1, k, 0.9, 0.8, 0.02 * k])}),
+    _recording(
+        "vr_supermarket",
+        {
+            "user1.csv.gz": _lines(
+                _VR, lambda k: [1, 0, 0, k, 0, 1, 0, 1.6, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 1, k, 0.9, 0.8, 0.02 * k]
+            )
+        },
+    ),
     _recording("unity", {"ann.csv": _lines(_UNITY, lambda k: [0.02 * k, "ann", 0, 1.6, k, 0, 0, 1, "VALID"])}),
     _recording("unity_local", {"ann.csv": _lines(_LOCAL, lambda k: [0.02 * k, 0, 1.6, k, 0, 0, 0, 1, 0, 0.1, 1])}),
     _recording("unity_head", {"ann.csv": _lines(_LOCAL[:8], lambda k: [0.02 * k, 0, 1.6, k, 0, 0, 0, 1])}),
-    _recording("varjo", {"ann.csv": _lines(
-        ["CaptureTime", "HMDPosition", "HMDRotation", "CombinedGazePosition", "CombinedGazeForward", "GazeStatus"],
-        lambda k: [k * 10**7, "(0, 1.6, 0)", "(0, 0, 0, 1)", "(0, 0, 0)", "(0, 0, 1)", "VALID"], ";",
-    )}, skip_bad_lines=True),
-    _recording("hololens", {"a_head_hand_eye.csv": _lines(None, lambda k: [k * 10**5, *[0] * 850, 1, 0, 1.6, 0, 1, 0, 0, 1, 0, 2])}),
-    _recording("pupil", {
-        "head_pose_tracker_poses.csv": _lines(_POSES, lambda k: [0.02 * k, 0, 0, 0.1, k, 1, 1]),
-        "gaze_positions.csv": _lines(_GAZE, lambda k: [0.02 * k, 0.9, *[0, 0.1, 1] * 4]),
-    }, marker=0.05),
-]  # fmt: skip
+    _recording(
+        "varjo",
+        {
+            "ann.csv": _lines(
+                [
+                    "CaptureTime",
+                    "HMDPosition",
+                    "HMDRotation",
+                    "CombinedGazePosition",
+                    "CombinedGazeForward",
+                    "GazeStatus",
+                ],
+                lambda k: [k * 10**7, "(0, 1.6, 0)", "(0, 0, 0, 1)", "(0, 0, 0)", "(0, 0, 1)", "VALID"],
+                ";",
+            )
+        },
+        skip_bad_lines=True,
+    ),
+    _recording(
+        "hololens",
+        {"a_head_hand_eye.csv": _lines(None, lambda k: [k * 10**5, *[0] * 850, 1, 0, 1.6, 0, 1, 0, 0, 1, 0, 2])},
+    ),
+    _recording(
+        "pupil",
+        {
+            "head_pose_tracker_poses.csv": _lines(_POSES, lambda k: [0.02 * k, 0, 0, 0.1, k, 1, 1]),
+            "gaze_positions.csv": _lines(_GAZE, lambda k: [0.02 * k, 0.9, *[0, 0.1, 1] * 4]),
+        },
+        marker=0.05,
+    ),
+]
 
 
 def _make_salt(folder: Path) -> None:

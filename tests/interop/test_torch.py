@@ -1,4 +1,5 @@
 """Fields as torch modules: values of the field, gradients of a restatement in torch and of central differences."""
+
 import subprocess
 import sys
 
@@ -9,16 +10,16 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.transport.observer.integral import GazeIntegral
+from nerg_mi.maths.box import Box
 from nerg_mi.transport.march.primal import MarchSettings
 from nerg_mi.transport.media.media import GazeMedium
+from nerg_mi.transport.observer.integral import GazeIntegral
 from nerg_mi.transport.place import Place
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
@@ -46,8 +47,14 @@ def varied(field):
 
 
 def radiance(background=False):
-    behind = Background.random(BackgroundConfig(3.0, HashGridConfig(levels=2, log2_rows=8, base=4, finest=16, dimensions=2), 16), ns)
-    return varied(RadianceField.random(RadianceConfig(GRID, width=16, geometry=7), BOX, ns, background=behind if background else None))
+    behind = Background.random(
+        BackgroundConfig(3.0, HashGridConfig(levels=2, log2_rows=8, base=4, finest=16, dimensions=2), 16), ns
+    )
+    return varied(
+        RadianceField.random(
+            RadianceConfig(GRID, width=16, geometry=7), BOX, ns, background=behind if background else None
+        )
+    )
 
 
 def rays(torch, n=200):
@@ -85,7 +92,9 @@ def test02_gradients_of_a_restatement_in_torch(torch, interop):
     features = np.array([f.numpy() for f in field.grid(field.box.to_unit(ns.Array3f(p.numpy().T)))]).T
     sh = np.array([np.broadcast_to(h.numpy(), len(p)) for h in encode_direction(ns.Array3f(d.numpy().T), 4)]).T
     features, sh = torch.tensor(features, requires_grad=True), torch.tensor(sh.copy())
-    weights = {k: torch.tensor(v.numpy(), requires_grad=True) for k, v in field.parameters().items() if k != "grid.table"}
+    weights = {
+        k: torch.tensor(v.numpy(), requires_grad=True) for k, v in field.parameters().items() if k != "grid.table"
+    }
     h = torch.relu(features @ weights["density_net.0"].T) @ weights["density_net.1"].T
     inside = torch.all(torch.abs(p) <= 1, 1)
     theirs = torch.where(inside, torch.exp(h[:, 0]), torch.zeros(()))
@@ -115,7 +124,11 @@ def test03_gradients_equal_central_differences(torch, interop):
 
     loss(p, d).backward()
     check = {"p": (p, p.grad), "d": (d, d.grad)}
-    check |= {k: (v, v.grad) for k, v in module.named_parameters() if k in ("color_net__1", "background_net__0", "density_net__0")}
+    check |= {
+        k: (v, v.grad)
+        for k, v in module.named_parameters()
+        if k in ("color_net__1", "background_net__0", "density_net__0")
+    }
     for name, (value, gradient) in check.items():
         direction = torch.tensor(np.random.default_rng(1).normal(size=value.shape).astype(np.float32))
         h = 2e-4
@@ -125,7 +138,9 @@ def test03_gradients_equal_central_differences(torch, interop):
                 value += sign * h * direction
                 ends.append(float(loss(p, d)))
                 value -= sign * h * direction
-        assert np.isclose(float((gradient * direction).sum()), (ends[0] - ends[1]) / (2 * h), rtol=0.03, atol=0.02), name
+        assert np.isclose(float((gradient * direction).sum()), (ends[0] - ends[1]) / (2 * h), rtol=0.03, atol=0.02), (
+            name
+        )
 
 
 @pytest.mark.parametrize("trunk", ["relu", "layernorm", "linear"])
@@ -140,7 +155,9 @@ def test04_a_gaze_field(torch, interop, trunk):
     (gaze * mix).sum().backward()
     points = [ns.Array3f(x.numpy().T) for x in (p_od, p_o, r_o)]
     own_gradients(module, field, lambda: dr.sum(field.evaluate(*points)[0] * ns.Float(mix.numpy())))
-    central_differences(torch, module, lambda: (module(p_od, p_o, r_o) * mix).double().sum(), ("emit_head__0", "capture_head__0"))
+    central_differences(
+        torch, module, lambda: (module(p_od, p_o, r_o) * mix).double().sum(), ("emit_head__0", "capture_head__0")
+    )
 
 
 def own_gradients(module, field, loss):
@@ -168,7 +185,9 @@ def central_differences(torch, module, loss, names):
                 value += sign * h * direction
                 ends.append(float(loss()))
                 value -= sign * h * direction
-        assert np.isclose(float((value.grad * direction).sum()), (ends[0] - ends[1]) / (2 * h), rtol=0.02, atol=1e-3), name
+        assert np.isclose(float((value.grad * direction).sum()), (ends[0] - ends[1]) / (2 * h), rtol=0.02, atol=1e-3), (
+            name
+        )
 
 
 HEADS = ((-0.8, -0.8, -0.8), (0.8, 0.8, 0.8))
@@ -179,9 +198,19 @@ def normalised(kind):
         field = varied(GazeField.random(GazeConfig(GRID, width=16, geometry=7, sh_degree=2, normalized=True), BOX, ns))
         field.set_parameters({"emit_head.0": 20 * field.emit_head.weights[0]})
         return field
-    config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=HEADS, mix=0.2 if kind == "mixed" else 0.0, variant="capture" if kind == "capture" else "emit_capture")
+    config = LogGazeConfig(
+        grid=GRID,
+        width=16,
+        prior=16,
+        heads=HEADS,
+        mix=0.2 if kind == "mixed" else 0.0,
+        variant="capture" if kind == "capture" else "emit_capture",
+    )
     field = varied(LogGazeField.random(config, BOX, ns, 3, RNG.normal(size=(16, 32)) - 2.5))
-    field.set_parameters({"escaped": ns.Float(0.6)} | {k: 6 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
+    field.set_parameters(
+        {"escaped": ns.Float(0.6)}
+        | {k: 6 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")}
+    )
     return field
 
 
@@ -212,7 +241,9 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
     # An integral a row is as good as one for all.
     assert torch.allclose(module(p_od, p_o, r_o, Z.expand(len(r_o)), escaped), gaze)
     trained = module.field()
-    assert {k: v.numpy().tolist() for k, v in trained.parameters().items()} == {k: v.numpy().tolist() for k, v in field.parameters().items()}
+    assert {k: v.numpy().tolist() for k, v in trained.parameters().items()} == {
+        k: v.numpy().tolist() for k, v in field.parameters().items()
+    }
     save_gaze(trained, tmp_path / "g.safetensors", {})
     with pytest.raises(ValueError, match='give its "integral" there'):
         module(p_od, p_o, r_o)
@@ -222,8 +253,8 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
 
 @pytest.mark.parametrize("kind", ["product", "mixed"])
 def test04c_gradients_pass_the_integral(torch, interop, kind):
-    """Those of Dr.Jit's own derivatives, and central differences where no ReLU has a kink, of a loss in which every weight also
-    moves the integral."""
+    """Those of Dr.Jit's own derivatives, and central differences where no ReLU has a kink, of a loss in which every
+    weight also moves the integral."""
     field = normalised(kind)
     module = interop.GazeModule(field)
     (p_od, r_o), (p_o, _) = rays(torch, 60), rays(torch, 60)
@@ -274,9 +305,7 @@ def test05_training_in_torch_and_back(torch, interop, tmp_path):
     assert np.array_equal(trained.density(ns.Array3f(p.numpy().T)).numpy(), module.density(p).detach().numpy())
 
 
-@pytest.mark.parametrize("change", [
-    lambda p: p.double(), lambda p: p[:, :2], lambda p: p[:10], lambda p: p[0],
-])  # fmt: skip
+@pytest.mark.parametrize("change", [lambda p: p.double(), lambda p: p[:, :2], lambda p: p[:10], lambda p: p[0]])
 def test06_wrong_tensors(torch, interop, change):
     module, (p, d) = interop.RadianceModule(radiance()), rays(torch, 20)
     with pytest.raises(ValueError, match=r"must be a float32 tensor \(N, 3\) on cpu"):

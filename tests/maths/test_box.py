@@ -1,4 +1,5 @@
 """The box of a field and its map to the unit cube."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -37,10 +38,16 @@ def test04_contains():
     assert BOX.contains(ns.Array3f(p.T)).numpy().tolist() == [True, True, True, False, False, False]
 
 
-@pytest.mark.parametrize("lower, upper, words", [
-    ((0, 0, 0), (1, 1, 0), "must exceed"), ((0, 0), (1, 1), "3 numbers"), ((0, 0, 0), (1, 1, np.inf), "finite"),
-    ((0, 0, np.nan), (1, 1, 1), "finite"), ((2, 0, 0), (1, 1, 1), "must exceed"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "lower, upper, words",
+    [
+        ((0, 0, 0), (1, 1, 0), "must exceed"),
+        ((0, 0), (1, 1), "3 numbers"),
+        ((0, 0, 0), (1, 1, np.inf), "finite"),
+        ((0, 0, np.nan), (1, 1, 1), "finite"),
+        ((2, 0, 0), (1, 1, 1), "must exceed"),
+    ],
+)
 def test05_wrong_corners(lower, upper, words):
     with pytest.raises(ValueError, match=words):
         Box(lower, upper)

@@ -1,4 +1,5 @@
 """From composited samples to linear radiance."""
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -56,8 +57,8 @@ def test04_no_opacity_no_nan(rgb, α):
 def test05_derivatives_of_a_composite_are_those_of_its_colour(rgb, alpha):
     """With respect to the weighted sum and to the opacity it is divided by: central differences of a lin(C / a)."""
     shares = np.array([0.01, 0.03, 0.05, 0.3, 0.9])
-    lin = lambda c: np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)  # noqa: E731
-    value = lambda total, a: a * lin(total / a)  # noqa: E731
+    lin = lambda c: np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    value = lambda total, a: a * lin(total / a)
     total, a = rgb.Float((shares * alpha).tolist()), rgb.Float(alpha)
     dr.enable_grad(total, a)
     a_lanes = a + dr.zeros(rgb.Float, 5)

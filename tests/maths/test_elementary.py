@@ -1,4 +1,5 @@
 """1 - exp(-x) and log(1 + x) against the C library's expm1 and log1p in double precision."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
@@ -25,7 +26,9 @@ def test02_its_gradient():
 
 
 def test03_log1p():
-    x = np.concatenate([[0], np.logspace(-30, 1, 1000), -np.logspace(-30, np.log10(0.9), 1000), [-0.5]]).astype(np.float32)
+    x = np.concatenate([[0], np.logspace(-30, 1, 1000), -np.logspace(-30, np.log10(0.9), 1000), [-0.5]]).astype(
+        np.float32
+    )
     got, expected = log1p(ns.Float(x)).numpy().astype(float), np.log1p(x.astype(float))
     assert np.all(np.abs(got - expected) <= 2e-6 * np.abs(expected))
 

@@ -1,10 +1,10 @@
 """The slab test against the same in float64, on ordinary and on awkward rays."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 from nerg_mi.maths.ray_box import intersect_box
-
 from tests.reference import march_numpy as reference
 
 LOWER, UPPER = (-1, 0, 2), (3, 2, 4)
@@ -38,23 +38,27 @@ def test01_random_rays(scale):
     assert not np.any(np.isnan(near) | np.isnan(far))
 
 
-@pytest.mark.parametrize("o, d, expected", [
-    ((1, 1, 0), (0, 0, 1), (2, 4)),  # along an axis
-    ((1, 1, 3), (0, 0, 1), (-1, 1)),  # from inside
-    ((1, 1, 6), (0, 0, -1), (2, 4)),  # backwards
-    ((1, 1, 2), (0, 0, 1), (0, 2)),  # from on a face
-    ((-1, 0, 2), (0, 0, 1), (0, 2)),  # along an edge, which belongs to the box
-    ((-1, 1, 0), (0, 0, 1), (2, 4)),  # in the plane of a face
-    ((1, 1, 0), (-0.0, -0.0, 1), (2, 4)),  # negative zeros
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "o, d, expected",
+    [
+        ((1, 1, 0), (0, 0, 1), (2, 4)),  # along an axis
+        ((1, 1, 3), (0, 0, 1), (-1, 1)),  # from inside
+        ((1, 1, 6), (0, 0, -1), (2, 4)),  # backwards
+        ((1, 1, 2), (0, 0, 1), (0, 2)),  # from on a face
+        ((-1, 0, 2), (0, 0, 1), (0, 2)),  # along an edge, which belongs to the box
+        ((-1, 1, 0), (0, 0, 1), (2, 4)),  # in the plane of a face
+        ((1, 1, 0), (-0.0, -0.0, 1), (2, 4)),  # negative zeros
+    ],
+)
 def test02_parallel_rays(o, d, expected):
     near, far = intersect(o, d)
     assert (near[0], far[0]) == expected
 
 
-@pytest.mark.parametrize("o, d", [
-    ((5, 1, 0), (0, 0, 1)), ((1, -1e-6, 3), (1, 0, 0)), ((-1.0001, 1, 0), (0, 0, 1)), ((1, 1, 5), (0.6, 0.8, 0)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "o, d",
+    [((5, 1, 0), (0, 0, 1)), ((1, -1e-6, 3), (1, 0, 0)), ((-1.0001, 1, 0), (0, 0, 1)), ((1, 1, 5), (0.6, 0.8, 0))],
+)
 def test03_misses(o, d):
     near, far = intersect(o, d)
     assert near[0] >= far[0] and not np.isnan(near[0]) and not np.isnan(far[0])

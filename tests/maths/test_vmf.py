@@ -11,7 +11,11 @@ from nerg_mi.maths.sphere import fibonacci_directions
 def test_normaliser_over_sixteen_orders(kappa):
     got = float(vmf.log_normaliser(kappa))
     # scipy's form, log of κ/(4π sinh κ) e^κ, in its stable regimes.
-    want = -np.log(4 * np.pi) + kappa if kappa < 1e-6 else np.log(kappa) - np.log(2 * np.pi) - np.log1p(-np.exp(-2 * kappa))
+    want = (
+        -np.log(4 * np.pi) + kappa
+        if kappa < 1e-6
+        else np.log(kappa) - np.log(2 * np.pi) - np.log1p(-np.exp(-2 * kappa))
+    )
     assert np.isclose(got, want, rtol=1e-12)
 
 
@@ -33,7 +37,9 @@ def test_density_keeps_its_digits_near_the_mean():
     mu = np.array([0.0, 0.0, 1.0])
     angle = 1e-5
     x = np.array([np.sin(angle), 0.0, np.cos(angle)])
-    assert np.isclose(vmf.log_density(x, mu, 1e8) - vmf.log_normaliser(1e8), -1e8 * 2 * np.sin(angle / 2) ** 2, rtol=1e-9)
+    assert np.isclose(
+        vmf.log_density(x, mu, 1e8) - vmf.log_normaliser(1e8), -1e8 * 2 * np.sin(angle / 2) ** 2, rtol=1e-9
+    )
 
 
 def test_kappa_inverts_the_resultant_length():

@@ -1,9 +1,10 @@
 """An integrator that knows the answers: shapes in a box of constant density, by one ray cast and closed forms.
 
 It shares no code with `nerg`: rays come from Mitsuba's sensors, distances from its ray casts, light on shapes from its
-integrators. What it returns for a ray is what `nerg` should return for the same ray, whatever film, sensor or integrator is
-around it.
+integrators. What it returns for a ray is what `nerg` should return for the same ray, whatever film, sensor or
+integrator is around it.
 """
+
 import drjit as dr
 
 AOVS = ["depth.T", "opacity.Y", "position.X", "position.Y", "position.Z", "visibility.Y"]
@@ -12,7 +13,8 @@ TOLERANCE = 1e-3
 
 def closed_form(mi, sigma, color, eye, lower=(-1, -1, -1), upper=(1, 1, 1), depth="expected", light=None):
     """The integrator: density `sigma` (0: vacuum) and `color` in a box; visibility by transmittance to the point `eye`
-    (None: everything with a surface is visible). `light`: the integrator that lights shapes; None: they show their albedo."""
+    (None: everything with a surface is visible). `light`: the integrator that lights shapes; None: they show their
+    albedo."""
 
     def crossing(o, d, end):
         """Where a ray is in the box, up to `end`."""
@@ -73,8 +75,14 @@ def closed_form(mi, sigma, color, eye, lower=(-1, -1, -1), upper=(1, 1, 1), dept
 
 def nerg(mi, sigma, color, eye, lower=(-1, -1, -1), upper=(1, 1, 1), depth="expected", light=None, **kwargs):
     """The same as a description of `nerg`."""
-    out = {"type": "nerg", "aovs": "depth,opacity,position,visibility", "depth": depth, "visibility": "transmittance",
-           "tolerance": TOLERANCE, **kwargs}  # fmt: skip
+    out = {
+        "type": "nerg",
+        "aovs": "depth,opacity,position,visibility",
+        "depth": depth,
+        "visibility": "transmittance",
+        "tolerance": TOLERANCE,
+        **kwargs,
+    }
     if light not in (None, "path"):
         out["light"] = {"type": light}
     if sigma:

@@ -1,4 +1,5 @@
 """What the tests of the plugins share: small fields in files."""
+
 import pytest
 
 from . import fields

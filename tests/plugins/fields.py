@@ -1,12 +1,13 @@
 """Small fields, written to files, for the tests of the plugins."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
+from nerg_mi.maths.box import Box
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((-1, -1, -1), (1, 1, 1))
@@ -14,9 +15,14 @@ BOX = Box((-1, -1, -1), (1, 1, 1))
 
 def radiance(path, density_scale=2.0, seed=0, occupancy=None, geometry=7, **kwargs):
     field = RadianceField.random(
-        RadianceConfig(GRID, width=16, geometry=geometry, sh_degree=2, density_scale=density_scale), BOX, ns, seed,
-        occupancy=occupancy, march_step=0.1, **kwargs,
-    )  # fmt: skip
+        RadianceConfig(GRID, width=16, geometry=geometry, sh_degree=2, density_scale=density_scale),
+        BOX,
+        ns,
+        seed,
+        occupancy=occupancy,
+        march_step=0.1,
+        **kwargs,
+    )
     table = np.random.default_rng(seed).normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
     save_radiance(field, path, {"test": seed})

@@ -1,4 +1,5 @@
 """Small scenes, and how to render them, for the tests of the integrator."""
+
 import numpy as np
 
 SIZE = 12
@@ -8,21 +9,36 @@ def look_at(mi, origin, target=(0, 0, 0), up=(0, 1, 0)):
     return mi.ScalarTransform4f().look_at(list(origin), list(target), list(up))
 
 
-def camera(mi, origin=(0.5, 0.4, -3), target=(0, 0, 0), kind="perspective", rfilter="box", size=SIZE, film=(), **kwargs):
+def camera(
+    mi, origin=(0.5, 0.4, -3), target=(0, 0, 0), kind="perspective", rfilter="box", size=SIZE, film=(), **kwargs
+):
     if kind == "perspective":
         kwargs = {"fov": 35, **kwargs}
     return {
-        "type": kind, "to_world": look_at(mi, origin, target), **kwargs,
+        "type": kind,
+        "to_world": look_at(mi, origin, target),
+        **kwargs,
         "sampler": {"type": "independent", "sample_count": 1},
-        "film": {"type": "hdrfilm", "width": size, "height": size, "component_format": "float32",
-                 "rfilter": {"type": rfilter}, "pixel_format": "luminance" if "mono" in mi.variant() else "rgb",
-                 **dict(film)},
-    }  # fmt: skip
+        "film": {
+            "type": "hdrfilm",
+            "width": size,
+            "height": size,
+            "component_format": "float32",
+            "rfilter": {"type": rfilter},
+            "pixel_format": "luminance" if "mono" in mi.variant() else "rgb",
+            **dict(film),
+        },
+    }
 
 
 # Expected depths have closed forms also where matter is thin, unlike the medians of the default.
 def with_field(files, **kwargs):
-    return {"type": "nerg", "depth": "expected", "field": {"type": "nerf", "filename": str(files / "field.safetensors")}, **kwargs}
+    return {
+        "type": "nerg",
+        "depth": "expected",
+        "field": {"type": "nerf", "filename": str(files / "field.safetensors")},
+        **kwargs,
+    }
 
 
 def with_gaze(files, aovs="depth,opacity,gaze,visibility", **kwargs):
@@ -42,7 +58,7 @@ def render(mi, integrator, sensor=None, spp=1, seed=0, **more):
 def named(mi, image, integrator):
     """The channels of ``image`` behind the colour, by name."""
     names = mi.load_dict(integrator).aov_names()
-    return dict(zip(names, np.moveaxis(image[..., image.shape[-1] - len(names):], -1, 0)))
+    return dict(zip(names, np.moveaxis(image[..., image.shape[-1] - len(names) :], -1, 0)))
 
 
 def channels(mi, integrator, sensor=None, **kwargs):
@@ -68,15 +84,25 @@ def wall(mi, gap=0.3):
     x = (np.arange(n) + 0.5) / n * 2 - 1
     data[19:21, :, x < gap] = 1e4
     data[36:] = 1e4
-    return {"type": "gridvolume", "grid": mi.VolumeGrid(data), "filter_type": "nearest",
-            "to_world": mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)}  # fmt: skip
+    return {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(data),
+        "filter_type": "nearest",
+        "to_world": mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
+    }
 
 
 def hidden_scene(mi, **kwargs):
     # The camera is behind the wall and sees the back wall; the observer is in front of it.
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
-    integrator = {"type": "nerg", "density": wall(mi), "aovs": "visibility,position,observer_depth", "step": 0.01,
-                  "observer": observer_at(mi, 0, 0, -0.9), **kwargs}  # fmt: skip
+    integrator = {
+        "type": "nerg",
+        "density": wall(mi),
+        "aovs": "visibility,position,observer_depth",
+        "step": 0.01,
+        "observer": observer_at(mi, 0, 0, -0.9),
+        **kwargs,
+    }
     return channels(mi, integrator, sensor)
 
 

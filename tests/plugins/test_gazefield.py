@@ -1,4 +1,5 @@
 """The volume `gazefield`: equation 1 in the scene, its place and its parameters."""
+
 import numpy as np
 import pytest
 
@@ -10,7 +11,10 @@ def load(mi, path, **kwargs):
 
 
 def ask(mi, medium, p_od, p_o, r_o):
-    return [v.numpy()[0] for v in medium.evaluate(*(mi.Vector3f(np.asarray(x, float).tolist()) for x in (p_od, p_o, r_o)), True)]
+    return [
+        v.numpy()[0]
+        for v in medium.evaluate(*(mi.Vector3f(np.asarray(x, float).tolist()) for x in (p_od, p_o, r_o)), True)
+    ]
 
 
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
@@ -22,7 +26,9 @@ def test01_placed_in_the_scene(rgb, tmp_path, variant):
     to_world = rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 1, 0], 30).scale(4)
     m = np.array(to_world.matrix)
     moved = load(rgb, tmp_path / "g.safetensors", to_world=to_world).gaze_medium()
-    assert np.allclose(ask(rgb, moved, (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r_o / 4), plain, rtol=1e-4)
+    assert np.allclose(
+        ask(rgb, moved, (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r_o / 4), plain, rtol=1e-4
+    )
 
 
 def test02_parameters_and_text(rgb, tmp_path):

@@ -1,9 +1,10 @@
 """The density of tracked rays in the integrator: against the sum over the rays in float64."""
+
 import numpy as np
 import pytest
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.maths.vmf import log_normaliser
+from nerg_mi.rays.rays import Rays
 from tests.reference import kde as reference
 
 from .scenes import camera, channels, named, observer_at, wall
@@ -21,7 +22,9 @@ def tracked(n=600, seed=0):
     origin = rng.normal(0, 0.3, (n, 3)).clip(-0.7, 0.7)
     target = np.where(np.arange(n)[:, None] % 3, (0.9, 0.3, 0.1), (0.2, 0.9, -0.3)) + rng.normal(0, 0.2, (n, 3))
     d = target - origin
-    return Rays(np.arange(n), np.arange(n) % 4, tuple("abcd"), origin, d / np.linalg.norm(d, axis=1, keepdims=True), np.ones(n))
+    return Rays(
+        np.arange(n), np.arange(n) % 4, tuple("abcd"), origin, d / np.linalg.norm(d, axis=1, keepdims=True), np.ones(n)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +35,13 @@ def rays(tmp_path_factory):
 
 
 def shown(rays, aovs="kde,position", count=4096, **more):
-    return {"type": "nerg", "aovs": aovs, "radiance": False, "kde": {"type": "gazekde", "filename": rays, "count": count, "kappa": KAPPA}, **more}
+    return {
+        "type": "nerg",
+        "aovs": aovs,
+        "radiance": False,
+        "kde": {"type": "gazekde", "filename": rays, "count": count, "kappa": KAPPA},
+        **more,
+    }
 
 
 def expected(eye, out, count=4096):
@@ -72,7 +81,14 @@ def test02_another_observer_and_what_is_hidden(rgb, rays):
 
 def test03_rays_are_gathered_once_an_observer(rgb, rays):
     integrator = shown(rays, observer=observer_at(rgb, 0.2, 0.1, 0), falloff=0.0)
-    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0), size=70), **room(rgb)})
+    scene = rgb.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator,
+            "sensor": camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0), size=70),
+            **room(rgb),
+        }
+    )
     view = scene.integrator()._views["kde"]
     first = np.array(rgb.render(scene, spp=1))
     made, table = view._known[0], view._known[0]._table
@@ -99,7 +115,10 @@ def test04_each_camera_of_a_batch_has_its_own(rgb, rays):
 
 def test05_rays_of_another_frame(rgb, rays):
     """The rays' frame turned, twice as large and moved: everything in the scene goes with it, densities stay."""
-    eye, matrix = np.array((0.1, -0.2, 0.3)), rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 0, 1], 90).scale(2)
+    eye, matrix = (
+        np.array((0.1, -0.2, 0.3)),
+        rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 0, 1], 90).scale(2),
+    )
     place = lambda p: (np.array(matrix.matrix) @ [*p, 1])[:3]
     shapes = {k: {**v, "to_world": matrix @ v["to_world"]} for k, v in room(rgb).items()}
     integrator = shown(rays)
@@ -107,14 +126,18 @@ def test05_rays_of_another_frame(rgb, rays):
     plain = channels(rgb, shown(rays), camera(rgb, eye, (0.5, 0.4, 0), fov=60), **room(rgb))["kde.Y"]
     sensor = {**camera(rgb, eye, (0.5, 0.4, 0), fov=60)}
     up = np.array(matrix.matrix)[:3, :3] @ [0, 1, 0] / 2
-    sensor["to_world"] = rgb.ScalarTransform4f().look_at(place(eye).tolist(), place((0.5, 0.4, 0)).tolist(), up.tolist())
+    sensor["to_world"] = rgb.ScalarTransform4f().look_at(
+        place(eye).tolist(), place((0.5, 0.4, 0)).tolist(), up.tolist()
+    )
     np.testing.assert_allclose(channels(rgb, integrator, sensor, **shapes)["kde.Y"], plain, rtol=2e-3, atol=1e-4)
 
 
 def test06_what_is_not_asked_for_is_not_traced(rgb, rays):
     without = {k: v for k, v in shown(rays, "depth").items() if k != "kde"}
     sensor = camera(rgb)
-    assert operations(rgb, {**without, "density": {"type": "constvolume"}}, sensor) == operations(rgb, shown(rays, "depth", density={"type": "constvolume"}), sensor)
+    assert operations(rgb, {**without, "density": {"type": "constvolume"}}, sensor) == operations(
+        rgb, shown(rays, "depth", density={"type": "constvolume"}), sensor
+    )
     assert rgb.load_dict(shown(rays, "depth"))._views == {}
 
 
@@ -122,8 +145,9 @@ def test07_what_is_needed_is_said(rgb, rays, tmp_path):
     for integrator, said in (
         ({"type": "nerg", "aovs": "kde"}, '"kde" volume of type "gazekde"'),
         ({"type": "nerg", "kde": {"type": "constvolume"}}, 'must be a volume of type "gazekde"'),
-        (shown(str(tmp_path / "no.npz")), "no.npz"), (shown(rays, count=0), '"count"'),
-    ):  # fmt: skip
+        (shown(str(tmp_path / "no.npz")), "no.npz"),
+        (shown(rays, count=0), '"count"'),
+    ):
         with pytest.raises(RuntimeError, match=said):
             rgb.load_dict(integrator)
     assert "count = 600" in str(rgb.load_dict(shown(rays)["kde"]))
@@ -132,7 +156,9 @@ def test07_what_is_needed_is_said(rgb, rays, tmp_path):
 def test08_a_frozen_function_is_refused_in_a_sentence(rgb, rays):
     import drjit as dr
 
-    scene = rgb.load_dict({"type": "scene", "integrator": shown(rays), "sensor": camera(rgb, (0, 0, 0), (1, 0, 0)), **room(rgb)})
+    scene = rgb.load_dict(
+        {"type": "scene", "integrator": shown(rays), "sensor": camera(rgb, (0, 0, 0), (1, 0, 0)), **room(rgb)}
+    )
     frozen = dr.freeze(lambda scene, seed: rgb.render(scene, spp=1, seed=seed))
     with pytest.raises(Exception) as said:
         frozen(scene, rgb.UInt32(0))

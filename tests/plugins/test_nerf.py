@@ -1,4 +1,5 @@
 """The volume `nerf`: what it returns, where it lies, and what it says about wrong files."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -97,8 +98,15 @@ def medium_scene(mi, files, spp, **kwargs):
     interior = {"type": "heterogeneous", "sigma_t": volume, "albedo": {"type": "constvolume", "value": 0.0}}
     scale = kwargs["to_world"] if "to_world" in kwargs else mi.ScalarTransform4f()
     cube = {"type": "cube", "to_world": scale, "bsdf": {"type": "null"}, "interior": interior}
-    return mi.load_dict({"type": "scene", "integrator": {"type": "volpath", "max_depth": 200, "rr_depth": 1000}, "sensor": camera(mi, size=8),
-                         "cube": cube, "sky": {"type": "constant", "radiance": 1.0}})  # fmt: skip
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": 200, "rr_depth": 1000},
+            "sensor": camera(mi, size=8),
+            "cube": cube,
+            "sky": {"type": "constant", "radiance": 1.0},
+        }
+    )
 
 
 @pytest.mark.parametrize("placed", [False, True])
@@ -108,7 +116,12 @@ def test_as_a_medium_it_absorbs_what_the_marcher_does(rgb, files, placed):
     where = {"to_world": rgb.ScalarTransform4f().translate([0.1, 0, 0]).scale(0.6)} if placed else {}
     through = np.array(rgb.render(medium_scene(rgb, files, spp, max_density=40.0, **where), spp=spp))[..., 0]
     field = {"type": "nerf", "filename": str(files / "field.safetensors"), **where}
-    opacity = channels(rgb, {"type": "nerg", "field": field, "aovs": "opacity", "step": 0.01, "radiance": False}, camera(rgb, size=8), spp=256)
+    opacity = channels(
+        rgb,
+        {"type": "nerg", "field": field, "aovs": "opacity", "step": 0.01, "radiance": False},
+        camera(rgb, size=8),
+        spp=256,
+    )
     T = 1 - opacity["opacity.Y"].astype(float)
     # Within a pixel T varies, over silhouettes too much for a mean of 256.
     inside = binary_erosion(T < 0.6)

@@ -1,4 +1,5 @@
 """A background network behind a field, as `nerg` shows it: composited with the field in its own colour space."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -27,8 +28,10 @@ def test01_seen_behind_the_field(rgb, tmp_path, scale, density):
     assert again.background.config == behind.config and np.array_equal(again.background.grid.table.numpy(), table)
 
     to_world = rgb.ScalarTransform4f().scale(scale)
-    sensor = {**camera(rgb, (0.5 * scale, 0.4 * scale, -2.5 * scale), size=8),
-              "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
+    sensor = {
+        **camera(rgb, (0.5 * scale, 0.4 * scale, -2.5 * scale), size=8),
+        "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+    }
     volume = lambda name: {"type": "nerf", "filename": str(tmp_path / name), "to_world": to_world}
     nerg = lambda name, **k: {"type": "nerg", "field": volume(name), "aovs": "opacity", "color_cutoff": 0.0, **k}
     image = render(rgb, nerg("behind.safetensors"), sensor)
@@ -38,7 +41,9 @@ def test01_seen_behind_the_field(rgb, tmp_path, scale, density):
 
     uv = (np.stack(np.meshgrid(np.arange(8), np.arange(8)), -1).reshape(-1, 2) + 0.5) / 8
     ray, _ = rgb.load_dict(sensor).sample_ray(0, 0.5, rgb.Point2f(uv.T.astype(np.float32)), rgb.Point2f(0.5))
-    shown = np.array(field.background(ns.Array3f(np.array(ray.o) / scale), ns.Array3f(np.array(ray.d)))).T.reshape(8, 8, 3)
+    shown = np.array(field.background(ns.Array3f(np.array(ray.o) / scale), ns.Array3f(np.array(ray.d)))).T.reshape(
+        8, 8, 3
+    )
     # C, out of α lin(C / α)
     safe = np.where(alpha > 0, alpha, 1)
     ratio = without[..., :3] / safe
@@ -47,4 +52,7 @@ def test01_seen_behind_the_field(rgb, tmp_path, scale, density):
     assert np.allclose(image[..., :3], expected, rtol=1e-3, atol=1e-5) and np.ptp(shown) > 0.05
     # An environment of the scene takes its place.
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.4, 0.8]}}
-    assert np.allclose(render(rgb, nerg("behind.safetensors"), sensor, sky=sky), render(rgb, nerg("field.safetensors"), sensor, sky=sky))
+    assert np.allclose(
+        render(rgb, nerg("behind.safetensors"), sensor, sky=sky),
+        render(rgb, nerg("field.safetensors"), sensor, sky=sky),
+    )

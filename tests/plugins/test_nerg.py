@@ -1,13 +1,24 @@
 """The integrator through Mitsuba: its parameters, its channels, and what Python sees of it."""
+
 import math
 
 import numpy as np
 import pytest
 
 from .scenes import (
-    GAZE, SIZE, camera, channels, constant, look_at, named, observer_at, render, straight, with_field, with_gaze,
-)  # fmt: skip
-
+    GAZE,
+    SIZE,
+    camera,
+    channels,
+    constant,
+    look_at,
+    named,
+    observer_at,
+    render,
+    straight,
+    with_field,
+    with_gaze,
+)
 
 XML = """<scene version="3.0.0">
   <integrator type="nerg" id="integrator">
@@ -42,8 +53,14 @@ def test01_xml_equals_dict_and_files_lie_beside_the_scene(rgb, files):
     path.write_text(XML)
     scene = rgb.load_file(str(path))
     observer = {"type": "perspective", "to_world": look_at(rgb, (-2, 0.3, -2))}
-    integrator = with_gaze(files, "depth,opacity,gaze,visibility,position", observer=observer, falloff=0.3, depth="median",
-                           background={"type": "rgb", "value": [0.1, 0.2, 0.3]})
+    integrator = with_gaze(
+        files,
+        "depth,opacity,gaze,visibility,position",
+        observer=observer,
+        falloff=0.3,
+        depth="median",
+        background={"type": "rgb", "value": [0.1, 0.2, 0.3]},
+    )
     a, b = np.array(rgb.render(scene, spp=2, seed=3)), render(rgb, integrator, spp=2, seed=3)
     # The XML parser rounds placements in another way.
     assert a.shape == (SIZE, SIZE, 3 + 7) and np.allclose(a, b, atol=3e-6)
@@ -62,9 +79,20 @@ def test02_unknown_parameters_are_errors(rgb):
 
 
 ALL = dict(
-    occlusion=False, falloff=0.5, tolerance=0.1, depth="median", surface_opacity=0.4, radiance=False, background=0.5,
-    aovs="depth", step=0.1, dt_gamma=0.01, stop=1e-3, color_cutoff=0.01, jitter=True,
-)  # fmt: skip
+    occlusion=False,
+    falloff=0.5,
+    tolerance=0.1,
+    depth="median",
+    surface_opacity=0.4,
+    radiance=False,
+    background=0.5,
+    aovs="depth",
+    step=0.1,
+    dt_gamma=0.01,
+    stop=1e-3,
+    color_cutoff=0.01,
+    jitter=True,
+)
 
 
 @pytest.mark.parametrize("name", list(ALL))
@@ -75,13 +103,37 @@ def test03_every_documented_parameter_is_read_and_documented(rgb, name):
         assert f"{name} = " in str(integrator)
 
 
-@pytest.mark.parametrize("name, value", [
-    ("falloff", -0.1), ("falloff", "far"), ("falloff", float("nan")), ("falloff", float("inf")), ("falloff", True),
-    ("tolerance", -1.0), ("depth", "mean"), ("depth", 3), ("surface_opacity", 1.5), ("surface_opacity", -0.1),
-    ("radiance", "no"), ("radiance", 2.0), ("occlusion", "false"), ("jitter", "yes"), ("background", -1.0),
-    ("background", "red"), ("aovs", "depth,colour"), ("aovs", "depth,depth"), ("aovs", 3), ("aovs", "gaze"),
-    ("step", -1.0), ("step", float("inf")), ("dt_gamma", -1.0), ("stop", 2.0), ("stop", -1.0), ("color_cutoff", -1.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("falloff", -0.1),
+        ("falloff", "far"),
+        ("falloff", float("nan")),
+        ("falloff", float("inf")),
+        ("falloff", True),
+        ("tolerance", -1.0),
+        ("depth", "mean"),
+        ("depth", 3),
+        ("surface_opacity", 1.5),
+        ("surface_opacity", -0.1),
+        ("radiance", "no"),
+        ("radiance", 2.0),
+        ("occlusion", "false"),
+        ("jitter", "yes"),
+        ("background", -1.0),
+        ("background", "red"),
+        ("aovs", "depth,colour"),
+        ("aovs", "depth,depth"),
+        ("aovs", 3),
+        ("aovs", "gaze"),
+        ("step", -1.0),
+        ("step", float("inf")),
+        ("dt_gamma", -1.0),
+        ("stop", 2.0),
+        ("stop", -1.0),
+        ("color_cutoff", -1.0),
+    ],
+)
 def test04_wrong_values_are_named(rgb, name, value):
     with pytest.raises((RuntimeError, ValueError), match=f'"{name}"'):
         rgb.load_dict(constant(**{name: value}))
@@ -116,9 +168,20 @@ def test05b_an_empty_place_is_refused(rgb):
 
 def test06_an_observer_who_is_a_batch_is_refused(rgb):
     # It would stand at the origin of the scene.
-    batch = {"type": "batch", "film": {"type": "hdrfilm", "width": 4, "height": 2},
-             "a": {"type": "perspective", "to_world": look_at(rgb, (1, 2, 3)), "film": {"type": "hdrfilm", "width": 2, "height": 2}},
-             "b": {"type": "perspective", "to_world": look_at(rgb, (3, 2, 1)), "film": {"type": "hdrfilm", "width": 2, "height": 2}}}
+    batch = {
+        "type": "batch",
+        "film": {"type": "hdrfilm", "width": 4, "height": 2},
+        "a": {
+            "type": "perspective",
+            "to_world": look_at(rgb, (1, 2, 3)),
+            "film": {"type": "hdrfilm", "width": 2, "height": 2},
+        },
+        "b": {
+            "type": "perspective",
+            "to_world": look_at(rgb, (3, 2, 1)),
+            "film": {"type": "hdrfilm", "width": 2, "height": 2},
+        },
+    }
     with pytest.raises(RuntimeError, match='"observer"'):
         rgb.load_dict(constant(observer=batch))
 
@@ -126,18 +189,28 @@ def test06_an_observer_who_is_a_batch_is_refused(rgb):
 def test07_missing_files_are_named(rgb, tmp_path):
     for kind, name in (("nerf", "field"), ("gazefield", "gaze")):
         with pytest.raises(RuntimeError, match="nowhere.safetensors.*does not exist"):
-            rgb.load_dict(constant(**{name: {"type": kind, "filename": "nowhere.safetensors"}}) if name == "gaze" else
-                          {"type": "nerg", name: {"type": kind, "filename": "nowhere.safetensors"}})
+            rgb.load_dict(
+                constant(**{name: {"type": kind, "filename": "nowhere.safetensors"}})
+                if name == "gaze"
+                else {"type": "nerg", name: {"type": kind, "filename": "nowhere.safetensors"}}
+            )
         with pytest.raises(RuntimeError, match='"filename"'):
             rgb.load_dict({"type": kind})
 
 
 CHANNELS = {
-    "depth": ["depth.T"], "opacity": ["opacity.Y"], "position": ["position.X", "position.Y", "position.Z"],
-    "gaze": ["gaze.Y"], "emit": ["emit.Y"], "capture": ["capture.Y"], "visibility": ["visibility.Y"],
-    "observer_depth": ["observer_depth.T"], "density_evals": ["density_evals.Y"], "color_evals": ["color_evals.Y"],
+    "depth": ["depth.T"],
+    "opacity": ["opacity.Y"],
+    "position": ["position.X", "position.Y", "position.Z"],
+    "gaze": ["gaze.Y"],
+    "emit": ["emit.Y"],
+    "capture": ["capture.Y"],
+    "visibility": ["visibility.Y"],
+    "observer_depth": ["observer_depth.T"],
+    "density_evals": ["density_evals.Y"],
+    "color_evals": ["color_evals.Y"],
     "gaze_evals": ["gaze_evals.Y"],
-}  # fmt: skip
+}
 
 
 def test08_names_and_order(rgb, files):
@@ -161,8 +234,9 @@ def test09_each_channel_alone_equals_all_together(rgb, files):
         for c in parts:
             assert np.array_equal(alone[c], everything[c]), c
             assert everything[c].any(), c
-    assert np.allclose(everything["gaze.Y"],
-                       everything["emit.Y"] * everything["capture.Y"] * everything["visibility.Y"], rtol=1e-5)
+    assert np.allclose(
+        everything["gaze.Y"], everything["emit.Y"] * everything["capture.Y"] * everything["visibility.Y"], rtol=1e-5
+    )
 
 
 def test10_without_radiance(rgb, files):
@@ -176,7 +250,10 @@ def test10_without_radiance(rgb, files):
 
 
 def test11_below_the_surface_opacity(rgb, files):
-    low, high = (channels(rgb, with_gaze(files, "opacity,depth,position,gaze,visibility", surface_opacity=s)) for s in (0.05, 0.97))
+    low, high = (
+        channels(rgb, with_gaze(files, "opacity,depth,position,gaze,visibility", surface_opacity=s))
+        for s in (0.05, 0.97)
+    )
     for c in ("opacity.Y", "depth.T"):
         assert np.array_equal(low[c], high[c])
     thin = high["opacity.Y"] < 0.97
@@ -187,25 +264,50 @@ def test11_below_the_surface_opacity(rgb, files):
 
 def test12_to_string(rgb, files):
     text = str(rgb.load_dict(with_gaze(files, GAZE, observer=observer_at(rgb, 1, 2, 3), falloff=0.25)))
-    for part in ("NergIntegrator[", "NerfVolume[", "GazeFieldVolume[", "falloff = [0.25]", "1, 2, 3", "depth = expected", "aovs = depth"):
+    for part in (
+        "NergIntegrator[",
+        "NerfVolume[",
+        "GazeFieldVolume[",
+        "falloff = [0.25]",
+        "1, 2, 3",
+        "depth = expected",
+        "aovs = depth",
+    ):
         assert part in text, part
 
 
 def test13_traverse_and_update(rgb, files):
-    scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files, GAZE, observer=observer_at(rgb, -2, 0.3, -2)),
-                           "sensor": camera(rgb)})
+    scene = rgb.load_dict(
+        {
+            "type": "scene",
+            "integrator": with_gaze(files, GAZE, observer=observer_at(rgb, -2, 0.3, -2)),
+            "sensor": camera(rgb),
+        }
+    )
     params = rgb.traverse(scene)
-    for key in ("field.grid.table", "field.density_net.0", "field.color_net.2", "gaze.grid.table", "gaze.emit_head.0",
-                "gaze.capture_head.0", "observer.to_world", "falloff"):
+    for key in (
+        "field.grid.table",
+        "field.density_net.0",
+        "field.color_net.2",
+        "gaze.grid.table",
+        "gaze.emit_head.0",
+        "gaze.capture_head.0",
+        "observer.to_world",
+        "falloff",
+    ):
         assert f"integrator.{key}" in params, key
 
     def picture():
-        return named(rgb, np.array(rgb.render(scene, spp=1)), with_gaze(files, GAZE)), np.array(rgb.render(scene, spp=1))[..., :3]
+        return named(rgb, np.array(rgb.render(scene, spp=1)), with_gaze(files, GAZE)), np.array(
+            rgb.render(scene, spp=1)
+        )[..., :3]
 
     changes = {
-        "field.density_net.1": ("opacity.Y", 1.3), "gaze.emit_head.0": ("emit.Y", -1.0), "gaze.grid.table": ("gaze.Y", 0.5),
+        "field.density_net.1": ("opacity.Y", 1.3),
+        "gaze.emit_head.0": ("emit.Y", -1.0),
+        "gaze.grid.table": ("gaze.Y", 0.5),
         "falloff": ("visibility.Y", 30.0),
-    }  # fmt: skip
+    }
     before, color = picture()
     for key, (channel, factor) in changes.items():
         name = f"integrator.{key}"
@@ -248,7 +350,9 @@ def test15_a_voxel_grid_that_changes_is_seen(rgb):
 
 def test16_another_integrator_may_ask_for_some_rays_only(rgb):
     """All of them, unless it says which; the others are black, not valid, and have no depth."""
-    scene = rgb.load_dict({"type": "scene", "integrator": constant(aovs="depth,opacity", background=0.5), "sensor": camera(rgb)})
+    scene = rgb.load_dict(
+        {"type": "scene", "integrator": constant(aovs="depth,opacity", background=0.5), "sensor": camera(rgb)}
+    )
     x = np.linspace(0.1, 1.9, 10, dtype=np.float32)  # five through the cube, five past it
     ray = rgb.RayDifferential3f(rgb.Point3f(x, 0.4, -1), rgb.Vector3f(0, 0, 1))
     sampler = rgb.load_dict({"type": "independent"})

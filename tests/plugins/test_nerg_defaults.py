@@ -1,4 +1,5 @@
 """What the manual says of the integrator's defaults is what it does without a say."""
+
 import re
 import sys
 
@@ -7,8 +8,25 @@ import pytest
 
 from .scenes import constant
 
-NAMES = ["occlusion", "falloff", "tolerance", "visibility", "map_height", "depth", "surface_opacity", "radiance", "background", "aovs",
-         "step", "quadrature", "coarse", "dt_gamma", "stop", "color_cutoff", "jitter"]  # fmt: skip
+NAMES = [
+    "occlusion",
+    "falloff",
+    "tolerance",
+    "visibility",
+    "map_height",
+    "depth",
+    "surface_opacity",
+    "radiance",
+    "background",
+    "aovs",
+    "step",
+    "quadrature",
+    "coarse",
+    "dt_gamma",
+    "stop",
+    "color_cutoff",
+    "jitter",
+]
 
 
 def manual(mi):
@@ -26,25 +44,50 @@ def test01_every_parameter_has_its_default_in_the_manual(rgb):
 
 def told(integrator):
     s = integrator.settings
-    return {**vars(s), "map_height": integrator.observer_pass.map_height, "kind": integrator.observer_pass.kind, "text": str(integrator),
-            "background": np.array(integrator.background).tolist(), "tolerance": integrator.observer_pass.tolerance}  # fmt: skip
+    return {
+        **vars(s),
+        "map_height": integrator.observer_pass.map_height,
+        "kind": integrator.observer_pass.kind,
+        "text": str(integrator),
+        "background": np.array(integrator.background).tolist(),
+        "tolerance": integrator.observer_pass.tolerance,
+    }
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test02_a_default_that_is_given_changes_nothing(rgb, name):
     plain = {"type": "nerg", "density": {"type": "constvolume", "value": 1.0}}
     value = manual(rgb)[name]
-    integers, numbers = ("map_height",), ("falloff", "tolerance", "surface_opacity", "background", "step", "coarse", "dt_gamma", "stop", "color_cutoff")
-    value = int(value) if name in integers else float(value) if name in numbers else {"true": True, "false": False}.get(value, value)
+    integers, numbers = (
+        ("map_height",),
+        ("falloff", "tolerance", "surface_opacity", "background", "step", "coarse", "dt_gamma", "stop", "color_cutoff"),
+    )
+    value = (
+        int(value)
+        if name in integers
+        else float(value)
+        if name in numbers
+        else {"true": True, "false": False}.get(value, value)
+    )
     assert told(rgb.load_dict({**plain, name: value})) == told(rgb.load_dict(plain))
-    other = {"visibility": "map", "depth": "refined", "quadrature": "linear", "aovs": "opacity", "surface_opacity": 0.25, "dt_gamma": 0.5, "stop": 0.5,
-             "color_cutoff": 0.5}  # fmt: skip
+    other = {
+        "visibility": "map",
+        "depth": "refined",
+        "quadrature": "linear",
+        "aovs": "opacity",
+        "surface_opacity": 0.25,
+        "dt_gamma": 0.5,
+        "stop": 0.5,
+        "color_cutoff": 0.5,
+    }
     other = other[name] if name in other else not value if isinstance(value, bool) else value + 2
     assert told(rgb.load_dict({**plain, name: other})) != told(rgb.load_dict(plain))
 
 
 def test03_a_step_that_is_not_given_is_a_share_of_the_diagonal(rgb):
     integrator = rgb.load_dict(constant())
-    assert integrator.settings.step == pytest.approx(3**0.5 / 1024, rel=1e-5) and integrator.settings.cell_step == float("inf")
+    assert integrator.settings.step == pytest.approx(
+        3**0.5 / 1024, rel=1e-5
+    ) and integrator.settings.cell_step == float("inf")
     given = rgb.load_dict(constant(step=0.25)).settings
     assert given.step == given.cell_step == 0.25

@@ -1,4 +1,6 @@
-"""The integrator at the ends of what a scene may ask for: densities, sizes, observers, films; forwards and backwards."""
+"""The integrator at the ends of what a scene may ask for: densities, sizes, observers, films; forwards and
+backwards."""
+
 import math
 
 import drjit as dr
@@ -6,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.reference import march_numpy as reference
+
 from .scenes import GAZE, camera, channels, constant, look_at, observer_at, render, with_gaze
 
 DEPTH_SLOPE = 1e-4
@@ -16,10 +19,12 @@ def probe(mi, ahead):
     """One ray along +z through the unit cube, whose face lies ``ahead`` of the ray's origin."""
     # Mitsuba starts the rays of this sensor a hair in front of it.
     return {
-        "type": "radiancemeter", "origin": [0.5, 0.5, -ahead - float(mi.math.RayEpsilon)], "direction": [0, 0, 1],
+        "type": "radiancemeter",
+        "origin": [0.5, 0.5, -ahead - float(mi.math.RayEpsilon)],
+        "direction": [0, 0, 1],
         "sampler": {"type": "independent", "sample_count": 1},
         "film": {"type": "hdrfilm", "width": 1, "height": 1, "component_format": "float32", "rfilter": {"type": "box"}},
-    }  # fmt: skip
+    }
 
 
 def volume(mi, kind, sigma):
@@ -29,7 +34,13 @@ def volume(mi, kind, sigma):
 
 
 def slab_scene(mi, kind, sigma, ahead):
-    integrator = {"type": "nerg", "id": "integrator", "density": volume(mi, kind, sigma), "depth": "expected", "radiance": False}
+    integrator = {
+        "type": "nerg",
+        "id": "integrator",
+        "density": volume(mi, kind, sigma),
+        "depth": "expected",
+        "radiance": False,
+    }
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": probe(mi, ahead)})
 
 
@@ -59,9 +70,13 @@ def test02_their_derivatives(rgb, kind):
             dr.backward(dr.gather(rgb.Float, rgb.render(scene, params, spp=1).array, channel))
             got[name] = float(np.array(dr.grad(value)).sum())
         slope = math.exp(-sigma)
-        assert np.isclose(got["opacity"], slope, rtol=1e-4 if slope > 1e-6 else 0, atol=0 if slope > 1e-6 else 1e-6), sigma
+        assert np.isclose(got["opacity"], slope, rtol=1e-4 if slope > 1e-6 else 0, atol=0 if slope > 1e-6 else 1e-6), (
+            sigma
+        )
         # h(τ) = 1/τ - 1/expm1(τ), the mean depth of absorption.
-        change = -1 / sigma**2 + (1 / (4 * math.sinh(sigma / 2) ** 2) if sigma < 700 else 0) if sigma > 0.01 else -1 / 12
+        change = (
+            -1 / sigma**2 + (1 / (4 * math.sinh(sigma / 2) ** 2) if sigma < 700 else 0) if sigma > 0.01 else -1 / 12
+        )
         if 0.1 <= sigma <= 1e3:
             assert np.isclose(got["depth"], change, rtol=DEPTH_SLOPE), sigma
         assert np.isfinite(got["depth"])
@@ -85,8 +100,13 @@ def test04_places_of_any_size(rgb, size):
     def view(s):
         to_world = rgb.ScalarTransform4f().translate([-s / 2] * 3).scale(s)
         integrator = {"type": "nerg", "density": {"type": "constvolume", "value": 3.0 / s, "to_world": to_world}}
-        sensor = {**camera(rgb, fov=25), "to_world": look_at(rgb, np.multiply((0.5, 0.4, -3), s)),
-                  "near_clip": 1e-2 * s, "far_clip": 1e4 * s, "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
+        sensor = {
+            **camera(rgb, fov=25),
+            "to_world": look_at(rgb, np.multiply((0.5, 0.4, -3), s)),
+            "near_clip": 1e-2 * s,
+            "far_clip": 1e4 * s,
+            "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+        }
         return channels(rgb, integrator, sensor)
 
     a, b = view(1.0), view(size)
@@ -98,7 +118,11 @@ def test04_places_of_any_size(rgb, size):
 def test05_a_place_far_from_the_origin_keeps_what_floats_hold(rgb):
     # 1e5 units away positions are 0.008 apart: opacity stays, depth is good to that.
     to_world = rgb.ScalarTransform4f().translate([1e5, 0, 0])
-    integrator = {"type": "nerg", "density": {"type": "constvolume", "value": 3.0, "to_world": to_world}, "depth": "expected"}
+    integrator = {
+        "type": "nerg",
+        "density": {"type": "constvolume", "value": 3.0, "to_world": to_world},
+        "depth": "expected",
+    }
     out = channels(rgb, integrator, camera(rgb, (1e5 + 0.5, 0.5, -2), (1e5 + 0.5, 0.5, 0), fov=2))
     alpha, expected, _ = reference.slab(3, 1.99, 2.99)
     assert np.allclose(out["opacity.Y"], alpha, rtol=1e-2)
@@ -109,9 +133,19 @@ def test05_a_place_far_from_the_origin_keeps_what_floats_hold(rgb):
 def test06_samples(rgb, step, spp):
     # Constant density is exact at any step, and so is the mean of equal samples.
     to_world = rgb.ScalarTransform4f().translate([-9, -9, 0]).scale([18, 18, 1])
-    integrator = {"type": "nerg", "density": {"type": "constvolume", "value": 2.0, "to_world": to_world}, "depth": "expected", "step": step}
-    sensor = {"type": "orthographic", "to_world": rgb.ScalarTransform4f().translate([0, 0, -1]),
-              "film": camera(rgb, size=2)["film"], "sampler": {"type": "independent"}, "near_clip": 0.5}  # fmt: skip
+    integrator = {
+        "type": "nerg",
+        "density": {"type": "constvolume", "value": 2.0, "to_world": to_world},
+        "depth": "expected",
+        "step": step,
+    }
+    sensor = {
+        "type": "orthographic",
+        "to_world": rgb.ScalarTransform4f().translate([0, 0, -1]),
+        "film": camera(rgb, size=2)["film"],
+        "sampler": {"type": "independent"},
+        "near_clip": 0.5,
+    }
     out = channels(rgb, integrator, sensor, spp=spp)
     alpha, expected, _ = reference.slab(2, 0.5, 1.5)
     assert np.allclose(out["opacity.Y"], alpha, rtol=1e-5) and np.allclose(out["depth.T"], expected, rtol=1e-5)
@@ -120,11 +154,11 @@ def test06_samples(rgb, step, spp):
 def test07_a_crop_of_one_pixel(rgb):
     still = {"sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
     integrator = constant(2.0)
-    sensor = lambda film=(): camera(rgb, (0.5, 0.4, -2), (0.5, 0.5, 0.5), film=film) | still  # noqa: E731
+    sensor = lambda film=(): camera(rgb, (0.5, 0.4, -2), (0.5, 0.5, 0.5), film=film) | still
     whole = render(rgb, integrator, sensor())
     for x, y in ((0, 0), (11, 11), (6, 5)):
         crop = {"crop_offset_x": x, "crop_offset_y": y, "crop_width": 1, "crop_height": 1}
-        assert np.allclose(render(rgb, integrator, sensor(crop)), whole[y:y + 1, x:x + 1], rtol=1e-5, atol=1e-6)
+        assert np.allclose(render(rgb, integrator, sensor(crop)), whole[y : y + 1, x : x + 1], rtol=1e-5, atol=1e-6)
 
 
 # ------------------------------------------------------------------------
@@ -136,8 +170,15 @@ def test07_a_crop_of_one_pixel(rgb):
 @pytest.mark.parametrize("falloff", [0.0, 1e-38, 1e30])
 def test08_observers_anywhere_with_any_falloff(rgb, files, kind, falloff):
     for origin in ((0, 0, -1), (0.1, 0.1, 0.1), (0.6, 0.5, -5), (1e6, 0, -1e6), (1e-30, 0, 0)):
-        integrator = with_gaze(files, GAZE, observer=observer_at(rgb, *origin), visibility=kind, falloff=falloff,
-                               map_height=32, surface_opacity=0.0)  # fmt: skip
+        integrator = with_gaze(
+            files,
+            GAZE,
+            observer=observer_at(rgb, *origin),
+            visibility=kind,
+            falloff=falloff,
+            map_height=32,
+            surface_opacity=0.0,
+        )
         out = channels(rgb, integrator)
         assert all(np.all(np.isfinite(v)) for v in out.values()), origin
         assert out["visibility.Y"].min() >= 0 and out["visibility.Y"].max() <= 1 + 1e-6
@@ -146,15 +187,25 @@ def test08_observers_anywhere_with_any_falloff(rgb, files, kind, falloff):
 def test09_who_stands_in_solid_matter_sees_nothing_of_its_outside(rgb):
     to_world = rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     for kind in ("depth", "transmittance", "map"):
-        integrator = {"type": "nerg", "density": {"type": "constvolume", "value": 1e3, "to_world": to_world}, "aovs": "visibility",
-                      "visibility": kind, "observer": observer_at(rgb, 0, 0, 0), "map_height": 64}  # fmt: skip
+        integrator = {
+            "type": "nerg",
+            "density": {"type": "constvolume", "value": 1e3, "to_world": to_world},
+            "aovs": "visibility",
+            "visibility": kind,
+            "observer": observer_at(rgb, 0, 0, 0),
+            "map_height": 64,
+        }
         assert np.all(channels(rgb, integrator, camera(rgb, fov=20))["visibility.Y"] <= 1e-6)  # the marches' "stop"
 
 
 def test10_observers_in_odd_places_give_finite_derivatives(rgb, files):
     for origin in ((0.5, 0.4, -3), (0, 0, -1), (0.2, 0.1, 0.1)):
-        integrator = {**with_gaze(files, "gaze,visibility,depth", observer=observer_at(rgb, *origin), surface_opacity=0.0,
-                                  falloff=0.5), "id": "integrator"}  # fmt: skip
+        integrator = {
+            **with_gaze(
+                files, "gaze,visibility,depth", observer=observer_at(rgb, *origin), surface_opacity=0.0, falloff=0.5
+            ),
+            "id": "integrator",
+        }
         scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, size=4)})
         params = rgb.traverse(scene)
         key = "integrator.field.density_net.1"
@@ -225,8 +276,12 @@ def test15_the_median_puts_no_surface_in_mid_air(rgb):
     z, y, x = np.meshgrid(*[(np.arange(n) + 0.5) / n * 2 - 1] * 3, indexing="ij")
     radius = np.sqrt(x**2 + y**2 + (z + 0.4) ** 2) / 0.5
     data = np.where(z > 0.8, 1e3, 200 * np.clip((1.05 - radius) / 0.1, 0, 1)).astype(np.float32)
-    density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True,
-               "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)}  # fmt: skip
+    density = {
+        "type": "gridvolume",
+        "grid": rgb.VolumeGrid(data),
+        "raw": True,
+        "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
+    }
     flying = {}
     for kind in ("expected", "median", "refined"):
         integrator = {"type": "nerg", "density": density, "depth": kind, "radiance": False, "aovs": "position,opacity"}
@@ -238,7 +293,9 @@ def test15_the_median_puts_no_surface_in_mid_air(rgb):
 
 
 def test16_weights_set_to_nan_are_empty_space(rgb, files):
-    scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files, "depth,opacity,visibility"), "sensor": camera(rgb)})
+    scene = rgb.load_dict(
+        {"type": "scene", "integrator": with_gaze(files, "depth,opacity,visibility"), "sensor": camera(rgb)}
+    )
     params = rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("field.density_net.1"))
     params[key] = params[key] * math.nan

@@ -1,4 +1,5 @@
 """Geometry features as AOVs: accumulated along the ray, and at the surface."""
+
 import numpy as np
 import pytest
 
@@ -66,7 +67,10 @@ def test03_the_snapshot_is_the_field_at_the_surface(rgb, files):
 
 
 def test04_a_shape_has_none_and_hides_those_behind(rgb, files):
-    wall = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().look_at([0.5, 0.4, -2], [0.5, 0.4, -3], [0, 1, 0]).scale(9)}
+    wall = {
+        "type": "rectangle",
+        "to_world": rgb.ScalarTransform4f().look_at([0.5, 0.4, -2], [0.5, 0.4, -3], [0, 1, 0]).scale(9),
+    }
     out = channels(rgb, with_field(files, aovs="features,features_at,opacity"), w=wall)
     assert (out["opacity.Y"] == 1).all() and not block(out, "features").any() and not block(out, "features_at").any()
 

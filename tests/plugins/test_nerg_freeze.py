@@ -1,4 +1,5 @@
 """Functions frozen by ``dr.freeze``: recorded once, their replays equal what is traced anew, whatever has changed."""
+
 import gc
 
 import drjit as dr
@@ -37,7 +38,9 @@ def sheet(mi, value, i):
 
 
 def scene_of(mi, files, shapes=(), gaze="gaze", **more):
-    integrator = with_gaze(files, **{"aovs": "depth,gaze,visibility", "falloff": 2.0, "observer": observer_at(mi, -2, 0.3, -2), **more})
+    integrator = with_gaze(
+        files, **{"aovs": "depth,gaze,visibility", "falloff": 2.0, "observer": observer_at(mi, -2, 0.3, -2), **more}
+    )
     integrator["gaze"] = {"type": "gazefield", "filename": str(files / f"{gaze}.safetensors")}
     sensor = {**camera(mi, size=6), "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, **dict(shapes)})
@@ -85,15 +88,25 @@ def test05_a_normalised_gaze_field(rgb, files):
 
 
 def test06_a_grid_whose_matter_moves(rgb):
-    grid = {"type": "gridvolume", "grid": rgb.VolumeGrid(np.zeros((8, 8, 8), np.float32)),
-            "to_world": rgb.ScalarTransform4f().translate(-1).scale(2)}  # fmt: skip
+    grid = {
+        "type": "gridvolume",
+        "grid": rgb.VolumeGrid(np.zeros((8, 8, 8), np.float32)),
+        "to_world": rgb.ScalarTransform4f().translate(-1).scale(2),
+    }
     integrator = {"type": "nerg", "density": grid, "aovs": "depth,opacity"}
-    check(rgb, rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, size=6)}), "integrator.density.data", sheet)
+    check(
+        rgb,
+        rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, size=6)}),
+        "integrator.density.data",
+        sheet,
+    )
 
 
 def test07_a_mesh_that_moves(rgb, files):
     cube = {"type": "cube", "to_world": rgb.ScalarTransform4f().translate([0, 0, -1.3]).scale(0.2)}
-    check(rgb, scene_of(rgb, files, shapes={"cube": cube}), "cube.vertex_positions", lambda mi, value, i: value + 0.1 * i)
+    check(
+        rgb, scene_of(rgb, files, shapes={"cube": cube}), "cube.vertex_positions", lambda mi, value, i: value + 0.1 * i
+    )
 
 
 @pytest.mark.parametrize("key", ["gaze.emit_head.0", "falloff"])

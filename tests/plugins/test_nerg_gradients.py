@@ -1,4 +1,5 @@
 """Derivatives of pictures, as mi.render gives them, against central differences of pictures."""
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -21,21 +22,40 @@ def files(tmp_path_factory):
 
 def camera(mi, origin=(0.3, 0.2, -3)):
     return {
-        "type": "perspective", "fov": 25, "to_world": mi.ScalarTransform4f().look_at(list(origin), [0, 0, 0], [0, 1, 0]),
+        "type": "perspective",
+        "fov": 25,
+        "to_world": mi.ScalarTransform4f().look_at(list(origin), [0, 0, 0], [0, 1, 0]),
         "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
-        "film": {"type": "hdrfilm", "width": SIZE, "height": SIZE, "component_format": "float32", "pixel_format": "rgb",
-                 "rfilter": {"type": "box"}},
-    }  # fmt: skip
+        "film": {
+            "type": "hdrfilm",
+            "width": SIZE,
+            "height": SIZE,
+            "component_format": "float32",
+            "pixel_format": "rgb",
+            "rfilter": {"type": "box"},
+        },
+    }
 
 
 def neural(mi, files, aovs="depth,opacity,gaze", observer=None, **kwargs):
     out = {
-        "type": "nerg", "depth": "expected", "field": {"type": "nerf", "filename": str(files / "field.safetensors")},
-        "gaze": {"type": "gazefield", "filename": str(files / "gaze.safetensors")}, "aovs": aovs, "step": 0.1,
-        "stop": 1e-12, "color_cutoff": 0.0, "surface_opacity": 0.0, "background": 0.3, **kwargs,
-    }  # fmt: skip
+        "type": "nerg",
+        "depth": "expected",
+        "field": {"type": "nerf", "filename": str(files / "field.safetensors")},
+        "gaze": {"type": "gazefield", "filename": str(files / "gaze.safetensors")},
+        "aovs": aovs,
+        "step": 0.1,
+        "stop": 1e-12,
+        "color_cutoff": 0.0,
+        "surface_opacity": 0.0,
+        "background": 0.3,
+        **kwargs,
+    }
     if observer:
-        out["observer"] = {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at(list(observer), [0, 0, 0], [0, 1, 0])}
+        out["observer"] = {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at(list(observer), [0, 0, 0], [0, 1, 0]),
+        }
     return out
 
 
@@ -67,7 +87,7 @@ def check(mi, scene, name, channels, h, picks=4, rtol=0.02):
     gradient = dr.grad(x).numpy().ravel()
     assert np.all(np.isfinite(gradient)) and gradient.any()
     base = value.numpy()
-    order = np.argsort(-np.abs(gradient))[: picks * 4: 4] if gradient.size > picks * 4 else np.arange(gradient.size)
+    order = np.argsort(-np.abs(gradient))[: picks * 4 : 4] if gradient.size > picks * 4 else np.arange(gradient.size)
     got, expected = [], []
     for i in order:
         ends = []
@@ -101,13 +121,17 @@ def test02_colour_net(rgb, files, name):
 
 @pytest.mark.parametrize("name", ["grid.table", "position_net.0", "direction_net.1", "emit_head.0", "capture_head.0"])
 def test03_gaze_weights(rgb, files, name):
-    check(rgb, scene_of(rgb, neural(rgb, files, observer=(-2, 0.5, -2))), f"integrator.gaze.{name}", GAZE, 1e-2, rtol=0.05)
+    check(
+        rgb, scene_of(rgb, neural(rgb, files, observer=(-2, 0.5, -2))), f"integrator.gaze.{name}", GAZE, 1e-2, rtol=0.05
+    )
 
 
 @pytest.mark.parametrize("depth", ["median", "refined"])
 @pytest.mark.parametrize("name", ["grid.table", "density_net.1"])
 def test04_median_depth(rgb, files, name, depth):
-    check(rgb, scene_of(rgb, neural(rgb, files, depth=depth)), f"integrator.field.{name}", DEPTH, 2e-3, picks=3, rtol=0.05)
+    check(
+        rgb, scene_of(rgb, neural(rgb, files, depth=depth)), f"integrator.field.{name}", DEPTH, 2e-3, picks=3, rtol=0.05
+    )
 
 
 def test05_falloff(rgb, files):
@@ -125,12 +149,21 @@ def test07_gridvolume(rgb, quadrature):
     data = np.random.default_rng(0).exponential(1, (4, 5, 6)).astype(np.float32)
     data[1] = 0  # empty voxels have derivatives too
     integrator = {
-        "type": "nerg", "depth": "expected", "aovs": "depth,opacity", "step": 0.1, "stop": 1e-12, "color_cutoff": 0.0, "background": 0.3,
+        "type": "nerg",
+        "depth": "expected",
+        "aovs": "depth,opacity",
+        "step": 0.1,
+        "stop": 1e-12,
+        "color_cutoff": 0.0,
+        "background": 0.3,
         "quadrature": quadrature,
-        "density": {"type": "gridvolume", "grid": rgb.VolumeGrid(data),
-                    "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)},
+        "density": {
+            "type": "gridvolume",
+            "grid": rgb.VolumeGrid(data),
+            "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
+        },
         "color": {"type": "constvolume", "value": {"type": "rgb", "value": [0.8, 0.5, 0.2]}},
-    }  # fmt: skip
+    }
     scene = scene_of(rgb, integrator)
     key = next(k for k in rgb.traverse(scene).keys() if k.endswith("density.data"))
     # One-sided at 0, where density is clamped: lift the empty voxels a little.
@@ -182,8 +215,11 @@ def test09_nothing_met_gives_no_nan(rgb, files):
 
 def test10_a_sensor_that_stands_on_its_own_near_plane(rgb, files):
     # Rays of a panorama start at the observer: where they miss, surface and observer coincide.
-    observer = {"type": "panorama", "to_world": rgb.ScalarTransform4f().translate([0, 0, -3]),
-                "film": {"type": "hdrfilm", "width": 4, "height": 4}}
+    observer = {
+        "type": "panorama",
+        "to_world": rgb.ScalarTransform4f().translate([0, 0, -3]),
+        "film": {"type": "hdrfilm", "width": 4, "height": 4},
+    }
     integrator = {**neural(rgb, files), "observer": {**observer}}
     sensor = {**observer, "film": {**camera(rgb)["film"], "width": 8, "height": 4}, "sampler": camera(rgb)["sampler"]}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
@@ -224,10 +260,17 @@ def test11_forward_mode(rgb, files):
 @pytest.mark.parametrize("whose", ["integrator.observer.to_world", "sensor.b.to_world"])
 def test12_poses_in_front_of_a_batch_go_backward_only(rgb, whose):
     """Forward mode is refused where Mitsuba would end the process."""
-    sensor = {"type": "batch", "film": {**camera(rgb)["film"], "width": 2 * SIZE},
-              **{n: camera(rgb, (x, 0.4, -3)) for n, x in (("a", 0.5), ("b", -0.5))}}  # fmt: skip
-    integrator = {"type": "nerg", "aovs": "observer_depth", "occlusion": False,
-                  "observer": {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate([2, 0.1, -3])}}  # fmt: skip
+    sensor = {
+        "type": "batch",
+        "film": {**camera(rgb)["film"], "width": 2 * SIZE},
+        **{n: camera(rgb, (x, 0.4, -3)) for n, x in (("a", 0.5), ("b", -0.5))},
+    }
+    integrator = {
+        "type": "nerg",
+        "aovs": "observer_depth",
+        "occlusion": False,
+        "observer": {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate([2, 0.1, -3])},
+    }
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, "s": {"type": "sphere"}})
     params = rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith(whose.split(".", 1)[1]))

@@ -1,13 +1,16 @@
-"""A checkpoint of the paper's authors, in their sizes, as a picture: `nerg` against NumPy from the state dictionary on."""
+"""A checkpoint of the paper's authors, in their sizes, as a picture: `nerg` against NumPy from the state dictionary
+on."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.formats.torch_ngp.nerg import read_nerg
-
 from tests.formats.torch_ngp.test_nerg import save
-from tests.reference import march_numpy, torch_ngp_numpy as reference
+from tests.reference import march_numpy
+from tests.reference import torch_ngp_numpy as reference
+
 from .scenes import camera, named, render
 
 SIZE, STEP = 6, 0.02
@@ -18,7 +21,8 @@ def srgb_to_linear(c):
 
 
 def expected(state, nerf, bound, origins, directions, eye):
-    """Colour, depth, opacity, gaze, emit and capture of every ray, marched without skipping but for the kernel's bits."""
+    """Colour, depth, opacity, gaze, emit and capture of every ray, marched without skipping but for the kernel's
+    bits."""
     out = []
     for o, d in zip(origins, directions):
         near, far = march_numpy.box(o, d, [-bound] * 3, [bound] * 3)
@@ -26,7 +30,9 @@ def expected(state, nerf, bound, origins, directions, eye):
         middles = o + d * (borders[:-1] + np.diff(borders) / 2)[:, None]
         seen = reference.occupied(nerf["density_bitfield"], bound, middles)
         sigma, color = np.zeros(len(seen)), np.zeros((len(seen), 3))
-        sigma[seen], color[seen], _ = reference.nerf(nerf, bound, middles[seen], np.tile(d.astype(np.float32), (seen.sum(), 1)))
+        sigma[seen], color[seen], _ = reference.nerf(
+            nerf, bound, middles[seen], np.tile(d.astype(np.float32), (seen.sum(), 1))
+        )
         tau, depth, _, total, _ = march_numpy.march(lambda p: sigma, o, d, borders, lambda p: color)
         alpha = -np.expm1(-tau)
         p_d = o + d * depth
@@ -40,7 +46,7 @@ def smooth(state, finest):
     """Weaken fine levels as training does: white noise at 4096 cells would show the last bit of every position."""
     where, levels = state["encoder.offsets"], len(state["encoder.offsets"]) - 1
     for level in range(levels):
-        state["encoder.embeddings"][where[level]:where[level + 1]] *= (16 / finest) ** (level / (levels - 1))
+        state["encoder.embeddings"][where[level] : where[level + 1]] *= (16 / finest) ** (level / (levels - 1))
 
 
 @pytest.mark.parametrize("bound, aligned", [(2, True), (5, False)])
@@ -56,15 +62,25 @@ def test01_a_picture_of_a_checkpoint(rgb, tmp_path, bound, aligned):
 
     eye = np.array([0.4, 0.3, -1.5]) if aligned else np.array([1.1, -0.7, 0.6])
     integrator = {
-        "type": "nerg", "depth": "expected", "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
-        "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")}, "step": STEP,
-        "aovs": "depth,opacity,gaze,emit,capture", "surface_opacity": 0.0, "color_cutoff": 0.0, "stop": 0.0,
-    }  # fmt: skip
+        "type": "nerg",
+        "depth": "expected",
+        "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
+        "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")},
+        "step": STEP,
+        "aovs": "depth,opacity,gaze,emit,capture",
+        "surface_opacity": 0.0,
+        "color_cutoff": 0.0,
+        "stop": 0.0,
+    }
     if not aligned:
-        integrator |= {"observer": {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate(eye.tolist())},
-                       "occlusion": False}  # fmt: skip
-    sensor = {**camera(rgb, (0.4, 0.3, -1.5), (0.1, 0, 0.4), size=SIZE, fov=60, near_clip=0.01),
-              "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}  # fmt: skip
+        integrator |= {
+            "observer": {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate(eye.tolist())},
+            "occlusion": False,
+        }
+    sensor = {
+        **camera(rgb, (0.4, 0.3, -1.5), (0.1, 0, 0.4), size=SIZE, fov=60, near_clip=0.01),
+        "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+    }
     loaded = rgb.load_dict(sensor)
     grid = (np.stack(np.meshgrid(np.arange(SIZE), np.arange(SIZE)), -1).reshape(-1, 2) + 0.5) / SIZE
     ray, _ = loaded.sample_ray(0, 0.5, rgb.Point2f(grid.T.astype(np.float32)), rgb.Point2f(0.5))
@@ -72,8 +88,9 @@ def test01_a_picture_of_a_checkpoint(rgb, tmp_path, bound, aligned):
 
     image = render(rgb, integrator, sensor)
     got = named(rgb, image, integrator)
-    flat = np.concatenate([image[..., :3]] + [got[k][..., None] for k in ("depth.T", "opacity.Y", "gaze.Y", "emit.Y", "capture.Y")],
-                          -1).reshape(SIZE**2, -1)
+    flat = np.concatenate(
+        [image[..., :3]] + [got[k][..., None] for k in ("depth.T", "opacity.Y", "gaze.Y", "emit.Y", "capture.Y")], -1
+    ).reshape(SIZE**2, -1)
     true = expected(state, nerf, bound, origins, directions, eye)
     assert true[:, 4].min() > 0.2 and np.ptp(true[:, 5]) > 0.1
     scale = np.abs(true).max(0)

@@ -1,4 +1,5 @@
 """What a scene does not need is not computed: counted in operations traced and evaluations made, never in time."""
+
 import subprocess
 import sys
 
@@ -33,17 +34,23 @@ def test02_nothing_asked_nothing_marched(rgb, files):
 
 def test03_no_gaze_unless_asked(rgb, files):
     without, unasked, asked = (
-        operations(rgb, i) for i in (with_field(files, aovs="depth,opacity"), with_gaze(files, "depth,opacity"),
-                                     with_gaze(files, "depth,opacity,gaze"))
-    )  # fmt: skip
+        operations(rgb, i)
+        for i in (
+            with_field(files, aovs="depth,opacity"),
+            with_gaze(files, "depth,opacity"),
+            with_gaze(files, "depth,opacity,gaze"),
+        )
+    )
     assert unasked == without and asked > without + 300
 
 
 def test04_an_aligned_observer_needs_no_second_march(rgb, files):
     sensor = camera(rgb, (0.5, 0.4, -3))
     none = with_gaze(files, "gaze,density_evals")
-    here, there = (with_gaze(files, "gaze,density_evals", observer={"type": "perspective", "to_world": look_at(rgb, o)})
-                   for o in ((0.5, 0.4, -3), (-2, 0.3, -2)))  # fmt: skip
+    here, there = (
+        with_gaze(files, "gaze,density_evals", observer={"type": "perspective", "to_world": look_at(rgb, o)})
+        for o in ((0.5, 0.4, -3), (-2, 0.3, -2))
+    )
     a, b, c = (channels(rgb, i, sensor)["density_evals.Y"] for i in (none, here, there))
     assert np.array_equal(a, b) and c.sum() > 1.3 * a.sum()
     first, second, third = (operations(rgb, i, sensor) for i in (none, here, there))
@@ -105,8 +112,8 @@ def test11_rendering_imports_neither_torch_nor_matplotlib_nor_scipy_stats(files)
 import sys, nerg_mi, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 scene = mi.load_dict({{"type": "scene", "integrator": {{"type": "nerg", "aovs": "depth,gaze",
-    "field": {{"type": "nerf", "filename": r"{files / 'field.safetensors'}"}},
-    "gaze": {{"type": "gazefield", "filename": r"{files / 'gaze.safetensors'}"}}}},
+    "field": {{"type": "nerf", "filename": r"{files / "field.safetensors"}"}},
+    "gaze": {{"type": "gazefield", "filename": r"{files / "gaze.safetensors"}"}}}},
     "sensor": {{"type": "perspective", "film": {{"type": "hdrfilm", "width": 4, "height": 4}}}}}})
 mi.render(scene, spp=1).numpy()
 print([m for m in ("torch", "matplotlib", "scipy.stats") if m in sys.modules])

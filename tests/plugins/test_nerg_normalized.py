@@ -1,12 +1,13 @@
 """Normalised gaze fields in the integrator: what an observer gives all directions together is one."""
+
 import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.formats.fields import save_gaze
+from nerg_mi.maths.box import Box
 
 from . import fields
 from .scenes import camera, channels, observer_at
@@ -20,7 +21,12 @@ def log_gaze(path, **kwargs):
     rng = np.random.default_rng(4)
     config = LogGazeConfig(grid=GRID, width=16, prior=16, heads=((-1, -1, -1), (1, 1, 1)), **kwargs)
     field = LogGazeField.random(config, Box((-1, -1, -1), (1, 1, 1)), ns, 3)
-    field.set_parameters({"grid.table": ns.Float((2 * rng.normal(size=len(field.grid.table))).astype(np.float32)), "escaped": ns.Float(0.4)})
+    field.set_parameters(
+        {
+            "grid.table": ns.Float((2 * rng.normal(size=len(field.grid.table))).astype(np.float32)),
+            "escaped": ns.Float(0.4),
+        }
+    )
     # Random networks are nearly constant: these are not.
     field.set_parameters({k: 8 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
     save_gaze(field, path, {})
@@ -36,15 +42,27 @@ def room(mi, open_side=False):
                 continue
             up = [0, 0, 1] if axis != 2 else [0, 1, 0]
             at = [0.9 * side if a == axis else 0 for a in range(3)]
-            walls[f"w{axis}{side + 1}"] = {"type": "rectangle", "to_world": mi.ScalarTransform4f().look_at(at, [0, 0, 0], up).scale([0.9, 0.9, 1])}
+            walls[f"w{axis}{side + 1}"] = {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().look_at(at, [0, 0, 0], up).scale([0.9, 0.9, 1]),
+            }
     return walls
 
 
 def around(mi, origin, integrator, size=48, **more):
     """Gaze in every direction of an observer, and the solid angles of the pixels."""
-    sensor = {"type": "panorama", "to_world": mi.ScalarTransform4f().translate(list(origin)),
-              "film": {"type": "hdrfilm", "width": 2 * size, "height": size, "component_format": "float32", "rfilter": {"type": "box"}},
-              "sampler": {"type": "stratified", "sample_count": 4}}  # fmt: skip
+    sensor = {
+        "type": "panorama",
+        "to_world": mi.ScalarTransform4f().translate(list(origin)),
+        "film": {
+            "type": "hdrfilm",
+            "width": 2 * size,
+            "height": size,
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "stratified", "sample_count": 4},
+    }
     out = channels(mi, integrator, sensor, spp=4, **more)
     theta = np.linspace(0, np.pi, size + 1)
     return out["gaze.Y"], (np.cos(theta[:-1]) - np.cos(theta[1:]))[:, None] * (np.pi / size)
@@ -58,7 +76,9 @@ def test01_integrates_to_one(rgb, tmp_path, origin, kind):
         fields.gaze(path, normalized=True)
         gaze = {"type": "gazefield", "filename": str(path)}
     else:
-        gaze = log_gaze(path, mix=0.3 if kind == "mixed" else 0.0, variant="capture" if kind == "capture" else "emit_capture")
+        gaze = log_gaze(
+            path, mix=0.3 if kind == "mixed" else 0.0, variant="capture" if kind == "capture" else "emit_capture"
+        )
     density, angle = around(rgb, origin, {"type": "nerg", "aovs": "gaze", "radiance": False, "gaze": gaze}, **room(rgb))
     assert np.ptp(density) > 2e-3 and (density >= 0).all()
     assert (density * angle).sum() == pytest.approx(1, abs=4e-3)
@@ -67,7 +87,9 @@ def test01_integrates_to_one(rgb, tmp_path, origin, kind):
 def test02_what_escapes_counts(rgb, tmp_path):
     """Through the open side goes what the constant says: the share that is missing from what the walls get."""
     gaze = log_gaze(tmp_path / "g.safetensors", variant="emit")
-    density, angle = around(rgb, (0, 0, 0), {"type": "nerg", "aovs": "gaze", "radiance": False, "gaze": gaze}, **room(rgb, True))
+    density, angle = around(
+        rgb, (0, 0, 0), {"type": "nerg", "aovs": "gaze", "radiance": False, "gaze": gaze}, **room(rgb, True)
+    )
     seen = density > 0
     share = (angle * ~seen).sum() / (4 * np.pi)
     assert share == pytest.approx(1 / 6, abs=0.02)
@@ -84,8 +106,16 @@ def test02_what_escapes_counts(rgb, tmp_path):
 def test03_one_integral_an_observer(rgb, tmp_path):
     """Kept between renders, made anew for another observer, another place or other weights."""
     gaze = log_gaze(tmp_path / "g.safetensors", mix=0.1)
-    integrator = {"type": "nerg", "aovs": "gaze,visibility", "gaze": gaze, "observer": observer_at(rgb, 0.2, 0.1, 0), "falloff": 0.0}
-    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0)), **room(rgb)})
+    integrator = {
+        "type": "nerg",
+        "aovs": "gaze,visibility",
+        "gaze": gaze,
+        "observer": observer_at(rgb, 0.2, 0.1, 0),
+        "falloff": 0.0,
+    }
+    scene = rgb.load_dict(
+        {"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0)), **room(rgb)}
+    )
     medium = scene.integrator().gaze
     first = np.array(rgb.render(scene, spp=1))
     traced, value = medium._integrals[0], medium._integrals[0].value()
@@ -118,10 +148,13 @@ def test04_a_batch_has_an_integral_a_camera(rgb, tmp_path):
 
 
 def test05_derivatives_pass_the_integral(rgb, tmp_path):
-    """Of all weights together: scaling emit by a factor changes nothing, so that the derivative with the blind table is 0."""
+    """Of all weights together: scaling emit by a factor changes nothing, so that the derivative with the blind table is
+    0."""
     gaze = log_gaze(tmp_path / "g.safetensors")
     integrator = {"type": "nerg", "aovs": "gaze", "radiance": False, "gaze": gaze}
-    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0)), **room(rgb)})
+    scene = rgb.load_dict(
+        {"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0)), **room(rgb)}
+    )
     params = rgb.traverse(scene)
     shift = rgb.Float(0)
     dr.enable_grad(shift)

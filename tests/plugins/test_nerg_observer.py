@@ -1,4 +1,5 @@
 """Observers: where they are, what is hidden from them, and how that is decided."""
+
 import numpy as np
 import pytest
 
@@ -71,11 +72,20 @@ def test07_no_shadow_acne_on_what_the_observer_sees(rgb):
     # Observer and camera on the same side of one flat wall, near each other and far apart.
     data = np.zeros((40, 2, 2), np.float32)
     data[30:] = 1e4
-    density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "filter_type": "nearest",
-               "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)}
+    density = {
+        "type": "gridvolume",
+        "grid": rgb.VolumeGrid(data),
+        "filter_type": "nearest",
+        "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
+    }
     for x in (0.01, 0.3, 0.9):
-        integrator = {"type": "nerg", "density": density, "aovs": "visibility", "falloff": 0.0,
-                      "observer": observer_at(rgb, x, 0.1, -0.9)}
+        integrator = {
+            "type": "nerg",
+            "density": density,
+            "aovs": "visibility",
+            "falloff": 0.0,
+            "observer": observer_at(rgb, x, 0.1, -0.9),
+        }
         out = channels(rgb, integrator, camera(rgb, (0, 0, -0.95), (0, 0, 1), fov=60, near_clip=1e-3))
         assert (out["visibility.Y"] == 1).all()
 
@@ -93,11 +103,16 @@ def test09_kinds_of_visibility_agree_on_opaque_walls(rgb, visibility):
     x = out["position.X"]
     hidden, visible = x * 0.95 / 1.7 < 0.3 - 0.08, x * 0.85 / 1.7 > 0.3 + 0.08
     assert hidden.sum() > 20 and visible.sum() > 5
-    assert np.allclose(out["visibility.Y"][hidden], 0, atol=1e-6) and np.allclose(out["visibility.Y"][visible], 1, atol=1e-6)
+    assert np.allclose(out["visibility.Y"][hidden], 0, atol=1e-6) and np.allclose(
+        out["visibility.Y"][visible], 1, atol=1e-6
+    )
 
 
 def test10_coarse_steps_in_front_of_matter_change_nothing_behind(rgb):
-    a, b = (hidden_scene(rgb, coarse=c, falloff=0.0, aovs="depth,opacity,visibility,position,observer_depth") for c in (1.0, 4.0))
+    a, b = (
+        hidden_scene(rgb, coarse=c, falloff=0.0, aovs="depth,opacity,visibility,position,observer_depth")
+        for c in (1.0, 4.0)
+    )
     # Steps end elsewhere: a pixel at the shadow's edge may change sides.
     assert np.mean(a["visibility.Y"] != b["visibility.Y"]) < 0.06
     same = a["visibility.Y"] == b["visibility.Y"]
@@ -113,19 +128,31 @@ def test30_no_wall_hides_itself_from_an_oblique_observer(rgb, kind, sigma, angle
     to_world = rgb.ScalarTransform4f().translate([-10, -10, 2]).scale([20, 20, 0.5])
     eye = [2 * np.sin(np.deg2rad(angle)), 0.0, 2 - 2 * np.cos(np.deg2rad(angle))]
     integrator = {
-        "type": "nerg", "density": {"type": "constvolume", "value": sigma, "to_world": to_world}, "step": 0.01,
-        "aovs": "visibility", "visibility": kind, "falloff": 0.0, "radiance": False, "map_height": 256,
+        "type": "nerg",
+        "density": {"type": "constvolume", "value": sigma, "to_world": to_world},
+        "step": 0.01,
+        "aovs": "visibility",
+        "visibility": kind,
+        "falloff": 0.0,
+        "radiance": False,
+        "map_height": 256,
         "observer": {"type": "perspective", "to_world": look_at(rgb, eye, (0, 0, 2))},
-    }  # fmt: skip
+    }
     out = channels(rgb, integrator, camera(rgb, (0, 0.1, 0), (0, 0, 2), fov=20, size=12))
     assert out["visibility.Y"].min() > 0.999
 
 
 @pytest.mark.parametrize("kind", ["depth", "map"])
 def test31_an_observer_who_meets_nothing_is_not_blocked_by_it(rgb, kind):
-    """Also where any opacity counts as a surface: rays that pass a ball by a hair find the point in front of it in the open."""
-    integrator = {"type": "nerg", "aovs": "visibility,observer_depth,position", "surface_opacity": 0.0, "visibility": kind,
-                  "observer": observer_at(rgb, -2, 0.5, -2.5)}  # fmt: skip
+    """Also where any opacity counts as a surface: rays that pass a ball by a hair find the point in front of it in the
+    open."""
+    integrator = {
+        "type": "nerg",
+        "aovs": "visibility,observer_depth,position",
+        "surface_opacity": 0.0,
+        "visibility": kind,
+        "observer": observer_at(rgb, -2, 0.5, -2.5),
+    }
     out = channels(rgb, integrator, camera(rgb, (0.3, 0.2, -3), fov=12), ball={"type": "sphere", "radius": 0.8})
     p = np.stack([out[f"position.{c}"] for c in "XYZ"], -1)
     faces = (p * ((-2, 0.5, -2.5) - p)).sum(-1) > 0

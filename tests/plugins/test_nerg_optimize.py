@@ -1,11 +1,13 @@
-"""What Mitsuba's optimisers and loaders of rays make of pictures: parameters found again, gaze learnt from views and rays."""
+"""What Mitsuba's optimisers and loaders of rays make of pictures: parameters found again, gaze learnt from views and
+rays."""
+
 import dataclasses
 
 import drjit as dr
 import numpy as np
 import pytest
 
-from .scenes import camera, constant, look_at, observer_at, with_gaze
+from .scenes import camera, constant, observer_at, with_gaze
 
 SEEN, HELD_OUT = ((0.5, 0.4, -3), (-1.5, 0.3, -2.6), (2.0, -0.5, -2.2)), (1.3, 0.0, -2.7)
 CENTERS = {"sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
@@ -33,7 +35,8 @@ def found(mi, scene, start, steps, lr):
 
 
 def test01_adam_finds_falloff_and_density(rgb):
-    """Both at once: visibility tells the first, opacity the second, in a fog that camera and observer see from two sides."""
+    """Both at once: visibility tells the first, opacity the second, in a fog that camera and observer see from two
+    sides."""
     place = rgb.ScalarTransform4f().translate(-1).scale(2)
     fog = {"type": "constvolume", "value": 1.5, "to_world": place}
     observer = observer_at(rgb, -2, 0.3, 2)
@@ -118,14 +121,17 @@ def test03_gaze_weights_learn_from_batches_of_rays(task):
 
 
 def test04_a_batch_of_rays_shows_what_its_pixels_show(rgb, files):
-    """All channels. Rays are almost parallel, as the loader moves each within its pixel: every camera shows but one number."""
+    """All channels. Rays are almost parallel, as the loader moves each within its pixel: every camera shows but one
+    number."""
     integrator = with_gaze(files, observer=observer_at(rgb, -2, 0.3, -2), falloff=2.0)
     eyes = [(0.2 * i - 0.5, 0.3 - 0.1 * i, -3) for i in range(3)]
     sensors = {f"camera{i}": camera(rgb, o, (o[0], o[1], 0), size=6, fov=0.01) for i, o in enumerate(eyes)}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, **sensors})
     pictures = [rgb.render(scene, sensor=s, spp=1) for s in scene.sensors()]
     # A divisor of the number of pixels: without tiles the loader of 3.9.1 draws pixels beyond the last one otherwise.
-    loader = rgb.ad.loaders.RayDataLoader(scene.sensors(), [p[..., :3] for p in pictures], pixels_per_batch=36, tile_size=1)
+    loader = rgb.ad.loaders.RayDataLoader(
+        scene.sensors(), [p[..., :3] for p in pictures], pixels_per_batch=36, tile_size=1
+    )
     colors, rays = loader.next()
     got, chosen = np.array(rgb.render(scene, sensor=rays, spp=1))[0], np.array(rays.pixel_idx)
     expected = np.array(pictures).reshape(3 * 36, -1)[chosen]
@@ -137,7 +143,9 @@ def test04_a_batch_of_rays_shows_what_its_pixels_show(rgb, files):
 
 def test05_batches_of_rays_need_an_observer(rgb, files):
     """The loader's sensor does not tell which camera a ray is of."""
-    scene = rgb.load_dict({"type": "scene", "integrator": with_gaze(files), "sensor": {**camera(rgb, size=4), **CENTERS}})
+    scene = rgb.load_dict(
+        {"type": "scene", "integrator": with_gaze(files), "sensor": {**camera(rgb, size=4), **CENTERS}}
+    )
     loader = rgb.ad.loaders.RayDataLoader(scene.sensors(), [rgb.render(scene, spp=1)[..., :3]], pixels_per_batch=4)
     _, rays = loader.next()
     with pytest.raises(Exception, match='FlatSensor.*"observer"'):

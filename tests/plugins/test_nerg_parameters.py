@@ -1,4 +1,5 @@
 """Parameters as ``mi.traverse`` shows them."""
+
 import numpy as np
 import pytest
 
@@ -10,7 +11,9 @@ def scene_of(mi, files, size=6, origins=((0.5, 0.4, -3),), **more):
     integrator = with_gaze(files, **{"aovs": "gaze", "falloff": 2.0, "observer": observer_at(mi, -2, 0.3, -2), **more})
     centers = {"sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
     sensors = {f"camera{i}": {**camera(mi, origin, size=size), **centers} for i, origin in enumerate(origins)}
-    return mi.load_dict({"type": "scene", "integrator": {k: v for k, v in integrator.items() if v is not None}, **sensors})
+    return mi.load_dict(
+        {"type": "scene", "integrator": {k: v for k, v in integrator.items() if v is not None}, **sensors}
+    )
 
 
 def test01_flags(rgb, files):

@@ -1,5 +1,6 @@
-"""Shapes, a field, and both, under everything that Mitsuba puts around an integrator: each picture against closed forms,
-against Mitsuba's own integrators, or against the same place built in another way."""
+"""Shapes, a field, and both, under everything that Mitsuba puts around an integrator: each picture against closed
+forms, against Mitsuba's own integrators, or against the same place built in another way."""
+
 import numpy as np
 import pytest
 
@@ -12,33 +13,59 @@ COLOR = (0.9, 0.4, 0.1)
 
 
 def film(**kwargs):
-    return {"type": "hdrfilm", "width": 12, "height": 12, "component_format": "float32", "pixel_format": "rgb",
-            "rfilter": {"type": "box"}, **kwargs}  # fmt: skip
+    return {
+        "type": "hdrfilm",
+        "width": 12,
+        "height": 12,
+        "component_format": "float32",
+        "pixel_format": "rgb",
+        "rfilter": {"type": "box"},
+        **kwargs,
+    }
 
 
 def furniture(mi):
     """A ball inside of the unit box's field, half a board behind it, and a board that casts a shadow from ``EYE``."""
-    return {"ball": sphere(mi, 0.5, 0, 0.2, radius=0.4), "back": square(mi, 1.4, 0.8, x=-0.4),
-            "lid": square(mi, -0.2, 0.25, x=-0.6)}  # fmt: skip
+    return {
+        "ball": sphere(mi, 0.5, 0, 0.2, radius=0.4),
+        "back": square(mi, 1.4, 0.8, x=-0.4),
+        "lid": square(mi, -0.2, 0.25, x=-0.6),
+    }
 
 
 def sensors(mi):
     crop = dict(crop_offset_x=3, crop_offset_y=5, crop_width=6, crop_height=4)
     ortho = look_at(mi, (0.5, 0.4, -3)) @ mi.ScalarTransform4f().scale(1.5)
     return {
-        "perspective": camera(mi), "crop": camera(mi, film=crop),
+        "perspective": camera(mi),
+        "crop": camera(mi, film=crop),
         "thinlens": camera(mi, kind="thinlens", fov=35, aperture_radius=0.15, focus_distance=3.0),
         "orthographic": {**camera(mi, kind="orthographic"), "to_world": ortho},
-        "batch": {"type": "batch", "film": film(height=6),
-                  **{f"c{i}": camera(mi, o, size=6) for i, o in enumerate([(0.5, 0.4, -3), (-2.5, 0.2, -1)])}},
-        "panorama": {"type": "panorama", "to_world": mi.ScalarTransform4f().translate([0, 0.1, -1.6]),
-                     "film": film(width=16, height=9)},
+        "batch": {
+            "type": "batch",
+            "film": film(height=6),
+            **{f"c{i}": camera(mi, o, size=6) for i, o in enumerate([(0.5, 0.4, -3), (-2.5, 0.2, -1)])},
+        },
+        "panorama": {
+            "type": "panorama",
+            "to_world": mi.ScalarTransform4f().translate([0, 0.1, -1.6]),
+            "film": film(width=16, height=9),
+        },
         "sample border": camera(mi, rfilter="gaussian", film=dict(sample_border=True)),
         "crop with a border": camera(mi, rfilter="gaussian", film=dict(sample_border=True, **crop)),
-    }  # fmt: skip
+    }
 
 
-SENSORS = ["perspective", "crop", "thinlens", "orthographic", "batch", "panorama", "sample border", "crop with a border"]
+SENSORS = [
+    "perspective",
+    "crop",
+    "thinlens",
+    "orthographic",
+    "batch",
+    "panorama",
+    "sample border",
+    "crop with a border",
+]
 
 
 def both_ways(mi, sensor, things, *place, spp=2, **kwargs):
@@ -96,17 +123,30 @@ def test04_emitters_and_the_sky_light_shapes_and_are_the_background(rgb, light):
 
 def boxes(mi):
     T = mi.ScalarTransform4f
-    return [T().translate([-0.5, 0.3, -0.3]).rotate([0, 1, 0], 30), T().translate([0.4, -0.3, 0.2]).rotate([1, 0, 0], 50)]
+    return [
+        T().translate([-0.5, 0.3, -0.3]).rotate([0, 1, 0], 30),
+        T().translate([0.4, -0.3, 0.2]).rotate([1, 0, 0], 50),
+    ]
 
 
 @pytest.mark.parametrize("kind", ["depth", "map"])
 def test05_instances_are_what_they_stand_for(rgb, kind):
     group = {"type": "shapegroup", "a": {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(0.25)}}
-    instances = {f"i{i}": {"type": "instance", "to_world": t, "g": {"type": "ref", "id": "group"}}
-                 for i, t in enumerate(boxes(rgb))}  # fmt: skip
-    plain = {f"c{i}": {"type": "cube", "to_world": t @ rgb.ScalarTransform4f().scale(0.25)} for i, t in enumerate(boxes(rgb))}
-    integrator = constant(0.3, aovs="depth,opacity,position,visibility", visibility=kind, map_height=64, falloff=0.0,
-                          observer=observer_at(rgb, *EYE))  # fmt: skip
+    instances = {
+        f"i{i}": {"type": "instance", "to_world": t, "g": {"type": "ref", "id": "group"}}
+        for i, t in enumerate(boxes(rgb))
+    }
+    plain = {
+        f"c{i}": {"type": "cube", "to_world": t @ rgb.ScalarTransform4f().scale(0.25)} for i, t in enumerate(boxes(rgb))
+    }
+    integrator = constant(
+        0.3,
+        aovs="depth,opacity,position,visibility",
+        visibility=kind,
+        map_height=64,
+        falloff=0.0,
+        observer=observer_at(rgb, *EYE),
+    )
     a = render(rgb, integrator, group=group, **instances, back=square(rgb, 1.4, 1.5))
     b = render(rgb, integrator, **plain, back=square(rgb, 1.4, 1.5))
     assert np.mean(np.abs(a - b) > 1e-4) < 0.005 and 0.1 < named(rgb, b, integrator)["visibility.Y"].mean() < 0.95
@@ -116,8 +156,11 @@ def mover(mi, name):
     """A shape, the key that moves it, the value to move it to, and the shape as it then is."""
     t = mi.ScalarTransform4f().translate([-0.4, 0.2, 0.1]).rotate([0, 1, 0], 20).scale(0.35)
     group = {"type": "shapegroup", "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.5)}}
-    instance = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0]),
-                "g": {"type": "ref", "id": "group"}}  # fmt: skip
+    instance = {
+        "type": "instance",
+        "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0]),
+        "g": {"type": "ref", "id": "group"},
+    }
     if name == "instance":
         return {"group": group, "it": instance}, "it.to_world", {"group": group, "it": {**instance, "to_world": t}}
     if name == "group":
@@ -132,8 +175,14 @@ def mover(mi, name):
 @pytest.mark.parametrize("name", ["sphere", "rectangle", "instance", "mesh", "group"])
 def test06_what_moves_is_seen_where_it_is(rgb, name, kind):
     before, key, after = mover(rgb, name)
-    integrator = {"type": "nerg", "aovs": "depth,visibility", "visibility": kind, "map_height": 64, "falloff": 0.0,
-                  "observer": observer_at(rgb, *EYE)}  # fmt: skip
+    integrator = {
+        "type": "nerg",
+        "aovs": "depth,visibility",
+        "visibility": kind,
+        "map_height": 64,
+        "falloff": 0.0,
+        "observer": observer_at(rgb, *EYE),
+    }
     description = {"type": "scene", "integrator": integrator, "sensor": camera(rgb), "back": square(rgb, 1.4, 1.5)}
     moved, new = (rgb.load_dict(description | things) for things in (before, after))
     first = np.array(rgb.render(moved, spp=1))
@@ -154,10 +203,17 @@ def test07_textures(rgb):
     assert np.allclose(image[..., :3], texels[::-1], atol=1e-5)
     # As `aov` has the albedo, also where it is turned and repeated.
     texture["to_uv"] = rgb.ScalarTransform4f().scale([3, 2, 1])
-    things = {"board": {**board, "to_world": rgb.ScalarTransform4f().rotate([0.5, 1, 0], 160),
-                        "bsdf": {"type": "twosided", "b": {"type": "principled", "base_color": texture}}},
-              "ball": {**sphere(rgb, 0.7, 0, -0.7, radius=0.4),
-                       "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}}}  # fmt: skip
+    things = {
+        "board": {
+            **board,
+            "to_world": rgb.ScalarTransform4f().rotate([0.5, 1, 0], 160),
+            "bsdf": {"type": "twosided", "b": {"type": "principled", "base_color": texture}},
+        },
+        "ball": {
+            **sphere(rgb, 0.7, 0, -0.7, radius=0.4),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "checkerboard"}},
+        },
+    }
     albedo = render(rgb, {"type": "aov", "aovs": "a:albedo"}, **things)
     image = render(rgb, {"type": "nerg", "aovs": ""}, **things)
     assert np.allclose(image[..., :3], albedo[..., -3:], atol=1e-5) and np.ptp(image[..., 0]) > 0.5
@@ -215,7 +271,10 @@ def test10_alpha_is_that_of_other_integrators(rgb, sky, hide):
 
 def test11_hidden_emitters_are_hidden_from_the_picture_only(rgb):
     """As in Mitsuba: `path` sees through a lamp, `depth` meets it."""
-    things = {"lamp": {"type": "sphere", "radius": 0.5, "e": {"type": "area", "radiance": 2.0}}, "back": square(rgb, 1.0, 2.0)}
+    things = {
+        "lamp": {"type": "sphere", "radius": 0.5, "e": {"type": "area", "radiance": 2.0}},
+        "back": square(rgb, 1.0, 2.0),
+    }
     image = render(rgb, {"type": "nerg", "aovs": "depth", "hide_emitters": True}, **things)
     assert np.allclose(image[..., 3], render(rgb, {"type": "depth"}, **things)[..., 0], atol=1e-5)
     assert np.allclose(image[..., :3], render(rgb, {"type": "path", "hide_emitters": True}, **things), atol=1e-5)
@@ -223,11 +282,15 @@ def test11_hidden_emitters_are_hidden_from_the_picture_only(rgb):
 
 
 def test12_what_is_far_away_does_not_blunt_shadows(rgb):
-    """A lid 20 cm before a wall hides it by a hard edge, also under a dome of a kilometre (1e-4 of its diagonal are 35 cm)."""
+    """A lid 20 cm before a wall hides it by a hard edge, also under a dome of a kilometre (1e-4 of its diagonal are 35
+    cm)."""
     integrator = {"type": "nerg", "aovs": "visibility,position", "falloff": 0.0, "observer": observer_at(rgb, 0, 0, -1)}
     sensor = camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24)
     things = {"wall": square(rgb, 1.0, 3.0), "lid": square(rgb, 0.8, 0.5)}
-    for dome in ({}, {"dome": {"type": "sphere", "radius": 1000.0, "bsdf": {"type": "twosided", "b": {"type": "diffuse"}}}}):
+    for dome in (
+        {},
+        {"dome": {"type": "sphere", "radius": 1000.0, "bsdf": {"type": "twosided", "b": {"type": "diffuse"}}}},
+    ):
         out = channels(rgb, integrator, sensor, **things, **dome)
         reach = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
         on_wall = np.abs(out["position.Z"] - 1) < 1e-3
@@ -240,10 +303,19 @@ def test13_media_of_mitsuba_light_shapes_through_a_nested_volpath(rgb):
     """Around shapes, and around the camera itself: the same paths as those of `volpath`."""
     fog = {"type": "homogeneous", "sigma_t": 0.4, "albedo": 0.5}
     things = {"back": square(rgb, 1.4, 1.5), "lamp": {"type": "point", "position": [1, 1, -1], "intensity": 9.0}}
-    cloud = {"cloud": {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(0.6), "bsdf": {"type": "null"}, "interior": fog}}
+    cloud = {
+        "cloud": {
+            "type": "cube",
+            "to_world": rgb.ScalarTransform4f().scale(0.6),
+            "bsdf": {"type": "null"},
+            "interior": fog,
+        }
+    }
     for sensor, more in ((camera(rgb), cloud), ({**camera(rgb), "medium": fog}, {})):
         known = render(rgb, {"type": "volpath"}, sensor, spp=2, seed=2, **things, **more)
-        ours = render(rgb, {"type": "nerg", "aovs": "depth", "lit": {"type": "volpath"}}, sensor, spp=2, seed=2, **things, **more)
+        ours = render(
+            rgb, {"type": "nerg", "aovs": "depth", "lit": {"type": "volpath"}}, sensor, spp=2, seed=2, **things, **more
+        )
         assert np.allclose(ours[..., :3], known, atol=1e-5) and np.ptp(known) > 0.05
 
 

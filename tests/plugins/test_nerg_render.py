@@ -1,4 +1,5 @@
 """Seeds, films, batches, nesting and variants."""
+
 import subprocess
 import sys
 
@@ -22,13 +23,29 @@ def test02_jitter_alone_makes_seeds_differ(rgb, files):
     still = {"type": "stratified", "jitter": False, "sample_count": 1}
 
     def picture(seed, jitter):
-        return render(rgb, with_field(files, jitter=jitter, aovs="opacity"), {**camera(rgb), "sampler": still}, seed=seed)
+        return render(
+            rgb, with_field(files, jitter=jitter, aovs="opacity"), {**camera(rgb), "sampler": still}, seed=seed
+        )
 
     def random(seed, jitter):
-        return render(rgb, constant(3.0, density={"type": "gridvolume", "grid": rgb.VolumeGrid(np.random.default_rng(0).exponential(
-            3, (6, 6, 6)).astype(np.float32))}, jitter=jitter, step=0.2), straight(rgb, "perspective"), seed=seed)
+        return render(
+            rgb,
+            constant(
+                3.0,
+                density={
+                    "type": "gridvolume",
+                    "grid": rgb.VolumeGrid(np.random.default_rng(0).exponential(3, (6, 6, 6)).astype(np.float32)),
+                },
+                jitter=jitter,
+                step=0.2,
+            ),
+            straight(rgb, "perspective"),
+            seed=seed,
+        )
 
-    assert not np.array_equal(random(1, True), random(2, True)) and np.allclose(random(1, False), random(2, False), rtol=1e-3)
+    assert not np.array_equal(random(1, True), random(2, True)) and np.allclose(
+        random(1, False), random(2, False), rtol=1e-3
+    )
     assert picture(1, True).shape == picture(1, False).shape
 
 
@@ -55,12 +72,16 @@ def test05_a_batch_equals_its_members(rgb, files, near_clip):
     origins = [(0.5, 0.4, -3), (-2.5, 0.2, -1), (0, 0.5, 3)]
     cameras = [{**camera(rgb, o, near_clip=near_clip), "sampler": still} for o in origins]
     integrator = with_gaze(files, GAZE)
-    batch = {"type": "batch", "sampler": still, "film": {**cameras[0]["film"], "width": SIZE * 3},
-             **{f"c{i}": c for i, c in enumerate(cameras)}}
+    batch = {
+        "type": "batch",
+        "sampler": still,
+        "film": {**cameras[0]["film"], "width": SIZE * 3},
+        **{f"c{i}": c for i, c in enumerate(cameras)},
+    }
     whole = render(rgb, integrator, batch)
     for i, c in enumerate(cameras):
         alone = render(rgb, integrator, c)
-        got = whole[:, SIZE * i: SIZE * (i + 1)]
+        got = whole[:, SIZE * i : SIZE * (i + 1)]
         assert np.mean(np.abs(got - alone) < 2e-3) > 0.99 and np.abs(got - alone).mean() < 1e-3
 
 
@@ -78,7 +99,9 @@ def test06_nested(rgb, files):
 def test07_integrator_given_to_render(rgb, files):
     scene = rgb.load_dict({"type": "scene", "sensor": camera(rgb)})
     integrator = rgb.load_dict(with_gaze(files, GAZE))
-    assert np.array_equal(np.array(rgb.render(scene, integrator=integrator, spp=1)), render(rgb, with_gaze(files, GAZE)))
+    assert np.array_equal(
+        np.array(rgb.render(scene, integrator=integrator, spp=1)), render(rgb, with_gaze(files, GAZE))
+    )
 
 
 def test08_a_sensor_outside_of_the_scene(rgb, files):

@@ -1,4 +1,5 @@
 """Gaze fields that see a radiance field's geometry features: the paper's semantic variants."""
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -13,8 +14,13 @@ def points(mi, out, name, mask):
 
 def semantic_scene(files, tmp_path, aovs, **config):
     fields.gaze(tmp_path / "semantic.safetensors", **config)
-    return with_field(files, aovs=aovs, depth="median", falloff=0.0,
-                      gaze={"type": "gazefield", "filename": str(tmp_path / "semantic.safetensors")})
+    return with_field(
+        files,
+        aovs=aovs,
+        depth="median",
+        falloff=0.0,
+        gaze={"type": "gazefield", "filename": str(tmp_path / "semantic.safetensors")},
+    )
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -23,7 +29,9 @@ def semantic_scene(files, tmp_path, aovs, **config):
 def test01_emit_takes_the_fields_features(rgb, files, tmp_path, semantic, own, aligned):
     """Against equation 1 evaluated apart, with features from AOVs: of a camera that stands where the observer does."""
     eye = (0.5, 0.4, -3)
-    integrator = semantic_scene(files, tmp_path, "position,gaze,emit,capture,visibility,opacity", semantic=semantic, semantic_own=own)
+    integrator = semantic_scene(
+        files, tmp_path, "position,gaze,emit,capture,visibility,opacity", semantic=semantic, semantic_own=own
+    )
     sensor = camera(rgb, eye)
     if not aligned:
         # An observer a hair beside the camera sees the same, by a pass of its own.
@@ -64,8 +72,9 @@ def test03_features_where_none_are_wanted_are_refused(rgb, files):
 
 def test04_configurations_that_make_no_sense_are_refused(tmp_path):
     for config, said in (
-        ({"semantic": "labels"}, "accumulated, snapshot or none"), ({"semantic_own": True}, "say which"),
+        ({"semantic": "labels"}, "accumulated, snapshot or none"),
+        ({"semantic_own": True}, "say which"),
         ({"semantic": "snapshot", "variant": "capture"}, "no emit"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(ValueError, match=said):
             fields.gaze(tmp_path / "x.safetensors", **config)

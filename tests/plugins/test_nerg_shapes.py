@@ -1,17 +1,22 @@
 """Shapes, alone and together with a field: exact depths, compositing, shadowing, gaze on surfaces, and their light."""
+
 import numpy as np
 import pytest
 
 from nerg_mi.evaluation.study.operations import traced_operations
 
-from .scenes import camera, channels, constant, look_at, named, observer_at, render, with_gaze
+from .scenes import camera, channels, constant, named, observer_at, render, with_gaze
 
 EVERYTHING = "depth,opacity,position,visibility,observer_depth"
 
 
 def sphere(mi, *center, radius=0.5, color=(0.2, 0.5, 0.8)):
-    return {"type": "sphere", "center": list(center), "radius": radius,
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}}}  # fmt: skip
+    return {
+        "type": "sphere",
+        "center": list(center),
+        "radius": radius,
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(color)}},
+    }
 
 
 def square(mi, z, size=1.0, x=0.0):
@@ -20,7 +25,12 @@ def square(mi, z, size=1.0, x=0.0):
 
 
 def gaze_only(files, aovs, **kwargs):
-    return {"type": "nerg", "gaze": {"type": "gazefield", "filename": str(files / "gaze.safetensors")}, "aovs": aovs, **kwargs}
+    return {
+        "type": "nerg",
+        "gaze": {"type": "gazefield", "filename": str(files / "gaze.safetensors")},
+        "aovs": aovs,
+        **kwargs,
+    }
 
 
 def rays(mi, sensor):
@@ -59,7 +69,14 @@ def test02_albedo_without_emitters_and_paths_with_them(rgb):
     image = render(rgb, {"type": "nerg", "aovs": ""}, sensor, s=sphere(rgb, 0, 0, 0))
     assert np.allclose(image[..., :3], [0.2, 0.5, 0.8], atol=1e-5)
     # Under a constant sky a convex body shows albedo times radiance, by path tracing.
-    lit = render(rgb, {"type": "nerg", "aovs": ""}, sensor, spp=64, s=sphere(rgb, 0, 0, 0), e={"type": "constant", "radiance": 2.0})
+    lit = render(
+        rgb,
+        {"type": "nerg", "aovs": ""},
+        sensor,
+        spp=64,
+        s=sphere(rgb, 0, 0, 0),
+        e={"type": "constant", "radiance": 2.0},
+    )
     assert np.allclose(lit[..., :3].mean((0, 1)), [0.4, 1.0, 1.6], rtol=0.02)
     dark = render(rgb, {"type": "nerg", "aovs": "", "radiance": False}, sensor, s=sphere(rgb, 0, 0, 0))
     assert not dark[..., :3].any()
@@ -75,19 +92,26 @@ def test03_the_nested_integrator_lights_shapes_and_its_aovs_follow(rgb):
     hit = out["opacity.Y"] > 0
     assert np.allclose(out["far.T"][hit], out["depth.T"][hit], atol=1e-5)
     plain = render(rgb, {"type": "direct"}, sensor, spp=256, s=sphere(rgb, 0, 0, 0), e=light)
-    ours = render(rgb, {"type": "nerg", "aovs": "", "i": {"type": "direct"}}, sensor, spp=256, s=sphere(rgb, 0, 0, 0), e=light)
+    ours = render(
+        rgb, {"type": "nerg", "aovs": "", "i": {"type": "direct"}}, sensor, spp=256, s=sphere(rgb, 0, 0, 0), e=light
+    )
     assert np.allclose(ours[..., :3], plain[..., :3], atol=0.1) and np.allclose(ours.mean(), plain.mean(), rtol=0.02)
 
 
 @pytest.mark.parametrize("sigma", [0.3, 3.0])
 def test04_the_field_in_front_attenuates_a_shape(rgb, sigma):
     """Closed forms: unit cube of constant density with a wall through its middle."""
-    integrator = constant(sigma, aovs="depth,opacity", color={"type": "constvolume", "value": {"type": "rgb", "value": [0, 0, 1]}})
-    wall = {**square(rgb, 0.5, 2.0), "bsdf": {"type": "twosided", "b": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1, 0, 0]}}}}
+    integrator = constant(
+        sigma, aovs="depth,opacity", color={"type": "constvolume", "value": {"type": "rgb", "value": [0, 0, 1]}}
+    )
+    wall = {
+        **square(rgb, 0.5, 2.0),
+        "bsdf": {"type": "twosided", "b": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [1, 0, 0]}}},
+    }
     sensor = camera(rgb, (0.5, 0.5, -2), (0.5, 0.5, 0), fov=1e-3, size=1, near_clip=0.01)
     T = np.exp(-sigma * 0.5)
     near = 2 - 0.01
-    first = (near * (1 - T) + (1 - T) / sigma - 0.5 * T)
+    first = near * (1 - T) + (1 - T) / sigma - 0.5 * T
     median = near + np.log(2) / sigma if T < 0.5 else near + 0.5
     for kind, depth in (("expected", first + T * (near + 0.5)), ("median", median), ("refined", median)):
         image = render(rgb, {**integrator, "depth": kind}, sensor, w=wall)
@@ -110,7 +134,13 @@ def test05_a_shape_hides_the_field_and_the_field_a_shape(rgb):
 def test06_shapes_hide_from_the_observer(rgb, kind, with_field_too):
     """A square at z = 0 between an observer in front and a wall at z = 1, seen from the side."""
     sensor = camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24)
-    integrator = {"type": "nerg", "aovs": EVERYTHING, "visibility": kind, "falloff": 0.0, "observer": observer_at(rgb, 0, 0, -1)}
+    integrator = {
+        "type": "nerg",
+        "aovs": EVERYTHING,
+        "visibility": kind,
+        "falloff": 0.0,
+        "observer": observer_at(rgb, 0, 0, -1),
+    }
     if with_field_too:
         # A thin veil in front of it all: far too thin to hide anything.
         box = rgb.ScalarTransform4f().translate([-4, -4, -0.9]).scale([8, 8, 0.5])
@@ -121,7 +151,9 @@ def test06_shapes_hide_from_the_observer(rgb, kind, with_field_too):
     reach = np.maximum(np.abs(out["position.X"]), np.abs(out["position.Y"]))
     hidden, seen = on_wall & (reach < 0.95), on_wall & (reach > 1.05)
     assert hidden.sum() > 10 and seen.sum() > 50
-    assert (out["visibility.Y"][hidden] < 1e-3).all() and (out["visibility.Y"][seen] > (0.95 if kind == "map" else 0.999)).all()
+    assert (out["visibility.Y"][hidden] < 1e-3).all() and (
+        out["visibility.Y"][seen] > (0.95 if kind == "map" else 0.999)
+    ).all()
     if kind == "depth":
         distance = np.sqrt(out["position.X"] ** 2 + out["position.Y"] ** 2 + 4)
         assert np.allclose(out["observer_depth.T"][hidden], distance[hidden] / 2, atol=1e-2)
@@ -132,7 +164,13 @@ def test07_no_shape_shadows_itself_at_grazing_angles(rgb, kind):
     for angle in (0, 60, 85, 89):
         a = np.radians(angle)
         observer = observer_at(rgb, float(2 * np.sin(a)), 0, float(1 - 2 * np.cos(a)))
-        integrator = {"type": "nerg", "aovs": "visibility,position", "visibility": kind, "falloff": 0.0, "observer": observer}
+        integrator = {
+            "type": "nerg",
+            "aovs": "visibility,position",
+            "visibility": kind,
+            "falloff": 0.0,
+            "observer": observer,
+        }
         out = channels(rgb, integrator, camera(rgb, (0, 0, -2), (0, 0, 1), fov=30), wall=square(rgb, 1.0, 3.0))
         assert (out["visibility.Y"] > 0.999).all(), angle
 
@@ -170,13 +208,24 @@ def test09_without_a_volume_no_march_without_shapes_no_cast(rgb):
 
 
 def test10_a_map_follows_shapes_that_move(rgb):
-    import drjit as dr
 
-    integrator = {"type": "nerg", "aovs": "visibility", "visibility": "map", "falloff": 0.0,
-                  "observer": observer_at(rgb, 0, 0, -1)}  # fmt: skip
+    integrator = {
+        "type": "nerg",
+        "aovs": "visibility",
+        "visibility": "map",
+        "falloff": 0.0,
+        "observer": observer_at(rgb, 0, 0, -1),
+    }
     sensor = camera(rgb, (3.0, 0, -1), (0, 0, 1), fov=40, size=24)
-    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, "wall": square(rgb, 1.0, 3.0),
-                           "lid": {"type": "disk", "to_world": rgb.ScalarTransform4f().scale(0.5)}})  # fmt: skip
+    scene = rgb.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator,
+            "sensor": sensor,
+            "wall": square(rgb, 1.0, 3.0),
+            "lid": {"type": "disk", "to_world": rgb.ScalarTransform4f().scale(0.5)},
+        }
+    )
     look = lambda: np.array(rgb.render(scene, spp=1))[..., -1]
     first, again = look(), traced_operations(lambda: rgb.render(scene, spp=1))
     kept = scene.integrator().observer_pass._map
@@ -190,7 +239,8 @@ def test10_a_map_follows_shapes_that_move(rgb):
 
 
 def test11_a_map_keeps_gaze(rgb, files):
-    """Looked up, gaze is that of the network but for interpolation, and costs no evaluation; weights are still differentiable."""
+    """Looked up, gaze is that of the network but for interpolation, and costs no evaluation; weights are still
+    differentiable."""
     import drjit as dr
 
     base = dict(observer=observer_at(rgb, -2, 0.3, -2), falloff=0.0)
@@ -205,8 +255,14 @@ def test11_a_map_keeps_gaze(rgb, files):
     assert both.sum() > 10
     assert np.allclose(kept["gaze.Y"][both], exact["gaze.Y"][both], rtol=0.02, atol=1e-5)
 
-    scene = rgb.load_dict({"type": "scene", "integrator": gaze_only(files, aovs, visibility="map", **base), "sensor": sensor,
-                           "s": sphere(rgb, 0, 0, 0)})  # fmt: skip
+    scene = rgb.load_dict(
+        {
+            "type": "scene",
+            "integrator": gaze_only(files, aovs, visibility="map", **base),
+            "sensor": sensor,
+            "s": sphere(rgb, 0, 0, 0),
+        }
+    )
     params = rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("emit_head.0"))
     before = np.array(rgb.render(scene, spp=1))
@@ -260,16 +316,26 @@ def test12_depth_follows_a_moving_shape(rgb, depth):
 def test13_nothing_met_is_the_background(rgb):
     image = render(rgb, {"type": "nerg", "background": 0.25, "aovs": "depth,opacity"}, s=sphere(rgb, 50, 0, 0))
     assert np.allclose(image[..., :3], 0.25) and not image[..., 3:].any()
-    nested = render(rgb, {"type": "nerg", "background": 0.25, "aovs": "", "n": {"type": "path"}}, s=sphere(rgb, 50, 0, 0))
+    nested = render(
+        rgb, {"type": "nerg", "background": 0.25, "aovs": "", "n": {"type": "path"}}, s=sphere(rgb, 50, 0, 0)
+    )
     assert np.allclose(nested[..., :3], 0.25)
 
 
 def test14_a_gaze_field_over_a_field_and_a_shape_in_it(rgb, files):
     """A ball put into a trained field hides what is behind it and carries gaze itself."""
-    integrator = with_gaze(files, "depth,opacity,gaze,visibility,position", falloff=0.0, observer=observer_at(rgb, -2, 0.3, -2))
+    integrator = with_gaze(
+        files, "depth,opacity,gaze,visibility,position", falloff=0.0, observer=observer_at(rgb, -2, 0.3, -2)
+    )
     bare = channels(rgb, integrator)
     ball = channels(rgb, integrator, s=sphere(rgb, 0.5, 0.4, -1.6, radius=0.2))
-    on_ball = np.abs(np.sqrt((ball["position.X"] - 0.5) ** 2 + (ball["position.Y"] - 0.4) ** 2 + (ball["position.Z"] + 1.6) ** 2) - 0.2) < 1e-3
+    on_ball = (
+        np.abs(
+            np.sqrt((ball["position.X"] - 0.5) ** 2 + (ball["position.Y"] - 0.4) ** 2 + (ball["position.Z"] + 1.6) ** 2)
+            - 0.2
+        )
+        < 1e-3
+    )
     assert on_ball.sum() > 5 and (ball["opacity.Y"][on_ball] == 1).all()
     assert (ball["depth.T"][on_ball] < 1.5).all()
     untouched = ~on_ball & (ball["visibility.Y"] == bare["visibility.Y"])

@@ -1,4 +1,5 @@
 """Pictures of the integrator against closed forms, and of grids that are skipped through."""
+
 import math
 
 import numpy as np
@@ -32,7 +33,9 @@ def test03_colour_of_a_homogeneous_volume(rgb_and_mono, sigma):
     mi = rgb_and_mono
     color = {"type": "constvolume", "value": {"type": "rgb", "value": [0.9, 0.5, 0.2]}}
     background = {"type": "rgb", "value": [0.1, 0.2, 0.4]}
-    image = render(mi, constant(sigma, color=color, background=background, aovs=""), straight(mi, "perspective")).ravel()
+    image = render(
+        mi, constant(sigma, color=color, background=background, aovs=""), straight(mi, "perspective")
+    ).ravel()
     α = -math.expm1(-sigma)
     expected = α * np.array([0.9, 0.5, 0.2]) + (1 - α) * np.array([0.1, 0.2, 0.4])
     if "mono" in mi.variant():
@@ -78,7 +81,9 @@ def test07_a_grid_that_repeats_is_bounded_as_it_repeats(rgb):
     for wrap in ("clamp", "repeat"):
         density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "wrap_mode": wrap}
         sensor = camera(rgb, (-2, 0.5, 0.99), (0, 0.5, 0.99), fov=1e-3, size=1)
-        opacity[wrap] = channels(rgb, {"type": "nerg", "density": density, "aovs": "opacity"}, sensor)["opacity.Y"].item()
+        opacity[wrap] = channels(rgb, {"type": "nerg", "density": density, "aovs": "opacity"}, sensor)[
+            "opacity.Y"
+        ].item()
     assert opacity["clamp"] == 0
     assert np.isclose(opacity["repeat"], 1 - math.exp(-40 * (0.5 - 0.01 * 8)), rtol=1e-4)
 
@@ -86,8 +91,11 @@ def test07_a_grid_that_repeats_is_bounded_as_it_repeats(rgb):
 @pytest.mark.parametrize("quadrature", ["constant", "linear", "cells"])
 def test08_quadratures_converge_to_one_picture(rgb, quadrature):
     data = np.random.default_rng(0).exponential(2, (4, 5, 6)).astype(np.float32)
-    density = {"type": "gridvolume", "grid": rgb.VolumeGrid(data),
-               "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2)}
+    density = {
+        "type": "gridvolume",
+        "grid": rgb.VolumeGrid(data),
+        "to_world": rgb.ScalarTransform4f().translate([-1, -1, -1]).scale(2),
+    }
     still = {**camera(rgb, size=6), "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}}
     base = {"type": "nerg", "density": density, "stop": 1e-9}
     fine = channels(rgb, {**base, "step": 1e-3}, still)

@@ -1,4 +1,5 @@
 """Ensembles and support in the integrator: against NumPy and the members one by one."""
+
 from dataclasses import asdict
 
 import drjit.llvm.ad as ns
@@ -11,7 +12,7 @@ from nerg_mi.formats.fields import load_gaze, save_gaze
 from tests.reference import fields_numpy
 
 from . import fields
-from .scenes import camera, channels, named, observer_at, render, with_field, with_gaze
+from .scenes import camera, channels, named, observer_at, with_field
 from .test_nerg_leaves_out import operations
 from .test_nerg_normalized import log_gaze, room
 
@@ -39,7 +40,13 @@ def test01_mean_and_spread_are_those_of_the_members(rgb, files, ensemble, aligne
     """In NumPy, at the surface that the camera sees; where it is hidden from the observer, both fade."""
     path, members = ensemble
     eye = np.array([0.5, 0.4, -3] if aligned else [-2, 0.3, -2.0])
-    integrator = with_field(files, gaze=volume(path), aovs=AOVS, occlusion=False, **({} if aligned else {"observer": observer_at(rgb, *eye)}))
+    integrator = with_field(
+        files,
+        gaze=volume(path),
+        aovs=AOVS,
+        occlusion=False,
+        **({} if aligned else {"observer": observer_at(rgb, *eye)}),
+    )
     out = channels(rgb, integrator)
     p = np.stack([out[f"position.{c}"] for c in "XYZ"], axis=-1)
     seen = np.abs(p).sum(axis=-1) > 0
@@ -48,8 +55,20 @@ def test01_mean_and_spread_are_those_of_the_members(rgb, files, ensemble, aligne
     for m in members:
         weights = {k: np.array(v, np.float64) for k, v in m.parameters().items()}
         grid = {k: v for k, v in asdict(fields.GRID).items() if k != "dimensions"}
-        each.append(fields_numpy.gaze(p[seen], np.broadcast_to(eye, p[seen].shape), r[seen], weights, grid, (-1, -1, -1), (1, 1, 1),
-                                      "emit_capture", "softplus", degree=2)[0])
+        each.append(
+            fields_numpy.gaze(
+                p[seen],
+                np.broadcast_to(eye, p[seen].shape),
+                r[seen],
+                weights,
+                grid,
+                (-1, -1, -1),
+                (1, 1, 1),
+                "emit_capture",
+                "softplus",
+                degree=2,
+            )[0]
+        )
     assert seen.sum() > 20 and np.std(each, axis=0, ddof=1).max() > 0.05
     np.testing.assert_allclose(out["gaze.Y"][seen], np.mean(each, axis=0), rtol=2e-3, atol=1e-4)
     np.testing.assert_allclose(out["gaze_std.Y"][seen], np.std(each, axis=0, ddof=1), rtol=5e-3, atol=1e-4)
@@ -58,7 +77,12 @@ def test01_mean_and_spread_are_those_of_the_members(rgb, files, ensemble, aligne
 
 def test02_the_spread_is_hidden_like_the_gaze(rgb, files, ensemble):
     observer = observer_at(rgb, -2, 0.3, -2)
-    open_, hidden = (channels(rgb, with_field(files, gaze=volume(ensemble[0]), aovs=AOVS, observer=observer, occlusion=o, falloff=0.0)) for o in (False, True))
+    open_, hidden = (
+        channels(
+            rgb, with_field(files, gaze=volume(ensemble[0]), aovs=AOVS, observer=observer, occlusion=o, falloff=0.0)
+        )
+        for o in (False, True)
+    )
     gone = (hidden["visibility.Y"] == 0) & (open_["gaze_std.Y"] > 0)
     assert gone.sum() > 1 and not hidden["gaze_std.Y"][gone].any()
     whole = hidden["visibility.Y"] == 1
@@ -92,8 +116,11 @@ def test04_support_is_that_of_the_observer(rgb, files, ensemble):
     eyes = [(-2, 0.3, -2), (-1.6, 0.3, -2.2), (5.0, 5, 5)]
     for eye in eyes:
         expected = np.maximum(1 - ((ORIGINS - eye) ** 2).sum(axis=1), 0).sum()
-        out = channels(rgb, with_field(files, gaze=volume(ensemble[0]), aovs="support,position", observer=observer_at(rgb, *eye)),
-                       camera(rgb, fov=80))  # fmt: skip
+        out = channels(
+            rgb,
+            with_field(files, gaze=volume(ensemble[0]), aovs="support,position", observer=observer_at(rgb, *eye)),
+            camera(rgb, fov=80),
+        )
         there = out["position.Z"] != 0
         np.testing.assert_allclose(out["support.Y"][there], expected, rtol=0.03)
         assert 0 < there.sum() < there.size and not out["support.Y"][~there].any()
@@ -103,8 +130,13 @@ def test04_support_is_that_of_the_observer(rgb, files, ensemble):
 def test05_support_follows_the_observer_and_the_placement(rgb, files, ensemble):
     """Twice as large and moved: p_o = 2 p + (1, 0, 0) is where p was."""
     to_world = rgb.ScalarTransform4f().translate([1, 0, 0]).scale(2)
-    placed = {"field": {"type": "nerf", "filename": str(files / "field.safetensors"), "to_world": to_world},
-              "gaze": {**volume(ensemble[0]), "to_world": to_world}, "type": "nerg", "aovs": "support", "radiance": False}  # fmt: skip
+    placed = {
+        "field": {"type": "nerf", "filename": str(files / "field.safetensors"), "to_world": to_world},
+        "gaze": {**volume(ensemble[0]), "to_world": to_world},
+        "type": "nerg",
+        "aovs": "support",
+        "radiance": False,
+    }
     integrator = {**placed, "observer": observer_at(rgb, -3, 0.6, -4)}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, (2, 0.8, -6), (1, 0, 0))})
     of = lambda eye: np.maximum(1 - ((ORIGINS - eye) ** 2).sum(axis=1), 0).sum()
@@ -125,8 +157,10 @@ def test06_what_is_not_asked_for_is_not_traced(rgb, files, ensemble, monkeypatch
 
 
 def test07_what_is_needed_is_said(rgb, files, ensemble):
-    for aov, gaze, said in (("gaze_std", "gaze.safetensors", "several members; train it with --ensemble"),
-                            ("support", "gaze.safetensors", "does not hold; train it again")):
+    for aov, gaze, said in (
+        ("gaze_std", "gaze.safetensors", "several members; train it with --ensemble"),
+        ("support", "gaze.safetensors", "does not hold; train it again"),
+    ):
         with pytest.raises(RuntimeError, match=said):
             rgb.load_dict(with_field(files, gaze=volume(files / gaze), aovs=aov))
     for aov in ("gaze_std", "support"):

@@ -13,8 +13,16 @@ from .scenes import camera, channels, observer_at, wall, with_field
 def behind_a_wall(mi, **more):
     """An observer before a wall with a gap, and a camera that sees what lies behind it."""
     sensor = camera(mi, (0.5, 0, 0.2), (0.5, 0, 1), fov=65, near_clip=1e-3)
-    integrator = {"type": "nerg", "density": wall(mi), "aovs": "visibility", "step": 0.01, "falloff": 0.0, "radiance": False,
-                  "observer": observer_at(mi, 0, 0, -0.9), **more}  # fmt: skip
+    integrator = {
+        "type": "nerg",
+        "density": wall(mi),
+        "aovs": "visibility",
+        "step": 0.01,
+        "falloff": 0.0,
+        "radiance": False,
+        "observer": observer_at(mi, 0, 0, -0.9),
+        **more,
+    }
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 
 
@@ -81,7 +89,14 @@ def test03_a_map_follows_the_field(rgb, files, change):
         scene = behind_a_wall(rgb, visibility="map", map_height=64)
         key = "integrator.density.data"
     else:
-        integrator = with_field(files, aovs="observer_depth", falloff=0.0, visibility="map", map_height=32, observer=observer_at(rgb, -2, 0.3, -2))
+        integrator = with_field(
+            files,
+            aovs="observer_depth",
+            falloff=0.0,
+            visibility="map",
+            map_height=32,
+            observer=observer_at(rgb, -2, 0.3, -2),
+        )
         scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb)})
         key = "integrator.field.density_net.1"
     params = rgb.traverse(scene)
@@ -129,10 +144,10 @@ def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
     """By transmittance the point stays the same, so that hidden and open differ by that share alone, whatever it is."""
     import drjit.llvm.ad as ns
 
-    from nerg_mi.rays.rays import Rays
     from nerg_mi.field.gaze.ensemble import GazeEnsemble
     from nerg_mi.field.gaze.support import RaySupport
     from nerg_mi.formats.fields import load_gaze, save_gaze
+    from nerg_mi.rays.rays import Rays
 
     from . import fields
 
@@ -142,9 +157,15 @@ def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):
     save_gaze(GazeEnsemble(members, RaySupport.of(origins, 1.0)), tmp_path / "e.safetensors", {})
     assert len(load_gaze(tmp_path / "e.safetensors", ns)[0].members) == 2
     d = np.random.default_rng(1).normal(size=(50, 3)) + (2, -0.3, 2)
-    Rays(np.arange(50), np.zeros(50), ("a",), origins, d / np.linalg.norm(d, axis=1, keepdims=True), np.ones(50)).save(tmp_path / "rays.npz")
-    more = {"gaze": {"type": "gazefield", "filename": str(tmp_path / "e.safetensors")}, "observer": observer_at(rgb, -2, 0.3, -2),
-            "kde": {"type": "gazekde", "filename": str(tmp_path / "rays.npz"), "kappa": 2.0}, "visibility": "transmittance"}  # fmt: skip
+    Rays(np.arange(50), np.zeros(50), ("a",), origins, d / np.linalg.norm(d, axis=1, keepdims=True), np.ones(50)).save(
+        tmp_path / "rays.npz"
+    )
+    more = {
+        "gaze": {"type": "gazefield", "filename": str(tmp_path / "e.safetensors")},
+        "observer": observer_at(rgb, -2, 0.3, -2),
+        "kde": {"type": "gazekde", "filename": str(tmp_path / "rays.npz"), "kappa": 2.0},
+        "visibility": "transmittance",
+    }
     aovs = "gaze,gaze_std,kde,support,visibility,opacity"
     hidden, open_ = (channels(rgb, with_field(files, aovs=aovs, occlusion=o, **more)) for o in (True, False))
     share = hidden["visibility.Y"]

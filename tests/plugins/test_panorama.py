@@ -20,10 +20,15 @@ def panorama(mi, to_world=None, sampler=None, **film):
         # One sample in the middle of each pixel
         "sampler": sampler or {"type": "stratified", "jitter": False, "sample_count": 1},
         "film": {
-            "type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "component_format": "float32",
-            "pixel_format": "luminance" if "mono" in mi.variant() else "rgb", "rfilter": {"type": "box"}, **film,
+            "type": "hdrfilm",
+            "width": WIDTH,
+            "height": HEIGHT,
+            "component_format": "float32",
+            "pixel_format": "luminance" if "mono" in mi.variant() else "rgb",
+            "rfilter": {"type": "box"},
+            **film,
         },
-    }  # fmt: skip
+    }
 
 
 def scene(mi, image, sensor, to_world=None):

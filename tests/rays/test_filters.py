@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from nerg_mi.rays.filters import select_mask, stays, thin_mask
 from nerg_mi.rays.rays import Rays
@@ -8,7 +9,15 @@ from nerg_mi.rays.rays import Rays
 
 def walk(origin, t=None, person=None, **more):
     n = len(origin)
-    return Rays(np.arange(n) * 0.1 if t is None else t, np.zeros(n) if person is None else person, ("ann", "bo"), origin, np.tile([1.0, 0, 0], (n, 1)), np.ones(n), **more)
+    return Rays(
+        np.arange(n) * 0.1 if t is None else t,
+        np.zeros(n) if person is None else person,
+        ("ann", "bo"),
+        origin,
+        np.tile([1.0, 0, 0], (n, 1)),
+        np.ones(n),
+        **more,
+    )
 
 
 def line(x):
@@ -18,14 +27,34 @@ def line(x):
 def test_conditions():
     hit = np.full((6, 3), np.nan)
     hit[1] = 0
-    rays = walk(line(np.arange(6.0)), person=np.array([0, 1, 0, 1, 0, 1]), hit=hit, cohort=np.array([0, 0, 0, 1, 1, 1]), cohorts=("old", "new"))
+    rays = walk(
+        line(np.arange(6.0)),
+        person=np.array([0, 1, 0, 1, 0, 1]),
+        hit=hit,
+        cohort=np.array([0, 0, 0, 1, 1, 1]),
+        cohorts=("old", "new"),
+    )
     where = lambda **c: np.flatnonzero(select_mask(rays, **c)).tolist()
     assert where() == [0, 1, 2, 3, 4, 5]
-    assert where(time=(0.1, 0.3)) == [1, 2] and where(time=(None, 0.15)) == [0, 1] and where(time=(0.35, None)) == [4, 5]
-    assert where(persons=["bo"]) == [1, 3, 5] and where(without_persons=["bo"]) == [0, 2, 4] and where(cohorts=["new"]) == [3, 4, 5]
-    assert where(box=[1, 3, -1, 1, 0, 2]) == [1, 2, 3] and where(with_hit=True) == [1] and where(min_confidence=1.0) == [0, 1, 2, 3, 4, 5]
+    assert (
+        where(time=(0.1, 0.3)) == [1, 2] and where(time=(None, 0.15)) == [0, 1] and where(time=(0.35, None)) == [4, 5]
+    )
+    assert (
+        where(persons=["bo"]) == [1, 3, 5]
+        and where(without_persons=["bo"]) == [0, 2, 4]
+        and where(cohorts=["new"]) == [3, 4, 5]
+    )
+    assert (
+        where(box=[1, 3, -1, 1, 0, 2]) == [1, 2, 3]
+        and where(with_hit=True) == [1]
+        and where(min_confidence=1.0) == [0, 1, 2, 3, 4, 5]
+    )
     assert where(persons=["bo"], cohorts=["old"]) == [1]
-    for wrong, message in [({"persons": ["cy"]}, "no person is called 'cy'"), ({"box": [0, 1, 0, 1]}, "a box is"), ({"box": [1, 0, 0, 1, 0, 1]}, "a box is")]:
+    for wrong, message in [
+        ({"persons": ["cy"]}, "no person is called 'cy'"),
+        ({"box": [0, 1, 0, 1]}, "a box is"),
+        ({"box": [1, 0, 0, 1, 0, 1]}, "a box is"),
+    ]:
         with pytest.raises(ValueError, match=message):
             select_mask(rays, **wrong)
     with pytest.raises(ValueError, match="no cohorts"):
@@ -58,7 +87,12 @@ def test_stays_by_definition(seed, distance):
     label[order] = stays(rays.select(order), distance)
     want, number = [], -1
     for i in range(n):
-        if i == 0 or rays.person[i] != rays.person[i - 1] or rays.t[i] - rays.t[i - 1] > 1 or np.linalg.norm(origin[i] - origin[first]) > distance:
+        if (
+            i == 0
+            or rays.person[i] != rays.person[i - 1]
+            or rays.t[i] - rays.t[i - 1] > 1
+            or np.linalg.norm(origin[i] - origin[first]) > distance
+        ):
             first, number = i, number + 1
         want.append(number)
     assert label.tolist() == want

@@ -2,7 +2,8 @@ import warnings
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from nerg_mi.rays.fixations import fixation_rays, idt, ivt
 from nerg_mi.rays.rays import Rays
@@ -13,7 +14,14 @@ def gaze(azimuth, elevation=0.0, dt=0.02, person=None, t=None):
     a, e = np.broadcast_arrays(np.radians(np.asarray(azimuth, float)), np.radians(elevation))
     d = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=1)
     n = len(d)
-    return Rays(np.arange(n) * dt if t is None else t, np.zeros(n) if person is None else person, ("ann", "bo"), np.tile([0, 0, 1.6], (n, 1)), d, np.ones(n))
+    return Rays(
+        np.arange(n) * dt if t is None else t,
+        np.zeros(n) if person is None else person,
+        ("ann", "bo"),
+        np.tile([0, 0, 1.6], (n, 1)),
+        d,
+        np.ones(n),
+    )
 
 
 # Ten rays at 0 degrees, a saccade of two, ten at 20, one at 40, ten at 60: 50 Hz.
@@ -45,7 +53,11 @@ def test_idt_by_hand():
 
 @pytest.mark.parametrize("find", [ivt, idt])
 def test_people_and_pauses_end_fixations(find):
-    still = gaze([0] * 40, person=np.r_[np.zeros(20), np.ones(20)], t=np.r_[np.arange(20) * 0.02 + (np.arange(20) >= 10), np.arange(20) * 0.02])
+    still = gaze(
+        [0] * 40,
+        person=np.r_[np.zeros(20), np.ones(20)],
+        t=np.r_[np.arange(20) * 0.02 + (np.arange(20) >= 10), np.arange(20) * 0.02],
+    )
     assert find(still).tolist() == [0] * 10 + [1] * 10 + [2] * 20
     order = np.random.default_rng(0).permutation(40)
     assert np.array_equal(find(still.select(order)), find(still)[order])
@@ -54,7 +66,11 @@ def test_people_and_pauses_end_fixations(find):
 @pytest.mark.parametrize("find", [ivt, idt])
 def test_a_pause_of_a_tenth_of_a_second_ends_a_fixation_unless_told_otherwise(find):
     paused = lambda gap: gaze([0] * 20, t=np.arange(20) * 0.02 + (np.arange(20) >= 10) * (gap - 0.02))
-    assert len(set(find(paused(0.09)))) == 1 and len(set(find(paused(0.11)))) == 2 and len(set(find(paused(0.11), gap=0.12))) == 1
+    assert (
+        len(set(find(paused(0.09)))) == 1
+        and len(set(find(paused(0.11)))) == 2
+        and len(set(find(paused(0.11), gap=0.12))) == 1
+    )
 
 
 def test_straight_up_is_measured_as_anywhere():

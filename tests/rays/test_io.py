@@ -5,15 +5,17 @@ import zipfile
 import numpy as np
 import pytest
 
-from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.errors import NergError
 from nerg_mi.rays.io import write_rays_file
+from nerg_mi.rays.rays import FRAME, Rays
 
 ENDINGS = [
     "npz",
     pytest.param(
         "parquet",
-        marks=pytest.mark.skipif(importlib.util.find_spec("pyarrow") is None, reason="pyarrow is not installed (pip install pyarrow)"),
+        marks=pytest.mark.skipif(
+            importlib.util.find_spec("pyarrow") is None, reason="pyarrow is not installed (pip install pyarrow)"
+        ),
     ),
 ]
 
@@ -24,10 +26,15 @@ def some(hit):
     points = rng.random((9, 3))
     points[4] = np.nan
     return Rays(
-        np.arange(9) / 7, np.arange(9) % 2, ("ann", "bo"), rng.random((9, 3)),
-        d / np.linalg.norm(d, axis=1, keepdims=True), rng.random(9), points if hit else None,
+        np.arange(9) / 7,
+        np.arange(9) % 2,
+        ("ann", "bo"),
+        rng.random((9, 3)),
+        d / np.linalg.norm(d, axis=1, keepdims=True),
+        rng.random(9),
+        points if hit else None,
         {"frame": dict(FRAME), "dropped": [{"reason": "blink", "count": 2, "rows": [[3, 4]]}]},
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -85,25 +92,54 @@ def stored(path, **changes):
     return path
 
 
-@pytest.mark.parametrize("changes, why", [
-    ({"person": np.full(9, 2)}, "unknown person"), ({"person": np.full(9, -1)}, "unknown person"),
-    ({"person": np.full(9, 1 << 32)}, "unknown person"), ({"person": np.zeros(9)}, "person is not whole numbers"),
-    ({"direction": np.full((9, 3), np.nan)}, "direction that is not finite"), ({"direction": np.zeros((9, 3))}, "zero direction"),
-    ({"direction": np.full((9, 3), np.inf)}, "not finite"), ({"origin": np.full((9, 3), np.inf)}, "origin that is not finite"),
-    ({"t": np.full(9, np.nan)}, "time that is not finite"), ({"confidence": np.full(9, 2.0)}, "confidence outside"),
-    ({"origin": np.zeros((9, 2))}, r"origin has the shape \(9, 2\)"), ({"t": np.zeros(8)}, "expected"), ({"t": np.zeros((3, 3))}, "expected"),
-    ({"t": np.array(1.0)}, "expected"), ({"hit": np.array(["a"] * 9)}, "expected"), ({"confidence": np.ones(9) * 1j}, "not numbers"),
-    ({"t": np.arange(9).astype("M8[s]")}, "not numbers"), ({"hit": None, "cohort": np.zeros(9, int)}, "unknown cohort"),
-    ({"t": None}, "lacks t"), ({"metadata": np.array("[1, 2]")}, "no JSON object"), ({"metadata": np.array("{")}, "not valid JSON"),
-    ({"metadata": np.array("[" * 5000)}, "nested"), ({"metadata": np.zeros(3)}, "no text"), ({"metadata": np.array("{}")}, 'lack "version"'),
-    ({"version": None}, 'lack "version"'), ({"version": 2}, "another version"), ({"version": "1"}, "another version"),
-    ({"persons": None}, 'lack "persons"'), ({"persons": "ann"}, "no list of names"), ({"persons": [1, 2]}, "no list of names"),
-    ({"frame": None}, 'lack "frame"'), ({"frame": []}, "no frame"), ({"transform": np.zeros((4, 4)).tolist()}, "inverted"),
-    ({"transform": [[1e400]]}, "inverted"), ({"transform": 3}, "inverted"), ({"rows_read": "x"}, "number of rows"), ({"rows_read": -1}, "number of rows"),
-    ({"dropped": [{"reason": "x"}]}, "reasons and counts"), ({"dropped": [{"reason": "x", "count": 1, "rows": [3]}]}, "reasons and counts"),
-    ({"steps": [{}]}, "steps"), ({"steps": [{"step": "split", "kept": 1, "of": 2, "by": {"position": {"test_centres": [[0, 0]]}}}]}, "steps"),
-    ({"source_frame": {"up": "y"}}, "no frame"), ({"tick": 0}, "time in seconds"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "changes, why",
+    [
+        ({"person": np.full(9, 2)}, "unknown person"),
+        ({"person": np.full(9, -1)}, "unknown person"),
+        ({"person": np.full(9, 1 << 32)}, "unknown person"),
+        ({"person": np.zeros(9)}, "person is not whole numbers"),
+        ({"direction": np.full((9, 3), np.nan)}, "direction that is not finite"),
+        ({"direction": np.zeros((9, 3))}, "zero direction"),
+        ({"direction": np.full((9, 3), np.inf)}, "not finite"),
+        ({"origin": np.full((9, 3), np.inf)}, "origin that is not finite"),
+        ({"t": np.full(9, np.nan)}, "time that is not finite"),
+        ({"confidence": np.full(9, 2.0)}, "confidence outside"),
+        ({"origin": np.zeros((9, 2))}, r"origin has the shape \(9, 2\)"),
+        ({"t": np.zeros(8)}, "expected"),
+        ({"t": np.zeros((3, 3))}, "expected"),
+        ({"t": np.array(1.0)}, "expected"),
+        ({"hit": np.array(["a"] * 9)}, "expected"),
+        ({"confidence": np.ones(9) * 1j}, "not numbers"),
+        ({"t": np.arange(9).astype("M8[s]")}, "not numbers"),
+        ({"hit": None, "cohort": np.zeros(9, int)}, "unknown cohort"),
+        ({"t": None}, "lacks t"),
+        ({"metadata": np.array("[1, 2]")}, "no JSON object"),
+        ({"metadata": np.array("{")}, "not valid JSON"),
+        ({"metadata": np.array("[" * 5000)}, "nested"),
+        ({"metadata": np.zeros(3)}, "no text"),
+        ({"metadata": np.array("{}")}, 'lack "version"'),
+        ({"version": None}, 'lack "version"'),
+        ({"version": 2}, "another version"),
+        ({"version": "1"}, "another version"),
+        ({"persons": None}, 'lack "persons"'),
+        ({"persons": "ann"}, "no list of names"),
+        ({"persons": [1, 2]}, "no list of names"),
+        ({"frame": None}, 'lack "frame"'),
+        ({"frame": []}, "no frame"),
+        ({"transform": np.zeros((4, 4)).tolist()}, "inverted"),
+        ({"transform": [[1e400]]}, "inverted"),
+        ({"transform": 3}, "inverted"),
+        ({"rows_read": "x"}, "number of rows"),
+        ({"rows_read": -1}, "number of rows"),
+        ({"dropped": [{"reason": "x"}]}, "reasons and counts"),
+        ({"dropped": [{"reason": "x", "count": 1, "rows": [3]}]}, "reasons and counts"),
+        ({"steps": [{}]}, "steps"),
+        ({"steps": [{"step": "split", "kept": 1, "of": 2, "by": {"position": {"test_centres": [[0, 0]]}}}]}, "steps"),
+        ({"source_frame": {"up": "y"}}, "no frame"),
+        ({"tick": 0}, "time in seconds"),
+    ],
+)
 def test_what_is_no_rays_file_is_one_sentence(tmp_path, changes, why):
     path = stored(tmp_path / "changed.npz", **changes)
     with pytest.raises(NergError, match=why) as caught:
@@ -114,9 +150,13 @@ def test_what_is_no_rays_file_is_one_sentence(tmp_path, changes, why):
 def test_narrow_numbers_and_other_columns_are_read(tmp_path):
     rays = some(True)
     path = stored(
-        tmp_path / "narrow.npz", person=rays.person.astype(np.uint8), confidence=np.ones(9, np.float16), t=np.arange(9),
-        origin=rays.origin.astype(np.float32), notes=[1],
-    )  # fmt: skip
+        tmp_path / "narrow.npz",
+        person=rays.person.astype(np.uint8),
+        confidence=np.ones(9, np.float16),
+        t=np.arange(9),
+        origin=rays.origin.astype(np.float32),
+        notes=[1],
+    )
     back = Rays.load(path)
     assert back.t.dtype == np.float64 and np.array_equal(back.person, rays.person) and back.person.dtype == np.int32
     assert np.allclose(back.origin, rays.origin, atol=1e-6) and back.metadata["notes"] == [1]
@@ -144,8 +184,14 @@ def test_a_small_file_does_not_become_a_large_array(tmp_path):
     """Zeros take no room in the file: 8 million rays would be three quarters of a gigabyte."""
     n, path = 8_000_000, tmp_path / "zeros.npz"
     metadata = {"version": 1, "persons": ["a"], "frame": dict(FRAME)}
-    half = {"origin": np.zeros((n, 3), np.float16), "direction": np.zeros((n, 3), np.float16), "confidence": np.zeros(n, np.float16)}
-    np.savez_compressed(path, metadata=np.array(json.dumps(metadata)), t=np.zeros(n, np.float16), person=np.zeros(n, np.int8), **half)
+    half = {
+        "origin": np.zeros((n, 3), np.float16),
+        "direction": np.zeros((n, 3), np.float16),
+        "confidence": np.zeros(n, np.float16),
+    }
+    np.savez_compressed(
+        path, metadata=np.array(json.dumps(metadata)), t=np.zeros(n, np.float16), person=np.zeros(n, np.int8), **half
+    )
     assert path.stat().st_size < 1 << 20
     with pytest.raises(NergError, match="8,000,000 rays, which its .* bytes do not warrant"):
         Rays.load(path)
@@ -180,7 +226,9 @@ def test_what_does_not_shrink_is_stored(tmp_path):
     with zipfile.ZipFile(tmp_path / "r.npz") as archive:
         kinds = {m.filename: m.compress_type for m in archive.infolist()}
     assert kinds["direction.npy"] == zipfile.ZIP_STORED
-    assert all(kind == zipfile.ZIP_DEFLATED for name, kind in kinds.items() if name not in ("direction.npy", "metadata.npy"))
+    assert all(
+        kind == zipfile.ZIP_DEFLATED for name, kind in kinds.items() if name not in ("direction.npy", "metadata.npy")
+    )
     assert np.array_equal(Rays.load(tmp_path / "r.npz").direction, rays.direction)
 
 

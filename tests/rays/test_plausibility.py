@@ -1,11 +1,12 @@
-import numpy as np
-import pytest
 from dataclasses import replace
 
+import numpy as np
+import pytest
+
 from nerg_mi.rays import plausibility
-from nerg_mi.rays.readers.frames import to_rays_frame
 from nerg_mi.rays.plausibility import walking_agreement
 from nerg_mi.rays.rays import FRAME, Rays
+from nerg_mi.rays.readers.frames import to_rays_frame
 from nerg_mi.rays.summary import summarise
 
 
@@ -71,7 +72,8 @@ def test_times_and_steep_gaze():
 @pytest.mark.parametrize("units", ["m", "cm", "mm"])
 @pytest.mark.parametrize("up", ["y", "x", "-y"])
 def test_axes_are_told_in_the_frame_of_the_file(units, up):
-    """In its own axes, which a cyclic change of them, unlike a swap, tells from those of the rays; whatever its unit."""
+    """In its own axes, which a cyclic change of them, unlike a swap, tells from those of the rays; whatever its
+    unit."""
     rays = walk(hit=False, frame={"up": up, "units": units})
     agreement, file_up = walking_agreement(rays), "xyz".index(up[-1])
     assert agreement[file_up] == 0 and (np.delete(agreement, file_up) > 0.5).all()

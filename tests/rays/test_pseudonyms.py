@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.tables import rays_from_table
-from nerg_mi.errors import NergError
 
 SALT = bytes(range(16))
 NAMES = ("Zoe Ames", "anna", "anna2", "bo")
@@ -21,8 +21,14 @@ NAMES = ("Zoe Ames", "anna", "anna2", "bo")
 def rays(tmp_path):
     """Four people, a file each that has their name, with a row that is dropped in each."""
     for i, name in enumerate(NAMES):
-        (tmp_path / f"{name}.csv").write_text("t,x,y,z,a,b,c\n" + f"{i},0,0,{i},0,1,0\n{i + .5},0,0,{i},0,0,1\n9,,0,0,1,0,0\n")
-    found = rays_from_table([tmp_path / f"{n}.csv" for n in NAMES], "origin=x,y,z direction=a,b,c t=t", recorded_by="ANNA, of /data/Zoe Ames/raw")
+        (tmp_path / f"{name}.csv").write_text(
+            "t,x,y,z,a,b,c\n" + f"{i},0,0,{i},0,1,0\n{i + 0.5},0,0,{i},0,0,1\n9,,0,0,1,0,0\n"
+        )
+    found = rays_from_table(
+        [tmp_path / f"{n}.csv" for n in NAMES],
+        "origin=x,y,z direction=a,b,c t=t",
+        recorded_by="ANNA, of /data/Zoe Ames/raw",
+    )
     return found.noting(step="filter", kept=8, of=8, persons=["anna", "bo"]).noting(
         step="split", kept=8, of=8, by={"person": {"test": ["anna2"]}}
     )
@@ -44,7 +50,11 @@ def test_no_name_is_left_anywhere(rays, tmp_path):
     for digest in (s["sha256"] for s in rays.metadata["sources"]):
         assert digest not in text
     step, split = back.metadata["steps"]
-    assert step["step"] == "filter" and set(step["persons"]) <= set(back.persons) and split["by"]["person"]["test"][0] in back.persons
+    assert (
+        step["step"] == "filter"
+        and set(step["persons"]) <= set(back.persons)
+        and split["by"]["person"]["test"][0] in back.persons
+    )
 
 
 def test_rays_stay_those_of_the_same_people(rays):
@@ -56,7 +66,10 @@ def test_rays_stay_those_of_the_same_people(rays):
         mine = hidden.person == p
         assert len(set(hidden.origin[mine, 2])) == 1
         assert np.array_equal(hidden.t[mine], by_name[hidden.origin[mine, 2][0]])
-    assert hidden.metadata["rows_read"] == rays.metadata["rows_read"] and hidden.metadata["transform"] == rays.metadata["transform"]
+    assert (
+        hidden.metadata["rows_read"] == rays.metadata["rows_read"]
+        and hidden.metadata["transform"] == rays.metadata["transform"]
+    )
 
 
 def test_the_salt_decides(rays):
@@ -72,7 +85,15 @@ def test_the_salt_decides(rays):
 
 def test_a_letter_or_two_are_no_word_to_look_for():
     """A person called "a" does not change the words of the metadata."""
-    rays = Rays([0.0], [0], ("a",), np.zeros((1, 3)), [[1.0, 0, 0]], [1.0], metadata={"frame": {"units": "m", "up": "z", "handedness": "right"}, "note": "a draft"})
+    rays = Rays(
+        [0.0],
+        [0],
+        ("a",),
+        np.zeros((1, 3)),
+        [[1.0, 0, 0]],
+        [1.0],
+        metadata={"frame": {"units": "m", "up": "z", "handedness": "right"}, "note": "a draft"},
+    )
     hidden = pseudonymise(rays, SALT)
     assert hidden.metadata["note"] == "a draft" and hidden.metadata["frame"] == rays.metadata["frame"]
 

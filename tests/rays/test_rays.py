@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers.collecting import RaysBuilder
 from nerg_mi.rays.rays import FRAME, Rays
+from nerg_mi.rays.readers.collecting import RaysBuilder
 
 
 def some(n=6, **change):
@@ -46,8 +46,18 @@ def test_refuses_by_row(change, message):
 
 def test_whole_numbers_are_taken_as_what_they_stand_for():
     n = 4
-    rays = Rays(np.arange(n), np.zeros(n, np.int8), ("ann",), np.zeros((n, 3), int), np.tile([0, 0, 1], (n, 1)), np.ones(n, int), np.ones((n, 3), int))
-    assert {a.dtype for a in (rays.t, rays.origin, rays.direction, rays.hit)} == {np.dtype(float)} and (rays.t + 0.5).tolist() == [0.5, 1.5, 2.5, 3.5]
+    rays = Rays(
+        np.arange(n),
+        np.zeros(n, np.int8),
+        ("ann",),
+        np.zeros((n, 3), int),
+        np.tile([0, 0, 1], (n, 1)),
+        np.ones(n, int),
+        np.ones((n, 3), int),
+    )
+    assert {a.dtype for a in (rays.t, rays.origin, rays.direction, rays.hit)} == {np.dtype(float)} and (
+        rays.t + 0.5
+    ).tolist() == [0.5, 1.5, 2.5, 3.5]
 
 
 def test_select_keeps_codes_and_provenance():
@@ -69,7 +79,11 @@ def test_builder_drops_with_an_account(tmp_path):
     assert len(rays) == 2 and np.allclose(rays.direction, [0, 0, 1]) and np.allclose(rays.origin, 1)
     assert rays.metadata["frame"] == FRAME and rays.metadata["rows_read"] == 6 and rays.metadata["preset"] == "made up"
     account = {d["reason"]: (d["count"], d["rows"]) for d in rays.metadata["dropped"]}
-    assert account == {"direction is missing": (1, [[4, 4]]), "direction is zero": (2, [[3, 3], [6, 6]]), "late": (1, [[7, 7]])}
+    assert account == {
+        "direction is missing": (1, [[4, 4]]),
+        "direction is zero": (2, [[3, 3], [6, 6]]),
+        "late": (1, [[7, 7]]),
+    }
     assert rays.metadata["sources"][0]["file"] == "walk.csv" and len(rays.metadata["sources"][0]["sha256"]) == 64
 
 
@@ -85,7 +99,9 @@ def test_kept_in_place():
     rng = np.random.default_rng(0)
     n = 700_000  # more than are moved at a time
     d = np.tile([1.0, 0, 0], (n, 1))
-    rays = Rays(rng.random(n), rng.integers(0, 3, n), tuple("abc"), rng.random((n, 3)), d, rng.random(n), rng.random((n, 3)))
+    rays = Rays(
+        rng.random(n), rng.integers(0, 3, n), tuple("abc"), rng.random((n, 3)), d, rng.random(n), rng.random((n, 3))
+    )
     mask = rng.random(n) < 0.6
     want = rays.select(mask)
     kept = rays.keep_in_place(mask)

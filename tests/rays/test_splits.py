@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from nerg_mi.density.probes import place_probes
 from nerg_mi.rays.rays import Rays
@@ -95,7 +96,10 @@ def test_by_time_with_a_gap(rays):
 
 
 @settings(max_examples=12, deadline=None)
-@given(st.integers(0, 2**16), st.sampled_from(["position", "person", "time", "position person", "person time", "position person time"]))
+@given(
+    st.integers(0, 2**16),
+    st.sampled_from(["position", "person", "time", "position person", "person time", "position person time"]),
+)
 def test_no_combination_shares_a_ray(rays, seed, kinds):
     made = {
         "position": lambda: split_by_position(rays, R, test_probes=20, seed=seed),

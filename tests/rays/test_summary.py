@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.rays import summary
+from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.summary import summarise
 
 
@@ -21,7 +21,13 @@ def test_figures_of_a_walk():
 
 
 @pytest.mark.parametrize(
-    "rays, word", [(walk(1000, 1600.0), "units mm"), (walk(1, 0.0), "up axis"), (walk(20), "walking pace"), (walk(0.001, 0.0016), "larger")]
+    "rays, word",
+    [
+        (walk(1000, 1600.0), "units mm"),
+        (walk(1, 0.0), "up axis"),
+        (walk(20), "walking pace"),
+        (walk(0.001, 0.0016), "larger"),
+    ],
 )
 def test_names_the_likely_mistake(rays, word):
     assert any(word in w for w in summarise(rays).warnings)
@@ -56,14 +62,20 @@ def test_figures_do_not_depend_on_order_or_blocks(monkeypatch, block):
     assert found.duration == pytest.approx(moving.sum()) and found.rate == pytest.approx(1 / np.median(moving))
     assert found.speed_p95 == pytest.approx(np.percentile(speed, 95)) and found.duplicates == (step == 0).sum() > 0
     distance = np.linalg.norm(hit - origin, axis=1)
-    assert found.hit_share == np.isfinite(distance).mean() and found.hit_distance == pytest.approx(np.nanmedian(distance))
+    assert found.hit_share == np.isfinite(distance).mean() and found.hit_distance == pytest.approx(
+        np.nanmedian(distance)
+    )
     assert found.persons == 3
 
 
 def test_rate_of_rays_far_apart():
     """Rays every two seconds have a rate, although no recorded time."""
-    rays = Rays(np.arange(9) * 2.0, np.zeros(9, int), ("a",), np.full((9, 3), 1.6), np.tile([1.0, 0, 0], (9, 1)), np.ones(9))
+    rays = Rays(
+        np.arange(9) * 2.0, np.zeros(9, int), ("a",), np.full((9, 3), 1.6), np.tile([1.0, 0, 0], (9, 1)), np.ones(9)
+    )
     found = summarise(rays)
-    assert found.rate == 0.5 and found.duration == 0 and np.isnan(found.speed_p95) and "--tick 0.001" in found.warnings[-1]
+    assert (
+        found.rate == 0.5 and found.duration == 0 and np.isnan(found.speed_p95) and "--tick 0.001" in found.warnings[-1]
+    )
     alone = summarise(rays.select([0]))
     assert np.isnan(alone.rate) and alone.duplicates == 0 and not any("tick" in w or "t=" in w for w in alone.warnings)

@@ -1,4 +1,5 @@
 """Volume rendering of packed samples in float64 NumPy, ray by ray (Mildenhall et al. 2020, eq. 3)."""
+
 import numpy as np
 
 

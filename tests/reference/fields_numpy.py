@@ -1,4 +1,5 @@
 """The networks of both fields in float64 NumPy: harmonics by their formulas, layers as matrix products, equation 1."""
+
 import numpy as np
 
 from . import hashgrid_numpy
@@ -9,16 +10,27 @@ def harmonics(d):
     x, y, z = np.asarray(d, np.float64).T
     r = np.sqrt
     pi = np.pi
-    return np.stack([
-        r(1 / pi) / 2 + 0 * x,
-        -r(3 / (4 * pi)) * y, r(3 / (4 * pi)) * z, -r(3 / (4 * pi)) * x,
-        r(15 / pi) / 2 * x * y, -r(15 / pi) / 2 * y * z, r(5 / pi) / 4 * (3 * z**2 - 1), -r(15 / pi) / 2 * x * z,
-        r(15 / pi) / 4 * (x**2 - y**2),
-        -r(35 / (2 * pi)) / 4 * y * (3 * x**2 - y**2), r(105 / pi) / 2 * x * y * z,
-        -r(21 / (2 * pi)) / 4 * y * (5 * z**2 - 1), r(7 / pi) / 4 * z * (5 * z**2 - 3),
-        -r(21 / (2 * pi)) / 4 * x * (5 * z**2 - 1), r(105 / pi) / 4 * z * (x**2 - y**2),
-        -r(35 / (2 * pi)) / 4 * x * (x**2 - 3 * y**2),
-    ], axis=-1)  # fmt: skip
+    return np.stack(
+        [
+            r(1 / pi) / 2 + 0 * x,
+            -r(3 / (4 * pi)) * y,
+            r(3 / (4 * pi)) * z,
+            -r(3 / (4 * pi)) * x,
+            r(15 / pi) / 2 * x * y,
+            -r(15 / pi) / 2 * y * z,
+            r(5 / pi) / 4 * (3 * z**2 - 1),
+            -r(15 / pi) / 2 * x * z,
+            r(15 / pi) / 4 * (x**2 - y**2),
+            -r(35 / (2 * pi)) / 4 * y * (3 * x**2 - y**2),
+            r(105 / pi) / 2 * x * y * z,
+            -r(21 / (2 * pi)) / 4 * y * (5 * z**2 - 1),
+            r(7 / pi) / 4 * z * (5 * z**2 - 3),
+            -r(21 / (2 * pi)) / 4 * x * (5 * z**2 - 1),
+            r(105 / pi) / 4 * z * (x**2 - y**2),
+            -r(35 / (2 * pi)) / 4 * x * (x**2 - 3 * y**2),
+        ],
+        axis=-1,
+    )
 
 
 def mlp(x, weights):
@@ -53,15 +65,16 @@ def radiance(p, d, parameters, grid, lower, upper, degree=4, scale=1.0):
     h = mlp(_grid(p, parameters, grid, lower, upper), _net(parameters, "density_net"))
     inside = np.all((p >= np.asarray(lower)) & (p <= np.asarray(upper)), axis=-1)
     sigma = np.where(inside, scale * np.exp(np.minimum(h[:, 0], 30)), 0)
-    x = np.concatenate([harmonics(d)[:, :degree**2], h[:, 1:]], axis=-1)
+    x = np.concatenate([harmonics(d)[:, : degree**2], h[:, 1:]], axis=-1)
     return sigma, sigmoid(mlp(x, _net(parameters, "color_net")))
 
 
 def gaze(p_od, p_o, r_o, parameters, grid, lower, upper, variant, activation, degree=4):
     """``(G, F_e, sigmoid F_c)`` of equation 1; a factor that the variant lacks is 1."""
+
     def trunk(p, d):
         geometry = mlp(_grid(p, parameters, grid, lower, upper), _net(parameters, "position_net"))
-        x = np.concatenate([harmonics(d)[:, :degree**2], geometry], axis=-1)
+        x = np.concatenate([harmonics(d)[:, : degree**2], geometry], axis=-1)
         return np.maximum(mlp(x, _net(parameters, "direction_net")), 0)
 
     activate = {"softplus": lambda x: np.logaddexp(0, x), "exp": np.exp, "linear": lambda x: x}[activation]

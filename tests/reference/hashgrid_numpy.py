@@ -3,6 +3,7 @@
 Positions are float32 with one fused multiply-add, as nvcc compiles the kernel (float64 holds the product of
 two float32 exactly, so that rounding once to float32 is the FMA); the interpolation is float64.
 """
+
 import math
 
 import numpy as np
@@ -60,6 +61,6 @@ def features(points, table, levels, features, log2_rows, base, finest):
                 weight = np.prod([f if b else 1 - f for f, b in zip(frac, bits)])
                 vertex = [int(c) + b for c, b in zip(cell, bits)]
                 row = offset + row_of_vertex(vertex, resolution, rows)
-                out[n, level * features:(level + 1) * features] += weight * table[row]
+                out[n, level * features : (level + 1) * features] += weight * table[row]
         offset += rows
     return out

@@ -2,6 +2,7 @@
 
 Also closed forms of a homogeneous slab, Mitsuba's trilinear grid look-up, and the slab test.
 """
+
 import math
 
 import numpy as np

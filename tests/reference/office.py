@@ -10,8 +10,8 @@ WINDOW = np.array([[1.0, 0.8], [5.0, 2.4]])
 
 
 def office(n: int = 200_000, far: float = 40.0, seed: int = 0) -> Rays:
-    """Rays of three people in a room of 8 x 6 x 3 m, evenly in all directions but the steepest; what leaves through the window
-    ends 5 to ``far`` metres behind it."""
+    """Rays of three people in a room of 8 x 6 x 3 m, evenly in all directions but the steepest; what leaves through the
+    window ends 5 to ``far`` metres behind it."""
     rng = np.random.default_rng(seed)
     origin = rng.uniform([1.5, 1.5, 1.5], [6.5, 4.5, 1.7], (n, 3))
     azimuth, z = rng.uniform(0, 2 * np.pi, n), rng.uniform(-0.86, 0.95, n)

@@ -1,5 +1,7 @@
-"""OpenCV's camera models, restated from its documentation in plain float64 NumPy (calib3d: projectPoints, undistortPoints,
-fisheye::projectPoints, fisheye::undistortPoints). The inverses iterate as OpenCV's do, but to convergence."""
+"""OpenCV's camera models, restated from its documentation in plain float64 NumPy (calib3d: projectPoints,
+undistortPoints, fisheye::projectPoints, fisheye::undistortPoints). The inverses iterate as OpenCV's do, but to
+convergence."""
+
 import numpy as np
 
 

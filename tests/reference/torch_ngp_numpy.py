@@ -1,5 +1,7 @@
-"""torch-ngp's and NeRG's networks and kernels, re-stated in NumPy float32 from their sources (gridencoder.cu, network.py,
-raymarching.cu, gaze_prediction.py) on a state dictionary, with checkpoints of random weights to try them on."""
+"""torch-ngp's and NeRG's networks and kernels, re-stated in NumPy float32 from their sources (gridencoder.cu,
+network.py, raymarching.cu, gaze_prediction.py) on a state dictionary, with checkpoints of random weights to try them
+on."""
+
 import math
 
 import numpy as np
@@ -75,7 +77,9 @@ def sh(d):
 
 def nerf(state, bound, x, d):
     """``(sigma (N,), colour (N, 3), geo_feat (N, 15))`` of NeRFNetwork.forward."""
-    h = linear_stack(encode(x, state["encoder.embeddings"], state["encoder.offsets"], 2048 * bound, bound), state, "sigma_net")
+    h = linear_stack(
+        encode(x, state["encoder.embeddings"], state["encoder.offsets"], 2048 * bound, bound), state, "sigma_net"
+    )
     color = sigmoid(linear_stack(np.concatenate([sh(d), h[:, 1:]], 1), state, "color_net"))
     return np.exp(h[:, 0]), color, h[:, 1:]
 
@@ -136,7 +140,9 @@ def gaze(state, bound, p_od, p_o, r_o, variant="EmitCapture"):
     state = {k: v.astype(np.float64) if k.endswith(("weight", "bias")) else v for k, v in state.items()}
 
     def trunk(x, d):
-        h = gaze_net(encode(x, state["encoder.embeddings"], state["encoder.offsets"], 256 * bound, bound), state, "net1")
+        h = gaze_net(
+            encode(x, state["encoder.embeddings"], state["encoder.offsets"], 256 * bound, bound), state, "net1"
+        )
         return gaze_net(np.concatenate([sh(d), h], 1), state, "net2")
 
     one = np.ones(len(p_od), F)
@@ -170,26 +176,37 @@ def nerf_state(bound, rng, with_background=False, filled=0.3):
     where, cascades = offsets(16, 2048 * bound), 1 + math.ceil(math.log2(bound))
     cube = np.array([-bound] * 3 + [bound] * 3, F)
     state = {
-        "aabb_train": cube, "aabb_infer": cube.copy(),
+        "aabb_train": cube,
+        "aabb_infer": cube.copy(),
         "density_bitfield": np.packbits(rng.random(cascades * 128**3, dtype=F) < filled, bitorder="little"),
         "step_counter": np.zeros((16, 2), np.int32),
-        "encoder.embeddings": table(where[-1], rng), "encoder.offsets": where,
-        "sigma_net.0.weight": matrix(rng, 64, 32), "sigma_net.1.weight": matrix(rng, 16, 64, 2),
-        "color_net.0.weight": matrix(rng, 64, 31), "color_net.1.weight": matrix(rng, 64, 64),
+        "encoder.embeddings": table(where[-1], rng),
+        "encoder.offsets": where,
+        "sigma_net.0.weight": matrix(rng, 64, 32),
+        "sigma_net.1.weight": matrix(rng, 16, 64, 2),
+        "color_net.0.weight": matrix(rng, 64, 31),
+        "color_net.1.weight": matrix(rng, 64, 64),
         "color_net.2.weight": matrix(rng, 3, 64, 2),
-    }  # fmt: skip
+    }
     if with_background:
         behind = offsets(4, 2048, 2)
-        state |= {"encoder_bg.embeddings": table(behind[-1], rng), "encoder_bg.offsets": behind,
-                  "bg_net.0.weight": matrix(rng, 64, 24), "bg_net.1.weight": matrix(rng, 3, 64, 2)}  # fmt: skip
+        state |= {
+            "encoder_bg.embeddings": table(behind[-1], rng),
+            "encoder_bg.offsets": behind,
+            "bg_net.0.weight": matrix(rng, 64, 24),
+            "bg_net.1.weight": matrix(rng, 3, 64, 2),
+        }
     return state
 
 
 def gaze_state(bound, rng, variant="EmitCapture", layernorm=True):
     """State dictionary of a gaze field of the authors' sizes, without its NeRF."""
     where = offsets(16, 256 * bound)
-    state = {"aabb_train": np.array([-bound] * 3 + [bound] * 3, F),
-             "encoder.embeddings": table(where[-1], rng), "encoder.offsets": where}  # fmt: skip
+    state = {
+        "aabb_train": np.array([-bound] * 3 + [bound] * 3, F),
+        "encoder.embeddings": table(where[-1], rng),
+        "encoder.offsets": where,
+    }
     for name, sizes in (("net1", (32, 64, 15)), ("net2", (31, 64, 64))):
         for i, (columns, rows) in enumerate(zip(sizes, sizes[1:])):
             if layernorm:

@@ -13,26 +13,41 @@ from tests.plugins.scenes import camera, constant, observer_at
 def neural(mi, folder, sensor, **kwargs):
     fields.radiance(folder / "field.safetensors", density_scale=2.0)
     fields.gaze(folder / "gaze.safetensors")
-    integrator = {"type": "nerg", "field": {"type": "nerf", "filename": str(folder / "field.safetensors")},
-                  "gaze": {"type": "gazefield", "filename": str(folder / "gaze.safetensors")},
-                  "aovs": "depth,gaze,visibility,position", "jitter": True, **kwargs}  # fmt: skip
+    integrator = {
+        "type": "nerg",
+        "field": {"type": "nerf", "filename": str(folder / "field.safetensors")},
+        "gaze": {"type": "gazefield", "filename": str(folder / "gaze.safetensors")},
+        "aovs": "depth,gaze,visibility,position",
+        "jitter": True,
+        **kwargs,
+    }
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor})
 
 
 def panorama(mi):
-    return {"type": "panorama", "to_world": mi.ScalarTransform4f().translate([0.3, 0, -2]),
-            "film": camera(mi)["film"] | {"width": 24, "height": 13}}  # fmt: skip
+    return {
+        "type": "panorama",
+        "to_world": mi.ScalarTransform4f().translate([0.3, 0, -2]),
+        "film": camera(mi)["film"] | {"width": 24, "height": 13},
+    }
 
 
 def lit(mi, film, sensor="perspective", sampler="independent"):
     """A textured ball under `path`, which draws random numbers in a loop of its own."""
-    return mi.load_dict({
-        "type": "scene", "integrator": {"type": "aov", "aovs": "dd:depth", "in": {"type": "path", "max_depth": 3}},
-        "ball": {"type": "sphere", "b": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}},
-        "sky": {"type": "constant"},
-        "sensor": {"type": sensor, "to_world": mi.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0]),
-                   "film": {"type": "hdrfilm", **film}, "sampler": {"type": sampler, "seed": 11}},
-    })  # fmt: skip
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "aov", "aovs": "dd:depth", "in": {"type": "path", "max_depth": 3}},
+            "ball": {"type": "sphere", "b": {"type": "diffuse", "reflectance": {"type": "checkerboard"}}},
+            "sky": {"type": "constant"},
+            "sensor": {
+                "type": sensor,
+                "to_world": mi.ScalarTransform4f().look_at([0, 0, -4], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", **film},
+                "sampler": {"type": sampler, "seed": 11},
+            },
+        }
+    )
 
 
 def whole(mi, scene, spp, seed=3):
@@ -59,13 +74,26 @@ def test_shapes_are_the_same_to_the_bit(rgb, spp):
 
 def test_a_camera_in_fog_is_the_same_to_the_bit(rgb):
     fog = {"type": "homogeneous", "albedo": 0.9, "sigma_t": 0.8}
-    scene = rgb.load_dict({
-        "type": "scene", "integrator": {"type": "volpath", "max_depth": 4}, "sky": {"type": "constant"},
-        "room": {"type": "cube", "to_world": rgb.ScalarTransform4f().scale(3), "bsdf": {"type": "null"}, "interior": fog},
-        "ball": {"type": "sphere", "radius": 0.5},
-        "sensor": {"type": "perspective", "to_world": rgb.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]),
-                   "medium": fog, "film": {"type": "hdrfilm", **BOX}},
-    })  # fmt: skip
+    scene = rgb.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "volpath", "max_depth": 4},
+            "sky": {"type": "constant"},
+            "room": {
+                "type": "cube",
+                "to_world": rgb.ScalarTransform4f().scale(3),
+                "bsdf": {"type": "null"},
+                "interior": fog,
+            },
+            "ball": {"type": "sphere", "radius": 0.5},
+            "sensor": {
+                "type": "perspective",
+                "to_world": rgb.ScalarTransform4f().look_at([0, 0, 2], [0, 0, 0], [0, 1, 0]),
+                "medium": fog,
+                "film": {"type": "hdrfilm", **BOX},
+            },
+        }
+    )
     assert bands.why_whole(scene, scene.sensors()[0]) is None
     assert np.array_equal(divided(scene, 4, rows=4), whole(rgb, scene, 4))
 
@@ -133,7 +161,9 @@ def test_other_films(rgb, film):
 
 
 def test_mono(mono):
-    scene = mono.load_dict({"type": "scene", "integrator": constant(0.8, aovs="depth", background=0.2), "sensor": camera(mono, size=9)})
+    scene = mono.load_dict(
+        {"type": "scene", "integrator": constant(0.8, aovs="depth", background=0.2), "sensor": camera(mono, size=9)}
+    )
     assert np.array_equal(divided(scene, 2, rows=4), whole(mono, scene, 2))
 
 
@@ -151,7 +181,9 @@ def test_eight_times_the_pixels_take_eight_times_the_bands(rgb):
     rows = [bands.rows_for(s, s.sensors()[0], memory) for s in (small, large)]
     assert rows[0] == rows[1] and 0 < rows[0] < 400
     for scene, count in ((small, -(-400 // rows[0])), (large, -(-3200 // rows[0]))):
-        sizes = [np.array(b.film.bitmap()).nbytes for b in bands.render_bands(scene, scene.sensors()[0], spp=1, rows=rows[0])]
+        sizes = [
+            np.array(b.film.bitmap()).nbytes for b in bands.render_bands(scene, scene.sensors()[0], spp=1, rows=rows[0])
+        ]
         assert len(sizes) == count and max(sizes) < memory / 3
     assert bands.rows_for(small, small.sensors()[0], 1.0) == 1
 
@@ -161,7 +193,9 @@ def test_a_wide_filter_is_not_rendered_many_times_for_want_of_memory(rgb):
     scene = lit(rgb, {"width": 18, "height": 200, "rfilter": {"type": "gaussian"}})
     rows = bands.rows_for(scene, scene.sensors()[0], -1e9)
     told = []
-    for _ in bands.render_bands(scene, scene.sensors()[0], spp=1, rows=rows, on_strip=lambda done, total: told.append(total)):
+    for _ in bands.render_bands(
+        scene, scene.sensors()[0], spp=1, rows=rows, on_strip=lambda done, total: told.append(total)
+    ):
         pass
     assert 1 < rows < 50 and told[-1] < 1.3 * 18 * 200
 

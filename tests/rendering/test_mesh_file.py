@@ -92,10 +92,17 @@ def vol(*size: int, kind: int = 1, values: int = 8) -> bytes:
 @pytest.mark.parametrize(
     "data",
     [
-        vol(2, 2, 2, -1), vol(0, 2, 2, 1), vol(2, 2, 2, 2), vol(2000, 2000, 2000, 1), vol(2**31 - 1, 2**31 - 1, 2**31 - 1, 1),
-        vol(2, 2, 2, 1, kind=7), vol(2, 2, 2, 1)[:30], b"VOX" + vol(2, 2, 2, 1)[3:], b"",
+        vol(2, 2, 2, -1),
+        vol(0, 2, 2, 1),
+        vol(2, 2, 2, 2),
+        vol(2000, 2000, 2000, 1),
+        vol(2**31 - 1, 2**31 - 1, 2**31 - 1, 1),
+        vol(2, 2, 2, 1, kind=7),
+        vol(2, 2, 2, 1)[:30],
+        b"VOX" + vol(2, 2, 2, 1)[3:],
+        b"",
     ],
-)  # fmt: skip
+)
 def test_wrong_volumes_are_a_sentence(tmp_path, data):
     (tmp_path / "a.vol").write_bytes(data)
     with pytest.raises(NergError, match="a.vol"):

@@ -18,7 +18,9 @@ SENSOR = """<sensor type="perspective"><sampler type="{sampler}"><integer name="
 
 def scene(*things: str, sampler="independent", spp="1", width="8", height="8") -> str:
     sensor = SENSOR.format(sampler=sampler, spp=spp, width=width, height=height)
-    return f'<scene version="3.0.0"><integrator type="direct"/><emitter type="constant"/>{"".join(things)}{sensor}</scene>'
+    return (
+        f'<scene version="3.0.0"><integrator type="direct"/><emitter type="constant"/>{"".join(things)}{sensor}</scene>'
+    )
 
 
 def shape(kind: str, file: str) -> str:
@@ -26,7 +28,9 @@ def shape(kind: str, file: str) -> str:
 
 
 def mesh(corner: int) -> bytes:
-    head = "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    )
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     return head.encode() + struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + b"\x03" + struct.pack("<3i", 0, 1, corner)
 
@@ -54,7 +58,17 @@ def test_what_would_end_the_process_is_a_sentence(tmp_path, name):
     (tmp_path / "s.xml").write_text(text)
     for file, data in files.items():
         (tmp_path / file).write_bytes(data)
-    run = [sys.executable, "-c", "import nerg_command; nerg_command.main()", "render", "s.xml", "-o", "a.exr", "-m", "llvm_ad_rgb"]
+    run = [
+        sys.executable,
+        "-c",
+        "import nerg_command; nerg_command.main()",
+        "render",
+        "s.xml",
+        "-o",
+        "a.exr",
+        "-m",
+        "llvm_ad_rgb",
+    ]
     done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, timeout=180)
     assert done.returncode == 1, done.stderr[-500:]
     assert len(done.stderr.strip().splitlines()) == 1 and said in done.stderr
@@ -79,7 +93,9 @@ def test_good_scenes_load(rgb, tmp_path):
     (tmp_path / "more").mkdir()
     (tmp_path / "more" / "part.xml").write_text('<scene version="3.0.0"><shape type="cube"/></scene>')
     (tmp_path / "a.ply").write_bytes(mesh(2))
-    text = scene('<default name="part" value="more/part.xml"/><include filename="$part"/>', shape("ply", "$mesh"), spp="$n")
+    text = scene(
+        '<default name="part" value="more/part.xml"/><include filename="$part"/>', shape("ply", "$mesh"), spp="$n"
+    )
     (tmp_path / "s.xml").write_text(text.replace("<integrator", '<default name="n" value="3"/><integrator', 1))
     loaded = load_scene(tmp_path / "s.xml", {"mesh": "a.ply"})
     assert len(loaded.shapes()) == 2 and loaded.sensors()[0].sampler().sample_count() == 3
@@ -96,7 +112,11 @@ def test_values_given_count_and_not_the_defaults(tmp_path):
 
 def test_entities_are_not_expanded(tmp_path):
     levels = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 12))
-    refused(tmp_path, f'<!DOCTYPE scene [<!ENTITY e0 "lol">{levels}]><scene version="3.0.0" id="&e11;"/>', "declares an entity")
+    refused(
+        tmp_path,
+        f'<!DOCTYPE scene [<!ENTITY e0 "lol">{levels}]><scene version="3.0.0" id="&e11;"/>',
+        "declares an entity",
+    )
 
 
 def test_includes_are_followed_and_do_not_go_round(tmp_path):
@@ -108,7 +128,9 @@ def test_includes_are_followed_and_do_not_go_round(tmp_path):
     refused(tmp_path, scene('<include filename="i0.xml"/>'), "files deep")
 
 
-@pytest.mark.parametrize("text, said", [("<scene", "well-formed"), ("", "well-formed"), ("<scene></shape>", "well-formed")])
+@pytest.mark.parametrize(
+    "text, said", [("<scene", "well-formed"), ("", "well-formed"), ("<scene></shape>", "well-formed")]
+)
 def test_what_is_no_xml(tmp_path, text, said):
     refused(tmp_path, text, said)
 

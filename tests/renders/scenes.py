@@ -2,9 +2,11 @@
 
     python -m tests.renders.scenes [NAME ...]     renders the references anew (about a minute on two cores)
 
-`mi.testing.RenderingRegressionTest` compares the first three channels of a `moment` integrator, and takes the three after
-them for the second moments. In Mitsuba 3.9 channels of the nested integrator stand there: `Shown` returns the squares.
+`mi.testing.RenderingRegressionTest` compares the first three channels of a `moment` integrator, and takes the three
+after them for the second moments. In Mitsuba 3.9 channels of the nested integrator stand there: `Shown` returns the
+squares.
 """
+
 import sys
 import tempfile
 from pathlib import Path
@@ -51,24 +53,36 @@ def things(mi):
     """A ball and a turned box on a floor."""
     T = mi.ScalarTransform4f
     return {
-        "ball": {"type": "sphere", "center": [-0.4, 0, 0], "radius": 0.5,
-                 "b": {"type": "diffuse", "reflectance": rgb_of(0.7, 0.3, 0.2)}},
+        "ball": {
+            "type": "sphere",
+            "center": [-0.4, 0, 0],
+            "radius": 0.5,
+            "b": {"type": "diffuse", "reflectance": rgb_of(0.7, 0.3, 0.2)},
+        },
         "box": {"type": "cube", "to_world": T().translate([0.7, -0.2, 0.3]).rotate([0, 1, 0], 30).scale(0.3)},
         "floor": {"type": "rectangle", "to_world": T().translate([0, -0.5, 0]).rotate([1, 0, 0], -90).scale(2)},
-    }  # fmt: skip
+    }
 
 
 def slab(mi, folder, change=1.0):
-    integrator = constant(0.8 * change, aovs="depth,opacity", background=0.2,
-                          color={"type": "constvolume", "value": rgb_of(0.9, 0.5, 0.1)})  # fmt: skip
+    integrator = constant(
+        0.8 * change,
+        aovs="depth,opacity",
+        background=0.2,
+        color={"type": "constvolume", "value": rgb_of(0.9, 0.5, 0.1)},
+    )
     return integrator, {}, ("depth.T", "opacity.Y", "R"), camera(mi, (1.8, 1.2, -1.5), (0.5, 0.5, 0.5), size=SIZE)
 
 
 def neural(folder, change=1.0, **kwargs):
     fields.radiance(folder / "field.safetensors", density_scale=2.0 * change)
     fields.gaze(folder / "gaze.safetensors")
-    return {"type": "nerg", "field": {"type": "nerf", "filename": str(folder / "field.safetensors")},
-            "gaze": {"type": "gazefield", "filename": str(folder / "gaze.safetensors")}, **kwargs}  # fmt: skip
+    return {
+        "type": "nerg",
+        "field": {"type": "nerf", "filename": str(folder / "field.safetensors")},
+        "gaze": {"type": "gazefield", "filename": str(folder / "gaze.safetensors")},
+        **kwargs,
+    }
 
 
 def gaze(mi, folder, change=1.0):
@@ -84,16 +98,27 @@ def shapes(mi, folder, change=1.0):
 
 def both(mi, folder, change=1.0):
     box = mi.ScalarTransform4f().translate([-1, -0.4, -1]).scale([2, 0.8, 1])
-    integrator = constant(1.0, density={"type": "constvolume", "value": 1.0 * change, "to_world": box}, aovs="depth,visibility",
-                          visibility="transmittance", observer=observer_at(mi, -2, 0.8, -2), background=0.1,
-                          color={"type": "constvolume", "value": rgb_of(0.2, 0.4, 0.8)})  # fmt: skip
+    integrator = constant(
+        1.0,
+        density={"type": "constvolume", "value": 1.0 * change, "to_world": box},
+        aovs="depth,visibility",
+        visibility="transmittance",
+        observer=observer_at(mi, -2, 0.8, -2),
+        background=0.1,
+        color={"type": "constvolume", "value": rgb_of(0.2, 0.4, 0.8)},
+    )
     return integrator, things(mi), ("depth.T", "visibility.Y", "B"), camera(mi, (1, 1, -3), size=SIZE)
 
 
 def observer(mi, folder, change=1.0):
     """Who stands elsewhere sees through a long fall-off."""
-    integrator = neural(folder, aovs="gaze,visibility,observer_depth", observer=observer_at(mi, -3, 0.5, 0.5),
-                        falloff=1.0 * change, radiance=False)  # fmt: skip
+    integrator = neural(
+        folder,
+        aovs="gaze,visibility,observer_depth",
+        observer=observer_at(mi, -3, 0.5, 0.5),
+        falloff=1.0 * change,
+        radiance=False,
+    )
     return integrator, {}, ("gaze.Y", "visibility.Y", "observer_depth.T"), camera(mi, size=SIZE)
 
 
@@ -102,17 +127,34 @@ def panorama(mi, folder, change=1.0):
     data = np.random.default_rng(0).uniform(0, 2, (5, 5, 5)).astype(np.float32)
     box = mi.ScalarTransform4f().translate([-1.5, -1.5, -1.5]).scale(3)
     density = {"type": "gridvolume", "grid": mi.VolumeGrid(data * np.float32(change)), "to_world": box}
-    integrator = {"type": "nerg", "density": density, "quadrature": "cells", "depth": "expected", "radiance": False,
-                  "aovs": "depth,opacity,visibility", "visibility": "transmittance", "surface_opacity": 0.0,
-                  "observer": observer_at(mi, 0.9, 0.2, -0.9)}  # fmt: skip
-    sensor = {"type": "panorama", "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0.4]),
-              "film": camera(mi)["film"] | {"width": 32, "height": 16}}  # fmt: skip
+    integrator = {
+        "type": "nerg",
+        "density": density,
+        "quadrature": "cells",
+        "depth": "expected",
+        "radiance": False,
+        "aovs": "depth,opacity,visibility",
+        "visibility": "transmittance",
+        "surface_opacity": 0.0,
+        "observer": observer_at(mi, 0.9, 0.2, -0.9),
+    }
+    sensor = {
+        "type": "panorama",
+        "to_world": mi.ScalarTransform4f().translate([0.3, 0, 0.4]),
+        "film": camera(mi)["film"] | {"width": 32, "height": 16},
+    }
     return integrator, {"ball": things(mi)["ball"]}, ("depth.T", "opacity.Y", "visibility.Y"), sensor
 
 
 # name: (scene, the relative change of its density, light or fall-off that its test must notice)
-SCENES = {"slab": (slab, 0.02), "gaze": (gaze, 0.02), "shapes": (shapes, 0.02), "both": (both, 0.02),
-          "observer": (observer, 0.02), "panorama": (panorama, 0.02)}  # fmt: skip
+SCENES = {
+    "slab": (slab, 0.02),
+    "gaze": (gaze, 0.02),
+    "shapes": (shapes, 0.02),
+    "both": (both, 0.02),
+    "observer": (observer, 0.02),
+    "panorama": (panorama, 0.02),
+}
 
 
 def scene(mi, name, folder, change=1.0):
@@ -124,16 +166,22 @@ def scene(mi, name, folder, change=1.0):
 def test_of(mi, name, folder, references=REFERENCES, change=1.0):
     from mitsuba.python.testing import RenderingRegressionTest
 
-    return RenderingRegressionTest(name, scene(mi, name, Path(folder), change), test_spp=TEST_SPP, ref_spp=REFERENCE_SPP,
-                                   references_folder=str(references))  # fmt: skip
+    return RenderingRegressionTest(
+        name,
+        scene(mi, name, Path(folder), change),
+        test_spp=TEST_SPP,
+        ref_spp=REFERENCE_SPP,
+        references_folder=str(references),
+    )
 
 
 test_of.__test__ = False
 
 
 def main(names):
-    import nerg_mi  # noqa: F401  chooses the libLLVM, so it comes before mitsuba
     import mitsuba as mi
+
+    import nerg_mi  # noqa: F401  chooses the libLLVM, so it comes before mitsuba
 
     mi.set_variant("llvm_ad_rgb")
     with tempfile.TemporaryDirectory() as folder:

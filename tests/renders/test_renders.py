@@ -1,5 +1,6 @@
-"""Pictures against stored ones, by a z-test for each pixel: what changes the expectation of any pixel's value by more than
-chance is noticed. `scenes.py` says how the references are made."""
+"""Pictures against stored ones, by a z-test for each pixel: what changes the expectation of any pixel's value by more
+than chance is noticed. `scenes.py` says how the references are made."""
+
 import shutil
 
 import numpy as np

@@ -123,7 +123,8 @@ def test_pinhole_projects_its_own_directions():
 
 
 def test_views_agree_with_each_other(store, tmp_path):
-    """A pixel moved into another view by its depth meets its own colour there: poses, depth and pictures are one frame."""
+    """A pixel moved into another view by its depth meets its own colour there: poses, depth and pictures are one
+    frame."""
     camera = cameras.Pinhole(80, 60)
     views.write_views(store, tmp_path, camera=camera, train=8, test=2, spp=16, say=lambda text: None)
     sets = [json.loads((tmp_path / n).read_text()) for n in ("transforms.json", "transforms_test.json")]
@@ -181,7 +182,7 @@ def test_law_depends_on_position_and_hides_what_is_hidden(law):
 def test_law_sample_follows_density(law):
     """Draws counted in the cells around 192 directions agree with the density integrated over the same cells."""
     centres, fine = equal_area(192), equal_area(60000)
-    cell = lambda d: np.argmax(d @ centres.T, axis=1)  # noqa: E731
+    cell = lambda d: np.argmax(d @ centres.T, axis=1)
     n = 40000
     for eye in EYES[:2]:
         expected = np.bincount(cell(fine), law.density(eye[None], fine)[0], 192) * n * 4 * np.pi / len(fine)
@@ -214,7 +215,9 @@ def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store,
         assert np.all(np.diff(times[mine]) == 200)
         assert np.linalg.norm(np.diff(origins[mine], axis=0), axis=1).max() < 0.5  # metres in 0.2 s
 
-    path = shoppers.write_shoppers(store, tmp_path / "s.csv", shoppers=3, stops=(2, 4), seed=5, law=law, say=lambda text: None)
+    path = shoppers.write_shoppers(
+        store, tmp_path / "s.csv", shoppers=3, stops=(2, 4), seed=5, law=law, say=lambda text: None
+    )
     rows = read_skeleton(path)
     o, d = head_poses(rows.keypoints)
     assert np.array_equal(rows.ids, ids) and np.array_equal(rows.times, times)

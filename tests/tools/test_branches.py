@@ -5,16 +5,23 @@ from tools import branches
 
 def entry(statements, lines, total, reached, missing):
     summary = {
-        "num_statements": statements, "covered_lines": lines, "num_branches": total, "covered_branches": reached,
+        "num_statements": statements,
+        "covered_lines": lines,
+        "num_branches": total,
+        "covered_branches": reached,
         "percent_covered": 100 * (lines + reached) / (statements + total),
-    }  # fmt: skip
+    }
     return {"summary": summary, "missing_lines": missing}
 
 
-REPORT = {"files": {
-    "nerg_mi/field/a.py": entry(10, 10, 4, 2, []), "nerg_mi/field/b.py": entry(30, 20, 0, 0, [3, 4]),
-    "plugins/nerg.py": entry(50, 50, 6, 6, []), "nerg_command.py": entry(4, 4, 0, 0, []),
-}}  # fmt: skip
+REPORT = {
+    "files": {
+        "nerg_mi/field/a.py": entry(10, 10, 4, 2, []),
+        "nerg_mi/field/b.py": entry(30, 20, 0, 0, [3, 4]),
+        "plugins/nerg.py": entry(50, 50, 6, 6, []),
+        "nerg_command.py": entry(4, 4, 0, 0, []),
+    }
+}
 
 
 def test_sums_of_each_part():

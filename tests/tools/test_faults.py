@@ -38,8 +38,13 @@ def test_kills_and_refusals_lose_nothing(name):
     # Not in pytest's folder, into which nobody else may look.
     with tempfile.TemporaryDirectory() as folder:
         os.chmod(folder, 0o755)
-        done = subprocess.run([sys.executable, "-c", _KILLS, folder, name], cwd=ROOT, stdin=subprocess.DEVNULL,
-                              capture_output=True, text=True)  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-c", _KILLS, folder, name],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+        )
     assert done.returncode == 0, done.stderr[-2000:]
     tally, rows, wrong = json.loads(done.stdout.splitlines()[-1])
     assert tally["tried"] == tally["started"] == 4 and tally["landed"] >= 1 and tally["lost"] == 0
@@ -60,10 +65,17 @@ def test_a_file_that_is_cut_off_is_lost(tmp_path):
     assert "rays.npz is gone" in said
 
 
-@pytest.mark.parametrize("name, data", [
-    ("a.vol", b"VOL\3" + np.array([1, 2, 2, 2, 1], "<i4").tobytes() + bytes(24) + bytes(31)), ("a.json", b'{"a": 1'),
-    ("a.csv", b"a,b\n1,"), ("a.safetensors", b"\x20\0\0\0\0\0\0\0{}"), ("a.ply", b"ply\nformat ascii 1.0\n"), ("a.exr", b"v/1\1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, data",
+    [
+        ("a.vol", b"VOL\3" + np.array([1, 2, 2, 2, 1], "<i4").tobytes() + bytes(24) + bytes(31)),
+        ("a.json", b'{"a": 1'),
+        ("a.csv", b"a,b\n1,"),
+        ("a.safetensors", b"\x20\0\0\0\0\0\0\0{}"),
+        ("a.ply", b"ply\nformat ascii 1.0\n"),
+        ("a.exr", b"v/1\1"),
+    ],
+)
 def test_what_is_no_whole_file(tmp_path, name, data):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(Exception):

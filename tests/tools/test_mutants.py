@@ -1,4 +1,5 @@
-"""The mutation tester: what it changes and what not, names that outlive other changes, and trials on a tree of their own."""
+"""The mutation tester: what it changes and what not, names that outlive other changes, and trials on a tree of their
+own."""
 
 from __future__ import annotations
 
@@ -128,9 +129,17 @@ def test_a_trial_runs_on_its_own_tree_and_says_what_failed(tmp_path):
         f"worker.serve(Path({str(tmp_path)!r}), sys.stdin, sys.stdout)\n"
     )
     names = ["test_good", "test_bad", "test_hangs", "test_dies", "test_stray"]
-    requests = [{"tests": [f"test_a.py::{n}"], "limit": 3 if n == "test_hangs" else 60, "log": str(tmp_path / "log")} for n in names]
+    requests = [
+        {"tests": [f"test_a.py::{n}"], "limit": 3 if n == "test_hangs" else 60, "log": str(tmp_path / "log")}
+        for n in names
+    ]
     run = subprocess.run(
-        [sys.executable, "-c", code], input="\n".join(map(json.dumps, requests)), cwd=tmp_path, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", code],
+        input="\n".join(map(json.dumps, requests)),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     answers = [json.loads(line) for line in run.stdout.splitlines()]
     assert [a["outcome"] for a in answers] == ["passed", "failed", "hang", "crash"]

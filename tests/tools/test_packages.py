@@ -34,11 +34,20 @@ def test_a_file_that_is_missing_is_named():
 
 
 def test_floors():
-    metadata = "\n".join([
-        "Metadata-Version: 2.4", "Name: x", "Requires-Dist: mitsuba==3.9.*", "Requires-Dist: drjit",
-        "Requires-Dist: trimesh<6,>=4", 'Requires-Dist: torch>=2.2; extra == "torch"',
-        'Requires-Dist: pyarrow>=15; extra == "parquet"', 'Requires-Dist: pytest>=8; extra == "test"', "", "text >= 3",
-    ])  # fmt: skip
+    metadata = "\n".join(
+        [
+            "Metadata-Version: 2.4",
+            "Name: x",
+            "Requires-Dist: mitsuba==3.9.*",
+            "Requires-Dist: drjit",
+            "Requires-Dist: trimesh<6,>=4",
+            'Requires-Dist: torch>=2.2; extra == "torch"',
+            'Requires-Dist: pyarrow>=15; extra == "parquet"',
+            'Requires-Dist: pytest>=8; extra == "test"',
+            "",
+            "text >= 3",
+        ]
+    )
     assert packages.floors(metadata) == ["mitsuba==3.9.0", "trimesh==4", "pyarrow==15"]
 
 

@@ -13,9 +13,20 @@ def test_a_row_for_each_command(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A page\n\n## Millions of rays\n\nSome words.\n")
     done = subprocess.run(
-        [sys.executable, ROOT / "tools" / "ray_sizes.py", "--rays", "5000", "--folder", tmp_path / "made", "--update", page],
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+        [
+            sys.executable,
+            ROOT / "tools" / "ray_sizes.py",
+            "--rays",
+            "5000",
+            "--folder",
+            tmp_path / "made",
+            "--update",
+            page,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert done.returncode == 0, done.stderr
     rows = [line.split("|") for line in page.read_text().splitlines() if line.startswith("| rays ")]
     assert len(rows) == 3 and all(row[2].strip() == "5,000" and float(row[5]) > 0 for row in rows)

@@ -74,7 +74,7 @@ def test03_installs_where_it_is(setup, commands, monkeypatch):
     troubles = iter(["No libLLVM was found.", None])
     monkeypatch.setattr(llvm, "problem", lambda: next(troubles))
     monkeypatch.setattr(setup.shutil, "which", lambda name: f"/usr/bin/{name}")
-    monkeypatch.setattr(setup, "administrator", lambda: [])
+    monkeypatch.setattr(setup, "administrator", list)
     packages = iter([None, "libllvm22"])  # the lists of packages come with the update
     monkeypatch.setattr(setup, "offered", lambda minimum: next(packages))
     setup.provide_llvm()

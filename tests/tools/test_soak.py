@@ -29,13 +29,24 @@ print("\\n" + json.dumps([asdict(sound), asdict(leaking)]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part, count, bound", [
-    ("moving observer", 60, 100.0), ("gaze training", 300, 50.0), ("changes of variant", 30, 2000.0), ("two threads, two scenes", 24, 200.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "part, count, bound",
+    [
+        ("moving observer", 60, 100.0),
+        ("gaze training", 300, 50.0),
+        ("changes of variant", 30, 2000.0),
+        ("two threads, two scenes", 24, 200.0),
+    ],
+)
 def test_memory_stays_flat_and_a_leak_is_seen(part, count, bound):
     """Sixty frames, or as much of another part, keep a bound (KiB a unit) that leaking four times as much exceeds."""
-    done = subprocess.run([sys.executable, "-c", _PROGRAM, part, str(count), str(bound)], cwd=ROOT, capture_output=True,
-                          text=True, stdin=subprocess.DEVNULL)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", _PROGRAM, part, str(count), str(bound)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     sound, leaking = (soak.Course(**said) for said in json.loads(done.stdout.splitlines()[-1]))
     assert sound.flat, sound

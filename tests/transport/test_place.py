@@ -31,7 +31,9 @@ def test_a_shape_is_opaque_and_a_medium_as_thick_as_it_is(rgb, sigma):
 
 
 def test_distances_follow_the_ray_where_no_shape_moves(rgb):
-    place = Place(None, rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0, 0, 5], "radius": 2.0}}))
+    place = Place(
+        None, rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "center": [0, 0, 5], "radius": 2.0}})
+    )
     x, z = np.float32([-1.0, 0.0, 0.5, 1.2]), rgb.Float([0, 0, 0, 0])
     across = rgb.Float(x)
     dr.enable_grad(across, z)
@@ -43,7 +45,9 @@ def test_distances_follow_the_ray_where_no_shape_moves(rgb):
 
 
 def test_distances_follow_a_shape_where_no_ray_moves(rgb):
-    scene = rgb.load_dict({"type": "scene", "plate": {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 4])}})
+    scene = rgb.load_dict(
+        {"type": "scene", "plate": {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 4])}}
+    )
     params, lift = rgb.traverse(scene), rgb.Float(0)
     dr.enable_grad(lift)
     key = next(k for k in params.keys() if k.endswith("to_world"))

@@ -1,4 +1,5 @@
 """Depth tracing outside of a render: closed forms, both kinds of arrays, batches that do not matter."""
+
 from __future__ import annotations
 
 import drjit as dr
@@ -6,9 +7,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.backend import namespace
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.maths.box import Box
 from nerg_mi.transport.march.primal import MarchSettings
 from nerg_mi.transport.media.media import FieldMedium, Similarity, VolumeMedium
 from nerg_mi.transport.trace import default_settings, trace_depth

@@ -1,4 +1,5 @@
-"""Fields to run the demo on where the store's own are not made yet: the store's walls and furniture in random colours."""
+"""Fields to run the demo on where the store's own are not made yet: the store's walls and furniture in random
+colours."""
 
 from __future__ import annotations
 
@@ -12,8 +13,9 @@ CELLS = 64
 
 def solid_cells() -> np.ndarray:
     """Cells (z, y, x), bool, that walls or furniture fill: 13 cm wide, on the unit cube of the store's box."""
-    from nerg_mi.maths.box import Box
     from nerg_mi.scenes.store import layout
+
+    from nerg_mi.maths.box import Box
 
     box = Box(*BOX)
     axis = (np.arange(CELLS) + 0.5) / CELLS
@@ -30,12 +32,12 @@ def write_standins(folder: Path) -> dict[str, str]:
     import mitsuba as mi
 
     from nerg_mi.field.backend import namespace
-    from nerg_mi.maths.box import Box
-    from nerg_mi.field.gaze.product import GazeConfig, GazeField
     from nerg_mi.field.encoding.hashgrid import HashGridConfig
+    from nerg_mi.field.gaze.product import GazeConfig, GazeField
     from nerg_mi.field.occupancy import OccupancyGrid
     from nerg_mi.field.radiance import RadianceConfig, RadianceField
     from nerg_mi.formats.fields import save_gaze, save_radiance
+    from nerg_mi.maths.box import Box
 
     ns, box = namespace(mi.variant()), Box(*BOX)
     grid = HashGridConfig(levels=4, log2_rows=12, base=4, finest=24)

@@ -12,7 +12,15 @@ def rays():
     rng = np.random.default_rng(0)
     origin = np.concatenate([rng.normal([1, 1, 1.6], 0.05, (900, 3)), rng.uniform([0, 0, 1.5], [4, 2, 1.7], (100, 3))])
     d = np.tile([1.0, 0, 0], (1000, 1))
-    return Rays(np.arange(1000) * 0.1, np.arange(1000) % 3, tuple("abc"), origin, d, np.ones(1000), origin + d * (6 - origin[:, :1]))
+    return Rays(
+        np.arange(1000) * 0.1,
+        np.arange(1000) % 3,
+        tuple("abc"),
+        origin,
+        d,
+        np.ones(1000),
+        origin + d * (6 - origin[:, :1]),
+    )
 
 
 def test_density_is_rays_a_square_metre(rays):

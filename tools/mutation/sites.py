@@ -13,21 +13,49 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 _SIGNS = {
-    ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
-    ast.Is: "is", ast.IsNot: "is not", ast.In: "in", ast.NotIn: "not in",
+    ast.Lt: "<",
+    ast.LtE: "<=",
+    ast.Gt: ">",
+    ast.GtE: ">=",
+    ast.Eq: "==",
+    ast.NotEq: "!=",
+    ast.Is: "is",
+    ast.IsNot: "is not",
+    ast.In: "in",
+    ast.NotIn: "not in",
 }
 _COMPARE = {"<": ">", "<=": ">=", "==": "!=", "is": "is not", "in": "not in"}
 _COMPARE |= {b: a for a, b in _COMPARE.items()}
 _BOUNDARY = {"<": "<=", "<=": "<", ">": ">=", ">=": ">"}
 _ARITHMETIC = {
-    ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"), ast.FloorDiv: ("//", "/"),
-    ast.Mod: ("%", "*"), ast.Pow: ("**", "*"), ast.BitAnd: ("&", "|"), ast.BitOr: ("|", "&"),
-    ast.LShift: ("<<", ">>"), ast.RShift: (">>", "<<"), ast.BitXor: ("^", "&"), ast.MatMult: ("@", "*"),
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Div: ("/", "*"),
+    ast.FloorDiv: ("//", "/"),
+    ast.Mod: ("%", "*"),
+    ast.Pow: ("**", "*"),
+    ast.BitAnd: ("&", "|"),
+    ast.BitOr: ("|", "&"),
+    ast.LShift: ("<<", ">>"),
+    ast.RShift: (">>", "<<"),
+    ast.BitXor: ("^", "&"),
+    ast.MatMult: ("@", "*"),
 }
 _TWINS = {
-    "min": "max", "minimum": "maximum", "fmin": "fmax", "argmin": "argmax", "any": "all", "nanmin": "nanmax",
-    "sin": "cos", "floor": "ceil", "cumsum": "cumprod", "zeros": "ones", "zeros_like": "ones_like",
-    "isfinite": "isnan", "left": "right",
+    "min": "max",
+    "minimum": "maximum",
+    "fmin": "fmax",
+    "argmin": "argmax",
+    "any": "all",
+    "nanmin": "nanmax",
+    "sin": "cos",
+    "floor": "ceil",
+    "cumsum": "cumprod",
+    "zeros": "ones",
+    "zeros_like": "ones_like",
+    "isfinite": "isnan",
+    "left": "right",
 }
 _TWINS |= {b: a for a, b in _TWINS.items()}
 _MATHS = {"dr", "np", "math", "mi", "numpy"}
@@ -35,10 +63,41 @@ _MATHS = {"dr", "np", "math", "mi", "numpy"}
 _SCHEDULING = {"eval", "schedule", "sync_thread", "make_opaque", "flush_malloc_cache"}
 # A call of these is no function of its first argument that could be left out, or only converts it.
 _MAKERS = {
-    "asarray", "array", "ascontiguousarray", "opaque",
-    "zeros", "ones", "full", "empty", "arange", "linspace", "eye", "width", "shape", "ndim", "array_t", "uint32_array_t",
-    "load_file", "load_dict", "traverse", "Log", "set_variant", "custom", "while_loop", "if_stmt", "scoped_set_flag",
-    "make_opaque", "eval", "sync_thread", "schedule", "enable_grad", "hint", "errstate", "random", "load", "save",
+    "asarray",
+    "array",
+    "ascontiguousarray",
+    "opaque",
+    "zeros",
+    "ones",
+    "full",
+    "empty",
+    "arange",
+    "linspace",
+    "eye",
+    "width",
+    "shape",
+    "ndim",
+    "array_t",
+    "uint32_array_t",
+    "load_file",
+    "load_dict",
+    "traverse",
+    "Log",
+    "set_variant",
+    "custom",
+    "while_loop",
+    "if_stmt",
+    "scoped_set_flag",
+    "make_opaque",
+    "eval",
+    "sync_thread",
+    "schedule",
+    "enable_grad",
+    "hint",
+    "errstate",
+    "random",
+    "load",
+    "save",
 }
 _UNTOUCHED_FUNCTIONS = {"__repr__", "__str__", "to_string", "name", "label"}
 _MESSAGE_CALLS = {"Log", "warn", "print", "log", "debug", "info", "echo"}
@@ -50,8 +109,8 @@ class Mutant:
     """One change: `before`, the source text of the node from byte `start` to `end`, becomes `after`.
 
     Named by its contents (`key`), so that changes elsewhere in the file leave its name as it is. `line`, `last`: the
-    lines of the node; `statement`: the first line of the statement around it; `called`: whether it lies in the body of a
-    function, and not in what runs once, when the file is imported.
+    lines of the node; `statement`: the first line of the statement around it; `called`: whether it lies in the body of
+    a function, and not in what runs once, when the file is imported.
     """
 
     file: str
@@ -109,7 +168,9 @@ class _Finder:
 
     def put(self, kind: str, node: ast.AST, replacement: str) -> None:
         if replacement != self.text(node):
-            self.found.append((".".join(self.scope) or "module", kind, node, replacement, self.statement, self.depth > 0))
+            self.found.append(
+                (".".join(self.scope) or "module", kind, node, replacement, self.statement, self.depth > 0)
+            )
 
     # -- statements ------------------------------------------------------------
 
@@ -217,8 +278,10 @@ class _Finder:
 
     def arithmetic(self, node: ast.BinOp) -> None:
         left, right = self.text(node.left), self.text(node.right)
-        if any(isinstance(side, (ast.List, ast.Tuple, ast.JoinedStr, ast.ListComp)) or _is_text(side)
-               for side in (node.left, node.right)):
+        if any(
+            isinstance(side, (ast.List, ast.Tuple, ast.JoinedStr, ast.ListComp)) or _is_text(side)
+            for side in (node.left, node.right)
+        ):
             return
         sign, swapped = _ARITHMETIC[type(node.op)]
         self.put("arithmetic", node, self.exchanged(node, node.left, node.right, sign, swapped))
@@ -242,7 +305,9 @@ class _Finder:
     def call(self, node: ast.Call) -> None:
         text, function = self.text, node.func
         name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
-        owner = function.value.id if isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name) else ""
+        owner = (
+            function.value.id if isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name) else ""
+        )
         if name in _TWINS:
             old = text(function)
             self.put("twin", function, old[: len(old) - len(name)] + _TWINS[name])
@@ -271,7 +336,8 @@ def _is_text(node: ast.expr) -> bool:
 
 
 def find(file: str, source: str) -> list[Mutant]:
-    """The mutants of the source text of `file`, in the order of the lines. A few of them may be no Python (`compiles`)."""
+    """The mutants of the source text of `file`, in the order of the lines. A few of them may be no Python
+    (`compiles`)."""
     finder = _Finder(source)
     finder.block(ast.parse(source).body)
     seen: Counter = Counter()

@@ -4,8 +4,8 @@
 
 runs in TREE, a copy of the repository, and answers each line of JSON on its input with one on its output. A request:
 `tests` (pytest's arguments), `limit` (seconds), `log` (a file for what the tests print), `record` (a file to write
-into which tests execute which lines, or null). An answer: `outcome` ("passed", "failed", "hang", "crash"), `by` (what failed
-first), `seconds`. A child in which a module of the project came from another place than TREE ends the worker.
+into which tests execute which lines, or null). An answer: `outcome` ("passed", "failed", "hang", "crash"), `by` (what
+failed first), `seconds`. A child in which a module of the project came from another place than TREE ends the worker.
 """
 
 from __future__ import annotations
@@ -27,9 +27,24 @@ _MEMORY = 12 << 30  # a mutant must not take the machine with it
 _TICK = 0.05
 
 _SHARED = (
-    "drjit", "drjit.nn", "drjit.opt", "mitsuba", "pytest", "hypothesis", "hypothesis.extra.pytestplugin", "matplotlib.pyplot", "rich.console",
-    "safetensors.numpy", "scipy.ndimage", "scipy.optimize", "scipy.spatial.transform", "scipy.special", "scipy.stats", "trimesh", "typer.testing",
-)  # fmt: skip
+    "drjit",
+    "drjit.nn",
+    "drjit.opt",
+    "mitsuba",
+    "pytest",
+    "hypothesis",
+    "hypothesis.extra.pytestplugin",
+    "matplotlib.pyplot",
+    "rich.console",
+    "safetensors.numpy",
+    "scipy.ndimage",
+    "scipy.optimize",
+    "scipy.spatial.transform",
+    "scipy.special",
+    "scipy.stats",
+    "trimesh",
+    "typer.testing",
+)
 """What tests and the code under test import, and mutants do not change."""
 
 
@@ -109,7 +124,9 @@ def run_tests(tree: Path, request: dict, answer: int) -> int:
     watch = Watch(tree, coverage)
     stop = [] if request.get("record") else ["-x"]
     quiet = ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of what is loaded already
-    status = pytest.main([*stop, *quiet, "-q", "-p", "no:cacheprovider", "--no-header", *request["tests"]], plugins=[watch])
+    status = pytest.main(
+        [*stop, *quiet, "-q", "-p", "no:cacheprovider", "--no-header", *request["tests"]], plugins=[watch]
+    )
     if coverage is not None:
         coverage.stop()
         Path(request["record"]).write_text(json.dumps({"tests": watch.tests, "lines": watch.lines()}))
@@ -171,7 +188,9 @@ def serve(tree: Path, requests, answers) -> None:
         else:
             told = json.loads(text)
             # A file that cannot be imported any more leaves pytest without the test that it was told to run.
-            outcome = {0: "passed", 1: "failed", 2: "failed", 5: "none"}.get(told["status"], "failed" if told["by"] else "error")
+            outcome = {0: "passed", 1: "failed", 2: "failed", 5: "none"}.get(
+                told["status"], "failed" if told["by"] else "error"
+            )
             answer = {"outcome": outcome, "by": told["by"]}
         print(json.dumps({**answer, "seconds": round(seconds, 2)}), file=answers, flush=True)
 

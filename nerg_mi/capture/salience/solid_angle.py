@@ -1,10 +1,12 @@
 """Solid angles of a picture's pixels, whatever the lens.
 
-A pixel covers the directions between those of its four corners: two spherical triangles, whose areas are exact (Van Oosterom
-& Strackee 1983). A pinhole's straight edges are great circles, so that its pixels' areas are exact too and those of all
-pixels sum to the frustum's; for other lenses the error falls with the square of the pixel's size. To first order this is
-the Jacobian dω/dA of the lens: cos³θ / f² for a pinhole (A in the image plane, focal length f, angle θ from the axis).
+A pixel covers the directions between those of its four corners: two spherical triangles, whose areas are exact (Van
+Oosterom & Strackee 1983). A pinhole's straight edges are great circles, so that its pixels' areas are exact too and
+those of all pixels sum to the frustum's; for other lenses the error falls with the square of the pixel's size. To first
+order this is the Jacobian dω/dA of the lens: cos³θ / f² for a pinhole (A in the image plane, focal length f, angle θ
+from the axis).
 """
+
 from __future__ import annotations
 
 from functools import lru_cache

@@ -1,16 +1,17 @@
 """A classical model of salience: the spectral residual of Hou & Zhang (CVPR 2007).
 
-What is salient is what a photo's spectrum does not share with others': the log amplitude less its local mean, with the phase
-kept, transformed back, squared and blurred. On scipy alone (a library with salience models, OpenCV's contributed modules,
-weighs 70 MB and replaces the cv2 of whoever has one). It looks for contrast and oddity, and knows nothing of people, faces or
-tasks: an example, not a measure of where people look.
+What is salient is what a photo's spectrum does not share with others': the log amplitude less its local mean, with the
+phase kept, transformed back, squared and blurred. On scipy alone (a library with salience models, OpenCV's contributed
+modules, weighs 70 MB and replaces the cv2 of whoever has one). It looks for contrast and oddity, and knows nothing of
+people, faces or tasks: an example, not a measure of where people look.
 """
+
 from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.capture.resize import area_average
+from nerg_mi.errors import NergError
 
 # The authors' scale of attention, and their blur in pixels at that width.
 WIDTH = 64
@@ -18,10 +19,11 @@ _SIGMA = 2.5
 
 
 def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
-    """Salience (h, w), float64, at most 1, of ``photo`` (H, W, 3) in 0..1, sRGB; computed and returned ``width`` pixels wide.
+    """Salience (h, w), float64, at most 1, of ``photo`` (H, W, 3) in 0..1, sRGB; computed and returned ``width`` pixels
+    wide.
 
-    As the authors' own script has it: grey, 3 x 3 mean of the log amplitude with repeated edges, Gaussian of 2.5 pixels. Raises
-    `NergError` for a photo of one colour, which has no salience.
+    As the authors' own script has it: grey, 3 x 3 mean of the log amplitude with repeated edges, Gaussian of 2.5
+    pixels. Raises `NergError` for a photo of one colour, which has no salience.
     """
     from scipy.fft import fft2, ifft2
     from scipy.ndimage import gaussian_filter, uniform_filter

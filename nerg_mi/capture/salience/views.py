@@ -1,9 +1,10 @@
 """Salience images of posed photos as densities over directions.
 
-A salience image says how the gaze of somebody at the camera's centre is shared among the pixels, and nothing about what lies
-outside the picture: with the share s_i of pixel i and its solid angle dω_i, the density there is s_i / dω_i / Σ s, in 1/sr,
-given that the picture is looked at.
+A salience image says how the gaze of somebody at the camera's centre is shared among the pixels, and nothing about what
+lies outside the picture: with the share s_i of pixel i and its solid angle dω_i, the density there is s_i / dω_i / Σ s,
+in 1/sr, given that the picture is looked at.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -11,16 +12,17 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.files.npy import read_npy
-from nerg_mi.capture.posed import Frame, inside
 from nerg_mi.capture import lens
 from nerg_mi.capture.cameras import Camera
+from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.capture.posed import Frame, inside
 from nerg_mi.capture.reading import open_bitmap, read_image, read_mask
 from nerg_mi.capture.resize import all_used, nearest, overlap
-from .solid_angle import pixel_solid_angles
 from nerg_mi.capture.sources import find_source, read_posed
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.files.npy import read_npy
+
+from .solid_angle import pixel_solid_angles
 from .spectral_residual import spectral_residual
 
 SUFFIXES = (".png", ".exr", ".npy")
@@ -35,8 +37,9 @@ _OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, eq=False)
 class SalienceView:
-    """What is looked at in one picture. ``camera``: its intrinsics are of the map's size; ``share`` (h, w): of the gaze,
-    summing to one; ``solid_angle`` (h, w): sr of the directions that are known, 0 where the lens or a mask shows none."""
+    """What is looked at in one picture. ``camera``: its intrinsics are of the map's size; ``share`` (h, w): of the
+    gaze, summing to one; ``solid_angle`` (h, w): sr of the directions that are known, 0 where the lens or a mask shows
+    none."""
 
     name: str
     camera: Camera
@@ -55,7 +58,8 @@ class SalienceView:
         return np.where(known, self.share / np.where(known, self.solid_angle, 1), 0)
 
     def reduced(self, pixels: int) -> SalienceView:
-        """The same on at most ``pixels`` pixels, each of which has the gaze and the solid angle of those that it covers."""
+        """The same on at most ``pixels`` pixels, each of which has the gaze and the solid angle of those that it
+        covers."""
         h, w = self.share.shape
         if h * w <= pixels:
             return self
@@ -68,9 +72,9 @@ class SalienceView:
         return SalienceView(self.name, camera, share / share.sum(), total(self.solid_angle))
 
     def draw(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """``count`` directions that each stand for as much of the view's extent: (count, 3) unit, in the world, at random
-        within the pixels (count,), flat indices, that are drawn by their solid angle (systematically: each as often as is its
-        due, rounded up or down)."""
+        """``count`` directions that each stand for as much of the view's extent: (count, 3) unit, in the world, at
+        random within the pixels (count,), flat indices, that are drawn by their solid angle (systematically: each as
+        often as is its due, rounded up or down)."""
         steps = np.cumsum(self.solid_angle.ravel(), dtype=np.float64)
         which = np.searchsorted(steps, (np.arange(count) + rng.random()) * (steps[-1] / count), side="right")
         which = np.minimum(which, np.flatnonzero(self.solid_angle.ravel())[-1])
@@ -91,8 +95,8 @@ class SalienceView:
 
 @dataclass(frozen=True)
 class SalienceSet:
-    """``views``; ``missing``: names of the frames without an image; ``stray``: files that belong to no frame; ``unused``:
-    sentences on frames that the posed set itself cannot use; ``about``: for provenance (JSON)."""
+    """``views``; ``missing``: names of the frames without an image; ``stray``: files that belong to no frame;
+    ``unused``: sentences on frames that the posed set itself cannot use; ``about``: for provenance (JSON)."""
 
     views: list[SalienceView]
     missing: list[str]
@@ -101,16 +105,24 @@ class SalienceSet:
     about: dict = field(default_factory=dict)
 
 
-def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", align: np.ndarray | None = None,
-                  trained: dict | None = None, allow_outside: bool = False) -> SalienceSet:
+def open_salience(
+    dataset: str | Path,
+    source: str | Path,
+    per: str = "pixel",
+    align: np.ndarray | None = None,
+    trained: dict | None = None,
+    allow_outside: bool = False,
+) -> SalienceSet:
     """The salience images of a posed image set ``dataset`` (as `sources.find_source` knows them).
 
-    ``source``: a folder with one .png, .exr or .npy a frame, called as the photo is but for the suffix, or the name of a model
-    (``MODELS``), which makes them from the photos. ``per``: what the images' values are proportional to: gaze a ``pixel``, as
-    models have it that predict where in a picture is looked, or a ``steradian``, as a rendered density has it. ``align``:
-    (4, 4) similarity from the set's coordinates to those wanted; by default they stay, or become those of a radiance field that
-    was trained on this very file, of which ``trained`` is the provenance. Masks of the frames hide what is not known.
-    ``allow_outside``: read files outside of the set's folder, and of that of the images, too, to which names and links may lead.
+    ``source``: a folder with one .png, .exr or .npy a frame, called as the photo is but for the suffix, or the name of
+    a model (``MODELS``), which makes them from the photos. ``per``: what the images' values are proportional to: gaze a
+    ``pixel``, as models have it that predict where in a picture is looked, or a ``steradian``, as a rendered density
+    has it. ``align``: (4, 4) similarity from the set's coordinates to those wanted; by default they stay, or become
+    those of a radiance field that was trained on this very file, of which ``trained`` is the provenance. Masks of the
+    frames hide what is not known.
+    ``allow_outside``: read files outside of the set's folder, and of that of the images, too, to which names and links
+    may lead.
 
     Raises `NergError`, naming the file, for an image that is none, and when no frame has one.
     """
@@ -129,12 +141,18 @@ def open_salience(dataset: str | Path, source: str | Path, per: str = "pixel", a
     views = [_view(f, files[f.name], model, per) for f in posed.frames if f.name in files]
     missing = [f.name for f in posed.frames if f.name not in files]
     if not views:
-        raise NergError(f'no image in "{source}" is called as one of the {len(posed.frames)} frames of "{posed.path}" is; '
-                         f'the first of these would be "{Path(posed.frames[0].name).stem}" with {", ".join(SUFFIXES)}')
+        raise NergError(
+            f'no image in "{source}" is called as one of the {len(posed.frames)} frames of "{posed.path}" is; '
+            f'the first of these would be "{Path(posed.frames[0].name).stem}" with {", ".join(SUFFIXES)}'
+        )
     about = {
-        "views": posed.path.name, "sha256": posed.sha256, "salience": str(source) if model else Path(source).resolve().name,
-        "per": per, "used": len(views), "missing": len(missing),
-    }  # fmt: skip
+        "views": posed.path.name,
+        "sha256": posed.sha256,
+        "salience": str(source) if model else Path(source).resolve().name,
+        "per": per,
+        "used": len(views),
+        "missing": len(missing),
+    }
     return SalienceSet(views, missing, stray, [str(u) for u in posed.unused], about)
 
 
@@ -153,12 +171,21 @@ def read_salience(path: str | Path) -> np.ndarray:
         if not all(np.array_equal(out[..., 0], out[..., k], equal_nan=True) for k in range(1, out.shape[2])):
             raise NergError(f'the salience image "{path}" is in colours; give the grey map itself, not a picture of it')
         out = out[..., 0]
-    if out.ndim != 2 or not out.size or not (np.issubdtype(out.dtype, np.number) or out.dtype == bool) or np.iscomplexobj(out):
-        raise NergError(f'the salience image "{path}" must hold one number a pixel, got shape {out.shape} of {out.dtype}')
+    if (
+        out.ndim != 2
+        or not out.size
+        or not (np.issubdtype(out.dtype, np.number) or out.dtype == bool)
+        or np.iscomplexobj(out)
+    ):
+        raise NergError(
+            f'the salience image "{path}" must hold one number a pixel, got shape {out.shape} of {out.dtype}'
+        )
     out = out.astype(np.float64)
     if not np.all(np.isfinite(out)):
-        raise NergError(f'the salience image "{path}" holds {np.sum(~np.isfinite(out))} values that are not finite; '
-                         "leave it out, or make it again")
+        raise NergError(
+            f'the salience image "{path}" holds {np.sum(~np.isfinite(out))} values that are not finite; '
+            "leave it out, or make it again"
+        )
     if (out < 0).any():
         raise NergError(f'the salience image "{path}" holds negative values; of log densities give the exponential')
     if not out.any():
@@ -171,19 +198,24 @@ def _stored(path: Path) -> np.ndarray:
 
     bitmap = open_bitmap(path, "salience image")
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel and bitmap.channel_count() != 1:
-        raise NergError(f'the salience image "{path}" has {bitmap.channel_count()} channels and not one; save it with one')
+        raise NergError(
+            f'the salience image "{path}" has {bitmap.channel_count()} channels and not one; save it with one'
+        )
     return np.array(bitmap)
 
 
 def _files(folder: Path, frames: list[Frame], allow_outside: bool) -> tuple[dict[str, Path], list[str]]:
     """The file of each frame that has one, and names of the others."""
     if not folder.is_dir():
-        raise MissingFile(f'there is no folder "{folder}" of salience images; '
-                                f'give one, or a model: {", ".join(MODELS)}')
+        raise MissingFile(
+            f'there is no folder "{folder}" of salience images; give one, or a model: {", ".join(MODELS)}'
+        )
     found: dict[str, Path] = {}
     for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES):
         if path.stem in found:
-            raise NergError(f'"{found[path.stem].name}" and "{path.name}" in "{folder}" are of the same frame; keep one')
+            raise NergError(
+                f'"{found[path.stem].name}" and "{path.name}" in "{folder}" are of the same frame; keep one'
+            )
         found[path.stem] = path
     out, owner = {}, {}
     for frame in frames:
@@ -191,8 +223,10 @@ def _files(folder: Path, frames: list[Frame], allow_outside: bool) -> tuple[dict
         if stem not in found:
             continue
         if stem in owner:
-            raise NergError(f'the salience image "{found[stem]}" could be of "{owner[stem]}" or of "{frame.name}"; '
-                             "give the photos different names")
+            raise NergError(
+                f'the salience image "{found[stem]}" could be of "{owner[stem]}" or of "{frame.name}"; '
+                "give the photos different names"
+            )
         path = found[stem]
         out[frame.name], owner[stem] = path if allow_outside else inside(folder, path, "salience image"), frame.name
     return out, [p.name for stem, p in found.items() if stem not in owner]
@@ -212,16 +246,20 @@ def _view(frame: Frame, path: Path | None, model, per: str) -> SalienceView:
     h, w = values.shape
     # A map may be a pixel off where its size was rounded.
     if abs(h - w * size[1] / size[0]) > max(1.0, _SHAPE * h):
-        raise NergError(f"{what} has {w} x {h} pixels, which is not the shape of its photo, {size[0]} x {size[1]}; "
-                         "bring it to that shape")
+        raise NergError(
+            f"{what} has {w} x {h} pixels, which is not the shape of its photo, {size[0]} x {size[1]}; "
+            "bring it to that shape"
+        )
     intrinsics = frame.intrinsics(*size).resized(w, h)
     solid = pixel_solid_angles(intrinsics)
     if frame.mask is not None:
         solid = np.where(_unmasked(frame, size, intrinsics), solid, 0)
     share = np.where(solid > 0, values, 0) if per == "pixel" else values * solid
     if not share.sum() > 0:
-        raise NergError(f"{what} is zero wherever the lens and the mask of its frame show anything; "
-                         "leave it out, or correct the mask")
+        raise NergError(
+            f"{what} is zero wherever the lens and the mask of its frame show anything; "
+            "leave it out, or correct the mask"
+        )
     view = SalienceView(frame.name, Camera(intrinsics, frame.to_world), share / share.sum(), solid).reduced(_KEPT)
     return SalienceView(view.name, view.camera, view.share.astype(np.float32), view.solid_angle.astype(np.float32))
 

@@ -4,6 +4,7 @@ A probe p holds a run of ray directions μ_i with weights w_i that sum to one,
 and one concentration: p(x) = Σ_i w_i f(x; μ_i, κ_p), f von Mises-Fisher (NeRG,
 Section 5.1). It integrates to one over the sphere whatever κ is.
 """
+
 from __future__ import annotations
 
 import math
@@ -16,7 +17,6 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.maths.vmf import log_normaliser
-
 
 GROUP = 16
 """Directions that a lane of `SphericalKde.evaluate` takes at once."""
@@ -51,8 +51,17 @@ class SphericalKde:
     ) -> None:
         rays, offsets = np.asarray(rays, dtype=np.float64), np.asarray(offsets, dtype=np.int64)
         counts = np.diff(offsets)
-        if rays.ndim != 2 or rays.shape[1] != 3 or offsets.ndim != 1 or len(counts) == 0 or offsets[0] != 0 or offsets[-1] != len(rays):
-            raise ValueError(f"rays {rays.shape} and offsets {offsets.shape} do not fit: offsets run from 0 to the number of rays")
+        if (
+            rays.ndim != 2
+            or rays.shape[1] != 3
+            or offsets.ndim != 1
+            or len(counts) == 0
+            or offsets[0] != 0
+            or offsets[-1] != len(rays)
+        ):
+            raise ValueError(
+                f"rays {rays.shape} and offsets {offsets.shape} do not fit: offsets run from 0 to the number of rays"
+            )
         if counts.min() < 1:
             raise NergError(f"probe {int(np.argmin(counts))} has no ray; raise min_rays")
         kappa = np.broadcast_to(np.asarray(kappa, dtype=np.float64), counts.shape)
@@ -82,7 +91,9 @@ class SphericalKde:
             return self
         offsets = np.array(self._offsets)[first : last + 1].astype(np.int64)
         packed = np.array(self._rays).reshape(-1, 4)[offsets[0] : offsets[-1]]
-        return SphericalKde(packed[:, :3], offsets - offsets[0], np.array(self._kappa)[first:last], packed[:, 3], self.ns)
+        return SphericalKde(
+            packed[:, :3], offsets - offsets[0], np.array(self._kappa)[first:last], packed[:, 3], self.ns
+        )
 
     def density(self, probe, direction):
         """Density of probe ``probe`` (UInt32, M lanes) in ``direction``
@@ -115,11 +126,14 @@ class SphericalKde:
         ``directions``: (D, 3), the same for all, or (P, D, 3), each its own.
         """
         directions = np.asarray(directions, dtype=np.float32)
-        if directions.shape[-1:] != (3,) or directions.ndim not in (2, 3) or (
-            directions.ndim == 3 and len(directions) != self.count
+        if (
+            directions.shape[-1:] != (3,)
+            or directions.ndim not in (2, 3)
+            or (directions.ndim == 3 and len(directions) != self.count)
         ):
             raise ValueError(f"directions have shape {directions.shape}, expected (D, 3) or ({self.count}, D, 3)")
-        # A lane takes several directions of one probe, so that a ray is fetched once for all of them: four times as fast.
+        # A lane takes several directions of one probe, so that a ray is fetched once for all of them: four times as
+        # fast.
         D = directions.shape[-2]
         G = min(GROUP, D)
         groups = -(-D // G)

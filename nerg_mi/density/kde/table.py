@@ -1,9 +1,10 @@
 """One kernel density on a table over the sphere: as good as exact for pictures, and for any number of directions.
 
 A density of kernels is smooth on the scale 1/sqrt(κ). So it is evaluated exactly at the texels of a cube map whose
-spacing is a fraction of that, and in between by cubic interpolation: a lookup costs sixteen values, however many rays the
-probe holds.
+spacing is a fraction of that, and in between by cubic interpolation: a lookup costs sixteen values, however many rays
+the probe holds.
 """
+
 from __future__ import annotations
 
 import math
@@ -14,8 +15,8 @@ import numpy as np
 from .estimate import SphericalKde
 
 SPACING = 0.15
-"""Texels' distance in units of 1/sqrt(κ). The error of the cubic interpolation goes with its fourth power; at 0.15 it is
-below 1e-4 of the highest density that the kernel of one ray reaches (measured in the tests)."""
+"""Texels' distance in units of 1/sqrt(κ). The error of the cubic interpolation goes with its fourth power; at 0.15 it
+is below 1e-4 of the highest density that the kernel of one ray reaches (measured in the tests)."""
 _PAD = 2  # texels that a face has beyond its edge, so that the interpolation never crosses from one face to another
 _MOST = 4096
 
@@ -23,17 +24,21 @@ _MOST = 4096
 class SphericalKdeTable:
     """The density of probe ``probe`` of ``kde``, tabulated.
 
-    ``used`` (N, 3): the directions that will be asked for, where they are known; other texels are then not evaluated, and
-    lookups there are wrong. A face of the cube is divided in equal angles, u = (4/π) atan(x/z). Raises ``ValueError`` for
-    a concentration whose texels would be too many (above about 1.5e5).
+    ``used`` (N, 3): the directions that will be asked for, where they are known; other texels are then not evaluated,
+    and lookups there are wrong. A face of the cube is divided in equal angles, u = (4/π) atan(x/z). Raises
+    ``ValueError`` for a concentration whose texels would be too many (above about 1.5e5).
     """
 
-    def __init__(self, kde: SphericalKde, probe: int = 0, used: np.ndarray | None = None, spacing: float = SPACING) -> None:
+    def __init__(
+        self, kde: SphericalKde, probe: int = 0, used: np.ndarray | None = None, spacing: float = SPACING
+    ) -> None:
         self.ns = ns = kde.ns
         kappa = float(np.array(kde._kappa)[probe])
         self.n = n = _texels(kappa, spacing)
         if n > _MOST:
-            raise ValueError(f"κ = {kappa:.3g} needs {6 * n * n:,} texels; evaluate the density directly (SphericalKde.evaluate)")
+            raise ValueError(
+                f"κ = {kappa:.3g} needs {6 * n * n:,} texels; evaluate the density directly (SphericalKde.evaluate)"
+            )
         self.width = n + 2 * _PAD
         wanted = np.ones((6, self.width, self.width), bool) if used is None else self._touched(used)
         at = np.flatnonzero(wanted.ravel())

@@ -1,30 +1,42 @@
-"""The kernel density of tracked rays as an observer's view: the ground truth beside a gaze field, inside the integrator.
+"""The kernel density of tracked rays as an observer's view: the ground truth beside a gaze field, inside the
+integrator.
 
-An observer's density is that of the rays that started nearest (NeRG, Section 5.3, and the baseline of ``nerg eval gaze``). It
-is gathered once an observer, and summed at every pixel or tabulated (:mod:`nerg_mi.density.kde.table`).
+An observer's density is that of the rays that started nearest (NeRG, Section 5.3, and the baseline of
+``nerg eval gaze``). It is gathered once an observer, and summed at every pixel or tabulated
+(:mod:`nerg_mi.density.kde.table`).
 """
+
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.observer.ensemble import keep_or_make
+from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.media.media import Similarity, at_nearest
+from nerg_mi.transport.observer.ensemble import keep_or_make
+
 from .estimate import SphericalKde
 from .frame import WORTH
 from .table import SphericalKdeTable
-from nerg_mi.rays.rays import Rays
 
 
 class KdeView:
-    """``rays`` around observers in the scene. ``count``: how many of the nearest; ``kappa``: of their kernels; ``to_world``: from
-    the rays' frame to the scene's; ``backend``: as of ``SphericalKde``. What is hidden from the observer fades, as gaze does.
+    """``rays`` around observers in the scene. ``count``: how many of the nearest; ``kappa``: of their kernels;
+    ``to_world``: from the rays' frame to the scene's; ``backend``: as of ``SphericalKde``. What is hidden from the
+    observer fades, as gaze does.
     """
 
     occluded = True
 
-    def __init__(self, rays: Rays, count: int = 4096, kappa: float = 20.0, to_world: Similarity | None = None, backend: object = None):
+    def __init__(
+        self,
+        rays: Rays,
+        count: int = 4096,
+        kappa: float = 20.0,
+        to_world: Similarity | None = None,
+        backend: object = None,
+    ):
         if len(rays) == 0:
             raise NergError("there are no rays to show the density of")
         self.to_world, self.backend = to_world or Similarity(), backend
@@ -43,9 +55,11 @@ class KdeView:
         self._known = keep_or_make(self._known, observers, lambda p_o: _Density(self, p_o))
 
     def value(self, p_o, r_o):
-        """Density (1/sr) in direction ``r_o``, unit, of the observer that is faced nearest to ``p_o``, lane by lane; without derivatives.
+        """Density (1/sr) in direction ``r_o``, unit, of the observer that is faced nearest to ``p_o``, lane by lane;
+        without derivatives.
 
-        ``kde_frame.WORTH`` directions or more are looked up in a table, where that costs less; fewer are summed exactly.
+        ``kde_frame.WORTH`` directions or more are looked up in a table, where that costs less; fewer are summed
+        exactly.
         """
         d = self.to_world.direction_to_local(dr.detach(r_o))
         return at_nearest(self._known, p_o, lambda known: known.density(d))

@@ -4,9 +4,10 @@ Each baseline is a function ``(positions (P, 3), directions) -> (P, D)`` of
 densities in 1/sr that integrate to one; ``directions`` is (D, 3) for all
 positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.density.kde.estimate`.
 """
+
 from __future__ import annotations
 
-from typing import Callable
+from collections.abc import Callable
 
 import numpy as np
 
@@ -63,7 +64,10 @@ def nearest_probes(probes: Probes, k: int = 16, *, backend: object = None) -> Ba
             used, back = np.unique(found, return_inverse=True)
             density = _of(probes, rays, used, backend).evaluate(directions)
             return _mean_rows(density, back.reshape(found.shape))
-        density = [_of(probes, rays, near, backend).evaluate(d).mean(axis=0, dtype=np.float64) for near, d in zip(found, directions)]
+        density = [
+            _of(probes, rays, near, backend).evaluate(d).mean(axis=0, dtype=np.float64)
+            for near, d in zip(found, directions)
+        ]
         return np.stack(density)
 
     return evaluate
@@ -92,15 +96,21 @@ def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: obj
 def standard_baselines(
     rays: Rays, radius: float, kappa: float = 20.0, blind_kappa: float = 50.0, seed: int = 0, count: int = 2048
 ) -> tuple[Baseline, dict[str, Baseline]]:
-    """``(blind, baselines)``: the density that information is counted from, and by name all that a gaze field is shown beside:
-    uniform, position-blind, nearest probes and nearest rays of the training ``rays``, with kernels of ``kappa``."""
-    probes = place_probes(rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed)
+    """``(blind, baselines)``: the density that information is counted from, and by name all that a gaze field is shown
+    beside: uniform, position-blind, nearest probes and nearest rays of the training ``rays``, with kernels of
+    ``kappa``."""
+    probes = place_probes(
+        rays, radius, count=count, min_rays=min(64, len(rays)), kappa_rule="fixed", kappa=kappa, seed=seed
+    )
     blind = position_blind(rays, kappa=blind_kappa)
     return blind, {
-        "uniform": uniform(), "position-blind": position_blind(rays, kappa=kappa), f"position-blind, kappa {blind_kappa:g}": blind,
-        "nearest probe": nearest_probes(probes, 1), "16 nearest probes": nearest_probes(probes, 16),
+        "uniform": uniform(),
+        "position-blind": position_blind(rays, kappa=kappa),
+        f"position-blind, kappa {blind_kappa:g}": blind,
+        "nearest probe": nearest_probes(probes, 1),
+        "16 nearest probes": nearest_probes(probes, 16),
         "4,096 nearest rays": nearest_rays(rays, 4096, kappa=kappa),
-    }  # fmt: skip
+    }
 
 
 def _of(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: object) -> SphericalKde:

@@ -1,38 +1,42 @@
 """A gaze field at positions, and of people, that it was not trained on, beside what needs no field.
 
-Truth at a test position is the kernel density of the rays within R of it. Maps are compared over directions of equal area,
-rays one by one as they are. What is uncertain is which people came: intervals are a bootstrap over persons, who are drawn
-whole, with all of their rays (Efron & Tibshirani 1993).
+Truth at a test position is the kernel density of the rays within R of it. Maps are compared over directions of equal
+area, rays one by one as they are. What is uncertain is which people came: intervals are a bootstrap over persons, who
+are drawn whole, with all of their rays (Efron & Tibshirani 1993).
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.density.probes import place_probes
-from nerg_mi.rays.rays import Rays
 from nerg_mi.density.kde.estimate import SphericalKde
-from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.rays.splits import purge, split_by_person
+from nerg_mi.density.probes import place_probes
+from nerg_mi.errors import NergError
 from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.splits import purge, split_by_person
+
 from .baselines import Baseline
 from .scores import EPS
 
 SPLITS = ("both", "pos", "people")
 MAPS, RAYS = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
 SCORES = MAPS + RAYS
-"""KLD in nats and CC, SIM of densities normalised over the sphere; MAE in 1/sr of densities as they are; NSS; AUC-Judd; sAUC
-against rays of other test positions; bits a ray beyond the blind density; mean log density (nats of 1/sr) of a ray."""
+"""KLD in nats and CC, SIM of densities normalised over the sphere; MAE in 1/sr of densities as they are; NSS; AUC-Judd;
+sAUC against rays of other test positions; bits a ray beyond the blind density; mean log density (nats of 1/sr) of a
+ray."""
 _PER_POSITION = 128
 
 
 @dataclass(frozen=True, eq=False)
 class GazeTest:
-    """``centres`` (P, 3), where ``rays`` (of the test) are scored within ``radius``; ``truth`` (P, D) in ``directions`` (D, 3);
-    ``parts`` (P, N, D) densities of each of the N ``persons`` alone and ``counts`` (P, N), their rays; ``at`` (P, K, 3), rays drawn
-    from each position and ``who`` (P, K) they are of (indices of ``persons``); ``others`` (P, K, 3), rays drawn at the other ones."""
+    """``centres`` (P, 3), where ``rays`` (of the test) are scored within ``radius``; ``truth`` (P, D) in ``directions``
+    (D, 3); ``parts`` (P, N, D) densities of each of the N ``persons`` alone and ``counts`` (P, N), their rays; ``at``
+    (P, K, 3), rays drawn from each position and ``who`` (P, K) they are of (indices of ``persons``); ``others`` (P, K,
+    3), rays drawn at the other ones."""
 
     centres: np.ndarray
     directions: np.ndarray
@@ -48,8 +52,8 @@ class GazeTest:
 def held_out_rays(rays: Rays, account: dict, split: str = "both", seed: int = 0) -> tuple[Rays, Rays, np.ndarray]:
     """``(training rays, test rays, test centres)`` of a checkpoint's ``account`` of what it held out (``hold_out``).
 
-    ``split``: ``both``: positions and people that are new; ``pos``: people who were trained on, at new positions; ``people``:
-    new people where others were trained on. Raises ``NergError`` where nobody was held out.
+    ``split``: ``both``: positions and people that are new; ``pos``: people who were trained on, at new positions;
+    ``people``: new people where others were trained on. Raises ``NergError`` where nobody was held out.
     """
     if split not in SPLITS:
         raise NergError(f'the split must be one of {", ".join(SPLITS)}, got "{split}"')
@@ -57,7 +61,9 @@ def held_out_rays(rays: Rays, account: dict, split: str = "both", seed: int = 0)
     if account.get("people"):
         unseen = split_by_person(rays, test_persons=account["people"])[1]
     elif split != "pos":
-        raise NergError(f'no people were held out of this training, so that there is no split "{split}"; train with --test-people')
+        raise NergError(
+            f'no people were held out of this training, so that there is no split "{split}"; train with --test-people'
+        )
     away = purge(rays, centres, account["purged_within"])
     train = rays.select(~unseen & away)
     if split == "people":
@@ -66,15 +72,26 @@ def held_out_rays(rays: Rays, account: dict, split: str = "both", seed: int = 0)
     return train, rays.select(unseen if split == "both" else ~unseen), centres
 
 
-def make_test(rays: Rays, centres: np.ndarray, radius: float, kappa: float = 20.0, directions: int = 2048, min_rays: int = 64,
-              cap: int = 1024, seed: int = 0) -> GazeTest:
-    """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, with a kernel of ``kappa``.
+def make_test(
+    rays: Rays,
+    centres: np.ndarray,
+    radius: float,
+    kappa: float = 20.0,
+    directions: int = 2048,
+    min_rays: int = 64,
+    cap: int = 1024,
+    seed: int = 0,
+) -> GazeTest:
+    """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, with a kernel of
+    ``kappa``.
 
     Raises ``NergError`` where none has."""
     enough = _enough(rays, centres, radius, min_rays)
     if not enough.any():
         raise NergError(f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; lower min_rays")
-    probes = place_probes(rays, radius, queries=centres[enough], cap=cap, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query")
+    probes = place_probes(
+        rays, radius, queries=centres[enough], cap=cap, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
+    )
     d, rng = fibonacci_directions(directions), np.random.default_rng(seed)
     person = rays.person[probes.indices]
     present = np.unique(person)
@@ -93,10 +110,17 @@ def make_test(rays: Rays, centres: np.ndarray, radius: float, kappa: float = 20.
     # From farther away than 2R where there is such a position, so that no ray is on both sides.
     apart = np.linalg.norm(probes.queries[:, None] - probes.queries[None], axis=2)
     far = [np.flatnonzero(row > 2 * radius) if (row > 2 * radius).any() else np.flatnonzero(row > 0) for row in apart]
-    others = np.stack([at[rng.choice(f, _PER_POSITION), rng.integers(0, _PER_POSITION, _PER_POSITION)] if len(f) else at[i] for i, f in enumerate(far)])
+    others = np.stack(
+        [
+            at[rng.choice(f, _PER_POSITION), rng.integers(0, _PER_POSITION, _PER_POSITION)] if len(f) else at[i]
+            for i, f in enumerate(far)
+        ]
+    )
     truth = np.einsum("pn,pnd->pd", counts / counts.sum(axis=1, keepdims=True), parts)
     names = tuple(rays.persons[i] for i in present)
-    return GazeTest(centres[enough], d, truth, parts, counts, names, at, np.searchsorted(present, person[which]), others)
+    return GazeTest(
+        centres[enough], d, truth, parts, counts, names, at, np.searchsorted(present, person[which]), others
+    )
 
 
 def _enough(rays: Rays, centres: np.ndarray, radius: float, min_rays: int) -> np.ndarray:
@@ -106,18 +130,24 @@ def _enough(rays: Rays, centres: np.ndarray, radius: float, min_rays: int) -> np
     return cKDTree(rays.origin).query_ball_point(centres, radius, return_length=True) >= min_rays
 
 
-def evaluate_gaze(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, resamples: int = 200, seed: int = 0) -> list[dict]:
-    """One row a method: the scores of ``SCORES``, each with ``.low`` and ``.high`` of its 95 % interval, and the integral.
+def evaluate_gaze(
+    test: GazeTest, methods: dict[str, Baseline], blind: Baseline, resamples: int = 200, seed: int = 0
+) -> list[dict]:
+    """One row a method: the scores of ``SCORES``, each with ``.low`` and ``.high`` of its 95 % interval, and the
+    integral.
 
-    ``blind``: the density that bits are counted from. An interval is 1.96 standard errors of the bootstrap either way; not
-    its quantiles, since the truth of a resample has fewer persons and narrower peaks, which every map meets worse. The
-    resamples are the same for all methods: the last method is the bar, and of the first one the row has ``.less``, how much
-    it is above the bar, with ``.less.low`` and ``.less.high``. With fewer than three persons there are no intervals.
+    ``blind``: the density that bits are counted from. An interval is 1.96 standard errors of the bootstrap either way;
+    not its quantiles, since the truth of a resample has fewer persons and narrower peaks, which every map meets worse.
+    The resamples are the same for all methods: the last method is the bar, and of the first one the row has ``.less``,
+    how much it is above the bar, with ``.less.low`` and ``.less.high``. With fewer than three persons there are no
+    intervals.
     """
     rng, N = np.random.default_rng(seed), len(test.persons)
     found = _answers(test, methods, blind)
-    rows = [{"method": name, **map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
-            for name, maps, values in found]
+    rows = [
+        {"method": name, **map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
+        for name, maps, values in found
+    ]
     boot = [[] for _ in found]
     for _ in range(resamples if N >= 3 else 0):
         times = rng.multinomial(N, np.full(N, 1 / N))
@@ -126,7 +156,12 @@ def evaluate_gaze(test: GazeTest, methods: dict[str, Baseline], blind: Baseline,
         share = share[there] / share[there].sum(axis=1, keepdims=True)
         truth, weight = np.einsum("pn,pnd->pd", share, test.parts[there]), times[test.who].astype(float)
         for kept, (_, maps, values) in zip(boot, found):
-            kept.append({**map_scores(truth, maps[there]), **{k: float((v * weight).sum() / weight.sum()) for k, v in values.items()}})
+            kept.append(
+                {
+                    **map_scores(truth, maps[there]),
+                    **{k: float((v * weight).sum() / weight.sum()) for k, v in values.items()},
+                }
+            )
     for row, kept, (_, maps, _) in zip(rows, boot, found):
         for k in SCORES if kept else ():
             reach = 1.96 * np.std([b[k] for b in kept])
@@ -155,7 +190,8 @@ def _answers(test: GazeTest, methods: dict, blind: Baseline) -> list[tuple]:
 
 
 def person_rows(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, min_rays: int = 64) -> list[dict]:
-    """One row a method and person: the person's rays, scored; map scores at positions where the person has ``min_rays`` rays."""
+    """One row a method and person: the person's rays, scored; map scores at positions where the person has ``min_rays``
+    rays."""
     rows = []
     for name, maps, values in _answers(test, methods, blind):
         for i, person in enumerate(test.persons):
@@ -166,9 +202,17 @@ def person_rows(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, m
     return rows
 
 
-def split_half(test_side: Rays, centres: np.ndarray, radius: float, kappa: float, blind: Baseline, min_rays: int = 64, seed: int = 0) -> dict | None:
-    """Scores of one half of the people at the other's expense, where both have ``min_rays`` rays: a reference and no bound.
-    None where there is no such position, or only one person."""
+def split_half(
+    test_side: Rays,
+    centres: np.ndarray,
+    radius: float,
+    kappa: float,
+    blind: Baseline,
+    min_rays: int = 64,
+    seed: int = 0,
+) -> dict | None:
+    """Scores of one half of the people at the other's expense, where both have ``min_rays`` rays: a reference and no
+    bound. None where there is no such position, or only one person."""
     if len(np.unique(test_side.person)) < 2:
         return None
     halves = [test_side.select(mask) for mask in split_by_person(test_side, seed=seed)]
@@ -176,7 +220,9 @@ def split_half(test_side: Rays, centres: np.ndarray, radius: float, kappa: float
     if not both.any():
         return None
     first = make_test(halves[0], centres[both], radius, kappa, min_rays=min_rays)
-    probes = place_probes(halves[1], radius, queries=first.centres, cap=1024, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query")
+    probes = place_probes(
+        halves[1], radius, queries=first.centres, cap=1024, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
+    )
     predicted = lambda positions, directions: probes.density(directions)
     row = evaluate_gaze(first, {"split half": predicted}, blind, resamples=0)[0]
     return {k: v for k, v in row.items() if "." not in k}
@@ -184,21 +230,32 @@ def split_half(test_side: Rays, centres: np.ndarray, radius: float, kappa: float
 
 def map_scores(truth: np.ndarray, maps: np.ndarray) -> dict[str, float]:
     """Means over positions of the scores of ``MAPS``."""
-    return {"KLD": float(metrics.kld(truth, maps, eps=EPS).mean()), "CC": float(metrics.cc(truth, maps).mean()),
-            "SIM": float(metrics.sim(truth, maps).mean()), "MAE": float(metrics.mae(truth, maps).mean())}
+    return {
+        "KLD": float(metrics.kld(truth, maps, eps=EPS).mean()),
+        "CC": float(metrics.cc(truth, maps).mean()),
+        "SIM": float(metrics.sim(truth, maps).mean()),
+        "MAE": float(metrics.mae(truth, maps).mean()),
+    }
 
 
 def ray_scores(maps: np.ndarray, at: np.ndarray, others: np.ndarray, log_blind: np.ndarray) -> dict[str, np.ndarray]:
-    """The scores of ``RAYS`` of each ray, (P, K), from the densities ``maps`` (P, D), at the rays ``at`` (P, K), and at rays
-    that were seen from elsewhere, ``others`` (P, M). AUC of a ray: the share of the sphere whose density is lower, ties half;
-    their mean is AUC-Judd with as many thresholds as there are values."""
+    """The scores of ``RAYS`` of each ray, (P, K), from the densities ``maps`` (P, D), at the rays ``at`` (P, K), and at
+    rays that were seen from elsewhere, ``others`` (P, M). AUC of a ray: the share of the sphere whose density is lower,
+    ties half; their mean is AUC-Judd with as many thresholds as there are values."""
     log = _log(at, maps)
     below = lambda among: np.stack([_share_below(a, g) for a, g in zip(among, at)])
-    return {"NSS": metrics.nss(maps, at), "AUC": below(maps), "sAUC": below(others), "bits": (log - log_blind) / np.log(2), "loglik": log}
+    return {
+        "NSS": metrics.nss(maps, at),
+        "AUC": below(maps),
+        "sAUC": below(others),
+        "bits": (log - log_blind) / np.log(2),
+        "loglik": log,
+    }
 
 
 def _log(at: np.ndarray, maps: np.ndarray) -> np.ndarray:
-    """Log of densities at rays, normalised over the sphere; what is negative or zero counts as the smallest that is known."""
+    """Log of densities at rays, normalised over the sphere; what is negative or zero counts as the smallest that is
+    known."""
     sphere = 4 * np.pi * np.maximum(maps, 0).mean(axis=1, keepdims=True)
     return np.log(np.maximum(at, 0) / np.where(sphere > 0, sphere, 1) + np.finfo(float).eps)
 

@@ -1,4 +1,5 @@
 """What an evaluation of gaze writes: tables as Markdown, CSV and JSON, and pictures of truth and prediction."""
+
 from __future__ import annotations
 
 import math
@@ -6,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.maths.sphere import Z_UP, latlong_grid
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.png import write_figure
 from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.maths.sphere import Z_UP, latlong_grid
+
 from .evaluation import SCORES, GazeTest
 
 _DIGITS = {"MAE": 4}
@@ -18,7 +20,10 @@ _DIGITS = {"MAE": 4}
 def markdown(rows: list[dict], columns: tuple = ("method", *SCORES, "integral")) -> str:
     """A table of ``rows``, with intervals in brackets where they are known."""
     shown = [c for c in columns if any(c in r for r in rows)]
-    lines = ["| " + " | ".join(shown) + " |", "|" + "|".join("---" if c in ("method", "person") else "---:" for c in shown) + "|"]
+    lines = [
+        "| " + " | ".join(shown) + " |",
+        "|" + "|".join("---" if c in ("method", "person") else "---:" for c in shown) + "|",
+    ]
     for row in rows:
         lines.append("| " + " | ".join(_cell(row, c) for c in shown) + " |")
     return "\n".join(lines) + "\n"
@@ -41,12 +46,17 @@ def write_report(folder: Path, rows: list[dict], persons: list[dict], about: dic
     """``gaze.md``, ``gaze.csv``, ``persons.csv`` and ``gaze.json`` in ``folder``; returns their paths."""
     files = [folder / name for name in ("gaze.md", "gaze.csv", "persons.csv", "gaze.json")]
     ours, bar = rows[0], next(r["method"] for r in reversed(rows) if r["method"] != "split half")
-    less = [{"method": f"{ours['method']} less {bar}"} | {k.replace(".less", ""): v for k, v in ours.items() if ".less" in k}]
+    less = [
+        {"method": f"{ours['method']} less {bar}"}
+        | {k.replace(".less", ""): v for k, v in ours.items() if ".less" in k}
+    ]
     each = markdown(persons, ("method", "person", "rays", "KLD", "CC", "NSS", "AUC", "bits", "loglik"))
     write_text(files[0], f"{notes}\n\n{markdown(rows)}\n{markdown(less)}\n## Each person\n\n{each}")
     for path, table in zip(files[1:3], (rows, persons)):
         write_csv(path, table)
-    clean = lambda table: [{k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()} for r in table]
+    clean = lambda table: [
+        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()} for r in table
+    ]
     write_json(files[3], {**about, "methods": clean(rows), "persons": clean(persons)}, allow_nan=False)
     return files
 
@@ -61,8 +71,12 @@ def side_by_side(test: GazeTest, methods: dict, path: Path, count: int = 4, heig
     d, _ = latlong_grid(2 * height, height, Z_UP)
     which = np.unique(np.linspace(0, len(test.centres) - 1, count).astype(int))
     near = np.argmax(test.directions @ d.T, axis=0)  # the truth is smooth at the scale of its directions
-    pictures = [("truth", test.truth[which][:, near])] + [(k, np.asarray(m(test.centres[which], d))) for k, m in methods.items()]
-    figure, axes = plt.subplots(len(which), len(pictures), figsize=(3.4 * len(pictures), 1.9 * len(which)), squeeze=False, layout="constrained")
+    pictures = [("truth", test.truth[which][:, near])] + [
+        (k, np.asarray(m(test.centres[which], d))) for k, m in methods.items()
+    ]
+    figure, axes = plt.subplots(
+        len(which), len(pictures), figsize=(3.4 * len(pictures), 1.9 * len(which)), squeeze=False, layout="constrained"
+    )
     for i, row in enumerate(axes):
         top = np.quantile(pictures[0][1][i], 0.995)
         for (name, maps), axis in zip(pictures, row):

@@ -1,21 +1,23 @@
 """A trained gaze field beside its baselines: densities over the sphere at positions, and a table of scores."""
+
 from __future__ import annotations
 
-from typing import Callable
+from collections.abc import Callable
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.product import GazeField
+from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeField
+from nerg_mi.field.gaze.product import GazeField
 from nerg_mi.training.gaze.supervision import SURFACE_OPACITY
+from nerg_mi.transport.media.media import GazeMedium, Similarity
 from nerg_mi.transport.observer.ensemble import EnsembleMedium
 from nerg_mi.transport.observer.integral import gaze_around
-from nerg_mi.transport.media.media import GazeMedium, Similarity
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
-from nerg_mi.evaluation import saliency as metrics
+
 from .baselines import Baseline
 
 # Of the uniform density: what a density of zero counts as in KLD. A truth that is a kernel density has
@@ -23,19 +25,25 @@ from .baselines import Baseline
 EPS = 1e-6
 
 
-def gaze_field(field: GazeField | LogGazeField | GazeEnsemble, medium, align: Similarity | None = None, kind: str = "median") -> Baseline:
-    """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the positions' units.
+def gaze_field(
+    field: GazeField | LogGazeField | GazeEnsemble, medium, align: Similarity | None = None, kind: str = "median"
+) -> Baseline:
+    """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the
+    positions' units.
 
-    What the integrator ``nerg`` shows on surfaces for an observer there, by the same functions: its depths, its integral of a
-    normalised field, its mean of an ensemble. Where no surface is met the field is what it was trained to be there.
+    What the integrator ``nerg`` shows on surfaces for an observer there, by the same functions: its depths, its
+    integral of a normalised field, its mean of an ensemble. Where no surface is met the field is what it was trained to
+    be there.
 
-    ``medium``: what the observer's depth is traced in, in the field's frame (a medium or a ``Place``; None for a field that knows
-    no geometry); ``align``: similarity from the frame of the positions to the field's; directions (D, 3) for all positions or
-    (P, D, 3), unit. The integrals of positions are kept: neither the field nor its place may change. Raises `NergError` for a field
-    that needs surfaces where there is no place.
+    ``medium``: what the observer's depth is traced in, in the field's frame (a medium or a ``Place``; None for a field
+    that knows no geometry); ``align``: similarity from the frame of the positions to the field's; directions (D, 3) for
+    all positions or (P, D, 3), unit. The integrals of positions are kept: neither the field nor its place may change.
+    Raises `NergError` for a field that needs surfaces where there is no place.
     """
     if medium is None and getattr(field.config, "geometry", "surface") != "none":
-        raise NergError("this gaze field was trained among surfaces, and there is no place that has any: give it the field, the scene or the geometry")
+        raise NergError(
+            "this gaze field was trained among surfaces, and there is no place that has any: give it the field, the scene or the geometry"
+        )
     align = align or Similarity()
     gaze = (EnsembleMedium if isinstance(field, GazeEnsemble) else GazeMedium)(field)
     place = medium if isinstance(medium, Place) else Place(medium)
@@ -65,19 +73,24 @@ def gaze_field(field: GazeField | LogGazeField | GazeEnsemble, medium, align: Si
 
 
 def scores(truth: np.ndarray, prediction: np.ndarray, eps: float = EPS) -> dict[str, float]:
-    """Means over positions of KLD (nats, both normalised over the sphere), CC, SIM, MAE (1/sr) and the prediction's integral.
+    """Means over positions of KLD (nats, both normalised over the sphere), CC, SIM, MAE (1/sr) and the prediction's
+    integral.
 
-    ``truth``, ``prediction``: (P, D) in 1/sr, directions of equal area; ``eps`` as in ``metrics.kld``. MAE and the integral
-    are of the prediction as it is, not normalised.
+    ``truth``, ``prediction``: (P, D) in 1/sr, directions of equal area; ``eps`` as in ``metrics.kld``. MAE and the
+    integral are of the prediction as it is, not normalised.
     """
     return {
-        "KLD": float(metrics.kld(truth, prediction, eps=eps).mean()), "CC": float(metrics.cc(truth, prediction).mean()),
-        "SIM": float(metrics.sim(truth, prediction).mean()), "MAE": float(metrics.mae(truth, prediction).mean()),
+        "KLD": float(metrics.kld(truth, prediction, eps=eps).mean()),
+        "CC": float(metrics.cc(truth, prediction).mean()),
+        "SIM": float(metrics.sim(truth, prediction).mean()),
+        "MAE": float(metrics.mae(truth, prediction).mean()),
         "integral": float(4 * np.pi * np.mean(prediction)),
-    }  # fmt: skip
+    }
 
 
-def score_rows(truth: np.ndarray, positions: np.ndarray, directions: np.ndarray, methods: dict[str, Callable]) -> list[dict]:
+def score_rows(
+    truth: np.ndarray, positions: np.ndarray, directions: np.ndarray, methods: dict[str, Callable]
+) -> list[dict]:
     """One row of ``scores`` for each of ``methods`` (name: density function), in order; ``method`` holds the name."""
     return [{"method": name, **scores(truth, density(positions, directions))} for name, density in methods.items()]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.evaluation import saliency as metrics
+
 from .reference import Truth
 
 SURFACE = 0.5
@@ -15,20 +16,31 @@ KLD_EPS = 1e-6
 """Of the mean: what a gaze of zero costs where the truth is not zero is bounded by it (13.8 nats)."""
 
 NAMES = (
-    "color_rmse", "color_psnr", "opacity_mae", "depth_mae", "depth_p99", "visibility_mae", "visibility_wrong", "gaze_mae", "gaze_kld",
-    "surface_mae", "surface_p99",
-)  # fmt: skip
+    "color_rmse",
+    "color_psnr",
+    "opacity_mae",
+    "depth_mae",
+    "depth_p99",
+    "visibility_mae",
+    "visibility_wrong",
+    "gaze_mae",
+    "gaze_kld",
+    "surface_mae",
+    "surface_p99",
+)
 
 
-def errors(seen: dict[str, np.ndarray], known: Truth, exact: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, float]:
+def errors(
+    seen: dict[str, np.ndarray], known: Truth, exact: tuple[np.ndarray, np.ndarray] | None = None
+) -> dict[str, float]:
     """Errors of the channels ``seen`` (N,), colour (N, 3), by name; what was not rendered is left out.
 
     ``color_rmse``: linear radiance, over pixels and channels; ``color_psnr``: -20 log10 of it in dB; ``depth_mae``,
-    ``depth_p99``: mean and 99th percentile of |depth - truth| in scene units, over rays of opacity >= `TRACE`, a ray that
-    met nothing counting with its depth of 0; ``visibility_mae``, ``gaze_mae`` (1/sr): over pixels that truly show a
-    surface; ``gaze_kld``: nats, of both pictures as densities over those pixels. With ``exact`` distances and visibilities:
-    ``surface_mae``, ``surface_p99``: |depth - exact| over exact hits; ``visibility_wrong``: share of these pixels that are
-    shown (above 1/2) and hidden, or the reverse.
+    ``depth_p99``: mean and 99th percentile of |depth - truth| in scene units, over rays of opacity >= `TRACE`, a ray
+    that met nothing counting with its depth of 0; ``visibility_mae``, ``gaze_mae`` (1/sr): over pixels that truly show
+    a surface; ``gaze_kld``: nats, of both pictures as densities over those pixels. With ``exact`` distances and
+    visibilities: ``surface_mae``, ``surface_p99``: |depth - exact| over exact hits; ``visibility_wrong``: share of
+    these pixels that are shown (above 1/2) and hidden, or the reverse.
     """
     out = {}
     if "color" in seen and np.any(seen["color"]):

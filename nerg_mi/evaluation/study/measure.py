@@ -1,7 +1,8 @@
 """From settings to rows: errors, evaluations, memory, and times taken in rounds over all settings.
 
-Time is the median of several renders of a finished kernel; the rounds go over all settings in turn, so that a busy moment
-of the machine falls on all of them alike. Evaluations are counted in a render of their own, since counting costs time.
+Time is the median of several renders of a finished kernel; the rounds go over all settings in turn, so that a busy
+moment of the machine falls on all of them alike. Evaluations are counted in a render of their own, since counting costs
+time.
 """
 
 from __future__ import annotations
@@ -20,11 +21,44 @@ from .settings import Setting
 from .subject import parameters
 
 COLUMNS = (
-    "setting", "group", "seconds", "cpu_seconds", "density_evals", "color_evals", "gaze_evals", "color_rmse", "color_psnr", "opacity_mae",
-    "depth_mae", "depth_p99", "visibility_mae", "visibility_wrong", "gaze_mae", "gaze_kld", "surface_mae", "surface_p99", "peak_mb",
-    "pareto", "reference", "quadrature", "step", "steps", "coarse", "dt_gamma", "stop", "color_cutoff", "depth", "visibility", "map_height",
-    "jitter", "radiance", "aovs", "spp", "resolution", "precision",
-)  # fmt: skip
+    "setting",
+    "group",
+    "seconds",
+    "cpu_seconds",
+    "density_evals",
+    "color_evals",
+    "gaze_evals",
+    "color_rmse",
+    "color_psnr",
+    "opacity_mae",
+    "depth_mae",
+    "depth_p99",
+    "visibility_mae",
+    "visibility_wrong",
+    "gaze_mae",
+    "gaze_kld",
+    "surface_mae",
+    "surface_p99",
+    "peak_mb",
+    "pareto",
+    "reference",
+    "quadrature",
+    "step",
+    "steps",
+    "coarse",
+    "dt_gamma",
+    "stop",
+    "color_cutoff",
+    "depth",
+    "visibility",
+    "map_height",
+    "jitter",
+    "radiance",
+    "aovs",
+    "spp",
+    "resolution",
+    "precision",
+)
 MARCHING = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "depth", "jitter")
 """The parameters that mean nothing where nothing is marched."""
 COUNTS = ("density_evals", "color_evals", "gaze_evals")
@@ -33,7 +67,13 @@ SEED = 1
 PIXEL_SPP = 256
 
 
-def measure(subject, rows: list[Setting], repeats: int, pixel_spp: int = PIXEL_SPP, on_step: Callable[[str], None] = lambda name: None) -> list[dict]:
+def measure(
+    subject,
+    rows: list[Setting],
+    repeats: int,
+    pixel_spp: int = PIXEL_SPP,
+    on_step: Callable[[str], None] = lambda name: None,
+) -> list[dict]:
     """One dict of `COLUMNS` a setting (but ``pareto``); ``on_step`` is told what is measured, ``2 len(rows)`` times."""
     pixels: dict = {}
     # Ray casts at a scene's exact geometry may take a minute, and are the same for all rows.
@@ -43,7 +83,9 @@ def measure(subject, rows: list[Setting], repeats: int, pixel_spp: int = PIXEL_S
         on_step(row.name)
         integrator = row.integrator(subject)
         values = _parameters(subject, row, subject.integrator(row.params, row.resolution))
-        table.append(values | _quality(subject, row, integrator, values, exact, pixels, pixel_spp) | _counts(subject, row))
+        table.append(
+            values | _quality(subject, row, integrator, values, exact, pixels, pixel_spp) | _counts(subject, row)
+        )
         made.append(integrator)
     times = _times(subject, rows, made, repeats, on_step)
     for line, (wall, cpu) in zip(table, times):
@@ -55,16 +97,26 @@ def _parameters(subject, row: Setting, integrator) -> dict:
     values = parameters(integrator)
     if row.paper is not None:
         steps, dt_gamma = row.paper
-        values |= {"quadrature": "paper", "step": subject.extent / steps, "dt_gamma": dt_gamma, "stop": study_paper.STOP}
+        values |= {
+            "quadrature": "paper",
+            "step": subject.extent / steps,
+            "dt_gamma": dt_gamma,
+            "stop": study_paper.STOP,
+        }
         values |= {"color_cutoff": 0.0, "coarse": 1.0, "jitter": False, "depth": "unnormalised"}
     if values["visibility"] != "map":
         values["map_height"] = ""
     if not subject.marched:
-        values |= {n: "" for n in MARCHING}
+        values |= dict.fromkeys(MARCHING, "")
     return {n: values[n] for n in values if n in COLUMNS} | {
-        "setting": row.name, "group": row.group, "steps": subject.extent / values["step"] if subject.marched else "", "aovs": ",".join(integrator.aovs),
-        "spp": row.spp, "resolution": row.resolution or "", "precision": precision(),
-    }  # fmt: skip
+        "setting": row.name,
+        "group": row.group,
+        "steps": subject.extent / values["step"] if subject.marched else "",
+        "aovs": ",".join(integrator.aovs),
+        "spp": row.spp,
+        "resolution": row.resolution or "",
+        "precision": precision(),
+    }
 
 
 def _quality(subject, row: Setting, integrator, values: dict, exact, pixels: dict, pixel_spp: int) -> dict:
@@ -93,7 +145,12 @@ def _pixel_truth(subject, spp: int) -> Truth:
     """The mean over many samples of each pixel, at the scene's own setting, with another seed."""
     seen = subject.channels(subject.integrator(), spp, SEED + 1)
     none = np.zeros(len(seen["depth"]))
-    return Truth(*(seen[n] for n in ("color", "opacity", "depth", "visibility")), seen.get("gaze", none), f"mean of {spp} samples a pixel", {})
+    return Truth(
+        *(seen[n] for n in ("color", "opacity", "depth", "visibility")),
+        seen.get("gaze", none),
+        f"mean of {spp} samples a pixel",
+        {},
+    )
 
 
 def _counts(subject, row: Setting) -> dict:
@@ -126,7 +183,8 @@ def timed(subject, integrator, spp: int = 1) -> tuple[float, float]:
 
 
 def precision() -> str:
-    """Of the variant in use: networks are fp16 on CUDA, where matrix units need it; everything else is fp32 everywhere."""
+    """Of the variant in use: networks are fp16 on CUDA, where matrix units need it; everything else is fp32
+    everywhere."""
     return "fp32, networks fp16" if _on_cuda() else "fp32"
 
 
@@ -141,9 +199,11 @@ def _on_cuda() -> bool:
 # ----------------------------------------------------------------------------
 
 
-def scaling(subject, repeats: int, quick: bool = False, on_step: Callable[[str], None] = lambda name: None) -> list[dict]:
-    """Cost of the default against pixels, samples a pixel, and the scene's extent: rows of ``axis``, ``value``, ``seconds``,
-    ``density_evals`` (mean a pixel).
+def scaling(
+    subject, repeats: int, quick: bool = False, on_step: Callable[[str], None] = lambda name: None
+) -> list[dict]:
+    """Cost of the default against pixels, samples a pixel, and the scene's extent: rows of ``axis``, ``value``,
+    ``seconds``, ``density_evals`` (mean a pixel).
 
     A scene s times as large, marched with steps of the same length, is by the scaling law of densities (σ/s) this scene
     marched with steps s times shorter: that is how its extent is varied.

@@ -1,4 +1,5 @@
 """How much work a render is, counted: operations traced into its kernels, and evaluations made."""
+
 from __future__ import annotations
 
 import drjit as dr

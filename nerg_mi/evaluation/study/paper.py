@@ -3,12 +3,12 @@
 As the inference kernels of torch-ngp do it, on which the paper's code rests: at most ``steps`` samples a ray; step
 dt = clamp(t·γ, diagonal/steps, diagonal/128); density and colour sampled at the step's start; α = 1 - exp(-σ dt),
 w = αT; a cell of the occupancy grid that is empty is left in multiples of dt; the march ends where T < 1e-4. Depth is
-Σ w_i t_i with t_i the *end* of step i, and is not divided by the opacity Σ w_i. Every sample gets a colour. The observer's
-ray towards p_d is marched likewise, and its depth compared with the distance.
+Σ w_i t_i with t_i the *end* of step i, and is not divided by the opacity Σ w_i. Every sample gets a colour. The
+observer's ray towards p_d is marched likewise, and its depth compared with the distance.
 
-Not taken over, because they would only make it worse here: fp16 networks, the near distance of 0.2, cascades, a comparison
-tolerance of 1e-5 (ours is the study's), gaze without a surface, and a sign of the shadow that shows what is hidden. A
-normalised gaze field is divided by the integral that ``nerg`` finds: the paper has none.
+Not taken over, because they would only make it worse here: fp16 networks, the near distance of 0.2, cascades, a
+comparison tolerance of 1e-5 (ours is the study's), gaze without a surface, and a sign of the shadow that shows what is
+hidden. A normalised gaze field is divided by the integral that ``nerg`` finds: the paper has none.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import functools
 
 import drjit as dr
 
-from nerg_mi.transport.observer import viewpoint
 from nerg_mi.maths.color import composite_to_linear
 from nerg_mi.transport.media.features import what_gaze_wants
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.observer import viewpoint
 from nerg_mi.transport.observer.visibility import visibility
+from nerg_mi.transport.place import Place
 
 STEPS = 1024
 DT_GAMMA = 1 / 128
@@ -30,7 +30,8 @@ STOP = 1e-4
 
 
 def as_in_the_paper(integrator, sensor, tolerance: float, steps: int = STEPS, dt_gamma: float = 0.0):
-    """An integrator with the field, gaze, observer and AOVs of ``integrator`` (of type ``nerg``) that marches by the paper's rule.
+    """An integrator with the field, gaze, observer and AOVs of ``integrator`` (of type ``nerg``) that marches by the
+    paper's rule.
 
     ``sensor``: the camera, which is the observer where there is no other; ``tolerance`` of visibility in scene units;
     ``steps``: to the medium's diagonal, and most samples a ray; ``dt_gamma``: growth γ of steps with distance.
@@ -52,7 +53,12 @@ def _integrator_class(variant: str):
             self._like, self._sensor, self._tolerance = like, sensor, tolerance
             extent = like.medium.length_scale
             self._march = functools.partial(
-                march, like.medium, steps=steps, shortest=extent / steps, longest=max(extent / 128, extent / steps), dt_gamma=dt_gamma
+                march,
+                like.medium,
+                steps=steps,
+                shortest=extent / steps,
+                longest=max(extent / 128, extent / steps),
+                dt_gamma=dt_gamma,
             )
 
         def aov_names(self):
@@ -67,7 +73,12 @@ def _integrator_class(variant: str):
             t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, ray.maxt)
             alpha, depth, total, n = self._march(local, t0, t1, mi.Bool(active), color)
             surface = alpha >= like.surface_opacity
-            out = {"depth": depth, "opacity": alpha, "density_evals": n, "color_evals": mi.Float(0) if color is None else n}
+            out = {
+                "depth": depth,
+                "opacity": alpha,
+                "density_evals": n,
+                "color_evals": mi.Float(0) if color is None else n,
+            }
             if {"visibility", "gaze"} & set(names):
                 out["density_evals"] = n + self._look(ray.o + ray.d * depth, surface, out, "gaze" in names)
             L = mi.Spectrum(0)
@@ -92,7 +103,9 @@ def _integrator_class(variant: str):
                 place, attended = Place(like.medium), surface & (seen > 0)
                 like.gaze.face([p_o], place, like.settings, like.depth_kind, like.surface_opacity)
                 p_od = p_o + r_o * d_o
-                semantic = what_gaze_wants(like.gaze.field.config.semantic, place, p_od, p_o, r_o, attended, like.settings)
+                semantic = what_gaze_wants(
+                    like.gaze.field.config.semantic, place, p_od, p_o, r_o, attended, like.settings
+                )
                 out["gaze"] = dr.select(attended, like.gaze.evaluate(p_od, p_o, r_o, attended, semantic)[0] * seen, 0)
                 out["gaze_evals"] = dr.select(surface, mi.Float(like.gaze.networks), 0.0)
             return n
@@ -143,6 +156,13 @@ def march(medium, ray, t0, t1, active, color, *, steps, shortest, longest, dt_ga
         t = t + dt
         return full & (t < t1) & more & (n < steps), t, transmittance, moment, total, n
 
-    start = (dr.mask_t(Float)(active) & (t0 < t1), Float(t0), Float(1), Float(0), None if color is None else dr.zeros(color), Float(0))
+    start = (
+        dr.mask_t(Float)(active) & (t0 < t1),
+        Float(t0),
+        Float(1),
+        Float(0),
+        None if color is None else dr.zeros(color),
+        Float(0),
+    )
     _, _, transmittance, moment, total, n = dr.while_loop(start, lambda active, *_: active, body, label="paper march")
     return 1 - transmittance, moment, total, n

@@ -7,24 +7,26 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.files.png import write_figure
+
 from .settings import PAPER
 from .tables import comparable
 
 PANELS = (
-    ("color_rmse", "colour RMSE [linear radiance]"), ("depth_mae", "depth MAE [scene units]"),
-    ("visibility_mae", "visibility MAE"), ("gaze_mae", "gaze MAE [1/sr]"),
-)  # fmt: skip
+    ("color_rmse", "colour RMSE [linear radiance]"),
+    ("depth_mae", "depth MAE [scene units]"),
+    ("visibility_mae", "visibility MAE"),
+    ("gaze_mae", "gaze MAE [1/sr]"),
+)
 # Errors below it are shown on the axis' lower end: single precision has nothing to say there.
 FLOOR = 1e-9
 
 
 def plot_errors(path: Path, rows: list[dict], title: str) -> None:
     """Four panels of error against seconds, a colour a factor, the front as a line, the paper's marching as crosses."""
+    import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator
-
-    import matplotlib
 
     figure = Figure(figsize=(9.6, 7.2), dpi=100)
     FigureCanvasAgg(figure)
@@ -40,10 +42,16 @@ def plot_errors(path: Path, rows: list[dict], title: str) -> None:
             xy = np.array([(r["seconds"], max(r[error], FLOOR)) for r in mine])
             marker, size = {"default": ("*", 150), PAPER: ("x", 34)}.get(group, ("o", 16))
             tint = {"default": "black", PAPER: "crimson"}.get(group, color)
-            handles[group] = axes.scatter(*xy.T, s=size, marker=marker, color=tint, zorder=4 if group in ("default", PAPER) else 3)
-        front = sorted((r["seconds"], max(r[error], FLOOR)) for r in able if error.rsplit("_", 1)[0] in r["pareto"].split())
+            handles[group] = axes.scatter(
+                *xy.T, s=size, marker=marker, color=tint, zorder=4 if group in ("default", PAPER) else 3
+            )
+        front = sorted(
+            (r["seconds"], max(r[error], FLOOR)) for r in able if error.rsplit("_", 1)[0] in r["pareto"].split()
+        )
         if front:
-            (handles["Pareto front"],) = axes.plot(*np.array(front).T, color="0.4", linewidth=1, drawstyle="steps-post", zorder=2)
+            (handles["Pareto front"],) = axes.plot(
+                *np.array(front).T, color="0.4", linewidth=1, drawstyle="steps-post", zorder=2
+            )
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xlabel("seconds a picture", fontsize=8)

@@ -1,9 +1,10 @@
 """What a ray sees of an analytic scene, in float64: closed forms, and Gauss-Legendre where there is none.
 
-Independent of ``transport``: nothing is stepped. Opacity α = 1 - exp(-τ); the first moment ∫ t σ T dt; the median, where
-the optical depth reaches -log(1 - α/2). Between breaks of constant density σ a piece of length δ and optical depth x = σδ
-absorbs 1 - e^{-x} at the mean distance 1/σ - δ/expm1(x) into it. Smooth profiles have τ in closed form and a moment by
-composite Gauss-Legendre quadrature (32 panels of 16 nodes: the integrands are analytic, so it is exact to rounding).
+Independent of ``transport``: nothing is stepped. Opacity α = 1 - exp(-τ); the first moment ∫ t σ T dt; the median,
+where the optical depth reaches -log(1 - α/2). Between breaks of constant density σ a piece of length δ and optical
+depth x = σδ absorbs 1 - e^{-x} at the mean distance 1/σ - δ/expm1(x) into it. Smooth profiles have τ in closed form and
+a moment by composite Gauss-Legendre quadrature (32 panels of 16 nodes: the integrands are analytic, so it is exact to
+rounding).
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ FUZZ = 1 / 64
 
 @dataclass(frozen=True)
 class Seen:
-    """Along rays (N,): optical depth, first moment ∫ t σ T dt, the median's distance (0 where nothing absorbs), and the mean
-    free path 1/σ where T = 1/2 (0 where that is not reached)."""
+    """Along rays (N,): optical depth, first moment ∫ t σ T dt, the median's distance (0 where nothing absorbs), and the
+    mean free path 1/σ where T = 1/2 (0 where that is not reached)."""
 
     tau: np.ndarray
     moment: np.ndarray
@@ -147,12 +148,15 @@ def _profile(scene, o, d, near, far) -> Seen:
     p = o + d * crossing(np.log(2))[:, None]
     reached = total >= np.log(2)
     sigma = np.where(reached, scene.density(p[:, 0], p[:, 1], p[:, 2], NUMPY), 1)
-    return Seen(total, moment, np.where(total > 0, crossing(_half_of_opacity(total)), 0), np.where(reached, 1 / sigma, 0))
+    return Seen(
+        total, moment, np.where(total > 0, crossing(_half_of_opacity(total)), 0), np.where(reached, 1 / sigma, 0)
+    )
 
 
 @dataclass(frozen=True)
 class Truth:
-    """A reference picture, a row a ray or pixel: ``color`` (N, 3) linear, the others (N,); ``gaze`` is 0 throughout without a gaze field.
+    """A reference picture, a row a ray or pixel: ``color`` (N, 3) linear, the others (N,); ``gaze`` is 0 throughout
+    without a gaze field.
 
     ``source``: what it is; ``convergence``: how much it changed when its step was halved, by name of error (empty for
     closed forms).
@@ -167,20 +171,30 @@ class Truth:
     convergence: dict
 
 
-def truth(scene: AnalyticScene, gaze, o, d, *, depth: str, visibility: str, falloff: float, tolerance: float,
-          surface_opacity: float) -> Truth:
+def truth(
+    scene: AnalyticScene,
+    gaze,
+    o,
+    d,
+    *,
+    depth: str,
+    visibility: str,
+    falloff: float,
+    tolerance: float,
+    surface_opacity: float,
+) -> Truth:
     """The reference of ``nerg``'s channels for rays (N, 3), as its manual page defines them.
 
-    ``gaze``: what ``evaluate(p_od, p_o, r_o, True)`` asks (a single-precision network, evaluated at float64 positions), or None;
-    a normalised one faces the observer already.
+    ``gaze``: what ``evaluate(p_od, p_o, r_o, True)`` asks (a single-precision network, evaluated at float64 positions),
+    or None; a normalised one faces the observer already.
     """
     seen = look(scene, o, d)
     t = seen.depth(depth)
     surface = seen.opacity >= surface_opacity
     p_d = o + d * t[:, None]
     p_o = np.asarray(scene.observer, float)
-    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it: one mean free
-    # path to the expected depth of thick matter, ln 2 of it to the median.
+    # The point looked for lies in front of the surface, by the tolerance and by how far light goes into it: one mean
+    # free path to the expected depth of thick matter, ln 2 of it to the median.
     paths = 1 if depth == "expected" else np.log(2)
     in_front = tolerance + np.minimum(paths * seen.free_path, t * FUZZ)
     distance, r_o = towards(p_o, p_d - d * in_front[:, None])
@@ -208,11 +222,13 @@ def towards(p_o, p):
 
 
 def evaluate_gaze(gaze, p_od, p_o, r_o) -> np.ndarray:
-    """Gaze density (N,) in 1/sr of the medium ``gaze`` at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, which a
-    normalised one faces already."""
+    """Gaze density (N,) in 1/sr of the medium ``gaze`` at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``,
+    which a normalised one faces already."""
     import mitsuba as mi
 
     def points(kind, v):
         return kind(np.ascontiguousarray(np.broadcast_to(v, p_od.shape).T, np.float32))
 
-    return np.array(gaze.evaluate(points(mi.Point3f, p_od), points(mi.Point3f, p_o), points(mi.Vector3f, r_o), True)[0], float)
+    return np.array(
+        gaze.evaluate(points(mi.Point3f, p_od), points(mi.Point3f, p_o), points(mi.Vector3f, r_o), True)[0], float
+    )

@@ -13,7 +13,11 @@ from nerg_mi import __version__
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.rendering.pictures import activate
-from . import errors as study_errors, measure as study_measure, plots as study_plots, tables as study_tables
+
+from . import errors as study_errors
+from . import measure as study_measure
+from . import plots as study_plots
+from . import tables as study_tables
 from .settings import settings
 from .subject import open_subject
 
@@ -29,18 +33,31 @@ class StudyResult:
 
 
 def run_study(
-    scene: str, out: str | Path, *, kind: str = "auto", width: int = WIDTH, height: int = HEIGHT, repeats: int = 5, quick: bool = False,
-    only: str = "", defaults: Mapping[str, str] | None = None, variant: str | None = None, on_step: Callable[[str, float], None] = lambda name, share: None,
+    scene: str,
+    out: str | Path,
+    *,
+    kind: str = "auto",
+    width: int = WIDTH,
+    height: int = HEIGHT,
+    repeats: int = 5,
+    quick: bool = False,
+    only: str = "",
+    defaults: Mapping[str, str] | None = None,
+    variant: str | None = None,
+    on_step: Callable[[str, float], None] = lambda name, share: None,
 ) -> StudyResult:
-    """Study ``scene`` (a scene file, or the name of an analytic scene) and write tables and plots into the folder ``out``.
+    """Study ``scene`` (a scene file, or the name of an analytic scene) and write tables and plots into the folder
+    ``out``.
 
     ``kind``: see `study_subject.KINDS`; ``width``, ``height`` in pixels; ``repeats``: timed renders of each setting;
-    ``quick``: few settings, timed once; ``only``: regular expression that the names of further settings than the default
-    match; ``defaults``: of a scene file; ``on_step`` is told what is done and the share done
+    ``quick``: few settings, timed once; ``only``: regular expression that the names of further settings than the
+    default match; ``defaults``: of a scene file; ``on_step`` is told what is done and the share done
     so far. Raises NergError for what the user can mend.
     """
     if min(width, height) < 4 or repeats < 1:
-        raise NergError(f"a study needs pictures of at least 4 x 4 pixels and one timed render, got {width} x {height} and {repeats}.")
+        raise NergError(
+            f"a study needs pictures of at least 4 x 4 pixels and one timed render, got {width} x {height} and {repeats}."
+        )
     try:
         wanted = re.compile(only)
     except re.error as error:
@@ -57,7 +74,9 @@ def run_study(
     default, *others = settings(subject, quick)
     rows = [default, *(row for row in others if wanted.search(row.name))]
     if only and len(rows) == 1:
-        raise NergError(f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}".')
+        raise NergError(
+            f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}".'
+        )
     repeats = 1 if quick else repeats
     done = 0
 
@@ -72,14 +91,30 @@ def run_study(
     scaling = study_measure.scaling(subject, min(repeats, 3), quick, step)
     known = subject.truth(study_measure.SEED, "expected", "depth")
     report = {
-        "scene": subject.name, "variant": active, "size": [width, height], "extent": subject.extent, "step": subject.step,
-        "tolerance": subject.tolerance, "reference": known.source, "reference_change_when_step_halved": known.convergence,
-        "precision": study_measure.precision(), "gaze_kld_eps": study_errors.KLD_EPS, "repeats": repeats, "threads": dr.thread_count(),
+        "scene": subject.name,
+        "variant": active,
+        "size": [width, height],
+        "extent": subject.extent,
+        "step": subject.step,
+        "tolerance": subject.tolerance,
+        "reference": known.source,
+        "reference_change_when_step_halved": known.convergence,
+        "precision": study_measure.precision(),
+        "gaze_kld_eps": study_errors.KLD_EPS,
+        "repeats": repeats,
+        "threads": dr.thread_count(),
         "peak_mb": "what Dr.Jit allocated at most during a first render, in MiB, beyond scene and field",
         "seconds_of_study": time.perf_counter() - begin,
-        "versions": {"nerg_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__, "python": platform.python_version()},
-        "against_paper": study_tables.against_paper(table), "rows": table, "scaling": scaling,
-    }  # fmt: skip
+        "versions": {
+            "nerg_mi": __version__,
+            "mitsuba": mi.__version__,
+            "drjit": dr.__version__,
+            "python": platform.python_version(),
+        },
+        "against_paper": study_tables.against_paper(table),
+        "rows": table,
+        "scaling": scaling,
+    }
     files = study_tables.write_tables(out, report)
     title = f"{subject.name}, {width} x {height}, {active}"
     study_plots.plot_errors(out / "errors.png", table, f"Error against time: {title}")

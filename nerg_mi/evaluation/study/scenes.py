@@ -26,9 +26,9 @@ class AnalyticScene:
     """Matter in the unit cube, a camera and an observer; lengths in scene units.
 
     ``density(x, y, z, ns)``: in 1/unit, with the functions of ``ns`` (`NUMPY` or drjit). ``breaks(o, d)``: distances
-    (N, K) at which density may jump along float64 rays (N, 3). ``optical_depth(o, d, a, b)``: of the density between the
-    distances a and b (N,), in closed form; None says that density is constant between the breaks. ``opaque``: surfaces
-    are hard enough for visibility to be yes or no.
+    (N, K) at which density may jump along float64 rays (N, 3). ``optical_depth(o, d, a, b)``: of the density between
+    the distances a and b (N,), in closed form; None says that density is constant between the breaks. ``opaque``:
+    surfaces are hard enough for visibility to be yes or no.
     """
 
     name: str
@@ -130,7 +130,9 @@ SCENES = {
     for s in (
         AnalyticScene("slab", _slab, _no_breaks),
         AnalyticScene("sphere", _sphere, _sphere_breaks, opaque=True, observer=(-0.9, -0.3, 0.7)),
-        AnalyticScene("sheets", _sheets, _sheets_breaks, opaque=True, camera=(0.75, -1.5, 0.95), observer=(0.2, -1.2, 0.3)),
+        AnalyticScene(
+            "sheets", _sheets, _sheets_breaks, opaque=True, camera=(0.75, -1.5, 0.95), observer=(0.2, -1.2, 0.3)
+        ),
         AnalyticScene("fog", _fog, _no_breaks, _fog_optical_depth),
         AnalyticScene("ramp", _ramp, _no_breaks, _ramp_optical_depth),
     )
@@ -172,7 +174,10 @@ def _volumes(variant: str):
             return mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])
 
         def eval(self, it, active=True):
-            rows = [b + s[0] * it.p.x + s[1] * it.p.y + s[2] * it.p.z for b, s in zip(COLOR_BASE.tolist(), COLOR_SLOPE.tolist())]
+            rows = [
+                b + s[0] * it.p.x + s[1] * it.p.y + s[2] * it.p.z
+                for b, s in zip(COLOR_BASE.tolist(), COLOR_SLOPE.tolist())
+            ]
             c = mi.Color3f(*rows)
             return mi.Spectrum(mi.luminance(c)) if mi.is_monochromatic else mi.Spectrum(c)
 
@@ -184,14 +189,16 @@ def _volumes(variant: str):
 
         def __init__(self, props):
             from nerg_mi.field.backend import namespace
-            from nerg_mi.maths.box import Box
-            from nerg_mi.field.gaze.product import GazeConfig, GazeField
             from nerg_mi.field.encoding.hashgrid import HashGridConfig
+            from nerg_mi.field.gaze.product import GazeConfig, GazeField
+            from nerg_mi.maths.box import Box
             from nerg_mi.transport.media.media import GazeMedium
 
             super().__init__(props)
             ns = namespace(variant)
-            config = GazeConfig(HashGridConfig(levels=2, log2_rows=10, base=3, finest=6), width=16, geometry=7, sh_degree=2)
+            config = GazeConfig(
+                HashGridConfig(levels=2, log2_rows=10, base=3, finest=6), width=16, geometry=7, sh_degree=2
+            )
             field = GazeField.random(config, Box((0, 0, 0), (1, 1, 1)), ns, seed=1)
             table = 2 * np.random.default_rng(1).normal(size=len(field.grid.table)).astype(np.float32)
             field.set_parameters({"grid.table": ns.Float(table)})
@@ -210,8 +217,8 @@ def _volumes(variant: str):
 
 
 def volumes(scene: AnalyticScene, resolution: int = 0) -> dict:
-    """``density``, ``color`` and ``gaze`` of the integrator; with a ``resolution`` the density is a ``gridvolume`` of so many
-    voxels along an edge, holding the exact density at their centres."""
+    """``density``, ``color`` and ``gaze`` of the integrator; with a ``resolution`` the density is a ``gridvolume`` of
+    so many voxels along an edge, holding the exact density at their centres."""
     import mitsuba as mi
 
     made = _volumes(mi.variant())
@@ -230,9 +237,18 @@ def sensor(origin, target, fov: float, width: int, height: int) -> dict:
     import mitsuba as mi
 
     return {
-        "type": "perspective", "fov": fov, "near_clip": 1e-3, "far_clip": 1e3,
+        "type": "perspective",
+        "fov": fov,
+        "near_clip": 1e-3,
+        "far_clip": 1e3,
         "to_world": mi.ScalarTransform4f().look_at(list(origin), list(target), [0, 0, 1]),
         "sampler": {"type": "independent", "sample_count": 1},
-        "film": {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32", "pixel_format": "rgb",
-                 "rfilter": {"type": "box"}},
-    }  # fmt: skip
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "component_format": "float32",
+            "pixel_format": "rgb",
+            "rfilter": {"type": "box"},
+        },
+    }

@@ -1,4 +1,5 @@
-"""Which settings a study renders: sweeps of one factor around the scene's own, steps x quadrature, the paper's marching."""
+"""Which settings a study renders: sweeps of one factor around the scene's own, steps x quadrature, the paper's
+marching."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ PAPER = "paper"
 
 @dataclass(frozen=True)
 class Setting:
-    """One row of a study. ``group``: the factor it belongs to; ``params``: of the integrator, over the scene's own; ``spp``;
+    """One row of a study. ``group``: the factor it belongs to; ``params``: of the integrator, over the scene's own;
+    ``spp``;
     ``resolution``: of the density as a grid (0: the scene's own); ``paper``: (steps, γ) of the paper's marching;
     ``first_frame``: what is kept from frame to frame is made anew in each."""
 
@@ -68,7 +70,11 @@ def settings(subject, quick: bool = False) -> list[Setting]:
                 rows.append(Setting(f"grid {r}, {rule}", "resolution", {"quadrature": rule}, resolution=r))
         for n in () if quick else (16, 64, 256):
             for rule in ("constant", "linear", "cells"):
-                rows.append(Setting(f"grid 64, {rule}, {n} steps", "resolution", {"quadrature": rule, **steps(n)}, resolution=64))
+                rows.append(
+                    Setting(
+                        f"grid 64, {rule}, {n} steps", "resolution", {"quadrature": rule, **steps(n)}, resolution=64
+                    )
+                )
     rows += [] if quick else _together(subject)
     return rows + _paper(quick)
 
@@ -106,7 +112,9 @@ def _together(subject) -> list[Setting]:
         rows.append(Setting(f"{n} steps, coarse 4", "together", {**step, "coarse": 4.0}))
         loose = {**step, "stop": 1e-4, "color_cutoff": 1e-2}
         rows.append(Setting(f"{n} steps, stop 1e-4, cutoff 1e-2", "together", loose))
-        rows.append(Setting(f"{n} steps, stop 1e-4, cutoff 1e-2, linear", "together", {**loose, "quadrature": "linear"}))
+        rows.append(
+            Setting(f"{n} steps, stop 1e-4, cutoff 1e-2, linear", "together", {**loose, "quadrature": "linear"})
+        )
         rows.append(Setting(f"{n} steps, stop 1e-4, cutoff 1e-2, refined", "together", {**loose, "depth": "refined"}))
     return rows
 

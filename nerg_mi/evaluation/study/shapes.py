@@ -6,6 +6,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.transport.place import Place
+
 from .reference import Truth, evaluate_gaze, towards
 
 # Rays tested against all triangles at once.
@@ -21,7 +22,9 @@ def triangles(scene) -> np.ndarray:
     found = []
     for shape in scene.shapes():
         if not shape.is_mesh():
-            raise NergError(f"a study of shapes needs meshes, and this scene has a {shape.class_name()}: give it as triangles.")
+            raise NergError(
+                f"a study of shapes needs meshes, and this scene has a {shape.class_name()}: give it as triangles."
+            )
         params = mi.traverse(shape)
         corners = np.array(params["vertex_positions"], float).reshape(-1, 3)
         found.append(corners[np.array(params["faces"], int).reshape(-1, 3)])
@@ -55,9 +58,15 @@ def facing(subject, p_o: np.ndarray):
     import mitsuba as mi
 
     integrator = subject.integrator()
-    # The integral is the integrator's own: over ray casts, which are exact to single precision, and tested against ``first_hit``.
-    integrator.gaze.face([mi.Point3f(*p_o.tolist())], Place(None, subject.scene), integrator.settings, integrator.depth_kind,
-                         integrator.surface_opacity)  # fmt: skip
+    # The integral is the integrator's own: over ray casts, which are exact to single precision, and tested against
+    # ``first_hit``.
+    integrator.gaze.face(
+        [mi.Point3f(*p_o.tolist())],
+        Place(None, subject.scene),
+        integrator.settings,
+        integrator.depth_kind,
+        integrator.surface_opacity,
+    )
     return integrator.gaze
 
 
@@ -88,4 +97,3 @@ def truth(subject, seed: int, visibility: str, color: np.ndarray) -> Truth:
         gaze = evaluate_gaze(facing(subject, p_o), p_od, p_o, towards(p_o, p_d)[1]) * share
     source = f"float64 ray casts; colour the mean of {COLOR_SPP} samples a pixel"
     return Truth(color, hit.astype(float), depth, share, gaze, source, {})
-

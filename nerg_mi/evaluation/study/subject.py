@@ -1,7 +1,7 @@
 """What is studied: a scene of which integrators with any parameters can be made, its rays, and its truth.
 
-Three kinds: analytic scenes and scenes of shapes, with float64 references, and scene files with a field, whose reference is
-a render with much smaller steps.
+Three kinds: analytic scenes and scenes of shapes, with float64 references, and scene files with a field, whose
+reference is a render with much smaller steps.
 """
 
 from __future__ import annotations
@@ -13,9 +13,12 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.pictures import load_scene
-from . import reference as study_reference, scenes as study_scenes, shapes as study_shapes
 from nerg_mi.transport.observer.sight import EXACT
 from nerg_mi.transport.place import Place
+
+from . import reference as study_reference
+from . import scenes as study_scenes
+from . import shapes as study_shapes
 from .reference import Truth
 
 KINDS = ("auto", "analytic", "file")
@@ -24,11 +27,19 @@ FALLOFF = 0.1
 # The reference of a scene file has steps this many times shorter than the scene's own.
 FINER = 32
 # Nothing is skipped, merged or cut short in a reference.
-_CONVERGED = {"coarse": 1.0, "dt_gamma": 0.0, "jitter": False, "color_cutoff": 0.0, "stop": 1e-9, "quadrature": "constant"}
+_CONVERGED = {
+    "coarse": 1.0,
+    "dt_gamma": 0.0,
+    "jitter": False,
+    "color_cutoff": 0.0,
+    "stop": 1e-9,
+    "quadrature": "constant",
+}
 
 
 def open_subject(scene: str, kind: str, width: int, height: int, defaults: Mapping[str, str] | None = None) -> Subject:
-    """The scene called, or in the file, ``scene``, with a picture of ``width`` x ``height``. Raises NergError for what the user can mend."""
+    """The scene called, or in the file, ``scene``, with a picture of ``width`` x ``height``. Raises NergError for what
+    the user can mend."""
     if kind not in KINDS:
         raise NergError(f'there is no kind of scene "{kind}": choose one of {", ".join(KINDS)}.')
     if kind == "analytic" or (kind == "auto" and scene in study_scenes.SCENES):
@@ -43,8 +54,8 @@ def open_subject(scene: str, kind: str, width: int, height: int, defaults: Mappi
 
 class Subject:
     """Common to all kinds. ``scene``: `mi.Scene`; ``sensor``; ``size``: (width, height) in pixels; ``base``: the
-    integrator's parameters and children; ``extent``: diagonal of the medium in scene units; ``tolerance``: fixed, so that
-    all settings answer the same question of visibility (the integrator's own default follows the step)."""
+    integrator's parameters and children; ``extent``: diagonal of the medium in scene units; ``tolerance``: fixed, so
+    that all settings answer the same question of visibility (the integrator's own default follows the step)."""
 
     name: str
     opaque: bool
@@ -65,7 +76,8 @@ class Subject:
         self.base = {**base, "tolerance": self.tolerance}
 
     def integrator(self, params: Mapping = {}, resolution: int = 0):
-        """A ``nerg`` integrator with ``params`` over the scene's own; ``resolution``: density as a grid of so many voxels."""
+        """A ``nerg`` integrator with ``params`` over the scene's own; ``resolution``: density as a grid of so many
+        voxels."""
         import mitsuba as mi
 
         if resolution:
@@ -87,7 +99,8 @@ class Subject:
         self._truths.clear()
 
     def rays(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and directions (N, 3) float64 of the rays that a render with one sample a pixel and ``seed`` traces."""
+        """Origins and directions (N, 3) float64 of the rays that a render with one sample a pixel and ``seed``
+        traces."""
         import mitsuba as mi
 
         class Recorder(mi.SamplingIntegrator):
@@ -118,14 +131,18 @@ class Subject:
     def truth(self, seed: int, depth: str, visibility: str) -> Truth:
         """The reference for the rays of ``seed``, for kinds of depth and visibility as the integrator names them."""
         # Refined depths and maps are ways to find the same answers.
-        key = seed, "expected" if depth == "expected" else "median", "transmittance" if visibility == "transmittance" else "depth"
+        key = (
+            seed,
+            "expected" if depth == "expected" else "median",
+            "transmittance" if visibility == "transmittance" else "depth",
+        )
         if key not in self._truths:
             self._truths[key] = self._find_truth(*key)
         return self._truths[key]
 
     def exact(self, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Where surfaces are exactly, and whether the observer sees them exactly: (N,) distances, inf on a miss, and (N,) bool.
-        None where that is not known."""
+        """Where surfaces are exactly, and whether the observer sees them exactly: (N,) distances, inf on a miss, and
+        (N,) bool. None where that is not known."""
         raise NotImplementedError
 
 
@@ -152,8 +169,15 @@ class AnalyticSubject(Subject):
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
         o, d = self.rays(seed)
         return study_reference.truth(
-            self.analytic, self._volumes["gaze"].gaze_medium(), o, d, depth=depth, visibility=visibility, falloff=FALLOFF,
-            tolerance=self.tolerance, surface_opacity=0.5,
+            self.analytic,
+            self._volumes["gaze"].gaze_medium(),
+            o,
+            d,
+            depth=depth,
+            visibility=visibility,
+            falloff=FALLOFF,
+            tolerance=self.tolerance,
+            surface_opacity=0.5,
         )
 
     def exact(self, seed: int):
@@ -178,7 +202,10 @@ class FileSubject(Subject):
 
     def __init__(self, path: Path, loaded, width: int, height: int):
         integrator, sensor = loaded.integrator(), loaded.sensors()[0]
-        self.name, self.twin = path.stem if path.stem != "scene" else path.resolve().parent.name, path.parent / "twin.xml"
+        self.name, self.twin = (
+            path.stem if path.stem != "scene" else path.resolve().parent.name,
+            path.parent / "twin.xml",
+        )
         self.opaque = self.twin.is_file()
         children = integrator.children
         self.has_gaze = "gaze" in children
@@ -202,7 +229,9 @@ class FileSubject(Subject):
         )
         none = np.zeros(len(fine["depth"]))
         names = ("color", "opacity", "depth", "visibility")
-        known = Truth(*(fine[n] for n in names), fine.get("gaze", none), f"render with steps of {self.step / FINER:.3g} units", {})
+        known = Truth(
+            *(fine[n] for n in names), fine.get("gaze", none), f"render with steps of {self.step / FINER:.3g} units", {}
+        )
         return Truth(*(fine[n] for n in names), known.gaze, known.source, errors(half, known))
 
     def exact(self, seed: int):
@@ -266,7 +295,9 @@ def _load(path: Path, width: int, height: int, defaults: Mapping[str, str]) -> F
     if not loaded.sensors():
         raise NergError(f'"{path}" has no sensor: add the camera that takes the pictures.')
     if not loaded.sensors()[0].film().rfilter().is_box_filter():
-        raise NergError(f'the film of "{path}" does not have a box filter, without which depths cannot be compared: give it one.')
+        raise NergError(
+            f'the film of "{path}" does not have a box filter, without which depths cannot be compared: give it one.'
+        )
     if loaded.integrator().medium is not None and len(loaded.shapes()) > 0:
         raise NergError(f'"{path}" holds a field and shapes, of which there is no reference: study each alone.')
     return (ShapesSubject if loaded.integrator().medium is None else FileSubject)(path, loaded, width, height)
@@ -279,6 +310,9 @@ def parameters(integrator) -> dict:
     out = {n: getattr(integrator, n) for n in names} | {n: getattr(integrator.settings, n) for n in march}
     observer = integrator.observer_pass
     return out | {
-        "falloff": float(integrator.falloff[0]), "depth": integrator.depth_kind, "visibility": observer.kind,
-        "map_height": observer.map_height, "background": np.array(integrator.background, float).ravel().tolist(),
-    }  # fmt: skip
+        "falloff": float(integrator.falloff[0]),
+        "depth": integrator.depth_kind,
+        "visibility": observer.kind,
+        "map_height": observer.map_height,
+        "background": np.array(integrator.background, float).ravel().tolist(),
+    }

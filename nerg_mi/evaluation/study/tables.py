@@ -7,6 +7,7 @@ from pathlib import Path
 
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import write_csv, write_json
+
 from .measure import COLUMNS
 from .settings import PAPER
 
@@ -32,7 +33,8 @@ def comparable(row: dict) -> bool:
 
 
 def mark_fronts(rows: list[dict]) -> None:
-    """Set ``pareto`` of each row: the errors of `FRONTS` for which it is on the front, without their suffix, space-separated."""
+    """Set ``pareto`` of each row: the errors of `FRONTS` for which it is on the front, without their suffix,
+    space-separated."""
     for row in rows:
         row["pareto"] = ""
     for error in FRONTS:
@@ -43,8 +45,8 @@ def mark_fronts(rows: list[dict]) -> None:
 
 
 def against_paper(rows: list[dict], clock: str = "seconds") -> list[dict]:
-    """For each row of the paper's marching: the default beside it, the least depth error of ours that takes no longer, and
-    the shortest time of ours whose depth error is no larger, with the ratios; None where ours has no such row.
+    """For each row of the paper's marching: the default beside it, the least depth error of ours that takes no longer,
+    and the shortest time of ours whose depth error is no larger, with the ratios; None where ours has no such row.
 
     ``clock``: ``seconds``, or ``cpu_seconds`` where other work shares the machine.
     """
@@ -55,25 +57,43 @@ def against_paper(rows: list[dict], clock: str = "seconds") -> list[dict]:
     for paper in (r for r in rows if r["group"] == PAPER):
         no_longer = min((r for r in ours if r[clock] <= paper[clock]), key=lambda r: r["depth_mae"], default=None)
         no_worse = min((r for r in ours if r["depth_mae"] <= paper["depth_mae"]), key=lambda r: r[clock], default=None)
-        out.append({
-            "paper": _brief(paper), "default": _brief(default),
-            "equal_time": no_longer and _brief(no_longer) | {"error_ratio": paper["depth_mae"] / max(no_longer["depth_mae"], 1e-12)},
-            "equal_error": no_worse and _brief(no_worse) | {"time_ratio": paper[clock] / no_worse[clock]},
-        })  # fmt: skip
+        out.append(
+            {
+                "paper": _brief(paper),
+                "default": _brief(default),
+                "equal_time": no_longer
+                and _brief(no_longer) | {"error_ratio": paper["depth_mae"] / max(no_longer["depth_mae"], 1e-12)},
+                "equal_error": no_worse and _brief(no_worse) | {"time_ratio": paper[clock] / no_worse[clock]},
+            }
+        )
     return out
 
 
 def _brief(row: dict) -> dict:
-    names = ("setting", "seconds", "cpu_seconds", "density_evals", "color_evals", "depth_mae", "depth_p99", "surface_mae", "visibility_wrong")
+    names = (
+        "setting",
+        "seconds",
+        "cpu_seconds",
+        "density_evals",
+        "color_evals",
+        "depth_mae",
+        "depth_p99",
+        "surface_mae",
+        "visibility_wrong",
+    )
     return {n: row[n] for n in names if n in row}
 
 
 def write_tables(out: Path, report: dict) -> list[Path]:
-    """Write ``study.csv`` (the rows), ``study.md`` (the same by factor, to read), ``scaling.csv`` and ``study.json`` (all of
-    ``report``); returns their paths."""
+    """Write ``study.csv`` (the rows), ``study.md`` (the same by factor, to read), ``scaling.csv`` and ``study.json``
+    (all of ``report``); returns their paths."""
     paths = [out / "study.csv", out / "study.md", out / "scaling.csv", out / "study.json"]
     for path, rows, columns in ((paths[0], report["rows"], COLUMNS), (paths[2], report["scaling"], None)):
-        write_csv(path, ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows), columns or list(rows[0]))
+        write_csv(
+            path,
+            ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows),
+            columns or list(rows[0]),
+        )
     write_text(paths[1], markdown(report))
     write_json(paths[3], report)
     return paths
@@ -81,10 +101,20 @@ def write_tables(out: Path, report: dict) -> list[Path]:
 
 # Column of study.csv, its heading to read, and what it is multiplied with.
 _SHOWN = (
-    ("seconds", "ms", 1e3), ("cpu_seconds", "CPU ms", 1e3), ("density_evals", "density", 1), ("color_evals", "colour", 1), ("color_rmse", "colour RMSE", 1),
-    ("depth_mae", "depth MAE", 1), ("depth_p99", "depth 99 %", 1), ("surface_mae", "surface MAE", 1), ("visibility_mae", "visibility MAE", 1),
-    ("visibility_wrong", "wrong %", 100), ("gaze_mae", "gaze MAE", 1), ("gaze_kld", "gaze KLD", 1), ("peak_mb", "MiB", 1),
-)  # fmt: skip
+    ("seconds", "ms", 1e3),
+    ("cpu_seconds", "CPU ms", 1e3),
+    ("density_evals", "density", 1),
+    ("color_evals", "colour", 1),
+    ("color_rmse", "colour RMSE", 1),
+    ("depth_mae", "depth MAE", 1),
+    ("depth_p99", "depth 99 %", 1),
+    ("surface_mae", "surface MAE", 1),
+    ("visibility_mae", "visibility MAE", 1),
+    ("visibility_wrong", "wrong %", 100),
+    ("gaze_mae", "gaze MAE", 1),
+    ("gaze_kld", "gaze KLD", 1),
+    ("peak_mb", "MiB", 1),
+)
 
 
 def markdown(report: dict) -> str:
@@ -93,7 +123,9 @@ def markdown(report: dict) -> str:
     shown = [c for c in _SHOWN if any(c[0] in r for r in rows)]
     default = rows[0]
     head = ["setting", *(title for _, title, _ in shown)]
-    text = [f"{report['scene']}, {report['size'][0]} x {report['size'][1]}, {report['variant']}, reference: {report['reference']}"]
+    text = [
+        f"{report['scene']}, {report['size'][0]} x {report['size'][1]}, {report['variant']}, reference: {report['reference']}"
+    ]
     if report["reference_change_when_step_halved"]:
         change = ", ".join(f"{k} {v:.2g}" for k, v in report["reference_change_when_step_halved"].items())
         text.append(f"Steps twice as long change the reference by: {change}")

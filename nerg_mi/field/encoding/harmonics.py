@@ -3,6 +3,7 @@
 Order and signs are those of instant-ngp and torch-ngp (Condon-Shortley phase,
 l = 0..3, m = -l..l), which Dr.Jit's ``sh_eval`` shares.
 """
+
 from __future__ import annotations
 
 import drjit as dr

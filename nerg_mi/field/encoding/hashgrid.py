@@ -6,6 +6,7 @@ rows rounded up to a multiple of 8, scales in float32, and zero outside of the
 unit cube. A level whose (resolution + 1)^3 vertices do not fit in the table is
 hashed with the primes of the paper.
 """
+
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
@@ -148,7 +149,9 @@ class HashGrid:
         cell = [ns.UInt32(c) for c in pos]
         w = [c - ns.Float(i) for c, i in zip(pos, cell)]
         lo, hi = self._corner_indices(level, cell)
-        read = lambda index: dr.gather(packet, self.table, self._combine(level, index) + self._offsets[level], active, mode=mode)  # noqa: E731
+        read = lambda index: dr.gather(
+            packet, self.table, self._combine(level, index) + self._offsets[level], active, mode=mode
+        )
         return list(dr.select(active, _blend(read, lo, hi, w, self.config.dimensions - 1, ()), 0))
 
     def _corner_indices(self, level: int, cell):

@@ -1,11 +1,13 @@
 """Several gaze fields for one: their mean is the gaze, their spread says how far the data decides it.
 
-Members are trained alike on resamples of the people (bagging, Breiman 1996; deep ensembles, Lakshminarayanan et al. 2017).
+Members are trained alike on resamples of the people (bagging, Breiman 1996; deep ensembles, Lakshminarayanan et al.
+2017).
 """
+
 from __future__ import annotations
 
-from .product import GazeField
 from .log_density import LogGazeField
+from .product import GazeField
 from .support import RaySupport
 
 
@@ -22,7 +24,9 @@ class GazeEnsemble:
         if len(self.members) < 2:
             raise ValueError(f"an ensemble of gaze fields needs at least two members, got {len(self.members)}")
         if any(_kind(m) != _kind(self.members[0]) for m in self.members):
-            raise ValueError("the members of an ensemble of gaze fields differ in kind, variant, output or box; train them alike")
+            raise ValueError(
+                "the members of an ensemble of gaze fields differ in kind, variant, output or box; train them alike"
+            )
         self.config, self.box, self.grid = self.members[0].config, self.members[0].box, self.members[0].grid
 
     def parameters(self) -> dict:
@@ -42,5 +46,8 @@ class GazeEnsemble:
 
 def _kind(field) -> tuple:
     c = field.config
-    more = [getattr(c, name, None) for name in ("variant", "activation", "normalized", "semantic", "geometry", "escaped", "reach")]
+    more = [
+        getattr(c, name, None)
+        for name in ("variant", "activation", "normalized", "semantic", "geometry", "escaped", "reach")
+    ]
     return type(field), tuple(field.box.lower), tuple(field.box.upper), *more

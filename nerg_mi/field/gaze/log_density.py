@@ -1,12 +1,14 @@
 """The gaze field as a log density that is normalised over the observer's sphere.
 
-gaze(p_o, r_o) = (1 - m) emit(p_od, -r_o, log |p_od - p_o|) * sigmoid(F_c(p_o, r_o)) * blind(r_o) / Z(p_o) + m blind(r_o)
+gaze(p_o, r_o) = (1 - m) emit(p_od, -r_o, log |p_od - p_o|) * sigmoid(F_c(p_o, r_o)) * blind(r_o) / Z(p_o) + m
+blind(r_o)
 
 Z(p_o) is the integral of the product over all directions, so that gaze integrates to one whatever the weights are: a
 softmax over the sphere. ``blind`` is the density of where people look whatever their position; m its share. What the
-factors mean is as in :mod:`nerg_mi.field.gaze.product`, but emit and capture have networks of their own: the one lives where the
-surfaces are, the other where people's heads were.
+factors mean is as in :mod:`nerg_mi.field.gaze.product`, but emit and capture have networks of their own: the one lives
+where the surfaces are, the other where people's heads were.
 """
+
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
@@ -15,12 +17,13 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from nerg_mi.maths.box import Box
-from .product import VARIANTS
 from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
+from nerg_mi.maths.box import Box
+
+from .product import VARIANTS
 
 GEOMETRIES = ("surface", "none")
 ESCAPES = ("constant", "nearest")
@@ -36,13 +39,15 @@ _FLOOR = 1e-3
 class LogGazeConfig:
     """Sizes and conventions.
 
-    ``grid``: of emit, over the field's box; coarse levels generalise to positions where nobody stood. ``variant``: as in
-    ``GazeConfig``. ``width``, ``layers``: of both networks' hidden layers. ``heads``: corners of the box of observers that
-    capture's encoding spans; positions beyond count as its nearest point. ``mix``: the share m of the blind density.
+    ``grid``: of emit, over the field's box; coarse levels generalise to positions where nobody stood. ``variant``: as
+    in ``GazeConfig``. ``width``, ``layers``: of both networks' hidden layers. ``heads``: corners of the box of
+    observers that capture's encoding spans; positions beyond count as its nearest point. ``mix``: the share m of the
+    blind density.
     ``prior``: rows of the blind density's latitude-longitude table.
-    ``geometry``: ``surface``, or ``none`` where no geometry was known: p_od then is ``reach`` from p_o whatever is there.
-    ``escaped``: what emit is where the observer meets no surface: a learnt ``constant``, or (where the geometry has holes,
-    as one made of hit points has) emit at the depth of the ``nearest`` directions that do.
+    ``geometry``: ``surface``, or ``none`` where no geometry was known: p_od then is ``reach`` from p_o whatever is
+    there.
+    ``escaped``: what emit is where the observer meets no surface: a learnt ``constant``, or (where the geometry has
+    holes, as one made of hit points has) emit at the depth of the ``nearest`` directions that do.
     """
 
     grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
@@ -64,8 +69,11 @@ class LogGazeConfig:
 
     def __post_init__(self):
         object.__setattr__(self, "heads", tuple(tuple(float(x) for x in corner) for corner in self.heads))
-        for what, value, known in (("variant", self.variant, VARIANTS), ("geometry", self.geometry, GEOMETRIES),
-                                   ("escaped", self.escaped, ESCAPES)):
+        for what, value, known in (
+            ("variant", self.variant, VARIANTS),
+            ("geometry", self.geometry, GEOMETRIES),
+            ("escaped", self.escaped, ESCAPES),
+        ):
             if value not in known:
                 raise ValueError(f'"{what}" of a gaze field must be one of {", ".join(known)}, got "{value}"')
         if min(self.width, self.layers, self.sh_degree) < 1 or self.prior < 2 or not self.reach > 0:
@@ -92,19 +100,23 @@ class LogGazeConfig:
 
 
 class LogGazeField:
-    """A normalised gaze density. Positions are in the field's units inside ``box``; ``prior``: table (rows, 2 rows) of the
-    log of the blind density, rows from +z to -z, columns by azimuth, at texel centres."""
+    """A normalised gaze density. Positions are in the field's units inside ``box``; ``prior``: table (rows, 2 rows) of
+    the log of the blind density, rows from +z to -z, columns by azimuth, at texel centres."""
 
     DRJIT_STRUCT = {"grid": None, "emit_net": None, "capture_net": None, "escaped": None, "prior": None}
     _NETS = ("emit_net", "capture_net")
 
-    def __init__(self, config: LogGazeConfig, box: Box, grid: HashGrid, emit_net: MLP, capture_net: MLP, escaped, prior):
+    def __init__(
+        self, config: LogGazeConfig, box: Box, grid: HashGrid, emit_net: MLP, capture_net: MLP, escaped, prior
+    ):
         grid.require(config.grid)
         emit_net.require(config.emit_sizes, "emit_net")
         capture_net.require(config.capture_sizes, "capture_net")
         if tuple(prior.shape) != (config.prior, 2 * config.prior) or dr.width(escaped) != 1:
-            raise ValueError(f"the blind density needs a table of {config.prior} x {2 * config.prior} and one escaped logit, "
-                             f"got {tuple(prior.shape)} and {dr.width(escaped)}")
+            raise ValueError(
+                f"the blind density needs a table of {config.prior} x {2 * config.prior} and one escaped logit, "
+                f"got {tuple(prior.shape)} and {dr.width(escaped)}"
+            )
         self.config, self.box, self.grid = config, box, grid
         self.emit_net, self.capture_net, self.escaped, self.prior = emit_net, capture_net, escaped, prior
         # How many rays it learnt from around a position (``support.RaySupport``), where that is known.
@@ -112,14 +124,22 @@ class LogGazeField:
         self.pack()
 
     @staticmethod
-    def random(config: LogGazeConfig, box: Box, ns: ModuleType, seed: int = 0, prior: np.ndarray | None = None) -> LogGazeField:
-        """An untrained field of backend ``ns``; equal seeds give equal weights. ``prior``: see ``blind_table``; uniform."""
+    def random(
+        config: LogGazeConfig, box: Box, ns: ModuleType, seed: int = 0, prior: np.ndarray | None = None
+    ) -> LogGazeField:
+        """An untrained field of backend ``ns``; equal seeds give equal weights. ``prior``: see ``blind_table``;
+        uniform."""
         rng = np.random.default_rng(seed)
         if prior is None:
             prior = np.full((config.prior, 2 * config.prior), -np.log(4 * np.pi))
         return LogGazeField(
-            config, box, HashGrid.random(config.grid, ns, rng), MLP.random(config.emit_sizes, ns, rng),
-            MLP.random(config.capture_sizes, ns, rng), ns.Float(0.0), ns.TensorXf(np.asarray(prior, np.float32)),
+            config,
+            box,
+            HashGrid.random(config.grid, ns, rng),
+            MLP.random(config.emit_sizes, ns, rng),
+            MLP.random(config.capture_sizes, ns, rng),
+            ns.Float(0.0),
+            ns.TensorXf(np.asarray(prior, np.float32)),
         )
 
     def parameters(self) -> dict:
@@ -149,10 +169,16 @@ class LogGazeField:
             p_od = p_o + r_o * self.config.reach
         # The maximum before the logarithm: its derivative at zero would not be finite.
         log_distance = 0.5 * dr.log(dr.maximum(dr.squared_norm(p_od - p_o), (_NEAREST * self.box.side) ** 2))
-        return [Float(1), log_distance, *encode_direction(-r_o, self.config.sh_degree), *self.grid(self.box.to_unit(p_od), active, mode)]
+        return [
+            Float(1),
+            log_distance,
+            *encode_direction(-r_o, self.config.sh_degree),
+            *self.grid(self.box.to_unit(p_od), active, mode),
+        ]
 
     def capture_position(self, p_o) -> list:
-        """What capture's network is given of the observer's position: coordinates in the box of heads and their first waves."""
+        """What capture's network is given of the observer's position: coordinates in the box of heads and their first
+        waves."""
         low, high = np.array(self.config.heads)
         scale = 2 / max((high - low).max(), 1e-6)
         u = [dr.clip((c - l) * scale - 1, -1, (h - l) * scale - 1) for c, l, h in zip(p_o, low.tolist(), high.tolist())]
@@ -181,14 +207,16 @@ class LogGazeField:
         return dr.exp(dr.minimum(logit, _HIGHEST)), one if c.variant == "emit" else self.capture(p_o, r_o, active)
 
     def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
-        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``escaped`` as for
-        ``unnormalized``.
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``escaped``
+        as for ``unnormalized``.
 
-        ``integral``: Z(p_o) (``transport.observer.integral``); ``emit`` is divided by it and includes the blind density, so that
-        gaze = (1 - m) emit * capture + m blind. Raises ``ValueError`` without it.
+        ``integral``: Z(p_o) (``transport.observer.integral``); ``emit`` is divided by it and includes the blind
+        density, so that gaze = (1 - m) emit * capture + m blind. Raises ``ValueError`` without it.
         """
         if integral is None:
-            raise ValueError("this gaze field is normalised over the observer's sphere: evaluating it needs its integral there")
+            raise ValueError(
+                "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
+            )
         emit, capture = self.unnormalized(p_od, p_o, r_o, active, escaped=escaped)
         emit = emit / integral
         gaze = emit * capture
@@ -198,7 +226,8 @@ class LogGazeField:
 
 
 def look_up(table, rows: int, d):
-    """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) in directions ``d``."""
+    """Bilinear value of a flat latitude-longitude ``table`` (rows x 2 rows, texel centres, +z first) in directions
+    ``d``."""
     Float = type(d.x)
     UInt32 = dr.uint32_array_t(Float)
     step, columns = dr.pi / rows, 2 * rows
@@ -215,15 +244,17 @@ def look_up(table, rows: int, d):
 
 def table_directions(rows: int) -> np.ndarray:
     """Directions (2 rows², 3) of the texels that ``look_up`` interpolates."""
-    theta, phi = np.meshgrid((np.arange(rows) + 0.5) * np.pi / rows, (np.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij")
+    theta, phi = np.meshgrid(
+        (np.arange(rows) + 0.5) * np.pi / rows, (np.arange(2 * rows) + 0.5) * np.pi / rows, indexing="ij"
+    )
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
 
 
 def blind_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.ndarray) -> np.ndarray:
     """Log table (rows, 2 rows) of a blind density given at ``table_directions(rows)``, 1/sr.
 
-    A thousandth of it is uniform. Scaled so that what ``look_up`` makes of it integrates to one over ``directions`` (N, 3),
-    a fine set of equal area.
+    A thousandth of it is uniform. Scaled so that what ``look_up`` makes of it integrates to one over ``directions`` (N,
+    3), a fine set of equal area.
     """
     density = np.asarray(density, np.float64)
     log = np.log((1 - _FLOOR) * density + _FLOOR / (4 * np.pi))

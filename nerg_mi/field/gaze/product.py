@@ -7,6 +7,7 @@ observer sees. F_e and F_c share a trunk of the NeRF's shape (hash grid, two
 small networks) and differ in their last layer. G is a density over directions
 around the observer, in 1/sr.
 """
+
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
@@ -15,12 +16,12 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.elementary import log1p
 from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.elementary import log1p
 
 VARIANTS = ("emit", "capture", "emit_capture")
 ACTIVATIONS = ("softplus", "exp", "linear")
@@ -56,8 +57,8 @@ class GazeConfig:
     inputs of every layer, adds biases, and puts a ReLU behind the position net too (what the paper's authors train by
     default); ``linear`` has no ReLU behind either net (their other choice).
 
-    ``normalized``: the density is divided by its integral over the observer's sphere wherever it is evaluated, so that it
-    integrates to one whatever the weights are.
+    ``normalized``: the density is divided by its integral over the observer's sphere wherever it is evaluated, so that
+    it integrates to one whatever the weights are.
 
     ``semantic``: what emit knows of the surface besides, or (without ``semantic_own``) instead of, the field's own
     grid: the ``geometry`` features of a radiance field, ``accumulated`` along the observer's ray by volume rendering
@@ -79,13 +80,17 @@ class GazeConfig:
 
     def __post_init__(self):
         if self.semantic not in SEMANTICS:
-            raise ValueError(f'the semantics of a gaze field must be one of {", ".join(SEMANTICS[1:])} or none, got "{self.semantic}"')
+            raise ValueError(
+                f'the semantics of a gaze field must be one of {", ".join(SEMANTICS[1:])} or none, got "{self.semantic}"'
+            )
         if self.semantic and self.variant == "capture":
             raise ValueError("a gaze field of the variant capture has no emit that semantic features could go to")
         if self.semantic_own and not self.semantic:
             raise ValueError("semantic_own adds a field's own features to semantic ones; say which those are")
         if self.semantic and self.normalized:
-            raise ValueError("a gaze field with semantic features cannot be normalised over the sphere: their integral is not kept")
+            raise ValueError(
+                "a gaze field with semantic features cannot be normalised over the sphere: their integral is not kept"
+            )
         if self.trunk not in TRUNKS:
             raise ValueError(f'the trunk of a gaze field must be one of {", ".join(TRUNKS)}, got "{self.trunk}"')
         if not 0 < self.emit_scale < float("inf"):
@@ -119,17 +124,25 @@ class GazeField:
     Positions are in the field's units inside ``box`` (outside of it the grid's features are 0).
     """
 
-    DRJIT_STRUCT = {
-        "grid": None, "position_net": None, "direction_net": None, "emit_head": None, "capture_head": None,
-    }
+    DRJIT_STRUCT = {"grid": None, "position_net": None, "direction_net": None, "emit_head": None, "capture_head": None}
     _NETS = ("position_net", "direction_net", "emit_head", "capture_head")
 
-    def __init__(self, config: GazeConfig, box: Box, grid: HashGrid, position_net: MLP, direction_net: MLP,
-                 emit_head: MLP, capture_head: MLP):
+    def __init__(
+        self,
+        config: GazeConfig,
+        box: Box,
+        grid: HashGrid,
+        position_net: MLP,
+        direction_net: MLP,
+        emit_head: MLP,
+        capture_head: MLP,
+    ):
         grid.require(config.grid)
         for name, net, sizes in (
-            ("position_net", position_net, config.position_sizes), ("direction_net", direction_net, config.direction_sizes),
-            ("emit_head", emit_head, [config.width, 1]), ("capture_head", capture_head, [config.width, 1]),
+            ("position_net", position_net, config.position_sizes),
+            ("direction_net", direction_net, config.direction_sizes),
+            ("emit_head", emit_head, [config.width, 1]),
+            ("capture_head", capture_head, [config.width, 1]),
         ):
             net.require(sizes, name, self._is_normalized(config, name))
         self.config, self.box, self.grid = config, box, grid
@@ -148,7 +161,8 @@ class GazeField:
         """An untrained field of backend ``ns``; equal seeds give equal weights."""
         rng, normalized = np.random.default_rng(seed), config.trunk == "layernorm"
         return GazeField(
-            config, box,
+            config,
+            box,
             HashGrid.random(config.grid, ns, rng),
             MLP.random(config.position_sizes, ns, rng, normalized),
             MLP.random(config.direction_sizes, ns, rng, normalized),
@@ -189,8 +203,10 @@ class GazeField:
         ``geometry`` features, for a field whose configuration asks for them."""
         c = self.config
         if (semantic is None) == bool(c.semantic) or (semantic is not None and len(semantic) != c.geometry):
-            raise ValueError(f"this gaze field takes {c.geometry if c.semantic else 'no'} semantic features, got "
-                             f"{'none' if semantic is None else len(semantic)}")
+            raise ValueError(
+                f"this gaze field takes {c.geometry if c.semantic else 'no'} semantic features, got "
+                f"{'none' if semantic is None else len(semantic)}"
+            )
         return activate(self.emit_head(self._trunk(p_od, -r_o, active, semantic))[0], c.activation) * c.emit_scale
 
     def capture(self, p_o, r_o, active=True):
@@ -198,7 +214,8 @@ class GazeField:
         return sigmoid(self.capture_head(self._trunk(p_o, r_o, active))[0])
 
     def unnormalized(self, p_od, p_o, r_o, active=True, semantic=None, escaped=False):
-        """``(emit, capture)``, whose product a normalised field divides by its integral; ``escaped`` makes no difference.
+        """``(emit, capture)``, whose product a normalised field divides by its integral; ``escaped`` makes no
+        difference.
 
         A variant that lacks a part has 1 in its place and does not evaluate it. ``semantic``: see ``emit``.
         """
@@ -207,7 +224,8 @@ class GazeField:
         return emit, one if self.config.variant == "emit" else self.capture(p_o, r_o, active)
 
     def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
-        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``; ``escaped`` makes no difference.
+        """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``; ``escaped`` makes
+        no difference.
 
         ``semantic``: see ``emit``. ``integral``: of a normalised field over the sphere at ``p_o``
         (``transport.observer.integral``), by which ``emit`` is divided; ``ValueError`` without it.
@@ -215,6 +233,8 @@ class GazeField:
         emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic)
         if self.config.normalized:
             if integral is None:
-                raise ValueError("this gaze field is normalised over the observer's sphere: evaluating it needs its integral there")
+                raise ValueError(
+                    "this gaze field is normalised over the observer's sphere: evaluating it needs its integral there"
+                )
             emit = emit / integral
         return emit * capture, emit, capture

@@ -1,20 +1,25 @@
-"""How much data a gaze field rests on around a position: where the rays that it learnt from started, in a few kilobytes.
+"""How much data a gaze field rests on around a position: where the rays that it learnt from started, in a few
+kilobytes.
 
-Support at p is the sum over rays of Epanechnikov's kernel, Σ_i max(0, 1 - |o_i - p|² / R²): a ray that started at p counts as
-one, a ray R away not at all. Rays are kept as cells of R/2 with their number, mean origin and variance. The sum over a cell
-inside of R follows from these exactly. In one that R cuts, the squared distances are taken to be spread uniformly.
+Support at p is the sum over rays of Epanechnikov's kernel, Σ_i max(0, 1 - |o_i - p|² / R²): a ray that started at p
+counts as one, a ray R away not at all. Rays are kept as cells of R/2 with their number, mean origin and variance. The
+sum over a cell inside of R follows from these exactly. In one that R cuts, the squared distances are taken to be spread
+uniformly.
 """
+
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
 
 CELLS = 2
-"""Cells along R: 95 of 100 places with a support of 5 or more are within 4 % of the sum over all rays (measured in the tests)."""
+"""Cells along R: 95 of 100 places with a support of 5 or more are within 4 % of the sum over all rays (measured in the
+tests)."""
 
 
 class RaySupport:
-    """``cells`` (n, 5): mean origin (3), number of rays, and their mean squared distance from that; ``radius``: R. Both in one frame."""
+    """``cells`` (n, 5): mean origin (3), number of rays, and their mean squared distance from that; ``radius``: R. Both
+    in one frame."""
 
     def __init__(self, cells: np.ndarray, radius: float):
         self.cells, self.radius = np.ascontiguousarray(cells, np.float32).reshape(-1, 5), float(radius)
@@ -27,19 +32,23 @@ class RaySupport:
         origins = np.asarray(origins, np.float64).reshape(-1, 3)
         lower = origins.min(axis=0)
         index = np.floor((origins - lower) * (CELLS / radius)).astype(np.int64)
-        _, cell, count = np.unique(np.ravel_multi_index(index.T, index.max(axis=0) + 1), return_inverse=True, return_counts=True)
+        _, cell, count = np.unique(
+            np.ravel_multi_index(index.T, index.max(axis=0) + 1), return_inverse=True, return_counts=True
+        )
         mean = np.stack([np.bincount(cell, weights=x) for x in origins.T], axis=1) / count[:, None]
         apart = np.bincount(cell, weights=((origins - mean[cell]) ** 2).sum(axis=1)) / count
         return RaySupport(np.concatenate([mean, count[:, None], apart[:, None]], axis=1), radius)
 
     def at(self, p):
-        """Support at ``p`` (Array3f or Point3f of one lane), a Float of one lane: rays that count, without derivatives."""
+        """Support at ``p`` (Array3f or Point3f of one lane), a Float of one lane: rays that count, without
+        derivatives."""
         Float, p = dr.float32_array_t(type(p.x)), dr.detach(p)
         x, y, z, count, apart = (Float(np.ascontiguousarray(column)) for column in self.cells.T)
         square = dr.square(x - p.x) + dr.square(y - p.y) + dr.square(z - p.z)
         scale = 1 / self.radius**2
         inside = 1 - (square + apart) * scale
-        # Half the width of a uniform law with the variance of |o - p|² in a cell whose rays spread alike in all directions.
+        # Half the width of a uniform law with the variance of |o - p|² in a cell whose rays spread alike in all
+        # directions.
         reach = dr.sqrt(4 * square * apart) * scale + 1e-9
         cut = dr.square(dr.maximum(inside + reach, 0)) / (4 * reach)
         return dr.sum(count * dr.select(inside > reach, inside, cut))

@@ -46,7 +46,7 @@ class TorchArchive:
 class StoredTensor:
     """A tensor in the archive, of ``shape``; ``numpy()`` reads it."""
 
-    __slots__ = ("_archive", "_key", "_dtype", "_offset", "shape", "_stride")
+    __slots__ = ("_archive", "_dtype", "_key", "_offset", "_stride", "shape")
 
     def __init__(self, key: str, dtype: str, offset: int, shape: tuple, stride: tuple):
         # The archive is given once all of the pickle is read.

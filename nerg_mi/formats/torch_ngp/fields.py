@@ -3,6 +3,7 @@
 They hold a state dictionary and no sizes: those are read off the shapes, and the hash grid's resolutions
 follow from ``aabb_train``. What is not in the file is an argument here.
 """
+
 from __future__ import annotations
 
 import math
@@ -14,13 +15,14 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.maths.box import Box
 from nerg_mi.field.cascades import CascadeGrid, levels_of
 from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.architecture import building, check_sizes
+from nerg_mi.maths.box import Box
+
 from .unpickling import StoredTensor, read_torch
 
 MARCH_STEP = 2 * math.sqrt(3) / 1024
@@ -50,7 +52,8 @@ class StateDict:
     def __init__(self, path: Path, tensors: dict, prefix: str = "", averaged: dict | None = None):
         self.path, self.prefix, self._averaged = path, prefix, averaged or {}
         self._tensors = {
-            k[len(prefix):]: v for k, v in tensors.items()
+            k[len(prefix) :]: v
+            for k, v in tensors.items()
             if isinstance(k, str) and k.startswith(prefix) and isinstance(v, StoredTensor)
         }
 
@@ -67,7 +70,9 @@ class StateDict:
     def shape(self, name: str) -> tuple[int, ...]:
         """The shape of ``self[name]``, which is not read."""
         if name not in self._tensors:
-            raise NergError(f'"{self.path}" lacks "{self.prefix}{name}", which its kind of checkpoint holds; copy it again')
+            raise NergError(
+                f'"{self.path}" lacks "{self.prefix}{name}", which its kind of checkpoint holds; copy it again'
+            )
         return self._tensors[name].shape
 
     def weights(self, name: str) -> np.ndarray:
@@ -100,7 +105,7 @@ def averaged_weights(path: str | Path, whole: dict, model: dict, wanted: bool | 
     keeps its averages as the weights themselves.
     """
     shadow = (whole.get("ema") or {}).get("shadow_params") or []
-    if not wanted and wanted is not None or not shadow:
+    if (not wanted and wanted is not None) or not shadow:
         if wanted and not shadow:
             raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
         return {}
@@ -131,25 +136,43 @@ def read_torch_ngp(
 
 def origin(path: str | Path, whole: dict, program: str, averaged: bool) -> dict:
     counts = {k: whole[k] for k in ("epoch", "global_step") if isinstance(whole.get(k), int)}
-    return {"imported_from": Path(path).name, "format": program, "weights": "moving averages" if averaged else "raw", **counts}
+    return {
+        "imported_from": Path(path).name,
+        "format": program,
+        "weights": "moving averages" if averaged else "raw",
+        **counts,
+    }
 
 
 def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density: float | None = None) -> RadianceField:
     """The field that a torch-ngp state dictionary describes."""
     for name in state.names():
         if name in ("encoder.params", "sigma_net.params", "color_net.params"):
-            raise NergError(f'"{state.path}" was trained with --tcnn or --ff, whose layout is not read: retrain without')
+            raise NergError(
+                f'"{state.path}" was trained with --tcnn or --ff, whose layout is not read: retrain without'
+            )
     box, bound = _box(state)
     density, color = layers(state, "sigma_net", ns), layers(state, "color_net", ns)
     width, geometry = density.weights[0].shape[0], density.outputs - 1
     config = RadianceConfig(
-        grid_config(state, "encoder", given.finest or 2048 * bound), width, len(density.weights) - 1, len(color.weights) - 1,
-        geometry, sh_degree(state, color.inputs - geometry),
+        grid_config(state, "encoder", given.finest or 2048 * bound),
+        width,
+        len(density.weights) - 1,
+        len(color.weights) - 1,
+        geometry,
+        sh_degree(state, color.inputs - geometry),
     )
     check_sizes(config.to_dict(), "networks")
     return RadianceField(
-        config, box, grid(state, "encoder", config.grid, ns), density, color, _occupancy(state, bound, ns, mean_density),
-        given.color_space, MARCH_STEP, _background(state, ns, given, config.sh_degree),
+        config,
+        box,
+        grid(state, "encoder", config.grid, ns),
+        density,
+        color,
+        _occupancy(state, bound, ns, mean_density),
+        given.color_space,
+        MARCH_STEP,
+        _background(state, ns, given, config.sh_degree),
     )
 
 
@@ -174,13 +197,18 @@ def whole(value: float) -> int | float:
 def sh_degree(state: StateDict, inputs: int) -> int:
     degree = math.isqrt(max(inputs, 0))
     if degree < 1 or degree**2 != inputs:
-        raise NergError(f'the direction encoding of "{state.path}" has {inputs} numbers, so it is not spherical harmonics')
+        raise NergError(
+            f'the direction encoding of "{state.path}" has {inputs} numbers, so it is not spherical harmonics'
+        )
     return degree
 
 
 def grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3) -> HashGridConfig:
     """Configuration of the hash grid ``name``, whose level sizes are compared with those stored."""
-    offsets, table = state[f"{name}.offsets"].astype(int).ravel()[: _LEVELS + 2].tolist(), state.shape(f"{name}.embeddings")
+    offsets, table = (
+        state[f"{name}.offsets"].astype(int).ravel()[: _LEVELS + 2].tolist(),
+        state.shape(f"{name}.embeddings"),
+    )
     levels, largest = len(offsets) - 1, max(np.diff(offsets), default=0)
     if not 1 <= levels <= _LEVELS or largest < 8 or len(table) != 2:
         raise NergError(
@@ -224,8 +252,11 @@ def _background(state: StateDict, ns: ModuleType, given: Given, degree: int) -> 
         return None
     net = layers(state, "bg_net", ns)
     config = BackgroundConfig(
-        float(given.background_radius), grid_config(state, "encoder_bg", 2048, 2), net.weights[0].shape[0],
-        len(net.weights) - 1, degree,
+        float(given.background_radius),
+        grid_config(state, "encoder_bg", 2048, 2),
+        net.weights[0].shape[0],
+        len(net.weights) - 1,
+        degree,
     )
     return Background(config, grid(state, "encoder_bg", config.grid, ns), net)
 
@@ -275,23 +306,41 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     """
     c, box = field.config, field.box
     bound = box.side / 2
-    expected = HashGridConfig(levels=c.grid.levels, features=c.grid.features, log2_rows=c.grid.log2_rows,
-                              finest=max(whole(2048 * bound), 16))
-    wrong = [words for fits, words in (
-        (box.center == (0, 0, 0) and bound >= 1,
-         f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}"),
-        (c.grid == expected, f"its grid must be from 16 to {expected.finest}, not {c.grid.base} to {c.grid.finest}"),
-        ((c.grid.levels, c.grid.features, c.grid.log2_rows) == (16, 2, 19),
-         "its grid must have 16 levels of 2 features and 2^19 rows"),
-        ((c.width, c.density_hidden, c.color_hidden, c.geometry, c.sh_degree) == (64, 1, 2, 15, 4),
-         "its networks must be 64 wide (paper size)"),
-        (c.density_scale == 1, f"its density scale must be 1, not {c.density_scale:g}"),
-    ) if not fits]  # fmt: skip
+    expected = HashGridConfig(
+        levels=c.grid.levels, features=c.grid.features, log2_rows=c.grid.log2_rows, finest=max(whole(2048 * bound), 16)
+    )
+    wrong = [
+        words
+        for fits, words in (
+            (
+                box.center == (0, 0, 0) and bound >= 1,
+                f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}",
+            ),
+            (
+                c.grid == expected,
+                f"its grid must be from 16 to {expected.finest}, not {c.grid.base} to {c.grid.finest}",
+            ),
+            (
+                (c.grid.levels, c.grid.features, c.grid.log2_rows) == (16, 2, 19),
+                "its grid must have 16 levels of 2 features and 2^19 rows",
+            ),
+            (
+                (c.width, c.density_hidden, c.color_hidden, c.geometry, c.sh_degree) == (64, 1, 2, 15, 4),
+                "its networks must be 64 wide (paper size)",
+            ),
+            (c.density_scale == 1, f"its density scale must be 1, not {c.density_scale:g}"),
+        )
+        if not fits
+    ]
     if wrong:
         raise NergError(f"this field has no torch-ngp form: {'; '.join(wrong)}")
     cube = np.float32([-bound] * 3 + [bound] * 3)
-    state = {"aabb_train": cube, "aabb_infer": np.float32([*box.lower, *box.upper]),
-             "density_bitfield": _bitfield(field.occupancy, bound), "step_counter": np.zeros((16, 2), np.int32)}  # fmt: skip
+    state = {
+        "aabb_train": cube,
+        "aabb_infer": np.float32([*box.lower, *box.upper]),
+        "density_bitfield": _bitfield(field.occupancy, bound),
+        "step_counter": np.zeros((16, 2), np.int32),
+    }
     _put_grid(state, "encoder", field.grid)
     _put_layers(state, "sigma_net", field.density_net)
     _put_layers(state, "color_net", field.color_net)
@@ -320,7 +369,9 @@ def _bitfield(occupancy, bound: float) -> np.ndarray:
     elif isinstance(occupancy, OccupancyGrid):
         bits = np.stack([_overlapped(occupancy.bits, min(2.0**k, bound) / bound) for k in range(levels)])
     else:
-        raise NergError(f"cascades of {occupancy.resolution}^3 cells to a bound of {occupancy.bound:g} have no torch-ngp form")
+        raise NergError(
+            f"cascades of {occupancy.resolution}^3 cells to a bound of {occupancy.bound:g} have no torch-ngp form"
+        )
     packed = np.zeros((levels, _CELLS**3), bool)
     packed[:, morton_order()] = bits.reshape(levels, -1)
     return np.packbits(packed.ravel(), bitorder="little")
@@ -344,5 +395,14 @@ def write_torch_ngp(field: RadianceField, path: str | Path) -> None:
 
     stats = {"loss": [], "valid_loss": [], "results": [], "checkpoints": [], "best_result": None}
     threshold = 0.0 if field.occupancy is None else field.occupancy.threshold
-    write_torch(path, {"epoch": 0, "global_step": 0, "stats": stats, "mean_count": 0, "mean_density": threshold,
-                       "model": torch_ngp_state(field)})  # fmt: skip
+    write_torch(
+        path,
+        {
+            "epoch": 0,
+            "global_step": 0,
+            "stats": stats,
+            "mean_count": 0,
+            "mean_density": threshold,
+            "model": torch_ngp_state(field),
+        },
+    )

@@ -1,4 +1,6 @@
-"""Checkpoints of the paper's authors (github.com/ch-andrei/nerg-neural-gaze): a gaze field, and the NeRF it looks at."""
+"""Checkpoints of the paper's authors (github.com/ch-andrei/nerg-neural-gaze): a gaze field, and the NeRF it looks
+at."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -7,17 +9,21 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.box import Box
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceField
-from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.files.bounded import plain
+from nerg_mi.formats.architecture import building, check_sizes
+from nerg_mi.maths.box import Box
+
 from .fields import Given, StateDict, decimals, grid, grid_config, open_checkpoint, origin, radiance_field, sh_degree
 from .unpickling import NamedValue
 
 _VARIANTS = {"Emit": "emit", "Capture": "capture", "EmitCapture": "emit_capture"}
-_HEADS = {"emit_head": ("emit_head.weight", "lin_emit.weight"), "capture_head": ("capture_head.weight", "lin_capture.weight")}
+_HEADS = {
+    "emit_head": ("emit_head.weight", "lin_emit.weight"),
+    "capture_head": ("capture_head.weight", "lin_capture.weight"),
+}
 
 
 def is_nerg(model: dict) -> bool:
@@ -35,7 +41,9 @@ def read_nerg(
     """
     whole, model = open_checkpoint(path)
     if ema is False and whole.get("ema"):
-        raise NergError(f'"{path}" keeps its moving averages as its weights and nothing else: import it without --no-ema')
+        raise NergError(
+            f'"{path}" keeps its moving averages as its weights and nothing else: import it without --no-ema'
+        )
     if ema and not whole.get("ema"):
         raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
     state = StateDict(Path(path), model)
@@ -57,7 +65,9 @@ def _variant(state: StateDict, stored) -> str:
             "the others need the NeRF's features along the ray or an attention block"
         )
     if any(n.startswith("capture_head.") and n != "capture_head.weight" for n in state.names()):
-        raise NergError(f'"{state.path}" captures gaze by a mixture of von Mises-Fisher lobes; only a linear head is read')
+        raise NergError(
+            f'"{state.path}" captures gaze by a mixture of von Mises-Fisher lobes; only a linear head is read'
+        )
     if ("Emit" in name and not emit) or ("Capture" in name and not capture):
         raise NergError(f'"{state.path}" is of the variant {name} and lacks one of its heads')
     return _VARIANTS[name]
@@ -73,8 +83,13 @@ def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
     if position.weights[0].shape[0] != width or direction.weights[0].shape[0] != width:
         raise NergError(f'the networks of "{state.path}" are not all {width} wide')
     config = GazeConfig(
-        grid_config(state, "encoder", 256 * bound), variant, "linear", width, geometry,
-        sh_degree(state, direction.inputs - geometry), trunk="layernorm" if normalized else "linear",
+        grid_config(state, "encoder", 256 * bound),
+        variant,
+        "linear",
+        width,
+        geometry,
+        sh_degree(state, direction.inputs - geometry),
+        trunk="layernorm" if normalized else "linear",
     )
     check_sizes(config.to_dict(), "networks")
     heads = [_head(state, names, width, ns) for names in _HEADS.values()]

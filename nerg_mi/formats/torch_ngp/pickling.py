@@ -1,4 +1,5 @@
 """Writes dictionaries of arrays as ``torch.save`` does, without torch: ``torch.load(weights_only=True)`` reads them."""
+
 from __future__ import annotations
 
 import io
@@ -10,7 +11,13 @@ import numpy as np
 
 from nerg_mi.files.atomic import replacing
 
-_STORAGE = {"<f4": "FloatStorage", "<f2": "HalfStorage", "<i4": "IntStorage", "<i8": "LongStorage", "|u1": "ByteStorage"}
+_STORAGE = {
+    "<f4": "FloatStorage",
+    "<f2": "HalfStorage",
+    "<i4": "IntStorage",
+    "<i8": "LongStorage",
+    "|u1": "ByteStorage",
+}
 
 
 class _Writer:

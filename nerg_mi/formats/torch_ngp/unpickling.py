@@ -20,6 +20,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.bounded import is_count, plain, reading, size_of
+
 from .archive import StoredTensor, TorchArchive
 
 PICKLE_BYTES = 8 << 20
@@ -29,10 +30,17 @@ OPERATIONS = 1_000_000
 """So many opcodes may it have."""
 
 _STORAGES = {
-    "DoubleStorage": "<f8", "FloatStorage": "<f4", "HalfStorage": "<f2", "BFloat16Storage": "bfloat16",
-    "LongStorage": "<i8", "IntStorage": "<i4", "ShortStorage": "<i2", "CharStorage": "i1", "ByteStorage": "u1",
+    "DoubleStorage": "<f8",
+    "FloatStorage": "<f4",
+    "HalfStorage": "<f2",
+    "BFloat16Storage": "bfloat16",
+    "LongStorage": "<i8",
+    "IntStorage": "<i4",
+    "ShortStorage": "<i2",
+    "CharStorage": "i1",
+    "ByteStorage": "u1",
     "BoolStorage": "?",
-}  # fmt: skip
+}
 
 
 class NamedValue:
@@ -128,10 +136,24 @@ class _Machine:
     """Reads one pickle. ``tensors``: all that it made."""
 
     _MARK = object()
-    _PUSHED = frozenset((
-        "INT", "BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8",
-        "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BINSTRING", "SHORT_BINSTRING",
-    ))  # fmt: skip
+    _PUSHED = frozenset(
+        (
+            "INT",
+            "BININT",
+            "BININT1",
+            "BININT2",
+            "LONG1",
+            "BINFLOAT",
+            "BINUNICODE",
+            "SHORT_BINUNICODE",
+            "BINUNICODE8",
+            "BINBYTES",
+            "SHORT_BINBYTES",
+            "BINBYTES8",
+            "BINSTRING",
+            "SHORT_BINSTRING",
+        )
+    )
     _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
     _EMPTY = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple, "MARK": lambda: _Machine._MARK}
     _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}

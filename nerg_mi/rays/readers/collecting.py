@@ -1,10 +1,12 @@
 """Collecting rays from sources: dropping what cannot be used, with an account of it."""
+
 from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -167,7 +169,9 @@ class RaysBuilder:
         entry["count"] += int(rows.size)
         entry["rows"] += named
         if len(named) < len(runs):
-            entry["rows_not_named"] = entry.get("rows_not_named", 0) + sum(last - first + 1 for first, last in runs[len(named) :])
+            entry["rows_not_named"] = entry.get("rows_not_named", 0) + sum(
+                last - first + 1 for first, last in runs[len(named) :]
+            )
 
     def build(self) -> Rays:
         """The rays collected. Raises `NergError` when none is left."""
@@ -183,7 +187,9 @@ class RaysBuilder:
             "dropped": self._dropped,
             **self._about,
         }
-        columns = {name: self._column(name) for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")}
+        columns = {
+            name: self._column(name) for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")
+        }
         columns["person"], persons = self._persons.sorted(columns["person"])
         cohorts: tuple[str, ...] = ()
         if columns["cohort"] is not None:
@@ -192,12 +198,14 @@ class RaysBuilder:
         return Rays(**columns, persons=persons, cohorts=cohorts, metadata=metadata)
 
     def _column(self, name: str) -> np.ndarray | None:
-        """A column of all parts; parts without hits or cohorts get NaN or the cohort ""; ``None`` where all are without.
-        The parts' own are let go, so that no more than one column is there twice."""
+        """A column of all parts; parts without hits or cohorts get NaN or the cohort ""; ``None`` where all are
+        without. The parts' own are let go, so that no more than one column is there twice."""
         if not any(name in part for part in self._parts):
             return None
         lacking = {"hit": lambda n: np.full((n, 3), np.nan), "cohort": lambda n: self._cohorts.codes("", n)}
-        return np.concatenate([part.pop(name) if name in part else lacking[name](n) for part, n in zip(self._parts, self._kept)])
+        return np.concatenate(
+            [part.pop(name) if name in part else lacking[name](n) for part, n in zip(self._parts, self._kept)]
+        )
 
 
 class _Names:

@@ -1,10 +1,12 @@
 """Which columns of a table of rays mean what.
 
-Written as ``origin=x,y,z direction=dx,dy,dz t=time person=id confidence=valid hit=hx,hy,hz cohort=group``. In place of a
-direction, or beside one that is in the head's own frame, the head's pose: ``xyzw=qx,qy,qz,qw`` or ``wxyz=qw,qx,qy,qz``
-(quaternion, its order in its name), ``ypr=yaw,pitch,roll`` (or yaw and pitch), ``matrix=m00,m01,...`` (12 or 16 columns,
-row by row, head to world; it holds the origin as well). ``eye=ex,ey,ez``: where the eye is in the head's frame.
+Written as ``origin=x,y,z direction=dx,dy,dz t=time person=id confidence=valid hit=hx,hy,hz cohort=group``. In place of
+a direction, or beside one that is in the head's own frame, the head's pose: ``xyzw=qx,qy,qz,qw`` or
+``wxyz=qw,qx,qy,qz`` (quaternion, its order in its name), ``ypr=yaw,pitch,roll`` (or yaw and pitch),
+``matrix=m00,m01,...`` (12 or 16 columns, row by row, head to world; it holds the origin as well). ``eye=ex,ey,ez``:
+where the eye is in the head's frame.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
@@ -12,9 +14,19 @@ from dataclasses import dataclass, fields
 from nerg_mi.errors import NergError
 
 _COUNTS = {
-    "origin": (3,), "direction": (3,), "xyzw": (4,), "wxyz": (4,), "ypr": (2, 3), "matrix": (12, 16), "eye": (3,),
-    "hit": (3,), "t": (1,), "person": (1,), "confidence": (1,), "cohort": (1,),
-}  # fmt: skip
+    "origin": (3,),
+    "direction": (3,),
+    "xyzw": (4,),
+    "wxyz": (4,),
+    "ypr": (2, 3),
+    "matrix": (12, 16),
+    "eye": (3,),
+    "hit": (3,),
+    "t": (1,),
+    "person": (1,),
+    "confidence": (1,),
+    "cohort": (1,),
+}
 POSES = ("xyzw", "wxyz", "ypr", "matrix")
 
 
@@ -22,9 +34,9 @@ POSES = ("xyzw", "wxyz", "ypr", "matrix")
 class ColumnMap:
     """Names of a table's columns. Required: where (``origin``, or in ``matrix``) and whereto (``direction`` or a pose).
 
-    A ``direction`` beside a pose is in the head's frame, without one in the table's. Without ``t`` rows are numbered, without
-    ``person`` the file is the person, without ``confidence`` it is one. Raises `NergError` for a map that is incomplete
-    or says one thing twice.
+    A ``direction`` beside a pose is in the head's frame, without one in the table's. Without ``t`` rows are numbered,
+    without ``person`` the file is the person, without ``confidence`` it is one. Raises `NergError` for a map that is
+    incomplete or says one thing twice.
     """
 
     origin: tuple[str, ...] | None = None
@@ -54,7 +66,9 @@ class ColumnMap:
                 "or a pose (xyzw, wxyz, ypr or matrix)"
             )
         if self.eye is not None and not poses:
-            raise NergError("column map: eye is in the head's frame and needs a pose; add one (xyzw, wxyz, ypr or matrix)")
+            raise NergError(
+                "column map: eye is in the head's frame and needs a pose; add one (xyzw, wxyz, ypr or matrix)"
+            )
 
     @property
     def pose(self) -> str | None:

@@ -2,6 +2,7 @@
 
 Ours is right-handed with z up, in metres.
 """
+
 from __future__ import annotations
 
 import numpy as np
@@ -15,9 +16,10 @@ UPS = ("y", "z", "x", "-y", "-z", "-x")
 def to_rays_frame(*, up: str = "z", handedness: str = "right", units: str = "m") -> np.ndarray:
     """4x4 matrix from a declared frame to ours (right-handed, z up, metres).
 
-    ``up``: the axis that points up, x, y or z or one of them negated. x is kept (where x is up, y becomes x). z up, right:
-    nothing. y up, right: (x, -z, y), a rotation. y up, left (Unity): (x, z, y), the mirror that makes Unity's forward our y.
-    z up, left (Unreal): (x, -y, z). -y up, right (a camera of OpenCV): (x, z, -y). Raises `NergError` for another word.
+    ``up``: the axis that points up, x, y or z or one of them negated. x is kept (where x is up, y becomes x). z up,
+    right: nothing. y up, right: (x, -z, y), a rotation. y up, left (Unity): (x, z, y), the mirror that makes Unity's
+    forward our y. z up, left (Unreal): (x, -y, z). -y up, right (a camera of OpenCV): (x, z, -y). Raises `NergError`
+    for another word.
     """
     if up not in UPS or handedness not in ("left", "right"):
         raise NergError(

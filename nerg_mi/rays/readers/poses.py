@@ -1,8 +1,9 @@
 """Heads' poses: from quaternions, angles and matrices to rotations, and on to rays.
 
-A rotation takes the head's frame to the table's. ``forward`` names the axis of the head's frame along which it looks: ``z``
-in Unity, ``-z`` of an OpenGL camera and in OpenXR, ``x`` in ROS and Unreal.
+A rotation takes the head's frame to the table's. ``forward`` names the axis of the head's frame along which it looks:
+``z`` in Unity, ``-z`` of an OpenGL camera and in OpenXR, ``x`` in ROS and Unreal.
 """
+
 from __future__ import annotations
 
 import numpy as np
@@ -28,8 +29,8 @@ def default_forward(up: str, handedness: str) -> str:
 
 
 def rotations_from_quaternions(q: np.ndarray, order: str = "xyzw") -> np.ndarray:
-    """Rotation matrices (N, 3, 3) of quaternions (N, 4) in ``order`` xyzw or wxyz; they need not be unit. NaN where one is
-    not finite or zero."""
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4) in ``order`` xyzw or wxyz; they need not be unit. NaN where one
+    is not finite or zero."""
     q = np.asarray(q, dtype=np.float64)
     if order not in ("xyzw", "wxyz") or q.ndim != 2 or q.shape[1] != 4:
         raise ValueError(f'quaternions {q.shape} in order "{order}": expected (N, 4), xyzw or wxyz')
@@ -43,9 +44,9 @@ def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bo
     """Rotation matrices (N, 3, 3) of yaw, pitch and, where there is a third column, roll (N, 2 or 3).
 
     First the head turns about the up axis (yaw), then about its own sideways axis (pitch), then about its forward axis
-    (roll), each by the usual rotation matrix about the coordinate axis of that name. So in Unity (y up, z forward) positive
-    angles turn right and look down, in ROS (z up, x forward) they turn left and look down, and in OpenXR (y up, -z forward)
-    they turn left and look up. Raises `NergError` where ``up`` and ``forward`` are the same axis.
+    (roll), each by the usual rotation matrix about the coordinate axis of that name. So in Unity (y up, z forward)
+    positive angles turn right and look down, in ROS (z up, x forward) they turn left and look down, and in OpenXR (y
+    up, -z forward) they turn left and look up. Raises `NergError` where ``up`` and ``forward`` are the same axis.
     """
     angles = np.asarray(angles, dtype=np.float64)
     up, forward = up[-1], forward[-1]
@@ -53,7 +54,9 @@ def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bo
         raise NergError(f"the up axis and the forward axis are both {up}; say where heads look with forward")
     (side,) = set("xyz") - {up, forward}
     sequence = (up + side + forward).upper()[: angles.shape[1]]
-    return _where(np.isfinite(angles).all(axis=1), angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees))
+    return _where(
+        np.isfinite(angles).all(axis=1), angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees)
+    )
 
 
 def rotations_from_matrices(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,23 +2,26 @@
 
 Each is a function of files; :data:`PRESETS` names them for the command line.
 """
+
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Callable
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from .ray_tables import iterate_table
+from nerg_mi.rays.rays import Rays
+
 from . import headsets
 from .collecting import RaysBuilder
 from .frames import to_rays_frame
-from nerg_mi.rays.rays import Rays
+from .ray_tables import iterate_table
 from .skeleton import rays_from_skeleton
 from .tables import Paths, person_from_filename
+
 
 def vr_supermarket(paths: Paths, *, min_openness: float = 0.5, skip_bad_lines: bool = False) -> Rays:
     """Eye gaze of people in a VR supermarket, one gzip CSV a person, 50 Hz.
@@ -36,10 +39,27 @@ def vr_supermarket(paths: Paths, *, min_openness: float = 0.5, skip_bad_lines: b
     with z up.
     """
     matrix = [f"ctw_{i}{j}" for i in range(3) for j in range(4)]
-    names = [*matrix, "ray_x", "ray_y", "ray_z", "eye_x", "eye_y", "eye_z", "xc", "yc", "zc", "opennessl", "opennessr", "time"]
+    names = [
+        *matrix,
+        "ray_x",
+        "ray_y",
+        "ray_z",
+        "eye_x",
+        "eye_y",
+        "eye_z",
+        "xc",
+        "yc",
+        "zc",
+        "opennessl",
+        "opennessr",
+        "time",
+    ]
     frame = {"up": "y", "handedness": "left", "units": "m"}
     builder = RaysBuilder(
-        transform=to_rays_frame(**frame), preset="vr_supermarket", source_frame=frame, min_openness=min_openness,
+        transform=to_rays_frame(**frame),
+        preset="vr_supermarket",
+        source_frame=frame,
+        min_openness=min_openness,
         skip_bad_lines=skip_bad_lines,
     )
     for path in map(Path, paths):
@@ -65,8 +85,8 @@ def vr_supermarket(paths: Paths, *, min_openness: float = 0.5, skip_bad_lines: b
 
 @dataclass(frozen=True)
 class Preset:
-    """A known recording: ``read(paths, **options)`` returns its rays; each knows ``skip_bad_lines`` (see `RaysBuilder`), and
-    the ``options`` named here."""
+    """A known recording: ``read(paths, **options)`` returns its rays; each knows ``skip_bad_lines`` (see
+    `RaysBuilder`), and the ``options`` named here."""
 
     summary: str
     read: Callable[..., Rays]
@@ -75,11 +95,15 @@ class Preset:
 
 PRESETS = {
     "skeleton22": Preset(
-        "22-keypoint skeletons, id|time|[66 floats], metres, z up: ears to nose", rays_from_skeleton, ("tick", "keypoints", "pitch")
+        "22-keypoint skeletons, id|time|[66 floats], metres, z up: ears to nose",
+        rays_from_skeleton,
+        ("tick", "keypoints", "pitch"),
     ),
     "vr_supermarket": Preset("VR supermarket eye gaze, one CSV a person (Unity frame)", vr_supermarket),
     "unity": Preset(
-        "Unity logs of gaze in the world: gaze_origin_*, gaze_dir_* (or gaze_direction_*, gaze_forward_*)", headsets.unity, ("tick",)
+        "Unity logs of gaze in the world: gaze_origin_*, gaze_dir_* (or gaze_direction_*, gaze_forward_*)",
+        headsets.unity,
+        ("tick",),
     ),
     "unity_local": Preset(
         "Unity logs of gaze in the head's frame, beside head_pos_* and head_rot_*", headsets.unity_local, ("tick",)
@@ -87,7 +111,9 @@ PRESETS = {
     "unity_head": Preset("Unity logs of heads: head_pos_*, head_rot_*", headsets.unity_head, ("tick",)),
     "varjo": Preset("the log of Varjo's eye tracking example for Unity", headsets.varjo),
     "hololens": Preset("*_head_hand_eye.csv of HoloLens 2's StreamRecorder", headsets.hololens),
-    "pupil": Preset("Pupil Core exports with the head pose tracker's", headsets.pupil, ("marker", "up", "min_confidence")),
+    "pupil": Preset(
+        "Pupil Core exports with the head pose tracker's", headsets.pupil, ("marker", "up", "min_confidence")
+    ),
 }
 
 

@@ -1,10 +1,12 @@
 """Tables of rays: CSV (also ``.gz``) and Parquet, read by named columns."""
+
 from __future__ import annotations
 
 import csv
 import os
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from typing import Any, Callable, Iterator, NamedTuple, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,9 +57,9 @@ def iterate_table(
     The separator (comma, semicolon or tab) is taken from the header. Cells
     that are empty or say nan, na, null or none are NaN. ``header``: the names
     of the columns of a CSV whose first line is none. Raises `NergError`
-    for a damaged file, a missing column (naming those there are), and, unless ``on_bad`` is given, a row with too few cells or
-    a cell that is no number (naming its line); ``on_bad`` is told of such lines, which are left out. Where pyarrow is
-    installed it converts the cells, to the same numbers.
+    for a damaged file, a missing column (naming those there are), and, unless ``on_bad`` is given, a row with too few
+    cells or a cell that is no number (naming its line); ``on_bad`` is told of such lines, which are left out. Where
+    pyarrow is installed it converts the cells, to the same numbers.
     """
     if str(path).lower().endswith(".parquet"):
         yield from _iterate_parquet(path, numbers, texts)
@@ -78,9 +80,11 @@ def iterate_table(
         count += len(raw)
         if kept:
             found = convert(kept)
-            block = TableBlock(*found, lines) if found else _convert(
-                path, kept, lines, separator, columns, number_at, text_at, on_bad
-            )  # fmt: skip
+            block = (
+                TableBlock(*found, lines)
+                if found
+                else _convert(path, kept, lines, separator, columns, number_at, text_at, on_bad)
+            )
             if len(block.lines):
                 yield block
     if convert is None and header is None:
@@ -102,10 +106,11 @@ def _header(path: object, line: str) -> tuple[list[str], str]:
 def _fast_reader(
     separator: str, columns: list[str], number_at: list[int], text_at: list[int]
 ) -> Callable[[list[str]], tuple[np.ndarray, np.ndarray] | None] | None:
-    """A function of lines that converts them with pyarrow, three times as fast and on all cores; ``None`` without pyarrow.
+    """A function of lines that converts them with pyarrow, three times as fast and on all cores; ``None`` without
+    pyarrow.
 
-    It gives ``None`` for lines that are in any way unusual (missing cells, words among numbers), which the slower reader
-    converts, or refuses by line and column.
+    It gives ``None`` for lines that are in any way unusual (missing cells, words among numbers), which the slower
+    reader converts, or refuses by line and column.
     """
     try:
         import pyarrow as pa
@@ -134,7 +139,11 @@ def _fast_reader(
             return None
         if table.num_rows != len(rows):  # a quoted cell with a line break
             return None
-        values = np.stack([table.column(names[i]).to_numpy() for i in number_at], axis=1) if number_at else np.empty((len(rows), 0))
+        values = (
+            np.stack([table.column(names[i]).to_numpy() for i in number_at], axis=1)
+            if number_at
+            else np.empty((len(rows), 0))
+        )
         words = [np.char.strip(table.column(names[i]).to_numpy().astype(str)) for i in text_at]
         return values, np.stack(words, axis=1) if words else np.empty((len(rows), 0), dtype=str)
 
@@ -142,19 +151,30 @@ def _fast_reader(
 
 
 def _convert(
-    path: object, rows: list[str], lines: np.ndarray, separator: str, columns: list[str], number_at: list[int],
-    text_at: list[int], on_bad: OnBadLine | None,
-) -> TableBlock:  # fmt: skip
+    path: object,
+    rows: list[str],
+    lines: np.ndarray,
+    separator: str,
+    columns: list[str],
+    number_at: list[int],
+    text_at: list[int],
+    on_bad: OnBadLine | None,
+) -> TableBlock:
     # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast
     # reader refuses them, so they are spelt out first.
     gap = separator * 2
     filled = rows
     if any(gap in row for row in rows):
-        filled = [r.replace(gap, f"{separator}nan{separator}").replace(gap, f"{separator}nan{separator}") if gap in r else r for r in rows]
+        filled = [
+            r.replace(gap, f"{separator}nan{separator}").replace(gap, f"{separator}nan{separator}") if gap in r else r
+            for r in rows
+        ]
     options = dict(delimiter=separator, comments=None, quotechar='"', ndmin=2)
     try:
         values = np.loadtxt(filled, usecols=number_at, dtype=np.float64, **options)
-        words = np.loadtxt(rows, usecols=text_at, dtype=str, **options) if text_at else np.empty((len(rows), 0), dtype=str)
+        words = (
+            np.loadtxt(rows, usecols=text_at, dtype=str, **options) if text_at else np.empty((len(rows), 0), dtype=str)
+        )
     except (ValueError, OverflowError):
         return _convert_slowly(path, rows, lines, separator, columns, number_at, text_at, on_bad)
     if len(values) != len(rows) or len(words) != len(rows):  # a quote that is never closed joins lines
@@ -163,9 +183,15 @@ def _convert(
 
 
 def _convert_slowly(
-    path: object, rows: list[str], lines: np.ndarray, separator: str, columns: list[str], number_at: list[int],
-    text_at: list[int], on_bad: OnBadLine | None,
-) -> TableBlock:  # fmt: skip
+    path: object,
+    rows: list[str],
+    lines: np.ndarray,
+    separator: str,
+    columns: list[str],
+    number_at: list[int],
+    text_at: list[int],
+    on_bad: OnBadLine | None,
+) -> TableBlock:
     """Line by line, cell by cell: knows more spellings of "missing", and names the bad cell."""
     values, words, kept = [], [], []
     least = max([*number_at, *text_at], default=0)
@@ -187,7 +213,9 @@ def _convert_slowly(
     )
 
 
-def _cells(row: str, separator: str, columns: list[str], number_at: list[int], least: int) -> tuple[list[str], list[float]] | str:
+def _cells(
+    row: str, separator: str, columns: list[str], number_at: list[int], least: int
+) -> tuple[list[str], list[float]] | str:
     """The cells of a line and the numbers among them; or what is wrong with it, and the remedy."""
     try:
         cells = next(csv.reader([row], delimiter=separator), [])
@@ -217,7 +245,9 @@ def _parquet(path: str | os.PathLike) -> Any:
         claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
     # Equal values are stored once: what counts is also what they become.
     if max(claimed, _ROW_BYTES * about.num_rows) > inflated_limit(size):
-        raise NergError(f'the table "{path}" claims {about.num_rows:,} rows, which its {size:,} bytes do not warrant; copy it again')
+        raise NergError(
+            f'the table "{path}" claims {about.num_rows:,} rows, which its {size:,} bytes do not warrant; copy it again'
+        )
     return table
 
 
@@ -229,7 +259,9 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
         _require(path, [*numbers, *texts], names)
         twice = [c for c in (*numbers, *texts) if names.count(c) > 1]
         if twice:
-            raise NergError(f'the table "{path}" has several columns called {plain(twice[0], 40)!r}; rename all but one')
+            raise NergError(
+                f'the table "{path}" has several columns called {plain(twice[0], 40)!r}; rename all but one'
+            )
         first, wanted = 1, list(dict.fromkeys([*numbers, *texts]))
         with reading(path, "table", also=(pa.lib.ArrowException,)):
             batches = table.iter_batches(batch_size=BLOCK, columns=wanted)
@@ -241,7 +273,9 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
                 n = batch.num_rows
                 column = lambda c: batch.column(batch.schema.get_field_index(c))
                 values = [_as_numbers(path, c, column(c)) for c in numbers]
-                words = [np.array(["" if v is None else str(v) for v in column(c).to_pylist()], dtype=str) for c in texts]
+                words = [
+                    np.array(["" if v is None else str(v) for v in column(c).to_pylist()], dtype=str) for c in texts
+                ]
             yield TableBlock(
                 np.stack(values, axis=1) if values else np.empty((n, 0)),
                 np.stack(words, axis=1) if words else np.empty((n, 0), dtype=str),
@@ -254,11 +288,15 @@ def _as_numbers(path: object, name: str, column: Any) -> np.ndarray:
     try:
         return column.to_numpy(zero_copy_only=False).astype(np.float64)
     except (TypeError, ValueError):
-        raise NergError(f'the column {plain(name, 40)!r} of the table "{path}" holds no numbers; name another one') from None
+        raise NergError(
+            f'the column {plain(name, 40)!r} of the table "{path}" holds no numbers; name another one'
+        ) from None
 
 
 def _require(path: object, wanted: list[str], there: list[str]) -> None:
     missing = [c for c in wanted if c not in there]
     if missing:
         brief = lambda names: ", ".join(plain(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
-        raise NergError(f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}; name those by --map")
+        raise NergError(
+            f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}; name those by --map"
+        )

@@ -3,18 +3,20 @@
 The paper's proxy for gaze (Section 5.1): a ray from the midpoint of the ears
 through the nose. Frame of the tracking data: metres, z up, right-handed.
 """
+
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Sequence
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from .skeleton_file import KEYPOINTS, iterate_skeleton
-from .collecting import RaysBuilder
 from nerg_mi.rays.rays import Rays
+
+from .collecting import RaysBuilder
+from .skeleton_file import KEYPOINTS, iterate_skeleton
 
 # The keypoints whose meaning is known: columns 6:9, 39:42 and 33:36 of the file.
 LEFT_EAR, RIGHT_EAR, NOSE = 2, 13, 11
@@ -26,13 +28,24 @@ EAR_HEIGHT = 1.58  # metres: the height for which _BODY is written
 # The other nineteen keypoints are unnamed in the published code. Bodies made
 # here fill them as a standing adult: (to the left, forward, height) in metres.
 _BODY = {
-    0: (0.10, 0.00, 0.08), 1: (0.12, 0.17, 0.02), 3: (0.25, 0.02, 1.05),  # left ankle, toe, elbow
-    5: (0.10, -0.06, 0.03), 6: (0.10, 0.00, 0.90), 7: (0.10, 0.03, 0.48),  # left heel, hip, knee
-    8: (0.19, 0.00, 1.36), 9: (0.26, 0.15, 0.88), 10: (0.00, 0.00, 1.40),  # left shoulder, wrist; neck
-    12: (-0.10, 0.00, 0.08), 14: (-0.25, 0.02, 1.05), 16: (-0.10, -0.06, 0.03),  # right ankle, elbow, heel
-    17: (-0.10, 0.00, 0.90), 18: (-0.10, 0.03, 0.48), 19: (-0.19, 0.00, 1.36),  # right hip, knee, shoulder
-    20: (-0.26, 0.15, 0.88), 21: (0.00, 0.00, 1.15),  # right wrist; chest
-}  # fmt: skip
+    0: (0.10, 0.00, 0.08),
+    1: (0.12, 0.17, 0.02),
+    3: (0.25, 0.02, 1.05),  # left ankle, toe, elbow
+    5: (0.10, -0.06, 0.03),
+    6: (0.10, 0.00, 0.90),
+    7: (0.10, 0.03, 0.48),  # left heel, hip, knee
+    8: (0.19, 0.00, 1.36),
+    9: (0.26, 0.15, 0.88),
+    10: (0.00, 0.00, 1.40),  # left shoulder, wrist; neck
+    12: (-0.10, 0.00, 0.08),
+    14: (-0.25, 0.02, 1.05),
+    16: (-0.10, -0.06, 0.03),  # right ankle, elbow, heel
+    17: (-0.10, 0.00, 0.90),
+    18: (-0.10, 0.03, 0.48),
+    19: (-0.19, 0.00, 1.36),  # right hip, knee, shoulder
+    20: (-0.26, 0.15, 0.88),
+    21: (0.00, 0.00, 1.15),  # right wrist; chest
+}
 _LEFT_EYE, _RIGHT_EYE = 4, 15
 
 
@@ -41,10 +54,10 @@ def head_poses(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays of the heads: from the midpoint of the ears through the nose.
 
-    ``keypoints``: (N, 22, 3). ``ears``, ``nose``: which of them. ``pitch``: degrees by which a ray is turned up about the
-    line through the ears, since a nose lies below the ears and a level head then seems to look down. Returns ``origin``
-    (N, 3) in the unit given and ``direction`` (N, 3), unit; where an ear or the nose is NaN or the nose lies on the
-    midpoint, the direction is NaN. NeRG, Section 5.1.
+    ``keypoints``: (N, 22, 3). ``ears``, ``nose``: which of them. ``pitch``: degrees by which a ray is turned up about
+    the line through the ears, since a nose lies below the ears and a level head then seems to look down. Returns
+    ``origin`` (N, 3) in the unit given and ``direction`` (N, 3), unit; where an ear or the nose is NaN or the nose lies
+    on the midpoint, the direction is NaN. NeRG, Section 5.1.
     """
     keypoints = np.asarray(keypoints, dtype=np.float64)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (KEYPOINTS, 3):
@@ -136,10 +149,13 @@ def rays_from_skeleton(
         paths = [paths]
     left, right, nose = keypoints
     builder = RaysBuilder(
-        preset="skeleton22", tick=tick, source_frame={"up": "z", "handedness": "right", "units": "m"},
-        keypoints=[left, right, nose], pitch=pitch,
+        preset="skeleton22",
+        tick=tick,
+        source_frame={"up": "z", "handedness": "right", "units": "m"},
+        keypoints=[left, right, nose],
+        pitch=pitch,
         skip_bad_lines=skip_bad_lines,
-    )  # fmt: skip
+    )
     for path in paths:
         builder.source(Path(path))
         for rows in iterate_skeleton(path, keypoints=(left, right, nose), on_bad=builder.on_bad):

@@ -5,6 +5,7 @@ time or frame number, and 22 keypoints of three coordinates each in metres with
 z up. A keypoint that was not seen is written as ``nan``. What the keypoints
 mean is the business of :mod:`nerg_mi.rays.readers.skeleton`.
 """
+
 from __future__ import annotations
 
 import gzip
@@ -12,9 +13,10 @@ import io
 import itertools
 import operator
 import os
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Iterator, NamedTuple, Sequence
+from typing import IO, NamedTuple
 
 import numpy as np
 
@@ -39,12 +41,7 @@ class SkeletonRows(NamedTuple):
 
 
 def write_skeleton(
-    path: str | os.PathLike,
-    ids: Sequence[str],
-    times: np.ndarray,
-    keypoints: np.ndarray,
-    *,
-    decimals: int = 6,
+    path: str | os.PathLike, ids: Sequence[str], times: np.ndarray, keypoints: np.ndarray, *, decimals: int = 6
 ) -> None:
     """Write poses in the order given; a name ending in ``.gz`` is compressed.
 
@@ -84,8 +81,9 @@ def iterate_skeleton(
     memory stays bounded (a day of a store is some 2.6 million lines).
 
     ``keypoints``: which of the 22 are wanted; the others are counted but not
-    converted, and come out NaN. Empty lines are skipped. Raises `NergError` for a damaged file and, naming file and line, for
-    a line that does not follow the format; where ``on_bad`` is given, that is told of such lines, which are left out.
+    converted, and come out NaN. Empty lines are skipped. Raises `NergError` for a damaged file and, naming file and
+    line, for a line that does not follow the format; where ``on_bad`` is given, that is told of such lines, which are
+    left out.
     """
     wanted = range(KEYPOINTS) if keypoints is None else sorted(set(keypoints))
     columns = [3 * k + i for k in wanted for i in range(3)]
@@ -133,7 +131,9 @@ def _fields(line: str) -> tuple[str, int, str] | str:
 
 def _refuse(path: object, line: int, why: str, on_bad: OnBadLine | None) -> None:
     if on_bad is None:
-        raise NergError(f"{path}, line {line}{why}; mend or remove the line, or leave such lines out with --skip-bad-lines")
+        raise NergError(
+            f"{path}, line {line}{why}; mend or remove the line, or leave such lines out with --skip-bad-lines"
+        )
     on_bad(line, why)
 
 
@@ -146,7 +146,13 @@ def read_skeleton(path: str | os.PathLike) -> SkeletonRows:
 
 
 def _rows(
-    path: object, ids: list[str], times: list[int], texts: list[str], lines: list[int], columns: list[int], on_bad: OnBadLine | None
+    path: object,
+    ids: list[str],
+    times: list[int],
+    texts: list[str],
+    lines: list[int],
+    columns: list[int],
+    on_bad: OnBadLine | None,
 ) -> SkeletonRows:
     # One conversion for the whole run; only when it fails is the line searched for.
     pick = operator.itemgetter(*columns)

@@ -1,19 +1,21 @@
 """Rays of tables through a column map: a direction of its own, or a head's pose, or both."""
+
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Sequence
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from .column_map import ColumnMap
-from .ray_tables import iterate_table
+from nerg_mi.rays.rays import Rays
+
 from . import poses
 from .collecting import RaysBuilder
+from .column_map import ColumnMap
 from .frames import to_rays_frame
-from nerg_mi.rays.rays import Rays
+from .ray_tables import iterate_table
 
 Paths = Sequence[str | os.PathLike]
 
@@ -70,9 +72,16 @@ def rays_from_table(
 
     frame = {"up": up, "handedness": handedness, "units": units}
     builder = RaysBuilder(
-        transform=to_rays_frame(**frame), skip_bad_lines=skip_bad_lines, columns=str(columns), source_frame=frame, tick=tick, min_confidence=min_confidence,
-        **({"forward": forward} if columns.pose else {}), **({"degrees": degrees} if columns.ypr else {}), **about,
-    )  # fmt: skip
+        transform=to_rays_frame(**frame),
+        skip_bad_lines=skip_bad_lines,
+        columns=str(columns),
+        source_frame=frame,
+        tick=tick,
+        min_confidence=min_confidence,
+        **({"forward": forward} if columns.pose else {}),
+        **({"degrees": degrees} if columns.ypr else {}),
+        **about,
+    )
     for path in map(Path, paths):
         builder.source(path)
         rows = 0
@@ -94,7 +103,9 @@ def rays_from_table(
                 direction = turn @ ahead if direction is None else np.einsum("nij,nj->ni", turn, direction)
             drop = {f"confidence below {min_confidence:g}": confidence < min_confidence}
             for name, words in (valid or {}).items():
-                drop[f"{name} is not {' or '.join(words)}"] = ~np.isin(np.char.lower(word[name]), [w.lower() for w in words])
+                drop[f"{name} is not {' or '.join(words)}"] = ~np.isin(
+                    np.char.lower(word[name]), [w.lower() for w in words]
+                )
             builder.add(
                 t * tick,
                 person_from_filename(path) if by_file else word[columns.person],

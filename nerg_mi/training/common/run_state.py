@@ -1,8 +1,9 @@
 """The whole state of a training in a file, so that an interrupted run goes on as if it had not been.
 
-With one thread the weights then equal those of a run without interruption bit for bit; with more, sums over threads come in
-no fixed order in either.
+With one thread the weights then equal those of a run without interruption bit for bit; with more, sums over threads
+come in no fixed order in either.
 """
+
 from __future__ import annotations
 
 import json
@@ -13,8 +14,8 @@ from pathlib import Path
 import drjit as dr
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.architecture import number
 from nerg_mi.files.bounded import reading
+from nerg_mi.formats.architecture import number
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
 
 KIND = "radiance run"
@@ -25,8 +26,8 @@ _NUMBERS = ("steps", "rays", "samples", "stride", "looked")
 
 
 def save_run(trainer, path: str | Path, about: dict, history: list) -> None:
-    """Write the state of ``trainer`` (`RadianceTrainer`) atomically. ``about``: what the run must agree on to be resumed
-    (JSON); ``history``: of its held-out error so far."""
+    """Write the state of ``trainer`` (`RadianceTrainer`) atomically. ``about``: what the run must agree on to be
+    resumed (JSON); ``history``: of its held-out error so far."""
     tensors, taken = optimiser_state(trainer)
     for name in _GRID:
         tensors[f"grid.{name}"] = getattr(trainer.grid, name).numpy()
@@ -34,10 +35,16 @@ def save_run(trainer, path: str | Path, about: dict, history: list) -> None:
     settling = trainer.settling
     tensors |= {"settling.found": settling.found.numpy(), "settling.shown": settling.shown.numpy()}
     metadata = {
-        "about": about, "history": history, "taken": taken, **{name: getattr(trainer, name) for name in _NUMBERS},
-        "seconds": trainer.seconds, "settling": settling.at, "turn": trainer.grid.turn, "clock": trainer.clock.to_dict(),
+        "about": about,
+        "history": history,
+        "taken": taken,
+        **{name: getattr(trainer, name) for name in _NUMBERS},
+        "seconds": trainer.seconds,
+        "settling": settling.at,
+        "turn": trainer.grid.turn,
+        "clock": trainer.clock.to_dict(),
         "random": trainer.rng.bit_generator.state,
-    }  # fmt: skip
+    }
     write_checkpoint(path, KIND, tensors, metadata)
 
 
@@ -57,7 +64,9 @@ def load_run(trainer, path: str | Path, about: dict) -> list:
         restore_optimiser(trainer, tensors, meta["taken"])
         trainer.grid.restore(*[tensors[f"grid.{name}"] for name in _GRID], int(count_of(meta, "turn")))
         trainer.rng.bit_generator.state = meta["random"]
-        trainer.settling.restore(int(number(meta, "settling", "state")), tensors["settling.found"], tensors["settling.shown"])
+        trainer.settling.restore(
+            int(number(meta, "settling", "state")), tensors["settling.found"], tensors["settling.shown"]
+        )
         trainer.clock.restore(meta["clock"])
         trainer.restore(hard=tensors["hard"], **counts)
         return list(meta["history"])
@@ -86,10 +95,12 @@ def require_shape(tensors: dict, name: str, like) -> None:
 
 @contextmanager
 def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iterator[None]:
-    """A block that measures and writes what a training has come to; only when it has ended is the state in ``path`` removed.
+    """A block that measures and writes what a training has come to; only when it has ended is the state in ``path``
+    removed.
 
-    ``path``: None where no state is kept; ``keep``: brings it up to date, called if the block raises, so that no step is lost
-    to a full disk or to Ctrl-C; ``done``: whether the state goes. A `NergError` of the block then says how to go on.
+    ``path``: None where no state is kept; ``keep``: brings it up to date, called if the block raises, so that no step
+    is lost to a full disk or to Ctrl-C; ``done``: whether the state goes. A `NergError` of the block then says how to
+    go on.
     """
     try:
         yield
@@ -112,7 +123,8 @@ def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iter
 
 
 def optimiser_state(trainer) -> tuple[dict, dict]:
-    """``(tensors, taken)``: weights, moments and averages of ``trainer`` by name, and the steps that each array has taken.
+    """``(tensors, taken)``: weights, moments and averages of ``trainer`` by name, and the steps that each array has
+    taken.
 
     ``trainer``: has an ``optimiser`` (Adam or AdamW) and the dictionary ``averaged`` of its weights.
     """
@@ -125,7 +137,8 @@ def optimiser_state(trainer) -> tuple[dict, dict]:
 
 
 def restore_optimiser(trainer, tensors: dict, taken: dict) -> None:
-    """Set ``trainer`` to what ``optimiser_state`` gave. Raises ``ValueError`` or `KeyError` where that does not fit it."""
+    """Set ``trainer`` to what ``optimiser_state`` gave. Raises ``ValueError`` or `KeyError` where that does not fit
+    it."""
     optimiser = trainer.optimiser
     for name, (value, promoted, rate, (count, first, second, largest)) in optimiser.state.items():
         old = {"weights": value, "first": first, "second": second, "averaged": trainer.averaged[name]}

@@ -1,4 +1,5 @@
 """How long the steps of a training take, and how fast the machine evaluates the field in them."""
+
 from __future__ import annotations
 
 import time
@@ -55,9 +56,13 @@ class StepClock:
     def to_dict(self) -> dict:
         """State for ``restore``."""
         return {
-            "evaluations": self.evaluations, "steps": self.steps, "seconds": self.seconds, "each": self.each,
-            "extremes": self.extremes if self.steps else [], "durations": [round(x, 5) for x in self.durations],
-        }  # fmt: skip
+            "evaluations": self.evaluations,
+            "steps": self.steps,
+            "seconds": self.seconds,
+            "each": self.each,
+            "extremes": self.extremes if self.steps else [],
+            "durations": [round(x, 5) for x in self.durations],
+        }
 
     def restore(self, state: dict) -> None:
         self.evaluations, self.steps, self.each = (int(state[name]) for name in ("evaluations", "steps", "each"))

@@ -1,8 +1,11 @@
-"""Ensembles of gaze fields: the same training on resamples of the people, whose spread says what the data does not decide.
+"""Ensembles of gaze fields: the same training on resamples of the people, whose spread says what the data does not
+decide.
 
-What repeats itself is drawn together: a person with all of their rays where there are several people, else stretches of time
-of each person (block bootstrap, Künsch 1989). Single rays of one second say the same, and their resamples would too.
+What repeats itself is drawn together: a person with all of their rays where there are several people, else stretches of
+time of each person (block bootstrap, Künsch 1989). Single rays of one second say the same, and their resamples would
+too.
 """
+
 from __future__ import annotations
 
 import time
@@ -12,15 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.rays.rays import Rays
+from nerg_mi.training.common.run_state import kept_unless, require_same
+
 from .run import GazeProgress, identity, support_of, train_gaze
 from .settings import GazeSettings, ProbeSettings
 from .state import KIND as RUN
-from nerg_mi.training.common.run_state import kept_unless, require_same
 
 FEW = 5
 """Blocks that a resample needs at least; people are the blocks where there are as many of them."""
@@ -40,7 +44,9 @@ def blocks_of(rays: Rays) -> tuple[np.ndarray, str]:
     stretch = np.floor((rays.t - first[block]) / BLOCK).astype(np.int64)
     _, block = np.unique(np.stack([block, stretch]), axis=1, return_inverse=True)
     if block.max() + 1 < FEW:
-        raise NergError(f"{block.max() + 1} stretches of {BLOCK:g} s of {len(persons)} people are too few to resample; leave out --ensemble")
+        raise NergError(
+            f"{block.max() + 1} stretches of {BLOCK:g} s of {len(persons)} people are too few to resample; leave out --ensemble"
+        )
     return block.ravel(), f"blocks of {BLOCK:g} s"
 
 
@@ -62,26 +68,46 @@ def resample(rays: Rays, seed) -> Rays:
 
 
 def train_ensemble(
-    members: int, rays: Rays | None, medium, box, config, settings: GazeSettings, probes: ProbeSettings, ns, align=None, on_progress=None,
-    initial: dict | None = None, *, state: Path | None = None, resume: bool = False, save_every: float = 60.0, about: dict | None = None,
-    views: list | tuple = (), write: Callable[[GazeEnsemble, dict], None] | None = None,
+    members: int,
+    rays: Rays | None,
+    medium,
+    box,
+    config,
+    settings: GazeSettings,
+    probes: ProbeSettings,
+    ns,
+    align=None,
+    on_progress=None,
+    initial: dict | None = None,
+    *,
+    state: Path | None = None,
+    resume: bool = False,
+    save_every: float = 60.0,
+    about: dict | None = None,
+    views: list | tuple = (),
+    write: Callable[[GazeEnsemble, dict], None] | None = None,
 ) -> tuple[GazeEnsemble, dict]:
-    """Train ``members`` gaze fields, each on a resample and with a seed of its own; returns them and their provenance (JSON).
+    """Train ``members`` gaze fields, each on a resample and with a seed of its own; returns them and their provenance
+    (JSON).
 
-    The other arguments are those of ``gaze_run.train_gaze``; minutes are those of all members together. With ``state``, what
-    is done is kept beside it, one file a member, and removed once ``write`` has put the ensemble into a file; without it the
-    members stay. Raises `KeyboardInterrupt`, whose message says how to go on, where it is interrupted.
+    The other arguments are those of ``gaze_run.train_gaze``; minutes are those of all members together. With ``state``,
+    what is done is kept beside it, one file a member, and removed once ``write`` has put the ensemble into a file;
+    without it the members stay. Raises `KeyboardInterrupt`, whose message says how to go on, where it is interrupted.
     """
     if members < 2:
         raise NergError(f"an ensemble needs at least two members, got {members}")
     if rays is None or views:
         raise NergError("an ensemble resamples people: it is trained on rays alone; leave out --ensemble or --views")
     if probes.kappa_rule == "loo":
-        raise NergError('an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"')
+        raise NergError(
+            'an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"'
+        )
     if settings.minutes is not None:
         settings = replace(settings, minutes=settings.minutes / members)
     _, kind = blocks_of(rays)
-    parts = [state.with_name(f"{state.stem}.member{k}.safetensors") if state is not None else None for k in range(members)]
+    parts = [
+        state.with_name(f"{state.stem}.member{k}.safetensors") if state is not None else None for k in range(members)
+    ]
     if resume and not (state.is_file() or any(p.is_file() for p in parts)):
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
     fields, each = [], []
@@ -89,7 +115,12 @@ def train_ensemble(
         mine, same = replace(settings, seed=settings.seed + 100 * k), {**(about or {}), "member": [k, members]}
         # All that a state of the run compares, of the rays that the resamples are drawn from.
         whole = identity(rays, (), mine, probes, config, box, align, same)
-        say = lambda s, k=k: on_progress and on_progress(GazeProgress(f"{k + 1}/{members} {s.stage}", (k + s.done) / members, s.steps, s.seconds, s.scores))
+        say = lambda s, k=k: (
+            on_progress
+            and on_progress(
+                GazeProgress(f"{k + 1}/{members} {s.stage}", (k + s.done) / members, s.steps, s.seconds, s.scores)
+            )
+        )
         if resume and part.is_file():
             field, meta = load_gaze(part, ns)
             done = meta["provenance"]
@@ -100,14 +131,32 @@ def train_ensemble(
                 state.unlink()
         else:
             keep = None if part is None else _keeper(part, whole)
-            field, done = train_gaze(resample(rays, (settings.seed, k)), medium, box, config, mine, probes, ns, align, say, initial, state=state,
-                                     resume=resume and state.is_file(), save_every=save_every, about=same, write=keep)
+            field, done = train_gaze(
+                resample(rays, (settings.seed, k)),
+                medium,
+                box,
+                config,
+                mine,
+                probes,
+                ns,
+                align,
+                say,
+                initial,
+                state=state,
+                resume=resume and state.is_file(),
+                save_every=save_every,
+                about=same,
+                write=keep,
+            )
             if done["interrupted"]:
                 kept = f"go on with --resume (state in {state})" if state is not None else "nothing was kept"
                 raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {kept}")
         fields.append(field)
         each.append(done)
-    ensemble, provenance = GazeEnsemble(fields, support_of(rays, probes.radius, align)), _together(each, settings, rays, kind)
+    ensemble, provenance = (
+        GazeEnsemble(fields, support_of(rays, probes.radius, align)),
+        _together(each, settings, rays, kind),
+    )
     if write is not None:
         # Every member is in its file by now: there is nothing more to keep if this fails.
         with kept_unless(state, lambda: None, done=False):
@@ -120,6 +169,7 @@ def train_ensemble(
 
 def _keeper(part: Path, about: dict):
     """Writes a member into ``part``; one that was interrupted has its state, and is none yet."""
+
     def keep(field, done: dict) -> None:
         if not done["interrupted"]:
             save_gaze(field, part, {"trained": done, "about": about})
@@ -132,11 +182,15 @@ def _together(each: list[dict], settings: GazeSettings, rays: Rays, kind: str) -
     total = lambda name: round(sum(d[name] for d in each), 1)
     mean = lambda name: round(float(np.mean([d[name] for d in each])), 6)
     out = {
-        **each[0], "settings": settings.to_dict(), "rays": len(rays), "probes_made": round(mean("probes_made")),
-        **{k: mean(k) for k in ("escaped_directions", "escaped_gaze")}, **{k: total(k) for k in ("steps", "seconds", "seconds_preparing")},
+        **each[0],
+        "settings": settings.to_dict(),
+        "rays": len(rays),
+        "probes_made": round(mean("probes_made")),
+        **{k: mean(k) for k in ("escaped_directions", "escaped_gaze")},
+        **{k: total(k) for k in ("steps", "seconds", "seconds_preparing")},
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "ensemble": {"members": len(each), "resampled": kind, "seeds": [d["settings"]["seed"] for d in each]},
-    }  # fmt: skip
+    }
     if "validation" in out:
         scores = [d["validation"] for d in each]
         out["ensemble"]["validation"] = scores

@@ -4,6 +4,7 @@ A probe's rays are drawn from its kernel density: rays, each moved by its kernel
 the kernel is wide. The loss is their mean negative log density; the integral that normalises it is estimated from
 directions drawn uniformly (Blanc & Rendle 2018 on sampled softmax). Expectations are those of KL(truth || field).
 """
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -12,9 +13,10 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
-from .trainer import GazeTrainer, _Samples
-from .supervision import Supervision
+
 from .log_density_model import log_gaze, used_parameters
+from .supervision import Supervision
+from .trainer import GazeTrainer, _Samples
 
 
 class LikelihoodTrainer(GazeTrainer):
@@ -60,7 +62,9 @@ class LikelihoodTrainer(GazeTrainer):
 
     def _logits(self, data: _Samples, escaped, parameters: dict, probe, which):
         p_od, p_o, r_o, index = data.gather(probe, which)
-        return log_gaze(self.config, self.box, parameters, p_od, p_o, r_o, dr.gather(self.ns.Bool, escaped, index), self.ns)
+        return log_gaze(
+            self.config, self.box, parameters, p_od, p_o, r_o, dr.gather(self.ns.Bool, escaped, index), self.ns
+        )
 
     def measure(self, supervision: Supervision, weights: dict | None = None):
         self._measured = self.ns.Bool(np.ascontiguousarray(supervision.escaped).ravel())

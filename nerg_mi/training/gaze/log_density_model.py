@@ -1,25 +1,27 @@
 """The log-density gaze field's forward pass in the form that trains fastest: networks as tensor products."""
+
 from __future__ import annotations
 
 import drjit as dr
 
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import softplus
 from nerg_mi.field.encoding.hashgrid import HashGrid
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
+from nerg_mi.field.gaze.product import softplus
 from nerg_mi.field.mlp import MLP
+from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.model import stack
 
 
 def log_gaze(config: LogGazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, escaped, ns):
-    """Log of the unnormalised density of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D for
-    each in turn) at ``p_od``, ``escaped`` (Bool, as many) where there is no surface.
+    """Log of the unnormalised density of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D
+    for each in turn) at ``p_od``, ``escaped`` (Bool, as many) where there is no surface.
 
     The logarithm of what ``LogGazeField.unnormalized`` multiplies, on ``parameters`` spelt as the field spells them;
     gradients reach every entry that the variant uses.
     """
     net = lambda name: MLP([parameters[f"{name}.{i}"] for i in range(config.layers + 1)])
-    # The field's own inputs; Expand: every thread adds to a copy of the table of its own, a fraction of the cost of atomics.
+    # The field's own inputs; Expand: every thread adds to a copy of the table of its own, a fraction of the cost of
+    # atomics.
     field = _Inputs(config, box, HashGrid(config.grid, parameters["grid.table"]), parameters["prior"])
     repeats = dr.width(r_o) // dr.width(p_o)
     logit = field.log_blind(r_o)
@@ -27,8 +29,17 @@ def log_gaze(config: LogGazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, 
     if config.variant != "capture":
         inputs = field.emit_inputs(p_od, each, r_o, True, dr.ReduceMode.Expand)
         emit = net("emit_net").tensor(stack(_full(inputs, r_o), ns)).array
-        logit = logit + (emit if config.escaped == "nearest" else dr.select(escaped, dr.gather(
-            ns.Float, parameters["escaped"], dr.zeros(ns.UInt32, dr.width(r_o)), mode=dr.ReduceMode.Expand), emit))
+        logit = logit + (
+            emit
+            if config.escaped == "nearest"
+            else dr.select(
+                escaped,
+                dr.gather(
+                    ns.Float, parameters["escaped"], dr.zeros(ns.UInt32, dr.width(r_o)), mode=dr.ReduceMode.Expand
+                ),
+                emit,
+            )
+        )
     if config.variant != "emit":
         position = [dr.repeat(v, repeats) for v in field.capture_position(p_o)]
         x = net("capture_net").tensor(stack(_full(field.capture_inputs(position, r_o), r_o), ns)).array

@@ -6,6 +6,7 @@ probe are weighted by solid angle. Definitions as in
 :mod:`nerg_mi.evaluation.saliency`; NeRG, Section 4.3 (whose text adds the
 correlation itself; it is 1 - CC that is minimised).
 """
+
 from __future__ import annotations
 
 from typing import Any, NamedTuple

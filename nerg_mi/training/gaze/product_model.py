@@ -2,30 +2,37 @@
 
 An observer looks in many directions from one position: what capture needs of the position is computed once a probe.
 """
+
 from __future__ import annotations
 
 import drjit as dr
 
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, activate
 from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.gaze.product import GazeConfig, activate
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import sigmoid
+from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.model import stack, unstack
 
 
 def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, ns, semantic: list | None = None):
-    """Gaze (1/sr) of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D for each in turn) at ``p_od``.
+    """Gaze (1/sr) of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D for each in turn) at
+    ``p_od``.
 
-    The same maths as ``GazeField.evaluate`` on ``parameters`` spelt as the field spells them. Gradients reach every entry
-    that the variant uses. ``semantic``: features (Floats, a lane a direction) where ``config`` wants them.
+    The same maths as ``GazeField.evaluate`` on ``parameters`` spelt as the field spells them. Gradients reach every
+    entry that the variant uses. ``semantic``: features (Floats, a lane a direction) where ``config`` wants them.
     """
+
     def net(name):
         count = sum(k.startswith(name + ".") for k in parameters)
         return MLP([parameters[f"{name}.{i}"] for i in range(count)])
 
-    grid, position, direction = HashGrid(config.grid, parameters["grid.table"]), net("position_net"), net("direction_net")
+    grid, position, direction = (
+        HashGrid(config.grid, parameters["grid.table"]),
+        net("position_net"),
+        net("direction_net"),
+    )
     repeats = dr.width(r_o) // dr.width(p_o)
 
     def head(name, geometry, d):

@@ -1,9 +1,10 @@
 """Salience images as supervision of a gaze field: each view is an observer at the camera's centre who is known in part.
 
-What a view says holds within its frustum alone. Its directions are of equal area there, its truth is the density given that the
-picture is looked at, and what is trained is the field's density given the same: normalised over the view, not over the
-sphere. How much is looked outside of a picture, views say together: each surface is in many of them.
+What a view says holds within its frustum alone. Its directions are of equal area there, its truth is the density given
+that the picture is looked at, and what is trained is the field's density given the same: normalised over the view, not
+over the sphere. How much is looked outside of a picture, views say together: each surface is in many of them.
 """
+
 from __future__ import annotations
 
 import hashlib
@@ -11,13 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from nerg_mi.errors import NergError
-from nerg_mi.density.kde.estimate import SphericalKde
-from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.capture.salience.views import SalienceView
-from nerg_mi.maths.box import Box
+from nerg_mi.density.kde.estimate import SphericalKde
+from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.log_density import LogGazeConfig, blind_table, table_directions
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.transport.media.media import Similarity
+
 from .settings import ProbeSettings
 from .supervision import Supervision, observe, supervise_rays
 
@@ -30,12 +32,20 @@ _ROUNDS = 100
 _SMOOTHING = 50.0
 
 
-def supervise_views(views: list[SalienceView], medium, box: Box, settings: ProbeSettings, seed: int = 0, semantic: str = "",
-                    config=None, blind: bool = True) -> Supervision:
+def supervise_views(
+    views: list[SalienceView],
+    medium,
+    box: Box,
+    settings: ProbeSettings,
+    seed: int = 0,
+    semantic: str = "",
+    config=None,
+    blind: bool = True,
+) -> Supervision:
     """What ``gaze_supervision.supervise_rays`` makes of probes, of ``views`` in the field's frame.
 
-    ``settings.directions`` directions a view, each with the density of the pixel that it lies in; pixels are joined until each
-    has some four. ``blind``: make the blind density for a ``LogGazeConfig``.
+    ``settings.directions`` directions a view, each with the density of the pixel that it lies in; pixels are joined
+    until each has some four. ``blind``: make the blind density for a ``LogGazeConfig``.
     """
     log, count = isinstance(config, LogGazeConfig), settings.directions
     small = [v.reduced(max(1, count // _PER_PIXEL)) for v in views]
@@ -49,7 +59,9 @@ def supervise_views(views: list[SalienceView], medium, box: Box, settings: Probe
         extent = np.array([v.extent for v in views])
         truth /= truth.mean(axis=1, keepdims=True) * extent[:, None]
         positions = np.array([v.camera.center for v in views])
-        out = observe(positions, directions, truth, medium, box, settings.depth, semantic, log and config.escaped == "nearest")
+        out = observe(
+            positions, directions, truth, medium, box, settings.depth, semantic, log and config.escaped == "nearest"
+        )
         return replace(out, extent=extent.astype(np.float32))
 
     out = drawn(seed)
@@ -58,8 +70,18 @@ def supervise_views(views: list[SalienceView], medium, box: Box, settings: Probe
     return replace(out, blind=blind_of_views(views, config.prior)) if log and blind else out
 
 
-def supervise_both(rays, views, medium, box: Box, settings: ProbeSettings, align=None, queries=None, seed: int = 0,
-                   semantic: str = "", config=None) -> Supervision:
+def supervise_both(
+    rays,
+    views,
+    medium,
+    box: Box,
+    settings: ProbeSettings,
+    align=None,
+    queries=None,
+    seed: int = 0,
+    semantic: str = "",
+    config=None,
+) -> Supervision:
     """``supervise_rays`` and ``supervise_views``, of which there may be none, in one."""
     if rays is None:
         return supervise_views(views, medium, box, settings, seed, semantic, config)
@@ -80,11 +102,12 @@ def together(a: Supervision, b: Supervision) -> Supervision:
 
 
 def blind_of_views(views: list[SalienceView], rows: int) -> np.ndarray:
-    """``field.gaze.log_density.blind_table`` of what is looked at wherever the camera stands, of which each of ``views`` shows a part.
+    """``field.gaze.log_density.blind_table`` of what is looked at wherever the camera stands, of which each of
+    ``views`` shows a part.
 
-    The density b of greatest likelihood when view v sees b given its part, found by Hunter's (2004) iteration for choices
-    among a few: b = Σ_v p_v / Σ_v 1_v / b(v). One more view, of the whole sphere, is uniform: it links those that share nothing.
-    What no view shows is looked at as what lies next to it is.
+    The density b of greatest likelihood when view v sees b given its part, found by Hunter's (2004) iteration for
+    choices among a few: b = Σ_v p_v / Σ_v 1_v / b(v). One more view, of the whole sphere, is uniform: it links those
+    that share nothing. What no view shows is looked at as what lies next to it is.
     """
     from scipy.spatial import cKDTree
 
@@ -130,14 +153,16 @@ def split_views(views: list[SalienceView], zones: int, distance: float, seed: in
     watched = np.unique(np.argsort(near, axis=0, kind="stable")[:each])
     learn = far_views(views, centres[watched], distance)
     if len(learn) < max(2, len(views) // 4):
-        raise NergError(f"{len(learn)} of {len(views)} views are left to train on, the others are watched or within "
-                         f"{distance:g} of one that is; choose fewer --zones (0: none), or a smaller --radius")
+        raise NergError(
+            f"{len(learn)} of {len(views)} views are left to train on, the others are watched or within "
+            f"{distance:g} of one that is; choose fewer --zones (0: none), or a smaller --radius"
+        )
     return learn, [views[k] for k in watched]
 
 
 def far_views(views, places: np.ndarray, distance: float, align: Similarity | None = None) -> list[SalienceView]:
-    """Those of ``views`` whose camera is farther than ``distance`` from every one of ``places`` (T, 3); ``align``: similarity
-    from the frame of these to that of the views."""
+    """Those of ``views`` whose camera is farther than ``distance`` from every one of ``places`` (T, 3); ``align``:
+    similarity from the frame of these to that of the views."""
     if align is not None:
         places, distance = places @ align.matrix[:3, :3].T + align.matrix[:3, 3], distance * align.scale
     return [v for v in views if np.linalg.norm(places - v.camera.center, axis=1).min(initial=np.inf) > distance]

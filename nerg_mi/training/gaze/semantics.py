@@ -1,7 +1,10 @@
-"""What a gaze field takes over from a radiance field: its features along the observers' rays, or its weights to begin with.
+"""What a gaze field takes over from a radiance field: its features along the observers' rays, or its weights to begin
+with.
 
-The paper's semantic variants, and its two initialisations: a trunk that starts as the radiance field's, frozen or fine-tuned.
+The paper's semantic variants, and its two initialisations: a trunk that starts as the radiance field's, frozen or
+fine-tuned.
 """
+
 from __future__ import annotations
 
 import drjit as dr
@@ -13,6 +16,7 @@ from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.transport.media.features import accumulated, snapshot
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
+
 from .settings import uniform_scale
 
 BATCH = 1 << 18
@@ -21,7 +25,8 @@ BATCH = 1 << 18
 def semantic_features(medium, origins, directions, distance, kind: str) -> np.ndarray:
     """Features (N, F), float16, of what rays see: ``accumulated`` along them, or the ``snapshot`` at ``distance`` (N,).
 
-    ``medium``: a ``FieldMedium``; ``origins``, ``directions`` (N, 3) in its frame, unit. Raises ``NergError`` for another medium.
+    ``medium``: a ``FieldMedium``; ``origins``, ``directions`` (N, 3) in its frame, unit. Raises ``NergError`` for
+    another medium.
     """
     import mitsuba as mi
 
@@ -31,8 +36,10 @@ def semantic_features(medium, origins, directions, distance, kind: str) -> np.nd
     with dr.suspend_grad():
         for a in range(0, len(out), BATCH):
             part = slice(a, a + BATCH)
-            o, d = (kind_(np.ascontiguousarray(np.asarray(v[part], np.float32).T))
-                    for kind_, v in ((mi.Point3f, origins), (mi.Vector3f, directions)))
+            o, d = (
+                kind_(np.ascontiguousarray(np.asarray(v[part], np.float32).T))
+                for kind_, v in ((mi.Point3f, origins), (mi.Vector3f, directions))
+            )
             if kind == "snapshot":
                 t = mi.Float(np.ascontiguousarray(distance[part], np.float32))
                 found = snapshot(medium, o + d * t, mi.Bool(True))
@@ -46,12 +53,21 @@ def semantic_features(medium, origins, directions, distance, kind: str) -> np.nd
 
 def config_like(radiance: RadianceConfig, variant: str, activation: str, **more) -> GazeConfig:
     """Architecture of a gaze field whose trunk begins as that of a radiance field of the configuration ``radiance``."""
-    return GazeConfig(grid=radiance.grid, variant=variant, activation=activation, width=radiance.width, geometry=radiance.geometry,
-                      sh_degree=radiance.sh_degree, emit_scale=uniform_scale(variant, activation), **more)
+    return GazeConfig(
+        grid=radiance.grid,
+        variant=variant,
+        activation=activation,
+        width=radiance.width,
+        geometry=radiance.geometry,
+        sh_degree=radiance.sh_degree,
+        emit_scale=uniform_scale(variant, activation),
+        **more,
+    )
 
 
 def trunk_of(field: RadianceField, config: GazeConfig) -> dict:
-    """Grid and position network of ``field`` by the names of a gaze field: what its features, but not its density, come from.
+    """Grid and position network of ``field`` by the names of a gaze field: what its features, but not its density, come
+    from.
 
     Raises ``NergError`` where ``config`` has other sizes.
     """

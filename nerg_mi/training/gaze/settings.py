@@ -1,12 +1,14 @@
 """What a gaze field is trained with."""
+
 from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.product import GazeConfig
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig
+
 from . import losses as gaze_losses
 
 # The likelihood has a trainer of its own; what is here weighs the parts of a validation.
@@ -14,10 +16,7 @@ LOSSES = {"paper": gaze_losses.PAPER, "code": gaze_losses.CODE, "likelihood": {"
 
 # (levels, log2 rows, base and finest resolution, width, geometry features). "paper" has the paper's sizes, 10.6 million
 # entries; "small" is what generalises to positions that nobody trained on, and stores in 0.4 MB as fp16.
-_SIZES = {
-    "small": (8, 14, 4, 128, 64, 15),
-    "paper": (16, 19, 16, 512, 64, 15),
-}
+_SIZES = {"small": (8, 14, 4, 128, 64, 15), "paper": (16, 19, 16, 512, 64, 15)}
 SIZES = tuple(_SIZES)
 
 
@@ -27,8 +26,14 @@ def sized_gaze_config(size: str = "small", variant: str = "emit_capture", activa
         raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
     levels, rows, base, finest, width, geometry = _SIZES[size]
     grid = HashGridConfig(levels=levels, log2_rows=rows, base=base, finest=finest)
-    return GazeConfig(grid=grid, variant=variant, activation=activation, width=width, geometry=geometry,
-                      emit_scale=uniform_scale(variant, activation))
+    return GazeConfig(
+        grid=grid,
+        variant=variant,
+        activation=activation,
+        width=width,
+        geometry=geometry,
+        emit_scale=uniform_scale(variant, activation),
+    )
 
 
 def uniform_scale(variant: str, activation: str) -> float:
@@ -47,10 +52,11 @@ def uniform_scale(variant: str, activation: str) -> float:
 class ProbeSettings:
     """How rays become supervision; lengths in metres, in the rays' frame.
 
-    ``radius``, ``placement``, ``count``, ``spacing``, ``cap``, ``min_rays``, ``kappa_rule``, ``kappa``, ``weights``: see
-    ``density.probes.place_probes``. ``directions``: how many of equal area each probe has, turned at random, fixed for the
-    whole training, so that depths are traced once; ``fresh``: turned anew, and traced again, for every epoch (as many steps
-    as draw as many probes as there are). ``depth``: kind of depth that is the surface (``transport.march.depth``).
+    ``radius``, ``placement``, ``count``, ``spacing``, ``cap``, ``min_rays``, ``kappa_rule``, ``kappa``, ``weights``:
+    see ``density.probes.place_probes``. ``directions``: how many of equal area each probe has, turned at random, fixed
+    for the whole training, so that depths are traced once; ``fresh``: turned anew, and traced again, for every epoch
+    (as many steps as draw as many probes as there are). ``depth``: kind of depth that is the surface
+    (``transport.march.depth``).
     """
 
     radius: float = 0.25
@@ -81,17 +87,17 @@ class GazeSettings:
     """Controls of a training run.
 
     ``steps`` or ``minutes``: how long, exactly one of them. ``loss``: ``paper`` (KLD + (1 - CC) + MAE), ``code`` (MAE +
-    0.1 (1 - CC), as the authors published) or, for a log density, ``likelihood`` (``gaze_likelihood``), for which a step
-    draws ``rays`` rays of each probe besides; ``integral``: weight of the squared error of a probe's integral, which the authors
-    compute and do not train (0: not here either; KLD and CC do not see the scale, and MAE alone pulls it towards the
-    median, far below a peaked density's mean). ``probes``, ``directions``: of a step, drawn at random. ``learning_rate``: held
-    for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself; ``weight_decay``: decoupled
-    (AdamW), a share of the weights a step a unit of learning rate; ``average``: decay a step of the averaged weights,
-    which are the result. ``looks``: how often in a run the validation is looked at; ``patience``: looks without an
-    improvement after which the run ends (0: never). ``zones``, ``watched``, ``watched_rays``: of the validation, groups
-    of positions, probes in them, and rays that each has at least (default: as many as those of the training); no zones, no
-    validation. ``refit``: train again on all rays, the validation's too, for as many
-    steps as were best. ``frozen``: weights that were given to begin with are not trained.
+    0.1 (1 - CC), as the authors published) or, for a log density, ``likelihood`` (``gaze_likelihood``), for which a
+    step draws ``rays`` rays of each probe besides; ``integral``: weight of the squared error of a probe's integral,
+    which the authors compute and do not train (0: not here either; KLD and CC do not see the scale, and MAE alone pulls
+    it towards the median, far below a peaked density's mean). ``probes``, ``directions``: of a step, drawn at random.
+    ``learning_rate``: held for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times
+    itself; ``weight_decay``: decoupled (AdamW), a share of the weights a step a unit of learning rate; ``average``:
+    decay a step of the averaged weights, which are the result. ``looks``: how often in a run the validation is looked
+    at; ``patience``: looks without an improvement after which the run ends (0: never). ``zones``, ``watched``,
+    ``watched_rays``: of the validation, groups of positions, probes in them, and rays that each has at least (default:
+    as many as those of the training); no zones, no validation. ``refit``: train again on all rays, the validation's
+    too, for as many steps as were best. ``frozen``: weights that were given to begin with are not trained.
     """
 
     steps: int | None = None
@@ -122,7 +128,11 @@ class GazeSettings:
             raise NergError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
         if self.loss not in LOSSES:
             raise NergError(f'the loss must be one of {", ".join(LOSSES)}, got "{self.loss}"')
-        if min(self.probes, self.directions, self.rays, self.looks) < 1 or min(self.weight_decay, self.integral) < 0 or min(self.zones, self.patience) < 0:
+        if (
+            min(self.probes, self.directions, self.rays, self.looks) < 1
+            or min(self.weight_decay, self.integral) < 0
+            or min(self.zones, self.patience) < 0
+        ):
             raise NergError(f"a training needs probes, directions and looks, and nothing negative, got {self}")
 
     def rate(self, progress: float) -> float:

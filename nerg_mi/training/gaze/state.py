@@ -1,4 +1,5 @@
 """The whole state of a gaze training in a file: of both of its fits, and of what validation has found so far."""
+
 from __future__ import annotations
 
 import hashlib
@@ -7,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
+from nerg_mi.rays.rays import Rays
 from nerg_mi.training.common.run_state import (
     count_of,
     optimiser_state,
@@ -27,9 +28,9 @@ STAGES = ("fit", "refit")
 class GazeRunFile:
     """State of one training, kept in ``path`` (None: not at all) every ``every`` seconds.
 
-    ``about``: what a run must agree on to go on (JSON). With ``resume`` the state is read at once: `NergError` where there is
-    none, or one of another run. ``stage``: that of the state, ``fit`` or ``refit``, None without one; ``seconds``: that
-    were spent before this process.
+    ``about``: what a run must agree on to go on (JSON). With ``resume`` the state is read at once: `NergError` where
+    there is none, or one of another run. ``stage``: that of the state, ``fit`` or ``refit``, None without one;
+    ``seconds``: that were spent before this process.
     """
 
     def __init__(self, path: Path | None, about: dict, every: float = 60.0, resume: bool = False):
@@ -53,7 +54,8 @@ class GazeRunFile:
         return self.seconds + time.perf_counter() - self._started
 
     def restore(self, stage: str, trainer) -> dict:
-        """Set ``trainer`` to the state of ``stage``, where that is what was read; returns the weights that ``keep`` was given."""
+        """Set ``trainer`` to the state of ``stage``, where that is what was read; returns the weights that ``keep`` was
+        given."""
         if stage != self.stage or "random" not in self._meta:
             return {}
         with restoring(self.path):
@@ -66,16 +68,23 @@ class GazeRunFile:
             return {k: type(v)(self._tensors[f"best.{k}"]) for k, v in best.items()}
 
     def keep(self, stage: str, trainer, found: dict, weights: dict, now: bool = False) -> None:
-        """Write the state, atomically, when it is time (or ``now``). ``trainer``: None between two fits; ``found``: what
-        validation has come to (JSON); ``weights``: the best ones so far."""
+        """Write the state, atomically, when it is time (or ``now``). ``trainer``: None between two fits; ``found``:
+        what validation has come to (JSON); ``weights``: the best ones so far."""
         if self.path is None or not (now or time.perf_counter() - self._kept > self.every):
             return
         tensors, meta = {f"best.{k}": v.numpy() for k, v in weights.items()}, {}
         if trainer is not None:
             state, taken = optimiser_state(trainer)
             tensors |= state
-            meta = {"taken": taken, "steps": trainer.steps, "seconds": trainer.seconds, "random": trainer.rng.bit_generator.state}
-        write_checkpoint(self.path, KIND, tensors, {"about": self.about, "stage": stage, "found": found, "spent": self.spent, **meta})
+            meta = {
+                "taken": taken,
+                "steps": trainer.steps,
+                "seconds": trainer.seconds,
+                "random": trainer.rng.bit_generator.state,
+            }
+        write_checkpoint(
+            self.path, KIND, tensors, {"about": self.about, "stage": stage, "found": found, "spent": self.spent, **meta}
+        )
         self._kept = time.perf_counter()
 
 

@@ -1,29 +1,31 @@
 """What a gaze field learns from: probes, the directions around each, the true densities, and the surfaces they meet.
 
-The radiance field (or any medium) is frozen while gaze is trained and each probe keeps its directions, so every depth is
-traced once, before the training.
+The radiance field (or any medium) is frozen while gaze is trained and each probe keeps its directions, so every depth
+is traced once, before the training.
 """
+
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Callable
 
 import numpy as np
 
 from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.density.probes import Probes, person_weights, place_probes
-from nerg_mi.rays.rays import Rays
-from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.maths.box import Box
 from nerg_mi.field.gaze.log_density import LogGazeConfig, blind_table, table_directions
-from nerg_mi.transport.observer.integral import nearest_depth
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.media.media import Similarity
+from nerg_mi.transport.observer.integral import nearest_depth
 from nerg_mi.transport.trace import trace_depth
+
 from .semantics import semantic_features
 from .settings import ProbeSettings
 
-# Concentration of the blind density's kernels, and of how many rays it is made at most. Wide, because the field learns what it lacks
-# from many probes, but nothing takes back the peaks of a few people, which others do not share.
+# Concentration of the blind density's kernels, and of how many rays it is made at most. Wide, because the field learns
+# what it lacks from many probes, but nothing takes back the peaks of a few people, which others do not share.
 _BLIND_KAPPA = 10.0
 _BLIND_RAYS = 1 << 16
 # How far everything is where no geometry is known, in the field's units.
@@ -38,10 +40,11 @@ class Supervision:
 
     ``positions`` (P, 3), the observers p_o; ``directions`` (P, D, 3), unit, r_o; ``truth`` (P, D), 1/sr; ``distance``
     (P, D), from p_o to p_od; ``escaped`` (P, D) bool: no surface was met, and p_od is where the box ends. ``semantic``
-    (P, D, F), float16: features of a radiance field, for a gaze field that wants them. ``blind``: table of the log of the
-    rays' density whatever their position (``field.gaze.log_density``), for one that begins with it. ``renew(epoch)``: the same probes
-    in other directions, where each epoch is to have its own. ``extent`` (P,): solid angle in sr of which the D directions are
-    equal parts and over which the truth integrates to one, where that is not the sphere (None) but a view.
+    (P, D, F), float16: features of a radiance field, for a gaze field that wants them. ``blind``: table of the log of
+    the rays' density whatever their position (``field.gaze.log_density``), for one that begins with it.
+    ``renew(epoch)``: the same probes in other directions, where each epoch is to have its own. ``extent`` (P,): solid
+    angle in sr of which the D directions are equal parts and over which the truth integrates to one, where that is not
+    the sphere (None) but a view.
     """
 
     positions: np.ndarray
@@ -66,8 +69,17 @@ class Supervision:
         return float((gaze * self.escaped).sum() / gaze.sum())
 
 
-def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | None = None, kind: str = "median",
-              seed: int | tuple = 0, semantic: str = "", fill: bool = False) -> Supervision:
+def supervise(
+    probes: Probes,
+    medium,
+    box: Box,
+    count: int,
+    align: Similarity | None = None,
+    kind: str = "median",
+    seed: int | tuple = 0,
+    semantic: str = "",
+    fill: bool = False,
+) -> Supervision:
     """Directions, true densities and surfaces of ``probes``.
 
     ``medium``: what depths are traced in (see ``surfaces``) and ``box``, where the gaze field will
@@ -83,10 +95,11 @@ def supervise(probes: Probes, medium, box: Box, count: int, align: Similarity | 
     return observe(positions, directions @ rotation.T, truth, medium, box, kind, semantic, fill)
 
 
-def observe(positions, directions, truth, medium, box: Box, kind: str = "median", semantic: str = "",
-            fill: bool = False) -> Supervision:
-    """Supervision by observers (P, 3) whose density in ``directions`` (P, D, 3) is ``truth`` (P, D), all in the field's frame,
-    with the surfaces that they see. The other arguments are those of ``supervise``."""
+def observe(
+    positions, directions, truth, medium, box: Box, kind: str = "median", semantic: str = "", fill: bool = False
+) -> Supervision:
+    """Supervision by observers (P, 3) whose density in ``directions`` (P, D, 3) is ``truth`` (P, D), all in the field's
+    frame, with the surfaces that they see. The other arguments are those of ``supervise``."""
     distance, escaped = surfaces(medium, box, positions, directions, kind, fill)
     features = None
     if semantic:
@@ -97,25 +110,49 @@ def observe(positions, directions, truth, medium, box: Box, kind: str = "median"
     return Supervision(*narrow, distance, escaped, features)
 
 
-def supervise_rays(rays: Rays, medium, box: Box, settings: ProbeSettings, align: Similarity | None = None,
-                   queries: np.ndarray | None = None, seed: int = 0, semantic: str = "",
-                   config=None) -> Supervision:
-    """Probes on ``rays``, at ``queries`` (P, 3) metres where given, and what ``supervise`` makes of them. ``config``: of
-    the gaze field; a ``LogGazeConfig`` has the blind density made, and says what to do with directions that escape. With
-    ``settings.fresh`` the result can ``renew`` its directions."""
+def supervise_rays(
+    rays: Rays,
+    medium,
+    box: Box,
+    settings: ProbeSettings,
+    align: Similarity | None = None,
+    queries: np.ndarray | None = None,
+    seed: int = 0,
+    semantic: str = "",
+    config=None,
+) -> Supervision:
+    """Probes on ``rays``, at ``queries`` (P, 3) metres where given, and what ``supervise`` makes of them. ``config``:
+    of the gaze field; a ``LogGazeConfig`` has the blind density made, and says what to do with directions that escape.
+    With ``settings.fresh`` the result can ``renew`` its directions."""
     s, log = settings, isinstance(config, LogGazeConfig)
-    probes = place_probes(rays, s.radius, placement=s.placement, count=s.count, spacing=s.spacing, queries=queries, cap=s.cap,
-                          min_rays=min(s.min_rays, s.cap), kappa_rule=s.kappa_rule, kappa=s.kappa, weights=s.weights, seed=seed)
-    turned = lambda seed: supervise(probes, medium, box, s.directions, align, s.depth, seed, semantic, log and config.escaped == "nearest")
+    probes = place_probes(
+        rays,
+        s.radius,
+        placement=s.placement,
+        count=s.count,
+        spacing=s.spacing,
+        queries=queries,
+        cap=s.cap,
+        min_rays=min(s.min_rays, s.cap),
+        kappa_rule=s.kappa_rule,
+        kappa=s.kappa,
+        weights=s.weights,
+        seed=seed,
+    )
+    turned = lambda seed: supervise(
+        probes, medium, box, s.directions, align, s.depth, seed, semantic, log and config.escaped == "nearest"
+    )
     out = turned(seed)
     if s.fresh:
         out = replace(out, renew=lambda epoch: turned((seed, epoch)))
     return replace(out, blind=blind_prior(rays, config.prior, align, seed, s.weights)) if log else out
 
 
-def blind_prior(rays: Rays, rows: int, align: Similarity | None = None, seed: int = 0, weights: str = "equal") -> np.ndarray:
-    """``field.gaze.log_density.blind_table`` of what people look at wherever they stand, in the field's frame. ``weights``: with
-    ``person`` all people count alike, however many rays are theirs."""
+def blind_prior(
+    rays: Rays, rows: int, align: Similarity | None = None, seed: int = 0, weights: str = "equal"
+) -> np.ndarray:
+    """``field.gaze.log_density.blind_table`` of what people look at wherever they stand, in the field's frame.
+    ``weights``: with ``person`` all people count alike, however many rays are theirs."""
     align = align or Similarity()
     which = np.random.default_rng(seed).permutation(len(rays))[:_BLIND_RAYS]
     # The table's directions in the rays' frame: its inverse is a rotation's transpose.
@@ -125,13 +162,17 @@ def blind_prior(rays: Rays, rows: int, align: Similarity | None = None, seed: in
     return blind_table(density, rows, kde.ns, fibonacci_directions(1 << 16))
 
 
-def surfaces(medium, box: Box, positions, directions, kind: str = "median", fill: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Distances from ``positions`` (P, 3) along ``directions`` (P, D, 3) to the surface that each meets, and which meet none.
+def surfaces(
+    medium, box: Box, positions, directions, kind: str = "median", fill: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances from ``positions`` (P, 3) along ``directions`` (P, D, 3) to the surface that each meets, and which meet
+    none.
 
-    Both (P, D): float32 in the field's units, and bool. ``medium``: see ``trace_depth``; None: no geometry, everything is
-    ``NOWHERE`` away and nothing counts as escaped. A direction that meets no surface ends where it leaves the box (or after
-    the box's diagonal, where it never enters): it still needs a p_od at which the field is evaluated. With ``fill`` it ends
-    at the depth of the directions of its position nearest to it that do meet one: where the geometry has holes.
+    Both (P, D): float32 in the field's units, and bool. ``medium``: see ``trace_depth``; None: no geometry, everything
+    is ``NOWHERE`` away and nothing counts as escaped. A direction that meets no surface ends where it leaves the box
+    (or after the box's diagonal, where it never enters): it still needs a p_od at which the field is evaluated. With
+    ``fill`` it ends at the depth of the directions of its position nearest to it that do meet one: where the geometry
+    has holes.
     """
     P, D = directions.shape[:2]
     if medium is None:
@@ -165,9 +206,18 @@ def rotated_sets(count: int, sets: int, rng: np.random.Generator) -> np.ndarray:
     # Unit quaternions from normal numbers are uniform rotations (Shoemake 1992).
     q = rng.normal(size=(sets, 4))
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rotation = np.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ], axis=1).reshape(-1, 3, 3)  # fmt: skip
+    rotation = np.stack(
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ],
+        axis=1,
+    ).reshape(-1, 3, 3)
     return np.einsum("dj,pij->pdi", fibonacci_directions(count), rotation)

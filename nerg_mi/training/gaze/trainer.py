@@ -1,4 +1,5 @@
 """Training a gaze field on probes (NeRG, Section 4.3): positions and directions in, densities out."""
+
 from __future__ import annotations
 
 import time
@@ -9,8 +10,9 @@ import numpy as np
 from drjit.opt import AdamW
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.box import Box
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.maths.box import Box
+
 from .losses import VANISHED, gaze_loss
 from .product_model import gaze_density, used_parameters
 from .settings import LOSSES, GazeSettings
@@ -39,8 +41,16 @@ class GazeTrainer:
     threads are not ordered, so that weights agree between runs to rounding (and bit for bit only with one thread).
     """
 
-    def __init__(self, supervision: Supervision, box: Box, config: GazeConfig, settings: GazeSettings, ns,
-                 schedule: int | None = None, initial: dict | None = None):
+    def __init__(
+        self,
+        supervision: Supervision,
+        box: Box,
+        config: GazeConfig,
+        settings: GazeSettings,
+        ns,
+        schedule: int | None = None,
+        initial: dict | None = None,
+    ):
         self.config, self.settings, self.box, self.ns = config, settings, box, ns
         self.rng = np.random.default_rng(settings.seed)
         self._schedule, self._supervision = schedule, supervision
@@ -50,8 +60,9 @@ class GazeTrainer:
             self.initial.set_parameters(initial)
         self.constant = dict(initial or {}) if settings.frozen else {}
         trained = {k: v for k, v in self._trainable(self.initial.parameters()).items() if k not in self.constant}
-        self.optimiser = AdamW(settings.learning_rate, trained,
-                               beta_2=0.99, epsilon=1e-15, weight_decay=settings.weight_decay)
+        self.optimiser = AdamW(
+            settings.learning_rate, trained, beta_2=0.99, epsilon=1e-15, weight_decay=settings.weight_decay
+        )
         self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.optimiser.items()}
         self.steps, self.loss = 0, None
         self._started = time.perf_counter()
@@ -100,7 +111,8 @@ class GazeTrainer:
         for k, old in self.averaged.items():
             self.averaged[k] = old + (dr.detach(self.optimiser[k]) - old) * dr.opaque(self.ns.Float, 1 - decay)
         dr.eval(self.averaged)
-        # Steps are only queued otherwise: their time would count as none, and a run of minutes would go on long after them.
+        # Steps are only queued otherwise: their time would count as none, and a run of minutes would go on long after
+        # them.
         dr.sync_thread()
 
     def _backward(self) -> None:
@@ -129,8 +141,12 @@ class GazeTrainer:
         with dr.suspend_grad():
             for a in range(0, data.probes, block):
                 probe = np.arange(a, min(a + block, data.probes))
-                prediction, truth = self._densities(data, {**self.constant, **(weights or self.averaged)}, probe,
-                                                    np.broadcast_to(which, (len(probe), data.count)))
+                prediction, truth = self._densities(
+                    data,
+                    {**self.constant, **(weights or self.averaged)},
+                    probe,
+                    np.broadcast_to(which, (len(probe), data.count)),
+                )
                 parts = gaze_loss(prediction, truth, data.count)
                 integral = _integral(prediction, data.extent(probe))
                 means = parts.kld, parts.cc, parts.mae, dr.mean(integral), dr.mean(dr.square(1 - integral))
@@ -160,7 +176,8 @@ class GazeTrainer:
 
 
 def _integral(density, extent):
-    """Integral of each probe's density over its ``extent`` (sr, a lane a probe), of which the directions are equal parts."""
+    """Integral of each probe's density over its ``extent`` (sr, a lane a probe), of which the directions are equal
+    parts."""
     directions = dr.width(density) // dr.width(extent)
     return dr.block_sum(density, directions) * (extent / directions)
 
@@ -194,11 +211,13 @@ class _Samples:
 
     def extent(self, probe: np.ndarray):
         """Solid angle (sr, a lane a probe) that the directions of the probes ``probe`` are equal parts of."""
-        return self.ns.Float(np.full(len(probe), 4 * np.pi, np.float32) if self._extent is None else self._extent[probe])
+        return self.ns.Float(
+            np.full(len(probe), 4 * np.pi, np.float32) if self._extent is None else self._extent[probe]
+        )
 
     def given_view(self, density, probe: np.ndarray, truth=None):
-        """Densities of probes that are views, given the view: what else is looked at is not known there. Others stay. The
-        result has the integral that ``truth`` has in the same directions, else one."""
+        """Densities of probes that are views, given the view: what else is looked at is not known there. Others stay.
+        The result has the integral that ``truth`` has in the same directions, else one."""
         if self._extent is None:
             return density
         extent = self.extent(probe)
@@ -214,7 +233,9 @@ class _Samples:
         at = ns.UInt32(probe.astype(np.uint32))
         index = ns.UInt32((probe[:, None] * self.count + which).astype(np.uint32).ravel())
         p_o, r_o = dr.gather(ns.Array3f, self._positions, at), dr.gather(ns.Array3f, self._directions, index)
-        p_od = dr.gather(ns.Array3f, self._positions, index // self.count) + r_o * dr.gather(ns.Float, self._distance, index)
+        p_od = dr.gather(ns.Array3f, self._positions, index // self.count) + r_o * dr.gather(
+            ns.Float, self._distance, index
+        )
         return p_od, p_o, r_o, index
 
     def truth(self, index):

@@ -1,8 +1,8 @@
 """How far a place made of hit points reaches, and how fine it is, so that its voxels stay within a stated number.
 
-Rays that leave through windows end tens of metres behind the room in which people are. A box around all of them would spend
-nearly every voxel on air. So the box gives up hit points where that saves most voxels for each of them; those beyond it are
-drawn where their rays leave it (its shell), in their true directions at too short a distance.
+Rays that leave through windows end tens of metres behind the room in which people are. A box around all of them would
+spend nearly every voxel on air. So the box gives up hit points where that saves most voxels for each of them; those
+beyond it are drawn where their rays leave it (its shell), in their true directions at too short a distance.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.errors import NergError
+from nerg_mi.rays.rays import Rays
 
 VOXEL = 0.08
 """Edge of a voxel in metres where none is asked for and the place is not too large for it."""
@@ -23,15 +23,17 @@ MOST = 1 << 24
 PAD = 6
 """Voxels around the points that a box holds."""
 
-# Share of the hit points at either end of an axis that the box need not hold: a glance through a gap ends tens of metres
-# behind the place. The same of the origins, where a box must be cut: a tracker that loses somebody puts them anywhere.
+# Share of the hit points at either end of an axis that the box need not hold: a glance through a gap ends tens of
+# metres behind the place. The same of the origins, where a box must be cut: a tracker that loses somebody puts them
+# anywhere.
 _OUTLIERS = 0.005
 # Share of the hit points that a box keeps at least, before voxels of a default edge become larger instead.
 _KEPT = 0.75
 # Metres around where people were that a box keeps at least: what is looked at most is near.
 _MARGIN = 1.0
 _SAMPLE, _STEPS = 1 << 15, 512
-# A box that is cut goes on being cut while one step, a 512th of the points, saves this share of the most voxels that may be.
+# A box that is cut goes on being cut while one step, a 512th of the points, saves this share of the most voxels that
+# may be.
 _WORTH = 0.01
 
 
@@ -39,8 +41,8 @@ _WORTH = 0.01
 class HitExtent:
     """Voxels of a place of hit points, in the rays' frame.
 
-    ``lower``: corner (3,) in metres; ``shape``: voxels along x, y, z; ``voxel``: their edge in metres; ``cut``: whether hit
-    points beyond the box stand on its shell; ``beyond``: their share of the hit points.
+    ``lower``: corner (3,) in metres; ``shape``: voxels along x, y, z; ``voxel``: their edge in metres; ``cut``: whether
+    hit points beyond the box stand on its shell; ``beyond``: their share of the hit points.
     """
 
     lower: np.ndarray
@@ -70,11 +72,11 @@ class HitExtent:
 def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitExtent:
     """The box of a place of at most ``most`` voxels made from the hit points of ``rays``.
 
-    It holds all origins and the hits but for half a percent at each end of each axis. Where these are too many voxels it is
-    cut to where most of them are worth their room, at the least to where people were (all but half a percent at each end of
-    each axis) and a metre around. Where that is not
-    enough, or less than three quarters of the hit points would be left, voxels become larger; not so a ``voxel`` that was
-    asked for. Raises `NergError` for rays without hit points and for a ``voxel`` that is too small or not positive.
+    It holds all origins and the hits but for half a percent at each end of each axis. Where these are too many voxels
+    it is cut to where most of them are worth their room, at the least to where people were (all but half a percent at
+    each end of each axis) and a metre around. Where that is not
+    enough, or less than three quarters of the hit points would be left, voxels become larger; not so a ``voxel`` that
+    was asked for. Raises `NergError` for rays without hit points and for a ``voxel`` that is too small or not positive.
     """
     known = None if rays.hit is None else np.isfinite(rays.hit).all(axis=1)
     if known is None or not known.any():
@@ -115,14 +117,17 @@ def _count(low: np.ndarray, high: np.ndarray, voxel: float) -> np.ndarray:
 
 def _padded(low: np.ndarray, high: np.ndarray, voxel: float):
     """The extent of the box around ``low`` and ``high``; a function of its other fields."""
-    return lambda **more: HitExtent(low - PAD * voxel, tuple(_count(low, high, voxel).astype(int).tolist()), voxel, **more)
+    return lambda **more: HitExtent(
+        low - PAD * voxel, tuple(_count(low, high, voxel).astype(int).tolist()), voxel, **more
+    )
 
 
 def _cut(
     low: np.ndarray, high: np.ndarray, core: np.ndarray, points: np.ndarray, voxel: float, most: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Corners of a box of at most ``most`` voxels, from ``low`` to ``high`` cut face by face down to ``core`` (2, 3) at the
-    least: each time where most voxels are saved for each of ``points`` (N, 3) that is given up. None where ``core`` is too large."""
+    """Corners of a box of at most ``most`` voxels, from ``low`` to ``high`` cut face by face down to ``core`` (2, 3) at
+    the least: each time where most voxels are saved for each of ``points`` (N, 3) that is given up. None where ``core``
+    is too large."""
     box = np.stack([low, high])
     step = max(1, len(points) // _STEPS)
     while True:

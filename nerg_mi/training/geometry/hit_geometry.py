@@ -4,14 +4,16 @@ Eye trackers in virtual reality record where each ray met the scene. Enough of t
 surfaces that are looked at. They become voxels, small holes are closed, and the result is a Mitsuba grid volume that
 depths are traced in and that the integrator ``nerg`` renders as its ``density``.
 """
+
 from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.maths.box import Box
+from nerg_mi.rays.rays import Rays
+
 from .hit_extent import HitExtent, hit_extent
 
 # Optical depth of a voxel: one is opaque.
@@ -25,10 +27,11 @@ _WALKED = 1 << 17
 def voxelise_hits(rays: Rays, voxel: float | None = None, extent: HitExtent | None = None) -> tuple[np.ndarray, Box]:
     """Density (z, y, x) in 1/metre, float32, and the box that it fills, both in the rays' frame.
 
-    A voxel is solid where a ray ended. Gaps of up to eight voxels are closed (morphological closing), but not where a ray
-    passed on its way to its hit; then voxels through which people put their heads, and their neighbours, are emptied. The
-    box is ``extent``, by default the `hit_extent` of ``rays`` with voxels of edge ``voxel`` metres. Hits outside of it are
-    left out; where it was cut, they stand where their rays leave its shell. Raises as `hit_extent` does.
+    A voxel is solid where a ray ended. Gaps of up to eight voxels are closed (morphological closing), but not where a
+    ray passed on its way to its hit; then voxels through which people put their heads, and their neighbours, are
+    emptied. The box is ``extent``, by default the `hit_extent` of ``rays`` with voxels of edge ``voxel`` metres. Hits
+    outside of it are left out; where it was cut, they stand where their rays leave its shell. Raises as `hit_extent`
+    does.
     """
     from scipy.ndimage import binary_closing, binary_dilation
 

@@ -1,4 +1,5 @@
 """Where people looked around: what a gaze field's depths are traced in, and what it is told where there is nothing."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
@@ -7,15 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.rays.readers.collecting import file_sha256
-from nerg_mi.rays.rays import Rays
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig
-from nerg_mi.rendering.mesh_file import check_vol
+from nerg_mi.field.gaze.product import GazeConfig
 from nerg_mi.formats.volumes import write_volume
+from nerg_mi.maths.box import Box
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.collecting import file_sha256
+from nerg_mi.rendering.mesh_file import check_vol
 from nerg_mi.transport.media.media import FieldMedium, VolumeMedium
 from nerg_mi.transport.place import Place
+
 from .hit_extent import hit_extent
 from .hit_geometry import volume_dict, voxelise_hits
 
@@ -34,13 +36,19 @@ class GazePlace:
     about: dict = field(default_factory=dict)
 
     def told(self, config: GazeConfig | LogGazeConfig) -> GazeConfig | LogGazeConfig:
-        """``config`` of a gaze field that knows what such a place is: one of hit points has holes, which were seen through by
-        nobody that it was made from; no place has no surfaces. Raises ``ValueError`` for a field that needs surfaces."""
+        """``config`` of a gaze field that knows what such a place is: one of hit points has holes, which were seen
+        through by nobody that it was made from; no place has no surfaces. Raises ``ValueError`` for a field that needs
+        surfaces."""
         if isinstance(config, LogGazeConfig):
-            return replace(config, escaped="nearest" if self.kind == "hits" else "constant",
-                           geometry="none" if self.kind == "none" else "surface")
+            return replace(
+                config,
+                escaped="nearest" if self.kind == "hits" else "constant",
+                geometry="none" if self.kind == "none" else "surface",
+            )
         if self.kind == "none":
-            raise NergError("a gaze field of this recipe needs surfaces; without any geometry only the default recipe trains")
+            raise NergError(
+                "a gaze field of this recipe needs surfaces; without any geometry only the default recipe trains"
+            )
         return config
 
 
@@ -70,15 +78,17 @@ def place_of_scene(path: Path) -> GazePlace:
 
 
 def place_of_hits(rays: Rays, path: Path, voxel: float | None = None) -> GazePlace:
-    """A volume made of the rays' hit points, written to ``path`` (.vol); ``voxel``: edge of its voxels in metres, by default
-    what `hit_extent` chooses."""
+    """A volume made of the rays' hit points, written to ``path`` (.vol); ``voxel``: edge of its voxels in metres, by
+    default what `hit_extent` chooses."""
     extent = hit_extent(rays, voxel)
     density, box = voxelise_hits(rays, extent=extent)
     write_volume(path, density, box.lower, box.upper)
     size = {
-        "shape": list(extent.shape), "solid": round(float((density > 0).mean()), 4), "voxel": extent.voxel,
+        "shape": list(extent.shape),
+        "solid": round(float((density > 0).mean()), 4),
+        "voxel": extent.voxel,
         "beyond": round(extent.beyond, 4),
-    }  # fmt: skip
+    }
     return place_of_volume(path, size)
 
 
@@ -95,7 +105,12 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
         raise NergError(f'the place of hit points "{path}" has no box with a lower and an upper corner; make it anew')
     medium = VolumeMedium(mi.load_dict(volume_dict(path)))
     lower, upper = medium.bounds()
-    return GazePlace(medium, Box(tuple(lower.tolist()), tuple(upper.tolist())), "hits", {"geometry_file": {**_file(path), **(about or {})}})
+    return GazePlace(
+        medium,
+        Box(tuple(lower.tolist()), tuple(upper.tolist())),
+        "hits",
+        {"geometry_file": {**_file(path), **(about or {})}},
+    )
 
 
 def place_of_nothing(origins: np.ndarray) -> GazePlace:

@@ -7,6 +7,7 @@ Sums along a ray are differences of one running sum over all samples, in float64
 any length cost the same and nothing recompiles. The derivatives are written out: Dr.Jit's own
 would add every sample of a ray to one address.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -47,8 +48,9 @@ class Segments:
     def before(self, x):
         """Sum of ``x`` over the earlier samples of the same ray, one float64 a sample."""
         running = dr.prefix_sum(self._masked(x))
-        return running - dr.gather(type(running), running, dr.gather(type(self.ray), self.start, self.ray, self.active),
-                                   self.active)
+        return running - dr.gather(
+            type(running), running, dr.gather(type(self.ray), self.start, self.ray, self.active), self.active
+        )
 
     def after(self, x):
         """Sum of ``x`` over the later samples of the same ray, one float64 a sample."""
@@ -72,8 +74,8 @@ class Segments:
 class Thinned:
     """What is known of samples that stand for others: one was kept with probability p, on the sum of all.
 
-    ``copies``: 1 / p of each sample; ``before``: optical depth in front of it, of all samples; ``opacity``: of each ray,
-    of all samples.
+    ``copies``: 1 / p of each sample; ``before``: optical depth in front of it, of all samples; ``opacity``: of each
+    ray, of all samples.
     """
 
     copies: object
@@ -82,7 +84,8 @@ class Thinned:
 
 
 class _Weights(dr.CustomOp):
-    """w of τ; dw_i = c_i T_i exp(-τ_i) dτ_i - w_i Σ_{j<i} c_j dτ_j along one ray, c the copies that a sample stands for."""
+    """w of τ; dw_i = c_i T_i exp(-τ_i) dτ_i - w_i Σ_{j<i} c_j dτ_j along one ray, c the copies that a sample stands
+    for."""
 
     def eval(self, tau, segments, thinned):
         self.segments = segments
@@ -142,10 +145,11 @@ def ray_sum(x, segments: Segments):
 
 
 def damp_near(values: list, t, reach) -> list:
-    """``values`` of samples at distance ``t``, with derivatives scaled by (t / reach)² where they are nearer than ``reach``.
+    """``values`` of samples at distance ``t``, with derivatives scaled by (t / reach)² where they are nearer than
+    ``reach``.
 
-    What is near a camera is sampled by many of its rays, and would turn to fog before far surfaces are found (Philip and
-    Deschaintre 2023, "Floaters No More").
+    What is near a camera is sampled by many of its rays, and would turn to fog before far surfaces are found (Philip
+    and Deschaintre 2023, "Floaters No More").
     """
     share = dr.minimum(dr.square(t / reach), 1)
     return [dr.replace_grad(x, x * share) for x in values]

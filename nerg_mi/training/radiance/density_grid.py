@@ -3,16 +3,17 @@
 A cubic grid over the field's unit cube, x varying fastest, as instant-ngp keeps it: each cell
 remembers a decaying maximum of the optical depth that one step finds in it.
 """
+
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.capture.cameras import Camera, view_tangents
+from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
-from nerg_mi.maths.box import Box
 from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.maths.box import Box
 
 _DECAY = 0.6
 # A share of the cells is refreshed at a time; the strides walk over all of them.
@@ -26,8 +27,17 @@ class DensityGrid:
     depth a step from which on a cell counts, lowered to half of the mean while the field is thin.
     """
 
-    def __init__(self, ns, box: Box, resolution: int, step: float, cameras: list[Camera], min_views: int,
-                 threshold: float = 0.01, near: float = 0.0):
+    def __init__(
+        self,
+        ns,
+        box: Box,
+        resolution: int,
+        step: float,
+        cameras: list[Camera],
+        min_views: int,
+        threshold: float = 0.01,
+        near: float = 0.0,
+    ):
         self.ns, self.box, self.resolution, self.step, self.threshold = ns, box, resolution, step, threshold
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
@@ -158,7 +168,8 @@ class DensityGrid:
         self.off = dr.compress(self.seen & (self.bits == 0))
 
     def empty_points(self, count: int, rng: np.random.Generator):
-        """Random points (Array3f, world) in cells that are not sampled though cameras see them; None if there are none."""
+        """Random points (Array3f, world) in cells that are not sampled though cameras see them; None if there are
+        none."""
         if dr.width(self.off) == 0:
             return None
         pick = self.ns.UInt32(aligned(rng.integers(0, dr.width(self.off), count, np.uint32), np.uint32))
@@ -195,8 +206,8 @@ class DensityGrid:
         return self.threshold / self.step
 
     def probe(self, found, index, density, rng: np.random.Generator, stratum: tuple, parts: int) -> None:
-        """Set ``found`` (UInt8 a cell) for those of the cells ``index`` that are denser than ``limit`` at a random point of their
-        ``stratum`` (three numbers) of ``parts`` an axis."""
+        """Set ``found`` (UInt8 a cell) for those of the cells ``index`` that are denser than ``limit`` at a random
+        point of their ``stratum`` (three numbers) of ``parts`` an axis."""
         stratum = self.ns.Array3f(*stratum)
         dr.make_opaque(stratum)
         hit = dr.compress(density(self._point(index, rng, stratum, parts), True) > self.limit)

@@ -1,9 +1,11 @@
 """What a radiance field is fitted to: the colours of rays and, where it is known, their depth."""
+
 from __future__ import annotations
 
 import drjit as dr
 
 from nerg_mi.transport.march.quadrature import mean_depth_share
+
 from .compositing import ray_sum, weights
 from .pixels import PixelBatch
 from .sampling import Samples
@@ -53,19 +55,21 @@ def depth_loss(weight, tau, samples: Samples, pixels: PixelBatch, margin: float,
 def feature_decay(features):
     """Mean square (Float) of a grid's ``features``.
 
-    What many rays see outweighs it, as each feature has one share in millions. Features that few rays have shaped, or chance
-    alone, it takes back to 0: Adam moves all alike, however small their derivatives are.
+    What many rays see outweighs it, as each feature has one share in millions. Features that few rays have shaped, or
+    chance alone, it takes back to 0: Adam moves all alike, however small their derivatives are.
     """
     return dr.mean(dr.square(features))
 
 
 def distortion_loss(weight, samples: Samples, scale: float):
-    """Loss a ray that draws its weight together: Σ_ij w_i w_j |m_i - m_j| + Σ_i w_i² δ_i / 3 with midpoints m and lengths
-    δ of the samples, in units of ``scale`` (Barron et al. 2022, mip-NeRF 360, eq. 15; summed in O(n) as samples are
-    in order). The samples' places have no derivative. Samples that stand for others count as one: the second term is then too
-    large by 1/p of each."""
+    """Loss a ray that draws its weight together: Σ_ij w_i w_j |m_i - m_j| + Σ_i w_i² δ_i / 3 with midpoints m and
+    lengths δ of the samples, in units of ``scale`` (Barron et al. 2022, mip-NeRF 360, eq. 15; summed in O(n) as samples
+    are in order). The samples' places have no derivative. Samples that stand for others count as one: the second term
+    is then too large by 1/p of each."""
     length = samples.length / scale
-    return ray_sum(dr.custom(_Spread, weight, samples.t / scale + 0.5 * length, length, samples.segments), samples.segments)
+    return ray_sum(
+        dr.custom(_Spread, weight, samples.t / scale + 0.5 * length, length, samples.segments), samples.segments
+    )
 
 
 class _Spread(dr.CustomOp):
@@ -102,8 +106,8 @@ class _Spread(dr.CustomOp):
 def composite(sigma, rgb: list, samples: Samples):
     """Weights, optical depths, colour (3 Floats) and opacity of every ray.
 
-    Of thinned samples the opacity is that of all, and the colour their mean times it: both without the noise of the sums of
-    weights. Derivatives are those of the plain sums, which are right on average.
+    Of thinned samples the opacity is that of all, and the colour their mean times it: both without the noise of the
+    sums of weights. Derivatives are those of the plain sums, which are right on average.
     """
     s, thinned = samples.segments, samples.thinned
     tau = dr.select(s.active, sigma * samples.length, 0)

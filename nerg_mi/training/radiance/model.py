@@ -1,13 +1,14 @@
 """The radiance field's forward pass in the form that trains fastest: networks as tensor products."""
+
 from __future__ import annotations
 
 import drjit as dr
 
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGrid
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceConfig, density_from_log, sigmoid
+from nerg_mi.maths.box import Box
 
 
 def stack(rows: list, ns):
@@ -24,16 +25,18 @@ def unstack(x, ns) -> list:
     """
     rows, width = x.shape
     index = dr.arange(ns.UInt32, width)
-    return [dr.gather(ns.Float, x.array, index + dr.opaque(ns.UInt32, k * width), mode=dr.ReduceMode.Permute)
-            for k in range(rows)]
+    return [
+        dr.gather(ns.Float, x.array, index + dr.opaque(ns.UInt32, k * width), mode=dr.ReduceMode.Permute)
+        for k in range(rows)
+    ]
 
 
 def density_color(config: RadianceConfig, box: Box, parameters: dict, p, d, ns, features: list | None = None):
     """Density (1/unit) and colour (list of 3 Floats in 0..1) at world points ``p`` seen along ``d``.
 
-    The same maths as ``RadianceField.density_features`` and ``color`` on ``parameters`` spelt as the field spells them; points
-    must lie in ``box``. Gradients reach every entry of ``parameters``. ``features``: what the grid returns at ``p``, where
-    that has been looked up already.
+    The same maths as ``RadianceField.density_features`` and ``color`` on ``parameters`` spelt as the field spells them;
+    points must lie in ``box``. Gradients reach every entry of ``parameters``. ``features``: what the grid returns at
+    ``p``, where that has been looked up already.
     """
     h = unstack(_net(parameters, "density_net").tensor(_features(config, box, parameters, p, ns, features)), ns)
     sigma = density_from_log(h[0], config.density_scale)
@@ -48,7 +51,8 @@ def density(config: RadianceConfig, box: Box, parameters: dict, p, ns):
 
 
 def density_of(config: RadianceConfig, parameters: dict, features: list):
-    """Density (1/unit) where the grid returns ``features`` (list of Floats); without weight gradients, as one kernel."""
+    """Density (1/unit) where the grid returns ``features`` (list of Floats); without weight gradients, as one
+    kernel."""
     return density_from_log(_head(parameters)(features)[0], config.density_scale)
 
 

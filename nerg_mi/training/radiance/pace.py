@@ -2,6 +2,7 @@
 
 Everything here follows the number of samples, and nothing the clock: equal steps do equal work on every machine.
 """
+
 from __future__ import annotations
 
 # Fewer rays a step are too noisy to learn from; marching waits to get finer until so many are affordable.
@@ -35,7 +36,8 @@ def refined(stride: int, strides: tuple[int, ...], scheduled: int, looked: float
     """The stride of the next step: ``stride``, or the next finer one of ``strides`` and 1.
 
     It is refined when the schedule has come to a finer one (``scheduled``), and free space is cleared far enough that
-    the pass has room for ``FEW_RAYS`` rays at it. ``looked``: samples a ray that the pass last looked at, at ``stride``;
+    the pass has room for ``FEW_RAYS`` rays at it. ``looked``: samples a ray that the pass last looked at, at
+    ``stride``;
     ``most``: of its samples a step. ``waits``: False refines without regard to what is cleared.
     """
     if scheduled >= stride:

@@ -1,4 +1,5 @@
 """All training pixels as device arrays, and batches of their rays."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -6,8 +7,9 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.capture.images import View
+from nerg_mi.errors import NergError
+
 from .unproject import LensTable
 
 # A pixel's place in its colours is 32 bits, four channels each.
@@ -30,8 +32,8 @@ class PixelBatch:
 class PixelBank:
     """Pixels of ``views`` that their masks leave in; which of them are drawn is the caller's business.
 
-    A pixel takes 3 bytes (8-bit pictures) or 6 (others), a third more with alpha, 2 with depth, and 4 with masks; its ray
-    is computed from its camera when it is drawn. Depth keeps 1/65535 of its picture's largest.
+    A pixel takes 3 bytes (8-bit pictures) or 6 (others), a third more with alpha, 2 with depth, and 4 with masks; its
+    ray is computed from its camera when it is drawn. Depth keeps 1/65535 of its picture's largest.
     """
 
     def __init__(self, ns, views: list[View]):
@@ -51,8 +53,11 @@ class PixelBank:
         self._where = None
         if any(v.mask is not None for v in views):
             starts = np.cumsum([0, *counts[:-1]])
-            self._where = ns.UInt32(np.concatenate([
-                (start + np.flatnonzero(_mask(v).ravel())).astype(np.uint32) for start, v in zip(starts, views)]))
+            self._where = ns.UInt32(
+                np.concatenate(
+                    [(start + np.flatnonzero(_mask(v).ravel())).astype(np.uint32) for start, v in zip(starts, views)]
+                )
+            )
         self._store_colors(views, used)
         self._store_depth(views, used)
 
@@ -66,8 +71,8 @@ class PixelBank:
             if view.mask is not None:
                 pixels = pixels[view.mask]
             c = pixels.shape[-1]
-            table[at:at + n, :c] = pixels.reshape(-1, c)
-            table[at:at + n, c:] = 255 if bytes_ else 1
+            table[at : at + n, :c] = pixels.reshape(-1, c)
+            table[at : at + n, c:] = 255 if bytes_ else 1
             at += n
         self._color_type = self.ns.UInt8 if bytes_ else self.ns.Float16
         self._color_unit = 1 / 255 if bytes_ else 1.0
@@ -84,7 +89,7 @@ class PixelBank:
                 depth = view.depth.ravel() if view.mask is None else view.depth[view.mask]
                 unit[k] = max(float(depth.max(initial=0)), 1e-30) / _DEPTH_STEPS
                 # What is known must not round to unknown.
-                table[at:at + n] = np.where(depth > 0, np.clip(np.round(depth / unit[k]), 1, _DEPTH_STEPS), 0)
+                table[at : at + n] = np.where(depth > 0, np.clip(np.round(depth / unit[k]), 1, _DEPTH_STEPS), 0)
             at += n
         self.depth_everywhere = np.count_nonzero(table) >= 0.999 * self.size
         self._depth, self._depth_unit = self.ns.UInt8(table.view(np.uint8)), self.ns.Float(unit)
@@ -103,8 +108,10 @@ class PixelBank:
         m = [dr.gather(ns.Float, self._pose, frame * 12 + k) for k in range(12)]
         d = dr.normalize(ns.Array3f(*[m[4 * r] * x + m[4 * r + 1] * y + m[4 * r + 2] * z for r in range(3)]))
         o = ns.Array3f(m[3], m[7], m[11])
-        color = [ns.Float(dr.gather(self._color_type, self._colors, index * self._channels + k)) * self._color_unit
-                 for k in range(self._channels)]
+        color = [
+            ns.Float(dr.gather(self._color_type, self._colors, index * self._channels + k)) * self._color_unit
+            for k in range(self._channels)
+        ]
         rgb, alpha = ns.Array3f(*color[:3]), color[3] if self._channels == 4 else None
         depth = None
         if self._depth is not None:

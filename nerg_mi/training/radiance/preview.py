@@ -1,4 +1,5 @@
 """Pictures of a field by the trainer's own marcher, for the error that is watched while it trains."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -9,10 +10,11 @@ import numpy as np
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.images import View
 from nerg_mi.field.radiance import RadianceField
+from nerg_mi.transport.march.quadrature import mean_depth_share
+
+from .compositing import ray_sum
 from .losses import composite
 from .sampling import StepTable, rays_in_box, visible_samples
-from nerg_mi.transport.march.quadrature import mean_depth_share
-from .compositing import ray_sum
 
 # Candidates (rays times steps) in flight at once.
 _CHUNK = 2**22
@@ -28,23 +30,32 @@ class Preview:
     depth: np.ndarray
 
 
-def render_view(field: RadianceField, occupied, table: StepTable, view: View, near: float, background: float = 0.0,
-                every: int = 1, stop: float = 1e-3) -> Preview:
+def render_view(
+    field: RadianceField,
+    occupied,
+    table: StepTable,
+    view: View,
+    near: float,
+    background: float = 0.0,
+    every: int = 1,
+    stop: float = 1e-3,
+) -> Preview:
     """March every ``every``-th pixel of ``view`` through ``field``.
 
-    ``occupied``: mask of points (Array3f, mask) in cells that may hold density; ``near``: where rays start, scene units.
+    ``occupied``: mask of points (Array3f, mask) in cells that may hold density; ``near``: where rays start, scene
+    units.
     """
     from nerg_mi.field.backend import namespace
 
     ns = namespace(field.grid.table)
-    d = pixel_directions(view.camera.intrinsics)[every // 2::every, every // 2::every]
+    d = pixel_directions(view.camera.intrinsics)[every // 2 :: every, every // 2 :: every]
     shape = d.shape[:2]
     d = (d.reshape(-1, 3) @ view.camera.to_world[:3, :3].T).astype(np.float32)
     parts = []
     size = max(1, _CHUNK // table.steps)
     with dr.suspend_grad():
         for first in range(0, len(d), size):
-            parts.append(_march(field, occupied, table, view.camera.center, d[first:first + size], near, stop, ns))
+            parts.append(_march(field, occupied, table, view.camera.center, d[first : first + size], near, stop, ns))
     color, opacity, moment = (np.concatenate([p[k] for p in parts]) for k in range(3))
     color = color + (1 - opacity[:, None]) * background
     depth = np.where(opacity > 0, moment / np.where(opacity > 0, opacity, 1), 0)
@@ -68,7 +79,8 @@ def _march(field, occupied, table, center, d, near: float, stop: float, ns):
 
 
 def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of values in 0..1, (h, w, c), over the pixels of ``mask`` (h, w); NaN if there is none."""
+    """Peak signal-to-noise ratio in dB of values in 0..1, (h, w, c), over the pixels of ``mask`` (h, w); NaN if there
+    is none."""
     error = (np.clip(picture, 0, 1).astype(np.float64) - truth) ** 2
     if mask is not None:
         error = error[mask]

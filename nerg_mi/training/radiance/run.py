@@ -1,23 +1,25 @@
 """A whole radiance training: from a data set to a checkpoint, with its held-out error on the way."""
+
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Callable
 
 import numpy as np
 
 from nerg_mi.capture.dataset import Dataset
 from nerg_mi.capture.images import View
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.formats.fields import save_radiance
 from nerg_mi.files.png import write_png
+from nerg_mi.formats.fields import save_radiance
 from nerg_mi.interruption import Interruption
-from .trainer import RadianceTrainer
 from nerg_mi.training.common.run_state import kept_unless, load_run, save_run
+
 from .settings import RadianceSettings
+from .trainer import RadianceTrainer
 from .verdict import complaints
 from .warm_up import warm_up
 
@@ -44,20 +46,30 @@ class Progress:
 
 
 def train_radiance(
-    dataset: Dataset, config: RadianceConfig, settings: RadianceSettings, ns: ModuleType, depth: bool = True,
-    on_progress: Callable[[Progress], None] | None = None, *, state: Path | None = None, resume: bool = False,
-    save_every: float = 60.0, preview: Path | None = None, write: Callable[[RadianceField, dict], None] | None = None,
+    dataset: Dataset,
+    config: RadianceConfig,
+    settings: RadianceSettings,
+    ns: ModuleType,
+    depth: bool = True,
+    on_progress: Callable[[Progress], None] | None = None,
+    *,
+    state: Path | None = None,
+    resume: bool = False,
+    save_every: float = 60.0,
+    preview: Path | None = None,
+    write: Callable[[RadianceField, dict], None] | None = None,
 ) -> tuple[RadianceField, dict]:
     """Train a field on ``dataset``; returns it, with its occupancy, and its provenance (JSON).
 
     Kernels are compiled before the run's time begins. The held-out views are looked at and never learnt from: a few of
-    them, coarsely, at some shares of the run, and all of them at the end, on every pixel unless that takes many samples. What
-    is wrong with the result stands in the provenance's ``complaints``. Ctrl-C ends the run after the step at hand, with what
-    it has come to.
+    them, coarsely, at some shares of the run, and all of them at the end, on every pixel unless that takes many
+    samples. What is wrong with the result stands in the provenance's ``complaints``. Ctrl-C ends the run after the step
+    at hand, with what it has come to.
 
     ``state``: file that holds the whole state of the run, written every ``save_every`` seconds and when the run is
-    interrupted; ``resume``: go on from there. ``write``: given the result, which it puts into a file. Once it has done so, the
-    state of a run that is done is removed; if it raises, the state is that of the end. Without it the state stays.
+    interrupted; ``resume``: go on from there. ``write``: given the result, which it puts into a file. Once it has done
+    so, the state of a run that is done is removed; if it raises, the state is that of the end. Without it the state
+    stays.
     ``preview``: PNG of the first watched view, its picture beside what is true, rewritten at every look and at the end.
     """
     trainer = RadianceTrainer(dataset.train, dataset.box, config, settings, ns, depth)
@@ -66,8 +78,11 @@ def train_radiance(
     watched = [dataset.held_out[i] for i in spread]
     about = {
         **{k: dataset.source.get(k) for k in ("sha256", "training_frames", "width", "height")},
-        "settings": settings.to_dict(), "architecture": config.to_dict(), "box": dataset.box.to_dict(), "depth": depth,
-    }  # fmt: skip
+        "settings": settings.to_dict(),
+        "architecture": config.to_dict(),
+        "box": dataset.box.to_dict(),
+        "depth": depth,
+    }
     history = load_run(trainer, state, about) if resume else []
     last = history[-1]["psnr"] if history else None
     looks = [x for x in _LOOKS if x > trainer.progress] if watched else []
@@ -86,7 +101,9 @@ def train_radiance(
                 saved = trainer.seconds
             try:
                 if on_progress is not None:
-                    on_progress(Progress(trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last))
+                    on_progress(
+                        Progress(trainer.progress, trainer.steps, trainer.seconds, trainer.rays, trainer.samples, last)
+                    )
                 stop.check()
             except KeyboardInterrupt:
                 # Only here, between two steps: elsewhere there would be weights and random numbers of different steps.
@@ -106,8 +123,9 @@ def train_radiance(
     return field, provenance
 
 
-def _result(trainer: RadianceTrainer, dataset: Dataset, watched: list[View], history: list, seconds: float,
-            interrupted: bool) -> tuple[RadianceField, dict]:
+def _result(
+    trainer: RadianceTrainer, dataset: Dataset, watched: list[View], history: list, seconds: float, interrupted: bool
+) -> tuple[RadianceField, dict]:
     """The field that the run has come to, and its provenance with the error on all held-out views."""
     field = trainer.field()
     provenance = {

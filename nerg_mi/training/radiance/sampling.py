@@ -4,6 +4,7 @@ Plain marching with true steps. Every ray shares one table of step edges, shifte
 steps are kept where the density grid has a bit, then where a density-only pass still sees light.
 What is kept lies packed, ray after ray (see ``compositing``).
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned, namespace
 from nerg_mi.maths.box import Box
 from nerg_mi.transport.march.quadrature import absorbed_share
+
 from .compositing import Segments, Thinned
 
 
@@ -82,7 +84,8 @@ def rays_in_box(o, d, box: Box, near: float) -> Rays:
 class Samples:
     """Packed steps of rays: ``ray`` index, ``t`` start and ``length`` (scene units), ``p`` midpoint
     (Array3f, world), and the rays' ``segments``. ``count``: real ones, the rest being padding; ``features``: what the
-    density pass knew of them, or None; ``thinned``: of samples that stand for others; ``looked``: samples a ray of the density pass."""
+    density pass knew of them, or None; ``thinned``: of samples that stand for others; ``looked``: samples a ray of the
+    density pass."""
 
     ray: object
     t: object
@@ -97,9 +100,9 @@ class Samples:
 
 @dataclass(frozen=True)
 class Thinning:
-    """Which samples to keep: those of a weight of ``sure`` or more all, others with a probability in proportion to their
-    weight, but ``least`` at least. ``seed``: of the choices. They are independent of one another, because derivatives hold
-    products of two samples, whose average is right only if so."""
+    """Which samples to keep: those of a weight of ``sure`` or more all, others with a probability in proportion to
+    their weight, but ``least`` at least. ``seed``: of the choices. They are independent of one another, because
+    derivatives hold products of two samples, whose average is right only if so."""
 
     sure: float
     least: float
@@ -107,11 +110,12 @@ class Thinning:
 
 
 def occupied_steps(rays: Rays, table: StepTable, offset, occupied, most: int | None = None) -> tuple | None:
-    """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated, and the rays covered.
+    """Steps whose midpoints lie in the box and in an occupied cell: (ray, t, length, p), evaluated, and the rays
+    covered.
 
     ``offset``: each ray's jitter, [0, 1); ``occupied``: function of points (Array3f) and a mask,
-    giving a mask. ``most``: bound of their number; the last rays, whose steps do not fit, are dropped. None when there is
-    not one step.
+    giving a mask. ``most``: bound of their number; the last rays, whose steps do not fit, are dropped. None when there
+    is not one step.
     """
     UInt32 = dr.uint32_array_t(type(offset))
     total = rays.count * table.steps
@@ -146,15 +150,22 @@ def _step(rays: Rays, table: StepTable, offset, ray, k):
 
 
 def visible_samples(
-    rays: Rays, table: StepTable, offset, occupied, density, stop: float, pad: int | None = None,
-    thinning: Thinning | None = None, most: int | None = None,
+    rays: Rays,
+    table: StepTable,
+    offset,
+    occupied,
+    density,
+    stop: float,
+    pad: int | None = None,
+    thinning: Thinning | None = None,
+    most: int | None = None,
 ) -> tuple[Samples | None, int]:
     """Samples that may matter, and the number of leading rays that they cover completely.
 
     ``density``: function of points and a mask giving σ without a gradient, or σ and a list of Floats that the samples
-    are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make exactly so many samples,
-    dropping the last rays that do not fit. ``thinning``: let few samples stand for the many that hardly absorb. ``most``:
-    samples at most at which ``density`` is evaluated, by the same means.
+    are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make exactly so many
+    samples, dropping the last rays that do not fit. ``thinning``: let few samples stand for the many that hardly
+    absorb. ``most``: samples at most at which ``density`` is evaluated, by the same means.
     Returns (None, rays) when no ray meets anything.
     """
     steps = occupied_steps(rays, table, offset, occupied, most)

@@ -1,20 +1,18 @@
 """What a radiance field is trained with."""
+
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 
 from nerg_mi.errors import NergError
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig
+from nerg_mi.maths.box import Box
 
-# (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's sizes;
-# "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16; "medium" holds the texture of a room, in 7 MB.
-_SIZES = {
-    "small": (8, 16, 32, 512, 32, 1),
-    "medium": (8, 18, 32, 512, 32, 1),
-    "paper": (16, 19, 16, 2048, 64, 2),
-}
+# (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's
+# sizes; "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16; "medium" holds the texture of a
+# room, in 7 MB.
+_SIZES = {"small": (8, 16, 32, 512, 32, 1), "medium": (8, 18, 32, 512, 32, 1), "paper": (16, 19, 16, 2048, 64, 2)}
 
 
 def sized_config(size: str, box: Box) -> RadianceConfig:
@@ -23,7 +21,9 @@ def sized_config(size: str, box: Box) -> RadianceConfig:
         raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
     levels, rows, base, finest, width, color_hidden = _SIZES[size]
     return RadianceConfig(
-        grid=HashGridConfig(levels=levels, log2_rows=rows, base=base, finest=finest), width=width, color_hidden=color_hidden,
+        grid=HashGridConfig(levels=levels, log2_rows=rows, base=base, finest=finest),
+        width=width,
+        color_hidden=color_hidden,
         density_scale=1 / box.side,
     )
 
@@ -33,22 +33,26 @@ class RadianceSettings:
     """Controls of a training run; lengths are shares of the scene box's side.
 
     ``steps`` or ``minutes``: how long, exactly one of them. ``batch``: samples a step. ``learning_rate``: held for the
-    share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself. ``average``: decay a step of the
-    averaged weights, which are the result. ``march_step``: shortest step (instant-ngp's √3/1024); ``growth``: steps are at
-    least this share of their distance; ``near``: where rays start, and distance to every camera within which nothing is;
+    share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself. ``average``: decay a step of
+    the averaged weights, which are the result. ``march_step``: shortest step (instant-ngp's √3/1024); ``growth``: steps
+    are at least this share of their distance; ``near``: where rays start, and distance to every camera within which
+    nothing is;
     ``reach``: the derivatives of samples nearer than this are scaled by the square of their share of it (Philip and
-    Deschaintre 2023, "Floaters No More"), 0: none are; it falls to 0 over ``reach_share`` of the run, as surfaces come to
-    stand where fog was; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on a
-    sample is always kept, others by chance in proportion to their weight, with ``thin_least`` at least (1: all are kept).
-    ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells that fewer
-    cameras see stay empty; ``settle``: share of the run from which on the cells that rendering will visit
+    Deschaintre 2023, "Floaters No More"), 0: none are; it falls to 0 over ``reach_share`` of the run, as surfaces come
+    to stand where fog was; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on
+    a sample is always kept, others by chance in proportion to their weight, with ``thin_least`` at least (1: all are
+    kept).
+    ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells that
+    fewer cameras see stay empty; ``settle``: share of the run from which on the cells that rendering will visit
     are found, all of which are then sampled.
-    ``look_most``: samples of the density-only pass, in batches: what it costs is then of the order of the rest of a step.
-    ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like part of it, which
-    clears early fog cheaply; while the pass has no room for enough rays at the next, it waits, for as long again.
+    ``look_most``: samples of the density-only pass, in batches: what it costs is then of the order of the rest of a
+    step.
+    ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like part of it,
+    which clears early fog cheaply; while the pass has no room for enough rays at the next, it waits, for as long again.
     ``huber``: error at which the colour loss turns linear (colours are in 0..1);
-    ``empty_weight``: weight of the penalty on density in cells that are not sampled; ``grid_decay``: of the mean square of
-    the grid's features, which lets go of what few rays have shaped (Barron et al. 2023, Zip-NeRF, there level by level);
+    ``empty_weight``: weight of the penalty on density in cells that are not sampled; ``grid_decay``: of the mean square
+    of the grid's features, which lets go of what few rays have shaped (Barron et al. 2023, Zip-NeRF, there level by
+    level);
     ``depth_weight``: of the depth terms
     where depth is known, falling to ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in
     march steps, within which a ray's weight should lie; ``replay``: share of the rays drawn from those whose depth was
@@ -97,12 +101,16 @@ class RadianceSettings:
         if min(given) < 0:
             raise NergError(f"weights of losses must be 0 or more, got {', '.join(map(str, given))}")
         if not (self.thin_sure > 0 and 0 < self.thin_least <= 1):
-            raise NergError(f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}")
+            raise NergError(
+                f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}"
+            )
         if not (self.stride_share >= 0 and self.reach_share > 0):
             shares = f"{self.stride_share} and {self.reach_share}"
             raise NergError(f"stride_share must be 0 or more and reach_share above 0, got {shares}")
         if self.look_most < 1:
-            raise NergError(f"look_most must be 1 or more, room for a batch in the density-only pass, got {self.look_most}")
+            raise NergError(
+                f"look_most must be 1 or more, room for a batch in the density-only pass, got {self.look_most}"
+            )
         if self.resolution % 8:
             raise NergError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
 

@@ -1,9 +1,10 @@
 """From some point of a training on, every cell that rendering will visit is sampled; found a piece a step.
 
-Cells that were left out stopped learning, and what hashing made of them shows once a picture is rendered under the bound
-of what the field has become (`DensityGrid.bound`): the last part of a run must clear it. Finding them at once would take
-as long as hundreds of steps.
+Cells that were left out stopped learning, and what hashing made of them shows once a picture is rendered under the
+bound of what the field has become (`DensityGrid.bound`): the last part of a run must clear it. Finding them at once
+would take as long as hundreds of steps.
 """
+
 from __future__ import annotations
 
 import drjit as dr
@@ -21,8 +22,8 @@ _LOOKS = 32
 class Settling:
     """Which cells the `DensityGrid.bound` of this moment would hold, nearly: by fewer points a cell and fewer rays.
 
-    ``at``: pieces done; ``found``: cells (UInt8 each) with density; ``shown``: cells that absorb some of a training ray's
-    light.
+    ``at``: pieces done; ``found``: cells (UInt8 each) with density; ``shown``: cells that absorb some of a training
+    ray's light.
     """
 
     PIECES = len(_STRATA) * _PARTS + _LOOKS
@@ -45,8 +46,8 @@ class Settling:
     def advance(self, density, lit, seed: int) -> None:
         """The next piece; with the last one the grid is told.
 
-        ``density``: of the field, as `DensityGrid.bound` has it; ``lit(density, occupied, rng)``: points (Array3f, world) of
-        samples that some training rays see, or None; ``seed``: of the points and rays.
+        ``density``: of the field, as `DensityGrid.bound` has it; ``lit(density, occupied, rng)``: points (Array3f,
+        world) of samples that some training rays see, or None; ``seed``: of the points and rays.
         """
         if self.done:
             return

@@ -1,10 +1,11 @@
 """Training a radiance field on posed pictures.
 
 instant-ngp's training (Müller et al. 2022) in Dr.Jit, arranged for the CPU backend: rays march a grid
-of occupied cells with true steps; a density-only pass drops what lies behind opaque surfaces, and lets one in many stand for
-samples that hardly absorb; what remains is packed into batches of constant size, the number of rays adapting; networks run
-as tensor products.
+of occupied cells with true steps; a density-only pass drops what lies behind opaque surfaces, and lets one in many
+stand for samples that hardly absorb; what remains is packed into batches of constant size, the number of rays adapting;
+networks run as tensor products.
 """
+
 from __future__ import annotations
 
 import time
@@ -13,12 +14,14 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
-from nerg_mi.errors import NergError
 from nerg_mi.capture.images import View
+from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.maths.box import Box
+from nerg_mi.training.common.step_clock import StepClock
+
 from .compositing import damp_near, weights
 from .density_grid import DensityGrid
 from .losses import color_loss, composite, depth_loss, distortion_loss, feature_decay
@@ -29,7 +32,6 @@ from .preview import Preview, psnr, render_view
 from .sampling import StepTable, Thinning, rays_in_box, visible_samples
 from .settings import RadianceSettings
 from .settling import Settling
-from nerg_mi.training.common.step_clock import StepClock
 
 # The average is taken of every fourth step.
 _AVERAGE_EVERY = 4
@@ -49,8 +51,9 @@ class RadianceTrainer:
     between runs to rounding (and bit for bit only with one thread).
     """
 
-    def __init__(self, views: list[View], box: Box, config: RadianceConfig, settings: RadianceSettings, ns,
-                 depth: bool = True):
+    def __init__(
+        self, views: list[View], box: Box, config: RadianceConfig, settings: RadianceSettings, ns, depth: bool = True
+    ):
         if not views:
             raise NergError("there are no pictures to train on")
         self.config, self.settings, self.box, self.ns = config, settings, box, ns
@@ -61,8 +64,15 @@ class RadianceTrainer:
         self.optimiser = Adam(settings.learning_rate, self.live.parameters(), beta_2=0.99, epsilon=1e-15)
         self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.live.parameters().items()}
         self.march_step = settings.march_step * box.side
-        self.grid = DensityGrid(ns, box, settings.resolution, self.march_step, [v.camera for v in views],
-                                settings.min_views, near=settings.near * box.side)
+        self.grid = DensityGrid(
+            ns,
+            box,
+            settings.resolution,
+            self.march_step,
+            [v.camera for v in views],
+            settings.min_views,
+            near=settings.near * box.side,
+        )
         # With exact depth everywhere the free space is known from the start, and there is no fog to clear.
         self.carved = self.use_depth and self.pixels.depth_everywhere
         if self.carved:
@@ -102,14 +112,16 @@ class RadianceTrainer:
         """Step edges ``stride`` times as coarse as the finest."""
         if stride not in self._tables:
             s, side = self.settings, self.box.side
-            self._tables[stride] = StepTable(self.ns, s.near * side, self._far(), stride * self.march_step,
-                                             stride * s.growth)
+            self._tables[stride] = StepTable(
+                self.ns, s.near * side, self._far(), stride * self.march_step, stride * s.growth
+            )
         return self._tables[stride]
 
     def _far(self) -> float:
         """The farthest that a training camera can be from a point of the box."""
-        corners = np.array([[b[i] for i, b in zip(k, zip(self.box.lower, self.box.upper))]
-                            for k in np.ndindex(2, 2, 2)])
+        corners = np.array(
+            [[b[i] for i, b in zip(k, zip(self.box.lower, self.box.upper))] for k in np.ndindex(2, 2, 2)]
+        )
         return float(max(np.linalg.norm(corners - c, axis=1).max() for c in self.pixels.centers))
 
     def density(self, p, active):
@@ -194,7 +206,7 @@ class RadianceTrainer:
 
     def _remember(self, index: np.ndarray) -> None:
         """Keep the pixels of this batch whose depth was wrong, in place of the oldest kept."""
-        wrong = self.misplaced.numpy()[:len(index)] > _WRONG
+        wrong = self.misplaced.numpy()[: len(index)] > _WRONG
         self.hard = np.concatenate([self.hard, index[wrong]])[-_HARD:]
 
     def _descend(self, samples, pixels, background, covered: int, stride: int) -> None:
@@ -216,7 +228,7 @@ class RadianceTrainer:
             unit = dr.opaque(ns.Float, stride * self.march_step)
             placed = depth_loss(weight, tau, samples, pixels, s.depth_margin * self.march_step, unit)
             # Places first, colours later: once surfaces stand, colour has more to say.
-            loss += dr.opaque(ns.Float, s.depth_weight * s.final_depth ** self.progress) * placed
+            loss += dr.opaque(ns.Float, s.depth_weight * s.final_depth**self.progress) * placed
             self.misplaced = dr.detach(placed)
         if s.distortion_weight > 0:
             loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
@@ -280,17 +292,22 @@ class RadianceTrainer:
         return samples, dr.gather(ns.Array3f, samples.p, dr.compress(weight > 1e-3))
 
     def pixels_within(self, views: list[View], samples: int) -> int:
-        """The ``every`` of `measure` with which ``views`` take about so many ``samples``, by those of the last step's rays."""
+        """The ``every`` of `measure` with which ``views`` take about so many ``samples``, by those of the last step's
+        rays."""
         rays = sum(v.pixels.shape[0] * v.pixels.shape[1] for v in views)
         return max(1, int(np.ceil((rays * max(self.looked * self.stride, 1) / samples) ** 0.5)))
 
     def measure(self, views: list[View], every: int = 1, field: RadianceField | None = None) -> list[float]:
-        """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel of those that their masks leave in.
+        """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel of those that their masks leave
+        in.
 
         Of ``field``, by its own occupancy; without one, of the averaged weights so far.
         """
         field, part = field or self.field(bound=False), (slice(every // 2, None, every),) * 2
-        return [psnr(self.render(v, every, field).color, v.over(0)[part], None if v.mask is None else v.mask[part]) for v in views]
+        return [
+            psnr(self.render(v, every, field).color, v.over(0)[part], None if v.mask is None else v.mask[part])
+            for v in views
+        ]
 
     def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
         """``view`` by the trainer's own marcher; ``every`` and ``field`` as `measure` has them."""

@@ -1,11 +1,12 @@
 """Directions that lenses show, on the device: the float32 counterpart of `capture.lens.rays`."""
+
 from __future__ import annotations
 
 import drjit as dr
 import numpy as np
 
-from nerg_mi.capture.lens import fisheye_limit
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.capture.lens import fisheye_limit
 
 # From the image's own coordinates, Newton's iteration reaches float32 in 3 to 5 steps at the corners of usual lenses.
 _STEPS = 8
@@ -29,9 +30,10 @@ class LensTable:
         self._columns = [ns.Float(c) for c in np.array(rows, np.float32).T]
 
     def directions(self, frame, column, row):
-        """Directions (3 Floats, OpenGL camera frame, of any length) of the pixels ``column``, ``row`` of ``frame`` (UInt32)."""
+        """Directions (3 Floats, OpenGL camera frame, of any length) of the pixels ``column``, ``row`` of ``frame``
+        (UInt32)."""
         ns = self.ns
-        get = lambda k: dr.gather(ns.Float, self._columns[k], frame)  # noqa: E731
+        get = lambda k: dr.gather(ns.Float, self._columns[k], frame)
         x, y = (ns.Float(column) + get(0)) * get(2), (ns.Float(row) + get(1)) * get(3)
         z = ns.Float(1)
         if self.distorted or any(self.fisheye):
@@ -77,7 +79,8 @@ class LensTable:
             slope = 1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * 9 * k4)))
             low, high = dr.select(excess > 0, low, theta), dr.select(excess > 0, theta, high)
             step = theta - excess / slope
-            # Where the polynomial flattens Newton's step may leave the bracket, by more than rounding: halve it instead.
+            # Where the polynomial flattens Newton's step may leave the bracket, by more than rounding: halve it
+            # instead.
             theta = dr.select((step > low - _ROUNDING) & (step < high + _ROUNDING), step, 0.5 * (low + high))
         sine, cosine = dr.sincos(theta)
         across = dr.select(r > 1e-7, sine / dr.maximum(r, 1e-7), 1)

@@ -1,4 +1,5 @@
 """What a finished radiance training has to say against itself."""
+
 from __future__ import annotations
 
 # Looks at a few views differ by some tenths of a dB from one another.

@@ -1,4 +1,5 @@
 """Compiling what a radiance training runs, before its clock starts."""
+
 from __future__ import annotations
 
 import copy
@@ -12,9 +13,9 @@ from nerg_mi.training.common.step_clock import StepClock
 def warm_up(trainer) -> None:
     """Run, and forget, what the steps of ``trainer`` (`RadianceTrainer`) consist of.
 
-    Compiling takes seconds where the kernels are not in Dr.Jit's cache on the disk: a large share of a run of a minute, in
-    the part that decides how it ends. Weights, random numbers and all else are as they were before; the clock of the run
-    starts.
+    Compiling takes seconds where the kernels are not in Dr.Jit's cache on the disk: a large share of a run of a minute,
+    in the part that decides how it ends. Weights, random numbers and all else are as they were before; the clock of the
+    run starts.
     """
     with _forgotten(trainer):
         # The kernels of the average differ the first two times; a step whose number is divisible looks over the grid.

@@ -15,30 +15,28 @@ transmittance, which may be zero.
 
 Steps keep their lengths and move with the ray's entry t0; the last one ends at t1.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from .primal import MarchResult, add, advance, limits, march_primal
 from nerg_mi.transport.media.media import LocalRay
+
+from .primal import MarchResult, add, advance, limits, march_primal
 from .quadrature import absorbed_share
 from .rules import rule
-
 
 _INPUTS = ("o", "d", "w", "t0", "t1")
 
 
 def attached(medium, ray, t0, t1) -> bool:
     """Whether any derivative is to be tracked through a march."""
-    return any(
-        dr.grad_enabled(x) for x in (ray.o, ray.d, ray.w, t0, t1, *medium.parameters())
-    )
+    return any(dr.grad_enabled(x) for x in (ray.o, ray.d, ray.w, t0, t1, *medium.parameters()))
 
 
-def differentiable_march(medium, ray, t0, t1, active, settings, offset, color, count, until,
-                         fine_from) -> MarchResult:
+def differentiable_march(medium, ray, t0, t1, active, settings, offset, color, count, until, fine_from) -> MarchResult:
     """``march_primal`` as one differentiable operation."""
     # Every sample gets its own colour: a shared one would hand its derivative to the wrong samples.
     settings = replace(settings, color_cutoff=0.0)
@@ -93,8 +91,17 @@ class _March(dr.CustomOp):
                     medium, LocalRay(*self.inputs), t0, t1, active, settings, offset, color, count, until, fine_from
                 )
         self.result = result
-        return (result.tau, result.moment, result.half, result.half_slope, result.enter, result.enter_tau,
-                result.color, result.density_evals, result.color_evals)
+        return (
+            result.tau,
+            result.moment,
+            result.half,
+            result.half_slope,
+            result.enter,
+            result.enter_tau,
+            result.color,
+            result.density_evals,
+            result.color_evals,
+        )
 
     def backward(self):
         active, color = self.fixed[1], self.fixed[4]
@@ -160,11 +167,20 @@ class _March(dr.CustomOp):
         """Repeat the primal's steps, threading ``extra`` through ``body(state, extra)``."""
         offset, color = self.fixed[3], self.fixed[4]
         Float = type(self.inputs[3])
-        start = _State(active, self.inputs[3], Float(1 if offset is None else offset), Float(0), Float(0),
-                       (Float(0), Float(0)), None if color is None else color(0))
+        start = _State(
+            active,
+            self.inputs[3],
+            Float(1 if offset is None else offset),
+            Float(0),
+            Float(0),
+            (Float(0), Float(0)),
+            None if color is None else color(0),
+        )
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
             _, extra = dr.while_loop(
-                (start, extra), lambda state, _: state.active, lambda state, extra: body(state, extra),
+                (start, extra),
+                lambda state, _: state.active,
+                lambda state, extra: body(state, extra),
                 label="march adjoint",
             )
         return extra
@@ -200,8 +216,15 @@ class _March(dr.CustomOp):
         crosses = active & ~before & (tau < goal)
         crossing = begin + step.crossing(dr.select(crosses, goal - tau, 0))
         replayed = _Replayed(active, step.dtau, mean, painted, transmittance, before, crosses, crossing)
-        after = _State(active & (t_next < primal_t1) & (tau_after < end), t_next, Float(1), tau_after, moment,
-                       (lost_tau, lost_moment), total)
+        after = _State(
+            active & (t_next < primal_t1) & (tau_after < end),
+            t_next,
+            Float(1),
+            tau_after,
+            moment,
+            (lost_tau, lost_moment),
+            total,
+        )
         return replayed, after
 
     def name(self):

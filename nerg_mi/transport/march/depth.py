@@ -1,4 +1,5 @@
 """Which distance along a ray is "the surface": expected, median or refined depth."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -6,6 +7,7 @@ from dataclasses import replace
 import drjit as dr
 
 from nerg_mi.maths.elementary import log1p
+
 from .primal import LOG2, MarchResult, MarchSettings, march, step_length
 
 KINDS = ("expected", "median", "refined")
@@ -16,8 +18,7 @@ _SOFTEST = 1 / 64
 _PARTS = 16
 
 
-def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, settings: MarchSettings,
-                  backed=None):
+def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, settings: MarchSettings, backed=None):
     """Depth of ``kind`` from a march's result, 0 where nothing absorbs.
 
     Evaluations that finding it takes are added to ``result.density_evals``, if that is counted.
@@ -54,8 +55,16 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
         # Steps of cells are as long as their voxels: they are searched until the crossing is found.
         end = t1 if settings.quadrature == "cells" else dr.minimum(enter + step_length(enter, settings), t1)
         part = settings.step / _PARTS
-        fine = march(medium, ray, enter, end, found, replace(settings, step=part, cell_step=part),
-                     until=dr.select(found, missing, 1), count=count)
+        fine = march(
+            medium,
+            ray,
+            enter,
+            end,
+            found,
+            replace(settings, step=part, cell_step=part),
+            until=dr.select(found, missing, 1),
+            count=count,
+        )
         if count:
             result.density_evals = result.density_evals + fine.density_evals
         # A finer march may find a little less in the step than the coarse one did.

@@ -6,6 +6,7 @@ the medium. Steps whose midpoint lies in an empty cell of the medium's occupancy
 grid are leapt over without an evaluation; marching ends behind opaque surfaces.
 Derivatives come from ``adjoint``, which marches again instead of storing samples.
 """
+
 from __future__ import annotations
 
 import math
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 
 from nerg_mi.maths.elementary import quotient
+
 from .quadrature import absorbed_share
 from .rules import rule
 
@@ -89,14 +91,27 @@ class MarchResult:
         return dr.select(some, self.origin + quotient(self.moment, dr.select(some, alpha, 1)), 0)
 
 
-def march(medium, ray, t0, t1, active, settings: MarchSettings, *, offset=None, color=None,
-          count: bool = False, until=None, fine_from=None) -> MarchResult:
+def march(
+    medium,
+    ray,
+    t0,
+    t1,
+    active,
+    settings: MarchSettings,
+    *,
+    offset=None,
+    color=None,
+    count: bool = False,
+    until=None,
+    fine_from=None,
+) -> MarchResult:
     """March ``ray`` (``media.LocalRay``) from ``t0`` to ``t1``.
 
     ``offset`` in [0, 1]: length of the first step as a share of a full one (jitter; None: a full
-    step). ``color``: array type of the medium's colour, or a function of one's entry that makes it; None for a density-only pass. ``until``:
-    optical depth at which to end, for a march that only looks for that crossing. ``count``: count
-    evaluations. ``fine_from``: distance up to which steps are coarse. Differentiable in the ray, ``t0``, ``t1``, ``until`` and the medium's parameters.
+    step). ``color``: array type of the medium's colour, or a function of one's entry that makes it; None for a
+    density-only pass. ``until``: optical depth at which to end, for a march that only looks for that crossing.
+    ``count``: count evaluations. ``fine_from``: distance up to which steps are coarse. Differentiable in the ray,
+    ``t0``, ``t1``, ``until`` and the medium's parameters.
     """
     from .adjoint import attached, differentiable_march
 
@@ -124,9 +139,7 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
     quadrature = rule(settings.quadrature, medium)
 
     def body(active, t, share, carry, lost, tau, moment, half, slope, enter, enter_tau, total, pending, n, m):
-        active, t, delta, t_next = advance(
-            medium, ray, t, t1, share, settings, active, quadrature.planes, fine_from
-        )
+        active, t, delta, t_next = advance(medium, ray, t, t1, share, settings, active, quadrature.planes, fine_from)
         step = quadrature.step(medium, ray, t, delta, t_next, carry, active, color)
         weight = dr.exp(-tau) * absorbed_share(step.dtau)
         moment, lost_moment = add(moment, lost[1], weight * dr.fma(delta, step.share, t - t0))
@@ -140,9 +153,7 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
         if color is not None:
             pending = pending + weight
             lit = active & (pending > settings.color_cutoff)
-            total = total + pending * dr.if_stmt(
-                (lit,), lit, step.color, lambda lit: color(0), label="colour"
-            )
+            total = total + pending * dr.if_stmt((lit,), lit, step.color, lambda lit: color(0), label="colour")
             pending = dr.select(lit, 0, pending)
             if count:
                 m = m + dr.select(lit, 1, 0)
@@ -151,13 +162,40 @@ def march_primal(medium, ray, t0, t1, active, settings, offset, color, count, un
 
         tau = after
         active = active & (t_next < t1) & (tau < end)
-        return (active, t_next, Float(1), step.carry, (lost_tau, lost_moment), tau, moment, half, slope, enter, enter_tau,
-                total, pending, n, m)
+        return (
+            active,
+            t_next,
+            Float(1),
+            step.carry,
+            (lost_tau, lost_moment),
+            tau,
+            moment,
+            half,
+            slope,
+            enter,
+            enter_tau,
+            total,
+            pending,
+            n,
+            m,
+        )
 
     start = (
-        active, t0, Float(1 if offset is None else offset), quadrature.start(Float), (Float(0), Float(0)), Float(0), Float(0),
-        Float(dr.inf), Float(0), Float(0), Float(0), None if color is None else color(0),
-        None if color is None else Float(0), Float(0) if count else None, Float(0) if count and color is not None else None,
+        active,
+        t0,
+        Float(1 if offset is None else offset),
+        quadrature.start(Float),
+        (Float(0), Float(0)),
+        Float(0),
+        Float(0),
+        Float(dr.inf),
+        Float(0),
+        Float(0),
+        Float(0),
+        None if color is None else color(0),
+        None if color is None else Float(0),
+        Float(0) if count else None,
+        Float(0) if count and color is not None else None,
     )
     state = dr.while_loop(start, lambda active, *_: active, body, label="march")
     *sums, total, pending, n, m = state[5:]

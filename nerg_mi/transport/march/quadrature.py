@@ -10,6 +10,7 @@ Where density rises or falls linearly from a to b (times δ), the mean is, by pa
 T = (a + b) / 2, that of ∫ exp(-τ(s)) ds over the step: the scaled complementary error function
 erfcx where density rises, Dawson's integral where it falls.
 """
+
 from __future__ import annotations
 
 import drjit as dr
@@ -35,9 +36,7 @@ def mean_depth_share(tau):
     """
     small = dr.minimum(tau, _SERIES_BELOW)
     square = small * small
-    series = 0.5 + small * dr.fma(
-        square, dr.fma(square, dr.fma(square, 1 / 1209600, -1 / 30240), 1 / 720), -1 / 12
-    )
+    series = 0.5 + small * dr.fma(square, dr.fma(square, dr.fma(square, 1 / 1209600, -1 / 30240), 1 / 720), -1 / 12)
     large = dr.maximum(tau, _SERIES_BELOW)
     closed = 1 / large - 1 / (dr.exp(dr.minimum(large, _EXP_LIMIT)) - 1)
     return dr.select(tau < _SERIES_BELOW, series, closed)
@@ -47,10 +46,27 @@ def mean_depth_share(tau):
 # of the optical depth T (rows) and of r = (b - a) / (a + b) (columns), good to 2e-8.
 _THIN_BELOW = 1.5
 _THIN = (
-    (0.49999999, 0.16666664, 6.7987697e-08, 1.0918575e-07, -1.3042581e-07, -8.6174076e-08, 6.8771346e-08,
-     -5.0923863e-09, -3.0330697e-09),
-    (-0.083333207, 4.696041e-07, 0.016665378, -2.3119287e-06, 1.8851202e-06, 2.0102928e-06, -6.0208229e-07,
-     1.9761391e-08),
+    (
+        0.49999999,
+        0.16666664,
+        6.7987697e-08,
+        1.0918575e-07,
+        -1.3042581e-07,
+        -8.6174076e-08,
+        6.8771346e-08,
+        -5.0923863e-09,
+        -3.0330697e-09,
+    ),
+    (
+        -0.083333207,
+        4.696041e-07,
+        0.016665378,
+        -2.3119287e-06,
+        1.8851202e-06,
+        2.0102928e-06,
+        -6.0208229e-07,
+        1.9761391e-08,
+    ),
     (-4.7494924e-07, -0.0027788291, 4.8875239e-06, 0.0011977268, -5.8555807e-06, -7.0758754e-06, 7.0219043e-07),
     (0.001389431, -4.4768449e-07, -0.00040419055, -5.8747659e-06, 7.463209e-05, 8.0344691e-06),
     (5.5822326e-08, 6.8628814e-05, 4.4154791e-06, -3.4397043e-05, -6.4088865e-06),
@@ -61,8 +77,17 @@ _THIN = (
 )
 # √π x erfcx(x) (1 + 2.5 / x) = 1 + t + t² Σ c_i t^i, t = 1 / (1 + 0.4 x), good to 1e-8 for x >= 0; the first two
 # terms are those of x -> ∞, without which derivatives would err where density is nearly constant.
-_RISING = (0.919975234, 0.760822631, 0.528661344, 0.366397487, -0.194325918, 0.589119012, -1.02504195,
-           0.612999031, -0.127472229)
+_RISING = (
+    0.919975234,
+    0.760822631,
+    0.528661344,
+    0.366397487,
+    -0.194325918,
+    0.589119012,
+    -1.02504195,
+    0.612999031,
+    -0.127472229,
+)
 # (1 + 2 y²) D(y) / y = N(w) / Q(w), w = 1 / (1 + y²), good to 1e-7 for y >= 0, D Dawson's integral;
 # again 1 + w + ... as y -> ∞.
 _FALLING_N = (1, -7.84594733, 113.145993, -51.5585158, 3020.43204, 13749.1012, 10526.1031, 530766.935, -269862.908)

@@ -8,15 +8,17 @@ interpolant is a cubic along the ray that two Gauss-Legendre samples integrate e
 Opacity is then exact, depth to a hundredth of a voxel: it takes the density between as
 the line through both samples.
 """
+
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Callable
 
 import drjit as dr
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.elementary import quotient
+
 from .quadrature import linear_crossing, linear_share, mean_depth_share
 
 KINDS = ("constant", "linear", "cells")
@@ -72,8 +74,14 @@ class Constant:
         def paint(lit):
             return color(medium.color(features, p, ray.w, lit))
 
-        return Step(dtau, mean_depth_share(dtau), lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
-                    paint, None, dr.select(active, 1.0, 0.0))
+        return Step(
+            dtau,
+            mean_depth_share(dtau),
+            lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
+            paint,
+            None,
+            dr.select(active, 1.0, 0.0),
+        )
 
 
 class Linear:
@@ -91,8 +99,13 @@ class Linear:
             first = medium.density(ray.o + ray.d * t, active)
         else:
             # After a leap the step's start is no end of a step before.
-            first = dr.if_stmt((t,), fresh, lambda t: medium.density(ray.o + ray.d * t, fresh),
-                               lambda t: dr.zeros(type(t)), label="first end")
+            first = dr.if_stmt(
+                (t,),
+                fresh,
+                lambda t: medium.density(ray.o + ray.d * t, fresh),
+                lambda t: dr.zeros(type(t)),
+                label="first end",
+            )
             first = dr.select(fresh, first, carry[0])
         last = medium.density(ray.o + ray.d * (t + delta), active)
         dtau = dr.select(active, 0.5 * (first + last) * delta, 0)
@@ -102,8 +115,14 @@ class Linear:
             p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
             return color(medium.color(medium.density_features(p, lit)[1], p, ray.w, lit))
 
-        return Step(dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint,
-                    (last, t_next), dr.select(active, 1.0, 0.0) + dr.select(fresh, 1.0, 0.0))
+        return Step(
+            dtau,
+            share,
+            lambda missing: linear_crossing(first, last, delta, missing),
+            paint,
+            (last, t_next),
+            dr.select(active, 1.0, 0.0) + dr.select(fresh, 1.0, 0.0),
+        )
 
 
 class Cells:
@@ -129,8 +148,14 @@ class Cells:
             p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
             return color(medium.color(medium.density_features(p, lit)[1], p, ray.w, lit))
 
-        return Step(dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint,
-                    None, dr.select(active, 2.0, 0.0))
+        return Step(
+            dtau,
+            share,
+            lambda missing: linear_crossing(first, last, delta, missing),
+            paint,
+            None,
+            dr.select(active, 2.0, 0.0),
+        )
 
 
 def rule(kind: str, medium):

@@ -1,4 +1,5 @@
 """The voxels of a grid volume: where its interpolant has kinks, and what bounds it."""
+
 from __future__ import annotations
 
 from types import ModuleType
@@ -31,8 +32,9 @@ class VoxelCells:
     def next_boundary(self, ray, t):
         """Distance at which ``ray`` leaves the cell that it is in just beyond ``t``."""
         end = type(t)(dr.inf)
-        for o, d, lower, scale in zip((ray.o.x, ray.o.y, ray.o.z), (ray.d.x, ray.d.y, ray.d.z), self._lower,
-                                      self._scale):
+        for o, d, lower, scale in zip(
+            (ray.o.x, ray.o.y, ray.o.z), (ray.d.x, ray.d.y, ray.d.z), self._lower, self._scale
+        ):
             a, b = (o - lower) * scale - self._shift, d * scale
             c = dr.fma(b, t, a)
             wall = dr.select(b > 0, dr.floor(c + _NUDGE) + 1, dr.ceil(c - _NUDGE) - 1)
@@ -66,8 +68,8 @@ def describe(volume) -> tuple[VoxelCells, np.ndarray] | None:
 
     def matches(shift, tolerance):
         """Whether the volume has the grid's values at ``shift`` of a voxel from every voxel's lower corner."""
-        # Every voxel is asked for: few of them tell a grid that is mostly empty from its mirror image. Some layers at a time:
-        # positions take thirty times the memory of values.
+        # Every voxel is asked for: few of them tell a grid that is mostly empty from its mirror image. Some layers at a
+        # time: positions take thirty times the memory of values.
         layers = max(1, _ASKED // (data.shape[1] * data.shape[2]))
         for first in range(0, data.shape[0], layers):
             part = data[first : first + layers]

@@ -4,6 +4,7 @@ What the density network hands to the colour network describes the place at a po
 volume rendering it is a semantic signal in the manner of Semantic-NeRF (Zhi et al. 2021, eq. 2-4); the paper's variants
 give either it or the snapshot at the surface to the gaze field.
 """
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -51,8 +52,9 @@ def snapshot(medium, p, active) -> list:
 
 
 def what_gaze_wants(kind: str, place, p_od, p_o, r_o, active, settings) -> list | None:
-    """Features (Floats) of what an observer sees at ``p_od`` along unit ``r_o`` from ``p_o``, for a gaze field that wants such
-    of ``kind`` (``field.gaze.product.SEMANTICS``); None for one that wants none. ``settings``: of the march."""
+    """Features (Floats) of what an observer sees at ``p_od`` along unit ``r_o`` from ``p_o``, for a gaze field that
+    wants such of ``kind`` (``field.gaze.product.SEMANTICS``); None for one that wants none. ``settings``: of the
+    march."""
     import mitsuba as mi
 
     if kind == "snapshot":
@@ -65,7 +67,8 @@ def what_gaze_wants(kind: str, place, p_od, p_o, r_o, active, settings) -> list 
 def accumulated(place, ray, active, settings) -> list:
     """Features (Floats) accumulated along a Mitsuba ``ray`` through ``place`` (``place.Place`` with a field).
 
-    What gathers them is always the default's, in training as in every picture: ``color_cutoff`` chooses how exact colours are."""
+    What gathers them is always the default's, in training as in every picture: ``color_cutoff`` chooses how exact
+    colours are."""
     settings = replace(settings, color_cutoff=MarchSettings.color_cutoff)
     featured = Featured(place.medium, False)
     march = Place(featured, place.scene).look(ray, active, settings, color=featured.blank).march

@@ -5,6 +5,7 @@ analytic cases, grids from other tools and neural fields run through one code pa
 Rays are handed over once (``local``), then every sample is ``o + t d`` in the
 medium's own coordinates while ``t`` stays the distance in the scene.
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -15,11 +16,11 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.radiance import RadianceField
-from .cells import bound, describe
+from nerg_mi.maths.ray_box import intersect_box
 from nerg_mi.transport.fingerprint import Fingerprint
 from nerg_mi.transport.freezing import recording
-from nerg_mi.maths.ray_box import intersect_box
 
+from .cells import bound, describe
 
 MAX_DENSITY = 1e30
 """Infinite densities count as this one, which is opaque over any length."""
@@ -38,7 +39,8 @@ class Similarity:
         determinant = np.linalg.det(linear) if np.all(np.isfinite(m)) else np.nan
         scale = abs(determinant) ** (1 / 3)
         if not (
-            determinant > 0 and np.array_equal(m[3], [0, 0, 0, 1])
+            determinant > 0
+            and np.array_equal(m[3], [0, 0, 0, 1])
             and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
         ):
             raise NergError(
@@ -62,8 +64,9 @@ class Similarity:
 
     def bounds(self, lower, upper):
         """Scene-space axis-aligned bounds of a field-space box."""
-        corners = np.array([[x, y, z, 1] for x in (lower[0], upper[0]) for y in (lower[1], upper[1])
-                            for z in (lower[2], upper[2])])
+        corners = np.array(
+            [[x, y, z, 1] for x in (lower[0], upper[0]) for y in (lower[1], upper[1]) for z in (lower[2], upper[2])]
+        )
         p = (corners @ self.matrix.T)[:, :3]
         return p.min(0), p.max(0)
 
@@ -191,7 +194,8 @@ class VolumeMedium:
         self.refresh()
 
     def refresh(self, anyway: bool = False) -> None:
-        """Read the grid's voxels again if they are other arrays than before, or ``anyway``; call after they may have changed."""
+        """Read the grid's voxels again if they are other arrays than before, or ``anyway``; call after they may have
+        changed."""
         if recording():
             # A bound would be that of these voxels, and not of those of the replays.
             self._bound = self._read = None
@@ -268,8 +272,8 @@ class VolumeMedium:
 
 
 class KnownEmpty:
-    """What a ``VolumeMedium`` skips, as dr.freeze finds it among an integrator's attributes. (The medium itself is handed to
-    custom operations, which would have to make another one of its kind.)"""
+    """What a ``VolumeMedium`` skips, as dr.freeze finds it among an integrator's attributes. (The medium itself is
+    handed to custom operations, which would have to make another one of its kind.)"""
 
     DRJIT_STRUCT = {"bound": None}
 
@@ -304,11 +308,14 @@ class GazeMedium:
         """Arrays that gaze depends on, for derivatives."""
         return list(self.field.parameters().values())
 
-    def face(self, observers: list, place, settings, kind: str, surface_opacity: float, like: GazeMedium | None = None) -> None:
-        """Integrate a normalised field over the spheres of ``observers`` (Point3f, one lane each) in ``place``; of another one
-        nothing needs to be known.
+    def face(
+        self, observers: list, place, settings, kind: str, surface_opacity: float, like: GazeMedium | None = None
+    ) -> None:
+        """Integrate a normalised field over the spheres of ``observers`` (Point3f, one lane each) in ``place``; of
+        another one nothing needs to be known.
 
-        ``settings``, ``kind``, ``surface_opacity``: of the observers' rays. Kept for as long as neither of them changes.
+        ``settings``, ``kind``, ``surface_opacity``: of the observers' rays. Kept for as long as neither of them
+        changes.
         ``like``: a medium of the same box, place and kind of field that faces the same observers, whose depths will do.
         """
         from nerg_mi.transport.observer.integral import GazeIntegral
@@ -321,12 +328,14 @@ class GazeMedium:
         self._recorded = recording()
         depths = [None] * len(observers) if like is None else like._integrals
         self._integrals = [
-            next((k for k in known if k.serves(p_o, *how)), None) or GazeIntegral(self, place, p_o, *how[1:], depths=traced)
+            next((k for k in known if k.serves(p_o, *how)), None)
+            or GazeIntegral(self, place, p_o, *how[1:], depths=traced)
             for p_o, traced in zip(observers, depths)
-        ]  # fmt: skip
+        ]
 
     def known(self) -> list:
-        """Of the observers that are faced, the integrals as numbers, for ``recall``: without the directions that they are over."""
+        """Of the observers that are faced, the integrals as numbers, for ``recall``: without the directions that they
+        are over."""
         from nerg_mi.transport.observer.integral import KnownIntegral
 
         return [KnownIntegral(k.center, k.value()) for k in self._integrals]
@@ -339,16 +348,26 @@ class GazeMedium:
         """``(emit, capture)`` of a normalised field, whose product is what is integrated."""
         local = self.to_world
         return self.field.unnormalized(
-            local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active, escaped=escaped
+            local.point_to_local(p_od),
+            local.point_to_local(p_o),
+            local.direction_to_local(r_o),
+            active,
+            escaped=escaped,
         )
 
     def evaluate(self, p_od, p_o, r_o, active, semantic=None, escaped=False):
-        """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``; ``semantic`` as the field wants it;
+        """``(gaze, emit, capture)`` for scene points and the unit scene direction ``r_o``; ``semantic`` as the field
+        wants it;
         ``escaped``: directions in which no surface is met."""
         local = self.to_world
         return self.field.evaluate(
-            local.point_to_local(p_od), local.point_to_local(p_o), local.direction_to_local(r_o), active, semantic,
-            self._integral(p_o), escaped,
+            local.point_to_local(p_od),
+            local.point_to_local(p_o),
+            local.direction_to_local(r_o),
+            active,
+            semantic,
+            self._integral(p_o),
+            escaped,
         )
 
     def _integral(self, p_o):

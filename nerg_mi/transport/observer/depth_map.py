@@ -4,12 +4,14 @@ A latitude-longitude map of depth, and of gaze, around the observer. A point is 
 four nearest entries and the results are interpolated (percentage-closer filtering,
 Reeves et al. 1987), not the depths themselves, which would float between surfaces.
 """
+
 from __future__ import annotations
 
 import drjit as dr
 
 from nerg_mi.transport.fingerprint import Fingerprint, of_shapes
 from nerg_mi.transport.place import Place
+
 from .visibility import visibility
 
 
@@ -77,8 +79,8 @@ class ObserverMap:
         return nearest, seen
 
     def gaze_along(self, r_o, distance, falloff, slack, active):
-        """Density at the surface that is met along unit ``r_o`` for points at ``distance``, negative where the map does not
-        know it: an entry that looks past the point, by more than ``slack``, sees another surface."""
+        """Density at the surface that is met along unit ``r_o`` for points at ``distance``, negative where the map does
+        not know it: an entry that looks past the point, by more than ``slack``, sees another surface."""
         Float = type(distance)
         total, share = Float(0), Float(0)
         for entry, weight in self._entries(r_o, distance):

@@ -1,4 +1,5 @@
 """An ensemble of gaze fields, and how much data there is around an observer, as the integrator sees them."""
+
 from __future__ import annotations
 
 import drjit as dr
@@ -86,7 +87,9 @@ def keep_or_make(known: list, observers: list, make) -> list:
 
     Raises ``NergError`` in a function that is being frozen, where the observers' positions cannot be read."""
     if recording():
-        raise NergError('"support" and "kde" depend on where the observer is, which a frozen function does not know while it is recorded: '
-                         'leave them out of "aovs"')
+        raise NergError(
+            '"support" and "kde" depend on where the observer is, which a frozen function does not know while it is recorded: '
+            'leave them out of "aovs"'
+        )
     same = lambda k, p_o: bool(dr.all(k.center == dr.detach(p_o), axis=None))
     return [next((k for k in known if same(k, p_o)), None) or make(p_o) for p_o in observers]

@@ -3,34 +3,45 @@
 It depends on where the observer stands and on nothing that the camera does: one integral an observer, over a set of
 directions of equal area whose depths are traced once.
 """
+
 from __future__ import annotations
 
 import math
-
 from dataclasses import dataclass
 
 import drjit as dr
 import numpy as np
 
-from nerg_mi.transport.media.features import what_gaze_wants
 from nerg_mi.transport.fingerprint import Fingerprint, of_shapes
+from nerg_mi.transport.media.features import what_gaze_wants
 
 COUNT = 1 << 17
 """Directions of an integral: enough for a thousandth at depths that jump from surface to surface."""
 
 _FILL = 1 << 14
-"""Directions whose depths fill those that escape. Always the same: filled from its own directions, an integral of more of them
-would be another one, by up to some per cent where half of them escape."""
+"""Directions whose depths fill those that escape. Always the same: filled from its own directions, an integral of more
+of them would be another one, by up to some per cent where half of them escape."""
 
 
 class GazeIntegral:
     """Of ``gaze`` (``media.GazeMedium``) at ``p_o`` (Point3f, one lane) in ``place``; see ``value``.
 
     ``settings``, ``kind``, ``surface_opacity``: of the observer's rays, as the integrator has them. The depths carry no
-    derivatives; the value has those of the field's parameters. ``depths``: an integral of such a field here, whose depths will do.
+    derivatives; the value has those of the field's parameters. ``depths``: an integral of such a field here, whose
+    depths will do.
     """
 
-    def __init__(self, gaze, place, p_o, settings, kind: str, surface_opacity: float, count: int = COUNT, depths: GazeIntegral | None = None):
+    def __init__(
+        self,
+        gaze,
+        place,
+        p_o,
+        settings,
+        kind: str,
+        surface_opacity: float,
+        count: int = COUNT,
+        depths: GazeIntegral | None = None,
+    ):
         import mitsuba as mi
 
         self.gaze, self.center = gaze, mi.Point3f(dr.detach(p_o))
@@ -49,7 +60,9 @@ class GazeIntegral:
 
     def serves(self, p_o, place, settings, kind, surface_opacity) -> bool:
         """Whether the depths are those of such an observer in such a place."""
-        return self._made == (_traced_in(place), settings, kind, surface_opacity) and bool(dr.all(self.center == dr.detach(p_o), axis=None))
+        return self._made == (_traced_in(place), settings, kind, surface_opacity) and bool(
+            dr.all(self.center == dr.detach(p_o), axis=None)
+        )
 
     def value(self):
         """The integral (Float of one lane), with derivatives where parameters of the field have any."""
@@ -65,22 +78,26 @@ class GazeIntegral:
 
     def _integral(self):
         o = self.center + dr.zeros(type(self.center), dr.width(self.directions))
-        emit, capture = self.gaze.unnormalized(o + self.directions * self.distance, o, self.directions, True, self.escaped)
+        emit, capture = self.gaze.unnormalized(
+            o + self.directions * self.distance, o, self.directions, True, self.escaped
+        )
         return dr.mean(emit * capture + dr.zeros(type(self.distance), dr.width(self.distance))) * (4 * dr.pi)
 
 
 class Surroundings:
-    """What an observer at ``center`` (Point3f, one lane) meets in every direction, as the field of ``gaze`` is to be evaluated
-    there: also where there is no surface. The other arguments are those of ``GazeIntegral``."""
+    """What an observer at ``center`` (Point3f, one lane) meets in every direction, as the field of ``gaze`` is to be
+    evaluated there: also where there is no surface. The other arguments are those of ``GazeIntegral``."""
 
     def __init__(self, gaze, place, center, settings, kind: str, surface_opacity: float):
         self.field, self.to_world, self.place, self.center = gaze.field, gaze.to_world, place, center
         self.settings, self.kind, self.surface_opacity = settings, kind, surface_opacity
 
     def along(self, directions):
-        """Distance (Float, scene units) along unit ``directions`` (Vector3f), and whether no surface is met there (Bool).
+        """Distance (Float, scene units) along unit ``directions`` (Vector3f), and whether no surface is met there
+        (Bool).
 
-        What escapes ends on the field's box, or at the depth of the nearest directions that do not, as the field wants it."""
+        What escapes ends on the field's box, or at the depth of the nearest directions that do not, as the field wants
+        it."""
         import mitsuba as mi
 
         config, width = self.field.config, dr.width(directions)
@@ -94,7 +111,9 @@ class Surroundings:
                 known, distance = (np.array(v) for v in self._trace(few))
                 if known.any():
                     depth = np.array(depth)
-                    depth[escaped] = nearest_depth(np.array(few).T[known], distance[known], np.array(directions).T[escaped])
+                    depth[escaped] = nearest_depth(
+                        np.array(few).T[known], distance[known], np.array(directions).T[escaped]
+                    )
                     depth = mi.Float(depth)
         return depth, ~met
 
@@ -111,13 +130,16 @@ class Surroundings:
         from nerg_mi.maths.ray_box import intersect_box
 
         box, local = self.field.box, self.to_world
-        near, far = intersect_box(local.point_to_local(self.center), local.vector_to_local(directions), box.lower, box.upper)
+        near, far = intersect_box(
+            local.point_to_local(self.center), local.vector_to_local(directions), box.lower, box.upper
+        )
         return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * local.scale)
 
 
 @dataclass(frozen=True)
 class KnownIntegral:
-    """An integral of which nothing but the number is kept: ``number`` (Float, one lane) of the observer at ``center``."""
+    """An integral of which nothing but the number is kept: ``number`` (Float, one lane) of the observer at
+    ``center``."""
 
     center: object
     number: object
@@ -131,8 +153,9 @@ class KnownIntegral:
 
 
 def gaze_around(gaze, place, p_o, r_o, settings, kind: str, surface_opacity: float):
-    """Density (Float, 1/sr) of the observer at ``p_o`` (Point3f, one lane) in directions ``r_o`` (unit Vector3f), carrying no
-    derivatives: on surfaces what the integrator shows there, and elsewhere what the field was trained to be.
+    """Density (Float, 1/sr) of the observer at ``p_o`` (Point3f, one lane) in directions ``r_o`` (unit Vector3f),
+    carrying no derivatives: on surfaces what the integrator shows there, and elsewhere what the field was trained to
+    be.
 
     ``gaze`` (``media.GazeMedium`` or ``gaze_ensemble.EnsembleMedium``) must ``face`` the observer; the others as there.
     """
@@ -150,7 +173,8 @@ def gaze_around(gaze, place, p_o, r_o, settings, kind: str, surface_opacity: flo
 
 
 def _spiral(count: int):
-    """``count`` directions of equal area (Vector3f) on a golden-angle spiral: ``maths.sphere``'s, made on the device."""
+    """``count`` directions of equal area (Vector3f) on a golden-angle spiral: ``maths.sphere``'s, made on the
+    device."""
     import mitsuba as mi
 
     i = dr.arange(mi.Float, count)

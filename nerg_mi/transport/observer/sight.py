@@ -3,6 +3,7 @@
 The paper's second depth pass: the observer's ray towards the camera's surface p_d is
 marched for its own depth d_o, and compared with the distance d_o* (see ``visibility``).
 """
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -11,8 +12,9 @@ import drjit as dr
 
 from nerg_mi.transport.freezing import recording
 from nerg_mi.transport.march.primal import MarchSettings
-from .depth_map import ObserverMap
 from nerg_mi.transport.place import Place
+
+from .depth_map import ObserverMap
 from .visibility import visibility
 
 KINDS = ("depth", "transmittance", "map")
@@ -59,8 +61,9 @@ class ObserverPass:
     ``map_height``: rows of the map.
     """
 
-    def __init__(self, settings: MarchSettings, kind: str, depth: str, surface_opacity: float,
-                 tolerance: float, map_height: int):
+    def __init__(
+        self, settings: MarchSettings, kind: str, depth: str, surface_opacity: float, tolerance: float, map_height: int
+    ):
         self.settings, self.kind, self.depth = settings, kind, depth
         self.surface_opacity, self.tolerance, self.map_height = surface_opacity, tolerance, map_height
         self._map = None

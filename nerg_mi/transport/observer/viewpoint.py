@@ -2,6 +2,7 @@
 
 The eye is the centre of the sensor, not the origin of its rays: Mitsuba starts those at the near plane.
 """
+
 from __future__ import annotations
 
 import drjit as dr

@@ -5,6 +5,7 @@ observer's ray meets with the distance d_o* to the point. s = clip((d_o* - d_o -
 is 1 where something stands in between; gaze is multiplied by the visibility 1 - s. (The text
 multiplies by s, which would show gaze only where it is hidden.)
 """
+
 from __future__ import annotations
 
 import drjit as dr

@@ -1,4 +1,5 @@
 """Solid angles of pixels against closed forms of whole pictures, and against the Jacobian of each lens."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -6,8 +7,8 @@ import pytest
 
 from nerg_mi.capture import lens
 from nerg_mi.capture.cameras import pixel_directions
-from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
 
 PLAIN = Intrinsics(96, 64, 60.0, 55.0, 44.0, 30.5)
 BARREL = replace(PLAIN, k1=-0.15, k2=0.03, p1=0.002, p2=-0.001)
@@ -34,8 +35,12 @@ def test_the_sum_is_that_of_the_border(i):
     """Between the axis and the border at azimuth φ lie 1 - cos θ(φ) of area for each radian."""
     n = 20000
     u, v = np.linspace(0, i.width, n, endpoint=False), np.linspace(0, i.height, n, endpoint=False)
-    edge = np.concatenate([np.stack(p, axis=-1) for p in (
-        (u, 0 * u), (0 * v + i.width, v), (i.width - u, 0 * u + i.height), (0 * v, i.height - v))])  # fmt: skip
+    edge = np.concatenate(
+        [
+            np.stack(p, axis=-1)
+            for p in ((u, 0 * u), (0 * v + i.width, v), (i.width - u, 0 * u + i.height), (0 * v, i.height - v))
+        ]
+    )
     d = lens.rays((edge - [i.cx, i.cy]) / [i.fx, i.fy], i)
     phi, height = np.unwrap(np.arctan2(d[:, 1], d[:, 0])), 1 - d[:, 2]
     turn = np.diff(phi, append=phi[0] + 2 * np.pi)
@@ -56,7 +61,9 @@ def test_a_fisheye_that_ends_within_the_picture_covers_a_cap(widest):
 def test_a_pixel_has_the_jacobian_of_its_lens(i):
     fine = i.resized(3 * i.width, 3 * i.height)
     h = 1e-4
-    x, y = np.meshgrid((np.arange(fine.width) + 0.5 - fine.cx) / fine.fx, (np.arange(fine.height) + 0.5 - fine.cy) / fine.fy)
+    x, y = np.meshgrid(
+        (np.arange(fine.width) + 0.5 - fine.cx) / fine.fx, (np.arange(fine.height) + 0.5 - fine.cy) / fine.fy
+    )
     ray = lambda dx, dy: lens.rays(np.stack([x + dx, y + dy], axis=-1), i)
     across = np.cross(ray(h, 0) - ray(-h, 0), ray(0, h) - ray(0, -h)) / (4 * h * h)
     jacobian = np.linalg.norm(across, axis=-1) / (fine.fx * fine.fy)

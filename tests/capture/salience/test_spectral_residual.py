@@ -1,4 +1,5 @@
 """The spectral residual against the authors' steps, written out with a plain Fourier sum."""
+
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ def restated(grey):
     mean = sum(around[a : a + h, b : b + w] for a in range(3) for b in range(3)) / 9
     back = F(h).conj() @ (np.exp(amplitude - mean) * spectrum / np.abs(spectrum)) @ F(w).conj() / (h * w)
     sharp = np.pad(np.abs(back) ** 2, 5)
-    kernel = np.exp(-np.arange(-5, 6) ** 2 / (2 * 2.5**2))
+    kernel = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 2.5**2))
     kernel = np.outer(kernel, kernel) / kernel.sum() ** 2
     return sum(kernel[a, b] * sharp[a : a + h, b : b + w] for a in range(11) for b in range(11))
 

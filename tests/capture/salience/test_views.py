@@ -1,14 +1,15 @@
 """Salience images: what is read and refused, whose they are, and the densities they mean."""
+
 import json
 
 import numpy as np
 import pytest
 
-from nerg_mi.errors import NergError
-from nerg_mi.capture.salience.views import open_salience, read_salience
-from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
-from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
+from nerg_mi.capture.salience.views import open_salience, read_salience
+from nerg_mi.errors import NergError
+from nerg_mi.files.exr import write_bitmap_exr
 
 LENSES = {
     "pinhole": {"fl_x": 40.0, "fl_y": 40.0},
@@ -57,26 +58,36 @@ def test_every_kind_of_file_says_the_same(tmp_path, rgb):
     values = np.arange(12).reshape(3, 4) * 5
     grey, byte = np.float32(values), values.astype(np.uint8)
     kinds = {
-        "eight.png": byte, "sixteen.png": values.astype(np.uint16), "opaque.png": np.dstack([byte, byte, byte, 0 * byte + 255]),
-        "three.png": np.dstack([byte, byte, byte]), "a.exr": grey, "three.exr": np.dstack([grey, grey, grey]),
-        "a.npy": values / 60, "whole.npy": values, "column.npy": values[..., None], "flags.npy": values > 20,
-    }  # fmt: skip
+        "eight.png": byte,
+        "sixteen.png": values.astype(np.uint16),
+        "opaque.png": np.dstack([byte, byte, byte, 0 * byte + 255]),
+        "three.png": np.dstack([byte, byte, byte]),
+        "a.exr": grey,
+        "three.exr": np.dstack([grey, grey, grey]),
+        "a.npy": values / 60,
+        "whole.npy": values,
+        "column.npy": values[..., None],
+        "flags.npy": values > 20,
+    }
     for name, array in kinds.items():
         found = read_salience(write(tmp_path / name, array))
         expected = (values > 20) if name == "flags.npy" else values
         assert np.allclose(found / found.sum(), expected / expected.sum(), atol=1e-7), name
 
 
-@pytest.mark.parametrize("name, values, said", [
-    ("a.png", np.zeros((4, 4), np.uint8), "zero everywhere"),
-    ("a.npy", np.full((4, 4), np.nan), "16 values that are not finite"),
-    ("a.exr", np.array([[1, np.inf]], np.float32), "1 values that are not finite"),
-    ("a.npy", np.array([[-1.0, 2]]), "log densities"),
-    ("a.png", np.random.default_rng(0).integers(0, 255, (4, 4, 3)).astype(np.uint8), "in colours"),
-    ("a.png", np.arange(1, 17, dtype=np.uint8).reshape(4, 4, 1) * np.ones(4, np.uint8), "partly transparent"),
-    ("a.npy", np.ones((2, 3, 4, 5)), "one number a pixel"),
-    ("a.npy", np.array([["x"]]), "one number a pixel"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "name, values, said",
+    [
+        ("a.png", np.zeros((4, 4), np.uint8), "zero everywhere"),
+        ("a.npy", np.full((4, 4), np.nan), "16 values that are not finite"),
+        ("a.exr", np.array([[1, np.inf]], np.float32), "1 values that are not finite"),
+        ("a.npy", np.array([[-1.0, 2]]), "log densities"),
+        ("a.png", np.random.default_rng(0).integers(0, 255, (4, 4, 3)).astype(np.uint8), "in colours"),
+        ("a.png", np.arange(1, 17, dtype=np.uint8).reshape(4, 4, 1) * np.ones(4, np.uint8), "partly transparent"),
+        ("a.npy", np.ones((2, 3, 4, 5)), "one number a pixel"),
+        ("a.npy", np.array([["x"]]), "one number a pixel"),
+    ],
+)
 def test_what_is_no_salience_is_refused_by_name(name, values, said, tmp_path, rgb):
     path = write(tmp_path / name, values)
     with pytest.raises(ValueError, match=said) as e:
@@ -97,7 +108,9 @@ def test_maps_belong_to_frames_by_name(posed):
     write(folder / "maps" / "c.png", np.ones((24, 32), np.uint8))
     write(folder / "maps" / "d.png", np.ones((24, 32), np.uint8))
     found = open_salience(folder, folder / "maps")
-    assert [v.name for v in found.views] == ["a.png", "c.png"] and found.missing == ["b.png"] and found.stray == ["d.png"]
+    assert (
+        [v.name for v in found.views] == ["a.png", "c.png"] and found.missing == ["b.png"] and found.stray == ["d.png"]
+    )
     assert found.views[1].share.shape == (24, 32) and np.allclose(found.views[1].camera.center, [2, 0, 0])
     assert found.about["used"] == 2 and found.about["missing"] == 1
 
@@ -108,7 +121,7 @@ def test_maps_belong_to_frames_by_name(posed):
 
 def test_a_map_of_another_shape_or_of_nobody_is_refused(posed):
     folder = posed()
-    with pytest.raises(ValueError, match="no image in .* would be \"a\""):
+    with pytest.raises(ValueError, match='no image in .* would be "a"'):
         open_salience(folder, folder / "maps")
     with pytest.raises(FileNotFoundError, match="spectral-residual"):
         open_salience(folder, folder / "nothing")
@@ -140,7 +153,9 @@ def test_one_map_of_two_photos_is_refused(posed):
 
 def lens_of(keys):
     named = {k: v for k, v in keys.items() if k[0] in "kp"}
-    return Intrinsics(64, 48, keys["fl_x"], keys["fl_y"], keys.get("cx", 32.0), 24.0, **named, fisheye="camera_model" in keys)
+    return Intrinsics(
+        64, 48, keys["fl_x"], keys["fl_y"], keys.get("cx", 32.0), 24.0, **named, fisheye="camera_model" in keys
+    )
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -197,7 +212,11 @@ def test_fewer_pixels_hold_the_same_gaze(posed):
     assert np.allclose(small.share, view.share.reshape(12, 4, 16, 4).sum(axis=(1, 3)), rtol=1e-4)
     assert np.allclose(small.solid_angle, pixel_solid_angles(small.camera.intrinsics), rtol=1e-5)
     odd = view.reduced(200)
-    assert odd.share.size <= 200 and odd.extent == pytest.approx(view.extent, rel=1e-5) and odd.share.sum() == pytest.approx(1)
+    assert (
+        odd.share.size <= 200
+        and odd.extent == pytest.approx(view.extent, rel=1e-5)
+        and odd.share.sum() == pytest.approx(1)
+    )
 
 
 def test_masked_pixels_are_unknown(posed):
@@ -210,7 +229,11 @@ def test_masked_pixels_are_unknown(posed):
     (folder / "transforms.json").write_text(json.dumps(data))
     write(folder / "maps" / "a.npy", np.ones((24, 32)))
     view = open_salience(folder, folder / "maps").views[0]
-    assert (view.solid_angle[:, :16] == 0).all() and (view.solid_angle[:, 16:] > 0).all() and (view.density[:, :16] == 0).all()
+    assert (
+        (view.solid_angle[:, :16] == 0).all()
+        and (view.solid_angle[:, 16:] > 0).all()
+        and (view.density[:, :16] == 0).all()
+    )
     assert (view.draw(200, np.random.default_rng(0))[1] % 32 >= 16).all()
     write(folder / "maps" / "a.npy", np.tile(np.arange(32) < 10, (24, 1)))
     with pytest.raises(ValueError, match="a.npy.*mask"):

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.density.kde.frame import directions_to, kde_frame, probe_at
+from nerg_mi.maths.sphere import uniform_directions
 from nerg_mi.rays.index import RayIndex
 from nerg_mi.rays.rays import Rays
-from nerg_mi.maths.sphere import uniform_directions
 from tests.reference.kde import kde as reference
 
 OBSERVER = np.array([1.0, 1.0, 1.6])
@@ -14,7 +14,14 @@ OBSERVER = np.array([1.0, 1.0, 1.6])
 def rays():
     rng = np.random.default_rng(3)
     n = 4000
-    return Rays(np.arange(n) * 0.1, np.arange(n) % 4, tuple("abcd"), rng.uniform([0, 0, 1.5], [2, 2, 1.7], (n, 3)), uniform_directions(n, rng), np.ones(n))
+    return Rays(
+        np.arange(n) * 0.1,
+        np.arange(n) % 4,
+        tuple("abcd"),
+        rng.uniform([0, 0, 1.5], [2, 2, 1.7], (n, 3)),
+        uniform_directions(n, rng),
+        np.ones(n),
+    )
 
 
 def wall(h=60, w=90):

@@ -2,9 +2,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.maths import vmf
 from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.density.kde.table import SphericalKdeTable
+from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
 from tests.reference.kde import kde as reference
 
@@ -18,7 +18,14 @@ def test_close_to_exact_everywhere(kappa, count):
     # All over, near the peaks, and on the cube's edges and corners.
     edges = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
     edges = np.concatenate([edges, edges + 1e-6, edges - 1e-6])
-    x = np.concatenate([uniform_directions(5000, rng), mu, vmf.sample(np.repeat(mu, 9, 0), kappa, rng), edges / np.linalg.norm(edges, axis=1, keepdims=True)])
+    x = np.concatenate(
+        [
+            uniform_directions(5000, rng),
+            mu,
+            vmf.sample(np.repeat(mu, 9, 0), kappa, rng),
+            edges / np.linalg.norm(edges, axis=1, keepdims=True),
+        ]
+    )
     peak = np.exp(vmf.log_normaliser(kappa))
     table = SphericalKdeTable(kde)
     assert np.abs(table.evaluate(x) - kde.evaluate(x)[0]).max() < 1e-4 * peak
@@ -49,7 +56,12 @@ def test_one_probe_of_several_and_its_slope():
     dr.set_grad(x, ns.Array3f(side.tolist()))
     slope = dr.forward_to(table.density(x))[0]
     ends = np.array([x0 + h * side for h in (1e-3, -1e-3)])
-    a, b = reference(ends / np.linalg.norm(ends, axis=1, keepdims=True), np.array(kde.part(1, 2)._rays).reshape(-1, 4)[:, :3], [0, 30], [30.0])[0]
+    a, b = reference(
+        ends / np.linalg.norm(ends, axis=1, keepdims=True),
+        np.array(kde.part(1, 2)._rays).reshape(-1, 4)[:, :3],
+        [0, 30],
+        [30.0],
+    )[0]
     assert np.isclose(slope, (a - b) / 2e-3, rtol=2e-2)
 
 

@@ -1,4 +1,6 @@
-"""The density of the rays nearest to an observer, in the scene's frame: exact sums for few directions, a table for many."""
+"""The density of the rays nearest to an observer, in the scene's frame: exact sums for few directions, a table for
+many."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
@@ -6,8 +8,8 @@ import pytest
 
 from nerg_mi.density.kde.frame import WORTH
 from nerg_mi.density.kde.view import KdeView
-from nerg_mi.rays.rays import Rays
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.media.media import Similarity
 from tests.reference.kde import kde as reference
 
@@ -17,7 +19,14 @@ COUNT, KAPPA = 40, 15.0
 @pytest.fixture
 def rays():
     rng = np.random.default_rng(0)
-    return Rays(np.arange(300.0), np.zeros(300), ("a",), rng.normal(size=(300, 3)) * (1, 3, 0.2), uniform_directions(300, rng), np.ones(300))
+    return Rays(
+        np.arange(300.0),
+        np.zeros(300),
+        ("a",),
+        rng.normal(size=(300, 3)) * (1, 3, 0.2),
+        uniform_directions(300, rng),
+        np.ones(300),
+    )
 
 
 def expected(rays, p, d):

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from nerg_mi.maths import vmf
 from nerg_mi.density.probes import place_probes
-from nerg_mi.rays.rays import Rays
-from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
-from nerg_mi.evaluation.gaze import baselines
 from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.evaluation.gaze import baselines
+from nerg_mi.maths import vmf
+from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
+from nerg_mi.rays.rays import Rays
 from tests.reference.kde import kde as reference
 
 X = fibonacci_directions(1024)
@@ -91,7 +91,12 @@ def test_probes_keep_their_weights(rays, weights):
     at = probes.positions[:4]
     assert np.allclose(baselines.nearest_probes(probes, 1, backend="llvm")(at, X), density[:4], rtol=1e-4, atol=1e-5)
     near = np.argsort(np.linalg.norm(probes.positions - at[0], axis=1))[:3]
-    assert np.allclose(baselines.nearest_probes(probes, 3, backend="llvm")(at[:1], X)[0], density[near].mean(axis=0), rtol=1e-4, atol=1e-5)
+    assert np.allclose(
+        baselines.nearest_probes(probes, 3, backend="llvm")(at[:1], X)[0],
+        density[near].mean(axis=0),
+        rtol=1e-4,
+        atol=1e-5,
+    )
 
 
 def test_the_standard_ones_are_what_they_are_called(rays):

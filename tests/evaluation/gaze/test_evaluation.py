@@ -1,4 +1,5 @@
 """Evaluation of gaze: truth from persons, scores against closed forms, what is held out, the command."""
+
 from __future__ import annotations
 
 import itertools
@@ -8,11 +9,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.density.probes import place_probes
-from nerg_mi.rays.rays import Rays
-from nerg_mi.evaluation.gaze import evaluation
 from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.evaluation.gaze import evaluation
 from nerg_mi.evaluation.gaze.baselines import position_blind, uniform
 from nerg_mi.evaluation.gaze.report import markdown
+from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.run import hold_out
 
 
@@ -23,7 +24,15 @@ def crowd(n=3000, people=4, seed=0):
     person = rng.integers(0, people, n)
     hit = np.stack([np.full(n, 1.5), rng.normal(0, 0.2, n), 1 + 0.3 * person + rng.normal(0, 0.1, n)], axis=1)
     way = hit - origin
-    return Rays(np.arange(n), person, tuple("abcdefgh"[:people]), origin, way / np.linalg.norm(way, axis=1, keepdims=True), np.ones(n), hit)
+    return Rays(
+        np.arange(n),
+        person,
+        tuple("abcdefgh"[:people]),
+        origin,
+        way / np.linalg.norm(way, axis=1, keepdims=True),
+        np.ones(n),
+        hit,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -33,24 +42,42 @@ def rays():
 
 @pytest.fixture(scope="module")
 def test_set(rays):
-    return evaluation.make_test(rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, 512, min_rays=20)
+    return evaluation.make_test(
+        rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, 512, min_rays=20
+    )
 
 
 def test_truth_is_the_probes(rays, test_set):
     assert len(test_set.centres) == 2
-    probes = place_probes(rays, 0.6, queries=test_set.centres, cap=1024, min_rays=1, kappa_rule="fixed", kappa=20.0, centre="query")
+    probes = place_probes(
+        rays, 0.6, queries=test_set.centres, cap=1024, min_rays=1, kappa_rule="fixed", kappa=20.0, centre="query"
+    )
     np.testing.assert_allclose(test_set.truth, probes.density(test_set.directions), rtol=1e-4, atol=1e-6)
     assert (test_set.counts.sum(axis=1) == probes.counts).all() and set(test_set.persons) == set("abcd")
 
 
 def test_scores_of_the_truth_and_of_nothing(test_set):
-    rows = evaluation.evaluate_gaze(test_set, {"truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]), "uniform": uniform()}, uniform(), 20)
+    rows = evaluation.evaluate_gaze(
+        test_set,
+        {"truth": lambda p, d: test_set.truth if d.ndim == 2 else np.ones(d.shape[:2]), "uniform": uniform()},
+        uniform(),
+        20,
+    )
     best, flat = rows
-    assert best["KLD"] < 1e-6 and best["CC"] == pytest.approx(1) and best["SIM"] == pytest.approx(1) and best["MAE"] == 0
+    assert (
+        best["KLD"] < 1e-6 and best["CC"] == pytest.approx(1) and best["SIM"] == pytest.approx(1) and best["MAE"] == 0
+    )
     assert flat["CC"] == 0 and flat["AUC"] == 0.5 and flat["sAUC"] == 0.5 and flat["NSS"] == 0
-    assert flat["bits"] == 0 and flat["loglik"] == pytest.approx(-np.log(4 * np.pi)) and flat["integral"] == pytest.approx(1)
+    assert (
+        flat["bits"] == 0
+        and flat["loglik"] == pytest.approx(-np.log(4 * np.pi))
+        and flat["integral"] == pytest.approx(1)
+    )
     assert flat["KLD"] == pytest.approx(float(metrics.kld(test_set.truth, np.ones((2, 512)), eps=1e-6).mean()))
-    assert best["KLD.less"] == pytest.approx(best["KLD"] - flat["KLD"]) and best["KLD.less.low"] < best["KLD.less"] < best["KLD.less.high"]
+    assert (
+        best["KLD.less"] == pytest.approx(best["KLD"] - flat["KLD"])
+        and best["KLD.less.low"] < best["KLD.less"] < best["KLD.less.high"]
+    )
     assert flat["bits.low"] == 0 and flat["KLD.low"] < flat["KLD"] < flat["KLD.high"]
 
 
@@ -111,7 +138,9 @@ def test_ray_scores_by_hand():
 def test_persons_are_scored_each_by_their_own(rays, test_set):
     blind = position_blind(rays, kappa=50)
     rows = evaluation.person_rows(test_set, {"blind": blind}, blind, min_rays=10)
-    assert [r["person"] for r in rows] == list(test_set.persons) and sum(r["rays"] for r in rows) == test_set.counts.sum()
+    assert [r["person"] for r in rows] == list(test_set.persons) and sum(
+        r["rays"] for r in rows
+    ) == test_set.counts.sum()
     assert all(r["bits"] == pytest.approx(0) for r in rows)
     # The heights of what they look at differ, and so does how well one density for all fits.
     assert np.ptp([r["KLD"] for r in rows]) > 0.01
@@ -138,7 +167,12 @@ def test_positions_without_rays_are_refused(rays):
 
 
 def test_markdown_has_intervals_and_gaps():
-    text = markdown([{"method": "a", "KLD": 0.5, "KLD.low": 0.4, "KLD.high": 0.6, "MAE": 0.01234}, {"method": "b", "KLD": float("nan")}])
+    text = markdown(
+        [
+            {"method": "a", "KLD": 0.5, "KLD.low": 0.4, "KLD.high": 0.6, "MAE": 0.01234},
+            {"method": "b", "KLD": float("nan")},
+        ]
+    )
     assert text.splitlines()[0] == "| method | KLD | MAE |"
     assert text.splitlines()[2:] == ["| a | 0.500 [0.400, 0.600] | 0.0123 |", "| b |  |  |"]
 
@@ -154,13 +188,45 @@ def test_the_command(rgb, rays, tmp_path, capsys):
             main([str(a) for a in arguments])
         return end.value.code, " ".join(capsys.readouterr().err.split())
 
-    train = ["train", "gaze", tmp_path / "rays.npz", "-o", gaze, "--geometry", "hits", "--voxel", "0.2", "--radius", "0.6", "--steps", "5",
-             "--directions", "64", "--probes", "20", "--zones", "0"]  # fmt: skip
+    train = [
+        "train",
+        "gaze",
+        tmp_path / "rays.npz",
+        "-o",
+        gaze,
+        "--geometry",
+        "hits",
+        "--voxel",
+        "0.2",
+        "--radius",
+        "0.6",
+        "--steps",
+        "5",
+        "--directions",
+        "64",
+        "--probes",
+        "20",
+        "--zones",
+        "0",
+    ]
     assert nerg(*train)[0] in (0, None)
     code, said = nerg("eval", "gaze", gaze, tmp_path / "rays.npz")
     assert code == 1 and "--test-zones 3" in said
     assert nerg(*train, "--test-zones", "2", "--test-positions", "6", "--test-people", "0.5")[0] in (0, None)
-    assert nerg("eval", "gaze", gaze, tmp_path / "rays.npz", "--min-rays", "16", "--resamples", "4", "--directions", "256", "--pictures", "1")[0] in (0, None)
+    assert nerg(
+        "eval",
+        "gaze",
+        gaze,
+        tmp_path / "rays.npz",
+        "--min-rays",
+        "16",
+        "--resamples",
+        "4",
+        "--directions",
+        "256",
+        "--pictures",
+        "1",
+    )[0] in (0, None)
     found = json.loads((tmp_path / "gaze.eval" / "gaze.json").read_text())
     names = [r["method"] for r in found["methods"]]
     assert names[:2] == ["gaze field", "uniform"] and "4,096 nearest rays" in names and found["split"] == "both"
@@ -173,7 +239,9 @@ def test_the_command(rgb, rays, tmp_path, capsys):
 
 
 def test_halves_of_the_people_are_compared_where_both_were(rays, test_set):
-    row = evaluation.split_half(rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, uniform(), min_rays=20)
+    row = evaluation.split_half(
+        rays, np.array([[-0.5, 0, 1.6], [-0.5, 3, 1.6], [40, 0, 0]]), 0.6, 20.0, uniform(), min_rays=20
+    )
     assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
     nobody = np.array([[40.0, 0, 0]])
     assert evaluation.split_half(rays, nobody, 0.6, 20.0, uniform(), min_rays=20) is None

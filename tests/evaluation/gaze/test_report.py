@@ -1,4 +1,5 @@
 """What an evaluation of gaze writes: cells by hand, files that are valid, and pictures of what was asked for."""
+
 from __future__ import annotations
 
 import csv
@@ -9,12 +10,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.evaluation.gaze import report as gaze_report
 from nerg_mi.evaluation.gaze.report import markdown, side_by_side, write_report
+from nerg_mi.maths.sphere import fibonacci_directions
 
 ROWS = [
-    {"method": "field", "KLD": 0.51234, "KLD.low": 0.4, "KLD.high": 0.65, "CC": 0.9, "MAE": 0.012345, "KLD.less": -0.25, "NSS": math.nan},
+    {
+        "method": "field",
+        "KLD": 0.51234,
+        "KLD.low": 0.4,
+        "KLD.high": 0.65,
+        "CC": 0.9,
+        "MAE": 0.012345,
+        "KLD.less": -0.25,
+        "NSS": math.nan,
+    },
     {"method": "uniform", "KLD": 1.5, "CC": 0.0, "MAE": 0.05, "integral": 1.0},
     {"method": "split half", "KLD": 0.25},
 ]
@@ -37,7 +47,11 @@ def test_files(tmp_path):
     files = write_report(tmp_path, ROWS, persons, {"seed": 4}, "notes")
     page = files[0].read_text()
     # Our method is compared with the last of the baselines, which the people's own agreement is none of.
-    assert page.startswith("notes\n") and "| field less uniform | -0.250 |" in page and "| field | ann | 3 | 0.500 |  |" in page
+    assert (
+        page.startswith("notes\n")
+        and "| field less uniform | -0.250 |" in page
+        and "| field | ann | 3 | 0.500 |  |" in page
+    )
     with open(files[1], newline="") as f:
         rows = list(csv.DictReader(f))
     assert [r["method"] for r in rows] == ["field", "uniform", "split half"] and float(rows[0]["MAE"]) == 0.012345

@@ -1,4 +1,5 @@
-"""What is scored is what is rendered: the field's densities at positions against the integrator's pictures, for every kind of field."""
+"""What is scored is what is rendered: the field's densities at positions against the integrator's pictures, for every
+kind of field."""
 
 from __future__ import annotations
 
@@ -6,16 +7,15 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze.scores import gaze_field, scores
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.places import place_of_field, place_of_scene
 from nerg_mi.transport.media.media import Similarity
-
+from tests.evaluation.gaze_fields import KINDS, made, saved
 from tests.plugins import fields
 from tests.plugins.scenes import channels
-from tests.evaluation.gaze_fields import KINDS, made, saved
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
 EYES = [(0.1, -0.2, 0.3), (-0.4, 0.3, -0.1)]
@@ -35,14 +35,34 @@ def places(tmp_path_factory):
     shapes = {f"s{i}": s for i, s in enumerate(mi.load_string(ROOM).shapes())}
     fields.radiance(folder / "field.safetensors", density_scale=30.0)
     volume = {"type": "nerf", "filename": str(folder / "field.safetensors")}
-    return {"shapes": (place_of_scene(folder / "room.xml").medium, {}, shapes), "field": (place_of_field(folder / "field.safetensors", ns).medium, {"field": volume}, {})}
+    return {
+        "shapes": (place_of_scene(folder / "room.xml").medium, {}, shapes),
+        "field": (place_of_field(folder / "field.safetensors", ns).medium, {"field": volume}, {}),
+    }
 
 
 def pictured(mi, gaze, children: dict, shapes: dict, eye) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (N, 3) in which the observer at ``eye`` meets a surface, and the gaze (N,) that a panorama shows there."""
-    sensor = {"type": "panorama", "to_world": mi.ScalarTransform4f().translate(list(eye)), "sampler": {"type": "independent", "sample_count": 1},
-              "film": {"type": "hdrfilm", "width": 32, "height": 16, "component_format": "float32", "rfilter": {"type": "box"}}}  # fmt: skip
-    integrator = {"type": "nerg", "aovs": "opacity,position,gaze", "radiance": False, "gaze": {"type": "gazefield", "filename": str(gaze)}, **children}
+    """Directions (N, 3) in which the observer at ``eye`` meets a surface, and the gaze (N,) that a panorama shows
+    there."""
+    sensor = {
+        "type": "panorama",
+        "to_world": mi.ScalarTransform4f().translate(list(eye)),
+        "sampler": {"type": "independent", "sample_count": 1},
+        "film": {
+            "type": "hdrfilm",
+            "width": 32,
+            "height": 16,
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+    }
+    integrator = {
+        "type": "nerg",
+        "aovs": "opacity,position,gaze",
+        "radiance": False,
+        "gaze": {"type": "gazefield", "filename": str(gaze)},
+        **children,
+    }
     out = channels(mi, integrator, sensor, **shapes)
     met = out["opacity.Y"] >= 0.5
     way = np.stack([out[f"position.{c}"][met] for c in "XYZ"], axis=-1) - np.array(eye)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.evaluation.study import shapes as study_shapes
 from nerg_mi.evaluation.study.run import run_study
 from nerg_mi.evaluation.study.subject import open_subject
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.gaze.supervision import box_exit
-
 from tests.evaluation.gaze_fields import KINDS, saved
 
 BOX = Box((-3, -3, -3), (3, 3, 3))
@@ -51,7 +50,8 @@ def test01_shapes_agree_with_their_reference(rgb, tmp_path, kind):
 
 @pytest.mark.parametrize("kind", ["normalised", "default recipe"])
 def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
-    """The reference takes the integrator's integral; here it is found again, by float64 intersections with the triangles."""
+    """The reference takes the integrator's integral; here it is found again, by float64 intersections with the
+    triangles."""
     subject = open_subject(str(scene(tmp_path, kind, True)), "auto", 8, 8)
     eye = subject.eye()
     medium = study_shapes.facing(subject, eye)
@@ -61,8 +61,13 @@ def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
     t[escaped] = box_exit(BOX, np.broadcast_to(eye, d.shape)[escaped], d[escaped])
     assert 0.1 < escaped.mean() < 0.9
     points = lambda kind, v: kind(np.ascontiguousarray(np.broadcast_to(v, d.shape).T, np.float32))
-    emit, capture = medium.unnormalized(points(rgb.Point3f, eye + d * t[:, None]), points(rgb.Point3f, eye), points(rgb.Vector3f, d), True,
-                                        rgb.Bool(escaped))  # fmt: skip
+    emit, capture = medium.unnormalized(
+        points(rgb.Point3f, eye + d * t[:, None]),
+        points(rgb.Point3f, eye),
+        points(rgb.Vector3f, d),
+        True,
+        rgb.Bool(escaped),
+    )
     expected = 4 * np.pi * np.array(emit * capture, float).mean()
     assert float(medium._integral(rgb.Point3f(*eye.tolist()))[0]) == pytest.approx(expected, rel=3e-3)
 
@@ -71,7 +76,9 @@ def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
 def test03_the_study_of_a_default_recipe(rgb, tmp_path, shapes):
     path = scene(tmp_path, "default recipe", shapes)
     only = "transmittance" if shapes else "paper, 64 steps$|jitter"
-    report = run_study(str(path), tmp_path / "out", width=12, height=8, quick=True, only=only, variant="llvm_ad_rgb").report
+    report = run_study(
+        str(path), tmp_path / "out", width=12, height=8, quick=True, only=only, variant="llvm_ad_rgb"
+    ).report
     rows = {r["setting"]: r for r in report["rows"]}
     assert len(rows) >= 2 and all(r["gaze_mae"] < 0.05 and np.isfinite(r["gaze_kld"]) for r in rows.values())
     assert rows["default"]["gaze_mae"] < 1e-3

@@ -24,13 +24,16 @@ def row(group, seconds, error, pareto=""):
 
 ALL = "color depth visibility gaze"
 ROWS = [
-    row("default", 0.02, 1e-3, ALL), row("steps", 0.01, 2e-3, ALL), row("steps", 0.16, 0.0, ALL),
+    row("default", 0.02, 1e-3, ALL),
+    row("steps", 0.01, 2e-3, ALL),
+    row("steps", 0.16, 0.0, ALL),
     row("paper", 0.08, 5e-3),
-]  # fmt: skip
+]
 SCALING = [
     {"axis": axis, "value": v, "seconds": 0.1 * v**p}
-    for axis, p in (("pixels", 1.0), ("samples", 0.5), ("extent", 2.0)) for v in (1, 2, 4, 8)
-]  # fmt: skip
+    for axis, p in (("pixels", 1.0), ("samples", 0.5), ("extent", 2.0))
+    for v in (1, 2, 4, 8)
+]
 
 
 def test_panels_show_all_rows_and_the_front_below_them(drawn):

@@ -7,18 +7,15 @@ import math
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.study import (
-    paper as study_paper,
-    plots as study_plots,
-    reference as study_reference,
-    scenes as study_scenes,
-    tables as study_tables,
-)
+from nerg_mi.evaluation.study import paper as study_paper
+from nerg_mi.evaluation.study import plots as study_plots
+from nerg_mi.evaluation.study import reference as study_reference
+from nerg_mi.evaluation.study import scenes as study_scenes
+from nerg_mi.evaluation.study import tables as study_tables
 from nerg_mi.evaluation.study.errors import errors
 from nerg_mi.evaluation.study.measure import COLUMNS
 from nerg_mi.evaluation.study.settings import STEP_COUNTS, settings
 from nerg_mi.evaluation.study.subject import open_subject
-
 from tests.reference import march_numpy
 
 NAMES = list(study_scenes.SCENES)
@@ -64,7 +61,9 @@ def test02_references_are_the_limit_of_a_float64_march(name):
             lambda p: scene.density(*p.T, study_scenes.NUMPY) + 0 * p[:, 0], o[i], d[i], borders, study_scenes.color
         )
         assert math.isclose(seen.tau[i], tau, rel_tol=1e-6)
-        assert math.isclose(seen.expected[i], expected, rel_tol=1e-6) and math.isclose(seen.median[i], median, rel_tol=1e-6)
+        assert math.isclose(seen.expected[i], expected, rel_tol=1e-6) and math.isclose(
+            seen.median[i], median, rel_tol=1e-6
+        )
         assert np.allclose(color[i], total, atol=2e-5)
 
 
@@ -99,8 +98,17 @@ def test03_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_dep
     seen = study_reference.look(subject.analytic, o, d)
     thick = np.isfinite(t) & (seen.tau > 12)
     for kind in ("expected", "median"):
-        known = study_reference.truth(subject.analytic, None, o, d, depth=kind, visibility="transmittance", falloff=0.1,
-                                      tolerance=1e-9, surface_opacity=0.5)  # fmt: skip
+        known = study_reference.truth(
+            subject.analytic,
+            None,
+            o,
+            d,
+            depth=kind,
+            visibility="transmittance",
+            falloff=0.1,
+            tolerance=1e-9,
+            surface_opacity=0.5,
+        )
         assert thick.sum() > 100 and np.array_equal(known.visibility[thick] > 0.999, visible[thick]), kind
 
 
@@ -108,8 +116,9 @@ def test03_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_dep
 def test03_what_is_no_surface_is_not_visible(visibility):
     scene = study_scenes.SCENES["ramp"]
     o, d = rays(scene, 64)
-    known = study_reference.truth(scene, None, o, d, depth="expected", visibility=visibility, falloff=0.1, tolerance=1e-3,
-                                  surface_opacity=0.9)  # fmt: skip
+    known = study_reference.truth(
+        scene, None, o, d, depth="expected", visibility=visibility, falloff=0.1, tolerance=1e-3, surface_opacity=0.9
+    )
     thin = known.opacity < 0.9
     assert 5 < thin.sum() < 60 and (known.opacity[thin] > 0.1).any() and known.opacity[-1] == 0
     assert (known.visibility[thin] == 0).all() and (known.visibility[~thin] > 0).any() and (known.gaze == 0).all()
@@ -135,7 +144,9 @@ def test04_mean_share(x):
 def test05_integrator_agrees_with_the_reference(name):
     subject = open_subject(name, "auto", 12, 8)
     known = subject.truth(1, "expected", "depth")
-    off = errors(subject.channels(subject.integrator({"depth": "expected", "step": subject.extent / 2048}), 1, 1), known)
+    off = errors(
+        subject.channels(subject.integrator({"depth": "expected", "step": subject.extent / 2048}), 1, 1), known
+    )
     # Thin or hard matter is what steps of a finite length find late.
     bound = 1e-3 if subject.opaque else 2e-6
     assert off["depth_mae"] < bound and off["opacity_mae"] < bound and off["color_rmse"] < max(20 * bound, 1e-4)
@@ -146,7 +157,11 @@ def test06_a_grid_tends_to_its_density():
     subject = open_subject("fog", "auto", 12, 8)
     known = subject.truth(1, "expected", "depth")
     off = [
-        errors(subject.channels(subject.integrator({"quadrature": "cells", "depth": "expected"}, resolution=r), 1, 1), known)["depth_mae"] for r in (8, 32)
+        errors(
+            subject.channels(subject.integrator({"quadrature": "cells", "depth": "expected"}, resolution=r), 1, 1),
+            known,
+        )["depth_mae"]
+        for r in (8, 32)
     ]
     assert off[1] < off[0] / 6 < 1e-2
 
@@ -161,7 +176,9 @@ def test07_the_papers_depth_is_unnormalised_and_at_the_steps_end():
     o, d = subject.rays(1)
     steps = 64
     step = subject.extent / steps
-    seen = subject.channels(study_paper.as_in_the_paper(subject.integrator(), subject.sensor, subject.tolerance, steps), 1, 1)
+    seen = subject.channels(
+        study_paper.as_in_the_paper(subject.integrator(), subject.sensor, subject.tolerance, steps), 1, 1
+    )
     for i in range(0, len(o), 7):
         hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
         depth, T = 0.0, 1.0
@@ -198,11 +215,26 @@ def test08_pareto():
 
 def test08b_against_paper_takes_the_best_of_either_kind():
     def row(setting, group, seconds, depth_mae):
-        return {"setting": setting, "group": group, "seconds": seconds, "cpu_seconds": 2 * seconds, "depth_mae": depth_mae,
-                "density_evals": 1.0, "spp": 1, "resolution": "", "visibility": "depth"}  # fmt: skip
+        return {
+            "setting": setting,
+            "group": group,
+            "seconds": seconds,
+            "cpu_seconds": 2 * seconds,
+            "depth_mae": depth_mae,
+            "density_evals": 1.0,
+            "spp": 1,
+            "resolution": "",
+            "visibility": "depth",
+        }
 
-    rows = [row("default", "default", 3, 0.1), row("short", "steps", 1, 0.4), row("map", "visibility", 0.1, 0.1) | {"visibility": "map"},
-            row("slow", "steps", 9, 0.01), row("p", "paper", 4, 0.5), row("fast", "paper", 0.5, 0.001)]  # fmt: skip
+    rows = [
+        row("default", "default", 3, 0.1),
+        row("short", "steps", 1, 0.4),
+        row("map", "visibility", 0.1, 0.1) | {"visibility": "map"},
+        row("slow", "steps", 9, 0.01),
+        row("p", "paper", 4, 0.5),
+        row("fast", "paper", 0.5, 0.001),
+    ]
     for clock in ("seconds", "cpu_seconds"):
         first, second = study_tables.against_paper(rows, clock)
         assert first["equal_time"]["setting"] == "default" and math.isclose(first["equal_time"]["error_ratio"], 5)
@@ -222,9 +254,23 @@ def test10_settings_vary_one_factor_at_a_time():
     names = [r.name for r in rows]
     assert len(set(names)) == len(names)
     for rule in ("constant", "linear"):
-        assert {r.params["step"] for r in rows if r.group == f"steps, {rule}"} == {subject.extent / n for n in STEP_COUNTS}
+        assert {r.params["step"] for r in rows if r.group == f"steps, {rule}"} == {
+            subject.extent / n for n in STEP_COUNTS
+        }
     groups = {r.group for r in rows}
-    assert groups >= {"dt_gamma", "coarse", "stop", "color_cutoff", "depth", "visibility", "jitter", "leave out", "spp", "resolution", "paper"}
+    assert groups >= {
+        "dt_gamma",
+        "coarse",
+        "stop",
+        "color_cutoff",
+        "depth",
+        "visibility",
+        "jitter",
+        "leave out",
+        "spp",
+        "resolution",
+        "paper",
+    }
 
 
 def test10b_a_quick_study_is_a_part_of_a_whole_one():
@@ -238,8 +284,13 @@ def test11_errors_of_known_pictures():
     n = 1000
     one, none = np.ones(n), np.zeros(n)
     known = study_reference.Truth(np.full((n, 3), 0.5), one, 2 * one, one, np.linspace(1, 2, n), "", {})
-    seen = {"color": np.full((n, 3), 0.6), "opacity": one, "depth": np.where(np.arange(n) < 100, 2.5, 2.0), "visibility": one,
-            "gaze": np.linspace(1, 2, n)}  # fmt: skip
+    seen = {
+        "color": np.full((n, 3), 0.6),
+        "opacity": one,
+        "depth": np.where(np.arange(n) < 100, 2.5, 2.0),
+        "visibility": one,
+        "gaze": np.linspace(1, 2, n),
+    }
     off = errors(seen, known, (2 * one, np.arange(n) >= 250))
     assert math.isclose(off["color_rmse"], 0.1, rel_tol=1e-9) and math.isclose(off["color_psnr"], 20, rel_tol=1e-9)
     assert math.isclose(off["depth_mae"], 0.05) and off["depth_p99"] == 0.5
@@ -259,7 +310,21 @@ def test12_quick_run_of_the_command(tmp_path, capsys):
     import nerg_mi.cli
 
     with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(["study", "slab", "--out", str(tmp_path / "new"), "--quick", "--width", "24", "--height", "16", "-m", "llvm_ad_rgb"])
+        nerg_mi.cli.main(
+            [
+                "study",
+                "slab",
+                "--out",
+                str(tmp_path / "new"),
+                "--quick",
+                "--width",
+                "24",
+                "--height",
+                "16",
+                "-m",
+                "llvm_ad_rgb",
+            ]
+        )
     assert not end.value.code
     said = capsys.readouterr().out
     out = tmp_path / "new"
@@ -289,8 +354,16 @@ def test12b_only_some_settings(tmp_path):
     from nerg_mi.evaluation.study.run import run_study
 
     told = []
-    report = run_study("slab", tmp_path, width=12, height=8, quick=True, only="jitter|paper, 1024 steps$",
-                       variant="llvm_ad_rgb", on_step=lambda name, share: told.append((name, share))).report  # fmt: skip
+    report = run_study(
+        "slab",
+        tmp_path,
+        width=12,
+        height=8,
+        quick=True,
+        only="jitter|paper, 1024 steps$",
+        variant="llvm_ad_rgb",
+        on_step=lambda name, share: told.append((name, share)),
+    ).report
     assert [r["setting"] for r in report["rows"]] == ["default", "jitter", "paper, 1024 steps"]
     # Of the share done the first renders have as much as the times, and the cost against size the rest.
     shares = [share for _, share in told]
@@ -338,7 +411,12 @@ def test14_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
         median = 0 if hit is None else march_numpy.slab(4.0, *hit)[2]
         assert abs(known.depth[i] - median) < 1e-5
     assert slab.name == "slab" and known.convergence["depth_mae"] < 1e-5
-    bad = path.read_text().replace('<integrator type="nerg">', '<integrator type="path">').replace("<volume", "<!--").replace("</volume>", "-->")
+    bad = (
+        path.read_text()
+        .replace('<integrator type="nerg">', '<integrator type="path">')
+        .replace("<volume", "<!--")
+        .replace("</volume>", "-->")
+    )
     path.write_text(bad)
     with pytest.raises(ValueError, match='is not "nerg"'):
         open_subject(str(path), "file", 12, 8)

@@ -1,11 +1,13 @@
 """The study of a scene of shapes alone: its reference, and what it finds."""
+
 import csv
 
 import numpy as np
 import pytest
 
 from nerg_mi.cli import main
-from nerg_mi.evaluation.study import shapes as study_shapes, subject as study_subject
+from nerg_mi.evaluation.study import shapes as study_shapes
+from nerg_mi.evaluation.study import subject as study_subject
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg">
@@ -70,7 +72,9 @@ def test03_the_integrator_agrees_with_the_reference(rgb, scene, falloff, visibil
 def test04_quick_run(tmp_path, scene, capsys):
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as end:
-        main(["study", str(scene), "--out", str(out), "--quick", "--width", "24", "--height", "16", "-m", "llvm_ad_rgb"])
+        main(
+            ["study", str(scene), "--out", str(out), "--quick", "--width", "24", "--height", "16", "-m", "llvm_ad_rgb"]
+        )
     assert not end.value.code
     rows = {r["setting"]: r for r in csv.DictReader((out / "study.csv").open())}
     assert {"default", "visibility transmittance", "visibility map 16", "no colour", "spp 2"} <= set(rows)

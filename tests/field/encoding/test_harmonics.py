@@ -1,10 +1,10 @@
 """Direction encoding against the formulas of the spherical harmonics."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 from nerg_mi.field.encoding.harmonics import encode_direction
-
 from tests.reference import fields_numpy as reference
 
 

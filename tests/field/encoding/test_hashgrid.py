@@ -1,4 +1,5 @@
 """The hash grid against a restatement of torch-ngp's kernel, its published sizes, and central differences."""
+
 import gc
 
 import drjit as dr
@@ -7,15 +8,19 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
-
 from tests.reference import hashgrid_numpy as reference
 
 SMALL = HashGridConfig(levels=4, log2_rows=12, base=4, finest=64)
 
 
 def spec(config):
-    return dict(levels=config.levels, features=config.features, log2_rows=config.log2_rows, base=config.base,
-                finest=config.finest)
+    return dict(
+        levels=config.levels,
+        features=config.features,
+        log2_rows=config.log2_rows,
+        base=config.base,
+        finest=config.finest,
+    )
 
 
 def random_grid(config, seed=0):
@@ -29,9 +34,10 @@ def evaluate(grid, points):
 
 
 # The paper's NeRF is 2048 x bound, its gaze grid 256 x bound (nerg-method.md, section 4).
-@pytest.mark.parametrize("finest, rows", [
-    (2048, 6_119_864), (4096, 6_328_848), (10240, 6_589_272), (256, 4_555_440), (512, 5_291_984), (1280, 5_842_848),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "finest, rows",
+    [(2048, 6_119_864), (4096, 6_328_848), (10240, 6_589_272), (256, 4_555_440), (512, 5_291_984), (1280, 5_842_848)],
+)
 def test01_sizes_are_those_of_torch_ngp(finest, rows):
     config = HashGridConfig(finest=finest)
     assert config.offsets()[-1] == rows
@@ -50,13 +56,16 @@ def test02_which_levels_are_dense(finest, dense):
     assert [grid.is_hashed(level) for level in range(16)] == [False] * dense + [True] * (16 - dense)
 
 
-@pytest.mark.parametrize("config", [
-    SMALL,
-    HashGridConfig(levels=4, features=4, log2_rows=10, base=5, finest=81),
-    HashGridConfig(levels=1, log2_rows=12, base=8, finest=8),
-    HashGridConfig(levels=6, log2_rows=12, base=16, finest=512),
-    HashGridConfig(levels=3, log2_rows=12, base=16, finest=10240),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "config",
+    [
+        SMALL,
+        HashGridConfig(levels=4, features=4, log2_rows=10, base=5, finest=81),
+        HashGridConfig(levels=1, log2_rows=12, base=8, finest=8),
+        HashGridConfig(levels=6, log2_rows=12, base=16, finest=512),
+        HashGridConfig(levels=3, log2_rows=12, base=16, finest=10240),
+    ],
+)
 def test03_equals_the_kernel(config):
     table, grid = random_grid(config)
     points = np.random.default_rng(1).random((60, 3)).astype(np.float32)
@@ -86,10 +95,19 @@ def test05_faces_edges_and_corners_do_not_alias():
     assert r == 5 and np.abs(got[15, 0] - got[0, 0]) > 1e-3
 
 
-@pytest.mark.parametrize("point", [
-    (-1e-7, 0.5, 0.5), (0.5, 1.0000001, 0.5), (0.5, 0.5, -3e9), (1e30, 0.5, 0.5), (np.inf, 0.5, 0.5),
-    (0.5, -np.inf, 0.5), (np.nan, 0.5, 0.5), (-0.1, -0.1, -0.1),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "point",
+    [
+        (-1e-7, 0.5, 0.5),
+        (0.5, 1.0000001, 0.5),
+        (0.5, 0.5, -3e9),
+        (1e30, 0.5, 0.5),
+        (np.inf, 0.5, 0.5),
+        (0.5, -np.inf, 0.5),
+        (np.nan, 0.5, 0.5),
+        (-0.1, -0.1, -0.1),
+    ],
+)
 def test06_zero_outside_with_zero_gradient(point):
     _, grid = random_grid(SMALL)
     dr.enable_grad(grid.table)
@@ -142,15 +160,22 @@ def test09_position_gradient_equals_central_differences():
 
 
 def test10_random_grid_is_seeded_and_bounded():
-    make = lambda seed: HashGrid.random(SMALL, ns, np.random.default_rng(seed)).table.numpy()  # noqa: E731
+    make = lambda seed: HashGrid.random(SMALL, ns, np.random.default_rng(seed)).table.numpy()
     assert np.array_equal(make(1), make(1)) and not np.array_equal(make(1), make(2))
     assert 0.99e-4 < np.abs(make(1)).max() <= 1e-4
 
 
-@pytest.mark.parametrize("wrong, words", [
-    (dict(levels=0), "levels=0"), (dict(base=0), "base=0"), (dict(finest=8), "finest=8"),
-    (dict(features=3), "features must be 2 or 4"), (dict(log2_rows=2), "log2_rows"), (dict(log2_rows=27), "log2_rows"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (dict(levels=0), "levels=0"),
+        (dict(base=0), "base=0"),
+        (dict(finest=8), "finest=8"),
+        (dict(features=3), "features must be 2 or 4"),
+        (dict(log2_rows=2), "log2_rows"),
+        (dict(log2_rows=27), "log2_rows"),
+    ],
+)
 def test11_wrong_sizes_are_named(wrong, words):
     with pytest.raises(ValueError, match=words):
         HashGridConfig(**wrong)

@@ -1,15 +1,17 @@
 """Ensembles of gaze fields: what fits together, their arrays, their file."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from nerg_mi.field.backend import namespace
-from nerg_mi.maths.box import Box
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.field.gaze.support import RaySupport
 from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.maths.box import Box
+
 from .test_log_density import SMALL, made
 
 
@@ -27,7 +29,9 @@ def test_members_are_alike():
 def test_arrays_are_the_members():
     ensemble = GazeEnsemble([made(seed=1), made(seed=2)])
     before = {k: np.array(v) for k, v in ensemble.parameters().items()}
-    assert len(before) == 2 * len(made().parameters()) and not np.array_equal(before["0.grid.table"], before["1.grid.table"])
+    assert len(before) == 2 * len(made().parameters()) and not np.array_equal(
+        before["0.grid.table"], before["1.grid.table"]
+    )
     ensemble.set_parameters({"1.grid.table": ensemble.parameters()["1.grid.table"] * 0})
     after = {k: np.array(v) for k, v in ensemble.parameters().items()}
     assert not after["1.grid.table"].any()
@@ -44,7 +48,9 @@ def test_a_file_holds_all_members_and_the_support(half, tmp_path):
     assert meta["provenance"] == {"made": "here"} and meta["output"] == {"activation": "log", "normalized": True}
     assert [m.config for m in again.members] == [m.config for m in members] and again.box == members[0].box
     for name, value in GazeEnsemble(members).parameters().items():
-        np.testing.assert_allclose(np.array(again.parameters()[name]), np.array(value), rtol=1e-3 if half else 0, atol=1e-3 if half else 0)
+        np.testing.assert_allclose(
+            np.array(again.parameters()[name]), np.array(value), rtol=1e-3 if half else 0, atol=1e-3 if half else 0
+        )
     np.testing.assert_array_equal(again.support.cells, support.cells)
     assert again.support.radius == 0.25
 

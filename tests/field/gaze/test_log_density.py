@@ -1,4 +1,5 @@
 """The normalised gaze field: against NumPy, its table, its limits, its file."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -7,13 +8,13 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.maths.vmf import log_normaliser
 from nerg_mi.field.backend import namespace
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField, blind_table, look_up, table_directions
 from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.maths.vmf import log_normaliser
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
 GRID = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
@@ -23,7 +24,9 @@ SMALL = LogGazeConfig(grid=GRID, width=16, prior=8, heads=((-1, -1, 1.4), (1, 0.
 def made(config=SMALL, seed=1):
     ns, rng = namespace("llvm"), np.random.default_rng(seed)
     field = LogGazeField.random(config, BOX, ns, seed, rng.normal(size=(config.prior, 2 * config.prior)))
-    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32)), "escaped": ns.Float(0.7)})
+    field.set_parameters(
+        {"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32)), "escaped": ns.Float(0.7)}
+    )
     return field
 
 
@@ -50,10 +53,20 @@ def test_is_what_it_says():
     np.testing.assert_allclose(inputs[1], np.log(np.linalg.norm(p_od - p_o, axis=1)), atol=1e-5)
     u = (p_o - (-1, -1, 1.4)) / 2 * 2 - 1
     heads = numpy(field.capture_position(jit(p_o)))
-    np.testing.assert_allclose(heads, np.concatenate([u, np.sin(u * np.pi / 2), np.cos(u * np.pi / 2)], axis=1).T, atol=1e-5)
+    np.testing.assert_allclose(
+        heads, np.concatenate([u, np.sin(u * np.pi / 2), np.cos(u * np.pi / 2)], axis=1).T, atol=1e-5
+    )
     weights = lambda net: [np.array(w, np.float64) for w in net.weights]
     emit = net(weights(field.emit_net), inputs)[0]
-    capture = 1 / (1 + np.exp(-net(weights(field.capture_net), numpy(field.capture_inputs([namespace("llvm").Float(h.astype(np.float32)) for h in heads], jit(r))))[0]))
+    capture = 1 / (
+        1
+        + np.exp(
+            -net(
+                weights(field.capture_net),
+                numpy(field.capture_inputs([namespace("llvm").Float(h.astype(np.float32)) for h in heads], jit(r))),
+            )[0]
+        )
+    )
     blind = np.exp(np.array(field.log_blind(jit(r)), np.float64))
     gaze, e, c = (np.array(v) for v in field.evaluate(jit(p_od), jit(p_o), jit(r), integral=2.0))
     np.testing.assert_allclose(e, np.exp(emit) * blind / 2, rtol=1e-4)
@@ -66,7 +79,9 @@ def test_is_what_it_says():
 def test_without_geometry_the_surface_makes_no_difference():
     field = made(replace(SMALL, geometry="none", reach=1.5))
     p_o, p_od, r = vectors()
-    near, far = (np.array(field.evaluate(jit(p), jit(p_o), jit(r), integral=1.0)[0]) for p in (p_od, p_o + 3 * (p_od - p_o)))
+    near, far = (
+        np.array(field.evaluate(jit(p), jit(p_o), jit(r), integral=1.0)[0]) for p in (p_od, p_o + 3 * (p_od - p_o))
+    )
     np.testing.assert_array_equal(near, far)
     assert np.ptp(near) > 0
 
@@ -100,7 +115,9 @@ def test_the_table_is_interpolated_all_around():
     table, step = rng.normal(size=(rows, 2 * rows)), np.pi / rows
     seams = np.concatenate([c + step * np.linspace(-1.3, 1.3, 27) for c in (0, np.pi, -np.pi, 2 * np.pi)])
     phi = np.concatenate([seams, rng.uniform(-np.pi, np.pi, 300)])
-    theta = np.concatenate([rng.uniform(0.3, np.pi - 0.3, len(phi) - 6), [1e-3, 0.1, 0.3, np.pi - 0.3, np.pi - 0.1, np.pi - 1e-3]])
+    theta = np.concatenate(
+        [rng.uniform(0.3, np.pi - 0.3, len(phi) - 6), [1e-3, 0.1, 0.3, np.pi - 0.3, np.pi - 0.1, np.pi - 1e-3]]
+    )
     d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
     x, y = (phi / step - 0.5) % (2 * rows), np.clip(theta / step - 0.5, 0, rows - 1)
     i, j = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), rows - 2)
@@ -113,8 +130,16 @@ def test_the_table_is_interpolated_all_around():
 def test_the_table_is_not_read_beyond_its_end():
     """At the poles the outermost rows stand alone; what lies behind them in memory has no part in it."""
     ns, rows = namespace("llvm"), 4
-    table = np.concatenate([np.full(2 * rows, 1.0), np.full(4 * rows, 7.0), np.full(2 * rows, 2.0), np.full(8 * rows, np.nan)])
-    found = np.array(look_up(ns.Float(table.astype(np.float32)), rows, jit([[0, 0, 1.0], [0, 0, -1.0], [1e-4, 0, -1.0], [1e-4, -1e-5, 1.0]])))
+    table = np.concatenate(
+        [np.full(2 * rows, 1.0), np.full(4 * rows, 7.0), np.full(2 * rows, 2.0), np.full(8 * rows, np.nan)]
+    )
+    found = np.array(
+        look_up(
+            ns.Float(table.astype(np.float32)),
+            rows,
+            jit([[0, 0, 1.0], [0, 0, -1.0], [1e-4, 0, -1.0], [1e-4, -1e-5, 1.0]]),
+        )
+    )
     np.testing.assert_allclose(found, [1, 2, 2, 1])
 
 
@@ -136,7 +161,8 @@ def test_a_lobe_on_the_seam_is_as_one_beside_it():
 
 
 def test_densities_leave_no_float_whatever_the_weights_are():
-    """Weights of any size: the logit is held below where its exponential would overflow, and stays below where it is not."""
+    """Weights of any size: the logit is held below where its exponential would overflow, and stays below where it is
+    not."""
     field = made(replace(SMALL, variant="emit"))
     p_o, p_od, r = (jit(v) for v in vectors())
     before = np.array(field.unnormalized(p_od, p_o, r)[0])
@@ -152,11 +178,22 @@ def test_file(tmp_path, half):
     again, meta = load_gaze(tmp_path / "gaze.safetensors", ns)
     assert again.config == field.config and meta["output"] == {"activation": "log", "normalized": True}
     for name, value in field.parameters().items():
-        np.testing.assert_allclose(again.parameters()[name].numpy(), value.numpy(), rtol=1e-3 if half else 0, atol=1e-6 if half else 0)
+        np.testing.assert_allclose(
+            again.parameters()[name].numpy(), value.numpy(), rtol=1e-3 if half else 0, atol=1e-6 if half else 0
+        )
 
 
-@pytest.mark.parametrize("wrong", [{"mix": 1.0}, {"variant": "both"}, {"geometry": "flat"}, {"escaped": "never"}, {"prior": 1},
-                                   {"heads": ((0, 0), (1, 1))}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"mix": 1.0},
+        {"variant": "both"},
+        {"geometry": "flat"},
+        {"escaped": "never"},
+        {"prior": 1},
+        {"heads": ((0, 0), (1, 1))},
+    ],
+)
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError):
         replace(SMALL, **wrong)

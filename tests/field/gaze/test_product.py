@@ -1,13 +1,13 @@
 """The gaze field against its NumPy version: equation 1, variants and activations."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import ACTIVATIONS, VARIANTS, GazeConfig, GazeField, activate, softplus
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
-
+from nerg_mi.field.gaze.product import ACTIVATIONS, VARIANTS, GazeConfig, GazeField, activate, softplus
+from nerg_mi.maths.box import Box
 from tests.reference import fields_numpy as reference
 
 GRID = dict(levels=4, features=2, log2_rows=12, base=4, finest=32)
@@ -124,28 +124,41 @@ def test08_gradients_equal_central_differences(name):
         for h in (1e-6, -1e-6):
             moved = {**values, name: values[name].copy()}
             moved[name].flat[i] += h
-            ends.append(reference.gaze(
-                p_od, p_o, r_o, moved, GRID, BOX.lower, BOX.upper, "emit_capture", "softplus")[0].sum())  # fmt: skip
+            ends.append(
+                reference.gaze(p_od, p_o, r_o, moved, GRID, BOX.lower, BOX.upper, "emit_capture", "softplus")[0].sum()
+            )
         assert np.isclose(gradient[i], (ends[0] - ends[1]) / 2e-6, rtol=3e-3, atol=1e-5)
 
 
 def test09_names_and_sizes():
     config = GazeConfig()
-    assert config.position_sizes == [32, 64, 15] and config.direction_sizes == [31, 64, 64] and config.grid.finest == 512
+    assert (
+        config.position_sizes == [32, 64, 15] and config.direction_sizes == [31, 64, 64] and config.grid.finest == 512
+    )
     assert GazeConfig.from_dict(make().config.to_dict()) == make().config
     assert list(make().parameters()) == [
-        "grid.table", "position_net.0", "position_net.1", "direction_net.0", "direction_net.1", "emit_head.0",
+        "grid.table",
+        "position_net.0",
+        "position_net.1",
+        "direction_net.0",
+        "direction_net.1",
+        "emit_head.0",
         "capture_head.0",
-    ]  # fmt: skip
+    ]
     with pytest.raises(ValueError, match='no parameter "color_net.0"'):
         make().set_parameters({"color_net.0": None})
 
 
-@pytest.mark.parametrize("wrong, words", [
-    (dict(variant="both"), 'variant must be one of emit, capture, emit_capture, got "both"'),
-    (dict(activation="relu"), 'activation must be one of softplus, exp, linear, got "relu"'), (dict(width=0), "at least 1"),
-    (dict(semantic="snapshot", normalized=True), "cannot be normalised"), (dict(semantic="snapshot", variant="capture"), "no emit"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (dict(variant="both"), 'variant must be one of emit, capture, emit_capture, got "both"'),
+        (dict(activation="relu"), 'activation must be one of softplus, exp, linear, got "relu"'),
+        (dict(width=0), "at least 1"),
+        (dict(semantic="snapshot", normalized=True), "cannot be normalised"),
+        (dict(semantic="snapshot", variant="capture"), "no emit"),
+    ],
+)
 def test10_wrong_settings(wrong, words):
     with pytest.raises(ValueError, match=words):
         GazeConfig(**wrong)
@@ -165,7 +178,17 @@ def test11_one_observer_and_many_directions():
     assert np.allclose(gaze.numpy(), evaluate(field, p_od, many, r_o)[0], rtol=1e-6)
     dr.backward(dr.sum(gaze))
     ends = [
-        reference.gaze(p_od, many + h * np.array([1, 0.5, -1]), r_o, arrays(field), GRID, BOX.lower, BOX.upper,
-                       "emit_capture", "softplus")[0].sum() for h in (1e-4, -1e-4)
-    ]  # fmt: skip
+        reference.gaze(
+            p_od,
+            many + h * np.array([1, 0.5, -1]),
+            r_o,
+            arrays(field),
+            GRID,
+            BOX.lower,
+            BOX.upper,
+            "emit_capture",
+            "softplus",
+        )[0].sum()
+        for h in (1e-4, -1e-4)
+    ]
     assert np.isclose(dr.grad(x).numpy()[0], (ends[0] - ends[1]) / 2e-4, rtol=0.02)

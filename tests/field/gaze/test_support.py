@@ -1,4 +1,5 @@
 """How much data there is around a position: cells against the sum over all rays."""
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -28,7 +29,9 @@ def test_cells_stand_for_their_rays(radius):
     assert support.cells[:, 3].sum() == len(origins) and len(support.cells) < len(origins)
     rng = np.random.default_rng(1)
     places = np.concatenate([origins[rng.integers(0, len(origins), 200)], rng.uniform(0, 4, (100, 3))])
-    found, expected = (np.array([f(p) for p in places]) for f in (lambda p: at(support, p), lambda p: exact(origins, radius, p)))
+    found, expected = (
+        np.array([f(p) for p in places]) for f in (lambda p: at(support, p), lambda p: exact(origins, radius, p))
+    )
     many = expected >= 5
     assert many.sum() > 100 and (expected == 0).sum() > 20
     off = np.abs(found / np.where(many, expected, 1) - 1)[many]

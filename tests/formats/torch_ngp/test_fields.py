@@ -1,17 +1,16 @@
 """torch-ngp checkpoints of the real sizes against a restatement of its kernels in NumPy float32, and back again."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance, save_radiance
-from nerg_mi.formats.torch_ngp.pickling import write_torch
 from nerg_mi.formats.torch_ngp.fields import Given, morton_order, read_torch_ngp, write_torch_ngp
-from nerg_mi.formats.torch_ngp.unpickling import read_torch
-
+from nerg_mi.formats.torch_ngp.pickling import write_torch
+from nerg_mi.maths.box import Box
 from tests.reference import torch_ngp_numpy as reference
 
 PARITY = 1e-6
@@ -69,7 +68,8 @@ def test01_equals_the_restatement(tmp_path, bound, behind):
     if behind:
         o = np.clip(p, -bound, bound)
         shown = columns(field.background(ns.Array3f(o.T), along))
-        # The last bit of an angle is 4e-4 cells of the finest level, so that this much differs by the machine's atan2 too.
+        # The last bit of an angle is 4e-4 cells of the finest level, so that this much differs by the machine's atan2
+        # too.
         assert np.abs(shown - reference.background(state, 3.0 * bound, o, d)).max() <= 1e-3
         angles = columns(field.background.coordinates(ns.Array3f(o.T), along))
         features = reference.encode(angles, state["encoder_bg.embeddings"], state["encoder_bg.offsets"], 2048, 1)
@@ -141,11 +141,18 @@ def test06_moving_averages(tmp_path, torch):
     adam = torch.optim.Adam([torch.nn.Parameter(torch.ones(3))])
     adam.param_groups[0]["params"][0].sum().backward()
     adam.step()
-    torch.save({
-        "epoch": 3, "global_step": 30, "stats": {"loss": [np.float64(0.5)], "best_result": None}, "mean_count": 0,
-        "model": {k: torch.tensor(v) for k, v in state.items()}, "optimizer": adam.state_dict(),
-        "ema": {"decay": 0.95, "num_updates": 3, "shadow_params": shadow, "collected_params": None},
-    }, tmp_path / "ngp_ep0003.pth")  # fmt: skip
+    torch.save(
+        {
+            "epoch": 3,
+            "global_step": 30,
+            "stats": {"loss": [np.float64(0.5)], "best_result": None},
+            "mean_count": 0,
+            "model": {k: torch.tensor(v) for k, v in state.items()},
+            "optimizer": adam.state_dict(),
+            "ema": {"decay": 0.95, "num_updates": 3, "shadow_params": shadow, "collected_params": None},
+        },
+        tmp_path / "ngp_ep0003.pth",
+    )
     for ema, factor, said in ((None, 2, "moving averages"), (True, 2, "moving averages"), (False, 1, "raw")):
         field, origin = read_torch_ngp(tmp_path / "ngp_ep0003.pth", ns, ema)
         assert np.array_equal(field.color_net.weights[2].numpy(), factor * state["color_net.2.weight"])
@@ -162,7 +169,9 @@ def test07_a_density_grid_without_its_bits(tmp_path):
     rng = np.random.default_rng(8)
     state = reference.nerf_state(1, rng)
     bits = np.unpackbits(state["density_bitfield"], bitorder="little").astype(bool)
-    state["density_grid"] = np.where(bits, 5 + rng.random(bits.size), rng.random(bits.size) - 0.5).astype(np.float32)[None]
+    state["density_grid"] = np.where(bits, 5 + rng.random(bits.size), rng.random(bits.size) - 0.5).astype(np.float32)[
+        None
+    ]
     expected = read_torch_ngp(save(tmp_path / "a.pth", state), ns)[0].occupancy
     assert 0.49 < expected.threshold <= 0.5
     del state["density_bitfield"]
@@ -184,18 +193,21 @@ def test08_a_bare_state_dictionary_and_a_smaller_box(tmp_path):
     assert np.allclose(field.density(ns.Array3f(p.T)).numpy(), [sigma[0], 0], rtol=1e-5)
 
 
-@pytest.mark.parametrize("change, words", [
-    (lambda s: s.pop("sigma_net.1.weight"), "numbers, so it is not spherical harmonics"),
-    (lambda s: s.pop("aabb_train"), 'lacks "aabb_train"'),
-    (lambda s: s.update({"aabb_train": s["aabb_train"] / 2}), "not those of a bound"),
-    (lambda s: s.update({"encoder.offsets": s["encoder.offsets"] + 8}), "begin at rows .*--finest"),
-    (lambda s: s.update({"color_net.0.bias": np.zeros(64, np.float32)}), "layers without biases"),
-    (lambda s: s.update({"color_net.0.weight": np.zeros((64, 30), np.float32)}), "not spherical harmonics"),
-    (lambda s: s.update({"color_net.2.weight": np.full((3, 64), np.nan, np.float32)}), "not finite.*diverged"),
-    (lambda s: s.update({"density_bitfield": np.zeros(5, np.uint8)}), "40 density bits"),
-    (lambda s: s.update({"encoder.params": np.zeros(5, np.float32)}), "--tcnn"),
-    (lambda s: s.update({"bg_net.0.weight": np.zeros((64, 24), np.float32)}), "--bg-radius"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (lambda s: s.pop("sigma_net.1.weight"), "numbers, so it is not spherical harmonics"),
+        (lambda s: s.pop("aabb_train"), 'lacks "aabb_train"'),
+        (lambda s: s.update({"aabb_train": s["aabb_train"] / 2}), "not those of a bound"),
+        (lambda s: s.update({"encoder.offsets": s["encoder.offsets"] + 8}), "begin at rows .*--finest"),
+        (lambda s: s.update({"color_net.0.bias": np.zeros(64, np.float32)}), "layers without biases"),
+        (lambda s: s.update({"color_net.0.weight": np.zeros((64, 30), np.float32)}), "not spherical harmonics"),
+        (lambda s: s.update({"color_net.2.weight": np.full((3, 64), np.nan, np.float32)}), "not finite.*diverged"),
+        (lambda s: s.update({"density_bitfield": np.zeros(5, np.uint8)}), "40 density bits"),
+        (lambda s: s.update({"encoder.params": np.zeros(5, np.float32)}), "--tcnn"),
+        (lambda s: s.update({"bg_net.0.weight": np.zeros((64, 24), np.float32)}), "--bg-radius"),
+    ],
+)
 def test09_what_does_not_fit_is_said(tmp_path, change, words):
     state = small_state()
     change(state)
@@ -210,11 +222,14 @@ def small_state():
     where = reference.offsets(2, 2048)
     return {
         "aabb_train": np.array([-1, -1, -1, 1, 1, 1], np.float32),
-        "encoder.embeddings": reference.table(where[-1], rng), "encoder.offsets": where,
-        "sigma_net.0.weight": reference.matrix(rng, 64, 4), "sigma_net.1.weight": reference.matrix(rng, 16, 64),
-        "color_net.0.weight": reference.matrix(rng, 64, 31), "color_net.1.weight": reference.matrix(rng, 64, 64),
+        "encoder.embeddings": reference.table(where[-1], rng),
+        "encoder.offsets": where,
+        "sigma_net.0.weight": reference.matrix(rng, 64, 4),
+        "sigma_net.1.weight": reference.matrix(rng, 16, 64),
+        "color_net.0.weight": reference.matrix(rng, 64, 31),
+        "color_net.1.weight": reference.matrix(rng, 64, 64),
         "color_net.2.weight": reference.matrix(rng, 3, 64),
-    }  # fmt: skip
+    }
 
 
 def test10_a_grid_of_another_resolution(tmp_path):

@@ -1,4 +1,5 @@
 """Checkpoints of the paper's authors: the gaze networks against their restatement, and what is refused."""
+
 import sys
 import types
 from enum import Enum
@@ -11,8 +12,8 @@ import pytest
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.formats.torch_ngp.nerg import read_nerg
 from nerg_mi.formats.torch_ngp.pickling import write_torch
-
 from tests.reference import torch_ngp_numpy as reference
+
 from .test_fields import small_state
 
 
@@ -96,8 +97,16 @@ def test04_as_torch_writes_it_with_an_enum_of_its_own(tmp_path, torch, monkeypat
     monkeypatch.setitem(sys.modules, "nerg", types.ModuleType("nerg"))
     monkeypatch.setitem(sys.modules, "nerg.gaze_prediction", module)
     state = {**small_gaze(), **{f"model_nerf.{k}": v for k, v in small_state().items()}}
-    torch.save({"epoch": 1, "global_step": 4, "stats": {}, "variant": NeRGVariant.EmitCapture,
-                "model": {k: torch.tensor(v) for k, v in state.items()}}, tmp_path / "nerg_ep0001.pth")  # fmt: skip
+    torch.save(
+        {
+            "epoch": 1,
+            "global_step": 4,
+            "stats": {},
+            "variant": NeRGVariant.EmitCapture,
+            "model": {k: torch.tensor(v) for k, v in state.items()},
+        },
+        tmp_path / "nerg_ep0001.pth",
+    )
     monkeypatch.delitem(sys.modules, "nerg.gaze_prediction")
     monkeypatch.delitem(sys.modules, "nerg")
     field, gaze, _ = read_nerg(tmp_path / "nerg_ep0001.pth", ns)

@@ -1,4 +1,5 @@
 """What torch.save wrote, read without torch: exact, and unable to run anything."""
+
 import io
 import pickle
 import sys
@@ -33,9 +34,19 @@ class Calls:
 def test01_what_torch_writes(tmp_path, torch):
     x = torch.arange(24.0).reshape(2, 3, 4)
     values = {
-        "plain": x, "strided": x.permute(2, 0, 1)[1:, :, ::2], "half": x.half(), "bf": x.bfloat16(), "long": x.long(),
-        "bool": x > 3, "empty": torch.zeros(0, 4), "scalar": torch.tensor(2.5), "parameter": torch.nn.Parameter(x),
-        "number": np.float64(0.1), "size": x.shape, "none": None, "list": [1, 2.5, "a", True, 2**40],
+        "plain": x,
+        "strided": x.permute(2, 0, 1)[1:, :, ::2],
+        "half": x.half(),
+        "bf": x.bfloat16(),
+        "long": x.long(),
+        "bool": x > 3,
+        "empty": torch.zeros(0, 4),
+        "scalar": torch.tensor(2.5),
+        "parameter": torch.nn.Parameter(x),
+        "number": np.float64(0.1),
+        "size": x.shape,
+        "none": None,
+        "list": [1, 2.5, "a", True, 2**40],
     }
     torch.save(values, tmp_path / "x.pth")
     got = read_torch(tmp_path / "x.pth")
@@ -48,23 +59,36 @@ def test01_what_torch_writes(tmp_path, torch):
 
 
 def test02_what_torch_reads(tmp_path, torch):
-    values = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": {"c": np.arange(5, dtype=np.uint8), "n": -3, "big": 2**40},
-              "s": ["x", None, True, 0.1, ()], "h": np.ones(3, np.float16), "i": np.zeros((4, 0), np.int32)}  # fmt: skip
+    values = {
+        "a": np.arange(6, dtype=np.float32).reshape(2, 3),
+        "b": {"c": np.arange(5, dtype=np.uint8), "n": -3, "big": 2**40},
+        "s": ["x", None, True, 0.1, ()],
+        "h": np.ones(3, np.float16),
+        "i": np.zeros((4, 0), np.int32),
+    }
     write_torch(tmp_path / "w.pth", values)
     got = torch.load(tmp_path / "w.pth", weights_only=True)
     assert got["b"]["n"] == -3 and got["b"]["big"] == 2**40 and got["s"] == values["s"]
-    for a, b in ((got["a"], values["a"]), (got["b"]["c"], values["b"]["c"]), (got["h"], values["h"]), (got["i"], values["i"])):
+    for a, b in (
+        (got["a"], values["a"]),
+        (got["b"]["c"], values["b"]["c"]),
+        (got["h"], values["h"]),
+        (got["i"], values["i"]),
+    ):
         assert np.array_equal(a.numpy(), b) and a.numpy().dtype == b.dtype
 
 
-@pytest.mark.parametrize("thing, name", [
-    (Calls(exec, "import sys; sys.pwned = True"), "exec"),
-    (Calls(eval, "1"), "eval"),
-    (Calls(getattr, "x", "upper"), "getattr"),
-    (Calls(io.open, "/etc/passwd"), "open"),
-    (Calls(__import__, "os"), "__import__"),
-    (np.zeros(3), "_reconstruct"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "thing, name",
+    [
+        (Calls(exec, "import sys; sys.pwned = True"), "exec"),
+        (Calls(eval, "1"), "eval"),
+        (Calls(getattr, "x", "upper"), "getattr"),
+        (Calls(io.open, "/etc/passwd"), "open"),
+        (Calls(__import__, "os"), "__import__"),
+        (np.zeros(3), "_reconstruct"),
+    ],
+)
 def test03_nothing_else_is_called(tmp_path, thing, name):
     for protocol in (2, 4):
         path = archive(tmp_path / "evil.pth", pickle.dumps({"model": thing}, protocol))
@@ -80,10 +104,19 @@ def tensor(shape, stride, offset=0, state=b""):
     return out + f"I{offset}\n".encode() + numbers(shape) + numbers(stride) + b"\x89NtR" + state + b"."
 
 
-@pytest.mark.parametrize("shape, stride, offset", [
-    ((5,), (1,), 0), ((4,), (1,), 1), ((2, 2), (3, 1), 0), ((2,), (1,), -1), ((2,), (-1,), 1), ((2,), (10**12,), 0),
-    ((2, 2), (1,), 0), ((-1,), (1,), 0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "shape, stride, offset",
+    [
+        ((5,), (1,), 0),
+        ((4,), (1,), 1),
+        ((2, 2), (3, 1), 0),
+        ((2,), (1,), -1),
+        ((2,), (-1,), 1),
+        ((2,), (10**12,), 0),
+        ((2, 2), (1,), 0),
+        ((-1,), (1,), 0),
+    ],
+)
 def test04_tensors_do_not_reach_beyond_their_storage(tmp_path, shape, stride, offset):
     path = archive(tmp_path / "t.pth", tensor(shape, stride, offset), **{"0": np.arange(4, dtype="<f4").tobytes()})
     with pytest.raises(ValueError):
@@ -102,9 +135,7 @@ def test05_what_is_made_cannot_be_changed(tmp_path):
         read_torch(archive(tmp_path / "b.pth", onto_function))
 
 
-@pytest.mark.parametrize("data, words", [
-    (b"not a zip", "not a zip archive"), (b"", "not a zip archive"),
-])  # fmt: skip
+@pytest.mark.parametrize("data, words", [(b"not a zip", "not a zip archive"), (b"", "not a zip archive")])
 def test06_other_files(tmp_path, data, words):
     (tmp_path / "x.pth").write_bytes(data)
     with pytest.raises(ValueError, match=words):
@@ -133,11 +164,15 @@ def test_a_huge_memo_index_makes_no_room(tmp_path):
         assert read_torch(archive(tmp_path / "m.pth", b"\x80\x02K\x01" + put + b".")) == 1
 
 
-@pytest.mark.parametrize("shape, stride", [((10**9,), (0,)), ((10**5, 10**5), (0, 0)), ((1 << 21,), (0,)), ((1,) * 40, (0,) * 40)])
+@pytest.mark.parametrize(
+    "shape, stride", [((10**9,), (0,)), ((10**5, 10**5), (0, 0)), ((1 << 21,), (0,)), ((1,) * 40, (0,) * 40)]
+)
 def test_repeated_numbers_are_bounded(tmp_path, shape, stride):
     with pytest.raises(NergError, match="t.pth"):
         read_torch(archive(tmp_path / "t.pth", tensor(shape, stride), **{"0": ONE})).numpy()
-    assert np.array_equal(read_torch(archive(tmp_path / "s.pth", tensor((3, 2), (0, 1)), **{"0": ONE})).numpy(), [[0, 1]] * 3)
+    assert np.array_equal(
+        read_torch(archive(tmp_path / "s.pth", tensor((3, 2), (0, 1)), **{"0": ONE})).numpy(), [[0, 1]] * 3
+    )
     far = tensor((1, 2), (2**61, 1))
     assert np.array_equal(read_torch(archive(tmp_path / "s.pth", far, **{"0": ONE})).numpy(), [[0, 1]])
 
@@ -155,11 +190,20 @@ def test_texts_are_not_copied_over_and_over(tmp_path):
         read_torch(archive(tmp_path / "e.pth", b"\x80\x02" + text + again + b"."))
 
 
-@pytest.mark.parametrize("pickled, words", [
-    (b"\x80\x02" + b"N" * 1_000_001 + b".", "operations"), (b"\x80\x02h\x07.", "recalls"), (b"\x80\x02t.", ""),
-    (b"\x80\x02(i\nos\nsystem\n.", ""), (b"\x80\x04\x96\xff\xff\xff\xff\xff\xff\xff\x7f.", ""), (b"\x80\x02\x82\x01.", "EXT1"),
-    (b"\x80\x02X\xff\xff\xff\x7f.", ""), (b"\x80\x02N", ""), (b"\x80\x02.", ""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "pickled, words",
+    [
+        (b"\x80\x02" + b"N" * 1_000_001 + b".", "operations"),
+        (b"\x80\x02h\x07.", "recalls"),
+        (b"\x80\x02t.", ""),
+        (b"\x80\x02(i\nos\nsystem\n.", ""),
+        (b"\x80\x04\x96\xff\xff\xff\xff\xff\xff\xff\x7f.", ""),
+        (b"\x80\x02\x82\x01.", "EXT1"),
+        (b"\x80\x02X\xff\xff\xff\x7f.", ""),
+        (b"\x80\x02N", ""),
+        (b"\x80\x02.", ""),
+    ],
+)
 def test_pickles_that_no_checkpoint_has(tmp_path, pickled, words):
     with pytest.raises(NergError, match=f"p.pth.*{words}"):
         read_torch(archive(tmp_path / "p.pth", pickled))
@@ -174,8 +218,13 @@ def test_nothing_of_a_pickle_leads_to_the_archive(tmp_path):
     assert out._archive is None and machine.tensors == [out]
     stored = unpickling._stored(("storage", unpickling._Global("torch", "FloatStorage"), "0", "cpu", 4))
     assert vars(stored) == {"key": "0", "dtype": "<f4"}
-    for pid in ("storage", ("storage",), ("storage", "FloatStorage", "0"), ("module", *[unpickling._Global("torch", "x")] * 2),
-                ("storage", unpickling._Global("torch", "FloatStorage"), "../0")):  # fmt: skip
+    for pid in (
+        "storage",
+        ("storage",),
+        ("storage", "FloatStorage", "0"),
+        ("module", *[unpickling._Global("torch", "x")] * 2),
+        ("storage", unpickling._Global("torch", "FloatStorage"), "../0"),
+    ):
         with pytest.raises(ValueError, match="stored array"):
             unpickling._stored(pid)
 

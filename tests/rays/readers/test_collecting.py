@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
+from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers import collecting
 from nerg_mi.rays.readers.collecting import RaysBuilder
-from nerg_mi.rays.rays import Rays
-from nerg_mi.errors import NergError
 
 
 def add(builder, n, gone=(), first=1):

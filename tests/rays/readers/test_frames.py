@@ -8,8 +8,11 @@ def test_usual_frames():
     assert np.array_equal(to_rays_frame(), np.eye(4))
     point = np.array([1.0, 2.0, 3.0])
     for (up, hand), want in {
-        ("y", "right"): (1, -3, 2), ("y", "left"): (1, 3, 2), ("z", "left"): (1, -2, 3), ("-y", "right"): (1, 3, -2),
-    }.items():  # fmt: skip
+        ("y", "right"): (1, -3, 2),
+        ("y", "left"): (1, 3, 2),
+        ("z", "left"): (1, -2, 3),
+        ("-y", "right"): (1, 3, -2),
+    }.items():
         assert np.array_equal(to_rays_frame(up=up, handedness=hand)[:3, :3] @ point, want)
 
 

@@ -14,7 +14,11 @@ def read(path, numbers, texts=()):
 def test_columns_gaps_and_lines(tmp_path, separator):
     path = tmp_path / "t.csv"
     rows = ["name,b,a,c", '"Ann, B",1,2,3', "", "bo,,,", "cy,7,NaN,null"]
-    path.write_text("\n".join(r if '"' in r and separator == "," else r.replace('"Ann, B"', "Ann").replace(",", separator) for r in rows))
+    path.write_text(
+        "\n".join(
+            r if '"' in r and separator == "," else r.replace('"Ann, B"', "Ann").replace(",", separator) for r in rows
+        )
+    )
     (block,) = read(path, ["a", "b", "c"], ["name"])
     assert np.array_equal(block.numbers, [[2, 1, 3], [np.nan] * 3, [np.nan, 7, np.nan]], equal_nan=True)
     assert list(block.texts[:, 0]) == ["Ann, B" if separator == "," else "Ann", "bo", "cy"]
@@ -69,13 +73,22 @@ def test_with_and_without_pyarrow(tmp_path, monkeypatch):
     values = rng.normal(size=(50, 3)) * 10.0 ** rng.integers(-12, 12, (50, 3))
     cells = [[repr(float(v)) for v in row] for row in values]
     cells[3][1], cells[7][0], cells[9][2], cells[11][1] = "", "NaN", "null", "inf"
-    path.write_text("a,who,b,a\n" + "\n".join(f'{a},"p {i % 3}",{b},{c}' + ("\n" if i == 20 else "") for i, (a, b, c) in enumerate(cells)))
+    path.write_text(
+        "a,who,b,a\n"
+        + "\n".join(f'{a},"p {i % 3}",{b},{c}' + ("\n" if i == 20 else "") for i, (a, b, c) in enumerate(cells))
+    )
     fast = read(path, ["b", "a"], ["who"])
     used = []
     monkeypatch.setattr(ray_tables, "_fast_reader", lambda *a: used.append(1))
     slow = read(path, ["b", "a"], ["who"])
-    assert used and np.array_equal(fast[0].numbers, slow[0].numbers, equal_nan=True) and np.isinf(fast[0].numbers[11, 0])
-    assert np.array_equal(fast[0].texts, slow[0].texts) and np.array_equal(fast[0].lines, slow[0].lines) and fast[0].lines[21] == 24
+    assert (
+        used and np.array_equal(fast[0].numbers, slow[0].numbers, equal_nan=True) and np.isinf(fast[0].numbers[11, 0])
+    )
+    assert (
+        np.array_equal(fast[0].texts, slow[0].texts)
+        and np.array_equal(fast[0].lines, slow[0].lines)
+        and fast[0].lines[21] == 24
+    )
 
 
 BAD = ["1,x\n", "1\n", "nonsense\n", '"1,2\n', "1,2e\n", "\x00\n", "1,1 2\n"]

@@ -49,7 +49,9 @@ def test_rays_of_a_file(tmp_path):
     assert len(rays) == 49 and rays.persons == ("p0", "p1", "p2") and rays.hit is None
     assert np.allclose(rays.t, np.arange(50)[keep] * 0.1)
     assert np.abs(rays.direction - direction[keep]).max() < 2e-5  # micrometres in the file
-    assert rays.metadata["dropped"] == [{"reason": "origin is missing", "file": "day.csv.gz", "count": 1, "rows": [[8, 8]]}]
+    assert rays.metadata["dropped"] == [
+        {"reason": "origin is missing", "file": "day.csv.gz", "count": 1, "rows": [[8, 8]]}
+    ]
 
 
 def test_other_keypoints_and_pitch(tmp_path):
@@ -79,20 +81,26 @@ def test_a_body_is_the_same_on_both_sides():
     direction = np.stack([np.cos(heading), np.sin(heading), np.zeros(3)], axis=1)
     body = skeleton.keypoints_from_head(origin, direction)
     left = np.cross([0, 0, 1.0], direction)
-    pairs = np.array([(skeleton.LEFT_EAR, skeleton.RIGHT_EAR), (4, 15), (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19)])
+    pairs = np.array(
+        [(skeleton.LEFT_EAR, skeleton.RIGHT_EAR), (4, 15), (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19)]
+    )
     # Mirrored in the plane through the middle of the ears in which the head looks.
     aside = np.einsum("nkj,nj->nk", body - origin[:, None], left)[..., None]
     mirrored = body - 2 * aside * left[:, None]
     assert np.allclose(body[:, pairs[:, 0]], mirrored[:, pairs[:, 1]], atol=1e-12)
     assert (aside[:, pairs[:, 0], 0] > 0.01).all()
     # The eyes lie between the ears; heels, knees, hips and shoulders one above the other, in proportion to the height.
-    eyes, ears = (np.linalg.norm(body[:, i] - body[:, j], axis=1) for i, j in ((4, 15), (skeleton.LEFT_EAR, skeleton.RIGHT_EAR)))
+    eyes, ears = (
+        np.linalg.norm(body[:, i] - body[:, j], axis=1) for i, j in ((4, 15), (skeleton.LEFT_EAR, skeleton.RIGHT_EAR))
+    )
     assert (eyes < 0.6 * ears).all()
     heights = body[:, [5, 7, 6, 8], 2] / origin[:, 2:]
     assert (np.diff(heights, axis=1) > 0.1).all() and np.allclose(heights, heights[0])
 
 
-@pytest.mark.parametrize("origin, bad", [((0, 0, 1.6), False), ((1, 0, 0), False), ((np.nan, 1, 1.6), True), ((1, 1, np.inf), True)])
+@pytest.mark.parametrize(
+    "origin, bad", [((0, 0, 1.6), False), ((1, 0, 0), False), ((np.nan, 1, 1.6), True), ((1, 1, np.inf), True)]
+)
 def test_a_head_may_be_at_zero_but_not_nowhere(origin, bad):
     if bad:
         with pytest.raises(ValueError, match="head pose 0"):

@@ -82,12 +82,23 @@ def test_bad_lines_are_told_and_left_out(tmp_path, poses):
     write_skeleton(path, *poses)
     good = path.read_text().splitlines(keepends=True)
     zeros = ", ".join(["0"] * 65)
-    bad = [f"a|1|[{zeros}, x]\n", "a|1\n", f"a|1.5|[{zeros}, 0]\n", f"a|{1 << 63}|[{zeros}, 0]\n", f"a|1|{zeros}, 0\n", good[0][:300]]
+    bad = [
+        f"a|1|[{zeros}, x]\n",
+        "a|1\n",
+        f"a|1.5|[{zeros}, 0]\n",
+        f"a|{1 << 63}|[{zeros}, 0]\n",
+        f"a|1|{zeros}, 0\n",
+        good[0][:300],
+    ]
     path.write_text("".join(line for pair in zip(good, [*bad[:-1], "", ""]) for line in pair) + bad[-1])
     for keypoints in (None, (21, 2, 13)):
         told.clear()
         (rows,) = iterate_skeleton(path, keypoints=keypoints, on_bad=lambda line, why: told.append(line))
-        assert list(rows.ids) == poses[0] and rows.lines.tolist() == [1, 3, 5, 7, 9, 11, 12] and sorted(told) == [2, 4, 6, 8, 10, 13]
+        assert (
+            list(rows.ids) == poses[0]
+            and rows.lines.tolist() == [1, 3, 5, 7, 9, 11, 12]
+            and sorted(told) == [2, 4, 6, 8, 10, 13]
+        )
     with pytest.raises(NergError, match="line 4: 2 fields.*--skip-bad-lines"):
         read_skeleton(path)
 

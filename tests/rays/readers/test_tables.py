@@ -11,7 +11,9 @@ def test_table_of_another_frame(tmp_path):
     path = tmp_path / "unity.csv.gz"
     with gzip.open(path, "wt") as out:
         out.write("id,ms,px,py,pz,dx,dy,dz,ok\n")
-        out.write("bo,0,100,160,300,0,0,2,1\nann,500,0,170,0,0,-1,0,0.2\nann,1000,0,170,0,1,0,0,.9\nann,1500,0,170,0,,,,1\n")
+        out.write(
+            "bo,0,100,160,300,0,0,2,1\nann,500,0,170,0,0,-1,0,0.2\nann,1000,0,170,0,1,0,0,.9\nann,1500,0,170,0,,,,1\n"
+        )
     mapping = "origin=px,py,pz direction=dx,dy,dz t=ms person=id confidence=ok"
     rays = rays_from_table([path], mapping, up="y", handedness="left", units="cm", tick=1e-3, min_confidence=0.5)
     assert np.allclose(rays.origin, [[1, 3, 1.6], [0, 0, 1.7]])
@@ -54,7 +56,9 @@ def test_poses_of_any_kind_give_the_same_rays(tmp_path, heads, kind, forward):
         mapping = f"origin=x,y,z {kind}={names}"
     rays = rays_from_table([path], mapping, up="y", handedness="left", forward=forward)
     ahead = np.array({"z": (0, 0, 1.0), "-z": (0, 0, -1.0), "x": (1.0, 0, 0)}[forward])
-    assert np.allclose(rays.origin, origin[:, [0, 2, 1]]) and np.allclose(rays.direction, turn.apply(ahead)[:, [0, 2, 1]])
+    assert np.allclose(rays.origin, origin[:, [0, 2, 1]]) and np.allclose(
+        rays.direction, turn.apply(ahead)[:, [0, 2, 1]]
+    )
     assert rays.metadata["forward"] == forward
 
 
@@ -94,16 +98,27 @@ def test_what_is_no_pose_is_dropped_by_row(tmp_path):
     assert len(rays) == 1 and rays.metadata["dropped"][0]["rows"] == [[3, 4]]
     path = write(tmp_path / "m.csv", ",".join("abcdefghijkl"), [np.eye(4)[:3].ravel(), np.ones(12)])
     rays = rays_from_table([path], "matrix=" + ",".join("abcdefghijkl"))
-    assert len(rays) == 1 and rays.metadata["dropped"][0] == {"reason": "direction is missing", "file": "m.csv", "count": 1, "rows": [[3, 3]]}
+    assert len(rays) == 1 and rays.metadata["dropped"][0] == {
+        "reason": "direction is missing",
+        "file": "m.csv",
+        "count": 1,
+        "rows": [[3, 3]],
+    }
 
 
 def test_cohorts_persons_and_validity(tmp_path):
     path = tmp_path / "t.csv"
-    path.write_text("x,y,z,a,b,c,who,group,ok\n" + "0,0,0,1,0,0,bo,new,Valid\n0,0,0,1,0,0,ann,,VALID\n0,0,0,1,0,0,,new,valid\n0,0,0,1,0,0,bo,new,lost\n")
+    path.write_text(
+        "x,y,z,a,b,c,who,group,ok\n"
+        + "0,0,0,1,0,0,bo,new,Valid\n0,0,0,1,0,0,ann,,VALID\n0,0,0,1,0,0,,new,valid\n0,0,0,1,0,0,bo,new,lost\n"
+    )
     rays = rays_from_table([path], "origin=x,y,z direction=a,b,c person=who cohort=group", valid={"ok": ["valid"]})
     assert rays.persons == ("ann", "bo") and list(rays.person) == [1, 0]
     assert rays.cohorts == ("unknown", "new") and list(rays.cohort) == [1, 0]
-    assert {d["reason"]: d["rows"] for d in rays.metadata["dropped"]} == {"ok is not valid": [[5, 5]], "person is missing": [[4, 4]]}
+    assert {d["reason"]: d["rows"] for d in rays.metadata["dropped"]} == {
+        "ok is not valid": [[5, 5]],
+        "person is missing": [[4, 4]],
+    }
     again = tmp_path / "rays.npz"
     rays.save(again)
     back = type(rays).load(again)
@@ -113,7 +128,7 @@ def test_cohorts_persons_and_validity(tmp_path):
 
 def test_refusals(tmp_path):
     path = write(tmp_path / "t.csv", "x,y,z,a,b,c", [(0, 0, 0, 1, 0, 0)])
-    with pytest.raises(ValueError, match="column or filename|\"column\" or \"filename\""):
+    with pytest.raises(ValueError, match='column or filename|"column" or "filename"'):
         rays_from_table([path], "origin=x,y,z direction=a,b,c", person_from="shoe")
     with pytest.raises(ValueError, match='forward is "ahead"'):
         rays_from_table([path], "origin=x,y,z ypr=a,b,c", forward="ahead")
@@ -134,4 +149,6 @@ def test_parquet_is_read_as_csv_is(tmp_path, heads):
     mapping = "origin=x,y,z xyzw=a,b,c,d"
     one, two = rays_from_table([path], mapping), rays_from_table([tmp_path / "t.parquet"], mapping + " person=who")
     assert np.array_equal(one.direction[:19], two.direction) and two.persons == ("p0", "p1", "p2")
-    assert two.metadata["dropped"] == [{"reason": "person is missing", "file": "t.parquet", "count": 1, "rows": [[20, 20]]}]
+    assert two.metadata["dropped"] == [
+        {"reason": "person is missing", "file": "t.parquet", "count": 1, "rows": [[20, 20]]}
+    ]

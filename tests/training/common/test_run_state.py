@@ -1,4 +1,5 @@
 """A training that is killed and resumed comes to what an uninterrupted one comes to."""
+
 import os
 import signal
 import subprocess
@@ -12,9 +13,9 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
-from nerg_mi.training.radiance.trainer import RadianceTrainer
-from nerg_mi.training.radiance.run import save_trained, train_radiance
 from nerg_mi.training.common.run_state import load_run, save_run
+from nerg_mi.training.radiance.run import save_trained, train_radiance
+from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.training.radiance.test_trainer import BOX, TINY, dataset, settings  # noqa: F401  (fixture)
 
 
@@ -71,8 +72,12 @@ def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):  # no
         if progress.steps == 5 and len(seen) == 5:
             raise KeyboardInterrupt
 
-    how = {"state": path, "preview": tmp_path / "a.png", "on_progress": stop,
-           "write": lambda field, about: written.append((about["steps"], path.is_file()))}  # fmt: skip
+    how = {
+        "state": path,
+        "preview": tmp_path / "a.png",
+        "on_progress": stop,
+        "write": lambda field, about: written.append((about["steps"], path.is_file())),
+    }
     _, about = train_radiance(dataset, TINY, settings(steps=12), ns, **how)
     assert about["interrupted"] and path.is_file()
     _, about = train_radiance(dataset, TINY, settings(steps=12), ns, resume=True, **how)
@@ -94,12 +99,21 @@ def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
         train_radiance(dataset, TINY, settings(steps=6), ns, write=refuse, **how)
     assert [p.name for p in tmp_path.iterdir()] == ["a.run"]
     seen.clear()
-    _, about = train_radiance(dataset, TINY, settings(steps=6), ns, resume=True, write=lambda f, a: save_trained(f, a, tmp_path / "a.safetensors"), **how)
+    _, about = train_radiance(
+        dataset,
+        TINY,
+        settings(steps=6),
+        ns,
+        resume=True,
+        write=lambda f, a: save_trained(f, a, tmp_path / "a.safetensors"),
+        **how,
+    )
     assert about["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
 def test_a_second_ctrl_c_leaves_the_state_before_the_step(dataset, one_thread, monkeypatch, tmp_path):  # noqa: F811
-    """Raised in the middle of a step, when weights and random numbers are of different steps: that state is not kept."""
+    """Raised in the middle of a step, when weights and random numbers are of different steps: that state is not
+    kept."""
     path, descend = tmp_path / "a.run", RadianceTrainer._descend
 
     def twice(self, *given):
@@ -140,7 +154,7 @@ def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thre
     time.sleep(0.3)
     child.send_signal(how)
     assert child.wait(120) == (0 if how == signal.SIGINT else -how)
-    about = {k: None for k in ("sha256", "training_frames", "width", "height")}
+    about = dict.fromkeys(("sha256", "training_frames", "width", "height"))
     killed = trainer(dataset, steps=10**6)
     load_run(killed, path, about)
     same = trainer(dataset, steps=10**6)
@@ -150,12 +164,20 @@ def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thre
         assert np.array_equal(value, state(killed)[name]), name
 
 
-@pytest.mark.parametrize("change", [
-    lambda tensors, meta: meta.pop("taken"), lambda tensors, meta: meta.update(about=[]), lambda tensors, meta: meta.update(steps="7"),
-    lambda tensors, meta: meta.update(random={"bit_generator": "PCG64", "state": 3}), lambda tensors, meta: meta.update(seconds=None),
-    lambda tensors, meta: tensors.pop("hard"), lambda tensors, meta: tensors.update({"grid.bits": np.zeros(3, np.uint8)}),
-    lambda tensors, meta: tensors.update({"weights.grid.table": np.zeros(5, np.float32)}), lambda tensors, meta: meta.update(history=3),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tensors, meta: meta.pop("taken"),
+        lambda tensors, meta: meta.update(about=[]),
+        lambda tensors, meta: meta.update(steps="7"),
+        lambda tensors, meta: meta.update(random={"bit_generator": "PCG64", "state": 3}),
+        lambda tensors, meta: meta.update(seconds=None),
+        lambda tensors, meta: tensors.pop("hard"),
+        lambda tensors, meta: tensors.update({"grid.bits": np.zeros(3, np.uint8)}),
+        lambda tensors, meta: tensors.update({"weights.grid.table": np.zeros(5, np.float32)}),
+        lambda tensors, meta: meta.update(history=3),
+    ],
+)
 def test_a_damaged_state_is_told_with_its_name(dataset, tmp_path, change):  # noqa: F811
     from nerg_mi.formats.checkpoint import write_checkpoint
 
@@ -163,6 +185,8 @@ def test_a_damaged_state_is_told_with_its_name(dataset, tmp_path, change):  # no
     save_run(t, tmp_path / "a.run", {"sha": 1}, [])
     tensors, meta = read_checkpoint(tmp_path / "a.run", "radiance run")
     change(tensors, meta)
-    write_checkpoint(tmp_path / "b.run", "radiance run", tensors, {k: v for k, v in meta.items() if k not in ("kind", "format")})
+    write_checkpoint(
+        tmp_path / "b.run", "radiance run", tensors, {k: v for k, v in meta.items() if k not in ("kind", "format")}
+    )
     with pytest.raises(NergError, match="b.run"):
         load_run(t, tmp_path / "b.run", {"sha": 1})

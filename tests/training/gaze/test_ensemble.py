@@ -1,4 +1,5 @@
 """Ensembles: what is resampled, members by themselves, going on, the command."""
+
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,16 +7,17 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.errors import NergError
-from nerg_mi.maths.box import Box
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.fields import _dump, load_gaze
+from nerg_mi.maths.box import Box
+from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.ensemble import blocks_of, resample, train_ensemble
 from nerg_mi.training.gaze.run import train_gaze
 from nerg_mi.transport.media.media import Similarity
-from .test_trainer import BOX, looking_at
+
 from .test_state import LIKELIHOOD, LOG, PROBES, threads  # noqa: F401  (fixture)
+from .test_trainer import BOX, looking_at
 
 PLACE = replace(LOG, geometry="none")
 SHORT = replace(LIKELIHOOD, steps=4, zones=0)
@@ -30,7 +32,9 @@ def crowd(people=6, n=1200, seconds=100.0):
 
 
 def together(members=3, rays=None, **options):
-    return train_ensemble(members, rays or crowd(), None, BOX, PLACE, SHORT, options.pop("probes", PROBES), ns, **options)
+    return train_ensemble(
+        members, rays or crowd(), None, BOX, PLACE, SHORT, options.pop("probes", PROBES), ns, **options
+    )
 
 
 def arrays(field):
@@ -71,7 +75,9 @@ def test_members_are_trainings_of_resamples(threads):  # noqa: F811
     rays = crowd()
     ensemble, about = together(3, rays)
     for k, member in enumerate(ensemble.members):
-        alone, _ = train_gaze(resample(rays, (SHORT.seed, k)), None, BOX, PLACE, replace(SHORT, seed=100 * k), PROBES, ns)
+        alone, _ = train_gaze(
+            resample(rays, (SHORT.seed, k)), None, BOX, PLACE, replace(SHORT, seed=100 * k), PROBES, ns
+        )
         for name, value in arrays(alone).items():
             np.testing.assert_array_equal(arrays(member)[name], value, err_msg=name)
     assert about["ensemble"] == {"members": 3, "resampled": "people", "seeds": [0, 100, 200]} and about["steps"] == 12
@@ -97,28 +103,55 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):  # noqa: F811
     seen.clear()
     written = []
     shares = []
-    got, about = together(state=path, resume=True, on_progress=lambda s: (seen.append(s.stage), shares.append(s.done)),
-                          write=lambda *_: written.append(sorted(p.name for p in tmp_path.iterdir())))
+    got, about = together(
+        state=path,
+        resume=True,
+        on_progress=lambda s: (seen.append(s.stage), shares.append(s.done)),
+        write=lambda *_: written.append(sorted(p.name for p in tmp_path.iterdir())),
+    )
     assert set(seen) == {"2/3 probes", "2/3 fit", "3/3 probes", "3/3 fit"} and seen.count("2/3 fit") == 2
     # Each member is a third of what is done, the first of them from before.
     assert shares == sorted(shares) and shares[-1] == pytest.approx(1)
     assert all(int(stage[0]) - 1 - 1e-9 <= 3 * share <= int(stage[0]) + 1e-9 for stage, share in zip(seen, shares))
-    assert written == [[f"a.member{k}.safetensors" for k in range(3)]] and not list(tmp_path.iterdir()) and about["steps"] == 12
+    assert (
+        written == [[f"a.member{k}.safetensors" for k in range(3)]]
+        and not list(tmp_path.iterdir())
+        and about["steps"] == 12
+    )
     expected = arrays(together()[0])
     for name, value in arrays(got).items():
         np.testing.assert_array_equal(value, expected[name], err_msg=name)
 
 
-@pytest.mark.parametrize("change, said", [
-    ({"config": replace(PLACE, width=8)}, "architecture"), ({"config": replace(PLACE, variant="emit")}, "architecture"),
-    ({"box": Box((-3, -3, 0), (3, 3, 3))}, "box"), ({"rays": crowd(people=7)}, "rays"), ({"settings": replace(SHORT, steps=5)}, "settings"),
-    ({"align": Similarity([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}, "align"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"config": replace(PLACE, width=8)}, "architecture"),
+        ({"config": replace(PLACE, variant="emit")}, "architecture"),
+        ({"box": Box((-3, -3, 0), (3, 3, 3))}, "box"),
+        ({"rays": crowd(people=7)}, "rays"),
+        ({"settings": replace(SHORT, steps=5)}, "settings"),
+        ({"align": Similarity([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}, "align"),
+    ],
+)
 def test_members_of_another_run_are_refused(tmp_path, change, said):
-    """Finished members count as members only of the run that they are of: of another architecture they would be averaged with it."""
+    """Finished members count as members only of the run that they are of: of another architecture they would be
+    averaged with it."""
     path, run = tmp_path / "a.run", {"rays": crowd(), "box": BOX, "config": PLACE, "settings": SHORT, "align": None}
-    train = lambda **more: train_ensemble(2, more["rays"], None, more["box"], more["config"], more["settings"], PROBES, ns, more["align"],
-                                          state=path, resume="stop" not in more, on_progress=more.get("stop"))
+    train = lambda **more: train_ensemble(
+        2,
+        more["rays"],
+        None,
+        more["box"],
+        more["config"],
+        more["settings"],
+        PROBES,
+        ns,
+        more["align"],
+        state=path,
+        resume="stop" not in more,
+        on_progress=more.get("stop"),
+    )
 
     def stop(state):
         if state.stage == "2/2 fit":
@@ -133,7 +166,8 @@ def test_members_of_another_run_are_refused(tmp_path, change, said):
 
 
 def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):  # noqa: F811
-    """Refused at the end: the next start trains no member again; nor does one that was killed before it removed a state."""
+    """Refused at the end: the next start trains no member again; nor does one that was killed before it removed a
+    state."""
     threads(1)
     path, stages = tmp_path / "a.run", []
     with pytest.raises(NergError, match="fp16.*--resume writes it"):
@@ -146,7 +180,10 @@ def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):  # noqa:
 
 
 def test_what_cannot_be_resampled_is_refused():
-    for members, said, options in ((1, "at least two members", {}), (2, "who would predict themselves", {"probes": replace(PROBES, kappa_rule="loo")})):
+    for members, said, options in (
+        (1, "at least two members", {}),
+        (2, "who would predict themselves", {"probes": replace(PROBES, kappa_rule="loo")}),
+    ):
         with pytest.raises(ValueError, match=said):
             together(members, **options)
     with pytest.raises(ValueError, match="trained on rays alone"):
@@ -163,8 +200,10 @@ def test_the_command(rgb, tmp_path, capsys):
     crowd().save(tmp_path / "rays.npz")
     out, app = tmp_path / "gaze.safetensors", typer.Typer()
     app.command()(command)
-    app(f"{tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 2 --directions 64 --zones 1 --min-rays 8 --ensemble 2 --half".split(),
-        standalone_mode=False)
+    app(
+        f"{tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 2 --directions 64 --zones 1 --min-rays 8 --ensemble 2 --half".split(),
+        standalone_mode=False,
+    )
     assert "held-out positions" in capsys.readouterr().out
     field, meta = load_gaze(out, ns)
     about = meta["provenance"]["ensemble"]

@@ -1,4 +1,5 @@
 """Likelihood training: the fast path is the field, gradients, the loss is the divergence, a law is learnt."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -7,22 +8,32 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.rays.rays import Rays
-from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.field.backend import namespace
 from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.field.backend import namespace
 from nerg_mi.field.gaze.log_density import blind_table, table_directions
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer, _log_mean_exp
+from nerg_mi.training.gaze.log_density_model import log_gaze, used_parameters
 from nerg_mi.training.gaze.losses import KLD_EPS
 from nerg_mi.training.gaze.recipes import gaze_recipe
 from nerg_mi.training.gaze.settings import GazeSettings
 from nerg_mi.training.gaze.supervision import Supervision, blind_prior
-from nerg_mi.training.gaze.log_density_model import log_gaze, used_parameters
 from nerg_mi.transport.observer.integral import nearest_depth
 from tests.field.gaze.test_log_density import BOX, SMALL, jit, made, vectors
 
-FAST = GazeSettings(steps=150, loss="likelihood", integral=0.0, probes=4, directions=128, rays=64, learning_rate=1e-2,
-                    weight_decay=0.1, zones=0, average=0.9)
+FAST = GazeSettings(
+    steps=150,
+    loss="likelihood",
+    integral=0.0,
+    probes=4,
+    directions=128,
+    rays=64,
+    learning_rate=1e-2,
+    weight_decay=0.1,
+    zones=0,
+    average=0.9,
+)
 
 
 def supervision(probes=6, count=512, seed=0):
@@ -37,8 +48,14 @@ def supervision(probes=6, count=512, seed=0):
     with np.errstate(divide="ignore"):
         t = (1.5 - positions[:, None, 0]) / d[..., 0]
     escaped = ~((t > 0) & (t < 10))
-    return Supervision(positions.astype(np.float32), d.astype(np.float32), truth.astype(np.float32),
-                       np.where(escaped, 3, t).astype(np.float32), escaped, blind=np.full((8, 16), -np.log(4 * np.pi)))
+    return Supervision(
+        positions.astype(np.float32),
+        d.astype(np.float32),
+        truth.astype(np.float32),
+        np.where(escaped, 3, t).astype(np.float32),
+        escaped,
+        blind=np.full((8, 16), -np.log(4 * np.pi)),
+    )
 
 
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
@@ -59,7 +76,16 @@ def test_gradients_reach_what_the_variant_uses(variant):
     parameters = used_parameters(field.config, field.parameters())
     dr.enable_grad(parameters)
     p_o, p_od, r = vectors(4)
-    logit = log_gaze(field.config, BOX, {**field.parameters(), **parameters}, jit(p_od), jit(p_o[:1]), jit(r), ns.Bool([True] + 3 * [False]), ns)
+    logit = log_gaze(
+        field.config,
+        BOX,
+        {**field.parameters(), **parameters},
+        jit(p_od),
+        jit(p_o[:1]),
+        jit(r),
+        ns.Bool([True] + 3 * [False]),
+        ns,
+    )
     dr.backward(dr.sum(logit))
     assert "prior" not in parameters
     for name, value in parameters.items():
@@ -75,7 +101,9 @@ def test_log_mean_exp():
 def test_the_loss_is_the_cross_entropy():
     """Over all directions and many rays, what is drawn is what it stands for."""
     data, ns = supervision(3), namespace("llvm")
-    trainer = LikelihoodTrainer(data, BOX, replace(SMALL, mix=0.0), replace(FAST, probes=3, directions=512, rays=8192), ns)
+    trainer = LikelihoodTrainer(
+        data, BOX, replace(SMALL, mix=0.0), replace(FAST, probes=3, directions=512, rays=8192), ns
+    )
     trainer._backward()
     drawn = float(trainer.loss[0])
     scores = trainer.measure(data)
@@ -117,7 +145,9 @@ def test_a_law_is_learnt_and_holds_elsewhere():
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
 def test_equal_seeds_train_equal_fields(variant):
     def train(seed):
-        trainer = LikelihoodTrainer(supervision(), BOX, replace(SMALL, variant=variant), replace(FAST, seed=seed), namespace("llvm"))
+        trainer = LikelihoodTrainer(
+            supervision(), BOX, replace(SMALL, variant=variant), replace(FAST, seed=seed), namespace("llvm")
+        )
         for _ in range(4):
             trainer.step()
         return trainer.weights()
@@ -142,7 +172,9 @@ def test_holes_take_the_depth_around_them():
 def test_recipes():
     assert gaze_recipe().settings["zones"] == 0 and GazeSettings(**gaze_recipe("small").settings).zones == 3
     # The one has to be told to look longer where there are views alone; the others' lengths stay their own.
-    assert gaze_recipe().views_alone["steps"] > gaze_recipe().settings["steps"] and gaze_recipe().views_alone["zones"] == 3
+    assert (
+        gaze_recipe().views_alone["steps"] > gaze_recipe().settings["steps"] and gaze_recipe().views_alone["zones"] == 3
+    )
     assert all("steps" not in gaze_recipe(name).views_alone for name in ("small", "paper"))
     assert gaze_recipe().config.normalized and gaze_recipe("paper").config.activation == "linear"
     assert gaze_recipe("small", "emit").config.variant == "emit"

@@ -3,8 +3,8 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.evaluation import saliency as metrics
+from nerg_mi.maths.sphere import latlong_grid
 from nerg_mi.training.gaze.losses import CODE, KLD_EPS, PAPER, gaze_loss
 
 P, D = 5, 128
@@ -52,7 +52,9 @@ def test_gradient_is_that_of_finite_differences(densities, weights):
         up, down = guess.copy(), guess.copy()
         up[p, d] += h
         down[p, d] -= h
-        want = (loss(ns.Float64, up, truth, **weights).total[0] - loss(ns.Float64, down, truth, **weights).total[0]) / (2 * h)
+        want = (loss(ns.Float64, up, truth, **weights).total[0] - loss(ns.Float64, down, truth, **weights).total[0]) / (
+            2 * h
+        )
         assert np.isclose(slope[p, d], want, rtol=1e-5, atol=1e-9)
 
 
@@ -71,7 +73,8 @@ def test_constants_give_numbers(densities, value, Float):
 
 @pytest.mark.parametrize("Float", [ns.Float32, ns.Float64])
 def test_negative_predictions_count_as_zero_in_the_divergence(densities, Float):
-    """A linear activation predicts both signs: the divergence is that of the clamped prediction, and moves only what is positive."""
+    """A linear activation predicts both signs: the divergence is that of the clamped prediction, and moves only what is
+    positive."""
     truth, guess = densities
     guess = guess - 0.4
     assert (guess < 0).any(axis=1).all() and (guess > 0).any(axis=1)[:3].all()

@@ -1,4 +1,6 @@
-"""Views as supervision: what they hold, likelihood and losses given a view, the blind density, a law learnt from views."""
+"""Views as supervision: what they hold, likelihood and losses given a view, the blind density, a law learnt from
+views."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -6,18 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.capture.cameras import Camera, pixel_directions
-from nerg_mi.capture.salience.views import SalienceView
+from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
+from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.gaze.log_density import look_up
-from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.training.gaze.trainer import GazeTrainer
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer
 from nerg_mi.training.gaze.run import train_gaze
-from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
-from nerg_mi.training.gaze.supervision import Supervision
 from nerg_mi.training.gaze.salience import (
     blind_of_views,
     digest_views,
@@ -26,9 +25,14 @@ from nerg_mi.training.gaze.salience import (
     supervise_views,
     together,
 )
+from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+from nerg_mi.training.gaze.supervision import Supervision
+from nerg_mi.training.gaze.trainer import GazeTrainer
 from nerg_mi.transport.media.media import Similarity
 from tests.field.gaze.test_log_density import BOX, SMALL
-from .test_trainer import SMALL as PLAIN, looking_at
+
+from .test_trainer import SMALL as PLAIN
+from .test_trainer import looking_at
 
 LENS = Intrinsics(24, 18, 14.0, 14.0, 12.0, 9.0, k1=-0.08)
 HOW = ProbeSettings(directions=512, radius=0.25, min_rays=1)
@@ -82,7 +86,9 @@ def test_directions_and_densities_of_a_view():
         given = lobe(v.camera.center, found.directions[k].astype(float))
         given /= given.mean() * found.extent[k]
         assert np.corrcoef(given, found.truth[k])[0, 1] > 0.9
-    assert digest_views(views) == digest_views(around(3)) != digest_views(around(3, seed=1)) and digest_views([]) is None
+    assert (
+        digest_views(views) == digest_views(around(3)) != digest_views(around(3, seed=1)) and digest_views([]) is None
+    )
 
 
 def test_the_likelihood_is_given_the_view():
@@ -109,8 +115,13 @@ def test_the_likelihood_is_given_the_view():
 def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
     """But do for probes of rays that are beside them."""
     data, ns = supervise_views(around(3), None, BOX, HOW), namespace("llvm")
-    sphere = Supervision(data.positions, np.broadcast_to(fibonacci_directions(512), (3, 512, 3)).astype(np.float32),
-                         np.full((3, 512), 1 / (4 * np.pi), np.float32), data.distance, data.escaped)
+    sphere = Supervision(
+        data.positions,
+        np.broadcast_to(fibonacci_directions(512), (3, 512, 3)).astype(np.float32),
+        np.full((3, 512), 1 / (4 * np.pi), np.float32),
+        data.distance,
+        data.escaped,
+    )
     settings = GazeSettings(steps=1, zones=0)
     of = lambda data, scale: GazeTrainer(data, BOX, replace(PLAIN, emit_scale=scale), settings, ns).measure(data)
     np.testing.assert_allclose(of(data, 0.1), of(data, 0.7), rtol=1e-4, atol=1e-6)
@@ -153,8 +164,19 @@ def test_one_view_counts_as_much_as_the_uniform_one_that_links_all():
 
 def test_a_law_is_learnt_from_views_alone_and_holds_around():
     views, ns = around(90), namespace("llvm")
-    settings = GazeSettings(steps=120, loss="likelihood", integral=0.0, probes=12, directions=128, rays=64, learning_rate=1e-2,
-                            weight_decay=0.1, zones=2, average=0.9, looks=4)
+    settings = GazeSettings(
+        steps=120,
+        loss="likelihood",
+        integral=0.0,
+        probes=12,
+        directions=128,
+        rays=64,
+        learning_rate=1e-2,
+        weight_decay=0.1,
+        zones=2,
+        average=0.9,
+        looks=4,
+    )
     config = replace(SMALL, mix=0.05, geometry="none", prior=16)
     field, about = train_gaze(None, None, BOX, config, settings, replace(HOW, radius=0.1), ns, views=views)
     assert about["rays"] == 0 and about["salience_views"] == 90 and about["validation"]["views_held_out"] >= 10
@@ -176,7 +198,9 @@ def test_rays_and_views_train_one_field():
     settings = GazeSettings(steps=4, probes=4, directions=32, zones=1, watched=4, looks=2)
     how = ProbeSettings(radius=0.25, count=8, cap=64, min_rays=4, directions=64)
     for config, more in ((PLAIN, {}), (SMALL, {"loss": "likelihood"})):
-        field, about = train_gaze(rays, None, BOX, config, replace(settings, **more), how, namespace("llvm"), views=views)
+        field, about = train_gaze(
+            rays, None, BOX, config, replace(settings, **more), how, namespace("llvm"), views=views
+        )
         assert about["rays"] == 400 and about["salience_views"] == 6 and about["probes_made"] == 14
         assert all(np.isfinite(np.array(v)).all() for v in field.parameters().values())
 
@@ -202,7 +226,8 @@ def in_a_row(count):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_zones_lie_far_from_one_another(seed):
-    """Of two, the second is around one of the quarter of the views that is farthest from the first; an eighth is watched."""
+    """Of two, the second is around one of the quarter of the views that is farthest from the first; an eighth is
+    watched."""
     views = in_a_row(40)
     learn, watched = split_views(views, 2, 0.5, seed)
     at = sorted(int(v.name[1:]) for v in watched)

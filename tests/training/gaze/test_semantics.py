@@ -1,4 +1,5 @@
 """Gaze fields that learn on a radiance field's features, and such that begin as its trunk."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -7,18 +8,18 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.rays.rays import Rays
 from nerg_mi.field.backend import namespace
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeField
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
-from nerg_mi.training.gaze.trainer import GazeTrainer
+from nerg_mi.maths.box import Box
+from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.product_model import gaze_density
 from nerg_mi.training.gaze.semantics import config_like, semantic_features, trunk_of
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
 from nerg_mi.training.gaze.supervision import supervise_rays
+from nerg_mi.training.gaze.trainer import GazeTrainer
 from nerg_mi.transport.media.media import FieldMedium
 from nerg_mi.transport.trace import default_settings
 
@@ -30,7 +31,9 @@ PROBES = ProbeSettings(radius=0.5, count=12, cap=64, min_rays=8, kappa=20.0, dir
 def place(rgb):
     """A random radiance field, dense enough to have surfaces."""
     ns = namespace("llvm")
-    config = RadianceConfig(HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=5, sh_degree=2, density_scale=6.0)
+    config = RadianceConfig(
+        HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=5, sh_degree=2, density_scale=6.0
+    )
     field = RadianceField.random(config, BOX, ns, 0, march_step=0.1)
     table = np.random.default_rng(0).normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
@@ -42,7 +45,14 @@ def rays():
     rng = np.random.default_rng(1)
     origin = rng.uniform([-1, -1, 1.5], [1, 1, 1.7], (300, 3))
     direction = np.array([1.5, 0.4, 1.2]) + rng.normal(0, 0.15, (300, 3)) - origin
-    return Rays(np.arange(300), np.arange(300) % 2, ("a", "b"), origin, direction / np.linalg.norm(direction, axis=1, keepdims=True), np.ones(300))
+    return Rays(
+        np.arange(300),
+        np.arange(300) % 2,
+        ("a", "b"),
+        origin,
+        direction / np.linalg.norm(direction, axis=1, keepdims=True),
+        np.ones(300),
+    )
 
 
 def test01_the_trunk_gives_the_fields_features(place):
@@ -122,16 +132,44 @@ def test05_the_command(rgb, place, rays, tmp_path, capsys):
 
     save_radiance(place, tmp_path / "field.safetensors", {"test": 0})
     rays.save(tmp_path / "rays.npz")
-    arguments = ["train", "gaze", str(tmp_path / "rays.npz"), "-o", str(tmp_path / "gaze.safetensors"), "--field", str(tmp_path / "field.safetensors"),
-                 "--semantic", "snapshot", "--begin", "field", "--freeze", "--steps", "4", "--probes", "6", "--radius", "0.5", "--min-rays", "8",
-                 "--directions", "32", "--zones", "0", "--recipe", "small"]
+    arguments = [
+        "train",
+        "gaze",
+        str(tmp_path / "rays.npz"),
+        "-o",
+        str(tmp_path / "gaze.safetensors"),
+        "--field",
+        str(tmp_path / "field.safetensors"),
+        "--semantic",
+        "snapshot",
+        "--begin",
+        "field",
+        "--freeze",
+        "--steps",
+        "4",
+        "--probes",
+        "6",
+        "--radius",
+        "0.5",
+        "--min-rays",
+        "8",
+        "--directions",
+        "32",
+        "--zones",
+        "0",
+        "--recipe",
+        "small",
+    ]
     with pytest.raises(SystemExit) as end:
         main(arguments)
     assert not end.value.code, capsys.readouterr().err
     gaze, about = load_gaze(tmp_path / "gaze.safetensors", namespace("llvm"))
     assert gaze.config.semantic == "snapshot" and about["provenance"]["begins_as"] == "field.safetensors"
     assert np.array_equal(np.array(gaze.grid.table), np.array(place.grid.table))
-    for wrong, said in ((["--freeze"], "add it, or leave --freeze out"), (["--begin", "nerf"], 'must be "random" or "field"')):
+    for wrong, said in (
+        (["--freeze"], "add it, or leave --freeze out"),
+        (["--begin", "nerf"], 'must be "random" or "field"'),
+    ):
         with pytest.raises(SystemExit) as end:
             main([a for a in arguments if a not in ("--freeze", "--begin", "field")] + wrong)
         assert end.value.code == 1 and said in " ".join(capsys.readouterr().err.split())
@@ -144,13 +182,21 @@ def test_features_of_training_are_those_of_rendering(rgb, place, tmp_path, monke
     save_radiance(place, tmp_path / "field.safetensors", {})
     config = config_like(place.config, "emit", "softplus", semantic=kind)
     save_gaze(GazeField.random(config, BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
-    integrator = {"type": "nerg", "aovs": "opacity,position,gaze", "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
-                  "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")}}  # fmt: skip
+    integrator = {
+        "type": "nerg",
+        "aovs": "opacity,position,gaze",
+        "field": {"type": "nerf", "filename": str(tmp_path / "field.safetensors")},
+        "gaze": {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")},
+    }
     if cutoff is not None:
         integrator["color_cutoff"] = cutoff
     eye = np.array([0.1, -1.9, 1.6])
-    sensor = {"type": "perspective", "to_world": rgb.ScalarTransform4f().look_at(eye.tolist(), [0, 0, 1.4], [0, 0, 1]), "near_clip": 1e-4,
-              "film": {"type": "hdrfilm", "width": 8, "height": 8, "component_format": "float32", "rfilter": {"type": "box"}}}  # fmt: skip
+    sensor = {
+        "type": "perspective",
+        "to_world": rgb.ScalarTransform4f().look_at(eye.tolist(), [0, 0, 1.4], [0, 0, 1]),
+        "near_clip": 1e-4,
+        "film": {"type": "hdrfilm", "width": 8, "height": 8, "component_format": "float32", "rfilter": {"type": "box"}},
+    }
     scene, given = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor}), []
     made = scene.integrator()
     if cutoff is None:
@@ -163,7 +209,9 @@ def test_features_of_training_are_those_of_rendering(rgb, place, tmp_path, monke
     met = picture[:, 0] >= 0.5
     way = picture[:, 1:4] - eye
     distance = np.linalg.norm(way, axis=1)
-    trained = semantic_features(made.medium, np.broadcast_to(eye, way.shape)[met], (way / distance[:, None])[met], distance[met], kind)
+    trained = semantic_features(
+        made.medium, np.broadcast_to(eye, way.shape)[met], (way / distance[:, None])[met], distance[met], kind
+    )
     assert met.sum() > 30 and np.ptp(rendered[met]) > 0.1
     # Half precision, and directions that were read back from positions.
     np.testing.assert_allclose(rendered[met], trained, atol=2e-3 * np.abs(trained).max())

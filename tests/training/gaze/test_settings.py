@@ -1,4 +1,5 @@
 """Settings of a gaze training: their limits, and the learning rate over a run."""
+
 import pytest
 
 from nerg_mi.training.gaze.recipes import gaze_recipe
@@ -10,7 +11,16 @@ def test_limits_are_where_they_are_said_to_be():
     for wrong in ({"count": 0}, {"directions": 15}):
         with pytest.raises(ValueError, match="at least one probe and 16 directions"):
             ProbeSettings(**wrong)
-    least = {"probes": 1, "directions": 1, "rays": 1, "looks": 1, "weight_decay": 0.0, "integral": 0.0, "zones": 0, "patience": 0}
+    least = {
+        "probes": 1,
+        "directions": 1,
+        "rays": 1,
+        "looks": 1,
+        "weight_decay": 0.0,
+        "integral": 0.0,
+        "zones": 0,
+        "patience": 0,
+    }
     GazeSettings(steps=1, **least)
     for name in least:
         with pytest.raises(ValueError, match="nothing negative"):
@@ -28,7 +38,11 @@ def test_the_learning_rate_is_held_and_then_falls_to_its_last():
 
 def test_a_larger_field_has_more_of_everything():
     small, paper = sized_gaze_config("small"), sized_gaze_config("paper")
-    assert small.grid.size < paper.grid.size and small.grid.levels < paper.grid.levels and small.grid.log2_rows < paper.grid.log2_rows
+    assert (
+        small.grid.size < paper.grid.size
+        and small.grid.levels < paper.grid.levels
+        and small.grid.log2_rows < paper.grid.log2_rows
+    )
 
 
 def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():

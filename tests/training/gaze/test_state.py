@@ -1,4 +1,5 @@
 """A gaze training that is interrupted and resumed comes to what an uninterrupted one comes to."""
+
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig
 from nerg_mi.training.gaze.run import train_gaze
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+
 from .test_trainer import BOX, GRID, SMALL, looking_at, wall  # noqa: F401  (fixture)
 
 RAYS = looking_at((1.5, 0, 1.2), 3000, spread=6.0)
@@ -50,9 +52,11 @@ def stopping(stage, step):
     return watch
 
 
-@pytest.mark.parametrize("settings, config, probes, count", [
-    (PRODUCT, SMALL, PROBES, 1), (LIKELIHOOD, LOG, replace(PROBES, fresh=True), 1), (LIKELIHOOD, LOG, PROBES, 2),
-], ids=["product", "fresh", "two threads"])  # fmt: skip
+@pytest.mark.parametrize(
+    "settings, config, probes, count",
+    [(PRODUCT, SMALL, PROBES, 1), (LIKELIHOOD, LOG, replace(PROBES, fresh=True), 1), (LIKELIHOOD, LOG, PROBES, 2)],
+    ids=["product", "fresh", "two threads"],
+)
 def test_a_resumed_run_equals_an_uninterrupted_one(wall, settings, config, probes, count, threads, tmp_path):  # noqa: F811
     """Bit for bit at one thread, to 1e-5 at two; interrupted in both of its fits, past validations and epochs."""
     threads(count)
@@ -66,11 +70,29 @@ def test_a_resumed_run_equals_an_uninterrupted_one(wall, settings, config, probe
     assert about["interrupted"] and path.is_file() and ("fit", 5) not in watch.seen and ("fit", 6) in watch.seen
     watch = stopping("", 0)
     there = []
-    got, about = train(wall, settings, config, probes, state=path, resume=True, on_progress=watch, write=lambda *_: there.append(path.is_file()))
-    assert not about["interrupted"] and there == [True] and not path.exists() and {s for s, _ in watch.seen} == {"probes", "refit"}
+    got, about = train(
+        wall,
+        settings,
+        config,
+        probes,
+        state=path,
+        resume=True,
+        on_progress=watch,
+        write=lambda *_: there.append(path.is_file()),
+    )
+    assert (
+        not about["interrupted"]
+        and there == [True]
+        and not path.exists()
+        and {s for s, _ in watch.seen} == {"probes", "refit"}
+    )
     assert ("refit", 3) not in watch.seen and ("refit", 4) in watch.seen
     for name, value in expected.parameters().items():
-        compare = np.testing.assert_array_equal if count == 1 else lambda a, b, err_msg: np.testing.assert_allclose(a, b, atol=1e-5, err_msg=err_msg)
+        compare = (
+            np.testing.assert_array_equal
+            if count == 1
+            else lambda a, b, err_msg: np.testing.assert_allclose(a, b, atol=1e-5, err_msg=err_msg)
+        )
         compare(np.array(got.parameters()[name]), np.array(value), err_msg=name)
     if count == 1:
         assert about["validation"] == whole["validation"] and about["steps"] == whole["steps"]
@@ -92,7 +114,9 @@ def test_the_state_is_kept_every_so_often_and_when_asked(monkeypatch, tmp_path):
 
     clock, kept = [100.0], []
     monkeypatch.setattr(gaze_state.time, "perf_counter", lambda: clock[0])
-    monkeypatch.setattr(gaze_state, "write_checkpoint", lambda path, kind, tensors, meta: kept.append((clock[0], meta["spent"])))
+    monkeypatch.setattr(
+        gaze_state, "write_checkpoint", lambda path, kind, tensors, meta: kept.append((clock[0], meta["spent"]))
+    )
     file = gaze_state.GazeRunFile(tmp_path / "a.run", {}, 10.0, False)
     for clock[0] in (105.0, 109.0, 111.0, 112.0, 120.0, 122.5):
         file.keep("fit", None, {}, {}, now=clock[0] == 112.0)
@@ -152,7 +176,9 @@ def test_a_result_that_cannot_be_written_is_kept(wall, refit, threads, tmp_path)
         train(wall, settings, SMALL, write=refuse, **how)
     assert path.is_file()
     watch = stopping("", 0)
-    field, _ = train(wall, settings, SMALL, resume=True, on_progress=watch, write=lambda *given: written.append(given), **how)
+    field, _ = train(
+        wall, settings, SMALL, resume=True, on_progress=watch, write=lambda *given: written.append(given), **how
+    )
     assert {s for s, _ in watch.seen} == {"probes"} and written[0][0] is field and not path.exists()
     expected = train(wall, settings, SMALL)[0].parameters()
     for name, value in field.parameters().items():
@@ -180,7 +206,12 @@ def test_the_command_goes_on(rgb, tmp_path, monkeypatch, capsys):
     assert code == 130 and "go on with --resume" in said and out.is_file() and out.with_suffix(".run").is_file()
     code, said = nerg("--resume")
     about = load_gaze(out, namespace("llvm"))[1]["provenance"]
-    assert about["steps"] == 8 and not about["interrupted"] and about["probes"]["fresh"] and not out.with_suffix(".run").exists()
+    assert (
+        about["steps"] == 8
+        and not about["interrupted"]
+        and about["probes"]["fresh"]
+        and not out.with_suffix(".run").exists()
+    )
     assert code == 0 and "go on" not in said
 
 

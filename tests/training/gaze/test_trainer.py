@@ -1,4 +1,6 @@
-"""Gaze training: the fast path is the field, one probe is learnt, equal seeds agree, escapes, hit geometry, the command."""
+"""Gaze training: the fast path is the field, one probe is learnt, equal seeds agree, escapes, hit geometry, the
+command."""
+
 from __future__ import annotations
 
 import json
@@ -9,18 +11,18 @@ import numpy as np
 import pytest
 
 from nerg_mi.density.probes import place_probes
-from nerg_mi.rays.rays import Rays
 from nerg_mi.field.backend import namespace
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.formats.volumes import write_volume
+from nerg_mi.maths.box import Box
+from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze import run as gaze_run
-from nerg_mi.training.gaze.trainer import GazeTrainer, _Samples
 from nerg_mi.training.gaze.product_model import gaze_density, used_parameters
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings, sized_gaze_config
 from nerg_mi.training.gaze.supervision import Supervision, box_exit, rotated_sets, supervise, supervise_rays
-from nerg_mi.formats.volumes import write_volume
+from nerg_mi.training.gaze.trainer import GazeTrainer, _Samples
 from nerg_mi.training.geometry.hit_geometry import volume_dict, voxelise_hits
 from nerg_mi.transport.media.media import Similarity, VolumeMedium
 
@@ -57,7 +59,8 @@ def wall(rgb):
 
 @pytest.fixture
 def drawn():
-    """Three probes of four directions, the first of the whole sphere, the others of parts of it; and that on the device."""
+    """Three probes of four directions, the first of the whole sphere, the others of parts of it; and that on the
+    device."""
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3, 4, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
@@ -135,7 +138,8 @@ def test_one_probe_is_learnt(rays, wall):
 
 @pytest.mark.parametrize("average", [0.0, 0.3, 0.999])
 def test_what_is_kept_is_the_average_of_the_weights_so_far(rays, wall, average):
-    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) after k steps, of ``average`` later."""
+    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) after k steps, of ``average``
+    later."""
     probes = place_probes(rays, 0.5, queries=[[-0.6, 0, 1.6]], min_rays=8, kappa_rule="fixed", kappa=20.0)
     settings = GazeSettings(steps=5, learning_rate=1e-2, zones=0, average=average)
     trainer = GazeTrainer(supervise(probes, wall, BOX, 64), BOX, SMALL, settings, namespace("llvm"))
@@ -181,7 +185,9 @@ def test_exits_of_a_box():
 def test_sets_of_directions_are_turned_each_its_own_way():
     sets = rotated_sets(64, 3, np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(sets, axis=-1), 1)
-    np.testing.assert_allclose(sets @ sets.transpose(0, 2, 1), np.broadcast_to((sets @ sets.transpose(0, 2, 1))[0], (3, 64, 64)), atol=1e-12)
+    np.testing.assert_allclose(
+        sets @ sets.transpose(0, 2, 1), np.broadcast_to((sets @ sets.transpose(0, 2, 1))[0], (3, 64, 64)), atol=1e-12
+    )
     assert np.abs(sets[0] - sets[1]).max() > 0.1
 
 
@@ -191,7 +197,9 @@ def test_rays_are_aligned_with_the_field(rays, wall):
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = 2 * turn, (0.3, -0.4, 0.5)
     inverse = np.linalg.inv(matrix)
-    moved = replace(rays, origin=rays.origin @ inverse[:3, :3].T + inverse[:3, 3], direction=rays.direction @ turn, hit=None)
+    moved = replace(
+        rays, origin=rays.origin @ inverse[:3, :3].T + inverse[:3, 3], direction=rays.direction @ turn, hit=None
+    )
     probes = lambda r, radius: place_probes(r, radius, count=8, min_rays=8, kappa_rule="fixed", seed=1)
     a = supervise(probes(rays, 0.5), wall, BOX, 32)
     b = supervise(probes(moved, 0.25), wall, BOX, 32, Similarity(matrix))
@@ -222,7 +230,9 @@ def test_validation_stops_and_the_best_is_fitted_again(rgb):
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "data": data, "to_world": to_world}))
     settings = GazeSettings(steps=12, looks=4, zones=2, watched=6, probes=4, directions=32)
     states = []
-    field, about = gaze_run.train_gaze(rays, medium, box, SMALL, settings, PROBES, namespace("llvm"), on_progress=states.append)
+    field, about = gaze_run.train_gaze(
+        rays, medium, box, SMALL, settings, PROBES, namespace("llvm"), on_progress=states.append
+    )
     v = about["validation"]
     assert v["best_step"] in [h["steps"] for h in v["history"]] and about["refitted"]
     assert about["steps"] == v["best_step"] and v["loss"] == min(h["loss"] for h in v["history"])
@@ -234,10 +244,26 @@ def test_validation_stops_and_the_best_is_fitted_again(rgb):
 @pytest.mark.parametrize("patience, looks", [(3, 4), (1, 2), (0, 10)])
 def test_a_run_ends_when_looking_has_been_in_vain_for_long_enough(wall, patience, looks):
     """Nothing is learnt at a rate of next to nothing: the first look is the best, and ``patience`` more are taken."""
-    settings = GazeSettings(steps=20, looks=10, patience=patience, zones=2, watched=6, probes=4, directions=32, learning_rate=1e-30, refit=False)
-    _, about = gaze_run.train_gaze(looking_at((1.5, 0, 1.2), 3000, spread=6.0), wall, BOX, SMALL, settings, PROBES, namespace("llvm"))
+    settings = GazeSettings(
+        steps=20,
+        looks=10,
+        patience=patience,
+        zones=2,
+        watched=6,
+        probes=4,
+        directions=32,
+        learning_rate=1e-30,
+        refit=False,
+    )
+    _, about = gaze_run.train_gaze(
+        looking_at((1.5, 0, 1.2), 3000, spread=6.0), wall, BOX, SMALL, settings, PROBES, namespace("llvm")
+    )
     v = about["validation"]
-    assert [h["steps"] for h in v["history"]] == [2 * k for k in range(1, looks + 1)] and v["best_step"] == 2 and about["steps"] == 2 * looks
+    assert (
+        [h["steps"] for h in v["history"]] == [2 * k for k in range(1, looks + 1)]
+        and v["best_step"] == 2
+        and about["steps"] == 2 * looks
+    )
 
 
 def test_a_place_made_of_hits(rgb, rays, tmp_path):
@@ -275,7 +301,13 @@ def test_weights_of_zero_are_the_uniform_density(variant, activation):
 
 
 def test_settings_that_make_no_sense_are_refused():
-    for wrong in ({}, {"steps": 1, "minutes": 1.0}, {"steps": 0}, {"steps": 1, "loss": "mse"}, {"steps": 1, "probes": 0}):
+    for wrong in (
+        {},
+        {"steps": 1, "minutes": 1.0},
+        {"steps": 0},
+        {"steps": 1, "loss": "mse"},
+        {"steps": 1, "probes": 0},
+    ):
         with pytest.raises(ValueError):
             GazeSettings(**wrong)
     with pytest.raises(ValueError, match="size"):
@@ -298,7 +330,9 @@ def test_the_command_trains_on_hits(rays, tmp_path, monkeypatch, capsys):
     assert "meet no surface" in said and out.with_suffix(".vol").exists()
     field, meta = load_gaze(out, namespace("llvm"))
     about = meta["provenance"]
-    assert about["steps"] == 3 and len(about["rays_file"]["sha256"]) == 64 and len(about["geometry_file"]["sha256"]) == 64
+    assert (
+        about["steps"] == 3 and len(about["rays_file"]["sha256"]) == 64 and len(about["geometry_file"]["sha256"]) == 64
+    )
     with pytest.raises(ValueError, match="one of --field FILE, --scene FILE"):
         app([str(tmp_path / "rays.npz"), "-o", str(out)], standalone_mode=False)
     with pytest.raises(ValueError, match="add --recipe small"):
@@ -318,11 +352,17 @@ def test_recipes_in_a_scene_of_shapes(rgb, rays, tmp_path, recipe):
     rays.save(tmp_path / "rays.npz")
     app, out = typer.Typer(), tmp_path / "gaze.safetensors"
     app.command()(train_gaze)
-    app(f"{tmp_path / 'rays.npz'} --scene {tmp_path / 'scene.xml'} --recipe {recipe} -o {out} --radius 0.5 --probes 6 --min-rays 8 "
-        f"--steps 2 --directions 64 --zones 0 {'--size small' if recipe == 'paper' else ''}".split(), standalone_mode=False)
+    app(
+        f"{tmp_path / 'rays.npz'} --scene {tmp_path / 'scene.xml'} --recipe {recipe} -o {out} --radius 0.5 --probes 6 --min-rays 8 "
+        f"--steps 2 --directions 64 --zones 0 {'--size small' if recipe == 'paper' else ''}".split(),
+        standalone_mode=False,
+    )
     field, meta = load_gaze(out, namespace("llvm"))
     assert meta["provenance"]["recipe"] == recipe and 0.3 < meta["provenance"]["escaped_directions"] < 0.9
-    assert meta["output"] == {"activation": {"default": "log", "small": "softplus", "paper": "linear"}[recipe], "normalized": recipe == "default"}
+    assert meta["output"] == {
+        "activation": {"default": "log", "small": "softplus", "paper": "linear"}[recipe],
+        "normalized": recipe == "default",
+    }
     place = place_of_scene(tmp_path / "scene.xml")
     data = supervise_rays(rays, place.medium, place.box, PROBES)
     hit = data.positions[:, None] + data.directions * data.distance[..., None]
@@ -337,10 +377,16 @@ def test_without_geometry(rays, tmp_path):
     rays.save(tmp_path / "rays.npz")
     app, out = typer.Typer(), tmp_path / "gaze.safetensors"
     app.command()(train_gaze)
-    arguments = f"{tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 2 --directions 64 --zones 0"
+    arguments = (
+        f"{tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 2 --directions 64 --zones 0"
+    )
     app(arguments.split(), standalone_mode=False)
     field, meta = load_gaze(out, namespace("llvm"))
-    assert field.config.geometry == "none" and meta["provenance"]["geometry"] == "none" and meta["provenance"]["escaped_directions"] == 0
+    assert (
+        field.config.geometry == "none"
+        and meta["provenance"]["geometry"] == "none"
+        and meta["provenance"]["escaped_directions"] == 0
+    )
     with pytest.raises(ValueError, match="needs surfaces"):
         app([*arguments.split(), "--recipe", "small"], standalone_mode=False)
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.training.geometry.places import place_of_hits
 from nerg_mi.training.geometry.hit_extent import PAD, VOXEL, hit_extent
 from nerg_mi.training.geometry.hit_geometry import voxelise_hits
+from nerg_mi.training.geometry.places import place_of_hits
 from nerg_mi.transport.trace import trace_depth
 from tests.reference.office import ROOM, looks_out, office
 
@@ -98,6 +98,11 @@ def test_a_voxel_that_is_asked_for_is_kept(rays):
 
 def test_hits_seen_from_outside_of_the_box_are_left_out(rays, extent):
     """Rays that start and end beyond the shell on one side never are in it."""
-    away = replace(rays.select(np.arange(100)), origin=np.full((100, 3), 60.0), hit=np.full((100, 3), 70.0), direction=np.full((100, 3), 3**-0.5))
+    away = replace(
+        rays.select(np.arange(100)),
+        origin=np.full((100, 3), 60.0),
+        hit=np.full((100, 3), 70.0),
+        direction=np.full((100, 3), 3**-0.5),
+    )
     density, _ = voxelise_hits(away, extent=extent)
     assert not density.any()

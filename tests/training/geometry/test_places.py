@@ -23,11 +23,21 @@ def test_a_whole_one(rgb, volume):
     assert place_of_volume(volume).box.upper == (1, 2, 3)
 
 
-@pytest.mark.parametrize("at, value", [
-    (0, b"XOL"), (3, b"\x02"), (4, struct.pack("<i", 2)), (8, struct.pack("<i", -3)), (8, struct.pack("<i", 0)),
-    (12, struct.pack("<i", 2**31 - 1)), (20, struct.pack("<i", -1)), (20, struct.pack("<i", 10**9)),
-    (24, struct.pack("<f", np.nan)), (36, struct.pack("<f", -1)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "at, value",
+    [
+        (0, b"XOL"),
+        (3, b"\x02"),
+        (4, struct.pack("<i", 2)),
+        (8, struct.pack("<i", -3)),
+        (8, struct.pack("<i", 0)),
+        (12, struct.pack("<i", 2**31 - 1)),
+        (20, struct.pack("<i", -1)),
+        (20, struct.pack("<i", 10**9)),
+        (24, struct.pack("<f", np.nan)),
+        (36, struct.pack("<f", -1)),
+    ],
+)
 def test_a_header_that_lies(rgb, volume, at, value):
     data = volume.read_bytes()
     volume.write_bytes(data[:at] + value + data[at + len(value) :])

@@ -1,11 +1,11 @@
 """Compositing of packed samples against a float64 reference and against finite differences."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 from nerg_mi.training.radiance.compositing import Segments, Thinned, ray_sum, weights
-
 from tests.reference import compositing as reference
 
 RAYS = 9
@@ -31,7 +31,7 @@ def test_weights_and_sums_equal_the_reference(packed):
     w = weights(ns.Float(padded_tau), segments)
     expected = reference.weights(tau, ray)
     assert np.allclose(w.numpy()[: len(ray)], expected, atol=2e-7)
-    assert np.all(w.numpy()[len(ray):] == 0)
+    assert np.all(w.numpy()[len(ray) :] == 0)
     x = np.r_[tau, np.full(len(padded_tau) - len(tau), 100.0)]
     assert np.allclose(ray_sum(ns.Float(x), segments).numpy(), reference.ray_sum(tau, ray, RAYS), atol=1e-6)
 
@@ -67,7 +67,7 @@ def test_gradient_agrees_with_finite_differences(packed):
     h = 1e-5
     numeric = [(loss(tau + h * e) - loss(tau - h * e)) / (2 * h) for e in np.eye(len(tau))]
     assert np.allclose(g[: len(tau)], numeric, atol=2e-6)
-    assert np.all(g[len(tau):] == 0)
+    assert np.all(g[len(tau) :] == 0)
 
 
 def test_forward_mode_agrees_with_reverse_mode(packed):

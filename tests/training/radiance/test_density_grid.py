@@ -1,12 +1,13 @@
 """Which cells a training samples: what cameras see, what has density, what surface points hold, and what is stored."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 from nerg_mi.capture.cameras import Camera
-from nerg_mi.maths.box import Box
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.density_grid import DensityGrid
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
@@ -38,7 +39,9 @@ def cube(values):
 def grown(cells):
     """``cells`` and all of their 26 neighbours, by hand."""
     padded = np.pad(cells, 1)
-    return np.any([padded[a : a + R, b : b + R, c : c + R] for a in range(3) for b in range(3) for c in range(3)], axis=0)
+    return np.any(
+        [padded[a : a + R, b : b + R, c : c + R] for a in range(3) for b in range(3) for c in range(3)], axis=0
+    )
 
 
 def around(point, radius, gain=1e3):
@@ -132,13 +135,15 @@ def test_optical_depth_of_a_cell_is_bounded():
 
 @pytest.mark.parametrize("thick", [0.001, 0.01, 3.0])
 def test_while_the_field_is_thin_half_of_its_mean_counts(thick):
-    """Slabs of x of optical depth 1, 0.3, 0.05 and 0 times ``thick``: cells above half of the mean count, and all above the threshold."""
+    """Slabs of x of optical depth 1, 0.3, 0.05 and 0 times ``thick``: cells above half of the mean count, and all above
+    the threshold."""
     grid = DensityGrid(ns, BOX, R, 1.0, above(), 1, threshold=0.3)
     shares = np.array([1, 0.3, 0.05, 0])
 
     def density(p, active):
         k = dr.minimum(ns.UInt32((p.x + 1) * 2), 3)
         return thick * dr.gather(ns.Float, ns.Float(shares), k)
+
     grid.update(density, rng(), everywhere=True)
     bound = min(0.3, 0.5 * thick * shares.mean())
     want = np.broadcast_to(np.repeat(thick * shares > bound, 2), (R, R, R))
@@ -193,8 +198,15 @@ def test_the_bound_finds_what_fills_a_small_part_of_a_cell():
     grid = DensityGrid(ns, BOX, R, 0.1, above(), 1)
     corner = centres()[3, 4, 2] + 1 / R
     inside = lambda p, active: dr.select(
-        (p.x > corner[0] - 0.25 / 3) & (p.x < corner[0]) & (p.y > corner[1] - 0.25 / 3) & (p.y < corner[1])
-        & (p.z > corner[2] - 0.25 / 3) & (p.z < corner[2]), ns.Float(5.0), 0.0)
+        (p.x > corner[0] - 0.25 / 3)
+        & (p.x < corner[0])
+        & (p.y > corner[1] - 0.25 / 3)
+        & (p.y < corner[1])
+        & (p.z > corner[2] - 0.25 / 3)
+        & (p.z < corner[2]),
+        ns.Float(5.0),
+        0.0,
+    )
     held = np.zeros((R, R, R), bool)
     held[3, 4, 2] = True
     for seed in range(5):

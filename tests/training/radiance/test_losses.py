@@ -1,4 +1,5 @@
 """What radiance training is fitted to, against NumPy: colours and the place of absorption."""
+
 from types import SimpleNamespace
 
 import drjit as dr
@@ -42,7 +43,9 @@ def test_depth_loss(margin):
     caught = np.bincount(RAY, weight * near)
     shift = np.bincount(RAY, weight * near * offset)
     want = np.where(truth > 0, 1 - caught + np.minimum(np.abs(shift) / scale, 10), 0)
-    got = depth_loss(ns.Float(weight), ns.Float(TAU), samples(), SimpleNamespace(depth=ns.Float(truth)), margin, scale).numpy()
+    got = depth_loss(
+        ns.Float(weight), ns.Float(TAU), samples(), SimpleNamespace(depth=ns.Float(truth)), margin, scale
+    ).numpy()
     assert np.allclose(got, want, rtol=1e-5, atol=1e-6)
     assert want[2] == 0 and (want[:2] > 0.01).all()
 

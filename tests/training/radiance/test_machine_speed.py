@@ -1,15 +1,17 @@
 """What a machine's speed changes in a training: nothing at equal steps, and the result says when there were few."""
+
 import json
 import time
 
 import drjit as dr
 import numpy as np
 
-from nerg_mi.training.radiance.trainer import RadianceTrainer
-from nerg_mi.training.radiance.run import train_radiance
 from nerg_mi.training.common.step_clock import StepClock
-from .test_trainer import BOX, TINY, dataset, ns, settings  # noqa: F401  (fixture)
+from nerg_mi.training.radiance.run import train_radiance
+from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.training.common.test_run_state import one_thread, state, trainer  # noqa: F401  (fixture)
+
+from .test_trainer import BOX, TINY, dataset, ns, settings  # noqa: F401  (fixture)
 
 
 def test_a_run_by_steps_does_not_see_the_clock(dataset, one_thread):  # noqa: F811
@@ -39,7 +41,14 @@ def test_a_run_by_minutes_is_the_run_of_as_many_steps(dataset, one_thread, monke
 
 def test_no_pass_of_a_run_is_larger_than_its_bound(dataset, monkeypatch):  # noqa: F811
     """A field that never clears: its density-only pass stays within the bound at every stride, down to the finest."""
-    t = RadianceTrainer(dataset.train, BOX, TINY, settings(steps=60, look_most=1.5, march_step=1 / 512, grid_every=10**6), ns, depth=False)
+    t = RadianceTrainer(
+        dataset.train,
+        BOX,
+        TINY,
+        settings(steps=60, look_most=1.5, march_step=1 / 512, grid_every=10**6),
+        ns,
+        depth=False,
+    )
     strides, asked = set(), []
     look = t._look
     t._look = lambda p, active: asked.append(dr.width(p)) or look(p, active)

@@ -1,4 +1,6 @@
-"""The forward pass that trains: what was looked up already changes no value and no derivative, and heads are the field's."""
+"""The forward pass that trains: what was looked up already changes no value and no derivative, and heads are the
+field's."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np

@@ -1,4 +1,5 @@
 """How much a training step takes on follows samples, within its bounds."""
+
 import pytest
 
 from nerg_mi.training.radiance.pace import FEW_RAYS, adapted_rays, affordable_rays, refined
@@ -22,12 +23,15 @@ def test_rays_change_by_a_factor_of_two_at_most_and_stay_in_bounds():
     assert adapted_rays(64, kept=1e6, looked=1e6, batch=16000, most=128000) == 64
 
 
-@pytest.mark.parametrize("rays, looked, steps, expected", [
-    (500, 100, 340, 500),
-    (5000, 100, 340, 1216),  # the pass
-    (5000, 1, 3400, 617),  # the steps on the way
-    (5000, 0, 10**9, 1),
-])
+@pytest.mark.parametrize(
+    "rays, looked, steps, expected",
+    [
+        (500, 100, 340, 500),
+        (5000, 100, 340, 1216),  # the pass
+        (5000, 1, 3400, 617),  # the steps on the way
+        (5000, 0, 10**9, 1),
+    ],
+)
 def test_rays_of_a_step_are_those_that_are_affordable(rays, looked, steps, expected):
     assert affordable_rays(rays, looked, steps, most=128000, candidates=2_100_000) == expected
 

@@ -1,4 +1,5 @@
 """The pixel bank against the views that it was made of."""
+
 from dataclasses import replace
 
 import drjit as dr
@@ -28,7 +29,13 @@ def view(lens, rng, dtype=np.uint8, channels=3, depth=False, mask=False):
     pose[:3, :3], pose[:3, 3] = q * np.sign(np.linalg.det(q)), rng.normal(size=3)
     shape = lens.height, lens.width
     pixels = rng.integers(0, 256, (*shape, channels)).astype(np.uint8)
-    pixels = pixels if dtype == np.uint8 else pixels.astype(np.uint16) * 257 if dtype == np.uint16 else pixels / np.float32(255)
+    pixels = (
+        pixels
+        if dtype == np.uint8
+        else pixels.astype(np.uint16) * 257
+        if dtype == np.uint16
+        else pixels / np.float32(255)
+    )
     distance = rng.uniform(0.5, 9, shape).astype(np.float32) * (rng.random(shape) > 0.2) if depth else None
     return View("v", Camera(lens, pose), pixels, distance, rng.random(shape) > 0.3 if mask else None)
 
@@ -41,8 +48,16 @@ def expected(views):
         d = (pixel_directions(v.camera.intrinsics) @ v.camera.to_world[:3, :3].T)[use]
         color = v.color[use]
         depth = np.zeros(len(d)) if v.depth is None else v.depth[use]
-        for to, x in zip(out, (np.broadcast_to(v.camera.center, d.shape), d, color[:, :3],
-                               color[:, 3] if v.has_alpha else np.ones(len(d)), depth)):
+        for to, x in zip(
+            out,
+            (
+                np.broadcast_to(v.camera.center, d.shape),
+                d,
+                color[:, :3],
+                color[:, 3] if v.has_alpha else np.ones(len(d)),
+                depth,
+            ),
+        ):
             to.append(x)
     return [np.concatenate(x) for x in out]
 
@@ -67,10 +82,16 @@ def test_rays_equal_those_of_the_cameras(lenses):
     assert batch.alpha is None and batch.depth is None
 
 
-@pytest.mark.parametrize("dtype, channels, depth, mask, size", [
-    (np.uint8, 3, False, False, 3), (np.uint8, 4, True, False, 6), (np.uint8, 3, False, True, 7),
-    (np.uint16, 3, True, True, 12), (np.float32, 4, False, False, 8),
-])
+@pytest.mark.parametrize(
+    "dtype, channels, depth, mask, size",
+    [
+        (np.uint8, 3, False, False, 3),
+        (np.uint8, 4, True, False, 6),
+        (np.uint8, 3, False, True, 7),
+        (np.uint16, 3, True, True, 12),
+        (np.float32, 4, False, False, 8),
+    ],
+)
 def test_colours_alpha_depth_and_masks(dtype, channels, depth, mask, size):
     rng = np.random.default_rng(1)
     views = [view(lens, rng, dtype, channels, depth, mask) for lens in LENSES[:3]]

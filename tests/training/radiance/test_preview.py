@@ -1,4 +1,5 @@
 """The trainer's own pictures against a march in NumPy, pixel by pixel, and PSNR by its definition."""
+
 from types import SimpleNamespace
 
 import drjit as dr
@@ -8,8 +9,8 @@ import pytest
 
 from nerg_mi.capture.cameras import Camera, pixel_directions
 from nerg_mi.capture.images import View
-from nerg_mi.maths.box import Box
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance import preview
 from nerg_mi.training.radiance.preview import psnr, render_view
 from nerg_mi.training.radiance.sampling import StepTable
@@ -49,7 +50,9 @@ def expected():
     sigma = 20 * np.exp(-12 * (p**2).sum(-1)) * (np.abs(p).max(-1) < 1) * (middle > NEAR)
     tau = sigma * STEP
     weight = np.exp(-(np.cumsum(tau, 1) - tau)) * -np.expm1(-tau)
-    rgb = np.stack([0.5 + 0.4 * p[..., 0], np.broadcast_to(0.5 - 0.3 * d[:, None, 0], tau.shape), np.full(tau.shape, 0.25)], -1)
+    rgb = np.stack(
+        [0.5 + 0.4 * p[..., 0], np.broadcast_to(0.5 - 0.3 * d[:, None, 0], tau.shape), np.full(tau.shape, 0.25)], -1
+    )
     small = np.maximum(tau, 1e-9)
     share = np.where(tau > 1e-4, 1 / small - 1 / np.expm1(small), 0.5)
     opacity = weight.sum(1)

@@ -1,4 +1,5 @@
 """Marching: each candidate has its ray and step, and no step of a training takes on more than it may."""
+
 from types import SimpleNamespace
 
 import drjit as dr
@@ -15,8 +16,12 @@ BOX = Box((-1, -1, -1), (1, 1, 1))
 def rays(count, seed=0):
     """From around (0, 0, -2) upwards, all through the box."""
     rng = np.random.default_rng(seed)
-    o = ns.Array3f(*[ns.Float(x.astype(np.float32)) for x in (*rng.uniform(-0.5, 0.5, (2, count)), np.full(count, -2.0))])
-    d = dr.normalize(ns.Array3f(*[ns.Float(x.astype(np.float32)) for x in (*rng.normal(0, 0.1, (2, count)), np.ones(count))]))
+    o = ns.Array3f(
+        *[ns.Float(x.astype(np.float32)) for x in (*rng.uniform(-0.5, 0.5, (2, count)), np.full(count, -2.0))]
+    )
+    d = dr.normalize(
+        ns.Array3f(*[ns.Float(x.astype(np.float32)) for x in (*rng.normal(0, 0.1, (2, count)), np.ones(count))])
+    )
     return rays_in_box(o, d, BOX, 0.01), ns.Float(rng.random(count).astype(np.float32))
 
 
@@ -24,8 +29,16 @@ def rays(count, seed=0):
 def test_candidates_split_into_ray_and_step_like_integers(step):
     table = StepTable(ns, 0.01, 4, step, 0)
     n = table.steps
-    index = np.unique(np.concatenate([np.arange(3 * n), np.arange(1, 2**32 // n, 991) * n, np.arange(1, 2**32 // n, 991) * n - 1,
-                                      [2**32 - 1, 2**31, 2**24 + 1]])).astype(np.uint32)
+    index = np.unique(
+        np.concatenate(
+            [
+                np.arange(3 * n),
+                np.arange(1, 2**32 // n, 991) * n,
+                np.arange(1, 2**32 // n, 991) * n - 1,
+                [2**32 - 1, 2**31, 2**24 + 1],
+            ]
+        )
+    ).astype(np.uint32)
     ray, k = table.split(ns.UInt32(index))
     assert np.array_equal(ray.numpy(), index // n) and np.array_equal(k.numpy(), index % n)
 

@@ -1,10 +1,12 @@
 """Cells that rendering will visit are found a piece at a time, and are then sampled whatever is found in them."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
 from nerg_mi.training.radiance.density_grid import DensityGrid
 from nerg_mi.training.radiance.settling import Settling
+
 from .test_density_grid import BOX, R, above, around, centres, cube, grown
 
 
@@ -31,7 +33,8 @@ def test_dense_cells_that_are_lit_and_their_neighbours_stay_on():
     grid.update(empty, np.random.default_rng(0), everywhere=True)
     held = np.zeros((R, R, R), bool)
     held[3, 4, 2] = True
-    # Neighbours of the dense cell are occupied when the rays are looked at, and lit here: only what touches none is not.
+    # Neighbours of the dense cell are occupied when the rays are looked at, and lit here: only what touches none is
+    # not.
     assert np.array_equal(cube(grid.bits) > 0, grown(held))
 
 
@@ -62,7 +65,9 @@ def test_no_piece_asks_for_more_than_a_part_of_the_cells():
 
 
 def test_settling_goes_on_from_a_stored_state():
-    lit = lambda density, occupied, rng: ns.Array3f(*[ns.Float(x) for x in rng.uniform(-1, 1, (3, 2)).astype(np.float32)])
+    lit = lambda density, occupied, rng: ns.Array3f(
+        *[ns.Float(x) for x in rng.uniform(-1, 1, (3, 2)).astype(np.float32)]
+    )
     density, whole, resumed = around((0.2, 0.1, 0), 0.6), *(DensityGrid(ns, BOX, R, 0.1, above(), 1) for _ in range(2))
     settle(whole, density, lit)
     for stop in (5, 40):

@@ -1,4 +1,5 @@
 """The radiance trainer on a tiny place: it learns, repeats itself, and its gradients are right."""
+
 from dataclasses import replace
 
 import drjit as dr
@@ -9,20 +10,20 @@ import pytest
 from nerg_mi.capture.cameras import Camera, pixel_directions
 from nerg_mi.capture.dataset import Dataset
 from nerg_mi.capture.images import View
-from nerg_mi.maths.box import Box
+from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.compositing import damp_near, ray_sum
 from nerg_mi.training.radiance.losses import color_loss, composite, depth_loss, feature_decay
 from nerg_mi.training.radiance.model import density_color
 from nerg_mi.training.radiance.pixels import PixelBank
 from nerg_mi.training.radiance.preview import render_view
-from nerg_mi.training.radiance.trainer import RadianceTrainer
 from nerg_mi.training.radiance.run import save_trained, train_radiance
 from nerg_mi.training.radiance.sampling import StepTable, Thinning, rays_in_box, visible_samples
 from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+from nerg_mi.training.radiance.trainer import RadianceTrainer
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
 RADIUS = 0.6
@@ -50,8 +51,12 @@ def ball(pose, depth=True):
     t = np.where(hit, -b - np.sqrt(np.where(hit, b * b - c, 0)), 0)
     rgb = 0.5 + 0.4 * (o + d * t[:, None]) / RADIUS
     color = np.concatenate([np.where(hit[:, None], rgb, 0), hit[:, None]], axis=1)
-    return View("ball", Camera(LENS, pose), color.reshape(24, 24, 4).astype(np.float32),
-                t.reshape(24, 24).astype(np.float32) if depth else None)
+    return View(
+        "ball",
+        Camera(LENS, pose),
+        color.reshape(24, 24, 4).astype(np.float32),
+        t.reshape(24, 24).astype(np.float32) if depth else None,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +68,17 @@ def dataset():
 
 
 def settings(**changes):
-    given = {"steps": 300, "batch": 2**12, "resolution": 32, "march_step": 1 / 64, "stride_share": 0.2, "seed": 1,
-             "depth_weight": 2e-3, "grid_decay": 1e-3, **changes}
+    given = {
+        "steps": 300,
+        "batch": 2**12,
+        "resolution": 32,
+        "march_step": 1 / 64,
+        "stride_share": 0.2,
+        "seed": 1,
+        "depth_weight": 2e-3,
+        "grid_decay": 1e-3,
+        **changes,
+    }
     return RadianceSettings(**given)
 
 
@@ -89,6 +103,7 @@ def test_learns_without_depth(dataset):
 
 def test_equal_seeds_give_equal_fields_to_rounding(dataset):
     """The sums of several threads come in no fixed order; a few steps differ by rounding alone."""
+
     def weights(seed):
         trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(seed=seed), ns)
         for _ in range(4):
@@ -101,7 +116,8 @@ def test_equal_seeds_give_equal_fields_to_rounding(dataset):
 
 @pytest.mark.parametrize("average", [0.0, 0.5, 0.999])
 def test_what_is_kept_is_the_average_of_every_fourth_steps_weights(dataset, average):
-    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) a step after k steps, of ``average`` later."""
+    """An exponential one, whose memory is short at first: of (k + 1) in (k + 10) a step after k steps, of ``average``
+    later."""
     trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(average=average), ns)
     expected = {k: v.numpy().astype(float) for k, v in trainer.optimiser.items()}
     for k in range(1, 13):
@@ -125,8 +141,10 @@ def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
     assert 0 < field.occupancy.fraction < 0.5
     bounded = lambda p, active: active & (field.occupancy.empty_cells(BOX.to_unit(p)) == 0)
     for view in dataset.held_out:
-        with_grid, without = (render_view(field, occupied, trainer.table(), view, 0.01)
-                              for occupied in (bounded, lambda p, active: active))
+        with_grid, without = (
+            render_view(field, occupied, trainer.table(), view, 0.01)
+            for occupied in (bounded, lambda p, active: active)
+        )
         assert np.mean(np.abs(with_grid.opacity - without.opacity)) < 0.02
         assert np.mean(np.abs(with_grid.color - without.color)) < 0.02
 
@@ -154,8 +172,9 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
     offset = ns.Float(rng.random(64).astype(np.float32))
     background = ns.Array3f(rng.random((3, 64)).astype(np.float32))
     with dr.suspend_grad():
-        samples, covered = visible_samples(rays, StepTable(ns, 0.01, 4, 0.03, 0), offset, lambda p, a: a, field.density,
-                                           2e-3, pad=2**13)
+        samples, covered = visible_samples(
+            rays, StepTable(ns, 0.01, 4, 0.03, 0), offset, lambda p, a: a, field.density, 2e-3, pad=2**13
+        )
     assert covered == 64
     start = {k: dr.detach(v) for k, v in field.parameters().items()}
 
@@ -171,8 +190,9 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
     dr.enable_grad(parameters)
     dr.backward(loss(parameters))
     # Along the signs of the gradient the parts of the slope do not cancel.
-    direction = {k: type(v)(dr.sign(dr.grad(v))) * type(v)(rng.random(v.shape).astype(np.float32))
-                 for k, v in parameters.items()}
+    direction = {
+        k: type(v)(dr.sign(dr.grad(v))) * type(v)(rng.random(v.shape).astype(np.float32)) for k, v in parameters.items()
+    }
     slope = sum(float(np.sum(dr.grad(parameters[k]).numpy() * direction[k].numpy())) for k in parameters)
     h = 3e-4
     up, down = (loss({k: v + s * h * direction[k] for k, v in start.items()}).numpy()[0] for s in (1, -1))
@@ -180,10 +200,13 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
 
 
 def test_thinned_samples_stand_for_all():
-    """Opacity is exact, colours (a ratio) nearly and derivatives wholly those of all samples on the mean over many choices."""
+    """Opacity is exact, colours (a ratio) nearly and derivatives wholly those of all samples on the mean over many
+    choices."""
     rng = np.random.default_rng(8)
     o = ns.Array3f(np.tile([[0.0], [0.0], [-2.0]], 16).astype(np.float32))
-    d = dr.normalize(ns.Array3f(*[ns.Float(rng.normal(size=16).astype(np.float32) * 0.3) for _ in range(2)], ns.Float(np.ones(16))))
+    d = dr.normalize(
+        ns.Array3f(*[ns.Float(rng.normal(size=16).astype(np.float32) * 0.3) for _ in range(2)], ns.Float(np.ones(16)))
+    )
     rays, table = rays_in_box(o, d, BOX, 0.01), StepTable(ns, 0.01, 4, 0.03, 0)
     offset, per_ray = ns.Float(rng.random(16).astype(np.float32)), ns.Float(rng.normal(size=16).astype(np.float32))
     density = lambda p, active=True: 0.3 + 20 * dr.exp(-40 * dr.square(p.z - 0.3 * p.x))
@@ -209,8 +232,14 @@ def test_thinned_samples_stand_for_all():
 
 
 def test_settings_and_sizes_are_checked():
-    for wrong in ({}, {"steps": 5, "minutes": 1.0}, {"steps": 0}, {"steps": 5, "resolution": 100}, {"steps": 5, "thin_least": 0},
-                  {"steps": 5, "reach_share": 0}):
+    for wrong in (
+        {},
+        {"steps": 5, "minutes": 1.0},
+        {"steps": 0},
+        {"steps": 5, "resolution": 100},
+        {"steps": 5, "thin_least": 0},
+        {"steps": 5, "reach_share": 0},
+    ):
         with pytest.raises(ValueError):
             RadianceSettings(**wrong)
     with pytest.raises(ValueError, match="small, medium, paper"):
@@ -227,7 +256,7 @@ def test_damping_near_cameras(dataset):
     """Derivatives nearer than the reach fall with the square of the distance, values stay; a trainer's step follows."""
     t, x = ns.Float([0.1, 0.2, 0.4, 3]), ns.Float([1, 2, 3, 4])
     dr.enable_grad(x)
-    y, = damp_near([x], t, 0.4)
+    (y,) = damp_near([x], t, 0.4)
     dr.backward(dr.sum(2 * y))
     assert np.array_equal(y.numpy(), x.numpy()) and np.allclose(dr.grad(x).numpy(), [2 / 16, 2 / 4, 2, 2])
 
@@ -246,8 +275,14 @@ def test_what_a_mask_hides_does_not_count_in_the_progress(dataset):
     mask = np.arange(24)[:, None] < np.full(24, 12)
     spoilt = view.pixels.copy()
     spoilt[~mask] = 1 - spoilt[~mask]
-    whole, other, masked, same = trainer.measure([view, replace(view, pixels=spoilt), *(
-        replace(view, pixels=pixels, mask=mask) for pixels in (view.pixels, spoilt))], 2)
+    whole, other, masked, same = trainer.measure(
+        [
+            view,
+            replace(view, pixels=spoilt),
+            *(replace(view, pixels=pixels, mask=mask) for pixels in (view.pixels, spoilt)),
+        ],
+        2,
+    )
     assert masked == same and whole != other and masked != whole
 
 
@@ -265,7 +300,9 @@ def test_features_that_no_ray_shapes_are_let_go(dataset):
 
     def left(weight):
         # Nearer than a reach of a thousand sides: nothing of the pictures reaches the features.
-        trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(reach=1000.0, empty_weight=0.0, grid_decay=weight), ns, depth=False)
+        trainer = RadianceTrainer(
+            dataset.train, BOX, TINY, settings(reach=1000.0, empty_weight=0.0, grid_decay=weight), ns, depth=False
+        )
         trainer.optimiser["grid.table"] = dr.full(ns.Float, 0.5, len(trainer.live.parameters()["grid.table"]))
         for _ in range(10):
             trainer.step()

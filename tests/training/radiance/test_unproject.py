@@ -1,4 +1,6 @@
-"""Directions of a lens's pixels on the device: projected again by OpenCV's formulas they are the pixels that were asked for."""
+"""Directions of a lens's pixels on the device: projected again by OpenCV's formulas they are the pixels that were asked
+for."""
+
 from dataclasses import replace
 
 import drjit.llvm.ad as ns
@@ -7,7 +9,6 @@ import pytest
 
 from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.training.radiance.unproject import LensTable
-
 from tests.reference import opencv
 
 PLAIN = Intrinsics(24, 18, 20.0, 21.0, 11.0, 9.5)

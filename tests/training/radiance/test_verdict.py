@@ -1,4 +1,5 @@
 """A training says when its result is worse than it might be."""
+
 from nerg_mi.training.radiance.verdict import complaints
 
 

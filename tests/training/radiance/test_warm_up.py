@@ -1,11 +1,13 @@
 """Compiling before a run's clock starts changes nothing of the run, and leaves nothing to be compiled in it."""
+
 import drjit as dr
 import numpy as np
 import pytest
 
 from nerg_mi.training.radiance.warm_up import warm_up
-from .test_trainer import dataset, settings  # noqa: F401  (fixture)
 from tests.training.common.test_run_state import one_thread, state, trainer  # noqa: F401  (fixture)
+
+from .test_trainer import dataset, settings  # noqa: F401  (fixture)
 
 
 @pytest.mark.parametrize("depth", [True, False])
@@ -32,6 +34,10 @@ def test_nothing_is_compiled_in_a_run(dataset, depth):  # noqa: F811
         while t.progress < 1:
             t.step()
             strides.add(t.stride)
-            compiled += [(t.steps, k["size"], k["operation_count"]) for k in dr.kernel_history([dr.KernelType.JIT]) if not k["cache_hit"]]
+            compiled += [
+                (t.steps, k["size"], k["operation_count"])
+                for k in dr.kernel_history([dr.KernelType.JIT])
+                if not k["cache_hit"]
+            ]
     assert strides == {16, 8, 4, 2, 1} and t.settling.done
     assert not compiled

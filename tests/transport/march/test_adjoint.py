@@ -1,4 +1,6 @@
-"""Derivatives by marching again, against those that Dr.Jit takes through the march itself, and what they hold in memory."""
+"""Derivatives by marching again, against those that Dr.Jit takes through the march itself, and what they hold in
+memory."""
+
 import gc
 from dataclasses import replace
 
@@ -16,16 +18,36 @@ def scene_of(mi, size, step, quadrature="constant"):
     """Voxels with a colour each: all rays of a camera cross them."""
     rng = np.random.default_rng(2)
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
-    volume = lambda data: {"type": "gridvolume", "grid": mi.VolumeGrid(data.astype(np.float32)), "to_world": place, "raw": True}
+    volume = lambda data: {
+        "type": "gridvolume",
+        "grid": mi.VolumeGrid(data.astype(np.float32)),
+        "to_world": place,
+        "raw": True,
+    }
     film = {"type": "hdrfilm", "width": size, "height": size, "component_format": "float32", "rfilter": {"type": "box"}}
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "nerg", "density": volume(0.1 + rng.exponential(1.2, (4, 5, 6))),
-                       "color": volume(rng.uniform(0.1, 0.9, (4, 5, 6, 3))), "step": step, "stop": 0.0, "color_cutoff": 0.0,
-                       "quadrature": quadrature, "depth": "expected", "aovs": "depth,opacity"},
-        "sensor": {"type": "perspective", "fov": 20, "to_world": mi.ScalarTransform4f().look_at([0.3, 0.2, -3], [0, 0, 0], [0, 1, 0]),
-                   "film": film, "sampler": {"type": "stratified", "jitter": False, "sample_count": 1}},
-    })  # fmt: skip
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {
+                "type": "nerg",
+                "density": volume(0.1 + rng.exponential(1.2, (4, 5, 6))),
+                "color": volume(rng.uniform(0.1, 0.9, (4, 5, 6, 3))),
+                "step": step,
+                "stop": 0.0,
+                "color_cutoff": 0.0,
+                "quadrature": quadrature,
+                "depth": "expected",
+                "aovs": "depth,opacity",
+            },
+            "sensor": {
+                "type": "perspective",
+                "fov": 20,
+                "to_world": mi.ScalarTransform4f().look_at([0.3, 0.2, -3], [0, 0, 0], [0, 1, 0]),
+                "film": film,
+                "sampler": {"type": "stratified", "jitter": False, "sample_count": 1},
+            },
+        }
+    )
 
 
 def gradients(mi, scene):
@@ -131,7 +153,7 @@ def test03_a_slab_between_entry_and_exit(mode, quadrature, offset):
     length, passed = t1 - t0, np.exp(-1.7 * (1.125 - 0.25))
     settings = MarchSettings(1 / 16, stop=0, color_cutoff=0, quadrature=quadrature)
     offset = None if offset is None else ns.Float(offset)
-    of = lambda value: slopes(Slanted(sigma), value, mode, settings, offset)  # noqa: E731
+    of = lambda value: slopes(Slanted(sigma), value, mode, settings, offset)
     assert np.allclose(of(lambda r: r.tau), [-sigma, sigma, 0, length], rtol=1e-5, atol=1e-5)
     # E = t0 + 1 / sigma - L / (exp(sigma L) - 1), the mean distance of absorption, of which the opacity is 1 - passed.
     q = passed / (1 - passed)
@@ -142,8 +164,12 @@ def test03_a_slab_between_entry_and_exit(mode, quadrature, offset):
     assert np.allclose(of(lambda r: r.half), half, rtol=1e-4, atol=1e-5)
     # The colour z is that of the mean absorption: C = opacity (o + E). A step takes it at its middle, or at its mean.
     opacity, mean = 1 - passed, t0 + 1 / sigma - length * q
-    want = [-sigma * passed * mean + opacity * (1 - by_length), sigma * passed * mean + opacity * by_length, opacity,
-            length * passed * mean + opacity * by_density]  # fmt: skip
+    want = [
+        -sigma * passed * mean + opacity * (1 - by_length),
+        sigma * passed * mean + opacity * by_length,
+        opacity,
+        length * passed * mean + opacity * by_density,
+    ]
     assert np.allclose(of(lambda r: r.color.x), want, rtol=2e-2 if quadrature == "constant" else 1e-4)
 
 

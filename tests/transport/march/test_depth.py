@@ -1,4 +1,5 @@
 """Expected and median depth against closed forms, for opaque and for semi-transparent matter."""
+
 import math
 
 import drjit as dr
@@ -8,7 +9,6 @@ import pytest
 from nerg_mi.transport.march.depth import KINDS, surface_depth, way_out
 from nerg_mi.transport.march.primal import MarchSettings, march
 from nerg_mi.transport.media.media import VolumeMedium
-
 from tests.reference import march_numpy as reference
 
 
@@ -52,7 +52,7 @@ def test03_a_window_and_a_wall(rgb, front, back):
     settings = MarchSettings(0.1 / 64)
     a, b = 0.2 * front, 0.2 * back
     w1, w2 = -math.expm1(-a), math.exp(-a) * -math.expm1(-b)
-    mean = lambda s, near: reference.slab(s, near, near + 0.2)[1]  # noqa: E731
+    mean = lambda s, near: reference.slab(s, near, near + 0.2)[1]
     expected = (w1 * mean(front, 1.2) + w2 * mean(back, 1.7)) / (w1 + w2)
     goal = -math.log1p(-(w1 + w2) / 2)
     median = 1.2 + goal / front if goal <= a else 1.7 + (goal - a) / back
@@ -117,7 +117,8 @@ def test07_evaluations_that_a_depth_takes_are_added(rgb, sigma):
         first = result.density_evals[0]
         surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)
         counts[kind] = result.density_evals[0] - first
-    # Thin matter is marched again to where half of its own opacity is reached; a refined depth takes sixteen steps at most in one.
+    # Thin matter is marched again to where half of its own opacity is reached; a refined depth takes sixteen steps at
+    # most in one.
     again = 0 if sigma > 1 else -math.log1p(0.5 * math.expm1(-sigma)) / sigma * 100
     assert counts["expected"] == 0 and abs(counts["median"] - again) <= 1
     assert counts["median"] < counts["refined"] <= counts["median"] + 17

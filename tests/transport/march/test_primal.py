@@ -1,17 +1,17 @@
 """The march against closed forms and a float64 march: slabs of every density, grids, leaping, jitter, stopping."""
+
 import math
 
 import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.maths.box import Box
 from nerg_mi.transport.march.primal import MarchSettings, march
 from nerg_mi.transport.media.media import FieldMedium, VolumeMedium
-
 from tests.reference import march_numpy as reference
 
 DIAGONAL = 3**0.5
@@ -66,9 +66,13 @@ def test02_depth_remaining_before_a_dense_slab(rgb, sigma):
 
 @pytest.mark.parametrize("size", [1e-3, 1, 1e6])
 def test03_boxes_of_any_size(rgb, size):
-    r = run(rgb, slab(rgb, 2 / size, size, size), (size / 2, size / 2, 0), (0, 0, 1), MarchSettings(size * DIAGONAL / 1024))
+    r = run(
+        rgb, slab(rgb, 2 / size, size, size), (size / 2, size / 2, 0), (0, 0, 1), MarchSettings(size * DIAGONAL / 1024)
+    )
     opacity, expected, _ = reference.slab(2, 1, 2)
-    assert np.isclose(one(r.opacity), opacity, rtol=1e-5) and np.isclose(one(r.expected_depth) / size, expected, rtol=1e-5)
+    assert np.isclose(one(r.opacity), opacity, rtol=1e-5) and np.isclose(
+        one(r.expected_depth) / size, expected, rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("distance", [100, 1000, 30000])
@@ -174,9 +178,12 @@ def test12_colour(rgb):
     for i in range(len(o)):
         near, far = reference.box(o[i].astype(float), d[i].astype(float), (0, 0, 0), (1, 1, 1))
         total = reference.march(
-            lambda p: reference.trilinear(data, p), o[i], d[i], reference.steps(near, far, 1 / 64),
+            lambda p: reference.trilinear(data, p),
+            o[i],
+            d[i],
+            reference.steps(near, far, 1 / 64),
             lambda p: reference.trilinear(tint, p),
-        )[3]  # fmt: skip
+        )[3]
         assert np.allclose(np.array(r.color)[:, i], total, rtol=5e-5)
 
 
@@ -232,7 +239,9 @@ def field_with(bits, seed=0, gain=1.0):
     """A field of visible density, and the same without its occupancy grid."""
     import drjit.llvm.ad as ns
 
-    config = RadianceConfig(HashGridConfig(levels=2, log2_rows=10, base=4, finest=16), width=16, geometry=3, sh_degree=2)
+    config = RadianceConfig(
+        HashGridConfig(levels=2, log2_rows=10, base=4, finest=16), width=16, geometry=3, sh_degree=2
+    )
     out = []
     for occupancy in (OccupancyGrid(bits, ns, 0.01), None):
         f = RadianceField.random(config, Box((0, 0, 0), (1, 1, 1)), ns, seed, occupancy=occupancy)
@@ -322,6 +331,12 @@ def test20_no_goal_falls_between_two_sums(rgb, quadrature):
     goals = np.float32(sigma * (t.astype(float) - 1))[:, None]
     goals = (goals + np.arange(-8, 9) * np.spacing(goals)).astype(np.float32).ravel()
     medium = slab(rgb, sigma, 1)
-    r = run(rgb, medium, np.tile(np.float32([0.5, 0.5, 0]), (len(goals), 1)), np.tile(np.float32([0, 0, 1]), (len(goals), 1)),
-            MarchSettings(1 / n, quadrature=quadrature), until=rgb.Float(goals))  # fmt: skip
+    r = run(
+        rgb,
+        medium,
+        np.tile(np.float32([0.5, 0.5, 0]), (len(goals), 1)),
+        np.tile(np.float32([0, 0, 1]), (len(goals), 1)),
+        MarchSettings(1 / n, quadrature=quadrature),
+        until=rgb.Float(goals),
+    )
     assert np.allclose(np.array(r.half), 1 + goals / sigma, rtol=1e-6)

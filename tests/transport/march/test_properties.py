@@ -1,4 +1,5 @@
 """What every march keeps, for densities over seventeen orders of magnitude, and how its error falls with the step."""
+
 import functools
 import math
 
@@ -11,13 +12,17 @@ from hypothesis import strategies as st
 from nerg_mi.transport.march.depth import KINDS, surface_depth
 from nerg_mi.transport.march.primal import MarchSettings, march
 from nerg_mi.transport.media.media import LocalRay, VolumeMedium
-
 from tests.reference import march_numpy as reference
 
 PIECES = 8
 # The fixture `rgb` is the module mitsuba: there is nothing in it to reset between examples.
-few = settings(max_examples=40, deadline=None, derandomize=True, database=None,
-               suppress_health_check=[HealthCheck.function_scoped_fixture])
+few = settings(
+    max_examples=40,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 density = st.one_of(st.just(0.0), st.floats(-8, 9).map(lambda e: 10**e))
 densities = st.lists(density, min_size=PIECES, max_size=PIECES).map(np.float32)
 
@@ -46,7 +51,7 @@ class Along:
 def pieces(mi, table):
     """Constant density in ``PIECES`` equal parts of [0, 1]."""
     table = table if dr.is_array_v(table) else mi.Float(table)
-    pick = lambda z: dr.gather(mi.Float, table, dr.minimum(mi.UInt32(z * PIECES), PIECES - 1))  # noqa: E731
+    pick = lambda z: dr.gather(mi.Float, table, dr.minimum(mi.UInt32(z * PIECES), PIECES - 1))
     return Along(mi, pick, table)
 
 
@@ -62,8 +67,9 @@ def exact(table, borders=None):
     """``(opacity, expected, median)`` of piecewise constant density in float64."""
     table = np.asarray(table, float)
     borders = np.linspace(0, 1, PIECES + 1)
-    tau, expected, median, _, _ = reference.march(lambda p: table[np.minimum((p[:, 2] * PIECES).astype(int), PIECES - 1)],
-                                                  (0, 0, 0), (0, 0, 1), borders)  # fmt: skip
+    tau, expected, median, _, _ = reference.march(
+        lambda p: table[np.minimum((p[:, 2] * PIECES).astype(int), PIECES - 1)], (0, 0, 0), (0, 0, 1), borders
+    )
     return -math.expm1(-tau), expected, median
 
 
@@ -89,7 +95,9 @@ def test01_a_march_is_its_float64_reference(rgb, table):
         assert np.isclose(one(r.expected_depth), expected, rtol=2e-6, atol=1e-12)
         found = surface_depth("median", r, pieces(rgb, table), ray, ray.t_near, ray.t_far, True, WHOLE)
         # Where hardly anything is absorbed behind the median, rounding of the optical depth moves it along.
-        tau = lambda t: np.interp(t, np.linspace(0, 1, PIECES + 1), np.concatenate([[0], np.cumsum(table.astype(float) / PIECES)]))  # noqa: E731
+        tau = lambda t: np.interp(
+            t, np.linspace(0, 1, PIECES + 1), np.concatenate([[0], np.cumsum(table.astype(float) / PIECES)])
+        )
         assert np.isclose(one(found), median, rtol=1e-5) or np.isclose(tau(one(found)), tau(median), rtol=1e-5)
 
 
@@ -135,8 +143,12 @@ def test06_more_matter_hides_more(rgb, table, gain):
     assert b >= a * (1 - 1e-6)
 
 
-@given(table=densities, kind=st.sampled_from(KINDS), quadrature=st.sampled_from(["constant", "linear"]),
-       stop=st.sampled_from([0.0, 1e-6, 1e-2]))  # fmt: skip
+@given(
+    table=densities,
+    kind=st.sampled_from(KINDS),
+    quadrature=st.sampled_from(["constant", "linear"]),
+    stop=st.sampled_from([0.0, 1e-6, 1e-2]),
+)
 @few
 def test07_depth_lies_in_the_box(rgb, table, kind, quadrature, stop):
     controls = MarchSettings(1 / 20, stop=stop, quadrature=quadrature)
@@ -163,8 +175,10 @@ def test08_derivatives_with_respect_to_each_density(rgb, table):
         assert np.all(np.isfinite(np.array(dr.grad(x))))
 
 
-@given(direction=st.tuples(*[st.one_of(st.sampled_from([0.0, 1e-38, 1e-20, -1e-30]), st.floats(-1, 1, width=32))] * 3),
-       origin=st.tuples(*[st.one_of(st.sampled_from([0.0, 1.0, 0.5, -1.0]), st.floats(-2, 3, width=32))] * 3))  # fmt: skip
+@given(
+    direction=st.tuples(*[st.one_of(st.sampled_from([0.0, 1e-38, 1e-20, -1e-30]), st.floats(-1, 1, width=32))] * 3),
+    origin=st.tuples(*[st.one_of(st.sampled_from([0.0, 1.0, 0.5, -1.0]), st.floats(-2, 3, width=32))] * 3),
+)
 @few
 def test09_rays_of_any_direction_from_anywhere(rgb, direction, origin):
     d = np.array(direction)
@@ -174,8 +188,10 @@ def test09_rays_of_any_direction_from_anywhere(rgb, direction, origin):
     hit = reference.box(np.float32(origin).astype(float), d, (0, 0, 0), (1, 1, 1))
     length = 0 if hit is None else max(hit[1] - max(hit[0], 0), 0)
     medium = _cube(rgb)
-    ray = medium.local(rgb.Point3f(*[dr.opaque(rgb.Float, float(v)) for v in origin]),
-                       rgb.Vector3f(*[dr.opaque(rgb.Float, float(v)) for v in d]))  # fmt: skip
+    ray = medium.local(
+        rgb.Point3f(*[dr.opaque(rgb.Float, float(v)) for v in origin]),
+        rgb.Vector3f(*[dr.opaque(rgb.Float, float(v)) for v in d]),
+    )
     r = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, MarchSettings(1 / 16, stop=0))
     assert np.isclose(one(r.opacity), -math.expm1(-3 * length), rtol=1e-4, atol=1e-5)
     assert np.isfinite(one(r.expected_depth))
@@ -197,7 +213,7 @@ def smooth(z, exp, sin):
 
 def smooth_reference():
     borders = np.linspace(0, 1, 40001)
-    f = lambda p: smooth(p[:, 2], np.exp, np.sin)  # noqa: E731
+    f = lambda p: smooth(p[:, 2], np.exp, np.sin)
     tau, expected, median, _, _ = reference.march(f, (0, 0, 0), (0, 0, 1), borders)
     return np.array([tau, expected, median])
 
@@ -223,7 +239,16 @@ def test11_cells_do_not_depend_on_the_step(rgb):
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True}))
     ray = medium.local(rgb.Point3f(0.2, 0.3, -1), rgb.Vector3f(*(np.array([0.1, 0.2, 1]) / math.sqrt(1.05)).tolist()))
     tau = [
-        one(march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / n, stop=0, quadrature="cells", cell_step=1 / n)).tau)
+        one(
+            march(
+                medium,
+                ray,
+                ray.t_near,
+                ray.t_far,
+                True,
+                MarchSettings(1 / n, stop=0, quadrature="cells", cell_step=1 / n),
+            ).tau
+        )
         for n in (1, 4, 16, 64)
     ]
     assert np.allclose(tau, tau[0], rtol=5e-6)

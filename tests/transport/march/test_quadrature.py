@@ -1,4 +1,5 @@
 """The step rule against integrals in extended precision, and its invariances."""
+
 from fractions import Fraction
 
 import drjit as dr
@@ -136,8 +137,12 @@ def test07_the_linear_reference_agrees_with_closed_forms():
 
     c = np.array([3.0, 10, 60, 800, 1e6])
     passed = np.exp(-c / 2)
-    assert np.allclose(exact_linear_share(0 * c, c), (np.sqrt(np.pi / 2 / c) * erf(np.sqrt(c / 2)) - passed) / (1 - passed), rtol=1e-13)
-    assert np.allclose(exact_linear_share(c, 0 * c), (np.sqrt(2 / c) * dawsn(np.sqrt(c / 2)) - passed) / (1 - passed), rtol=1e-13)
+    assert np.allclose(
+        exact_linear_share(0 * c, c), (np.sqrt(np.pi / 2 / c) * erf(np.sqrt(c / 2)) - passed) / (1 - passed), rtol=1e-13
+    )
+    assert np.allclose(
+        exact_linear_share(c, 0 * c), (np.sqrt(2 / c) * dawsn(np.sqrt(c / 2)) - passed) / (1 - passed), rtol=1e-13
+    )
 
 
 def test08_linear_share():
@@ -152,12 +157,14 @@ def test08_linear_share():
 @pytest.mark.parametrize("which", [0, 1])
 def test09_its_derivatives(which, mode):
     a, b = ends()
-    got = slope_of(lambda x: linear_share(x, ns.Float(b)) if which == 0 else linear_share(ns.Float(a), x), (a, b)[which], mode)
+    got = slope_of(
+        lambda x: linear_share(x, ns.Float(b)) if which == 0 else linear_share(ns.Float(a), x), (a, b)[which], mode
+    )
     assert np.all(np.isfinite(got))
     a, b = a.astype(float), b.astype(float)
     # One-sided differences of second order: densities are not negative.
     h = 1e-4 * (np.minimum(np.maximum(a, np.sqrt(a + b)), a + b) if which == 0 else a + b)
-    at = lambda k: exact_linear_share(a + k * h * (which == 0), b + k * h * (which == 1))  # noqa: E731
+    at = lambda k: exact_linear_share(a + k * h * (which == 0), b + k * h * (which == 1))
     want = (4 * at(1) - 3 * at(0) - at(2)) / (2 * h)
     assert np.all(np.abs(got - want) <= 3e-4 * (np.abs(want) + at(0) / (a + b)))
 

@@ -1,4 +1,5 @@
 """The quadrature rules: what each is exact for, and that every march ends."""
+
 import math
 import subprocess
 import sys
@@ -9,18 +10,17 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.transport.media.cells import VoxelCells
 from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.media.media import LocalRay, VolumeMedium
 from nerg_mi.transport.march.rules import KINDS, color_share, linear_crossing, linear_share, rule
-
+from nerg_mi.transport.media.cells import VoxelCells
+from nerg_mi.transport.media.media import LocalRay, VolumeMedium
 from tests.reference import march_numpy as reference
 
 
 def linear_moments(first, last, n=4000):
     """``(mean absorption distance, distance of half of the optical depth)`` of a linear density over [0, 1]."""
     borders = np.linspace(0, 1, n + 1)
-    density = lambda p: first + (last - first) * p[:, 2]  # noqa: E731
+    density = lambda p: first + (last - first) * p[:, 2]
     tau, expected, _, _, _ = reference.march(density, (0, 0, 0), (0, 0, 1), borders)
     return tau, expected
 
@@ -73,12 +73,16 @@ def test04_cells_are_exact_in_opacity_for_any_grid(rgb):
         d /= np.linalg.norm(d)
         near, far = reference.box(o, d, (0, 0, 0), (1, 1, 1))
         tau = reference.march(lambda p: reference.trilinear(data, p), o, d, np.linspace(near, far, 8001))[0]
-        assert np.isclose(gather(rgb, medium, o, d, MarchSettings(1.0, quadrature="cells", stop=0)).tau.numpy()[0], tau, rtol=1e-4)
+        assert np.isclose(
+            gather(rgb, medium, o, d, MarchSettings(1.0, quadrature="cells", stop=0)).tau.numpy()[0], tau, rtol=1e-4
+        )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test05_homogeneous_matter_is_exact_for_every_rule(rgb, kind):
-    medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.full((4, 4, 4), 3, np.float32))}))
+    medium = VolumeMedium(
+        rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.full((4, 4, 4), 3, np.float32))})
+    )
     r = gather(rgb, medium, (0.5, 0.5, -1), (0, 0, 1), MarchSettings(0.05, quadrature=kind))
     opacity, expected, median = reference.slab(3, 1, 2)
     assert np.isclose(r.opacity.numpy()[0], opacity, rtol=1e-5)
@@ -95,7 +99,8 @@ def test06_wrong_rules(rgb):
 
 
 class Colored:
-    """Density and colour that depend on z only: ``density(z, x)``, ``color(z)``; ``x`` is what derivatives are asked of."""
+    """Density and colour that depend on z only: ``density(z, x)``, ``color(z)``; ``x`` is what derivatives are asked
+    of."""
 
     occupancy = cells = step = None
 
@@ -123,8 +128,8 @@ def along_z(medium, n, **controls):
 
 @pytest.mark.parametrize("n", [1, 3, 10, 64])
 def test08_the_colour_of_a_wall_is_not_that_of_the_air_before_it(n):
-    wall = lambda z, x: dr.select((z > 0.487) & (z < 0.513 + 1 / n), 1e4 * x, 1e-6)  # noqa: E731
-    tint = lambda z: dr.select((z > 0.48) & (z < 0.52 + 1 / n), 0.25, -9)  # noqa: E731
+    wall = lambda z, x: dr.select((z > 0.487) & (z < 0.513 + 1 / n), 1e4 * x, 1e-6)
+    tint = lambda z: dr.select((z > 0.48) & (z < 0.52 + 1 / n), 0.25, -9)
     r = along_z(Colored(wall, tint, ns.Float(1)), n, quadrature="linear")
     if r.opacity.numpy()[0] > 0.5:
         assert np.isclose(np.array(r.color)[0, 0], 0.25, rtol=1e-3)
@@ -136,9 +141,14 @@ def smooth(z, x, exp=dr.exp, sin=dr.sin):
 
 
 def test09_colour_is_of_second_order_in_smooth_matter():
-    tint = lambda z, exp=dr.exp: exp(-z) * z  # noqa: E731
-    total = reference.march(lambda p: smooth(p[:, 2], 1, np.exp, np.sin), (0, 0, 0), (0, 0, 1), np.linspace(0, 1, 20001),
-                            lambda p: tint(p[:, 2:], np.exp))[3][0]  # fmt: skip
+    tint = lambda z, exp=dr.exp: exp(-z) * z
+    total = reference.march(
+        lambda p: smooth(p[:, 2], 1, np.exp, np.sin),
+        (0, 0, 0),
+        (0, 0, 1),
+        np.linspace(0, 1, 20001),
+        lambda p: tint(p[:, 2:], np.exp),
+    )[3][0]
     errors = [
         abs(np.array(along_z(Colored(smooth, tint, ns.Float(1)), n, quadrature="linear").color)[0, 0] - total)
         for n in (8, 16, 32, 64)
@@ -148,7 +158,7 @@ def test09_colour_is_of_second_order_in_smooth_matter():
 
 def test10_derivatives_are_those_of_the_colour_that_is_shown():
     # The place where a step takes its colour moves with the density, and the colour with it.
-    tint = lambda z: dr.sin(7 * z)  # noqa: E731
+    tint = lambda z: dr.sin(7 * z)
     for density in (smooth, lambda z, x: x * dr.select(z > 0.43, 30.0, 0.5)):
         x = ns.Float(1)
         dr.enable_grad(x)
@@ -165,7 +175,9 @@ def test11_cells_step_from_wall_to_wall_of_voxels(rgb, gain):
     medium = VolumeMedium(rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "raw": True}))
     o, d = np.array((0.21, 0.34, -1)), np.array((0.1, 0.17, 1)) / math.sqrt(1 + 0.1**2 + 0.17**2)
     near, far = reference.box(o, d, (0, 0, 0), (1, 1, 1))
-    borders = np.unique(np.concatenate([np.linspace(near, far, 20001), np.linspace(near, min(far, near + 100 / gain), 20001)]))
+    borders = np.unique(
+        np.concatenate([np.linspace(near, far, 20001), np.linspace(near, min(far, near + 100 / gain), 20001)])
+    )
     tau, expected, _, _, _ = reference.march(lambda p: reference.trilinear(data, p), o, d, borders)
     r = gather(rgb, medium, o, d, MarchSettings(1e-3, quadrature="cells", stop=0), count=True)
     assert np.isclose(r.tau.numpy()[0], tau, rtol=1e-5)
@@ -178,8 +190,9 @@ def test11_cells_step_from_wall_to_wall_of_voxels(rgb, gain):
 
 @pytest.mark.parametrize("offset", [None, 0.4])
 def test12_a_leap_forgets_the_density_before_it(offset):
-    # Matter everywhere, and growing; the steps whose middle lies in an empty cell are left out, the others are trapezia.
-    rise = lambda z, x: 1 + 6 * z * z  # noqa: E731
+    # Matter everywhere, and growing; the steps whose middle lies in an empty cell are left out, the others are
+    # trapezia.
+    rise = lambda z, x: 1 + 6 * z * z
     medium, n, occupied = Colored(rise, lambda z: z, ns.Float(1)), 32, np.array([1, 0, 1, 1, 0, 0, 0, 1], bool)
     bits = np.broadcast_to(occupied[:, None, None], (8, 2, 2))
     medium.occupancy, medium.to_unit, medium.vector_to_unit = OccupancyGrid(bits, ns, 0), lambda p: p, lambda d: d
@@ -228,7 +241,8 @@ for distance in (3, 30, 300, 3e4):
 
 
 def test13_where_a_step_takes_its_colour():
-    # At the mean absorption for equal ends, at the denser end where the other is empty, in between by the square of (b - a) / (a + b).
+    # At the mean absorption for equal ends, at the denser end where the other is empty, in between by the square of (b
+    # - a) / (a + b).
     first, last = ns.Float([2, 0, 5, 1, 3, 1, 0]), ns.Float([2, 5, 0, 3, 1, 4, 0])
     got = color_share(first, last, ns.Float(0.4)).numpy()
     assert np.allclose(got, [0.4, 1, 0, 0.4 + 0.6 / 4, 0.4 - 0.4 / 4, 0.4 + 0.6 * 0.36, 0.4], rtol=1e-5)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.transport.media.cells import VoxelCells
 from nerg_mi.transport.march.primal import MarchSettings, advance, fine_start
+from nerg_mi.transport.media.cells import VoxelCells
 
 from .test_primal import grid
 
@@ -18,7 +18,9 @@ def test01_every_step_moves_on(rgb, distance):
     t = rgb.Float(np.concatenate([wall, np.nextafter(wall, np.float32(0)), np.nextafter(wall, np.float32(2e6))]))
     ray = medium.local(rgb.Point3f(0.4, 0.6, -float(distance)), rgb.Vector3f(0, 0, 1))
     for step in (1e-12, 1e-3, 0.5):
-        _, begin, delta, after = advance(medium, ray, t, rgb.Float(1e9), rgb.Float(1), MarchSettings(step, cell_step=step), rgb.Bool(True), planes)
+        _, begin, delta, after = advance(
+            medium, ray, t, rgb.Float(1e9), rgb.Float(1), MarchSettings(step, cell_step=step), rgb.Bool(True), planes
+        )
         assert (after.numpy() > begin.numpy()).all() and np.array_equal(delta.numpy(), after.numpy() - begin.numpy())
 
 
@@ -48,7 +50,9 @@ def test03_a_march_goes_on_where_it_begins_on_a_wall(rgb):
     medium = grid(rgb, np.ones((4, 4, 4)))
     t = rgb.Float([0, 1e-30, 1e-3, 5, 1e6])
     ray = medium.local(rgb.Point3f(0.4, 0.6, 0), rgb.Vector3f(0, 0, 1))
-    _, begin, delta, after = advance(medium, ray, t, rgb.Float(1e9), rgb.Float(1), MarchSettings(0.01), rgb.Bool(True), Reached())
+    _, begin, delta, after = advance(
+        medium, ray, t, rgb.Float(1e9), rgb.Float(1), MarchSettings(0.01), rgb.Bool(True), Reached()
+    )
     assert (after.numpy() > begin.numpy()).all() and (delta.numpy() > 0).all()
     # Nothing that counts is passed over.
     assert (delta.numpy() <= 2e-6 * np.maximum(t.numpy(), 0.01)).all()

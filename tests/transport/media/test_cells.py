@@ -15,7 +15,9 @@ def test_no_matter_lies_in_an_empty_cell(rgb, wrap_mode, filter_type, voxel):
     """Also not where a grid that repeats shows its first voxel at its far side."""
     data = np.zeros((8, 8, 8), np.float32)
     data[voxel] = 1
-    volume = rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(data), "wrap_mode": wrap_mode, "filter_type": filter_type})
+    volume = rgb.load_dict(
+        {"type": "gridvolume", "grid": rgb.VolumeGrid(data), "wrap_mode": wrap_mode, "filter_type": filter_type}
+    )
     cells = bound(data, ns)
     it = dr.zeros(rgb.Interaction3f)
     it.p = rgb.Point3f(np.random.default_rng(0).random((3, 100_000)).astype(np.float32))

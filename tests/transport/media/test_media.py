@@ -1,16 +1,17 @@
 """What media answer: scale, bounds, errors."""
+
 from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.maths.box import Box
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.maths.box import Box
 from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.media.media import at_nearest, FieldMedium, GazeMedium, Similarity, VolumeMedium
+from nerg_mi.transport.media.media import FieldMedium, GazeMedium, Similarity, VolumeMedium, at_nearest
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((0, 0, 0), (1, 1, 2))
@@ -19,8 +20,12 @@ BOX = Box((0, 0, 0), (1, 1, 2))
 def field(**kwargs):
     import drjit.llvm.ad as ns
 
-    f = RadianceField.random(RadianceConfig(GRID, width=16, geometry=3, sh_degree=2), BOX, ns, march_step=0.05, **kwargs)
-    f.set_parameters({"grid.table": ns.Float(np.random.default_rng(0).normal(size=len(f.grid.table)).astype(np.float32))})
+    f = RadianceField.random(
+        RadianceConfig(GRID, width=16, geometry=3, sh_degree=2), BOX, ns, march_step=0.05, **kwargs
+    )
+    f.set_parameters(
+        {"grid.table": ns.Float(np.random.default_rng(0).normal(size=len(f.grid.table)).astype(np.float32))}
+    )
     return f
 
 
@@ -45,7 +50,9 @@ def test01_similarity(rgb, scale):
     w = m[:3, :3] @ p
     assert np.allclose(np.array(s.vector_to_local(rgb.Vector3f(w.tolist()))).ravel(), p, rtol=1e-5, atol=1e-6)
     unit = w / np.linalg.norm(w)
-    assert np.allclose(np.array(s.direction_to_local(rgb.Vector3f(unit.tolist()))).ravel(), p / np.linalg.norm(p), atol=1e-6)
+    assert np.allclose(
+        np.array(s.direction_to_local(rgb.Vector3f(unit.tolist()))).ravel(), p / np.linalg.norm(p), atol=1e-6
+    )
 
 
 def test02_bounds_hold_the_corners():
@@ -101,15 +108,21 @@ def test05_gaze_turns_and_does_not_scale(rgb):
     import drjit.llvm.ad as ns
 
     g = GazeField.random(GazeConfig(GRID, width=16), BOX, ns)
-    g.set_parameters({"grid.table": ns.Float(np.random.default_rng(0).normal(size=len(g.grid.table)).astype(np.float32))})
+    g.set_parameters(
+        {"grid.table": ns.Float(np.random.default_rng(0).normal(size=len(g.grid.table)).astype(np.float32))}
+    )
     p_o, p_od = np.array([0.2, 0.3, 0.1]), np.array([0.7, 0.6, 1.5])
     r = (p_od - p_o) / np.linalg.norm(p_od - p_o)
-    plain = GazeMedium(g).evaluate(rgb.Point3f(p_od.tolist()), rgb.Point3f(p_o.tolist()), rgb.Vector3f(r.tolist()), True)
+    plain = GazeMedium(g).evaluate(
+        rgb.Point3f(p_od.tolist()), rgb.Point3f(p_o.tolist()), rgb.Vector3f(r.tolist()), True
+    )
     m = turn(50.0)
     moved = GazeMedium(g, Similarity(m)).evaluate(
-        rgb.Point3f((m @ [*p_od, 1])[:3].tolist()), rgb.Point3f((m @ [*p_o, 1])[:3].tolist()),
-        rgb.Vector3f((m[:3, :3] @ r / 50).tolist()), True,
-    )  # fmt: skip
+        rgb.Point3f((m @ [*p_od, 1])[:3].tolist()),
+        rgb.Point3f((m @ [*p_o, 1])[:3].tolist()),
+        rgb.Vector3f((m[:3, :3] @ r / 50).tolist()),
+        True,
+    )
     assert np.allclose([v.numpy()[0] for v in plain], [v.numpy()[0] for v in moved], rtol=1e-4)
 
 

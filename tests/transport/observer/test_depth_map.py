@@ -1,4 +1,5 @@
 """The map around an observer: depths and gaze between its entries, across the seam of azimuth 0 and at the poles."""
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -27,7 +28,9 @@ def directions():
     rng, width = np.random.default_rng(0), np.pi / HEIGHT
     seams = np.concatenate([c + width * np.linspace(-1.3, 1.3, 27) for c in (0, np.pi, -np.pi, 2 * np.pi)])
     phi = np.concatenate([seams, rng.uniform(-np.pi, np.pi, 500)])
-    return phi, np.concatenate([rng.uniform(0.2, np.pi - 0.2, len(phi) - 40), np.geomspace(1e-3, 0.2, 20), np.pi - np.geomspace(1e-3, 0.2, 20)])
+    return phi, np.concatenate(
+        [rng.uniform(0.2, np.pi - 0.2, len(phi) - 40), np.geomspace(1e-3, 0.2, 20), np.pi - np.geomspace(1e-3, 0.2, 20)]
+    )
 
 
 def interpolated(table, phi, theta):
@@ -36,7 +39,7 @@ def interpolated(table, phi, theta):
     x, y = (phi / width - 0.5) % (2 * HEIGHT), np.clip(theta / width - 0.5, 0, HEIGHT - 1)
     i, j = np.floor(x).astype(int), np.minimum(np.floor(y).astype(int), HEIGHT - 2)
     fx, fy = x - i, y - j
-    at = lambda column, row: table[row, column % (2 * HEIGHT)]  # noqa: E731
+    at = lambda column, row: table[row, column % (2 * HEIGHT)]
     rows = [(1 - fx) * at(i, j + k) + fx * at(i + 1, j + k) for k in (0, 1)]
     return (1 - fy) * rows[0] + fy * rows[1]
 
@@ -57,8 +60,13 @@ def test_visibility_is_interpolated_between_entries_and_across_the_seam(rgb, aro
     # A point is hidden by what is nearer than it by more than the tolerance.
     assert np.allclose(seen.numpy(), interpolated((table >= 1.5).astype(float), phi, theta), atol=2e-4)
     width = np.pi / HEIGHT
-    column, row = np.floor(phi / width).astype(int) % (2 * HEIGHT), np.clip(np.floor(theta / width).astype(int), 0, HEIGHT - 1)
-    inside = np.maximum(np.abs(phi / width % 1 - 0.5), np.abs(theta / width % 1 - 0.5)) < 0.49  # no tie between two entries
+    column, row = (
+        np.floor(phi / width).astype(int) % (2 * HEIGHT),
+        np.clip(np.floor(theta / width).astype(int), 0, HEIGHT - 1),
+    )
+    inside = (
+        np.maximum(np.abs(phi / width % 1 - 0.5), np.abs(theta / width % 1 - 0.5)) < 0.49
+    )  # no tie between two entries
     assert np.allclose(nearest.numpy()[inside], table[row, column][inside])
 
 
@@ -81,9 +89,14 @@ def test_gaze_is_that_of_the_entries_that_see_the_point(rgb, around):
     known = (depth == 2).astype(float)
     share = interpolated(known, phi, theta)
     sure = share > 0.02
-    assert np.allclose(found[sure], (interpolated(known * gaze, phi, theta) / np.where(sure, share, 1))[sure], rtol=2e-2, atol=2e-3)
+    assert np.allclose(
+        found[sure], (interpolated(known * gaze, phi, theta) / np.where(sure, share, 1))[sure], rtol=2e-2, atol=2e-3
+    )
     around.depth = dr.full(rgb.Float, 3.0, 2 * HEIGHT**2)
-    assert (around.gaze_along(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.1, True).numpy() == -1).all()
+    assert (
+        around.gaze_along(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.1, True).numpy()
+        == -1
+    ).all()
 
 
 def test_a_map_serves_until_a_shape_moves(rgb):

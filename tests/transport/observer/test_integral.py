@@ -1,4 +1,6 @@
-"""The integral over an observer's sphere: a number of the place and the observer, not of how many directions it is a sum over."""
+"""The integral over an observer's sphere: a number of the place and the observer, not of how many directions it is a
+sum over."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -7,14 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.field.backend import namespace
-from nerg_mi.training.geometry.places import place_of_volume
+from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.formats.volumes import write_volume
-from nerg_mi.transport.observer.integral import GazeIntegral, nearest_depth
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.training.geometry.places import place_of_volume
 from nerg_mi.transport.march.primal import MarchSettings
 from nerg_mi.transport.media.media import GazeMedium
+from nerg_mi.transport.observer.integral import GazeIntegral, nearest_depth
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
 from tests.field.gaze.test_log_density import BOX, SMALL
@@ -40,7 +42,9 @@ def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
     # Steep, so that it matters where what escapes is taken to end.
     field.set_parameters({"grid.table": ns.Float(10 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
     place, settings = Place(speckled), default_settings(speckled)
-    integral = lambda count, p: float(GazeIntegral(GazeMedium(field), place, mi.Point3f(*p), settings, "median", 0.5, count).value()[0])
+    integral = lambda count, p: float(
+        GazeIntegral(GazeMedium(field), place, mi.Point3f(*p), settings, "median", 0.5, count).value()[0]
+    )
     for p in ((0, 0, 1.5), (0.3, -0.2, 1.6)):
         assert integral(1 << 17, p) == pytest.approx(integral(1 << 19, p), rel=3e-4), p
 
@@ -49,12 +53,24 @@ def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
 def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
     """In a room of shapes, whose walls are where a formula says."""
     ns, rng = namespace("llvm_ad_rgb"), np.random.default_rng(1)
-    field = LogGazeField.random(replace(SMALL, variant=variant, mix=0.0), BOX, ns, 1, rng.normal(size=(SMALL.prior, 2 * SMALL.prior)))
+    field = LogGazeField.random(
+        replace(SMALL, variant=variant, mix=0.0), BOX, ns, 1, rng.normal(size=(SMALL.prior, 2 * SMALL.prior))
+    )
     field.set_parameters({"grid.table": ns.Float(3 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
-    room = rgb.load_dict({"type": "scene", "walls": {"type": "cube", "to_world": rgb.ScalarTransform4f().translate([0, 0, 1.5]).scale([1.9, 1.9, 1.4])}})
+    room = rgb.load_dict(
+        {
+            "type": "scene",
+            "walls": {
+                "type": "cube",
+                "to_world": rgb.ScalarTransform4f().translate([0, 0, 1.5]).scale([1.9, 1.9, 1.4]),
+            },
+        }
+    )
     o = np.array([0.4, -0.7, 1.7])
     gaze = GazeMedium(field)
-    found = GazeIntegral(gaze, Place(None, room), rgb.Point3f(*map(float, o)), MarchSettings(0.1), "median", 0.5, 1 << 16).value()[0]
+    found = GazeIntegral(
+        gaze, Place(None, room), rgb.Point3f(*map(float, o)), MarchSettings(0.1), "median", 0.5, 1 << 16
+    ).value()[0]
     d = fibonacci_directions(20_000)
     walls = np.where(d > 0, [1.9, 1.9, 2.9], [-1.9, -1.9, 0.1])
     distance = ((walls - o) / d).min(axis=1)

@@ -1,7 +1,7 @@
 """What an observer meets on the way to a point: where the point is looked for, and what it costs."""
+
 import math
 
-import drjit as dr
 import numpy as np
 import pytest
 
@@ -18,21 +18,43 @@ def slab(mi, sigma):
     return Place(VolumeMedium(mi.load_dict({"type": "constvolume", "value": float(sigma)})))
 
 
-def look(mi, place, kind, p_d, p_o, *, camera=(0.5, 0.5, -1), fuzz=0.0, tolerance=0.0, falloff=0.0, dt_gamma=0.0, count=False):
+def look(
+    mi, place, kind, p_d, p_o, *, camera=(0.5, 0.5, -1), fuzz=0.0, tolerance=0.0, falloff=0.0, dt_gamma=0.0, count=False
+):
     """Sight of the point ``p_d`` that a camera sees along its ray, from ``p_o``."""
     o, p_d, p_o = (np.asarray(v, np.float64) for v in (camera, p_d, p_o))
     ray = mi.Ray3f(mi.Point3f(*map(float, o)), mi.Vector3f(*map(float, (p_d - o) / np.linalg.norm(p_d - o))))
     observer = ObserverPass(MarchSettings(STEP, dt_gamma=dt_gamma), kind, "median", 0.5, tolerance, 64)
-    return observer.look(place, ray, mi.Point3f(*map(float, p_d)), mi.Point3f(*map(float, p_o)), fuzz, mi.Bool(True), mi.Float(falloff), count)
+    return observer.look(
+        place,
+        ray,
+        mi.Point3f(*map(float, p_d)),
+        mi.Point3f(*map(float, p_o)),
+        fuzz,
+        mi.Bool(True),
+        mi.Float(falloff),
+        count,
+    )
 
 
-@pytest.mark.parametrize("dt_gamma, tolerance, want", [
-    (0.0, 0.0, 2 * STEP), (0.004, 0.0, 2 * STEP), (0.1, 0.0, 2 * 0.1 * 1.5), (0.1, 0.3, 0.3),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "dt_gamma, tolerance, want",
+    [(0.0, 0.0, 2 * STEP), (0.004, 0.0, 2 * STEP), (0.1, 0.0, 2 * 0.1 * 1.5), (0.1, 0.3, 0.3)],
+)
 def test_a_point_is_looked_for_two_steps_in_front_of_its_surface(rgb, dt_gamma, tolerance, want):
-    # Steps grow with the distance from the camera, 1.5, and so does what two of them are; a tolerance that is given stays.
+    # Steps grow with the distance from the camera, 1.5, and so does what two of them are; a tolerance that is given
+    # stays.
     for fuzz in (0.0, 0.05):
-        sight = look(rgb, slab(rgb, 0), "transmittance", (0.5, 0.5, 0.5), (0.5, 0.5, -3), fuzz=fuzz, dt_gamma=dt_gamma, tolerance=tolerance)
+        sight = look(
+            rgb,
+            slab(rgb, 0),
+            "transmittance",
+            (0.5, 0.5, 0.5),
+            (0.5, 0.5, -3),
+            fuzz=fuzz,
+            dt_gamma=dt_gamma,
+            tolerance=tolerance,
+        )
         assert sight.depth[0] == pytest.approx(3.5 - want - fuzz, rel=1e-5)
 
 
@@ -55,7 +77,9 @@ def test_transmittance_is_what_matter_lets_through(rgb):
     sight = look(rgb, slab(rgb, 0.7), "transmittance", (0.5, 0.5, 2.0), (0.5, 0.5, -2), camera=(0.5, 0.5, 5))
     assert sight.visibility[0] == pytest.approx(math.exp(-0.7), rel=1e-4)
     # Only what lies before the point: half of the slab.
-    sight = look(rgb, slab(rgb, 0.7), "transmittance", (0.5, 0.5, 0.5), (0.5, 0.5, -2), camera=(0.5, 0.5, -1), tolerance=1e-4)
+    sight = look(
+        rgb, slab(rgb, 0.7), "transmittance", (0.5, 0.5, 0.5), (0.5, 0.5, -2), camera=(0.5, 0.5, -1), tolerance=1e-4
+    )
     assert sight.visibility[0] == pytest.approx(math.exp(-0.35), rel=1e-3)
 
 

@@ -1,4 +1,5 @@
 """Where eyes are: the sensor's centre, whatever the near plane, and for every member of a batch."""
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -7,8 +8,12 @@ from nerg_mi.transport.observer import viewpoint
 
 
 def camera(mi, origin, target=(0, 0, 0), kind="perspective", **kwargs):
-    d = {"type": kind, "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 1, 0]),
-         "film": {"type": "hdrfilm", "width": 4, "height": 4}, **kwargs}  # fmt: skip
+    d = {
+        "type": kind,
+        "to_world": mi.ScalarTransform4f().look_at(origin, target, [0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 4, "height": 4},
+        **kwargs,
+    }
     return d
 
 
@@ -35,7 +40,9 @@ def test02_sensors_without_a_center(rgb, kind):
         shape = rgb.load_dict({"type": "rectangle", "s": {"type": "irradiancemeter", "film": {"type": "hdrfilm"}}})
         sensor = shape.sensor()
     else:
-        sensor = rgb.load_dict({"type": kind, "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}})
+        sensor = rgb.load_dict(
+            {"type": kind, "film": {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}}
+        )
     with pytest.raises(ValueError, match='the camera is a .* no centre .* explicit "observer"'):
         viewpoint.require_center(sensor, "the camera")
     with pytest.raises(ValueError, match="no centre"):

@@ -1,4 +1,5 @@
 """The shadow factor: its sign, its ramp, and fall-off zero."""
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
