@@ -1,0 +1,256 @@
+"""What the commands make, compared bit for bit with what they made before: for changes that are to change nothing.
+
+    python tools/unchanged.py record FOLDER [--only NAME]     run every command below, keep what it writes and its
+    digest python tools/unchanged.py compare FOLDER [--only NAME]    run them again, and name what differs; exit code 1
+    where anything does
+
+Pictures of the demo store with every kind of depth, visibility, quadrature, gaze field and AOV, of shapes and through a
+panorama; trainings of radiance and gaze at one thread; a study's errors; tables and exports. Everything is made of the
+demo store and of seeds, by the command line alone, so that it can be recorded by one version and compared by another.
+The bits depend on the machine, on libLLVM and on Mitsuba: record and compare on the same one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import hashlib
+import json
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+STORE = ROOT / "scenes" / "store"
+NERG = str(Path(sys.executable).with_name("nerg"))
+SIZE = ["-D", "width=96", "-D", "height=64", "-D", "sphere_width=96", "-D", "sphere_height=48", "-D", "spp=2"]
+ALL_AOVS = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth,features,features_at"
+COUNTS = "depth,gaze,gaze_evals,density_evals,color_evals"
+VIEWS = [
+    (7.4, 3.4, 2.2),
+    (4.6, 3.0, 1.6),
+    (2.4, 2.0, 1.7),
+    (8.4, 5.0, 2.0),
+    (5.5, 1.2, 1.8),
+    (3.0, 5.0, 1.5),
+    (6.5, 4.5, 2.3),
+    (4.0, 1.5, 2.4),
+]
+TARGET = (4.8, 4.2, 1.0)
+GAZE = {
+    "default": ["--recipe", "default", "--steps", "12"],
+    "small": ["--recipe", "small", "--steps", "12", "--no-refit"],
+    "paper": ["--recipe", "paper", "--size", "small", "--steps", "6", "--no-refit"],
+    "emit": ["--recipe", "default", "--variant", "emit", "--steps", "6"],
+    "capture": ["--recipe", "small", "--variant", "capture", "--steps", "6", "--no-refit"],
+    "zones": ["--recipe", "default", "--zones", "2", "--steps", "10"],
+    "snapshot": ["--recipe", "small", "--semantic", "snapshot", "--steps", "6", "--no-refit"],
+    "accumulated": ["--recipe", "small", "--semantic", "accumulated", "--semantic-own", "--steps", "6", "--no-refit"],
+    "normalized": ["--recipe", "small", "--normalized", "--steps", "6", "--no-refit"],
+    "ensemble": ["--recipe", "default", "--ensemble", "2", "--steps", "6"],
+}
+"""Gaze fields by name, and the options that train them."""
+PICTURES = {
+    "plain": [],
+    "all_aovs": ["aovs=" + ALL_AOVS],
+    "counts": ["aovs=" + COUNTS],
+    "expected": ["depth=expected"],
+    "refined": ["depth=refined"],
+    "transmittance": ["visibility=transmittance"],
+    "map": ["visibility=map"],
+    "open": ["occlusion=false"],
+    "dark": ["radiance=false"],
+    "support": ["aovs=gaze,support"],
+}
+"""Pictures of the store's scene by name, and what they change in it."""
+
+
+def make_rays(folder: Path) -> Path:
+    """Rays of three people who walk through the store and look at its middle, as a CSV file."""
+    rng = np.random.default_rng(7)
+    lines = ["person,time,x,y,z,dx,dy,dz"]
+    for person in range(3):
+        place = np.array([4.4, 2.8, 1.6]) + rng.normal(0, 0.2, 3) * [1, 1, 0.2]
+        for k in range(400):
+            place = place + rng.normal(0, 0.02, 3) * [1, 1, 0]
+            to = np.array([4.8, 4.2, 1.0]) + rng.normal(0, 0.5, 3) - place
+            to /= np.linalg.norm(to)
+            lines.append(",".join([f"p{person}", f"{k * 0.1:.1f}", *(f"{v:.6f}" for v in (*place, *to))]))
+    path = folder / "walk.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_transforms(folder: Path, width: int, height: int) -> None:
+    """The pictures ``photos/K.png`` as a posed image set."""
+    frames = []
+    for k, eye in enumerate(VIEWS):
+        back = np.subtract(eye, TARGET)
+        back = back / np.linalg.norm(back)
+        right = np.cross([0, 0, 1], back)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)
+        frames.append({"file_path": f"{k}.png", "transform_matrix": pose.tolist()})
+    focal = 0.5 * width / np.tan(np.radians(78) / 2)
+    camera = {"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+
+
+def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """Each command line in the order that they need each other, and the file or folder that it writes."""
+    render = ["render", str(STORE / "scene.xml")]
+    one = ["--threads", "1"]
+    rays = str(folder / "rays.npz")
+    yield (
+        "rays.npz",
+        ["rays", "import", str(make_rays(folder)), "--map", "origin=x,y,z direction=dx,dy,dz time=time person=person"],
+    )
+    yield "fewer.npz", ["rays", "filter", rays, "--fixations", "idt"]
+    for name, changes in PICTURES.items():
+        yield f"{name}.exr", [*render, *SIZE, *(v for c in changes for v in ("-D", c))]
+    for sensor in ("1", "2"):
+        yield f"sensor{sensor}.exr", [*render, *SIZE, "-s", sensor]
+    for scene in ("shapes", "display", "twin"):
+        yield f"{scene}.exr", ["render", str(STORE / f"{scene}.xml"), "-D", "width=96", "-D", "height=64", "--spp", "2"]
+    (folder / "photos").mkdir(exist_ok=True)
+    for k, eye in enumerate(VIEWS):
+        place = ["-D", "camera={}, {}, {}".format(*eye), "-D", "target={}, {}, {}".format(*TARGET)]
+        yield f"photos/{k}.png", [*render, *SIZE, *place, "-D", "aovs=depth"]
+    write_transforms(folder / "photos", 96, 64)
+    yield (
+        "place.safetensors",
+        [
+            "train",
+            "radiance",
+            str(folder / "photos"),
+            "--aabb",
+            "0,0,0,10,7,3",
+            "--steps",
+            "60",
+            "--holdout",
+            "4",
+            *one,
+        ],
+    )
+    yield "place.ply", ["export", "points", str(folder / "place.safetensors")]
+    yield "place.vol", ["export", "volume", str(folder / "place.safetensors"), "--resolution", "24"]
+    for name, options in GAZE.items():
+        yield (
+            f"gaze_{name}.safetensors",
+            [
+                "train",
+                "gaze",
+                rays,
+                "--field",
+                str(STORE / "store.safetensors"),
+                "--probes",
+                "60",
+                "--min-rays",
+                "8",
+                *options,
+                *one,
+            ],
+        )
+        more = {"ensemble": "gaze,gaze_std,support", "emit": "gaze,emit", "capture": "gaze,capture"}.get(
+            name, "gaze,emit,capture"
+        )
+        yield f"gaze_{name}.exr", [*render, *SIZE, "-D", f"gaze={folder}/gaze_{name}.safetensors", "-D", f"aovs={more}"]
+    yield (
+        "study",
+        ["study", str(STORE / "scene.xml"), "--quick", "--width", "48", "--height", "32", "--only", "depth|visib|step"],
+    )
+    yield (
+        "eval",
+        [
+            "eval",
+            "gaze",
+            str(folder / "gaze_default.safetensors"),
+            rays,
+            "--min-rays",
+            "8",
+            "--resamples",
+            "20",
+            "--pictures",
+            "1",
+            *one,
+        ],
+    )
+
+
+def digest(path: Path) -> str:
+    """Of what a file holds: of a checkpoint or a rays file its arrays, since their documents tell times and names of
+    files; of others their bytes."""
+    if path.suffix == ".npz":
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        kept = [(name, a.tobytes()) for name, a in arrays.items() if a.dtype.kind in "fiub" and a.ndim]
+        return hashlib.sha256(b"".join(name.encode() + bytes_ for name, bytes_ in kept)).hexdigest()
+    data = path.read_bytes()
+    if path.suffix == ".safetensors":
+        (size,) = struct.unpack("<Q", data[:8])
+        header = json.loads(data[8 : 8 + size])
+        header.pop("__metadata__", None)
+        data = json.dumps(header, sort_keys=True).encode() + data[8 + size :]
+    return hashlib.sha256(data).hexdigest()
+
+
+def errors_of_study(folder: Path) -> str:
+    """Digest of a study's rows without their times and memory."""
+    rows = list(csv.DictReader((folder / "study.csv").open()))
+    kept = [
+        {k: v for k, v in row.items() if not any(w in k for w in ("ms", "second", "time", "memory", "bytes"))}
+        for row in rows
+    ]
+    return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
+
+
+def run(folder: Path, only: str | None) -> dict[str, str]:
+    """Run every command that ``only`` names; file -> digest, or what went wrong."""
+    found = {}
+    for name, line in commands(folder):
+        if only is not None and only not in name:
+            continue
+        out = folder / name
+        answer = subprocess.run([NERG, *line, "-o", str(out)], capture_output=True, text=True)
+        if answer.returncode != 0:
+            found[name] = f"exit code {answer.returncode}: {answer.stderr.strip()[-400:]}"
+        elif name == "study":
+            found[name] = errors_of_study(out)
+        elif out.is_dir():
+            for table in sorted(out.glob("*.csv")):
+                found[f"{name}/{table.name}"] = digest(table)
+        else:
+            found[name] = digest(out)
+        print(f"{name:28} {found.get(name, '')[:70]}", flush=True)
+    return found
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["record", "compare"])
+    parser.add_argument("folder", type=Path, help="of the recorded digests and of what the commands made")
+    parser.add_argument("--only", help="only outputs whose names contain this, and nothing that they are made of")
+    args = parser.parse_args(argv)
+    record = args.folder / "digests.json"
+    if args.what == "record":
+        args.folder.mkdir(parents=True, exist_ok=True)
+        found = run(args.folder.resolve(), args.only)
+        before = json.loads(record.read_text()) if record.exists() and args.only else {}
+        record.write_text(json.dumps({**before, **found}, indent=1))
+        return int(any(v.startswith("exit code") for v in found.values()))
+    known = json.loads(record.read_text())
+    with tempfile.TemporaryDirectory(prefix="nerg-unchanged-") as temporary:
+        found = run(Path(temporary), args.only)
+    differ = [name for name, value in found.items() if known.get(name) != value]
+    print(f"{len(found)} outputs, {len(differ)} of them differ" + "".join(f"\n  {n}" for n in differ))
+    return int(bool(differ))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
