@@ -28,7 +28,7 @@ def main(argv=None) -> None:
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.training.geometry.places import place_of_field, place_of_volume
-    from nerg_mi.transport.media.media import GazeMedium
+    from nerg_mi.transport.observer.gaze_medium import GazeMedium
     from nerg_mi.transport.observer.integral import COUNT, GazeIntegral
     from nerg_mi.transport.place import Place
     from nerg_mi.transport.trace import default_settings

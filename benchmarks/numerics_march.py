@@ -14,7 +14,8 @@ from nerg_mi.transport.march.depth import surface_depth
 from nerg_mi.transport.march.primal import MarchSettings, march
 from nerg_mi.transport.march.quadrature import absorbed_share, mean_depth_share
 from nerg_mi.transport.march.rules import linear_crossing, linear_share
-from nerg_mi.transport.media.media import LocalRay, VolumeMedium
+from nerg_mi.transport.media.protocol import LocalRay
+from nerg_mi.transport.media.volume import VolumeMedium
 
 HEAD = ["case", "range", "quantity", "largest error", "reference"]
 # With nothing set, a 1024th of the diagonal of a unit cube.

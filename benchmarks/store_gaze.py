@@ -53,7 +53,7 @@ def main(argv=None) -> None:
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.rays.rays import Rays
     from nerg_mi.rays.splits import purge
-    from nerg_mi.transport.media.media import FieldMedium
+    from nerg_mi.transport.media.field import FieldMedium
 
     here = Path(store.__file__).resolve().parent
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

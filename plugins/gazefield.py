@@ -64,10 +64,11 @@ import mitsuba as mi
 
 from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.properties import text
 from nerg_mi.registration import register
-from nerg_mi.transport.media.media import GazeMedium, Similarity
 from nerg_mi.transport.observer.ensemble import EnsembleMedium
+from nerg_mi.transport.observer.gaze_medium import GazeMedium
 
 
 class GazeFieldVolume(mi.Volume):

@@ -55,10 +55,10 @@ import mitsuba as mi
 
 from nerg_mi.density.kde.view import KdeView
 from nerg_mi.field.backend import namespace
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.properties import integer, number, text
 from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import register
-from nerg_mi.transport.media.media import Similarity
 
 
 class GazeKdeVolume(mi.Volume):

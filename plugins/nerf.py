@@ -58,9 +58,10 @@ import mitsuba as mi
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.formats.fields import load_radiance
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.properties import number, text
 from nerg_mi.registration import register
-from nerg_mi.transport.media.media import FieldMedium, Similarity
+from nerg_mi.transport.media.field import FieldMedium
 
 
 class NerfVolume(mi.Volume):

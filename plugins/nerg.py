@@ -231,7 +231,7 @@ from nerg_mi.transport.march.primal import MarchSettings
 from nerg_mi.transport.march.rules import KINDS as QUADRATURES
 from nerg_mi.transport.march.rules import rule
 from nerg_mi.transport.media.features import Featured, snapshot, what_gaze_wants
-from nerg_mi.transport.media.media import KnownEmpty, VolumeMedium
+from nerg_mi.transport.media.volume import KnownEmpty, VolumeMedium
 from nerg_mi.transport.observer import viewpoint
 from nerg_mi.transport.observer.ensemble import SupportView
 from nerg_mi.transport.observer.sight import KINDS as VISIBILITIES

@@ -50,10 +50,10 @@ def eval_gaze(
     from nerg_mi.field.backend import namespace
     from nerg_mi.files.atomic import check_folder
     from nerg_mi.formats.fields import load_gaze
+    from nerg_mi.maths.similarity import Similarity
     from nerg_mi.rays.rays import Rays
     from nerg_mi.rays.readers.collecting import file_sha256
     from nerg_mi.rendering.pictures import activate
-    from nerg_mi.transport.media.media import Similarity
 
     output = output or gaze.with_suffix(".eval")
     check_folder(output)

@@ -356,7 +356,7 @@ def place_for(field, scene, geometry, rays, views, output: Path, voxel: float | 
 
 
 def _similarity(path: Path | None):
-    from nerg_mi.transport.media.media import Similarity
+    from nerg_mi.maths.similarity import Similarity
 
     if path is None:
         return None

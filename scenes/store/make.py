@@ -89,7 +89,7 @@ def make_gaze(job: Job) -> list[Path]:
     from nerg_mi.rays.readers.collecting import file_sha256
     from nerg_mi.training.gaze.run import hold_out, train_gaze
     from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings, sized_gaze_config
-    from nerg_mi.transport.media.media import FieldMedium
+    from nerg_mi.transport.media.field import FieldMedium
 
     source, place = job.build / "rays.npz", job.store / "store.safetensors"
     _require(source, "rays")

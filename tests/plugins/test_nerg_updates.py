@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nerg_mi.transport.media import media
+from nerg_mi.transport.media import volume
 
 from .scenes import camera, channels, observer_at, wall, with_field
 
@@ -33,8 +33,8 @@ def seen(mi, scene) -> np.ndarray:
 @pytest.fixture
 def reads(monkeypatch):
     """One entry for each time that the voxels of a grid are read."""
-    count, describe = [], media.describe
-    monkeypatch.setattr(media, "describe", lambda volume: (count.append(volume), describe(volume))[1])
+    count, describe = [], volume.describe
+    monkeypatch.setattr(volume, "describe", lambda volume: (count.append(volume), describe(volume))[1])
     return count
 
 

@@ -12,9 +12,10 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.media.media import Similarity, at_nearest
 from nerg_mi.transport.observer.ensemble import keep_or_make
+from nerg_mi.transport.observer.gaze_medium import at_nearest
 
 from .estimate import SphericalKde
 from .frame import WORTH

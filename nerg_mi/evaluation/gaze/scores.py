@@ -11,9 +11,10 @@ from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.field.gaze.product import GazeField
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.training.gaze.supervision import SURFACE_OPACITY
-from nerg_mi.transport.media.media import GazeMedium, Similarity
 from nerg_mi.transport.observer.ensemble import EnsembleMedium
+from nerg_mi.transport.observer.gaze_medium import GazeMedium
 from nerg_mi.transport.observer.integral import gaze_around
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings

@@ -192,7 +192,7 @@ def _volumes(variant: str):
             from nerg_mi.field.encoding.hashgrid import HashGridConfig
             from nerg_mi.field.gaze.product import GazeConfig, GazeField
             from nerg_mi.maths.box import Box
-            from nerg_mi.transport.media.media import GazeMedium
+            from nerg_mi.transport.observer.gaze_medium import GazeMedium
 
             super().__init__(props)
             ns = namespace(variant)

@@ -16,10 +16,10 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.gaze.support import RaySupport
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.splits import purge, split_by_person, split_by_position
 from nerg_mi.training.common.run_state import kept_unless
-from nerg_mi.transport.media.media import Similarity
 
 from .likelihood import LikelihoodTrainer
 from .salience import digest_views, far_views, split_views, supervise_both

@@ -17,8 +17,8 @@ from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.log_density import LogGazeConfig, blind_table, table_directions
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.transport.media.media import Similarity
 
 from .settings import ProbeSettings
 from .supervision import Supervision, observe, supervise_rays

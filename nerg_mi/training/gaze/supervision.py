@@ -15,9 +15,9 @@ from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.density.probes import Probes, person_weights, place_probes
 from nerg_mi.field.gaze.log_density import LogGazeConfig, blind_table, table_directions
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.media.media import Similarity
 from nerg_mi.transport.observer.integral import nearest_depth
 from nerg_mi.transport.trace import trace_depth
 

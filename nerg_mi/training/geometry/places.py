@@ -15,7 +15,8 @@ from nerg_mi.maths.box import Box
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.collecting import file_sha256
 from nerg_mi.rendering.mesh_file import check_vol
-from nerg_mi.transport.media.media import FieldMedium, VolumeMedium
+from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.media.volume import VolumeMedium
 from nerg_mi.transport.place import Place
 
 from .hit_extent import hit_extent

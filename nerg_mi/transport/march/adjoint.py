@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from nerg_mi.transport.media.media import LocalRay
+from nerg_mi.transport.media.protocol import LocalRay
 
 from .primal import MarchResult, add, advance, limits, march_primal
 from .quadrature import absorbed_share

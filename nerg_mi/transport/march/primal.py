@@ -105,7 +105,7 @@ def march(
     until=None,
     fine_from=None,
 ) -> MarchResult:
-    """March ``ray`` (``media.LocalRay``) from ``t0`` to ``t1``.
+    """March ``ray`` (``media.protocol.LocalRay``) from ``t0`` to ``t1``.
 
     ``offset`` in [0, 1]: length of the first step as a share of a full one (jitter; None: a full
     step). ``color``: array type of the medium's colour, or a function of one's entry that makes it; None for a

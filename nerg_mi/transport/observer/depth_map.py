@@ -42,7 +42,7 @@ class ObserverMap:
         return self._shapes == of_shapes(place)
 
     def keep(self, gaze) -> None:
-        """Have ``look_up`` know the density of ``gaze`` (``media.GazeMedium``) where the observer meets a surface."""
+        """Have ``look_up`` know the density of ``gaze`` (``gaze_medium.GazeMedium``) where the observer meets a surface."""
         if self._gaze_of is not None and self._gaze_of == Fingerprint(gaze.parameters()):
             return
         with dr.suspend_grad():

@@ -7,8 +7,9 @@ import drjit as dr
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.support import RaySupport
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.transport.freezing import recording
-from nerg_mi.transport.media.media import GazeMedium, Similarity, at_nearest
+from nerg_mi.transport.observer.gaze_medium import GazeMedium, at_nearest
 
 
 class EnsembleMedium:

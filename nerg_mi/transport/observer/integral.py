@@ -24,7 +24,7 @@ of them would be another one, by up to some per cent where half of them escape."
 
 
 class GazeIntegral:
-    """Of ``gaze`` (``media.GazeMedium``) at ``p_o`` (Point3f, one lane) in ``place``; see ``value``.
+    """Of ``gaze`` (``gaze_medium.GazeMedium``) at ``p_o`` (Point3f, one lane) in ``place``; see ``value``.
 
     ``settings``, ``kind``, ``surface_opacity``: of the observer's rays, as the integrator has them. The depths carry no
     derivatives; the value has those of the field's parameters. ``depths``: an integral of such a field here, whose
@@ -157,7 +157,7 @@ def gaze_around(gaze, place, p_o, r_o, settings, kind: str, surface_opacity: flo
     carrying no derivatives: on surfaces what the integrator shows there, and elsewhere what the field was trained to
     be.
 
-    ``gaze`` (``media.GazeMedium`` or ``gaze_ensemble.EnsembleMedium``) must ``face`` the observer; the others as there.
+    ``gaze`` (``gaze_medium.GazeMedium`` or ``gaze_ensemble.EnsembleMedium``) must ``face`` the observer; the others as there.
     """
     import mitsuba as mi
 

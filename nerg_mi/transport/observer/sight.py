@@ -78,7 +78,7 @@ class ObserverPass:
         The point that is looked for lies a little in front of the surface, towards the camera: by the
         tolerance, and by ``fuzz``, how far light goes into the surface. A surface then never hides itself,
         however obliquely the observer looks along it, because the ray stays above it. A tolerance along the
-        observer's ray alone would have to grow without bound. ``gaze`` (``media.GazeMedium``): have a map keep
+        observer's ray alone would have to grow without bound. ``gaze`` (``gaze_medium.GazeMedium``): have a map keep
         the gaze as well, where no derivative needs the field itself.
         """
         import mitsuba as mi

@@ -8,9 +8,9 @@ import pytest
 
 from nerg_mi.density.kde.frame import WORTH
 from nerg_mi.density.kde.view import KdeView
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.media.media import Similarity
 from tests.reference.kde import kde as reference
 
 COUNT, KAPPA = 40, 15.0

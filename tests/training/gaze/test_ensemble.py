@@ -11,10 +11,10 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.fields import _dump, load_gaze
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.ensemble import blocks_of, resample, train_ensemble
 from nerg_mi.training.gaze.run import train_gaze
-from nerg_mi.transport.media.media import Similarity
 
 from .test_state import LIKELIHOOD, LOG, PROBES, threads  # noqa: F401  (fixture)
 from .test_trainer import BOX, looking_at

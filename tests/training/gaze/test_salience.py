@@ -14,6 +14,7 @@ from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
 from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.gaze.log_density import look_up
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer
 from nerg_mi.training.gaze.run import train_gaze
@@ -28,7 +29,6 @@ from nerg_mi.training.gaze.salience import (
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
 from nerg_mi.training.gaze.supervision import Supervision
 from nerg_mi.training.gaze.trainer import GazeTrainer
-from nerg_mi.transport.media.media import Similarity
 from tests.field.gaze.test_log_density import BOX, SMALL
 
 from .test_trainer import SMALL as PLAIN

@@ -20,7 +20,7 @@ from nerg_mi.training.gaze.semantics import config_like, semantic_features, trun
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
 from nerg_mi.training.gaze.supervision import supervise_rays
 from nerg_mi.training.gaze.trainer import GazeTrainer
-from nerg_mi.transport.media.media import FieldMedium
+from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.trace import default_settings
 
 BOX = Box((-2, -2, 0), (2, 2, 3))

@@ -17,6 +17,7 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze import run as gaze_run
 from nerg_mi.training.gaze.product_model import gaze_density, used_parameters
@@ -24,7 +25,7 @@ from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings, sized_ga
 from nerg_mi.training.gaze.supervision import Supervision, box_exit, rotated_sets, supervise, supervise_rays
 from nerg_mi.training.gaze.trainer import GazeTrainer, _Samples
 from nerg_mi.training.geometry.hit_geometry import volume_dict, voxelise_hits
-from nerg_mi.transport.media.media import Similarity, VolumeMedium
+from nerg_mi.transport.media.volume import VolumeMedium
 
 BOX = Box((-2, -2, 0), (2, 2, 3))
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=8)

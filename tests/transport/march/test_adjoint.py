@@ -11,7 +11,7 @@ import pytest
 
 from nerg_mi.transport.march import adjoint
 from nerg_mi.transport.march.primal import MarchSettings, march, march_primal
-from nerg_mi.transport.media.media import LocalRay
+from nerg_mi.transport.media.protocol import LocalRay
 
 
 def scene_of(mi, size, step, quadrature="constant"):

@@ -8,7 +8,7 @@ import pytest
 
 from nerg_mi.transport.march.depth import KINDS, surface_depth, way_out
 from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.media.media import VolumeMedium
+from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
 
 

@@ -11,7 +11,8 @@ from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.media.media import FieldMedium, VolumeMedium
+from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
 
 DIAGONAL = 3**0.5

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from nerg_mi.transport.march.depth import KINDS, surface_depth
 from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.media.media import LocalRay, VolumeMedium
+from nerg_mi.transport.media.protocol import LocalRay
+from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
 
 PIECES = 8

@@ -13,7 +13,8 @@ from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.transport.march.primal import MarchSettings, march
 from nerg_mi.transport.march.rules import KINDS, color_share, linear_crossing, linear_share, rule
 from nerg_mi.transport.media.cells import VoxelCells
-from nerg_mi.transport.media.media import LocalRay, VolumeMedium
+from nerg_mi.transport.media.protocol import LocalRay
+from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
 
 
@@ -218,7 +219,8 @@ import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.media.media import LocalRay, VolumeMedium
+from nerg_mi.transport.media.protocol import LocalRay
+from nerg_mi.transport.media.volume import VolumeMedium
 data = np.full((64, 64, 64), 1.5, np.float32)
 data[::2] = 0.5
 medium = VolumeMedium(mi.load_dict({{"type": "gridvolume", "grid": mi.VolumeGrid(data)}}))

@@ -7,9 +7,10 @@ import pytest
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.transport.march.primal import MarchSettings
 from nerg_mi.transport.media.features import what_gaze_wants
-from nerg_mi.transport.media.media import FieldMedium, Similarity
+from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.place import Place
 
 O, D = np.array([0.1, -0.2, -3.0]), np.array([0.0, 0.1, 1.0]) / np.hypot(0.1, 1)

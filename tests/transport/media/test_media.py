@@ -10,8 +10,11 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.media.media import FieldMedium, GazeMedium, Similarity, VolumeMedium, at_nearest
+from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.observer.gaze_medium import GazeMedium, at_nearest
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((0, 0, 0), (1, 1, 2))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.transport.march.primal import MarchSettings
-from nerg_mi.transport.media.media import VolumeMedium
+from nerg_mi.transport.media.volume import VolumeMedium
 from nerg_mi.transport.observer.sight import ObserverPass
 from nerg_mi.transport.place import Place
 

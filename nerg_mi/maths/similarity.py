@@ -1,0 +1,58 @@
+"""Rotations, uniform scales and translations: what places a field in a scene."""
+
+from __future__ import annotations
+
+import drjit as dr
+import numpy as np
+
+from nerg_mi.errors import NergError
+
+
+class Similarity:
+    """A rotation, uniform scale and translation: a field's ``to_world``.
+
+    ``matrix``: (4, 4), field to scene. Raises ``NergError`` when it shears, mirrors or scales
+    unevenly: densities and directions would then have no single scale.
+    """
+
+    def __init__(self, matrix=None):
+        m = np.eye(4) if matrix is None else np.asarray(matrix, float)
+        linear = m[:3, :3]
+        determinant = np.linalg.det(linear) if np.all(np.isfinite(m)) else np.nan
+        scale = abs(determinant) ** (1 / 3)
+        if not (
+            determinant > 0
+            and np.array_equal(m[3], [0, 0, 0, 1])
+            and np.allclose(linear @ linear.T, scale**2 * np.eye(3), atol=1e-4 * scale**2)
+        ):
+            raise NergError(
+                '"to_world" of a field must be a rotation, a uniform scale and a translation; bake any other '
+                "transform into the field's training data"
+            )
+        self.matrix, self.scale = m, float(scale)
+        self.inverse = np.linalg.inv(m)
+        self.identity = bool(np.array_equal(m, np.eye(4)))
+
+    def point_to_local(self, p):
+        return p if self.identity else self._apply(self.inverse, p, 1)
+
+    def vector_to_local(self, v):
+        """A scene vector in field coordinates; a unit vector becomes 1 / scale long."""
+        return v if self.identity else self._apply(self.inverse, v, 0)
+
+    def direction_to_local(self, v):
+        """A unit scene direction as a unit field direction."""
+        return v if self.identity else self._apply(self.inverse * self.scale, v, 0)
+
+    def bounds(self, lower, upper):
+        """Scene-space axis-aligned bounds of a field-space box."""
+        corners = np.array(
+            [[x, y, z, 1] for x in (lower[0], upper[0]) for y in (lower[1], upper[1]) for z in (lower[2], upper[2])]
+        )
+        p = (corners @ self.matrix.T)[:, :3]
+        return p.min(0), p.max(0)
+
+    @staticmethod
+    def _apply(m, v, w):
+        rows = [dr.fma(a, v.x, dr.fma(b, v.y, dr.fma(c, v.z, w * e))) for a, b, c, e in m[:3].tolist()]
+        return type(v)(*rows)
