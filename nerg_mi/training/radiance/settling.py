@@ -26,7 +26,8 @@ class Settling:
     ray's light.
     """
 
-    PIECES = len(_STRATA) * _PARTS + _LOOKS
+    PROBES = len(_STRATA) * _PARTS
+    PIECES = PROBES + _LOOKS
 
     def __init__(self, grid: DensityGrid):
         self.grid, self.at = grid, 0
@@ -52,8 +53,7 @@ class Settling:
         if self.done:
             return
         grid, rng = self.grid, np.random.default_rng((seed, self.at))
-        probes = len(_STRATA) * _PARTS
-        if self.at < probes:
+        if self.at < self.PROBES:
             part = grid.part(self.at)
             open_ = dr.compress(dr.gather(grid.ns.UInt8, self.found, part) == 0)
             if dr.width(open_) > 0:

@@ -176,11 +176,15 @@ class RadianceTrainer:
         settling = self.progress >= s.settle and not self.settling.done
         due = self.steps % s.grid_every == 0 and self.steps > 0
         if settling or due:
-            self.live.set_parameters({k: dr.detach(v) for k, v in self._parameters().items()})
+            self.update_live()
         if settling:
             self.settle()
         if due:
             self.grid.update(self.density, self.rng)
+
+    def update_live(self) -> None:
+        """Have ``live`` hold the weights of this step."""
+        self.live.set_parameters({k: dr.detach(v) for k, v in self._parameters().items()})
 
     def settle(self) -> None:
         """Find a piece of what rendering will visit, by the weights that ``live`` holds."""

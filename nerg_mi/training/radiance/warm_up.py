@@ -18,17 +18,25 @@ def warm_up(trainer) -> None:
     run starts.
     """
     with _forgotten(trainer):
+        every, grid = trainer.settings.grid_every, trainer.grid
         # The kernels of the average differ the first two times; a step whose number is divisible looks over the grid.
-        every = trainer.settings.grid_every
-        for before in (3, 7, every, every + 1):
+        for before in (3, 7, every):
             trainer.steps = before
-            if before == every + 1:
-                # Nothing is empty yet, and the penalty on what is has kernels of its own.
-                trainer.grid.off = dr.opaque(type(trainer.grid.off), 0, 64)
             trainer.step()
-        pieces = trainer.settling.PIECES
-        for at in (0, pieces - 2, pieces - 1):
-            trainer.settling.at = at
+        # Nothing is empty yet, and the penalty on what is has kernels of its own, which differ where the grid has just
+        # been looked over.
+        for before in (every, every + 1):
+            grid.value = dr.select((grid.index & 1) == 0, grid.value, 0)
+            dr.eval(grid.value)
+            grid.off = dr.opaque(type(grid.off), 0, 64)
+            trainer.steps = before
+            trainer.step()
+        settling = trainer.settling
+        for at in (0, 1, settling.PROBES, settling.PIECES - 1):
+            # As if density had been found everywhere: where there is none yet no ray would meet any.
+            settling.dense = dr.select(grid.seen, type(grid.bits)(1), 0)
+            settling.at = at
+            trainer.update_live()
             trainer.settle()
         dr.sync_thread()
     trainer.start()
