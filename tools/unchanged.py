@@ -44,14 +44,14 @@ VIEWS = [
 TARGET = (4.8, 4.2, 1.0)
 GAZE = {
     "default": ["--recipe", "default", "--steps", "12"],
-    "small": ["--recipe", "small", "--steps", "12", "--no-refit"],
-    "paper": ["--recipe", "paper", "--size", "small", "--steps", "6", "--no-refit"],
+    "small": ["--recipe", "small", "--steps", "12", "--zones", "0"],
+    "paper": ["--recipe", "paper", "--size", "small", "--steps", "6", "--zones", "0"],
     "emit": ["--recipe", "default", "--variant", "emit", "--steps", "6"],
-    "capture": ["--recipe", "small", "--variant", "capture", "--steps", "6", "--no-refit"],
+    "capture": ["--recipe", "small", "--variant", "capture", "--steps", "6", "--zones", "0"],
     "zones": ["--recipe", "default", "--zones", "2", "--steps", "10"],
-    "snapshot": ["--recipe", "small", "--semantic", "snapshot", "--steps", "6", "--no-refit"],
-    "accumulated": ["--recipe", "small", "--semantic", "accumulated", "--semantic-own", "--steps", "6", "--no-refit"],
-    "normalized": ["--recipe", "small", "--normalized", "--steps", "6", "--no-refit"],
+    "snapshot": ["--recipe", "small", "--semantic", "snapshot", "--steps", "6", "--zones", "0"],
+    "accumulated": ["--recipe", "small", "--semantic", "accumulated", "--semantic-own", "--steps", "6", "--zones", "0"],
+    "normalized": ["--recipe", "small", "--normalized", "--steps", "6", "--zones", "0"],
     "ensemble": ["--recipe", "default", "--ensemble", "2", "--steps", "6"],
 }
 """Gaze fields by name, and the options that train them."""
@@ -65,7 +65,6 @@ PICTURES = {
     "map": ["visibility=map"],
     "open": ["occlusion=false"],
     "dark": ["radiance=false"],
-    "support": ["aovs=gaze,support"],
 }
 """Pictures of the store's scene by name, and what they change in it."""
 
@@ -109,7 +108,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     rays = str(folder / "rays.npz")
     yield (
         "rays.npz",
-        ["rays", "import", str(make_rays(folder)), "--map", "origin=x,y,z direction=dx,dy,dz time=time person=person"],
+        ["rays", "import", str(make_rays(folder)), "--map", "origin=x,y,z direction=dx,dy,dz t=time person=person"],
     )
     yield "fewer.npz", ["rays", "filter", rays, "--fixations", "idt"]
     for name, changes in PICTURES.items():
