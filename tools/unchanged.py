@@ -43,7 +43,7 @@ VIEWS = [
 ]
 TARGET = (4.8, 4.2, 1.0)
 GAZE = {
-    "default": ["--recipe", "default", "--steps", "12"],
+    "default": ["--recipe", "default", "--steps", "12", "--test-zones", "2", "--test-positions", "8"],
     "small": ["--recipe", "small", "--steps", "12", "--zones", "0"],
     "paper": ["--recipe", "paper", "--size", "small", "--steps", "6", "--zones", "0"],
     "emit": ["--recipe", "default", "--variant", "emit", "--steps", "6"],
@@ -74,9 +74,9 @@ def make_rays(folder: Path) -> Path:
     rng = np.random.default_rng(7)
     lines = ["person,time,x,y,z,dx,dy,dz"]
     for person in range(3):
-        place = np.array([4.4, 2.8, 1.6]) + rng.normal(0, 0.2, 3) * [1, 1, 0.2]
+        begin, end = rng.uniform([1.5, 1.0, 1.5], [8.5, 5.5, 1.7], (2, 3))
         for k in range(400):
-            place = place + rng.normal(0, 0.02, 3) * [1, 1, 0]
+            place = begin + (end - begin) * (k / 400) + rng.normal(0, 0.1, 3) * [1, 1, 0.1]
             to = np.array([4.8, 4.2, 1.0]) + rng.normal(0, 0.5, 3) - place
             to /= np.linalg.norm(to)
             lines.append(",".join([f"p{person}", f"{k * 0.1:.1f}", *(f"{v:.6f}" for v in (*place, *to))]))
