@@ -57,7 +57,7 @@ def row(name: str, rays, seen, far: np.ndarray) -> str:
 
 def supermarket(count: int):
     """Rays of recorded people with hit points, at most ``count``; None where the recording is not there."""
-    from nerg_mi.rays.readers import presets
+    from nerg_mi.rays.readers import vr_supermarket as presets
 
     folder = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "vr_supermarket"
     if not folder.is_dir():

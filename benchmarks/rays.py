@@ -71,8 +71,8 @@ def main() -> None:
     from nerg_mi.density.probes import place_probes
     from nerg_mi.rays.index import RayIndex
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.readers.presets import vr_supermarket
-    from nerg_mi.rays.readers.tables import rays_from_table
+    from nerg_mi.rays.readers.table import rays_from_table
+    from nerg_mi.rays.readers.vr_supermarket import vr_supermarket
     from nerg_mi.rays.summary import summarise
 
     table = []

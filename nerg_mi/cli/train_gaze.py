@@ -139,7 +139,7 @@ def train_gaze(
     from nerg_mi.files.atomic import check_writable
     from nerg_mi.formats.fields import save_gaze
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.readers.collecting import file_sha256
+    from nerg_mi.rays.readers.builder import file_sha256
     from nerg_mi.rendering.pictures import activate
     from nerg_mi.training.gaze.ensemble import train_ensemble
     from nerg_mi.training.gaze.recipes import gaze_recipe

@@ -2,7 +2,7 @@
 
 Frame of every :class:`Rays`: right-handed, z up, metres, seconds. Readers
 convert into it and record the transform they applied in the metadata
-(:mod:`nerg_mi.rays.readers.collecting`).
+(:mod:`nerg_mi.rays.readers.builder`).
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ from typer.testing import CliRunner
 from nerg_mi.cli.rays import app
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.skeleton import keypoints_from_head
-from nerg_mi.rays.readers.skeleton_file import write_skeleton
+from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
+from nerg_mi.rays.readers.skeleton22 import keypoints_from_head
 
 
 def run(*arguments):

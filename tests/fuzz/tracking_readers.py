@@ -97,7 +97,7 @@ def _table() -> str:
 
 def _tables(name: str, make, *kinds: str, **options) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.rays.readers.tables import rays_from_table
+        from nerg_mi.rays.readers.table import rays_from_table
 
         _shown(rays_from_table([folder / name], _MAP, **options))
 
@@ -115,8 +115,8 @@ def _make_parquet(path: Path) -> None:
 
 
 def _make_skeleton(path: Path) -> None:
-    from nerg_mi.rays.readers.skeleton import keypoints_from_head
-    from nerg_mi.rays.readers.skeleton_file import write_skeleton
+    from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
+    from nerg_mi.rays.readers.skeleton22 import keypoints_from_head
 
     body = keypoints_from_head(np.array([[0.1 * k, 0, 1.65] for k in range(6)]), np.tile([0.0, 1.0, 0.0], (6, 1)))
     write_skeleton(path, ["ann", "bo"] * 3, np.arange(6), body, decimals=2)
@@ -124,8 +124,8 @@ def _make_skeleton(path: Path) -> None:
 
 def _skeletons(name: str, *kinds: str, skip: bool = False) -> Reader:
     def read(folder: Path) -> None:
-        from nerg_mi.rays.readers.skeleton import rays_from_skeleton
-        from nerg_mi.rays.readers.skeleton_file import read_skeleton
+        from nerg_mi.rays.readers.parsing.skeleton_file import read_skeleton
+        from nerg_mi.rays.readers.skeleton22 import rays_from_skeleton
 
         _shown(rays_from_skeleton(folder / name, tick=0.1, skip_bad_lines=skip))
         if not skip:
@@ -147,7 +147,7 @@ def _recording(preset: str, files: dict[str, str], **options) -> Reader:
             )
 
     def read(folder: Path) -> None:
-        from nerg_mi.rays.readers.presets import PRESETS
+        from nerg_mi.rays.readers.vr_supermarket import PRESETS
 
         _shown(PRESETS[preset].read([folder / list(files)[-1]], **options))
 

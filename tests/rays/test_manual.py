@@ -7,7 +7,7 @@ import numpy as np
 
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.presets import PRESETS
+from nerg_mi.rays.readers.vr_supermarket import PRESETS
 
 MANUAL = Path(__file__).resolve().parents[2] / "docs" / "rays.md"
 

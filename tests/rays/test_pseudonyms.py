@@ -11,7 +11,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.tables import rays_from_table
+from nerg_mi.rays.readers.table import rays_from_table
 
 SALT = bytes(range(16))
 NAMES = ("Zoe Ames", "anna", "anna2", "bo")

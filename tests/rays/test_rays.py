@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.rays.rays import FRAME, Rays
-from nerg_mi.rays.readers.collecting import RaysBuilder
+from nerg_mi.rays.readers.builder import RaysBuilder
 
 
 def some(n=6, **change):

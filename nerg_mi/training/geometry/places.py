@@ -13,7 +13,7 @@ from nerg_mi.field.gaze.product import GazeConfig
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.collecting import file_sha256
+from nerg_mi.rays.readers.builder import file_sha256
 from nerg_mi.rendering.mesh_file import check_vol
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.media.volume import VolumeMedium

@@ -11,11 +11,11 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import poses
-from .collecting import RaysBuilder
-from .column_map import ColumnMap
+from .builder import RaysBuilder
 from .frames import to_rays_frame
-from .ray_tables import iterate_table
+from .parsing import poses
+from .parsing.column_map import ColumnMap
+from .parsing.tables import iterate_table
 
 Paths = Sequence[str | os.PathLike]
 
@@ -48,9 +48,9 @@ def rays_from_table(
     not be unit. Where the map has a head's pose (``xyzw``, ``wxyz``, ``ypr``,
     ``matrix``), ``direction`` and ``eye`` are in the head's frame, and without a
     ``direction`` the ray is where the head points: along ``forward``, an axis of
-    its frame (default: :func:`nerg_mi.rays.readers.poses.default_forward`). Angles
+    its frame (default: :func:`nerg_mi.rays.readers.parsing.poses.default_forward`). Angles
     are in degrees unless ``degrees`` is false; how they turn is said at
-    :func:`nerg_mi.rays.readers.poses.rotations_from_angles`.
+    :func:`nerg_mi.rays.readers.parsing.poses.rotations_from_angles`.
 
     ``person_from``: ``column`` (the map's ``person``) or ``filename``. Rows with
     a confidence below ``min_confidence`` are dropped; so are rows where a column

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers import skeleton
-from nerg_mi.rays.readers.skeleton_file import write_skeleton
+from nerg_mi.rays.readers import skeleton22 as skeleton
+from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
 
 
 def heads(n=200, seed=0):

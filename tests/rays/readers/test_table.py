@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.rays.readers.tables import rays_from_table
+from nerg_mi.rays.readers.table import rays_from_table
 
 
 def test_table_of_another_frame(tmp_path):

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.readers import headsets
-from nerg_mi.rays.readers.presets import PRESETS, preset
+from nerg_mi.rays.readers import unity as headsets
+from nerg_mi.rays.readers.vr_supermarket import PRESETS, preset
 
 TURN = Rotation.from_euler("YX", [90, 30], degrees=True)  # of Unity: to the right, then down
 

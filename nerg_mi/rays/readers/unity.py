@@ -12,12 +12,12 @@ from nerg_mi.files.bounded import plain
 from nerg_mi.files.line_blocks import OnBadLine
 from nerg_mi.rays.rays import Rays
 
-from . import poses
-from .collecting import RaysBuilder
-from .column_map import ColumnMap
+from .builder import RaysBuilder
 from .frames import to_rays_frame
-from .ray_tables import iterate_table, table_columns
-from .tables import Paths, person_from_filename, rays_from_table
+from .parsing import poses
+from .parsing.column_map import ColumnMap
+from .parsing.tables import iterate_table, table_columns
+from .table import Paths, person_from_filename, rays_from_table
 
 UNITY = {"up": "y", "handedness": "left", "units": "m"}
 

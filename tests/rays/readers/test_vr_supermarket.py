@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.density.probes import place_probes
-from nerg_mi.rays.readers import presets
+from nerg_mi.rays.readers import vr_supermarket as presets
 
 
 def test_unknown_preset():

@@ -7,8 +7,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers import collecting
-from nerg_mi.rays.readers.collecting import RaysBuilder
+from nerg_mi.rays.readers import builder as collecting
+from nerg_mi.rays.readers.builder import RaysBuilder
 
 
 def add(builder, n, gone=(), first=1):

@@ -15,8 +15,8 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from .collecting import RaysBuilder
-from .skeleton_file import KEYPOINTS, iterate_skeleton
+from .builder import RaysBuilder
+from .parsing.skeleton_file import KEYPOINTS, iterate_skeleton
 
 # The keypoints whose meaning is known: columns 6:9, 39:42 and 33:36 of the file.
 LEFT_EAR, RIGHT_EAR, NOSE = 2, 13, 11

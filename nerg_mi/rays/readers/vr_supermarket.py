@@ -15,12 +15,12 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import headsets
-from .collecting import RaysBuilder
+from . import unity as headsets
+from .builder import RaysBuilder
 from .frames import to_rays_frame
-from .ray_tables import iterate_table
-from .skeleton import rays_from_skeleton
-from .tables import Paths, person_from_filename
+from .parsing.tables import iterate_table
+from .skeleton22 import rays_from_skeleton
+from .table import Paths, person_from_filename
 
 
 def vr_supermarket(paths: Paths, *, min_openness: float = 0.5, skip_bad_lines: bool = False) -> Rays:

@@ -88,8 +88,8 @@ def import_rays(
 ) -> None:
     """Convert tracking files to rays: right-handed, z up, metres, seconds."""
     from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
-    from nerg_mi.rays.readers import presets
-    from nerg_mi.rays.readers.tables import rays_from_table
+    from nerg_mi.rays.readers import vr_supermarket as presets
+    from nerg_mi.rays.readers.table import rays_from_table
 
     _check(output)
     if salt is not None and not pseudonyms:
