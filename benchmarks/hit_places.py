@@ -57,12 +57,12 @@ def row(name: str, rays, seen, far: np.ndarray) -> str:
 
 def supermarket(count: int):
     """Rays of recorded people with hit points, at most ``count``; None where the recording is not there."""
-    from nerg_mi.rays.readers import vr_supermarket as presets
+    from nerg_mi.rays.readers.registry import read_rays
 
     folder = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "vr_supermarket"
     if not folder.is_dir():
         return None
-    rays = presets.preset("vr_supermarket").read(sorted(folder.glob("*.csv.gz")))
+    rays = read_rays("vr_supermarket", sorted(folder.glob("*.csv.gz")))
     known = np.nonzero(np.isfinite(rays.hit).all(axis=1))[0]
     return rays.select(np.sort(np.random.default_rng(0).permutation(known)[:count]))
 

@@ -71,8 +71,7 @@ def main() -> None:
     from nerg_mi.density.probes import place_probes
     from nerg_mi.rays.index import RayIndex
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.readers.table import rays_from_table
-    from nerg_mi.rays.readers.vr_supermarket import vr_supermarket
+    from nerg_mi.rays.readers.registry import parse_options, read_rays
     from nerg_mi.rays.summary import summarise
 
     table = []
@@ -94,11 +93,11 @@ def main() -> None:
         raise SystemExit(f"there is no vr_supermarket in {options.data}; say where it is with --data or NERG_DATA")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     raw, saved = options.out.with_name("rays-raw.csv"), options.out.with_name("rays-imported.npz")
-    write_resampled(vr_supermarket(files), options.rays, raw)
+    write_resampled(read_rays("vr_supermarket", files), options.rays, raw)
     print(f"{options.rays:,} rays, {raw.stat().st_size / 1e6:.0f} MB")
 
     mapping = "origin=x,y,z direction=dx,dy,dz t=time person=person confidence=confidence"
-    rays = timed("import CSV", lambda: rays_from_table([raw], mapping))
+    rays = timed("import CSV", lambda: read_rays("table", raw, parse_options("table", {"columns": mapping})))
     timed("save .npz", lambda: rays.save(saved))
     rays = timed("load .npz", lambda: Rays.load(saved))
     timed("sanity card", lambda: summarise(rays))

@@ -54,7 +54,7 @@ TESTS = (
     "transport/march/test_quadrature.py",
     "view",
     "cli/test_demo.py",
-    "cli/test_rays.py",
+    "cli/rays",
     "cli/test_render.py",
 )
 """Tests of an installed package, below tests/: they ask for nothing of the checkout but themselves."""

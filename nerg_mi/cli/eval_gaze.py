@@ -49,10 +49,10 @@ def eval_gaze(
     from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
     from nerg_mi.field.backend import namespace
     from nerg_mi.files.atomic import check_folder
+    from nerg_mi.files.checksum import file_sha256
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.maths.similarity import Similarity
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.readers.builder import file_sha256
     from nerg_mi.rendering.pictures import activate
 
     output = output or gaze.with_suffix(".eval")
@@ -117,7 +117,7 @@ def _print(rows: list[dict], title: str) -> None:
 
 def _place(gaze: Path, about: dict, field, scene, geometry, ns):
     """What the field was trained in: the file that is named, or the one of the checkpoint's beside it."""
-    from nerg_mi.rays.readers.builder import file_sha256
+    from nerg_mi.files.checksum import file_sha256
     from nerg_mi.training.geometry import places
 
     if about.get("geometry") == "none":

@@ -137,9 +137,9 @@ def train_gaze(
 
     from nerg_mi.field.backend import namespace
     from nerg_mi.files.atomic import check_writable
+    from nerg_mi.files.checksum import file_sha256
     from nerg_mi.formats.fields import save_gaze
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.readers.builder import file_sha256
     from nerg_mi.rendering.pictures import activate
     from nerg_mi.training.gaze.ensemble import train_ensemble
     from nerg_mi.training.gaze.recipes import gaze_recipe

@@ -77,7 +77,7 @@ def person_order(rays: Rays) -> tuple[np.ndarray, np.ndarray]:
     return order, np.r_[starts, len(rays)]
 
 
-def stays(rays: Rays, distance: float = 0.1, gap: float = 1.0) -> np.ndarray:
+def label_stays(rays: Rays, distance: float = 0.1, gap: float = 1.0) -> np.ndarray:
     """Which stay each ray belongs to, (N,) int64: the rays of a person from a first one on, as long as the origins lie
     within ``distance`` metres of its origin and no pause is longer than ``gap`` seconds. Numbered from 0."""
     order, starts = person_order(rays)
@@ -108,15 +108,15 @@ def stays(rays: Rays, distance: float = 0.1, gap: float = 1.0) -> np.ndarray:
 
 
 def thin_mask(rays: Rays, seconds: float = 2.0, distance: float = 0.1, gap: float = 1.0) -> np.ndarray:
-    """Rays (N,) bool that stay where people stand still: of a stay (:func:`stays`) longer than ``seconds``, as many as
-    ``seconds`` hold at its own rate, evenly over all of it.
+    """Rays (N,) bool that are left where people stand still: of a stay (:func:`label_stays`) longer than ``seconds``,
+    as many as ``seconds`` hold at its own rate, evenly over all of it.
 
     Somebody who waits at a counter for ten minutes then counts as much as somebody who stops there for ``seconds``, and
     what they looked at keeps its shares. Walking is left as it is.
     """
     if not (seconds > 0 and distance > 0):
         raise NergError(f"seconds {seconds} and distance {distance} must be positive")
-    label = stays(rays, distance, gap)
+    label = label_stays(rays, distance, gap)
     order = np.lexsort((rays.t, label))
     counts = np.bincount(label)
     first = np.r_[0, np.cumsum(counts)[:-1]]

@@ -21,14 +21,15 @@ _WALKED = 1 << 19, 1 << 11  # rays looked at in runs of so many, where it matter
 _USUAL = 5.0, 2100.0  # rays a second of devices that there are
 
 
-def warnings(
+def find_warnings(
     rays: Rays, height: np.ndarray, extent: np.ndarray, speed: float, step: float | None, order: np.ndarray | None
 ) -> list[str]:
-    """Sentences about rays in our frame. ``height``: 5, 50 and 95 % of the origins' heights; ``extent`` (3,) of their
-    box;
-    ``speed``: 95 % of the speeds; ``step``: median of
-    the times between a person's rays that are positive, NaN if none is, None without any; ``order``:
-    `filters.time_order` of them."""
+    """Sentences about rays in the frame of rays, each with the likely mistake and its remedy.
+
+    ``height``: 5, 50 and 95 % of the origins' heights, metres; ``extent`` (3,) of their box, metres; ``speed``: 95 % of
+    the speeds, m/s; ``step``: median of the times between a person's rays that are positive, seconds, NaN if none is,
+    None without any; ``order``: `filters.time_order` of them.
+    """
     return [*_lengths(rays, height, extent), *_times(rays, speed, step), *_directions(rays, order)]
 
 
@@ -44,7 +45,8 @@ def _lengths(rays: Rays, height: np.ndarray, extent: np.ndarray) -> list[str]:
         out.append(f"the median height is {median:.0f} m: is the unit centimetres? (--units cm)")
     elif extent.max() > 1000 or 1000 <= median <= 2300:
         out.append(
-            f"the origins span {extent.max():.0f} m, at a median height of {median:.0f} m: is the unit millimetres? (--units mm)"
+            f"the origins span {extent.max():.0f} m, at a median height of {median:.0f} m: "
+            "is the unit millimetres? (--units mm)"
         )
     elif extent.max() < 0.05:
         out.append(f"the origins span {extent.max():.3f} m: is the unit larger than declared?")
@@ -78,7 +80,8 @@ def _times(rays: Rays, speed: float, step: float | None) -> list[str]:
     out = []
     if speed > 5:
         out.append(
-            f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: check the unit of time (--tick) or length"
+            f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: "
+            "check the unit of time (--tick) or length"
         )
     if step is None or np.isnan(step):
         if step is not None:
@@ -90,11 +93,10 @@ def _times(rays: Rays, speed: float, step: float | None) -> list[str]:
     if not 1e-4 <= step <= 1.0:
         tick = rays.metadata.get("tick", 1.0)
         fits = [f for f in (1e-3, 1e-6, 1e-7, 1e-9, 1e3, 60.0) if _USUAL[0] <= 1 / (step * f) <= _USUAL[1]]
-        remedy = (
-            f"were a unit of the file's time {tick * fits[0]:g} s, it would be {1 / (step * fits[0]):.3g} a second (--tick {tick * fits[0]:g})"
-            if fits
-            else "check the unit of time (--tick)"
-        )
+        remedy = "check the unit of time (--tick)"
+        if fits:
+            unit, rate = tick * fits[0], 1 / (step * fits[0])
+            remedy = f"were a unit of the file's time {unit:g} s, it would be {rate:.3g} a second (--tick {unit:g})"
         out.append(f"a ray comes every {step:.3g} s; {remedy}")
     return out
 
@@ -135,7 +137,8 @@ def _directions(rays: Rays, order: np.ndarray | None) -> list[str]:
         along = [i for i in range(3) if agree[i] > _AHEAD]
         if against and not along:
             out.append(
-                "people look back to where they came from: are the directions reversed? (--forward, or the sign of the direction)"
+                "people look back to where they came from: are the directions reversed? "
+                "(--forward, or the sign of the direction)"
             )
         elif against:
             axis = " and ".join("xyz"[i] for i in against)

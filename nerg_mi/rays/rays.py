@@ -128,7 +128,7 @@ class Rays:
             columns[name] = column[: len(kept)]
         return replace(self, **columns)
 
-    def noting(self, **what: Any) -> Rays:
+    def with_step(self, **what: Any) -> Rays:
         """The same rays with a step added to the list ``steps`` of the metadata: what was done to them since the
         import."""
         return replace(self, metadata={**self.metadata, "steps": [*self.metadata.get("steps", []), what]})

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +33,11 @@ class PositionSplit:
     test_centres: np.ndarray
     zone_centres: np.ndarray
     zone: np.ndarray
+
+    @property
+    def sides(self) -> tuple[np.ndarray, np.ndarray]:
+        """Masks (N,) of training and test rays."""
+        return self.train, self.test
 
     @property
     def purged(self) -> np.ndarray:
@@ -71,7 +77,8 @@ def split_by_position(
     candidates = candidates[_enough(index, candidates, radius, min_rays)]
     if len(candidates) < zones:
         raise NergError(
-            f"only {len(candidates)} of 256 positions have {min_rays} rays within {radius} m; enlarge the radius or lower min_rays"
+            f"only {len(candidates)} of 256 positions have {min_rays} rays within {radius} m; "
+            "enlarge the radius or lower min_rays"
         )
     chosen = [0]
     while len(chosen) < zones:
@@ -158,22 +165,32 @@ def split_by_time(
     return train, test
 
 
-def both(*splits: PositionSplit | tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Several splits at once: training rays are those of every training side, test rays those of every test side
-    (unseen people at unseen places, say). What is on the training side of one and the test side of another is used on
-    neither.
+def combine(*sides: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (N,) of training and test rays of several splits at once.
+
+    Training rays are those of every training side, test rays those of every test side (unseen people at unseen places,
+    say). What is on the training side of one and the test side of another is used on neither.
 
     Raises `NergError` when a side is empty.
     """
-    masks = [(s.train, s.test) if isinstance(s, PositionSplit) else s for s in splits]
-    if not masks:
+    if not sides:
         raise ValueError("say how to split: by position, person or time")
-    train, test = (np.logical_and.reduce(side) for side in zip(*masks))
+    train, test = (np.logical_and.reduce(side) for side in zip(*sides))
     if not train.any() or not test.any():
         raise NergError(
-            f"together the splits leave {train.sum()} rays to train on and {test.sum()} to test; hold out more of one of them"
+            f"together the splits leave {train.sum()} rays to train on and {test.sum()} to test; "
+            "hold out more of one of them"
         )
     return train, test
+
+
+def position_of_split(rays: Rays) -> dict[str, Any]:
+    """How ``rays``, one side of a split by position, were parted: ``test_centres`` (lists of 3), ``radius`` and so on,
+    as their metadata tell; empty where they do not."""
+    for step in rays.metadata.get("steps", []):
+        if step["step"] == "split" and isinstance(step.get("by"), dict):
+            return step["by"].get("position", {})
+    return {}
 
 
 def _enough(index: RayIndex, places: np.ndarray, radius: float, least: int) -> np.ndarray:

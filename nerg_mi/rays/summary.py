@@ -10,7 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 
 from .filters import time_order
-from .plausibility import warnings
+from .plausibility import find_warnings
 from .rays import Rays
 
 _BLOCK = 1 << 18  # rays looked at at a time: a summary takes little memory besides the rays
@@ -92,7 +92,7 @@ def summarise(rays: Rays) -> RaysSummary:
         cohorts={}
         if rays.cohort is None
         else dict(zip(rays.cohorts, np.bincount(rays.cohort, minlength=len(rays.cohorts)).tolist())),
-        warnings=tuple(warnings(rays, height, high - low, speed_p95, median_step if some else None, order)),
+        warnings=tuple(find_warnings(rays, height, high - low, speed_p95, median_step if some else None, order)),
     )
 
 

@@ -70,11 +70,12 @@ def make_field(job: Job) -> list[Path]:
 
 def make_rays(job: Job) -> list[Path]:
     """Rays of attention from the tracking data, as `nerg rays import --preset skeleton22 --tick 0.001` makes them."""
-    from nerg_mi.rays.readers.vr_supermarket import preset
+    from nerg_mi.rays.readers.registry import read_rays
+    from nerg_mi.rays.readers.skeleton22 import SkeletonOptions
 
     tracking, path = job.build / "shoppers.csv", job.build / "rays.npz"
     _require(tracking, "shoppers")
-    preset("skeleton22").read([tracking], tick=1e-3).save(path)
+    read_rays("skeleton22", tracking, SkeletonOptions(tick=1e-3)).save(path)
     return [path]
 
 
@@ -84,9 +85,9 @@ def make_gaze(job: Job) -> list[Path]:
     import mitsuba as mi
 
     from nerg_mi.field.backend import namespace
+    from nerg_mi.files.checksum import file_sha256
     from nerg_mi.formats.fields import load_radiance, save_gaze
     from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.readers.builder import file_sha256
     from nerg_mi.training.gaze.run import hold_out, train_gaze
     from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings, sized_gaze_config
     from nerg_mi.transport.media.field import FieldMedium

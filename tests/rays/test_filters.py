@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nerg_mi.rays.filters import select_mask, stays, thin_mask
+from nerg_mi.rays.filters import label_stays, select_mask, thin_mask
 from nerg_mi.rays.rays import Rays
 
 
@@ -63,7 +63,7 @@ def test_conditions():
 
 def test_stays_of_a_walk_with_a_stop():
     x = np.r_[np.arange(0, 1, 0.05), np.full(200, 1.0), np.arange(1, 2, 0.05)]
-    label = stays(walk(line(x)), 0.12)
+    label = label_stays(walk(line(x)), 0.12)
     # Steps of 5 cm: three rays within 12 cm of the first; the stop is one stay, with what is near it.
     assert list(label[:6]) == [0, 0, 0, 1, 1, 1]
     longest = np.bincount(label).max()
@@ -72,7 +72,7 @@ def test_stays_of_a_walk_with_a_stop():
 
 def test_stays_end_at_pauses_and_people():
     rays = walk(line(np.zeros(6)), t=np.array([0, 0.1, 5, 5.1, 0, 0.1]), person=np.array([0, 0, 0, 0, 1, 1]))
-    assert list(stays(rays)) == [0, 0, 1, 1, 2, 2]
+    assert list(label_stays(rays)) == [0, 0, 1, 1, 2, 2]
 
 
 @settings(max_examples=40, deadline=None)
@@ -84,8 +84,8 @@ def test_stays_by_definition(seed, distance):
     rays = walk(origin, t=np.cumsum(rng.choice([0.1, 2.0], n, p=[0.95, 0.05])), person=np.sort(rng.integers(0, 2, n)))
     order = rng.permutation(n)
     label = np.empty(n, int)
-    label[order] = stays(rays.select(order), distance)
-    want, number = [], -1
+    label[order] = label_stays(rays.select(order), distance)
+    want, number, first = [], -1, 0
     for i in range(n):
         if (
             i == 0

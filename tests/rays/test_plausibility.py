@@ -6,7 +6,7 @@ import pytest
 from nerg_mi.rays import plausibility
 from nerg_mi.rays.plausibility import walking_agreement
 from nerg_mi.rays.rays import FRAME, Rays
-from nerg_mi.rays.readers.frames import to_rays_frame
+from nerg_mi.rays.readers.frames import Frame
 from nerg_mi.rays.summary import summarise
 
 
@@ -21,7 +21,7 @@ def walk(hit=True, frame=None, seed=0):
     turned = heading + rng.normal(0, 0.6, n)
     d = np.stack([np.cos(turned), np.sin(turned), rng.normal(-0.2, 0.2, n)], axis=1)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    metadata = {"frame": dict(FRAME), "transform": to_rays_frame(**(frame or {})).tolist()}
+    metadata = {"frame": dict(FRAME), "transform": Frame(**(frame or {})).to_rays().tolist()}
     return Rays(t, np.zeros(n), ("ann",), origin, d, np.ones(n), origin + 2 * d if hit else None, metadata)
 
 
@@ -78,7 +78,7 @@ def test_axes_are_told_in_the_frame_of_the_file(units, up):
     agreement, file_up = walking_agreement(rays), "xyz".index(up[-1])
     assert agreement[file_up] == 0 and (np.delete(agreement, file_up) > 0.5).all()
     # Heads that stand along another axis of the file than the one that was declared.
-    turn = to_rays_frame(up=up)[:3, :3]
+    turn = Frame(up=up).to_rays()[:3, :3]
     for standing in {"x", "y", "z"} - {up[-1]}:
         file = rays.origin[:, {"x": [2, 0, 1], "y": [1, 2, 0], "z": [0, 1, 2]}[standing]]
         assert f"(--up {standing})" in said(replace(rays, origin=file @ turn.T))

@@ -11,7 +11,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.table import rays_from_table
+from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from tests.rays.readers.reading import read
 
 SALT = bytes(range(16))
 NAMES = ("Zoe Ames", "anna", "anna2", "bo")
@@ -24,12 +25,10 @@ def rays(tmp_path):
         (tmp_path / f"{name}.csv").write_text(
             "t,x,y,z,a,b,c\n" + f"{i},0,0,{i},0,1,0\n{i + 0.5},0,0,{i},0,0,1\n9,,0,0,1,0,0\n"
         )
-    found = rays_from_table(
-        [tmp_path / f"{n}.csv" for n in NAMES],
-        "origin=x,y,z direction=a,b,c t=t",
-        recorded_by="ANNA, of /data/Zoe Ames/raw",
-    )
-    return found.noting(step="filter", kept=8, of=8, persons=["anna", "bo"]).noting(
+    files = [tmp_path / f"{n}.csv" for n in NAMES]
+    found = read("table", *files, columns=ColumnMap.parse("origin=x,y,z direction=a,b,c t=t"))
+    found.metadata["recorded_by"] = "ANNA, of /data/Zoe Ames/raw"
+    return found.with_step(step="filter", kept=8, of=8, persons=["anna", "bo"]).with_step(
         step="split", kept=8, of=8, by={"person": {"test": ["anna2"]}}
     )
 
@@ -79,7 +78,7 @@ def test_the_salt_decides(rays):
     assert not set(pseudonymise(rays).persons) & set(pseudonymise(rays).persons)
     # The same person in another import, among others.
     some = pseudonymise(rays.select(rays.person == 2), SALT)
-    at = {h: p for h, p in zip(one.origin[:, 2], one.person)}
+    at = dict(zip(one.origin[:, 2], one.person))
     assert some.persons[some.person[0]] == one.persons[at[some.origin[0, 2]]]
 
 

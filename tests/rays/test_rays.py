@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.rays.rays import FRAME, Rays
-from nerg_mi.rays.readers.builder import RaysBuilder
+from nerg_mi.rays.rays import Rays
 
 
 def some(n=6, **change):
@@ -65,33 +64,6 @@ def test_select_keeps_codes_and_provenance():
     part = rays.select(rays.person == 1)
     assert len(part) == 3 and part.persons == rays.persons and part.metadata == rays.metadata
     assert np.array_equal(part.origin, rays.origin[1::2])
-
-
-def test_builder_drops_with_an_account(tmp_path):
-    source = tmp_path / "walk.csv"
-    source.write_text("x")
-    d = np.tile([0.0, 0.0, 2.0], (6, 1))
-    d[1], d[2], d[4] = 0, np.nan, 0
-    builder = RaysBuilder(transform=np.diag([0.01, 0.01, 0.01, 1]), preset="made up")
-    builder.source(source)
-    builder.add(np.arange(6.0), "ann", np.full((6, 3), 100.0), d, rows=np.arange(2, 8), drop={"late": np.arange(6) > 4})
-    rays = builder.build()
-    assert len(rays) == 2 and np.allclose(rays.direction, [0, 0, 1]) and np.allclose(rays.origin, 1)
-    assert rays.metadata["frame"] == FRAME and rays.metadata["rows_read"] == 6 and rays.metadata["preset"] == "made up"
-    account = {d["reason"]: (d["count"], d["rows"]) for d in rays.metadata["dropped"]}
-    assert account == {
-        "direction is missing": (1, [[4, 4]]),
-        "direction is zero": (2, [[3, 3], [6, 6]]),
-        "late": (1, [[7, 7]]),
-    }
-    assert rays.metadata["sources"][0]["file"] == "walk.csv" and len(rays.metadata["sources"][0]["sha256"]) == 64
-
-
-def test_builder_with_nothing_left(tmp_path):
-    builder = RaysBuilder()
-    builder.add(np.zeros(2), "ann", np.zeros((2, 3)), np.zeros((2, 3)), rows=np.arange(2))
-    with pytest.raises(ValueError, match="no ray is left of 2 rows .*direction is zero"):
-        builder.build()
 
 
 def test_kept_in_place():

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from nerg_mi.density.probes import place_probes
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.splits import both, purge, split_by_person, split_by_position, split_by_time
+from nerg_mi.rays.splits import combine, position_of_split, purge, split_by_person, split_by_position, split_by_time
 
 R = 0.25
 
@@ -101,13 +101,13 @@ def test_by_time_with_a_gap(rays):
     st.sampled_from(["position", "person", "time", "position person", "person time", "position person time"]),
 )
 def test_no_combination_shares_a_ray(rays, seed, kinds):
+    by_position = split_by_position(rays, R, test_probes=20, seed=seed) if "position" in kinds else None
     made = {
-        "position": lambda: split_by_position(rays, R, test_probes=20, seed=seed),
+        "position": lambda: by_position.sides,
         "person": lambda: split_by_person(rays, test_share=0.4, seed=seed),
         "time": lambda: split_by_time(rays, test_share=0.4, gap=2.0),
     }
-    splits = [made[k]() for k in kinds.split()]
-    train, test = both(*splits)
+    train, test = combine(*(made[k]() for k in kinds.split()))
     assert train.any() and test.any() and not (train & test).any()
     if "person" in kinds:
         assert not set(rays.person[train]) & set(rays.person[test])
@@ -115,18 +115,18 @@ def test_no_combination_shares_a_ray(rays, seed, kinds):
         assert rays.t[test].min() - rays.t[train].max() >= 2
     if "position" in kinds:
         a = place_probes(rays.select(train), R, placement="blue", count=300, min_rays=4)
-        b = place_probes(rays.select(test), R, queries=splits[0].test_centres, min_rays=1)
+        b = place_probes(rays.select(test), R, queries=by_position.test_centres, min_rays=1)
         assert not rows(train, a) & rows(test, b)
-        apart = np.linalg.norm(rays.origin[train][:, None] - splits[0].test_centres[None], axis=2)
+        apart = np.linalg.norm(rays.origin[train][:, None] - by_position.test_centres[None], axis=2)
         assert apart.min() > 2 * R
 
 
 def test_both_refuses_what_leaves_nothing(rays):
     nobody = np.zeros(len(rays), bool)
     with pytest.raises(ValueError, match="0 rays to train on"):
-        both((nobody, ~nobody))
+        combine((nobody, ~nobody))
     with pytest.raises(ValueError, match="how to split"):
-        both()
+        combine()
 
 
 @pytest.mark.parametrize("count, each", [(10, [4, 3, 3]), (11, [4, 4, 3]), (12, [4, 4, 4]), (2, [1, 1, 0])])
@@ -134,3 +134,12 @@ def test_every_test_position_that_was_asked_for(rays, count, each):
     """What does not divide by the zones goes to the first of them."""
     split = split_by_position(rays, R, zones=3, zone_radius=0.4, test_probes=count, min_rays=8)
     assert len(split.test_centres) == count and np.bincount(split.zone, minlength=3).tolist() == each
+
+
+def test_the_metadata_tell_how_rays_were_split(rays):
+    """What the layout draws; nothing where there was none."""
+    assert position_of_split(rays) == {}
+    by = {"position": {"radius": R, "test_centres": [[0.0, 0.0, 1.5]]}, "person": {"test": ["a"]}}
+    split = rays.with_step(step="filter", kept=9, of=9).with_step(step="split", side="test", kept=9, of=9, by=by)
+    assert position_of_split(split) == by["position"]
+    assert position_of_split(rays.with_step(step="split", kept=9, of=9, by={"time": {"share": 0.2}})) == {}

@@ -1,35 +1,25 @@
-"""Collecting rays from sources: dropping what cannot be used, with an account of it."""
+"""Building rays of what readers find: one frame for all, what cannot be used dropped, with an account of it."""
 
 from __future__ import annotations
 
-import hashlib
-import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import reading, size_of
+from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.line_blocks import OnBadLine
 from nerg_mi.rays.rays import FRAME, Rays
+
+from .frames import RAYS, Frame
 
 BAD_LINES = 0.01
 """Share of a file's lines that may be left out since they cannot be read."""
 
 NAMED_RUNS = 500_000
 """So many runs of dropped rows are named; of more, as where every other row is a blink, only the number is kept."""
-
-
-def file_sha256(path: str | os.PathLike) -> str:
-    """Hex digest of a file's bytes. Raises `NergError` for what is no ordinary file, or cannot be read."""
-    digest = hashlib.sha256()
-    size_of(path)
-    with reading(path), open(path, "rb") as source:
-        while block := source.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def _ranges(rows: np.ndarray) -> list[list[int]]:
@@ -45,19 +35,19 @@ def _ranges(rows: np.ndarray) -> list[list[int]]:
 
 
 class RaysBuilder:
-    """Collects rays source by source, drops what cannot be used, and keeps the
+    """Collects rays source by source, takes them into the frame of rays, drops what cannot be used, and keeps the
     account: how many rows of which source were dropped, and why.
 
-    ``about`` goes into the metadata as it is (preset, tick, column map, ...). ``skip_bad_lines``: leave out lines that
-    cannot be read, with an account of them too, as long as they are at most `BAD_LINES` of a file's, or one.
+    ``frame``: that of all that is added. ``skip_bad_lines``: leave out lines that cannot be read, with an account of
+    them too, as long as they are at most `BAD_LINES` of a file's, or one. ``on_source``: called with the name of each
+    source as it is begun.
     """
 
-    def __init__(self, *, transform: np.ndarray | None = None, skip_bad_lines: bool = False, **about: Any) -> None:
-        tick = about.get("tick", 1.0)
-        if not (0 < tick < 1e12):
-            raise NergError(f"a unit of the file's time is a positive number of seconds, got {tick} (--tick)")
-        self._transform = np.eye(4) if transform is None else np.asarray(transform, dtype=np.float64)
-        self._about = about
+    def __init__(
+        self, frame: Frame = RAYS, *, skip_bad_lines: bool = False, on_source: Callable[[str], None] | None = None
+    ) -> None:
+        self._frame, self._transform, self._on_source = frame, frame.to_rays(), on_source
+        self._notes: dict[str, Any] = {}
         self._parts: list[dict[str, np.ndarray]] = []
         self._kept: list[int] = []
         self._persons, self._cohorts = _Names(), _Names()
@@ -66,9 +56,13 @@ class RaysBuilder:
         self._rows_read = self._runs = 0
         self._skips, self._lines, self._bad, self._first_bad = skip_bad_lines, 0, [], ""
 
+    def note(self, **what: Any) -> None:
+        """Keep something in the metadata of the rays; values as JSON has them."""
+        self._notes.update(what)
+
     @property
     def on_bad(self) -> OnBadLine | None:
-        """What readers tell of lines that cannot be read; None where such a line ends the import."""
+        """Called with each line that cannot be read: its number, from 1, and why. None where it ends the import."""
         return self._bad_line if self._skips else None
 
     def _bad_line(self, line: int, why: str) -> None:
@@ -87,8 +81,8 @@ class RaysBuilder:
         bad, lines = len(self._bad), self._lines + len(self._bad)
         if bad > max(1, BAD_LINES * lines):
             raise NergError(
-                f"{self._sources[-1]['file']}: {bad:,} of {lines:,} lines cannot be read, more than the {100 * BAD_LINES:g} % that "
-                f"--skip-bad-lines leaves out (the first is {self._first_bad})"
+                f"{self._sources[-1]['file']}: {bad:,} of {lines:,} lines cannot be read, more than the "
+                f"{100 * BAD_LINES:g} % that --skip-bad-lines leaves out (the first is {self._first_bad})"
             )
         if bad:
             self._drop("the line is cut off or holds a cell that is no number", np.array(self._bad))
@@ -98,6 +92,8 @@ class RaysBuilder:
     def source(self, path: Path, name: str | None = None) -> None:
         """Begin a file; only its name (or another one, where files share theirs) is recorded, with its checksum."""
         self._end_source()
+        if self._on_source is not None:
+            self._on_source(name or path.name)
         self._sources.append({"file": name or path.name, "sha256": file_sha256(path)})
 
     def add(
@@ -113,12 +109,14 @@ class RaysBuilder:
         cohort: Sequence[str] | np.ndarray | None = None,
         drop: dict[str, np.ndarray] | None = None,
     ) -> None:
-        """Add n rows in the source's frame; directions need not be unit.
+        """Add n rows of the present source.
 
-        ``rows`` (n,): 1-based rows of the source. ``drop``: reasons of the
-        recording's own, each with its mask (n,), before those found here. A row
-        counts under the first reason it meets; one without a person's name is dropped, one without a cohort is of the
-        cohort "unknown".
+        ``t`` (n,) seconds. ``person``: a name for each row, or one for all. ``origin`` (n, 3) and ``hit`` (n, 3), the
+        point looked at: in the frame and units given to the builder. ``direction`` (n, 3) in the same frame, of any
+        length. ``confidence`` (n,) in [0, 1], by default one. ``cohort``: the name of each row's group of people.
+        ``rows`` (n,): 1-based rows of the source. ``drop``: reasons of the recording's own, each with its mask (n,),
+        before those found here: what is NaN or, of a direction, zero. A row counts under the first reason it meets;
+        one without a person's name is dropped, one without a cohort is of the cohort "unknown".
         """
         n = len(t)
         person = self._persons.codes(person, n)
@@ -174,7 +172,7 @@ class RaysBuilder:
             )
 
     def build(self) -> Rays:
-        """The rays collected. Raises `NergError` when none is left."""
+        """The rays collected; the builder is empty afterwards. Raises `NergError` when no ray is left."""
         self._end_source()
         if not sum(self._kept):
             why = "; ".join(f"{d['count']} rows: {d['reason']}" for d in self._dropped[:4]) or "the files hold no rows"
@@ -182,10 +180,11 @@ class RaysBuilder:
         metadata = {
             "frame": dict(FRAME),
             "transform": self._transform.tolist(),
+            "source_frame": self._frame.to_dict(),
             "sources": self._sources,
             "rows_read": self._rows_read,
             "dropped": self._dropped,
-            **self._about,
+            **self._notes,
         }
         columns = {
             name: self._column(name) for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")

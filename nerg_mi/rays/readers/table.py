@@ -1,128 +1,177 @@
-"""Rays of tables through a column map: a direction of its own, or a head's pose, or both."""
+"""Tables through a column map: a direction of its own, or a head's pose, or both."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.rays import Rays
 
 from .builder import RaysBuilder
-from .frames import to_rays_frame
+from .frames import Frame
+from .options import TickOption, option
 from .parsing import poses
 from .parsing.column_map import ColumnMap
-from .parsing.tables import iterate_table
-
-Paths = Sequence[str | os.PathLike]
-
-
-def person_from_filename(path: str | os.PathLike) -> str:
-    """The file's name without its endings (``anna.csv.gz`` is ``anna``)."""
-    return Path(path).name.split(".")[0]
+from .parsing.tables import TableBlock, iterate_table
+from .protocol import RECORDINGS
 
 
-def rays_from_table(
-    paths: Paths,
-    columns: ColumnMap | str,
-    *,
-    up: str = "z",
-    handedness: str = "right",
-    units: str = "m",
-    forward: str | None = None,
-    degrees: bool = True,
-    person_from: str = "column",
-    min_confidence: float = 0.0,
-    tick: float = 1.0,
-    valid: dict[str, Sequence[str]] | None = None,
-    skip_bad_lines: bool = False,
-    **about: object,
-) -> Rays:
-    """Rays of CSV or Parquet tables through a column map.
+@dataclass(frozen=True, kw_only=True)
+class TableOptions(TickOption):
+    """What no table says of itself. Raises `NergError` for words that are not known."""
 
-    ``up``, ``handedness`` and ``units`` declare the tables' frame; rays come out
-    right-handed, z up, in metres, and the transform is recorded. Directions need
-    not be unit. Where the map has a head's pose (``xyzw``, ``wxyz``, ``ypr``,
-    ``matrix``), ``direction`` and ``eye`` are in the head's frame, and without a
-    ``direction`` the ray is where the head points: along ``forward``, an axis of
-    its frame (default: :func:`nerg_mi.rays.readers.parsing.poses.default_forward`). Angles
-    are in degrees unless ``degrees`` is false; how they turn is said at
-    :func:`nerg_mi.rays.readers.parsing.poses.rotations_from_angles`.
-
-    ``person_from``: ``column`` (the map's ``person``) or ``filename``. Rows with
-    a confidence below ``min_confidence`` are dropped; so are rows where a column
-    of ``valid`` does not hold one of its words (upper and lower case are one).
-    ``tick``: seconds in one unit of the time column; without one, in one row.
-    ``skip_bad_lines``: see `RaysBuilder`. ``about``: further metadata. Raises `NergError` for missing columns, cells
-    that are no numbers, or when no ray is left.
-    """
-    columns = ColumnMap.parse(columns) if isinstance(columns, str) else columns
-    if person_from not in ("column", "filename"):
-        raise NergError(f'person_from is "{person_from}"; it is "column" or "filename"')
-    by_file = person_from == "filename" or columns.person is None
-    forward = forward or poses.default_forward(up, handedness)
-    ahead = poses.axis(forward, "forward")
-    vectors = [c for c in (columns.origin, columns.direction, columns.eye, columns.hit) if c]
-    pose = getattr(columns, columns.pose) if columns.pose else ()
-    numbers = [*(name for v in vectors for name in v), *pose, *(c for c in (columns.t, columns.confidence) if c)]
-    texts = [*([] if by_file else [columns.person]), *([columns.cohort] if columns.cohort else []), *(valid or {})]
-
-    frame = {"up": up, "handedness": handedness, "units": units}
-    builder = RaysBuilder(
-        transform=to_rays_frame(**frame),
-        skip_bad_lines=skip_bad_lines,
-        columns=str(columns),
-        source_frame=frame,
-        tick=tick,
-        min_confidence=min_confidence,
-        **({"forward": forward} if columns.pose else {}),
-        **({"degrees": degrees} if columns.ypr else {}),
-        **about,
+    columns: ColumnMap | None = option(  # needed
+        None,
+        'Column map: "origin=x,y,z direction=dx,dy,dz t=time person=id confidence=c hit=hx,hy,hz cohort=g"; for heads, '
+        "in place of direction: xyzw=..., wxyz=..., ypr=yaw,pitch,roll or matrix=... (12 or 16 columns, instead of "
+        "origin too).",
+        flag="--map",
+        parse=ColumnMap.parse,
+        recorded=False,
     )
-    for path in map(Path, paths):
+    units: str = option("m", "Unit of length of a mapped table: m, cm or mm.", recorded=False)
+    up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
+    handedness: str = option(
+        "right", "Handedness of a mapped table: right, or left (Unity).", flag="--hand", recorded=False
+    )
+    forward: str | None = option(
+        None, "Axis of a head's frame along which it looks.", shown="y up z (left-handed) or -z, else x", recorded=False
+    )
+    radians: bool = option(False, "Angles of a mapped table are in radians.", recorded=False)
+    person_from: str = option("column", "Persons of a mapped table: column or filename.", recorded=False)
+    min_confidence: float = option(0.0, "Drop rows below this confidence.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        poses.axis(self.looks_along, "forward")
+        if self.person_from not in ("column", "filename"):
+            raise NergError(f'person_from is "{self.person_from}"; it is "column" or "filename" (--person-from)')
+
+    @property
+    def frame(self) -> Frame:
+        """The frame that was declared. Raises `NergError` for words that are not known."""
+        return Frame(self.up, self.handedness, self.units)
+
+    @property
+    def looks_along(self) -> str:
+        """The axis of a head's frame along which it looks."""
+        return self.forward or poses.default_forward(self.up, self.handedness)
+
+
+class Table:
+    """CSV or Parquet tables through a column map.
+
+    Directions need not be unit. Where the map has a head's pose (``xyzw``, ``wxyz``, ``ypr``, ``matrix``),
+    ``direction`` and ``eye`` are in the head's frame, and without a ``direction`` the ray is where the head points:
+    along ``forward``, an axis of its frame. How angles turn is told at
+    :func:`nerg_mi.rays.readers.parsing.poses.rotations_from_angles`. Rows with a confidence below ``min_confidence``
+    are dropped. ``tick``: seconds in one unit of the time column; without one, in one row.
+    """
+
+    name = "table"
+    files = "CSV (comma, semicolon or tab; `.gz` too) or Parquet tables, whose columns are named by `--map`"
+    world = "declared: `--up`, `--hand`, `--units`"
+    checked_on = RECORDINGS
+    Options = TableOptions
+
+    def frame(self, files: Sequence[Path], options: TableOptions) -> Frame:
+        return options.frame
+
+    def read(self, files: Sequence[Path], options: TableOptions, builder: RaysBuilder) -> None:
+        add_tables(files, options, builder)
+
+
+TABLE = Table()
+READERS = (TABLE,)
+
+
+def add_tables(
+    files: Sequence[Path], options: TableOptions, builder: RaysBuilder, valid: Mapping[str, Sequence[str]] | None = None
+) -> None:
+    """Add the rays of ``files`` to ``builder``, which was given ``options.frame``.
+
+    ``valid``: columns of words with those by which a row is kept (upper and lower case are one). Raises `NergError` for
+    missing columns, and cells that are no numbers.
+    """
+    if options.columns is None:
+        raise NergError("a table needs a column map; say what its columns are (--map)")
+    rows = _Rows(options.columns, options, valid or {})
+    builder.note(columns=str(rows.columns), min_confidence=options.min_confidence, tick=options.tick)
+    if rows.columns.pose:
+        builder.note(forward=options.looks_along)
+    if rows.columns.ypr:
+        builder.note(degrees=not options.radians)
+    for path in files:
+        rows.add(path, builder)
+
+
+def person_from_filename(path: Path) -> str:
+    """The file's name without its endings (``anna.csv.gz`` is ``anna``)."""
+    return path.name.split(".")[0]
+
+
+class _Rows:
+    """Rows of tables that have the same columns, as rays."""
+
+    def __init__(self, columns: ColumnMap, options: TableOptions, valid: Mapping[str, Sequence[str]]) -> None:
+        self.columns, self.options, self.valid = columns, options, valid
+        self.by_file = options.person_from == "filename" or columns.person is None
+        self.pose_columns = getattr(columns, columns.pose) if columns.pose else ()
+        vectors = [c for c in (columns.origin, columns.direction, columns.eye, columns.hit) if c]
+        self.numbers = [name for v in vectors for name in v]
+        self.numbers += [*self.pose_columns, *(c for c in (columns.t, columns.confidence) if c)]
+        self.texts = [c for c in (None if self.by_file else columns.person, columns.cohort, *valid) if c]
+
+    def add(self, path: Path, builder: RaysBuilder) -> None:
+        """Add the rows of ``path``."""
         builder.source(path)
-        rows = 0
-        for block in iterate_table(path, numbers, texts, on_bad=builder.on_bad):
-            value = dict(zip(numbers, block.numbers.T))
-            word = dict(zip(texts, block.texts.T))
-            vector = lambda names: np.stack([value[c] for c in names], axis=1)
-            n = len(block.lines)
-            t = value[columns.t] if columns.t else np.arange(rows, rows + n, dtype=np.float64)
-            rows += n
-            confidence = value[columns.confidence] if columns.confidence else np.ones(n)
-            origin = vector(columns.origin) if columns.origin else None
-            direction = vector(columns.direction) if columns.direction else None
-            if columns.pose:
-                turn, place = _pose(columns.pose, vector(pose), up, forward, degrees)
-                origin = place if origin is None else origin
-                if columns.eye:
-                    origin = origin + np.einsum("nij,nj->ni", turn, vector(columns.eye))
-                direction = turn @ ahead if direction is None else np.einsum("nij,nj->ni", turn, direction)
-            drop = {f"confidence below {min_confidence:g}": confidence < min_confidence}
-            for name, words in (valid or {}).items():
-                drop[f"{name} is not {' or '.join(words)}"] = ~np.isin(
-                    np.char.lower(word[name]), [w.lower() for w in words]
-                )
-            builder.add(
-                t * tick,
-                person_from_filename(path) if by_file else word[columns.person],
-                origin,
-                direction,
-                rows=block.lines,
-                confidence=confidence,
-                hit=vector(columns.hit) if columns.hit else None,
-                cohort=word[columns.cohort] if columns.cohort else None,
-                drop=drop,
-            )
-    return builder.build()
+        before = 0
+        for block in iterate_table(path, self.numbers, self.texts, on_bad=builder.on_bad):
+            self._add_block(path, block, before, builder)
+            before += len(block.lines)
+
+    def _add_block(self, path: Path, block: TableBlock, before: int, builder: RaysBuilder) -> None:
+        """Add the rows of ``block``, ahead of which the file has ``before`` others."""
+        columns, options = self.columns, self.options
+        value = dict(zip(self.numbers, block.numbers.T))
+        word = dict(zip(self.texts, block.texts.T))
+        vector = lambda names: np.stack([value[c] for c in names], axis=1)
+        n = len(block.lines)
+        t = value[columns.t] if columns.t else np.arange(before, before + n, dtype=np.float64)
+        confidence = value[columns.confidence] if columns.confidence else np.ones(n)
+        origin = vector(columns.origin) if columns.origin else None
+        direction = vector(columns.direction) if columns.direction else None
+        if columns.pose:
+            turn, place = _pose(columns.pose, vector(self.pose_columns), options)
+            origin = place if origin is None else origin
+            if columns.eye:
+                origin = origin + poses.rotate(turn, vector(columns.eye))
+            ahead = poses.axis(options.looks_along, "forward")
+            direction = turn @ ahead if direction is None else poses.rotate(turn, direction)
+        drop = {f"confidence below {options.min_confidence:g}": confidence < options.min_confidence}
+        for name, words in self.valid.items():
+            known = np.isin(np.char.lower(word[name]), [w.lower() for w in words])
+            drop[f"{name} is not {' or '.join(words)}"] = ~known
+        builder.add(
+            t * options.tick,
+            person_from_filename(path) if self.by_file else word[columns.person],
+            origin,
+            direction,
+            rows=block.lines,
+            confidence=confidence,
+            hit=vector(columns.hit) if columns.hit else None,
+            cohort=word[columns.cohort] if columns.cohort else None,
+            drop=drop,
+        )
 
 
-def _pose(kind: str, values: np.ndarray, up: str, forward: str, degrees: bool) -> tuple[np.ndarray, np.ndarray | None]:
+def _pose(kind: str, values: np.ndarray, options: TableOptions) -> tuple[np.ndarray, np.ndarray | None]:
+    """Rotations (N, 3, 3) from head to world of the pose columns (N, C), and where a head is, if they tell."""
     if kind == "matrix":
         return poses.rotations_from_matrices(values)
     if kind == "ypr":
-        return poses.rotations_from_angles(values, up, forward, degrees), None
+        return poses.rotations_from_angles(values, options.up, options.looks_along, not options.radians), None
     return poses.rotations_from_quaternions(values, kind), None

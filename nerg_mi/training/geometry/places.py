@@ -10,10 +10,10 @@ import numpy as np
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.field.gaze.log_density import LogGazeConfig
 from nerg_mi.field.gaze.product import GazeConfig
+from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.builder import file_sha256
 from nerg_mi.rendering.mesh_file import check_vol
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.media.volume import VolumeMedium

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers import builder as collecting
+from nerg_mi.rays.rays import FRAME, Rays
+from nerg_mi.rays.readers import builder as builder_module
 from nerg_mi.rays.readers.builder import RaysBuilder
+from nerg_mi.rays.readers.frames import UNITY, Frame
 
 
 def add(builder, n, gone=(), first=1):
@@ -19,7 +20,7 @@ def add(builder, n, gone=(), first=1):
 
 def test_more_runs_than_are_named(tmp_path, monkeypatch):
     """Every other row is a blink: their number is exact, and the file can be read again."""
-    monkeypatch.setattr(collecting, "NAMED_RUNS", 10)
+    monkeypatch.setattr(builder_module, "NAMED_RUNS", 10)
     builder = RaysBuilder()
     (tmp_path / "a.csv").write_text("x")
     builder.source(tmp_path / "a.csv")
@@ -61,3 +62,46 @@ def test_a_file_of_another_kind_ends_early(tmp_path):
         for line in range(1, 10**6):
             builder.on_bad(line, ": 1 cells")
     assert line < 20_000
+
+
+def test_builder_drops_with_an_account(tmp_path):
+    source = tmp_path / "walk.csv"
+    source.write_text("x")
+    d = np.tile([0.0, 0.0, 2.0], (6, 1))
+    d[1], d[2], d[4] = 0, np.nan, 0
+    builder = RaysBuilder(Frame(units="cm"))
+    builder.note(preset="made up")
+    builder.source(source)
+    builder.add(np.arange(6.0), "ann", np.full((6, 3), 100.0), d, rows=np.arange(2, 8), drop={"late": np.arange(6) > 4})
+    rays = builder.build()
+    assert len(rays) == 2 and np.allclose(rays.direction, [0, 0, 1]) and np.allclose(rays.origin, 1)
+    assert rays.metadata["frame"] == FRAME and rays.metadata["rows_read"] == 6 and rays.metadata["preset"] == "made up"
+    account = {d["reason"]: (d["count"], d["rows"]) for d in rays.metadata["dropped"]}
+    assert account == {
+        "direction is missing": (1, [[4, 4]]),
+        "direction is zero": (2, [[3, 3], [6, 6]]),
+        "late": (1, [[7, 7]]),
+    }
+    assert rays.metadata["sources"][0]["file"] == "walk.csv" and len(rays.metadata["sources"][0]["sha256"]) == 64
+
+
+def test_builder_with_nothing_left(tmp_path):
+    builder = RaysBuilder()
+    builder.add(np.zeros(2), "ann", np.zeros((2, 3)), np.zeros((2, 3)), rows=np.arange(2))
+    with pytest.raises(ValueError, match="no ray is left of 2 rows .*direction is zero"):
+        builder.build()
+
+
+def test_rays_are_taken_out_of_the_frame(tmp_path):
+    """Mirrored, in centimetres; each source is told as it is begun."""
+    begun = []
+    builder = RaysBuilder(Frame(UNITY.up, UNITY.handedness, "cm"), on_source=begun.append)
+    (tmp_path / "a.csv").write_text("x")
+    builder.source(tmp_path / "a.csv", "ann/a.csv")
+    point, ahead = np.array([[100.0, 160.0, 300.0]]), np.array([[0.0, 0.0, 5.0]])
+    builder.add(np.zeros(1), "ann", point, ahead, rows=np.ones(1, int), hit=point + 100 * ahead)
+    rays = builder.build()
+    assert np.allclose(rays.origin, [1, 3, 1.6]) and np.allclose(rays.direction, [0, 1, 0])
+    assert np.allclose(rays.hit, [1, 8, 1.6]) and begun == ["ann/a.csv"]
+    assert rays.metadata["source_frame"] == {"up": "y", "handedness": "left", "units": "cm"}
+    assert np.allclose(rays.metadata["transform"], Frame("y", "left", "cm").to_rays())

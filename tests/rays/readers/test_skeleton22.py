@@ -1,50 +1,23 @@
+"""Skeleton files as rays."""
+
 import numpy as np
 import pytest
 
-from nerg_mi.rays.readers import skeleton22 as skeleton
+from nerg_mi.errors import NergError
+from nerg_mi.rays.readers.parsing.bodies import RIGHT_EAR, head_poses, keypoints_from_head
 from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
-
-
-def heads(n=200, seed=0):
-    rng = np.random.default_rng(seed)
-    d = rng.normal(size=(n, 3))
-    d[0], d[1] = (0, 0, -1), (0, 0, 1)  # straight down and up
-    return rng.uniform([0, 0, 1.2], [8, 6, 1.9], (n, 3)), d / np.linalg.norm(d, axis=1, keepdims=True)
-
-
-def test_body_gives_exactly_its_head_pose():
-    origin, direction = heads()
-    body = skeleton.keypoints_from_head(origin, direction)
-    o, d = skeleton.head_poses(body)
-    assert np.abs(o - origin).max() < 1e-6 and np.abs(d - direction).max() < 1e-6
-    assert np.isfinite(body).all() and body[..., 2].min() > -0.05
-    # The left ear is on the left of where the head looks.
-    side = body[2:, skeleton.LEFT_EAR] - body[2:, skeleton.RIGHT_EAR]
-    left = np.cross([0, 0, 1.0], direction[2:])
-    assert np.all(np.sum(side * left, axis=1) > 0)
-    assert np.allclose(np.linalg.norm(side, axis=1), skeleton.EAR_DISTANCE)
-
-
-def test_unseen_keypoints_and_bad_heads():
-    origin, direction = heads(3)
-    body = skeleton.keypoints_from_head(origin, direction)
-    body[0, skeleton.NOSE] = np.nan
-    body[1, skeleton.NOSE] = 0.5 * (body[1, skeleton.LEFT_EAR] + body[1, skeleton.RIGHT_EAR])
-    _, d = skeleton.head_poses(body)
-    assert np.isnan(d[:2]).all() and np.isfinite(d[2]).all()
-    with pytest.raises(ValueError, match="head pose 1"):
-        skeleton.keypoints_from_head(origin, direction * [[1], [0], [1]])
-    with pytest.raises(ValueError, match="expected"):
-        skeleton.head_poses(np.zeros((4, 21, 3)))
+from nerg_mi.rays.readers.skeleton22 import parse_keypoints
+from tests.rays.readers.parsing.test_bodies import heads
+from tests.rays.readers.reading import read
 
 
 def test_rays_of_a_file(tmp_path):
     origin, direction = heads(50)
-    body = skeleton.keypoints_from_head(origin, direction)
-    body[7, skeleton.RIGHT_EAR] = np.nan
+    body = keypoints_from_head(origin, direction)
+    body[7, RIGHT_EAR] = np.nan
     path = tmp_path / "day.csv.gz"
     write_skeleton(path, [f"p{i % 3}" for i in range(50)], np.arange(50), body)
-    rays = skeleton.rays_from_skeleton(path, tick=0.1)
+    rays = read("skeleton22", path, tick=0.1)
     keep = np.arange(50) != 7
     assert len(rays) == 49 and rays.persons == ("p0", "p1", "p2") and rays.hit is None
     assert np.allclose(rays.t, np.arange(50)[keep] * 0.1)
@@ -52,58 +25,24 @@ def test_rays_of_a_file(tmp_path):
     assert rays.metadata["dropped"] == [
         {"reason": "origin is missing", "file": "day.csv.gz", "count": 1, "rows": [[8, 8]]}
     ]
+    assert rays.metadata["preset"] == "skeleton22" and rays.metadata["keypoints"] == [2, 13, 11]
 
 
 def test_other_keypoints_and_pitch(tmp_path):
-    origin, direction = heads(40)
-    origin, direction = origin[2:], direction[2:]  # level-able heads
-    body = skeleton.keypoints_from_head(origin, direction)
+    origin, direction = (v[2:] for v in heads(40))
+    body = keypoints_from_head(origin, direction)
     swapped = body[:, ::-1]
-    o, d = skeleton.head_poses(swapped, ears=(21 - skeleton.LEFT_EAR, 21 - skeleton.RIGHT_EAR), nose=21 - skeleton.NOSE)
-    assert np.allclose(o, origin) and np.allclose(d, direction)
-    _, up = skeleton.head_poses(body, pitch=10)
-    elevation = lambda v: np.degrees(np.arcsin(v[:, 2]))
-    low = elevation(direction) < 75
-    assert np.allclose(elevation(up)[low] - elevation(direction)[low], 10)
     path = tmp_path / "day.csv"
     write_skeleton(path, ["ann"] * 38, np.arange(38), swapped)
-    rays = skeleton.rays_from_skeleton(path, keypoints=(19, 8, 10), pitch=10)
-    assert np.allclose(rays.direction, up, atol=2e-5) and rays.metadata["pitch"] == 10
+    rays = read("skeleton22", path, keypoints=(19, 8, 10), pitch=10)
+    assert np.allclose(rays.direction, head_poses(body, pitch=10)[1], atol=2e-5) and rays.metadata["pitch"] == 10
     path.write_text(path.read_text().replace(f"{swapped[3, 8, 0]:.6f}", "left"))
     with pytest.raises(ValueError, match="line 4: 'left' is not a number"):
-        skeleton.rays_from_skeleton(path, keypoints=(19, 8, 10))
-    with pytest.raises(ValueError, match="three different keypoints"):
-        skeleton.head_poses(body, nose=skeleton.LEFT_EAR)
+        read("skeleton22", path, keypoints=(19, 8, 10))
 
 
-def test_a_body_is_the_same_on_both_sides():
-    origin, heading = np.array([[2.0, 3.0, 1.58], [0.0, -1.0, 0.79], [0.5, 0.0, 1.7]]), np.array([0.3, 2.0, -1.1])
-    direction = np.stack([np.cos(heading), np.sin(heading), np.zeros(3)], axis=1)
-    body = skeleton.keypoints_from_head(origin, direction)
-    left = np.cross([0, 0, 1.0], direction)
-    pairs = np.array(
-        [(skeleton.LEFT_EAR, skeleton.RIGHT_EAR), (4, 15), (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19)]
-    )
-    # Mirrored in the plane through the middle of the ears in which the head looks.
-    aside = np.einsum("nkj,nj->nk", body - origin[:, None], left)[..., None]
-    mirrored = body - 2 * aside * left[:, None]
-    assert np.allclose(body[:, pairs[:, 0]], mirrored[:, pairs[:, 1]], atol=1e-12)
-    assert (aside[:, pairs[:, 0], 0] > 0.01).all()
-    # The eyes lie between the ears; heels, knees, hips and shoulders one above the other, in proportion to the height.
-    eyes, ears = (
-        np.linalg.norm(body[:, i] - body[:, j], axis=1) for i, j in ((4, 15), (skeleton.LEFT_EAR, skeleton.RIGHT_EAR))
-    )
-    assert (eyes < 0.6 * ears).all()
-    heights = body[:, [5, 7, 6, 8], 2] / origin[:, 2:]
-    assert (np.diff(heights, axis=1) > 0.1).all() and np.allclose(heights, heights[0])
-
-
-@pytest.mark.parametrize(
-    "origin, bad", [((0, 0, 1.6), False), ((1, 0, 0), False), ((np.nan, 1, 1.6), True), ((1, 1, np.inf), True)]
-)
-def test_a_head_may_be_at_zero_but_not_nowhere(origin, bad):
-    if bad:
-        with pytest.raises(ValueError, match="head pose 0"):
-            skeleton.keypoints_from_head([origin], [(1, 0, 0)])
-    else:
-        assert np.allclose(skeleton.head_poses(skeleton.keypoints_from_head([origin], [(1, 0, 0)]))[0], [origin])
+def test_keypoints_of_the_command_line():
+    assert parse_keypoints("19,8,10") == (19, 8, 10)
+    for text in ("1,2", "1,2,3,4", "a,b,c"):
+        with pytest.raises(NergError, match="--keypoints is three numbers"):
+            parse_keypoints(text)

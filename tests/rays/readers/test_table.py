@@ -1,10 +1,20 @@
+"""Tables through a column map."""
+
 import gzip
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.rays.readers.table import rays_from_table
+from nerg_mi.errors import NergError
+from nerg_mi.rays.readers.builder import RaysBuilder
+from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.table import TableOptions, add_tables
+from tests.rays.readers.reading import read
+
+
+def read_table(path, columns, **options):
+    return read("table", path, columns=ColumnMap.parse(columns), **options)
 
 
 def test_table_of_another_frame(tmp_path):
@@ -15,7 +25,7 @@ def test_table_of_another_frame(tmp_path):
             "bo,0,100,160,300,0,0,2,1\nann,500,0,170,0,0,-1,0,0.2\nann,1000,0,170,0,1,0,0,.9\nann,1500,0,170,0,,,,1\n"
         )
     mapping = "origin=px,py,pz direction=dx,dy,dz t=ms person=id confidence=ok"
-    rays = rays_from_table([path], mapping, up="y", handedness="left", units="cm", tick=1e-3, min_confidence=0.5)
+    rays = read_table(path, mapping, up="y", handedness="left", units="cm", tick=1e-3, min_confidence=0.5)
     assert np.allclose(rays.origin, [[1, 3, 1.6], [0, 0, 1.7]])
     assert np.allclose(rays.direction, [[0, 1, 0], [1, 0, 0]])
     assert np.allclose(rays.t, [0, 1]) and [rays.persons[p] for p in rays.person] == ["bo", "ann"]
@@ -24,7 +34,7 @@ def test_table_of_another_frame(tmp_path):
         "confidence below 0.5": [[3, 3]],
     }
     assert rays.metadata["source_frame"] == {"up": "y", "handedness": "left", "units": "cm"}
-    by_file = rays_from_table([path], mapping, person_from="filename")
+    by_file = read_table(path, mapping, person_from="filename")
     assert by_file.persons == ("unity",)
 
 
@@ -54,7 +64,7 @@ def test_poses_of_any_kind_give_the_same_rays(tmp_path, heads, kind, forward):
         q = np.roll(turn.as_quat(), 1 if kind == "wxyz" else 0, axis=1) * 1.7  # need not be unit
         path = write(tmp_path / "t.csv", "x,y,z," + names, np.hstack([origin, q]))
         mapping = f"origin=x,y,z {kind}={names}"
-    rays = rays_from_table([path], mapping, up="y", handedness="left", forward=forward)
+    rays = read_table(path, mapping, up="y", handedness="left", forward=forward)
     ahead = np.array({"z": (0, 0, 1.0), "-z": (0, 0, -1.0), "x": (1.0, 0, 0)}[forward])
     assert np.allclose(rays.origin, origin[:, [0, 2, 1]]) and np.allclose(
         rays.direction, turn.apply(ahead)[:, [0, 2, 1]]
@@ -67,7 +77,7 @@ def test_eyes_in_the_heads_frame(tmp_path, heads):
     eye, gaze = np.array([0.03, 0.0, 0.08]), np.array([0.1, -0.2, 1.0])
     rows = np.hstack([origin, turn.as_quat(), np.tile(np.r_[eye, gaze], (20, 1))])
     path = write(tmp_path / "t.csv", "x,y,z,a,b,c,d,ex,ey,ez,gx,gy,gz", rows)
-    rays = rays_from_table([path], "origin=x,y,z xyzw=a,b,c,d eye=ex,ey,ez direction=gx,gy,gz")
+    rays = read_table(path, "origin=x,y,z xyzw=a,b,c,d eye=ex,ey,ez direction=gx,gy,gz")
     assert np.allclose(rays.origin, origin + turn.apply(eye))
     assert np.allclose(rays.direction, turn.apply(gaze / np.linalg.norm(gaze)))
 
@@ -85,19 +95,19 @@ def test_eyes_in_the_heads_frame(tmp_path, heads):
 )
 def test_angles_turn_as_in_their_world(tmp_path, frame, angles, want):
     path = write(tmp_path / "t.csv", "x,y,z,a,b,c", [(0, 0, 0, *angles), (0, 0, 0, *angles)])
-    assert np.allclose(rays_from_table([path], "origin=x,y,z ypr=a,b,c", **frame).direction, want)
-    assert np.allclose(rays_from_table([path], "origin=x,y,z ypr=a,b", **frame).direction, want)
+    assert np.allclose(read_table(path, "origin=x,y,z ypr=a,b,c", **frame).direction, want)
+    assert np.allclose(read_table(path, "origin=x,y,z ypr=a,b", **frame).direction, want)
     path = write(tmp_path / "r.csv", "x,y,z,a,b,c", [(0, 0, 0, *np.radians(angles))])
-    assert np.allclose(rays_from_table([path], "origin=x,y,z ypr=a,b,c", degrees=False, **frame).direction, want)
+    assert np.allclose(read_table(path, "origin=x,y,z ypr=a,b,c", radians=True, **frame).direction, want)
 
 
 def test_what_is_no_pose_is_dropped_by_row(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("x,y,z,a,b,c,d\n0,0,0,0,0,0,1\n0,0,0,0,0,0,0\n0,0,0,nan,0,0,1\n")
-    rays = rays_from_table([path], "origin=x,y,z xyzw=a,b,c,d")
+    rays = read_table(path, "origin=x,y,z xyzw=a,b,c,d")
     assert len(rays) == 1 and rays.metadata["dropped"][0]["rows"] == [[3, 4]]
     path = write(tmp_path / "m.csv", ",".join("abcdefghijkl"), [np.eye(4)[:3].ravel(), np.ones(12)])
-    rays = rays_from_table([path], "matrix=" + ",".join("abcdefghijkl"))
+    rays = read_table(path, "matrix=" + ",".join("abcdefghijkl"))
     assert len(rays) == 1 and rays.metadata["dropped"][0] == {
         "reason": "direction is missing",
         "file": "m.csv",
@@ -112,7 +122,10 @@ def test_cohorts_persons_and_validity(tmp_path):
         "x,y,z,a,b,c,who,group,ok\n"
         + "0,0,0,1,0,0,bo,new,Valid\n0,0,0,1,0,0,ann,,VALID\n0,0,0,1,0,0,,new,valid\n0,0,0,1,0,0,bo,new,lost\n"
     )
-    rays = rays_from_table([path], "origin=x,y,z direction=a,b,c person=who cohort=group", valid={"ok": ["valid"]})
+    builder = RaysBuilder()
+    columns = ColumnMap.parse("origin=x,y,z direction=a,b,c person=who cohort=group")
+    add_tables([path], TableOptions(columns=columns), builder, {"ok": ["valid"]})
+    rays = builder.build()
     assert rays.persons == ("ann", "bo") and list(rays.person) == [1, 0]
     assert rays.cohorts == ("unknown", "new") and list(rays.cohort) == [1, 0]
     assert {d["reason"]: d["rows"] for d in rays.metadata["dropped"]} == {
@@ -129,11 +142,18 @@ def test_cohorts_persons_and_validity(tmp_path):
 def test_refusals(tmp_path):
     path = write(tmp_path / "t.csv", "x,y,z,a,b,c", [(0, 0, 0, 1, 0, 0)])
     with pytest.raises(ValueError, match='column or filename|"column" or "filename"'):
-        rays_from_table([path], "origin=x,y,z direction=a,b,c", person_from="shoe")
+        read_table(path, "origin=x,y,z direction=a,b,c", person_from="shoe")
     with pytest.raises(ValueError, match='forward is "ahead"'):
-        rays_from_table([path], "origin=x,y,z ypr=a,b,c", forward="ahead")
+        read_table(path, "origin=x,y,z ypr=a,b,c", forward="ahead")
+    with pytest.raises(NergError, match="needs a column map"):
+        read("table", path)
+    with pytest.raises(NergError, match='units "inch"'):
+        read_table(path, "origin=x,y,z direction=a,b,c", units="inch")
+    for tick in (0, -1, float("nan")):
+        with pytest.raises(NergError, match="--tick"):
+            read_table(path, "origin=x,y,z direction=a,b,c", tick=tick)
     with pytest.raises(ValueError, match="both z"):
-        rays_from_table([path], "origin=x,y,z ypr=a,b,c", forward="z")
+        read_table(path, "origin=x,y,z ypr=a,b,c", forward="z")
 
 
 def test_parquet_is_read_as_csv_is(tmp_path, heads):
@@ -147,7 +167,7 @@ def test_parquet_is_read_as_csv_is(tmp_path, heads):
     people = [f"p{i % 3}" for i in range(19)] + [None]
     pq.write_table(pa.table({**dict(zip(names, values.T)), "who": people}), tmp_path / "t.parquet")
     mapping = "origin=x,y,z xyzw=a,b,c,d"
-    one, two = rays_from_table([path], mapping), rays_from_table([tmp_path / "t.parquet"], mapping + " person=who")
+    one, two = read_table(path, mapping), read_table(tmp_path / "t.parquet", mapping + " person=who")
     assert np.array_equal(one.direction[:19], two.direction) and two.persons == ("p0", "p1", "p2")
     assert two.metadata["dropped"] == [
         {"reason": "person is missing", "file": "t.parquet", "count": 1, "rows": [[20, 20]]}

@@ -1,18 +1,14 @@
+"""Recordings of the VR supermarket."""
+
 import numpy as np
-import pytest
 
 from nerg_mi.density.probes import place_probes
-from nerg_mi.rays.readers import vr_supermarket as presets
-
-
-def test_unknown_preset():
-    with pytest.raises(ValueError, match="choose one of skeleton22, vr_supermarket"):
-        presets.preset("etch")
+from tests.rays.readers.reading import dropped, read
 
 
 def test_real_supermarket(recorded):
     files = sorted(recorded("vr_supermarket").glob("*.csv.gz"))[:2]
-    rays = presets.vr_supermarket(files)
+    rays = read("vr_supermarket", *files)
     assert rays.persons == ("user10", "user11") and 0.85 < len(rays) / rays.metadata["rows_read"] < 0.97
     # The gaze ray points at the recorded hit: the frame was decoded right.
     hit = np.isfinite(rays.hit).all(axis=1)
@@ -24,3 +20,26 @@ def test_real_supermarket(recorded):
     assert 1.2 < np.median(rays.origin[:, 2]) < 1.8  # z is up: eye heights
     probes = place_probes(rays, 0.25, count=64, min_rays=8, cap=100_000)
     assert 200 < np.median(probes.counts) < 2000
+
+
+def test_frame_eyes_and_openness(tmp_path):
+    """A camera that is turned by 90 degrees about Unity's y, against the formula by hand."""
+    names = [f"ctw_{i}{j}" for i in range(3) for j in range(4)]
+    names += "ray_x ray_y ray_z eye_x eye_y eye_z xc yc zc opennessl opennessr time".split()
+    turn = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    pose = np.hstack([turn, [[1.0], [1.6], [2.0]]]).ravel()
+    rows = [
+        [*pose, 0, 0, 2, 0.01, 0, 0.1, "", "", "", *openness, 0.02 * k]
+        for k, openness in enumerate([(0.9, 0.8), (0.9, 0.5), (1.2, 1.1), ("", 1)])
+    ]
+    path = tmp_path / "gaze_user7_x.csv"
+    path.write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]) + "\n")
+    rays = read("vr_supermarket", path)
+    assert rays.persons == ("user7",) and np.allclose(rays.t, [0, 0.04]) and np.allclose(rays.confidence, [0.8, 1])
+    assert np.allclose(rays.direction, (turn @ (0, 0, -1))[[0, 2, 1]]) and np.isnan(rays.hit).all()
+    assert np.allclose(rays.origin, ((1, 1.6, 2) + turn @ (0.01, 0, -0.1))[[0, 2, 1]])
+    assert dropped(rays) == {
+        "an eye is closed (openness at most 0.5)": [[3, 3]],
+        "confidence is missing or outside [0, 1]": [[5, 5]],
+    }
+    assert len(read("vr_supermarket", path, min_openness=0.4)) == 3

@@ -74,6 +74,11 @@ def rotations_from_matrices(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return R, origin
 
 
+def rotate(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (N, 3), each turned by its own of the ``rotations`` (N, 3, 3)."""
+    return np.einsum("nij,nj->ni", rotations, vectors)
+
+
 def _where(good: np.ndarray, values: np.ndarray, make) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 

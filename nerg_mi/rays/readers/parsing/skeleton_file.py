@@ -3,7 +3,7 @@
 The tracking format of the NeRG paper (Section 5.1): a person's id, an integer
 time or frame number, and 22 keypoints of three coordinates each in metres with
 z up. A keypoint that was not seen is written as ``nan``. What the keypoints
-mean is the business of :mod:`nerg_mi.rays.readers.skeleton`.
+mean is the business of :mod:`nerg_mi.rays.readers.parsing.bodies`.
 """
 
 from __future__ import annotations
@@ -87,13 +87,13 @@ def iterate_skeleton(
     """
     wanted = range(KEYPOINTS) if keypoints is None else sorted(set(keypoints))
     columns = [3 * k + i for k in wanted for i in range(3)]
-    number = 0
+    before = 0
     for block in line_blocks(path, "skeleton file", chunk):
         ids: list[str] = []
         times: list[int] = []
         texts: list[str] = []
         lines: list[int] = []
-        for number, line in enumerate(block, start=number + 1):
+        for number, line in enumerate(block, start=before + 1):
             line = line.strip()
             if not line:
                 continue
@@ -104,6 +104,7 @@ def iterate_skeleton(
             for column, value in zip((ids, times, texts), found):
                 column.append(value)
             lines.append(number)
+        before += len(block)
         if ids:
             rows = _rows(path, ids, times, texts, lines, columns, on_bad)
             if len(rows.ids):

@@ -229,7 +229,8 @@ def _cells(
         try:
             numbers.append(np.nan if word.lower() in _MISSING else float(word))
         except ValueError:
-            return f", column {plain(columns[k], 40)!r}: {plain(word, 60)!r} is not a number; mend the cell or the column map"
+            cell = f"column {plain(columns[k], 40)!r}: {plain(word, 60)!r}"
+            return f", {cell} is not a number; mend the cell or the column map"
     return cells, numbers
 
 
@@ -271,10 +272,10 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
                 if batch is None:
                     return
                 n = batch.num_rows
-                column = lambda c: batch.column(batch.schema.get_field_index(c))
-                values = [_as_numbers(path, c, column(c)) for c in numbers]
+                column = {c: batch.column(batch.schema.get_field_index(c)) for c in wanted}
+                values = [_as_numbers(path, c, column[c]) for c in numbers]
                 words = [
-                    np.array(["" if v is None else str(v) for v in column(c).to_pylist()], dtype=str) for c in texts
+                    np.array(["" if v is None else str(v) for v in column[c].to_pylist()], dtype=str) for c in texts
                 ]
             yield TableBlock(
                 np.stack(values, axis=1) if values else np.empty((n, 0)),

@@ -1,16 +1,13 @@
+"""``nerg rays import`` and ``show``."""
+
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from nerg_mi.cli.rays import app
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.parsing.bodies import keypoints_from_head
 from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
-from nerg_mi.rays.readers.skeleton22 import keypoints_from_head
-
-
-def run(*arguments):
-    return CliRunner().invoke(app, [str(a) for a in arguments])
+from tests.cli.rays.running import run
 
 
 def test_import_and_show_skeletons(tmp_path):
@@ -63,119 +60,6 @@ def test_contradictions(tmp_path):
     ]:
         done = run("import", tmp_path / "a.csv", "-o", tmp_path / "r.npz", *extra)
         assert done.exit_code != 0 and message in str(done.exception)
-
-
-@pytest.fixture
-def walk(tmp_path):
-    """Four people on a 4 x 3 m floor, a minute each, who look at something two metres away; a stop at the end."""
-    rng = np.random.default_rng(0)
-    n = 3000
-    origin = np.concatenate(
-        [np.cumsum(rng.normal(0, 0.02, (n, 3)) * (1, 1, 0.1), axis=0) % [4, 3, 9] + [0, 0, 1.6] for _ in range(4)]
-    )
-    d = rng.normal(size=(4 * n, 3)) * 0.02 + np.repeat(np.eye(3)[[0, 1, 0, 1]], n, axis=0)
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    t = np.tile(np.arange(n) * 0.02, 4) + np.repeat(np.arange(4) * 1e-5, n)  # no two times alike: a ray is known by it
-    rays = Rays(t, np.repeat(np.arange(4), n), tuple("abcd"), origin, d, np.ones(4 * n), origin + 2 * d)
-    rays.save(tmp_path / "walk.npz")
-    return tmp_path / "walk.npz"
-
-
-def test_filter(walk, tmp_path):
-    out = tmp_path / "some.npz"
-    done = run(
-        "filter", walk, "-o", out, "--person", "a", "--person", "c", "--from", 10, "--to", 30, "--box=0,3,0,3,0,3"
-    )
-    assert done.exit_code == 0, done.output
-    some = Rays.load(out)
-    assert (
-        {some.persons[p] for p in some.person} == {"a", "c"}
-        and some.t.min() >= 10
-        and some.t.max() < 30
-        and some.origin[:, 0].max() <= 3
-    )
-    (step,) = some.metadata["steps"]
-    assert (
-        step["step"] == "filter"
-        and step["kept"] == len(some)
-        and step["of"] == 12_000
-        and step["persons"] == ["a", "c"]
-    )
-    done = run(
-        "filter", out, "-o", tmp_path / "few.npz", "--fixations", "idt", "--dispersion", 30, "--one-ray", "--thin", 1
-    )
-    assert done.exit_code == 0, done.output
-    few = Rays.load(tmp_path / "few.npz")
-    assert [s["step"] for s in few.metadata["steps"]] == ["filter", "fixations", "thin"] and 0 < len(few) < len(some)
-    assert "then" in run("show", tmp_path / "few.npz").output
-
-
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ([], "say which rays"),
-        (["--one-ray"], "add --fixations"),
-        (["--fixations", "magic"], "ivt or idt"),
-        (["--person", "zoe"], "no person is called"),
-        (["--from", "1e9"], "leaves none"),
-        (["--box", "1,2"], "a box is"),
-        (["--box", "a,b"], "numbers with commas"),
-    ],
-)
-def test_filter_refuses(walk, tmp_path, arguments, message):
-    done = run("filter", walk, "-o", tmp_path / "x.npz", *arguments)
-    assert done.exit_code != 0 and message in str(done.exception) and not (tmp_path / "x.npz").exists()
-
-
-@pytest.mark.parametrize(
-    "how",
-    [
-        ["--zones", 2, "--positions", 10, "--min-rays", 8],
-        ["--people", 0.5],
-        ["--time", 0.3, "--gap", 1],
-        ["--zones", 2, "--min-rays", 8, "--person", "b", "--time", 0.5, "--clock", "person"],
-    ],
-)
-def test_split_shares_no_ray(walk, tmp_path, how):
-    done = run("split", walk, "-o", tmp_path / "s.npz", *how)
-    assert done.exit_code == 0, done.output
-    train, test = (Rays.load(tmp_path / f"s-{side}.npz") for side in ("train", "test"))
-    assert len(train) and len(test) and not set(train.t) & set(test.t)
-    assert set(train.t) | set(test.t) <= set(Rays.load(walk).t)
-    step = test.metadata["steps"][-1]
-    assert step["side"] == "test" and step["kept"] == len(test) and set(step["by"]) <= {"position", "person", "time"}
-    if "--zones" in how:
-        centres = np.array(step["by"]["position"]["test_centres"])
-        assert np.linalg.norm(train.origin[:, None] - centres[None], axis=2).min() > 0.5
-        done = run(
-            "plot",
-            tmp_path / "s-train.npz",
-            "-o",
-            tmp_path / "s.png",
-            "--kind",
-            "layout",
-            "--test",
-            tmp_path / "s-test.npz",
-        )
-        assert done.exit_code == 0 and (tmp_path / "s.png").read_bytes().startswith(b"\x89PNG"), done.output
-
-
-def test_split_and_plot_refuse(walk, tmp_path):
-    for arguments, message in [
-        (["split", walk, "-o", tmp_path / "s.npz"], "say how to split"),
-        (["plot", walk, "-o", tmp_path / "p.jpg"], "end in .png"),
-        (["plot", walk, "-o", tmp_path / "p.png", "--kind", "map"], "density or layout"),
-        (["plot", walk, "-o", tmp_path / "p.png", "--test", walk], "add --kind layout"),
-    ]:
-        done = run(*arguments)
-        assert done.exit_code != 0 and message in str(done.exception)
-
-
-def test_plot_density(walk, tmp_path):
-    assert run("plot", walk, "-o", tmp_path / "p.png").exit_code == 0
-    first = (tmp_path / "p.png").read_bytes()
-    run("plot", walk, "-o", tmp_path / "p.png")
-    assert (tmp_path / "p.png").read_bytes() == first
 
 
 def test_import_of_heads_and_their_options(tmp_path):

@@ -1,0 +1,54 @@
+"""What a job tells, on the terminal: its messages, its warnings, and one bar for its progress."""
+
+from __future__ import annotations
+
+import sys
+
+
+class TerminalReporter:
+    """A `nerg_mi.jobs.reporter.Reporter`, and a context that takes the bar away again.
+
+    Messages go to the standard output and warnings to the standard error. The bar is on the standard error, from the
+    first ``progress`` on and only where that is a terminal, so that neither a pipe nor a file ever holds it.
+    """
+
+    def __enter__(self) -> TerminalReporter:
+        self._bar = self._task = None
+        return self
+
+    def message(self, text: str) -> None:
+        self._print(text, sys.stdout)
+
+    def warn(self, text: str) -> None:
+        self._print(f"warning: {text}", sys.stderr)
+
+    def progress(self, share: float, text: str = "") -> None:
+        if self._bar is None and not self._start():
+            return
+        self._bar.update(self._task, completed=share, description=text)
+
+    def _start(self) -> bool:
+        if not sys.stderr.isatty():
+            return False
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+        columns = BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)
+        # The bar would else take what is printed to the standard output with it, which may be a file.
+        self._bar = Progress(
+            *columns, console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False
+        )
+        self._task = self._bar.add_task("", total=1.0)
+        self._bar.start()
+        return True
+
+    def _print(self, text: str, stream) -> None:
+        if self._bar is not None and stream.isatty():
+            # Above the bar, on the same terminal.
+            self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(text, file=stream, flush=True)
+
+    def __exit__(self, *error) -> None:
+        if self._bar is not None:
+            self._bar.stop()

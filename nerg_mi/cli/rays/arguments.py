@@ -1,0 +1,42 @@
+"""Arguments that sub-commands of ``nerg rays`` have in common, and the card that they print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from nerg_mi.errors import NergError
+
+if TYPE_CHECKING:
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.rays.summary import RaysSummary
+
+RaysFile = Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet).")]
+Output = Annotated[Path, typer.Option("-o", "--output", help="Rays file to write (.npz or .parquet).")]
+
+
+def parse_numbers(text: str, flag: str) -> list[float]:
+    """Numbers with commas between them. Raises `NergError` naming ``flag`` for other texts."""
+    try:
+        return [float(v) for v in text.split(",")]
+    except ValueError:
+        raise NergError(f"{flag} is numbers with commas between them, got {text!r}") from None
+
+
+def print_card(rays: Rays, summary: RaysSummary, path: Path) -> None:
+    """The sanity card of the rays in the file ``path``, as a table on the terminal."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from nerg_mi.files.bounded import plain
+    from nerg_mi.rays.card import WARNING, card_lines
+
+    # Names come from files: they are neither markup nor control characters of a terminal.
+    safe = lambda text: escape(plain(text, 10_000))
+    card = Table(show_header=False, box=None, title=safe(path), title_justify="left")
+    for name, text in card_lines(rays, summary):
+        card.add_row(f"[bold]{name}[/bold]" if name == WARNING else name, safe(text))
+    Console().print(card)

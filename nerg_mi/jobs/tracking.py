@@ -1,0 +1,311 @@
+"""Rays of attention from tracking files, and what is done to them: imported, summed up, filtered, split, drawn."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import check_writable
+from nerg_mi.rays import filters, fixations, splits
+from nerg_mi.rays.io import SUFFIXES
+from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.registry import TABLE, read_rays
+from nerg_mi.rays.summary import RaysSummary, summarise
+
+from .reporter import SILENT, Reporter
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FileName = str | os.PathLike
+DETECTORS = ("ivt", "idt")
+KINDS = ("density", "layout")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """How tracking files become rays. Raises `NergError` for a salt without pseudonyms."""
+
+    reader: str = TABLE  # name of a registered reader (`nerg_mi.rays.readers.registry`)
+    settings: Any = None  # an object of the reader's Options; None: as they are by default
+    skip_bad_lines: bool = False  # leave out lines that cannot be read, at most 1 % of a file's
+    pseudonyms: bool = False  # replace the names of persons by salted hashes
+    salt: FileName | None = None  # of the hashes: a file of 16 bytes or more; None: random, not kept
+    output: FileName | None = None  # rays file to write, .npz or .parquet; None: none
+
+    def __post_init__(self) -> None:
+        if self.salt is not None and not self.pseudonyms:
+            raise NergError("--salt belongs to --pseudonyms; add it, or leave out --salt")
+
+
+@dataclass(frozen=True, eq=False)
+class ImportResult:
+    """Rays, whose metadata hold the account of what was dropped, and their figures."""
+
+    rays: Rays
+    summary: RaysSummary
+
+
+def import_rays(
+    files: FileName | Sequence[FileName], options: ImportOptions = ImportOptions(), reporter: Reporter = SILENT
+) -> ImportResult:
+    """Tracking files (or folders, by the reader) as rays: right-handed, z up, metres, seconds.
+
+    Raises `NergError` for what the reader refuses, or an output that cannot be written, before anything is read.
+    """
+    files = [files] if isinstance(files, (str, os.PathLike)) else list(files)
+    _check_outputs(options.output)
+    salt = None if options.salt is None else read_salt(options.salt)
+    begun: list[str] = []
+
+    def progress(name: str) -> None:
+        reporter.progress(min(len(begun) / len(files), 1.0), f"reading {name}")
+        begun.append(name)
+
+    rays = read_rays(options.reader, files, options.settings, skip_bad_lines=options.skip_bad_lines, on_source=progress)
+    if options.pseudonyms:
+        rays = pseudonymise(rays, salt)
+    _save(rays, options.output)
+    return ImportResult(rays, summarise(rays))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterOptions:
+    """Which rays to keep: conditions first, then fixations, then fewer of those who stand still.
+
+    Raises `NergError` for an unknown word, or where nothing is said.
+    """
+
+    start: float | None = None  # rays from this time on, seconds
+    end: float | None = None  # rays before this time, seconds
+    persons: Sequence[str] = ()  # only these
+    without_persons: Sequence[str] = ()  # not these
+    cohorts: Sequence[str] = ()  # only these groups of people
+    box: Sequence[float] | None = None  # origins in x0, x1, y0, y1, z0, z1, metres
+    min_confidence: float | None = None  # at least this
+    with_hit: bool = False  # only rays whose hit point is known
+    fixations: str | None = None  # only rays of fixations: "ivt" (by velocity) or "idt" (by dispersion)
+    velocity: float = 100.0  # ivt: degrees a second that end a fixation
+    dispersion: float = 3.0  # idt: degrees within which a fixation stays
+    least: float | None = None  # shortest fixation, seconds; None: ivt 0.06, idt 0.1
+    one_ray: bool = False  # one ray a fixation, its mean
+    thin: float | None = None  # a stop counts as at most this many seconds of rays
+    thin_distance: float = 0.1  # a stop is a stay within this many metres
+    output: FileName | None = None  # rays file to write, .npz or .parquet; None: none
+
+    def __post_init__(self) -> None:
+        if self.fixations not in (None, *DETECTORS):
+            raise NergError(f'--fixations is "{self.fixations}"; it is ivt or idt')
+        if self.one_ray and self.fixations is None:
+            raise NergError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
+        if not self.conditions and self.fixations is None and self.thin is None:
+            raise NergError(
+                "say which rays to keep, for instance with --from, --person, --box, --fixations or --thin "
+                "(--help lists all)"
+            )
+
+    @property
+    def conditions(self) -> dict[str, Any]:
+        """What was asked for, as `nerg_mi.rays.filters.select_mask` takes it."""
+        what = {
+            "time": None if self.start is None and self.end is None else (self.start, self.end),
+            "persons": list(self.persons) or None,
+            "without_persons": list(self.without_persons) or None,
+            "cohorts": list(self.cohorts) or None,
+            "box": None if self.box is None else list(self.box),
+            "min_confidence": self.min_confidence,
+            "with_hit": self.with_hit or None,
+        }
+        return {name: value for name, value in what.items() if value is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class FilterResult:
+    """The rays that were kept, and how many fixations there were, if they were asked for."""
+
+    rays: Rays
+    fixations: int | None
+
+
+def filter_rays(rays: Rays | FileName, options: FilterOptions, reporter: Reporter = SILENT) -> FilterResult:
+    """Some of the rays; each step is noted in their metadata. ``rays``: those, or a file of them.
+
+    Raises `NergError` where a step leaves no ray, and for what `nerg_mi.rays.filters` and `.fixations` refuse.
+    """
+    _check_outputs(options.output)
+    steps = _Steps(rays, reporter)
+    if options.conditions:
+        steps.keep(filters.select_mask(steps.rays, **options.conditions), "filter", options.conditions)
+    count = None
+    if options.fixations is not None:
+        by_velocity = options.fixations == "ivt"
+        limit = {"velocity": options.velocity} if by_velocity else {"dispersion": options.dispersion}
+        limit |= {} if options.least is None else {"least": options.least}
+        label = (fixations.ivt if by_velocity else fixations.idt)(steps.rays, **limit)
+        count = len(np.unique(label[label >= 0]))
+        reporter.message(f"{count:,} fixations ({options.fixations})")
+        what = {"by": options.fixations, **limit}
+        if options.one_ray:
+            steps.replace(fixations.fixation_rays(steps.rays, label)[0], "fixations", {**what, "one_ray": True})
+        else:
+            steps.keep(label >= 0, "fixations", what)
+    if options.thin is not None:
+        what = {"seconds": options.thin, "distance": options.thin_distance}
+        steps.keep(filters.thin_mask(steps.rays, **what), "thin", what)
+    _save(steps.rays, options.output)
+    return FilterResult(steps.rays, count)
+
+
+class _Steps:
+    """Rays to which one thing after the other is done."""
+
+    def __init__(self, rays: Rays | FileName, reporter: Reporter) -> None:
+        self.rays, self.reporter = _load(rays), reporter
+        # Rays that somebody else holds stay as they are.
+        self.own = self.rays is not rays
+
+    def keep(self, mask: np.ndarray, step: str, what: dict[str, Any]) -> None:
+        """Keep the rays of a mask (N,); in their own memory, if nobody else holds them."""
+        rays, count = self.rays, int(mask.sum())
+        if not count:
+            raise NergError(f"{step} leaves none of {len(rays):,} rays; widen its conditions")
+        self.reporter.message(f"{step}: {count:,} of {len(rays):,} rays")
+        kept = rays.keep_in_place(mask) if self.own else rays.select(mask)
+        self.rays, self.own = kept.with_step(step=step, kept=count, of=len(rays), **what), True
+
+    def replace(self, rays: Rays, step: str, what: dict[str, Any]) -> None:
+        """Go on with other rays that were made of these."""
+        before = len(self.rays)
+        self.reporter.message(f"{step}: one ray each, {len(rays):,} of {before:,} rays")
+        self.rays, self.own = rays.with_step(step=step, kept=len(rays), of=before, **what), True
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitOptions:
+    """How training and test rays are parted: by position, person or time, or several of them at once.
+
+    Raises `NergError` where nothing is said.
+    """
+
+    zones: int = 0  # by position: zones held out; 0: not by position
+    radius: float = 0.25  # by position: R of probes, metres; rays within 2R of a test position are purged
+    zone_radius: float = 0.2  # by position: radius of a zone, metres
+    positions: int = 150  # by position: test positions in the zones
+    min_rays: int = 64  # by position: rays that a test position has within R
+    people: float = 0.0  # by person: share held out, at random; 0: not by share
+    persons: Sequence[str] = ()  # by person: these are held out
+    time: float = 0.0  # by time: share at the end that is held out; 0: not by time
+    gap: float = 5.0  # by time: seconds purged before the end part
+    clock: str = "all"  # by time: "all" (one clock) or "person" (each their own)
+    seed: int = 0  # of zones, positions and people
+    train_output: FileName | None = None  # rays file to write, .npz or .parquet; None: none
+    test_output: FileName | None = None  # the same of the test rays
+
+    def __post_init__(self) -> None:
+        if not (self.zones or self.people or self.persons or self.time):
+            raise NergError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
+
+
+@dataclass(frozen=True, eq=False)
+class SplitResult:
+    """Training and test rays that share none, and how many are used on neither side."""
+
+    train: Rays
+    test: Rays
+    purged: int
+
+
+def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter = SILENT) -> SplitResult:
+    """Training rays, which are on the training side of each split, and test rays, on the test side of each.
+
+    ``rays``: those, or a file of them. Raises `NergError` for what `nerg_mi.rays.splits` refuses.
+    """
+    _check_outputs(options.train_output, options.test_output)
+    data, seed = _load(rays), options.seed
+    parts: list[tuple[np.ndarray, np.ndarray]] = []
+    about: dict[str, Any] = {}
+    if options.zones:
+        where = {name: getattr(options, name) for name in ("zones", "zone_radius", "min_rays")}
+        held = splits.split_by_position(data, options.radius, test_probes=options.positions, seed=seed, **where)
+        parts.append(held.sides)
+        about["position"] = {
+            "radius": options.radius,
+            "zones": options.zones,
+            "zone_radius": options.zone_radius,
+            "test_centres": held.test_centres.tolist(),
+        }
+    if options.people or options.persons:
+        sides = splits.split_by_person(
+            data, test_share=options.people or 0.5, test_persons=list(options.persons) or None, seed=seed
+        )
+        parts.append(sides)
+        about["person"] = {"test": sorted(data.persons[p] for p in np.unique(data.person[sides[1]]))}
+    if options.time:
+        parts.append(splits.split_by_time(data, test_share=options.time, gap=options.gap, of=options.clock))
+        about["time"] = {"share": options.time, "gap": options.gap, "of": options.clock}
+    train, test = splits.combine(*parts)
+    purged = int((~(train | test)).sum())
+    reporter.message(f"{train.sum():,} training rays, {test.sum():,} test rays, {purged:,} purged of {len(data):,}")
+    side = lambda name, mask: data.select(mask).with_step(
+        step="split", side=name, seed=seed, kept=int(mask.sum()), of=len(data), by=about
+    )
+    result = SplitResult(side("train", train), side("test", test), purged)
+    _save(result.train, options.train_output)
+    _save(result.test, options.test_output)
+    return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlotOptions:
+    """What a floor plan shows. Raises `NergError` for an unknown word, or test rays beside densities."""
+
+    kind: str = "density"  # "density": rays/m² with mean directions; "layout": each ray's place, with dimensions
+    cell: float | None = None  # density: edge of a cell, metres; None: a fiftieth of the plan
+    test: Rays | FileName | None = None  # layout: test rays of a split, drawn beside
+    output: FileName | None = None  # picture to write, .png; None: none
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise NergError(f'--kind is "{self.kind}"; it is density or layout')
+        if self.kind == "density" and self.test is not None:
+            raise NergError("--test is drawn in the layout; add --kind layout")
+
+
+def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions()) -> Figure:
+    """The floor plan of rays, or of a file of them, as a figure of matplotlib."""
+    from nerg_mi.view import figures, ray_figures
+
+    if options.output is not None:
+        check_writable(options.output, ".png")
+    if options.kind == "density":
+        figure = ray_figures.floor_plan(_load(rays), options.cell)
+    else:
+        test = None if options.test is None else _load(options.test)
+        where = {} if test is None else splits.position_of_split(test)
+        figure = ray_figures.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
+    if options.output is not None:
+        figures.save(figure, options.output)
+    return figure
+
+
+def _load(rays: Rays | FileName) -> Rays:
+    return rays if isinstance(rays, Rays) else Rays.load(rays)
+
+
+def _check_outputs(*outputs: FileName | None) -> None:
+    """Raise `NergError` where rays cannot be written: before minutes of reading."""
+    for path in outputs:
+        if path is not None:
+            check_writable(path, *SUFFIXES)
+
+
+def _save(rays: Rays, output: FileName | None) -> None:
+    if output is not None:
+        rays.save(Path(output))

@@ -1,0 +1,97 @@
+"""A small recording of each reader: what its contract and the fuzzer are tried on. A new reader needs one here."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.rays.readers.parsing.bodies import keypoints_from_head
+from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
+
+
+@dataclass(frozen=True)
+class Example:
+    """Files by name, as text or as a function that writes one; the last of them is what is given to the reader."""
+
+    files: dict[str, str | Callable[[Path], None]]
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def make(self, folder: Path) -> Path:
+        """Write the files into ``folder``; the path to give to the reader."""
+        for name, content in self.files.items():
+            if callable(content):
+                content(folder / name)
+            elif name.endswith(".gz"):
+                (folder / name).write_bytes(gzip.compress(content.encode(), mtime=0))
+            else:
+                (folder / name).write_text(content)
+        return folder / list(self.files)[-1]
+
+
+def lines(head: list[str] | None, row: Callable[[int], list], separator: str = ",", count: int = 8) -> str:
+    """A table of ``count`` rows, with a header or without."""
+    rows = [separator.join(map(str, row(k))) for k in range(count)]
+    return "\n".join([*([separator.join(head)] if head else []), *rows]) + "\n"
+
+
+def write_walk(path: Path) -> None:
+    """Two people's skeletons."""
+    body = keypoints_from_head(np.array([[0.1 * k, 0, 1.65] for k in range(6)]), np.tile([0.0, 1.0, 0.0], (6, 1)))
+    write_skeleton(path, ["ann", "bo"] * 3, np.arange(6), body, decimals=2)
+
+
+MAP = "origin=x,y,z direction=a,b,c t=t person=who confidence=conf hit=h,i,j"
+TABLE = lines(
+    "t,who,x,y,z,a,b,c,conf,h,i,j".split(","),
+    lambda k: [f"{0.02 * k},{'ann' if k % 2 else 'bo'},0.{k},1,1.6,1,0.{k},0,1,{k},2,{'' if k % 3 else k}"],
+    count=20,
+)
+
+_SUPERMARKET = [f"ctw_{i}{j}" for i in range(3) for j in range(4)]
+_SUPERMARKET += "ray_x ray_y ray_z eye_x eye_y eye_z xc yc zc opennessl opennessr time".split()
+_UNITY = "time id gaze_origin_x gaze_origin_y gaze_origin_z gaze_dir_x gaze_dir_y gaze_dir_z status".split()
+_LOCAL = ["time", *(f"head_pos_{a}" for a in "xyz"), *(f"head_rot_{a}" for a in "xyzw")]
+_LOCAL += [f"gaze_dir_{a}" for a in "xyz"]
+_VARJO = "CaptureTime HMDPosition HMDRotation CombinedGazePosition CombinedGazeForward GazeStatus".split()
+_POSES = ["timestamp", *(f"{what}_{axis}" for what in ("rotation", "translation") for axis in "xyz")]
+_GAZE = ["gaze_timestamp", "confidence", *(f"gaze_normal{e}_{a}" for e in "01" for a in "xyz")]
+_GAZE += [f"eye_center{e}_3d_{a}" for e in "01" for a in "xyz"]
+
+EXAMPLES = {
+    "skeleton22": Example({"day.csv": write_walk}, {"tick": 0.1}),
+    "unity": Example({"ann.csv": lines(_UNITY, lambda k: [0.02 * k, "ann", 0, 1.6, k, 0, 0, 1, "VALID"])}),
+    "unity_local": Example({"ann.csv": lines(_LOCAL, lambda k: [0.02 * k, 0, 1.6, k, 0, 0, 0, 1, 0, 0.1, 1])}),
+    "unity_head": Example({"ann.csv": lines(_LOCAL[:8], lambda k: [0.02 * k, 0, 1.6, k, 0, 0, 0, 1])}),
+    "varjo": Example(
+        {
+            "ann.csv": lines(
+                _VARJO, lambda k: [k * 10**7, "(0, 1.6, 0)", "(0, 0, 0, 1)", "(0, 0, 0)", "(0, 0, 1)", "VALID"], ";"
+            )
+        }
+    ),
+    "hololens": Example(
+        {"a_head_hand_eye.csv": lines(None, lambda k: [k * 10**5, *[0] * 850, 1, 0, 1.6, 0, 1, 0, 0, 1, 0, 2])}
+    ),
+    "pupil": Example(
+        {
+            "head_pose_tracker_poses.csv": lines(_POSES, lambda k: [0.02 * k, 0, 0, 0.1, k, 1, 1]),
+            "gaze_positions.csv": lines(_GAZE, lambda k: [0.02 * k, 0.9, *[0, 0.1, 1] * 4]),
+        },
+        {"marker": 0.05},
+    ),
+    "vr_supermarket": Example(
+        {
+            "user1.csv.gz": lines(
+                _SUPERMARKET,
+                lambda k: [1, 0, 0, k, 0, 1, 0, 1.6, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 1, k, 0.9, 0.8, 0.02 * k],
+            )
+        }
+    ),
+    "table": Example({"gaze.csv": TABLE}, {"columns": ColumnMap.parse(MAP)}),
+}

@@ -1,0 +1,157 @@
+"""The list of readers; and a format added by one object, through the library, the job and the command."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from nerg_mi.errors import NergError
+from nerg_mi.jobs.tracking import ImportOptions, import_rays
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers import registry
+from nerg_mi.rays.readers.options import option
+from tests.rays.readers.examples import EXAMPLES
+from tests.rays.readers.made_up import MadeUp, MadeUpOptions, write_recording
+
+
+@pytest.fixture
+def made_up():
+    registry.register(MadeUp())
+    yield
+    registry.unregister("made_up")
+
+
+def test_a_format_is_added_by_one_object(tmp_path, made_up):
+    from nerg_mi.cli.rays import make_app
+
+    eyes, heads = write_recording(tmp_path)
+    settings = MadeUpOptions(heads=heads, scale=0.01, tick=1e-3)
+    result = import_rays(eyes, ImportOptions(reader="made_up", settings=settings))
+    rays = result.rays
+    assert np.allclose(rays.origin, [[1, 3, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]])
+    assert rays.persons == ("ann",) and result.summary.dropped == {"a blink": 1}
+    assert rays.metadata["preset"] == "made_up" and rays.metadata["scale"] == 0.01 and rays.metadata["tick"] == 1e-3
+    assert "heads" not in rays.metadata and [s["file"] for s in rays.metadata["sources"]] == ["heads.csv", "ann.csv"]
+
+    run = lambda *arguments: CliRunner().invoke(make_app(), [str(a) for a in arguments])
+    command = ["import", eyes, "-o", tmp_path / "r.npz", "--preset", "made_up", "--heads", heads, "--scale", 0.01]
+    done = run(*command, "--tick", 1e-3)
+    assert done.exit_code == 0, done.output
+    found = Rays.load(tmp_path / "r.npz")
+    assert np.array_equal(found.origin, rays.origin) and found.metadata == rays.metadata
+    done = run(*command, "--tick", 1e-3, "--blinks")
+    assert done.exit_code == 0 and len(Rays.load(tmp_path / "r.npz")) == 2
+    assert "name the file of the heads (--heads)" in str(run(*command[:6]).exception)
+    assert "leave out --up" in str(run(*command, "--up", "y").exception)
+    shown = " ".join(run("import", "--help").output.replace("│", " ").split())
+    assert "made_up: What a unit of the heads' places is, in metres." in shown and "made_up" in shown
+    assert "| `made_up` | directions, with the file of the heads in `--heads`" in registry.preset_table()
+
+
+def test_without_it_the_command_knows_nothing_of_it(tmp_path):
+    from nerg_mi.cli.rays import make_app
+
+    done = CliRunner().invoke(make_app(), ["import", "a.csv", "-o", str(tmp_path / "r.npz"), "--blinks"])
+    assert done.exit_code == 2 and "made_up" not in registry.reader_names()
+
+
+def test_what_cannot_be_registered(made_up):
+    with pytest.raises(ValueError, match="name is taken"):
+        registry.register(MadeUp())
+    for name in ("", "Upper", "a-b", "1st"):
+        reader = MadeUp()
+        reader.name = name
+        with pytest.raises(ValueError, match="cannot be called"):
+            registry.register(reader)
+
+    @dataclass(frozen=True, kw_only=True)
+    class Other:
+        tick: str = option("a", "Of another type.")
+
+    reader = MadeUp()
+    reader.name, reader.Options = "other", Other
+    with pytest.raises(ValueError, match="--tick of other is tick .str., and of other readers tick .float."):
+        registry.register(reader)
+    assert "other" not in registry.reader_names()
+    with pytest.raises(KeyError):
+        registry.unregister("other")
+
+
+def test_names():
+    assert registry.TABLE not in registry.preset_names()
+    assert set(registry.reader_names()) == {*registry.preset_names(), registry.TABLE}
+    with pytest.raises(NergError, match="choose one of skeleton22, .*, or give a column map"):
+        registry.reader_named("etch")
+    with pytest.raises(NergError, match="choose one of skeleton22"):
+        registry.read_rays("etch", "a.csv")
+
+
+def test_options_of_another_reader():
+    with pytest.raises(NergError, match="preset varjo knows its own conventions; leave out --tick, --map"):
+        registry.make_options("varjo", {"tick": 1.0, "columns": "x"})
+    with pytest.raises(NergError, match="--marker belongs to a preset"):
+        registry.parse_options("table", {"marker": 0.05})
+    with pytest.raises(TypeError, match="varjo takes NoOptions, not MadeUpOptions"):
+        registry.read_rays("varjo", "a.csv", MadeUpOptions())
+    with pytest.raises(NergError, match="no tracking files"):
+        registry.read_rays("varjo", [])
+    assert registry.parse_options("skeleton22", {"keypoints": "1,2,3"}).keypoints == (1, 2, 3)
+
+
+def test_options_that_several_have(made_up):
+    shared = {o.name: o for o in registry.shared_options()}
+    assert shared["up"].help == "Up axis: x, y, z, -x, -y or -z.  [default: z; pupil: y]"
+    assert shared["min_confidence"].help == "Drop rows below this confidence.  [default: 0; pupil: 0.6]"
+    assert shared["marker"].help == "pupil: Edge of a tracking marker in metres."
+    assert shared["keypoints"].kind is str and shared["radians"].kind is bool and shared["heads"].kind is Path
+    assert shared["handedness"].flag == "--hand" and shared["columns"].flag == "--map"
+    # Those of tables are first.
+    assert list(shared).index("person_from") < list(shared).index("pitch")
+
+
+def test_the_table_of_the_manual():
+    rows = registry.preset_table().splitlines()
+    assert len(rows) == 2 + len(registry.preset_names()) and all(
+        row.count(" | ") == 3 for row in rows if "---" not in row
+    )
+    assert r"`id\|time\|[66 floats]`" in registry.preset_table()
+    assert "`--marker`: edge of a tracking marker in metres" in registry.preset_table()
+
+
+@pytest.mark.parametrize("name", registry.reader_names())
+@pytest.mark.parametrize("skip_bad_lines", [False, True])
+def test_what_all_readers_keep(tmp_path, name, skip_bad_lines):
+    """Of the example of each: rays in the frame that is declared, with an account of all rows."""
+    example, reader = EXAMPLES[name], registry.reader_named(name)
+    given, options = example.make(tmp_path), registry.make_options(name, example.options)
+    begun = []
+    rays = registry.read_rays(name, given, options, skip_bad_lines=skip_bad_lines, on_source=begun.append)
+    about = rays.metadata
+    assert (
+        len(rays) > 0
+        and about["preset"] == name
+        and about["rows_read"] == len(rays) + sum(d["count"] for d in about["dropped"])
+    )
+    assert about["source_frame"] == reader.frame([given], options).to_dict()
+    assert np.allclose(about["transform"], reader.frame([given], options).to_rays())
+    assert [s["file"] for s in about["sources"]] == begun and len(begun) == len(example.files)
+    # Heads are where heads are: the frame was not taken for another.
+    assert 0.9 < np.median(rays.origin[:, 2]) < 2.0 or name in ("pupil", "table")
+    rays.save(tmp_path / "rays.npz")
+    assert Rays.load(tmp_path / "rays.npz").metadata == about
+    # The same by name and by object, and of several files at once where there is one a recording.
+    again = registry.read_rays(reader, [given], options)
+    assert np.array_equal(again.origin, rays.origin) and np.array_equal(again.direction, rays.direction)
+
+
+@pytest.mark.parametrize("name", registry.reader_names())
+def test_a_file_that_is_none_of_theirs(tmp_path, name):
+    example = EXAMPLES[name]
+    given = example.make(tmp_path)
+    given.write_text("this is a letter\nand no table\n")
+    with pytest.raises(NergError, match=given.name.split(".")[0]):
+        registry.read_rays(name, given, registry.make_options(name, example.options))
