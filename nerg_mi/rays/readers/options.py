@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Callable
@@ -69,6 +70,8 @@ def check_tick(tick: float) -> None:
         raise NergError(f"a unit of the file's time is a positive number of seconds, got {tick} (--tick)")
 
 
+# Annotations are evaluated as code: once, when a reader is registered, and not beside files that are read.
+@functools.cache
 def options_of(kind: type) -> tuple[Option, ...]:
     """The options of a dataclass, in the order of its fields.
 
