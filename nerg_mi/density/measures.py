@@ -3,12 +3,15 @@ it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 
+from .kde.estimate import Backend
 from .probes import Probes
 
 _LEAST, _MOST = 2048, 1 << 17
@@ -20,12 +23,15 @@ def resolving_count(kappa: float) -> int:
     return int(np.clip(np.ceil(4.0 * np.pi * 16.0 * kappa), _LEAST, _MOST))
 
 
-def integral(probes: Probes, count: int | None = None, backend: object = None) -> np.ndarray:
-    """∫ p over the sphere by quadrature with ``count`` directions, (P,): one, as far as they resolve the kernels."""
+def integral(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
+    """∫ p over the sphere by quadrature with ``count`` directions, (P,): one, as far as they resolve the kernels.
+
+    ``count``: None for as many as `resolving_count` of the sharpest kernel.
+    """
     return _average(probes, count, backend, lambda p: p)
 
 
-def entropy(probes: Probes, count: int | None = None, backend: object = None) -> np.ndarray:
+def entropy(probes: Probes, count: int | None = None, backend: Backend = None) -> np.ndarray:
     """Differential entropy -∫ p log p, (P,), natural, by quadrature; at most log 4π = 2.53, that of the uniform
     density."""
     return -_average(probes, count, backend, lambda p: p * np.log(np.where(p > 0, p, 1.0)))
@@ -66,7 +72,7 @@ def sample(probes: Probes, count: int, rng: np.random.Generator) -> np.ndarray:
     return vmf.sample(mu, np.repeat(probes.kappa, count), rng).reshape(len(probes), count, 3)
 
 
-def _average(probes: Probes, count: int | None, backend: object, of) -> np.ndarray:
+def _average(probes: Probes, count: int | None, backend: Backend, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """4π times the mean of a function of the density over directions of equal area, in blocks of probes."""
     x = fibonacci_directions(count or resolving_count(float(probes.kappa.max())))
     kde = probes.kde(backend)

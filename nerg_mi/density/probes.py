@@ -12,36 +12,30 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths import vmf
-from nerg_mi.rays.index import RayIndex
+from nerg_mi.rays.index import Neighbours, RayIndex
 from nerg_mi.rays.rays import Rays
 
 from .bandwidth import loo_kappas, silverman_kappas
-from .kde.estimate import SphericalKde
+from .kde.estimate import Backend, SphericalKde
 from .placement import PLACEMENTS, place_queries
 
 KAPPA_RULES = ("silverman", "loo", "fixed")
 WEIGHTS = ("equal", "distance", "person")
+CENTRES = ("mean", "query")
 
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """P probes and the rays they hold.
+    """P probes and the n rays that they hold, probe after probe, in metres in the rays' frame."""
 
-    ``positions`` (P, 3) metres, where the density is said to hold; ``queries``
-    (P, 3), the centres of the searched balls of ``radius`` metres; probe p holds
-    the rays ``indices[offsets[p]:offsets[p + 1]]`` of the set it was made from,
-    nearest first, with unit ``directions`` (n, 3) in the same order; ``kappa``
-    (P,); ``weights`` (n,) or ``None`` for equal ones.
-    """
-
-    positions: np.ndarray
-    queries: np.ndarray
-    radius: float
-    indices: np.ndarray
-    offsets: np.ndarray
-    directions: np.ndarray
-    kappa: np.ndarray
-    weights: np.ndarray | None = None
+    positions: np.ndarray  # (P, 3) where the densities are said to hold
+    queries: np.ndarray  # (P, 3) centres of the searched balls
+    radius: float  # of the balls
+    indices: np.ndarray  # (n,) into the rays they were made from; of a probe, nearest first
+    offsets: np.ndarray  # (P + 1,): probe p holds indices[offsets[p]:offsets[p + 1]]
+    directions: np.ndarray  # (n, 3) of these rays, unit
+    kappa: np.ndarray  # (P,) concentrations of the kernels
+    weights: np.ndarray | None = None  # (n,) of these rays, positive; None: equal ones
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -51,11 +45,11 @@ class Probes:
         """Rays in each probe, (P,)."""
         return np.diff(self.offsets)
 
-    def kde(self, backend: object = None) -> SphericalKde:
+    def kde(self, backend: Backend = None) -> SphericalKde:
         """The densities as a Dr.Jit object, for evaluation inside kernels."""
         return SphericalKde(self.directions, self.offsets, self.kappa, self.weights, backend)
 
-    def density(self, directions: np.ndarray, backend: object = None) -> np.ndarray:
+    def density(self, directions: np.ndarray, backend: Backend = None) -> np.ndarray:
         """Densities (P, D) float32 in 1/sr at ``directions`` (D, 3) or (P, D, 3),
         unit. Each integrates to one over the sphere."""
         return self.kde(backend).evaluate(directions)
@@ -118,75 +112,43 @@ def place_probes(
     """
     _check_one_of("placement", placement, PLACEMENTS)
     _check_one_of("kappa_rule", kappa_rule, KAPPA_RULES)
-    _check_one_of("centre", centre, ("mean", "query"))
+    _check_one_of("centre", centre, CENTRES)
     _check_one_of("weights", weights, WEIGHTS)
     if not radius > 0 or min_rays < 1 or cap < min_rays:
         raise NergError(f"radius {radius}, min_rays {min_rays}, cap {cap}: need radius > 0 and 1 <= min_rays <= cap")
     rng = np.random.default_rng(seed)
+    counted = None
     if ray_weights is not None:
-        ray_weights = np.asarray(ray_weights, dtype=np.float64)
-        if ray_weights.shape != (len(rays),) or not (ray_weights >= 0).all():
-            raise ValueError(f"ray_weights {ray_weights.shape} must be {len(rays)} non-negative numbers, one a ray")
+        ray_weights = _check_ray_weights(ray_weights, len(rays))
         if not ray_weights.all():
-            some = np.flatnonzero(ray_weights)
-            kept = place_probes(
-                rays.select(some),
-                radius,
-                placement=placement,
-                count=count,
-                queries=queries,
-                spacing=spacing,
-                cap=cap,
-                min_rays=min_rays,
-                kappa_rule=kappa_rule,
-                kappa=kappa,
-                kappa_max=kappa_max,
-                kappa_shared=kappa_shared,
-                widen=widen,
-                weights=weights,
-                ray_weights=ray_weights[some],
-                centre=centre,
-                seed=seed,
-            )
-            return replace(kept, indices=some[kept.indices])
+            # A ray of weight zero is not there.
+            counted = np.flatnonzero(ray_weights)
+            rays, ray_weights, index = rays.select(counted), ray_weights[counted], None
     if queries is None:
         queries = place_queries(rays.origin, placement, count, spacing, radius, rng)
     queries = np.asarray(queries, dtype=np.float64).reshape(-1, 3)
 
     near = (index or RayIndex(rays)).nearest(queries, cap, radius)
-    counts = np.diff(near.offsets)
-    enough = counts >= min_rays
+    enough = np.diff(near.offsets) >= min_rays
     if not enough.any():
         raise NergError(
-            f"none of {len(queries)} probes holds {min_rays} rays within {radius} m; enlarge the radius or lower min_rays"
+            f"none of {len(queries)} probes holds {min_rays} rays within {radius} m; "
+            "enlarge the radius or lower min_rays"
         )
-    held = np.repeat(enough, counts)
-    queries, counts = queries[enough], counts[enough]
-    indices, distances = near.indices[held], near.distances[held]
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    directions = rays.direction[indices]
-
-    w = None if ray_weights is None else ray_weights[indices]
-    if weights == "distance":
-        # Never quite zero: a probe may hold nothing but rays at its rim.
-        w = np.maximum(1.0 - distances / radius, 1e-6) * (1.0 if w is None else w)
-    elif weights == "person":
-        probe = np.repeat(np.arange(len(counts)), counts)
-        _, whose, times = np.unique(
-            probe * (1 + rays.person.max()) + rays.person[indices], return_inverse=True, return_counts=True
-        )
-        w = (1.0 if w is None else w) / times[whose]
-    share = (1.0 / counts if w is None else 1.0 / np.add.reduceat(w, offsets[:-1]))[:, None]
-    means = np.add.reduceat(rays.origin[indices] * (1.0 if w is None else w[:, None]), offsets[:-1]) * share
+    queries, near = queries[enough], _only(near, enough)
+    indices, offsets = near.indices, near.offsets
+    directions, persons = rays.direction[indices], rays.person[indices]
+    w = _weigh(near, persons, radius, weights, None if ray_weights is None else ray_weights[indices])
     if kappa_rule == "fixed":
-        kappas = np.full(len(counts), float(kappa))
+        kappas = np.full(len(queries), float(kappa))
     elif kappa_rule == "silverman":
         kappas = silverman_kappas(directions, w, offsets, kappa_max, kappa_shared)
     else:
-        kappas = loo_kappas(directions, rays.person[indices], offsets, kappa_max, kappa_shared, rng)
-    probes = Probes(
-        means if centre == "mean" else queries, queries, float(radius), indices, offsets, directions, kappas, w
-    )
+        kappas = loo_kappas(directions, persons, offsets, kappa_max, kappa_shared, rng)
+    positions = _weighted_means(rays.origin[indices], w, offsets) if centre == "mean" else queries
+    if counted is not None:
+        indices = counted[indices]
+    probes = Probes(positions, queries, float(radius), indices, offsets, directions, kappas, w)
     return probes if widen is None else probes.widened(widen)
 
 
@@ -199,3 +161,42 @@ def person_weights(rays: Rays) -> np.ndarray:
 def _check_one_of(name: str, value: str, words: tuple[str, ...]) -> None:
     if value not in words:
         raise NergError(f'{name} is "{value}"; it is one of {", ".join(words)}')
+
+
+def _check_ray_weights(weights: np.ndarray, count: int) -> np.ndarray:
+    weights = np.asarray(weights, dtype=np.float64)
+    if weights.shape != (count,) or not (weights >= 0).all():
+        raise ValueError(f"ray_weights {weights.shape} must be {count} non-negative numbers, one a ray")
+    return weights
+
+
+def _only(near: Neighbours, places: np.ndarray) -> Neighbours:
+    """The neighbours of some of the places, by a mask."""
+    counts = np.diff(near.offsets)
+    held = np.repeat(places, counts)
+    return Neighbours(near.indices[held], near.distances[held], np.concatenate([[0], np.cumsum(counts[places])]))
+
+
+def _weigh(
+    near: Neighbours, persons: np.ndarray, radius: float, rule: str, own: np.ndarray | None
+) -> np.ndarray | None:
+    """Weights (n,) of the rays that are held, whose ``persons`` (n,) and ``own`` weights are given; None where all are
+    equal."""
+    if rule == "distance":
+        # Never quite zero: a probe may hold nothing but rays at its rim.
+        return np.maximum(1.0 - near.distances / radius, 1e-6) * (1.0 if own is None else own)
+    if rule == "person":
+        counts = np.diff(near.offsets)
+        probe = np.repeat(np.arange(len(counts)), counts)
+        _, whose, rays = np.unique(probe * (1 + persons.max()) + persons, return_inverse=True, return_counts=True)
+        return (1.0 if own is None else own) / rays[whose]
+    return own
+
+
+def _weighted_means(values: np.ndarray, weights: np.ndarray | None, offsets: np.ndarray) -> np.ndarray:
+    """Means (P, 3) of each probe's ``values`` (n, 3)."""
+    if weights is None:
+        share, weighted = 1.0 / np.diff(offsets), values
+    else:
+        share, weighted = 1.0 / np.add.reduceat(weights, offsets[:-1]), values * weights[:, None]
+    return np.add.reduceat(weighted, offsets[:-1]) * share[:, None]

@@ -1,8 +1,8 @@
 """Kernel densities on the sphere, evaluated exactly in one Dr.Jit kernel.
 
-A probe p holds a run of ray directions μ_i with weights w_i that sum to one,
-and one concentration: p(x) = Σ_i w_i f(x; μ_i, κ_p), f von Mises-Fisher (NeRG,
-Section 5.1). It integrates to one over the sphere whatever κ is.
+A probe p holds a run of ray directions μ_i with weights w_i that sum to one, and one concentration:
+p(x) = Σ_i w_i f(x; μ_i, κ_p), f von Mises-Fisher (NeRG, Section 5.1). It integrates to one over the sphere whatever κ
+is.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.maths.vmf import log_normaliser
 
+Backend = str | ModuleType | dr.ArrayBase | None
+"""Where a density is evaluated: a name such as ``"llvm"``, a namespace of Dr.Jit's arrays, an array, or None for that
+of Mitsuba's variant (:func:`default_backend`)."""
+
 GROUP = 16
 """Directions that a lane of `SphericalKde.evaluate` takes at once."""
 
@@ -32,13 +36,10 @@ def default_backend() -> str:
 class SphericalKde:
     """P kernel densities on one Dr.Jit backend.
 
-    ``rays`` (n, 3): unit directions, probe after probe; ``offsets`` (P + 1,):
-    probe p holds ``rays[offsets[p]:offsets[p + 1]]``, at least one; ``kappa``
-    (P,) or a number; ``weights`` (n,) positive, normalised here per probe, or
-    ``None`` for equal ones. ``backend``: a name, a Dr.Jit array or namespace
-    (:func:`nerg_mi.field.backend.namespace`), or ``None`` for
-    :func:`default_backend`. Raises ``ValueError`` for shapes that do not fit or
-    an empty probe.
+    ``rays`` (n, 3): unit directions, probe after probe; ``offsets`` (P + 1,): probe p holds
+    ``rays[offsets[p]:offsets[p + 1]]``, at least one; ``kappa`` (P,) or a number; ``weights`` (n,) not negative,
+    normalised here per probe, or ``None`` for equal ones. ``backend``: see `Backend`. Raises ``ValueError`` for shapes
+    that do not fit, `NergError` for a probe without rays, or whose rays all have weight zero.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class SphericalKde:
         offsets: np.ndarray,
         kappa: np.ndarray | float,
         weights: np.ndarray | None = None,
-        backend: object = None,
+        backend: Backend = None,
     ) -> None:
         rays, offsets = np.asarray(rays, dtype=np.float64), np.asarray(offsets, dtype=np.int64)
         counts = np.diff(offsets)
@@ -85,21 +86,22 @@ class SphericalKde:
         self._kappa = self.ns.Float(kappa.astype(np.float32))
         self._log_c = self.ns.Float(log_normaliser(kappa).astype(np.float32))
 
+    @property
+    def kappa(self) -> np.ndarray:
+        """Concentrations of the kernels, (P,) float32."""
+        return np.array(self._kappa)
+
     def part(self, first: int, last: int) -> SphericalKde:
         """The densities of probes ``first`` to ``last`` - 1 as an object of their own."""
         if (first, last) == (0, self.count):
             return self
         offsets = np.array(self._offsets)[first : last + 1].astype(np.int64)
         packed = np.array(self._rays).reshape(-1, 4)[offsets[0] : offsets[-1]]
-        return SphericalKde(
-            packed[:, :3], offsets - offsets[0], np.array(self._kappa)[first:last], packed[:, 3], self.ns
-        )
+        return SphericalKde(packed[:, :3], offsets - offsets[0], self.kappa[first:last], packed[:, 3], self.ns)
 
     def density(self, probe, direction):
-        """Density of probe ``probe`` (UInt32, M lanes) in ``direction``
-        (Array3f, unit, M lanes), in 1/sr; a Float of M lanes, traced, not
-        evaluated. Lanes of one probe should be neighbours: they then share
-        their loop."""
+        """Density of probe ``probe`` (UInt32, M lanes) in ``direction`` (Array3f, unit, M lanes), in 1/sr; a Float of M
+        lanes, traced, not evaluated. Lanes of one probe should be neighbours: they then share their loop."""
         ns = self.ns
         first = dr.gather(ns.UInt32, self._offsets, probe)
         last = dr.gather(ns.UInt32, self._offsets, probe + 1)

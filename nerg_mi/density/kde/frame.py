@@ -5,6 +5,8 @@ What the paper shows beside its field (Section 5.3), there in five seconds a fra
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nerg_mi.density.probes import Probes, place_probes
@@ -12,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.index import RayIndex
 from nerg_mi.rays.rays import Rays
 
-from .estimate import SphericalKde
+from .estimate import Backend, SphericalKde
 from .table import SphericalKdeTable
 
 METHODS = ("auto", "exact", "table")
@@ -20,10 +22,10 @@ WORTH = 4096  # directions from which on a table is quicker
 
 
 def probe_at(
-    rays: Rays, observer: np.ndarray, radius: float = 0.25, *, index: RayIndex | None = None, **options: object
+    rays: Rays, observer: np.ndarray, radius: float = 0.25, *, index: RayIndex | None = None, **options: Any
 ) -> Probes:
     """The one probe of an observer at ``observer`` (3,), in metres in the rays' frame; ``options`` as for
-    :func:`nerg_mi.density.probes.place_probes`. Raises ``ValueError`` where too few rays start near."""
+    :func:`nerg_mi.density.probes.place_probes`. Raises `NergError` where too few rays start near."""
     options = {"min_rays": 1, "centre": "query", **options}
     return place_probes(
         rays, radius, queries=np.asarray(observer, dtype=np.float64).reshape(1, 3), index=index, **options
@@ -49,7 +51,7 @@ def kde_frame(
     points: np.ndarray | None = None,
     mask: np.ndarray | None = None,
     method: str = "auto",
-    backend: object = None,
+    backend: Backend = None,
 ) -> np.ndarray:
     """Densities in 1/sr at every pixel, float32, of the shape of the picture.
 
@@ -58,8 +60,8 @@ def kde_frame(
 
     ``method``: ``exact`` sums all rays at all pixels in one kernel; ``table`` does so on the part of the sphere that is
     seen, at a spacing that resolves the kernels, and interpolates (:mod:`nerg_mi.density.kde.table`: within 1e-4 of the
-    highest density of one ray's kernel); ``auto`` tabulates from 4,096 pixels on. Measured for 1280 x 720 pixels and
-    4,096 rays: docs/rays.md. Raises ``ValueError`` for another word, or when it is not said where the pixels look.
+    highest density of one ray's kernel); ``auto`` tabulates from 4,096 pixels on. Run times: docs/rays.md. Raises
+    `NergError` for another word, ``ValueError`` where it is not given where the pixels look, or more than one density.
     """
     if method not in METHODS:
         raise NergError(f'method is "{method}"; it is one of {", ".join(METHODS)}')

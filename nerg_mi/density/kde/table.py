@@ -33,7 +33,7 @@ class SphericalKdeTable:
         self, kde: SphericalKde, probe: int = 0, used: np.ndarray | None = None, spacing: float = SPACING
     ) -> None:
         self.ns = ns = kde.ns
-        kappa = float(np.array(kde._kappa)[probe])
+        kappa = float(kde.kappa[probe])
         self.n = n = _texels(kappa, spacing)
         if n > _MOST:
             raise ValueError(
@@ -53,7 +53,7 @@ class SphericalKdeTable:
     @staticmethod
     def fits(kde: SphericalKde, count: int) -> bool:
         """Whether a table of the first probe has texels no denser than ``count`` directions over the sphere."""
-        n = _texels(float(np.array(kde._kappa)[0]), SPACING)
+        n = _texels(float(kde.kappa[0]), SPACING)
         return n <= _MOST and 6 * n * n <= 16 * count
 
     def _touched(self, directions: np.ndarray) -> np.ndarray:

@@ -78,7 +78,7 @@ def test_reads_gzip_of_others(tmp_path):
 
 
 def test_bad_lines_are_told_and_left_out(tmp_path, poses):
-    path, told = tmp_path / "day.csv", []
+    path, bad_lines = tmp_path / "day.csv", []
     write_skeleton(path, *poses)
     good = path.read_text().splitlines(keepends=True)
     zeros = ", ".join(["0"] * 65)
@@ -92,12 +92,12 @@ def test_bad_lines_are_told_and_left_out(tmp_path, poses):
     ]
     path.write_text("".join(line for pair in zip(good, [*bad[:-1], "", ""]) for line in pair) + bad[-1])
     for keypoints in (None, (21, 2, 13)):
-        told.clear()
-        (rows,) = iterate_skeleton(path, keypoints=keypoints, on_bad=lambda line, why: told.append(line))
+        bad_lines.clear()
+        (rows,) = iterate_skeleton(path, keypoints=keypoints, on_bad=lambda line, why: bad_lines.append(line))
         assert (
             list(rows.ids) == poses[0]
             and rows.lines.tolist() == [1, 3, 5, 7, 9, 11, 12]
-            and sorted(told) == [2, 4, 6, 8, 10, 13]
+            and sorted(bad_lines) == [2, 4, 6, 8, 10, 13]
         )
     with pytest.raises(NergError, match="line 4: 2 fields.*--skip-bad-lines"):
         read_skeleton(path)

@@ -99,21 +99,21 @@ BAD = ["1,x\n", "1\n", "nonsense\n", '"1,2\n', "1,2e\n", "\x00\n", "1,1 2\n"]
 def test_bad_lines_are_told_and_left_out(tmp_path, monkeypatch, bad, fast):
     if not fast:
         monkeypatch.setattr(ray_tables, "_fast_reader", lambda *a: None)
-    path, told = tmp_path / "t.csv", []
+    path, bad_lines = tmp_path / "t.csv", []
     path.write_text("a,b\n" + "".join(f"{i},{i}\n" for i in range(5)) + bad + "7,7\n")
-    (block,) = iterate_table(path, ["a", "b"], on_bad=lambda line, why: told.append((line, why)))
+    (block,) = iterate_table(path, ["a", "b"], on_bad=lambda line, why: bad_lines.append((line, why)))
     assert block.numbers[:, 0].tolist() == [0, 1, 2, 3, 4, 7] and block.lines.tolist() == [2, 3, 4, 5, 6, 8]
-    assert [line for line, _ in told] == [7]
+    assert [line for line, _ in bad_lines] == [7]
     with pytest.raises(NergError, match="t.csv, line 7[:,].*--skip-bad-lines"):
         read(path, ["a", "b"])
 
 
 def test_a_bad_line_among_texts(tmp_path):
     """Texts and numbers of the other lines stay beside each other."""
-    path, told = tmp_path / "t.csv", []
+    path, bad_lines = tmp_path / "t.csv", []
     path.write_text("who,a\nann,1\nbo\ncy,3\n")
-    (block,) = iterate_table(path, ["a"], ["who"], on_bad=lambda line, why: told.append(line))
-    assert block.texts[:, 0].tolist() == ["ann", "cy"] and block.numbers[:, 0].tolist() == [1, 3] and told == [3]
+    (block,) = iterate_table(path, ["a"], ["who"], on_bad=lambda line, why: bad_lines.append(line))
+    assert block.texts[:, 0].tolist() == ["ann", "cy"] and block.numbers[:, 0].tolist() == [1, 3] and bad_lines == [3]
     path.write_text("a,who\n1,ann\n2\n3,cy\n")
     with pytest.raises(NergError, match="line 3: 1 cells"):
         read(path, ["a"], ["who"])
