@@ -30,10 +30,10 @@ def ivt(rays: Rays, velocity: float = 100.0, least: float = 0.06, gap: float = _
     order, starts = person_order(rays)
     t, d = rays.t[order], rays.direction[order]
     step = np.diff(t)
-    together = (step > 0) & (step <= gap)
-    together[starts[1:-1] - 1] = False
+    joined = (step > 0) & (step <= gap)
+    joined[starts[1:-1] - 1] = False
     with np.errstate(divide="ignore", invalid="ignore"):
-        slow = together & (_angles(d[1:], d[:-1]) <= velocity * step)
+        slow = joined & (_angles(d[1:], d[:-1]) <= velocity * step)
     # Rays joined by slow steps are one run; a ray after a fast step begins one.
     run = np.cumsum(np.r_[True, ~slow]) - 1
     return _numbered(run, t, order, least)

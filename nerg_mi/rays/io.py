@@ -81,7 +81,7 @@ def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict
     """Columns and metadata as :func:`write_rays_file` took them.
 
     Numbers of any width are read; other columns are not. Room is made for what the file's bytes warrant, column by
-    column. Raises `NergError` when the file is damaged, is not one of ours, or lacks a column.
+    column. Raises `NergError` when the file is damaged, is no rays file, or lacks a column.
     """
     if _suffix(path) == ".npz":
         columns, document = _read_npz(path)

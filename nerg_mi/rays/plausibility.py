@@ -8,39 +8,51 @@ contradicts nothing and cannot be seen without the place itself.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
+from .filters import time_order
 from .rays import Rays
 
 # The bounds are wide: they catch a wrong unit or axis, not an unusual shop.
 _OFF = 5.0  # degrees between direction and hit point
+_NEAR = 0.2  # metres: directions to nearer hit points say little
+_FEW = 20  # hit points from which on they are asked
+_STEEP = 50.0  # degrees up or down
 _AHEAD = 0.2  # correlation of gaze and walking along an axis
 _MOST = 200_000  # rays looked at
 _WALKED = 1 << 19, 1 << 11  # rays looked at in runs of so many, where it matters which comes after which
 _USUAL = 5.0, 2100.0  # rays a second of devices that there are
 
 
-def find_warnings(
-    rays: Rays, height: np.ndarray, extent: np.ndarray, speed: float, step: float | None, order: np.ndarray | None
-) -> list[str]:
-    """Sentences about rays in the frame of rays, each with the likely mistake and its remedy.
+@dataclass(frozen=True, eq=False)
+class Figures:
+    """What a summary has found of rays already, in the frame of rays."""
 
-    ``height``: 5, 50 and 95 % of the origins' heights, metres; ``extent`` (3,) of their box, metres; ``speed``: 95 % of
-    the speeds, m/s; ``step``: median of the times between a person's rays that are positive, seconds, NaN if none is,
-    None without any; ``order``: `filters.time_order` of them.
-    """
-    return [*_lengths(rays, height, extent), *_times(rays, speed, step), *_directions(rays, order)]
+    height: np.ndarray  # (3,) 5, 50 and 95 % of the origins' heights, metres
+    extent: np.ndarray  # (3,) of the origins' box, metres
+    speed: float  # 95 % of the origins' speeds, m/s; NaN if unknown
+    step: float | None  # median of a person's positive times between rays, seconds; NaN: none is; None: no times
+    order: np.ndarray | None  # (N,) by person and time, as `filters.time_order` gives it
+
+
+def find_warnings(rays: Rays, figures: Figures) -> list[str]:
+    """Sentences about what people cannot have produced, each with the likely mistake and its remedy: those of all
+    `CHECKS`."""
+    return [warning for check in CHECKS for warning in check(rays, figures)]
 
 
 def _to_source(rays: Rays) -> np.ndarray:
-    """Rotation, or mirror, from our frame back to the file's, (3, 3): file = R ours."""
+    """Rotation, or mirror, from the frame of rays back to the file's, (3, 3): file = R ours."""
     matrix = np.asarray(rays.metadata.get("transform", np.eye(4)), dtype=np.float64)[:3, :3]
     return np.linalg.inv(matrix / np.cbrt(abs(np.linalg.det(matrix))))
 
 
-def _lengths(rays: Rays, height: np.ndarray, extent: np.ndarray) -> list[str]:
-    median, out = height[1], []
+def check_lengths(rays: Rays, figures: Figures) -> list[str]:
+    """Units of length and the up axis, by the heights and the extent of the origins."""
+    extent, median, out = figures.extent, figures.height[1], []
     if 100 <= median <= 230:
         out.append(f"the median height is {median:.0f} m: is the unit centimetres? (--units cm)")
     elif extent.max() > 1000 or 1000 <= median <= 2300:
@@ -76,8 +88,9 @@ def _standing_axis(rays: Rays) -> str | None:
     return None if len(found) != 1 else ("-" if mid[found[0]] < 0 else "") + "xyz"[found[0]]
 
 
-def _times(rays: Rays, speed: float, step: float | None) -> list[str]:
-    out = []
+def check_times(rays: Rays, figures: Figures) -> list[str]:
+    """The unit and the column of time, by the speeds of the origins and the rate of rays."""
+    speed, step, out = figures.speed, figures.step, []
     if speed > 5:
         out.append(
             f"5 % of the steps are faster than {speed:.1f} m/s, no walking pace: "
@@ -101,52 +114,68 @@ def _times(rays: Rays, speed: float, step: float | None) -> list[str]:
     return out
 
 
-def _directions(rays: Rays, order: np.ndarray | None) -> list[str]:
+def check_directions(rays: Rays, figures: Figures) -> list[str]:
+    """The frame of the directions: by the hit points or, where these tell nothing, by steep gaze and by walking."""
+    return _check_hits(rays) or [*_check_elevation(rays), *_check_walking(rays, figures.order)]
+
+
+def _check_hits(rays: Rays) -> list[str]:
+    if rays.hit is None:
+        return []
     R = _to_source(rays)
+    some = np.flatnonzero(np.isfinite(rays.hit).all(axis=1))
+    some = some[:: max(1, len(some) // _MOST)]
+    to_hit = (rays.hit[some] - rays.origin[some]) @ R.T
+    length = np.linalg.norm(to_hit, axis=1)
+    far = length > _NEAR
+    if far.sum() < _FEW:
+        return []
+    to_hit, d = to_hit[far] / length[far, None], rays.direction[some][far] @ R.T
+    angle = lambda v: float(np.median(np.degrees(np.arccos(np.clip(np.sum(v * to_hit, axis=1), -1, 1)))))
+    now = angle(d)
+    if not now > _OFF:
+        return []
     signs = np.array(list(itertools.product((1.0, -1.0), repeat=3)))[1:]
-    name = lambda s: " and ".join("xyz"[i] for i in np.flatnonzero(s < 0))
-    if rays.hit is not None:
-        some = np.flatnonzero(np.isfinite(rays.hit).all(axis=1))
-        some = some[:: max(1, len(some) // _MOST)]
-        to_hit = (rays.hit[some] - rays.origin[some]) @ R.T
-        length = np.linalg.norm(to_hit, axis=1)
-        far = length > 0.2
-        if far.sum() >= 20:
-            to_hit, d = to_hit[far] / length[far, None], rays.direction[some][far] @ R.T
-            off = lambda v: float(np.median(np.degrees(np.arccos(np.clip(np.sum(v * to_hit, axis=1), -1, 1)))))
-            now = off(d)
-            if now > _OFF:
-                tried = {name(s): off(d * s) for s in signs}
-                best = min(tried, key=tried.get)
-                fits = f"with {best} of the directions negated they would, to {tried[best]:.2g}: check their frame"
-                return [
-                    f"the directions miss the hit points by {now:.0f} degrees (median); "
-                    + (fits if tried[best] < min(_OFF, 0.5 * now) else "check that they are of one frame and one unit")
-                ]
-    out = []
+    tried = {" and ".join("xyz"[i] for i in np.flatnonzero(s < 0)): angle(d * s) for s in signs}
+    best = min(tried, key=tried.__getitem__)
+    remedy = "check that they are of one frame and one unit"
+    if tried[best] < min(_OFF, 0.5 * now):
+        remedy = f"with {best} of the directions negated they would, to {tried[best]:.2g}: check their frame"
+    return [f"the directions miss the hit points by {now:.0f} degrees (median); {remedy}"]
+
+
+def _check_elevation(rays: Rays) -> list[str]:
     elevation = np.degrees(np.arcsin(np.clip(rays.direction[:: max(1, len(rays) // _MOST), 2], -1, 1)))
-    if abs(np.median(elevation)) > 50:
-        up = "up" if np.median(elevation) > 0 else "down"
-        out.append(
-            f"half of the rays look more than {abs(np.median(elevation)):.0f} degrees {up}: "
-            "check the axes of the directions, or which way is forward"
-        )
+    median = np.median(elevation)
+    if abs(median) <= _STEEP:
+        return []
+    return [
+        f"half of the rays look more than {abs(median):.0f} degrees {'up' if median > 0 else 'down'}: "
+        "check the axes of the directions, or which way is forward"
+    ]
+
+
+def _check_walking(rays: Rays, order: np.ndarray | None) -> list[str]:
     agree = walking_agreement(rays, order)
-    if agree is not None:
-        against = [i for i in range(3) if agree[i] < -_AHEAD]
-        along = [i for i in range(3) if agree[i] > _AHEAD]
-        if against and not along:
-            out.append(
-                "people look back to where they came from: are the directions reversed? "
-                "(--forward, or the sign of the direction)"
-            )
-        elif against:
-            axis = " and ".join("xyz"[i] for i in against)
-            out.append(
-                f"along {axis} of the file people look away from where they walk: "
-                "are positions and directions mirrored against each other? (--hand)"
-            )
-    return out
+    if agree is None:
+        return []
+    against = [i for i in range(3) if agree[i] < -_AHEAD]
+    along = [i for i in range(3) if agree[i] > _AHEAD]
+    if against and not along:
+        return [
+            "people look back to where they came from: are the directions reversed? "
+            "(--forward, or the sign of the direction)"
+        ]
+    if against:
+        return [
+            f"along {' and '.join('xyz'[i] for i in against)} of the file people look away from where they walk: "
+            "are positions and directions mirrored against each other? (--hand)"
+        ]
+    return []
+
+
+CHECKS: tuple[Callable[[Rays, Figures], list[str]], ...] = (check_lengths, check_times, check_directions)
+"""What is looked for, in the order of the card; each check gives no sentence where nothing is wrong."""
 
 
 def walking_agreement(rays: Rays, order: np.ndarray | None = None) -> np.ndarray | None:
@@ -157,8 +186,6 @@ def walking_agreement(rays: Rays, order: np.ndarray | None = None) -> np.ndarray
     ``order``: `filters.time_order` of the rays, if it is known. Of millions of rays, runs of some thousands are looked
     at.
     """
-    from .filters import time_order
-
     order = time_order(rays) if order is None else order
     n, (most, run) = len(rays), _WALKED
     order = np.arange(n) if order is None and n <= most else order
@@ -170,15 +197,15 @@ def walking_agreement(rays: Rays, order: np.ndarray | None = None) -> np.ndarray
     starts = np.r_[np.flatnonzero(np.r_[True, np.diff(person) != 0]), len(t)]
     later = np.minimum(np.arange(len(t)) + _lag(t, starts), len(t) - 1)
     dt = t[later] - t
-    together = (person[later] == person) & (dt > 0) & (dt < 2.0)
-    moved = (rays.origin[order[later]] - rays.origin[order])[together]
+    same = (person[later] == person) & (dt > 0) & (dt < 2.0)
+    moved = (rays.origin[order[later]] - rays.origin[order])[same]
     moved[:, 2] = 0
-    speed = np.linalg.norm(moved, axis=1) / dt[together]
+    speed = np.linalg.norm(moved, axis=1) / dt[same]
     walks = (speed > 0.3) & (speed < 3.0)
     if walks.sum() < 200:
         return None
     R = _to_source(rays)
-    d = rays.direction[order[together]][walks] * (1, 1, 0)
+    d = rays.direction[order[same]][walks] * (1, 1, 0)
     v, d = moved[walks] / np.linalg.norm(moved[walks], axis=1, keepdims=True) @ R.T, d @ R.T
     norm = np.sqrt((v**2).mean(axis=0) * (d**2).mean(axis=0))
     # An axis on which hardly anybody walks says nothing.

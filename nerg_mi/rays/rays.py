@@ -1,8 +1,7 @@
 """Rays of attention: who looked from where to where, and when.
 
-Frame of every :class:`Rays`: right-handed, z up, metres, seconds. Readers
-convert into it and record the transform they applied in the metadata
-(:mod:`nerg_mi.rays.readers.builder`).
+Frame of every :class:`Rays`: right-handed, z up, metres, seconds. Readers convert into it
+(:mod:`nerg_mi.rays.readers`) and record the transform that they applied in the metadata.
 """
 
 from __future__ import annotations
@@ -27,28 +26,22 @@ FRAME = {"units": "m", "up": "z", "handedness": "right"}
 class Rays:
     """N rays of attention, checked on construction.
 
-    ``t`` (N,) seconds; ``person`` (N,) int32 index into ``persons``, the names;
-    ``origin`` (N, 3) metres; ``direction`` (N, 3) unit; ``confidence`` (N,) in
-    [0, 1]; ``hit`` (N, 3) metres, the point looked at, NaN where unknown, or
-    ``None``; ``metadata``: ``frame`` (units, up, handedness), ``sources`` (file
-    name and sha256), ``transform`` (4x4 from the source's frame), ``rows_read``
-    and ``dropped`` (reason, count, and rows of each source); ``cohort`` (N,)
-    int32 index into ``cohorts``, the names of groups of people, or ``None``.
-
     Raises `NergError` naming the first offending ray for NaN, zero or non-unit directions, non-finite origins or times,
     and persons out of range; ``ValueError`` for arrays of different lengths.
     """
 
-    t: np.ndarray
-    person: np.ndarray
-    persons: tuple[str, ...]
-    origin: np.ndarray
-    direction: np.ndarray
-    confidence: np.ndarray
-    hit: np.ndarray | None = None
+    t: np.ndarray  # (N,) seconds, on any clock
+    person: np.ndarray  # (N,) int32 index into persons
+    persons: tuple[str, ...]  # names
+    origin: np.ndarray  # (N, 3) metres: the eye, or the head
+    direction: np.ndarray  # (N, 3) unit
+    confidence: np.ndarray  # (N,) in [0, 1]
+    hit: np.ndarray | None = None  # (N, 3) metres, the point looked at, NaN where unknown
+    # frame (units, up, handedness), and of what was imported: source_frame, sources (file name and sha256), transform
+    # (4x4 from the source's frame), rows_read, dropped (reason, count and rows of each source); steps done since then.
     metadata: dict[str, Any] = field(default_factory=lambda: {"frame": dict(FRAME)})
-    cohort: np.ndarray | None = None
-    cohorts: tuple[str, ...] = ()
+    cohort: np.ndarray | None = None  # (N,) int32 index into cohorts
+    cohorts: tuple[str, ...] = ()  # names of groups of people
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)
@@ -99,8 +92,8 @@ class Rays:
         return len(self.t)
 
     def select(self, which: np.ndarray) -> Rays:
-        """The rays of a boolean mask (N,) or an index array; persons and
-        metadata are kept, so that codes and provenance stay comparable."""
+        """The rays of a boolean mask (N,) or an index array; persons and metadata are kept, so that codes and
+        provenance stay comparable."""
         return replace(
             self,
             t=self.t[which],

@@ -21,18 +21,13 @@ from .rays import Rays
 
 @dataclass(frozen=True, eq=False)
 class PositionSplit:
-    """Rays split by position.
+    """Rays split by position; those on neither side were purged."""
 
-    ``train`` (N,) bool: farther than 2R from every test centre. ``test`` (N,)
-    bool: within R of one. What is neither was purged. ``test_centres`` (T, 3)
-    and ``zone_centres`` (Z, 3), metres; ``zone`` (T,), the zone of each centre.
-    """
-
-    train: np.ndarray
-    test: np.ndarray
-    test_centres: np.ndarray
-    zone_centres: np.ndarray
-    zone: np.ndarray
+    train: np.ndarray  # (N,) bool: farther than 2R from every test centre
+    test: np.ndarray  # (N,) bool: within R of one
+    test_centres: np.ndarray  # (T, 3) metres
+    zone_centres: np.ndarray  # (Z, 3) metres
+    zone: np.ndarray  # (T,) the zone of each test centre
 
     @property
     def sides(self) -> tuple[np.ndarray, np.ndarray]:

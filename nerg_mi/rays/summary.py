@@ -10,7 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 
 from .filters import time_order
-from .plausibility import find_warnings
+from .plausibility import Figures, find_warnings
 from .rays import Rays
 
 _BLOCK = 1 << 18  # rays looked at at a time: a summary takes little memory besides the rays
@@ -19,36 +19,27 @@ GAP = 1.0  # seconds: a longer pause of a person does not count as recorded time
 
 @dataclass(frozen=True)
 class RaysSummary:
-    """Figures of :func:`summarise`; lengths in metres, times in seconds.
-
-    ``duration``: recorded time over all persons, without pauses above one
-    second. ``rate``: rays a second of a person (one over the median step; over that of
-    pauses where there is nothing else), NaN when no person has two times. ``eye_height``: 5, 50 and 95 % of the
-    origins' heights. ``speed_p95``: 95 % of the origins' speeds. ``duplicates``: rays with
-    person and time of another. ``dropped``: rows by reason; ``cohorts``: rays
-    by cohort. ``warnings``: sentences about figures that people cannot produce
-    (:mod:`nerg_mi.rays.plausibility`).
-    """
+    """Figures of :func:`summarise`, of rays in the frame of rays."""
 
     rays: int
     persons: int
-    duration: float
-    rate: float
-    box_low: np.ndarray
+    duration: float  # seconds recorded over all persons, without pauses above one second
+    rate: float  # rays a second of a person, by the median step; NaN when no person has two times
+    box_low: np.ndarray  # (3,) of the origins, metres
     box_high: np.ndarray
-    eye_height: np.ndarray
-    speed_p95: float
-    hit_share: float
-    hit_distance: float
-    duplicates: int
-    rows_read: int
-    dropped: dict[str, int]
-    cohorts: dict[str, int]
-    warnings: tuple[str, ...]
+    eye_height: np.ndarray  # (3,) 5, 50 and 95 % of the origins' heights, metres
+    speed_p95: float  # 95 % of the origins' speeds, m/s; NaN if unknown
+    hit_share: float  # of the rays whose hit point is known
+    hit_distance: float  # median distance of the hit points, metres; NaN without any
+    duplicates: int  # rays with person and time of another
+    rows_read: int  # by the import
+    dropped: dict[str, int]  # rows by reason
+    cohorts: dict[str, int]  # rays by cohort
+    warnings: tuple[str, ...]  # about figures that people cannot produce (`nerg_mi.rays.plausibility`)
 
 
 def summarise(rays: Rays) -> RaysSummary:
-    """Figures and warnings for rays in our frame (z up, metres).
+    """Figures and warnings.
 
     Raises `NergError` for an empty set.
     """
@@ -75,6 +66,7 @@ def summarise(rays: Rays) -> RaysSummary:
 
     height = np.percentile(rays.origin[:, 2], [5, 50, 95])
     low, high = rays.origin.min(axis=0), rays.origin.max(axis=0)
+    figures = Figures(height, high - low, speed_p95, median_step if some else None, order)
     return RaysSummary(
         rays=len(rays),
         persons=int(np.count_nonzero(np.bincount(rays.person))),
@@ -92,7 +84,7 @@ def summarise(rays: Rays) -> RaysSummary:
         cohorts={}
         if rays.cohort is None
         else dict(zip(rays.cohorts, np.bincount(rays.cohort, minlength=len(rays.cohorts)).tolist())),
-        warnings=tuple(find_warnings(rays, height, high - low, speed_p95, median_step if some else None, order)),
+        warnings=tuple(find_warnings(rays, figures)),
     )
 
 

@@ -25,48 +25,50 @@ def walk(hit=True, frame=None, seed=0):
     return Rays(t, np.zeros(n), ("ann",), origin, d, np.ones(n), origin + 2 * d if hit else None, metadata)
 
 
-def said(rays):
+def warnings_of(rays):
     return " | ".join(summarise(rays).warnings)
 
 
 def test_nothing_to_say_of_a_plausible_walk():
-    assert said(walk()) == "" and said(walk(hit=False)) == ""
+    assert warnings_of(walk()) == "" and warnings_of(walk(hit=False)) == ""
     assert (walking_agreement(walk())[:2] > 0.5).all()
 
 
 def test_directions_against_hit_points():
     rays = walk(frame={"up": "y", "handedness": "left"})  # the file's z is our y
-    assert "with z of the directions negated they would" in said(replace(rays, direction=rays.direction * (1, -1, 1)))
+    assert "with z of the directions negated they would" in warnings_of(
+        replace(rays, direction=rays.direction * (1, -1, 1))
+    )
     swapped = replace(rays, direction=rays.direction[:, [1, 0, 2]])
-    assert "miss the hit points" in said(swapped) and "one frame" in said(swapped)
+    assert "miss the hit points" in warnings_of(swapped) and "one frame" in warnings_of(swapped)
 
 
 def test_directions_against_walking():
     rays = walk(hit=False, frame={"up": "y"})
-    assert "reversed" in said(replace(rays, direction=rays.direction * (-1, -1, 1)))
-    assert "along x of the file" in said(replace(rays, direction=rays.direction * (-1, 1, 1)))
-    assert "along z of the file" in said(replace(rays, direction=rays.direction * (1, -1, 1)))
+    assert "reversed" in warnings_of(replace(rays, direction=rays.direction * (-1, -1, 1)))
+    assert "along x of the file" in warnings_of(replace(rays, direction=rays.direction * (-1, 1, 1)))
+    assert "along z of the file" in warnings_of(replace(rays, direction=rays.direction * (1, -1, 1)))
 
 
 @pytest.mark.parametrize("scale, word", [(1000, "--units mm"), (100, "--units cm")])
 def test_units(scale, word):
     rays = walk(hit=False)
-    assert word in said(replace(rays, origin=rays.origin * scale))
+    assert word in warnings_of(replace(rays, origin=rays.origin * scale))
 
 
 def test_the_axis_that_is_up():
     # A file with y up that was declared with z up: heights stand in y.
     rays = walk(hit=False)
-    assert "--up y" in said(replace(rays, origin=rays.origin[:, [0, 2, 1]]))
-    assert "--up -x" in said(replace(rays, origin=rays.origin[:, [2, 0, 1]] * (-1, 1, 1)))
-    assert "floor is not at height 0" in said(replace(rays, origin=rays.origin - (0, 0, 1.6)))
+    assert "--up y" in warnings_of(replace(rays, origin=rays.origin[:, [0, 2, 1]]))
+    assert "--up -x" in warnings_of(replace(rays, origin=rays.origin[:, [2, 0, 1]] * (-1, 1, 1)))
+    assert "floor is not at height 0" in warnings_of(replace(rays, origin=rays.origin - (0, 0, 1.6)))
 
 
 def test_times_and_steep_gaze():
     rays = walk(hit=False)
-    assert "a ray comes every 20 s" in said(replace(rays, t=rays.t * 1000))
+    assert "a ray comes every 20 s" in warnings_of(replace(rays, t=rays.t * 1000))
     down = np.tile([0.1, 0.1, -1.0], (len(rays), 1)) / np.linalg.norm([0.1, 0.1, -1.0])
-    assert "degrees down" in said(replace(rays, direction=down))
+    assert "degrees down" in warnings_of(replace(rays, direction=down))
 
 
 @pytest.mark.parametrize("units", ["m", "cm", "mm"])
@@ -81,7 +83,7 @@ def test_axes_are_told_in_the_frame_of_the_file(units, up):
     turn = Frame(up=up).to_rays()[:3, :3]
     for standing in {"x", "y", "z"} - {up[-1]}:
         file = rays.origin[:, {"x": [2, 0, 1], "y": [1, 2, 0], "z": [0, 1, 2]}[standing]]
-        assert f"(--up {standing})" in said(replace(rays, origin=file @ turn.T))
+        assert f"(--up {standing})" in warnings_of(replace(rays, origin=file @ turn.T))
 
 
 def test_some_runs_speak_for_millions(monkeypatch):
@@ -109,4 +111,4 @@ def test_a_kilometre_is_the_most_that_origins_in_metres_span(along):
         origin = rays.origin.copy()
         origin[:, along] *= span / np.ptp(origin[:, along])
         slow = replace(rays, origin=origin, t=rays.t * 40)  # nobody runs
-        assert ("--units mm" in said(slow)) == warned
+        assert ("--units mm" in warnings_of(slow)) == warned
