@@ -49,6 +49,11 @@ def option(
     return dataclasses.field(default=default, metadata={_KEY: about})
 
 
+def tick_option() -> Any:
+    """The unit of the file's time, in seconds; `check_tick` is to be asked of it."""
+    return option(1.0, "Seconds in one unit of the file's time.")
+
+
 @dataclass(frozen=True, kw_only=True)
 class NoOptions:
     """The options of a reader that has none."""
@@ -58,7 +63,7 @@ class NoOptions:
 class TickOption:
     """For readers of files whose unit of time is not known. Raises `NergError` for what is no length of time."""
 
-    tick: float = option(1.0, "Seconds in one unit of the file's time.")
+    tick: float = tick_option()
 
     def __post_init__(self) -> None:
         check_tick(self.tick)

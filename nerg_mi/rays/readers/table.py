@@ -12,7 +12,7 @@ from nerg_mi.errors import NergError
 
 from .builder import RaysBuilder
 from .frames import Frame
-from .options import TickOption, option
+from .options import check_tick, option, tick_option
 from .parsing import poses
 from .parsing.column_map import ColumnMap
 from .parsing.tables import TableBlock, iterate_table
@@ -20,7 +20,7 @@ from .protocol import RECORDINGS
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableOptions(TickOption):
+class TableOptions:
     """What no table says of itself. Raises `NergError` for words that are not known."""
 
     columns: ColumnMap | None = option(  # needed
@@ -43,9 +43,10 @@ class TableOptions(TickOption):
     radians: bool = option(False, "Angles of a mapped table are in radians.", recorded=False)
     person_from: str = option("column", "Persons of a mapped table: column or filename.", recorded=False)
     min_confidence: float = option(0.0, "Drop rows below this confidence.")
+    tick: float = tick_option()
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        check_tick(self.tick)
         poses.axis(self.looks_along, "forward")
         if self.person_from not in ("column", "filename"):
             raise NergError(f'person_from is "{self.person_from}"; it is "column" or "filename" (--person-from)')
