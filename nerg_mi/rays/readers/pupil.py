@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from .builder import RaysBuilder
 from .frames import Frame
 from .options import option
 from .parsing import poses
+from .parsing.pose_track import PoseTrack
 from .parsing.tables import iterate_table
 from .protocol import DESCRIPTION
 
@@ -61,17 +61,17 @@ class Pupil:
         for given in files:
             gaze = given / "gaze_positions.csv" if given.is_dir() else given
             person = _person(gaze)
-            heads = _read_heads(gaze.with_name("head_pose_tracker_poses.csv"), person, options.marker, builder)
+            heads = _read_heads(gaze.with_name("head_pose_tracker_poses.csv"), person, builder)
             builder.source(gaze, f"{person}/{gaze.name}")
             columns = ["gaze_timestamp", "confidence", *_NORMALS, *_CENTRES]
             for v, _, lines in iterate_table(gaze, columns, on_bad=builder.on_bad):
-                turn, place, lost = heads.at(v[:, 0])
+                turn, place, lost = heads.at(v[:, 0], _GAP)
                 # An eye that was not seen has no columns filled: the other one stands alone.
                 direction, eye = (_mean_of_two(v[:, a : a + 6].reshape(-1, 2, 3)) for a in (2, 8))
                 builder.add(
                     v[:, 0],
                     person,
-                    place + poses.rotate(turn, 1e-3 * eye),
+                    options.marker * place + poses.rotate(turn, 1e-3 * eye),
                     poses.rotate(turn, direction),
                     rows=lines,
                     confidence=v[:, 1],
@@ -85,42 +85,18 @@ class Pupil:
 READERS = (Pupil(),)
 
 
-class _Heads(NamedTuple):
-    """Poses of the scene camera in a recording: ``times`` (N,) seconds, rising, ``vectors`` (N, 3) Rodrigues,
-    ``places`` (N, 3) in marker edges of ``marker`` metres."""
-
-    times: np.ndarray
-    vectors: np.ndarray
-    places: np.ndarray
-    marker: float
-
-    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rotations (n, 3, 3) and places (n, 3) in metres at the times ``t`` (n,), and where none is near, (n,)
-        bool."""
-        from scipy.spatial.transform import Rotation, Slerp
-
-        times = self.times
-        inside = np.clip(np.nan_to_num(t), times[0], times[-1])
-        after = np.clip(np.searchsorted(times, inside), 1, len(times) - 1)
-        apart = np.abs(t[:, None] - times[np.stack([after - 1, after], axis=1)])
-        lost = (apart.min(axis=1) > _GAP) | (inside != t)
-        turn = Slerp(times, Rotation.from_rotvec(self.vectors))(inside).as_matrix()
-        place = np.stack([np.interp(inside, times, self.places[:, i]) for i in range(3)], axis=1)
-        return turn, self.marker * place, lost
-
-
-def _read_heads(path: Path, person: str, marker: float, builder: RaysBuilder) -> _Heads:
+def _read_heads(path: Path, person: str, builder: RaysBuilder) -> PoseTrack:
+    """Poses of the scene camera in a recording, in marker edges."""
     if not path.is_file():
         raise NergError(f"there is no {path}; run the head pose tracker in Pupil Player and export again")
     builder.source(path, f"{person}/{path.name}")
     blocks = iterate_table(path, _POSES, on_bad=builder.on_bad)
     track = np.concatenate([block.numbers for block in blocks] or [np.empty((0, 7))])
     builder.count_lines(len(track))
-    track = track[np.isfinite(track).all(axis=1)]
-    track = track[np.unique(track[:, 0], return_index=True)[1]]
-    if len(track) < 2:
-        raise NergError(f"{path} holds {len(track)} head poses; two are needed to interpolate between")
-    return _Heads(track[:, 0], track[:, 1:4], track[:, 4:], marker)
+    heads = PoseTrack.of_samples(track[:, 0], track[:, 1:4], track[:, 4:])
+    if heads is None:
+        raise NergError(f"{path} holds {len(track)} head poses; two that are whole are needed to interpolate between")
+    return heads
 
 
 def _person(gaze: Path) -> str:

@@ -1,0 +1,24 @@
+"""Columns by their usual names."""
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
+
+
+@pytest.fixture
+def table(tmp_path):
+    (tmp_path / "t.csv").write_text("Gaze Dir.X,gaze_dir_y,GAZE_DIR_Z,hit_x,hit_y,Time,time\n")
+    return ColumnFinder(tmp_path / "t.csv")
+
+
+def test_spaces_dots_and_cases_are_one(table):
+    assert table.vector("look", "gaze_dir") == ("Gaze Dir.X", "gaze_dir_y", "GAZE_DIR_Z")
+    assert table.find_vector("hit") is None and table.find_vector("hit", axes="xy") == ("hit_x", "hit_y")
+    # Of columns whose names differ in case alone, the first.
+    assert table.find("clock", "time") == "Time" and table.find("person") is None
+
+
+def test_what_is_missing_is_named_with_what_is_there(table):
+    with pytest.raises(NergError, match=r"t.csv has no columns head_\{x,y,z,w\} or hmd_\{x,y,z,w\}.*Gaze Dir.X.*--map"):
+        table.vector("head", "hmd", axes="xyzw")
