@@ -8,6 +8,7 @@ import types
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError
@@ -109,8 +110,10 @@ def options_of(kind: type) -> tuple[Option, ...]:
 
 
 def recorded_options(options: Any) -> dict[str, Any]:
-    """The values that go into the metadata of rays: those that are set, tuples as lists."""
-    values = {o.name: getattr(options, o.name) for o in options_of(type(options)) if o.recorded}
+    """The values that go into the metadata of rays: those that are set, tuples as lists. Files are kept there as
+    sources, when a reader begins them."""
+    known = [o for o in options_of(type(options)) if o.recorded and o.kind is not Path]
+    values = {o.name: getattr(options, o.name) for o in known}
     return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items() if v is not None}
 
 

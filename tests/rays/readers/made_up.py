@@ -17,7 +17,7 @@ from nerg_mi.rays.readers.parsing.tables import iterate_table
 
 @dataclass(frozen=True, kw_only=True)
 class MadeUpOptions(TickOption):
-    heads: Path | None = option(None, "File of the heads' places.", recorded=False)
+    heads: Path | None = option(None, "File of the heads' places.")
     scale: float = option(1.0, "What a unit of the heads' places is, in metres.")
     blinks: bool = option(False, "Keep blinks.")
 

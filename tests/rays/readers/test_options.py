@@ -14,18 +14,19 @@ from nerg_mi.rays.readers.options import NoOptions, TickOption, option, options_
 @dataclass(frozen=True, kw_only=True)
 class Some(TickOption):
     min_height: float = option(1.5, "Metres.")
-    poses: Path | None = option(None, "A file.", recorded=False)
+    poses: Path | None = option(None, "A file.")
     pair: tuple[int, int] = option((1, 2), "Two.", flag="--two", shown="1,2", parse=lambda text: (0, 0))
     rough: bool = option(False, "Whether.")
+    secret: str = option("a", "Told elsewhere.", recorded=False)
 
 
 def test_what_is_said_of_each():
-    tick, height, poses, pair, rough = options_of(Some)
+    tick, height, poses, pair, rough, secret = options_of(Some)
     assert (tick.flag, tick.kind, tick.shown, tick.default) == ("--tick", float, "1", 1.0)
     assert (height.flag, height.shown, height.help, height.recorded) == ("--min-height", "1.5", "Metres.", True)
-    assert (poses.kind, poses.shown, poses.recorded) == (Path, "", False)
+    assert (poses.kind, poses.shown, poses.default) == (Path, "", None)
     assert (pair.flag, pair.kind, pair.shown, pair.parse("9,9")) == ("--two", str, "1,2", (0, 0))
-    assert (rough.kind, rough.shown) == (bool, "") and options_of(NoOptions) == ()
+    assert (rough.kind, rough.shown) == (bool, "") and not secret.recorded and options_of(NoOptions) == ()
 
 
 def test_what_goes_into_the_metadata():
