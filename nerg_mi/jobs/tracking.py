@@ -18,6 +18,7 @@ from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.registry import TABLE, read_rays
 from nerg_mi.rays.summary import RaysSummary, summarise
+from nerg_mi.view import figures, ray_figures
 
 from .reporter import SILENT, Reporter
 
@@ -280,8 +281,6 @@ class PlotOptions:
 
 def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions()) -> Figure:
     """The floor plan of rays, or of a file of them, as a figure of matplotlib."""
-    from nerg_mi.view import figures, ray_figures
-
     if options.output is not None:
         check_writable(options.output, ".png")
     if options.kind == "density":

@@ -12,19 +12,15 @@ _BLOCK = 1 << 21  # neighbours held at a time: memory stays bounded
 
 
 class Neighbours(NamedTuple):
-    """Of Q places: ``indices`` (n,) of rays, place after place, nearest first, ``distances`` (n,) metres, and
-    ``offsets`` (Q + 1,): place q has ``indices[offsets[q]:offsets[q + 1]]``."""
+    """The rays near each of Q places, place after place."""
 
-    indices: np.ndarray
-    distances: np.ndarray
-    offsets: np.ndarray
+    indices: np.ndarray  # (n,) of rays; of a place, nearest first
+    distances: np.ndarray  # (n,) metres
+    offsets: np.ndarray  # (Q + 1,): place q has indices[offsets[q]:offsets[q + 1]]
 
 
 class RayIndex:
-    """A k-d tree of ray origins: built in a second or two for millions, thousands of places in less than that.
-
-    ``rays``: a set of rays, or origins (N, 3) in metres.
-    """
+    """A k-d tree of ray origins. ``rays``: a set of rays, or origins (N, 3) in metres."""
 
     def __init__(self, rays: Rays | np.ndarray) -> None:
         from scipy.spatial import cKDTree

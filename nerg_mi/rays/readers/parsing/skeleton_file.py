@@ -30,14 +30,12 @@ VALUES = 3 * KEYPOINTS
 
 
 class SkeletonRows(NamedTuple):
-    """A run of poses: ``ids`` (N,) str, ``times`` (N,) int64, ``keypoints``
-    (N, 22, 3) float64 in metres (NaN where unseen), ``lines`` (N,) int64, the
-    1-based line of the file each pose stands on."""
+    """A run of N poses."""
 
-    ids: np.ndarray
-    times: np.ndarray
-    keypoints: np.ndarray
-    lines: np.ndarray
+    ids: np.ndarray  # (N,) str
+    times: np.ndarray  # (N,) int64, in the file's unit
+    keypoints: np.ndarray  # (N, 22, 3) float64 metres, NaN where unseen
+    lines: np.ndarray  # (N,) int64, the 1-based line of the file that each stands on
 
 
 def write_skeleton(
@@ -130,7 +128,7 @@ def _fields(line: str) -> tuple[str, int, str] | str:
     return fields[0].strip(), time, body[1:-1]
 
 
-def _refuse(path: object, line: int, why: str, on_bad: OnBadLine | None) -> None:
+def _refuse(path: str | os.PathLike, line: int, why: str, on_bad: OnBadLine | None) -> None:
     if on_bad is None:
         raise NergError(
             f"{path}, line {line}{why}; mend or remove the line, or leave such lines out with --skip-bad-lines"
@@ -147,7 +145,7 @@ def read_skeleton(path: str | os.PathLike) -> SkeletonRows:
 
 
 def _rows(
-    path: object,
+    path: str | os.PathLike,
     ids: list[str],
     times: list[int],
     texts: list[str],

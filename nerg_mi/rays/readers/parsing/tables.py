@@ -27,13 +27,11 @@ _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
 
 
 class TableBlock(NamedTuple):
-    """``numbers`` (n, C) float64 in the order asked, NaN where a cell is empty;
-    ``texts`` (n, T) str; ``lines`` (n,) 1-based lines of the file (rows for
-    Parquet)."""
+    """A run of n rows of a table."""
 
-    numbers: np.ndarray
-    texts: np.ndarray
-    lines: np.ndarray
+    numbers: np.ndarray  # (n, C) float64 in the order asked, NaN where a cell is empty
+    texts: np.ndarray  # (n, T) str
+    lines: np.ndarray  # (n,) 1-based lines of the file; rows for Parquet
 
 
 def table_columns(path: str | os.PathLike) -> list[str]:
@@ -91,7 +89,7 @@ def iterate_table(
         _require(path, [*numbers, *texts], [])
 
 
-def _header(path: object, line: str) -> tuple[list[str], str]:
+def _header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
     """Column names and the separator between them."""
     line = line.rstrip("\r\n").lstrip("\ufeff")
     separator = max(",;\t", key=line.count)
@@ -106,8 +104,7 @@ def _header(path: object, line: str) -> tuple[list[str], str]:
 def _fast_reader(
     separator: str, columns: list[str], number_at: list[int], text_at: list[int]
 ) -> Callable[[list[str]], tuple[np.ndarray, np.ndarray] | None] | None:
-    """A function of lines that converts them with pyarrow, three times as fast and on all cores; ``None`` without
-    pyarrow.
+    """A function of lines that converts them with pyarrow, on all cores; ``None`` without pyarrow.
 
     It gives ``None`` for lines that are in any way unusual (missing cells, words among numbers), which the slower
     reader converts, or refuses by line and column.
@@ -151,7 +148,7 @@ def _fast_reader(
 
 
 def _convert(
-    path: object,
+    path: str | os.PathLike,
     rows: list[str],
     lines: np.ndarray,
     separator: str,
@@ -183,7 +180,7 @@ def _convert(
 
 
 def _convert_slowly(
-    path: object,
+    path: str | os.PathLike,
     rows: list[str],
     lines: np.ndarray,
     separator: str,
@@ -285,7 +282,7 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
             first += n
 
 
-def _as_numbers(path: object, name: str, column: Any) -> np.ndarray:
+def _as_numbers(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
     try:
         return column.to_numpy(zero_copy_only=False).astype(np.float64)
     except (TypeError, ValueError):
@@ -294,7 +291,7 @@ def _as_numbers(path: object, name: str, column: Any) -> np.ndarray:
         ) from None
 
 
-def _require(path: object, wanted: list[str], there: list[str]) -> None:
+def _require(path: str | os.PathLike, wanted: list[str], there: list[str]) -> None:
     missing = [c for c in wanted if c not in there]
     if missing:
         brief = lambda names: ", ".join(plain(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
