@@ -27,6 +27,8 @@ from .metadata import VERSION, not_rays, read_metadata
 SUFFIXES = (".npz", ".parquet")
 _REQUIRED = ("t", "person", "origin", "direction", "confidence")
 _OPTIONAL = ("hit", "cohort")
+COLUMNS = (*_REQUIRED, *_OPTIONAL)
+"""Columns of rays, one row each; hit points and cohorts may be missing."""
 _VECTORS = ("origin", "direction", "hit")
 # Columns of numbers of names; all others are measurements.
 _CODES = ("person", "cohort")
@@ -92,7 +94,7 @@ def read_rays_file(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], dict
 
 def _read_npz(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]:
     with open_npz(path, "rays file") as archive:
-        there = {name: archive.about(name) for name in archive.names if name in (*_REQUIRED, *_OPTIONAL)}
+        there = {name: archive.about(name) for name in archive.names if name in COLUMNS}
         _check_columns(path, {name: (shape, dtype.kind) for name, (shape, dtype) in there.items()})
         if "metadata" not in archive:
             raise not_rays(path, "it lacks the metadata")
@@ -113,7 +115,7 @@ def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes
         if claimed > inflated_limit(size):
             raise _not_warranted(path, about.num_rows, size)
         there = {}
-        for name in (*_REQUIRED, *_OPTIONAL):
+        for name in COLUMNS:
             if all(part in schema.names for part in _parts(name)):
                 kinds = "".join(sorted({_arrow_kind(pa, schema.field(part).type) for part in _parts(name)}))
                 shape = (about.num_rows, 3) if name in _VECTORS else (about.num_rows,)

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-from .io import read_rays_file, write_rays_file
+from .io import COLUMNS, read_rays_file, write_rays_file
 
 # Rows moved at a time.
 _BLOCK = 1 << 18
@@ -91,29 +91,22 @@ class Rays:
     def __len__(self) -> int:
         return len(self.t)
 
+    def columns(self) -> dict[str, np.ndarray]:
+        """The arrays with a row a ray, by name; without those that are not there."""
+        found = {name: getattr(self, name) for name in COLUMNS}
+        return {name: column for name, column in found.items() if column is not None}
+
     def select(self, which: np.ndarray) -> Rays:
         """The rays of a boolean mask (N,) or an index array; persons and metadata are kept, so that codes and
         provenance stay comparable."""
-        return replace(
-            self,
-            t=self.t[which],
-            person=self.person[which],
-            origin=self.origin[which],
-            direction=self.direction[which],
-            confidence=self.confidence[which],
-            hit=None if self.hit is None else self.hit[which],
-            cohort=None if self.cohort is None else self.cohort[which],
-        )
+        return replace(self, **{name: column[which] for name, column in self.columns().items()})
 
     def keep_in_place(self, mask: np.ndarray) -> Rays:
         """The rays of a boolean mask (N,), moved together in the memory of these, which must not be used afterwards: of
         millions of rays there are then never two copies."""
         kept = np.flatnonzero(mask)
         columns = {}
-        for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort"):
-            column = getattr(self, name)
-            if column is None:
-                continue
+        for name, column in self.columns().items():
             for a in range(0, len(kept), _BLOCK):
                 # What is read lies at or behind what is written.
                 rows = kept[a : a + _BLOCK]
@@ -128,10 +121,8 @@ class Rays:
 
     def save(self, path: str | os.PathLike) -> None:
         """Write ``.npz`` or ``.parquet``; see :mod:`nerg_mi.rays.io`."""
-        columns = {k: getattr(self, k) for k in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")}
-        columns = {k: v for k, v in columns.items() if v is not None}
         cohorts = {"cohorts": list(self.cohorts)} if self.cohort is not None else {}
-        write_rays_file(path, columns, {**self.metadata, "persons": list(self.persons), **cohorts})
+        write_rays_file(path, self.columns(), {**self.metadata, "persons": list(self.persons), **cohorts})
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Rays:

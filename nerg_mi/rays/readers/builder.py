@@ -11,6 +11,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.line_blocks import OnBadLine
+from nerg_mi.rays.io import COLUMNS
 from nerg_mi.rays.rays import FRAME, Rays
 
 from .frames import RAYS, Frame
@@ -186,9 +187,7 @@ class RaysBuilder:
             "dropped": self._dropped,
             **self._notes,
         }
-        columns = {
-            name: self._column(name) for name in ("t", "person", "origin", "direction", "confidence", "hit", "cohort")
-        }
+        columns = {name: self._column(name) for name in COLUMNS}
         columns["person"], persons = self._persons.sorted(columns["person"])
         cohorts: tuple[str, ...] = ()
         if columns["cohort"] is not None:
