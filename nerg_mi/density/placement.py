@@ -6,13 +6,11 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-PLACEMENTS = ("data", "grid", "random", "blue")
-
 
 def place_queries(
     origin: np.ndarray, placement: str, count: int, spacing: float | None, radius: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Centres (Q, 3) of probes of ``radius`` R among ray origins (N, 3), metres.
+    """Centres (Q, 3) of probes of ``radius`` R among ray origins (N, 3), metres, by one of `PLACEMENTS`.
 
     ``data``: ``count`` distinct ray origins at random. ``grid``: a lattice of ``spacing`` (2R) over the origins' box.
     ``random``: ``count`` places uniform in that box. ``blue``: at most ``count`` ray origins, none nearer to another
@@ -21,37 +19,52 @@ def place_queries(
     """
     if placement not in PLACEMENTS:
         raise NergError(f'placement is "{placement}"; it is one of {", ".join(PLACEMENTS)}')
-    if placement == "data":
-        return origin[rng.choice(len(origin), min(count, len(origin)), replace=False)]
-    if placement == "blue":
-        return blue_noise(origin, count, spacing, radius, rng)
-    low, high = origin.min(axis=0), origin.max(axis=0)
-    if placement == "random":
-        return rng.uniform(low, high, (count, 3))
-    # The lattice is centred in the box, so that it does not favour one wall.
+    return PLACEMENTS[placement](origin, count, spacing, radius, rng)
+
+
+def _origins(
+    origin: np.ndarray, count: int, spacing: float | None, radius: float, rng: np.random.Generator
+) -> np.ndarray:
+    return origin[rng.choice(len(origin), min(count, len(origin)), replace=False)]
+
+
+def _lattice(
+    origin: np.ndarray, count: int, spacing: float | None, radius: float, rng: np.random.Generator
+) -> np.ndarray:
+    # Centred in the box, so that it does not favour one wall.
     spacing = spacing or 2.0 * radius
     axes = []
-    for a, b in zip(low, high):
+    for a, b in zip(origin.min(axis=0), origin.max(axis=0)):
         n = max(1, int(np.floor((b - a) / spacing)) + 1)
         axes.append(0.5 * (a + b) + spacing * (np.arange(n) - 0.5 * (n - 1)))
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
+def _uniform(
+    origin: np.ndarray, count: int, spacing: float | None, radius: float, rng: np.random.Generator
+) -> np.ndarray:
+    return rng.uniform(origin.min(axis=0), origin.max(axis=0), (count, 3))
+
+
 def blue_noise(
-    origin: np.ndarray, count: int, spacing: float | None, start: float, rng: np.random.Generator
+    origin: np.ndarray, count: int, spacing: float | None, radius: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Ray origins in random order, each taken if none taken before is within ``spacing`` (Poisson discs by dart
     throwing).
 
-    Without a ``spacing``: from ``start`` on, ever wider until no more than ``count`` are left.
+    Without a ``spacing``: from ``radius`` on, ever wider until no more than ``count`` are left.
     """
     if spacing is not None:
         found = _darts(origin, spacing, rng)
         return found[rng.permutation(len(found))[:count]]
-    spacing = start
+    spacing = radius
     while len(found := _darts(origin, spacing, rng)) > count:
         spacing *= max(1.02, (len(found) / count) ** 0.4)
     return found
+
+
+PLACEMENTS = {"data": _origins, "grid": _lattice, "random": _uniform, "blue": blue_noise}
+"""How queries are placed, by name: functions of the arguments of `place_queries` without the name."""
 
 
 def _darts(origin: np.ndarray, spacing: float, rng: np.random.Generator) -> np.ndarray:

@@ -6,6 +6,7 @@ their directions into a density on the sphere (NeRG, Section 5.1).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -158,7 +159,7 @@ def person_weights(rays: Rays) -> np.ndarray:
     return len(rays) / np.count_nonzero(counts) / counts[rays.person]
 
 
-def _check_one_of(name: str, value: str, words: tuple[str, ...]) -> None:
+def _check_one_of(name: str, value: str, words: Iterable[str]) -> None:
     if value not in words:
         raise NergError(f'{name} is "{value}"; it is one of {", ".join(words)}')
 
