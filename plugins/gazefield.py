@@ -18,7 +18,7 @@ Trained gaze field (:monosp:`gazefield`)
 
  * - grid.table, position_net.0, ..., direction_net.0, ..., emit_head.0, capture_head.0
    - |tensor|
-   - Hash grid features and the weight matrices of the trunk and of the two heads.
+   - Features of the grid and the weight matrices of the trunk and of the two heads.
    - |exposed|, |differentiable|
 
  * - 0.grid.table, 1.grid.table, ...
@@ -28,7 +28,7 @@ Trained gaze field (:monosp:`gazefield`)
 
  * - grid.table, emit_net.0, ..., capture_net.0, ..., escaped, prior
    - |tensor|
-   - Of a log density: hash grid features, the weight matrices of its two networks, the logit where no surface is met,
+   - Of a log density: features of the grid, the weight matrices of its two networks, the logit where no surface is met,
      and the table of the log of the density that does not depend on the position.
    - |exposed|, |differentiable|
 
@@ -105,8 +105,7 @@ class GazeFieldVolume(mi.Volume):
         return (
             f"GazeFieldVolume[\n  filename = {self.filename},\n  members = {len(getattr(self.field, 'members', [0]))},\n  variant = {c.variant},\n"
             f"  activation = {c.activation},\n  normalized = {c.normalized},\n"
-            f"  grid = {c.grid.levels} x {c.grid.features}, 2^{c.grid.log2_rows} rows, "
-            f"{c.grid.base} to {c.grid.finest}\n]"
+            f"  grid = {c.grid.describe()}\n]"
         )
 
 

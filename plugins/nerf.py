@@ -24,7 +24,7 @@ Trained radiance field (:monosp:`nerf`)
 
  * - grid.table, density_net.0, ..., color_net.0, ...
    - |tensor|
-   - Hash grid features and the weight matrices of both networks.
+   - Features of the grid and the weight matrices of both networks.
    - |exposed|, |differentiable|
 
 Density and view-dependent colour of a place, as a multiresolution hash grid with two small networks. It is meant as the
@@ -105,7 +105,7 @@ class NerfVolume(mi.Volume):
         return self.max_density
 
     def resolution(self):
-        cells = self.field.config.grid.finest
+        cells = int(self.field.config.grid.finest)
         return mi.ScalarVector3i(cells, cells, cells)
 
     def traverse(self, cb):
@@ -120,8 +120,7 @@ class NerfVolume(mi.Volume):
         lower, upper = self.medium().bounds()
         return (
             f"NerfVolume[\n  filename = {self.filename},\n"
-            f"  grid = {c.grid.levels} x {c.grid.features}, 2^{c.grid.log2_rows} rows, "
-            f"{c.grid.base} to {c.grid.finest},\n"
+            f"  grid = {c.grid.describe()},\n"
             f"  networks = {c.density_sizes}, {c.color_sizes},\n"
             f"  bbox = {lower.round(4).tolist()} to {upper.round(4).tolist()},\n"
             f"  color_space = {self.field.color_space}\n]"

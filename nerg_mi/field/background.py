@@ -14,7 +14,9 @@ import numpy as np
 
 from .backend import namespace
 from .encoding.harmonics import encode_direction
-from .encoding.hashgrid import HashGrid, HashGridConfig
+from .encoding.hashgrid import HashGridConfig
+from .encoding.protocol import Encoding, EncodingConfig
+from .encoding.registry import encoding_config, random_encoding
 from .mlp import MLP
 
 
@@ -23,7 +25,7 @@ class BackgroundConfig:
     """``radius`` of the sphere about the field's origin, in the field's units, and the sizes. Defaults: torch-ngp's."""
 
     radius: float
-    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
+    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
     width: int = 64
     hidden: int = 1
     sh_degree: int = 4
@@ -39,11 +41,11 @@ class BackgroundConfig:
         return [self.sh_degree**2 + self.grid.size] + [self.width] * self.hidden + [3]
 
     def to_dict(self) -> dict:
-        return asdict(self)
+        return {**asdict(self), "grid": self.grid.to_dict()}
 
     @staticmethod
     def from_dict(d: dict) -> BackgroundConfig:
-        return BackgroundConfig(**{**d, "grid": HashGridConfig(**d["grid"])})
+        return BackgroundConfig(**{**d, "grid": encoding_config(d["grid"])})
 
 
 class Background:
@@ -51,7 +53,7 @@ class Background:
 
     DRJIT_STRUCT = {"grid": None, "net": None}
 
-    def __init__(self, config: BackgroundConfig, grid: HashGrid, net: MLP):
+    def __init__(self, config: BackgroundConfig, grid: Encoding, net: MLP):
         grid.require(config.grid)
         net.require(config.sizes, "background_net")
         self.config, self.grid, self.net = config, grid, net
@@ -60,7 +62,7 @@ class Background:
     def random(config: BackgroundConfig, ns: ModuleType, seed: int = 0) -> Background:
         """An untrained background; equal seeds give equal weights."""
         rng = np.random.default_rng(seed)
-        return Background(config, HashGrid.random(config.grid, ns, rng), MLP.random(config.sizes, ns, rng))
+        return Background(config, random_encoding(config.grid, ns, rng), MLP.random(config.sizes, ns, rng))
 
     def coordinates(self, o, d) -> list:
         """[2 θ / π - 1, φ / π] where the ray ``o + t d`` (unit ``d``) leaves the sphere; θ from +y, φ from +x to +z."""

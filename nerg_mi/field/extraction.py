@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from .backend import namespace
 from .radiance import RadianceField
 
 # Points a kernel launch: some hundred megabytes of intermediate values at most.
@@ -51,7 +50,7 @@ class Sampler:
     """Asks a field about many points, in batches; densities are 0 in the empty cells of its occupancy grid."""
 
     def __init__(self, field: RadianceField):
-        self.field, self.ns = field, namespace(field.grid.table)
+        self.field, self.ns = field, field.ns
 
     def _point(self, p):
         return self.ns.Array3f(np.ascontiguousarray(np.asarray(p, np.float32).T))

@@ -15,10 +15,13 @@ import numpy as np
 
 from nerg_mi.maths.box import Box
 
+from .backend import namespace
 from .background import Background
 from .cascades import CascadeGrid
 from .encoding.harmonics import encode_direction
-from .encoding.hashgrid import HashGrid, HashGridConfig
+from .encoding.hashgrid import HashGridConfig
+from .encoding.protocol import Encoding, EncodingConfig
+from .encoding.registry import encoding_config, random_encoding
 from .mlp import MLP
 from .occupancy import OccupancyGrid
 
@@ -36,7 +39,7 @@ class RadianceConfig:
     ``density_scale``: density, in 1/unit, where the density net returns 0.
     """
 
-    grid: HashGridConfig = field(default_factory=HashGridConfig)
+    grid: EncodingConfig = field(default_factory=HashGridConfig)
     width: int = 64
     density_hidden: int = 1
     color_hidden: int = 2
@@ -59,11 +62,11 @@ class RadianceConfig:
         return [self.sh_degree**2 + self.geometry] + [self.width] * self.color_hidden + [3]
 
     def to_dict(self) -> dict:
-        return asdict(self)
+        return {**asdict(self), "grid": self.grid.to_dict()}
 
     @staticmethod
     def from_dict(d: dict) -> RadianceConfig:
-        return RadianceConfig(**{**d, "grid": HashGridConfig(**d["grid"])})
+        return RadianceConfig(**{**d, "grid": encoding_config(d["grid"])})
 
 
 def assign(field, values: dict) -> None:
@@ -76,10 +79,7 @@ def assign(field, values: dict) -> None:
             raise ValueError(f'"{name}" has shape {known[name].shape}, and cannot become one of {value.shape}')
     for name, value in values.items():
         owner, part = name.split(".", 1)
-        if part == "table":
-            getattr(field, owner).table = value
-        else:
-            getattr(field, owner).replace(part, value)
+        getattr(field, owner).replace(part, value)
 
 
 def density_from_log(h, scale: float):
@@ -115,7 +115,7 @@ class RadianceField:
         self,
         config: RadianceConfig,
         box: Box,
-        grid: HashGrid,
+        grid: Encoding,
         density_net: MLP,
         color_net: MLP,
         occupancy: OccupancyGrid | CascadeGrid | None = None,
@@ -140,7 +140,7 @@ class RadianceField:
         return RadianceField(
             config,
             box,
-            HashGrid.random(config.grid, ns, rng),
+            random_encoding(config.grid, ns, rng),
             MLP.random(config.density_sizes, ns, rng),
             MLP.random(config.color_sizes, ns, rng),
             **kwargs,
@@ -148,16 +148,18 @@ class RadianceField:
 
     def parameters(self) -> dict:
         """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
-        out = {"grid.table": self.grid.table}
-        for name, net in (("density_net", self.density_net), ("color_net", self.color_net)):
-            out |= {f"{name}.{i}": w for i, w in enumerate(net.weights)}
+        owners = ["grid", "density_net", "color_net"]
         if self.background is not None:
-            out["background_grid.table"] = self.background.grid.table
-            out |= {f"background_net.{i}": w for i, w in enumerate(self.background.net.weights)}
-        return out
+            owners += ["background_grid", "background_net"]
+        return {f"{name}.{key}": value for name in owners for key, value in getattr(self, name).named().items()}
 
     @property
-    def background_grid(self) -> HashGrid:
+    def ns(self) -> ModuleType:
+        """Array types of the field's backend; see ``field.backend.namespace``."""
+        return namespace(self.density_net.weights[0])
+
+    @property
+    def background_grid(self) -> Encoding:
         return self.background.grid
 
     @property
@@ -171,18 +173,19 @@ class RadianceField:
 
     def pack(self) -> None:
         """Refresh what the kernels read; call after any change of the weights."""
-        self.density_net.pack()
-        self.color_net.pack()
+        for part in (self.grid, self.density_net, self.color_net):
+            part.pack()
         # Depth passes need one output of the last layer, not 1 + geometry of them.
         last = self.density_net.weights[-1]
         self._head = MLP(self.density_net.weights[:-1] + [last[0:1, :]])
         self._head.pack()
         if self.background is not None:
+            self.background.grid.pack()
             self.background.net.pack()
 
     def kernel_parameters(self) -> list:
-        """The arrays that evaluations read: the table and the packed networks, attached to ``parameters()``."""
-        return [self.grid.table, self.density_net.buffer, self.color_net.buffer, self._head.buffer]
+        """The arrays that evaluations read: the encoding's and the packed networks, attached to ``parameters()``."""
+        return [*self.grid.kernel_parameters(), self.density_net.buffer, self.color_net.buffer, self._head.buffer]
 
     def density(self, p, active=True):
         """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside of the box."""

@@ -7,18 +7,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from nerg_mi.errors import NergError
+from nerg_mi.field.encoding.registry import config_type
 from nerg_mi.files.bounded import plain
 
 _MOST = {
-    "levels": 64,
-    "features": 4,
-    "log2_rows": 26,
-    "base": 1 << 20,
-    "dimensions": 3,
     "width": 4096,
     "geometry": 4096,
     "density_hidden": 64,
@@ -55,24 +51,26 @@ def building(path: str | os.PathLike) -> Iterator[None]:
         raise NergError(f'the checkpoint "{path}" holds no usable field: {plain(e)}; {remedy}') from e
 
 
-def check_sizes(about: object, what: str = "architecture") -> dict:
-    """``about``, the JSON object of a configuration, where its sizes are whole numbers in their bounds.
+def check_sizes(about: object, what: str = "architecture", most: Mapping[str, int] = _MOST) -> dict:
+    """``about``, the JSON object of a configuration, where its sizes are whole numbers in their bounds, ``most``.
 
-    Raises ``ValueError`` otherwise; which entries there must be is for the configuration to say.
+    The sizes of an encoding, its ``grid``, have the bounds that its kind gives. Raises ``ValueError`` otherwise; which
+    entries there must be is for the configuration to say.
     """
     if not isinstance(about, dict):
         raise ValueError(f'its "{what}" is not a JSON object')
     for name, value in about.items():
         if name == "geometry" and isinstance(value, str):
             continue  # what a log density knows of surfaces, and not a size
-        if name in _MOST and not (isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= _MOST[name]):
+        if name in most and not (isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= most[name]):
             raise ValueError(
-                f'"{name}" of its {what} must be a whole number from 1 to {_MOST[name]}, not {_short(value)}'
+                f'"{name}" of its {what} must be a whole number from 1 to {most[name]}, not {_short(value)}'
             )
     if "finest" in about and not 1 <= number(about, "finest", what) <= FINEST:
         raise ValueError(f'"finest" of its {what} must lie in 1..{FINEST}, not {_short(about["finest"])}')
     if "grid" in about:
-        check_sizes(about["grid"], "grid")
+        grid = about["grid"]
+        check_sizes(grid, "grid", config_type(grid).limits if isinstance(grid, dict) else {})
     return about
 
 
@@ -92,8 +90,8 @@ def check_occupancy(about: dict) -> dict:
         levels = 1 + math.ceil(math.log2(max(number(about, "bound", "occupancy"), 1)))
     if not (isinstance(resolution, int) and resolution >= 1 and levels * resolution**3 <= OCCUPANCY_CELLS):
         raise ValueError(
-            f'"resolution" of its occupancy must be a whole number of cells along an edge, {OCCUPANCY_CELLS:,} cells at '
-            f"most, not {_short(resolution)}"
+            f'"resolution" of its occupancy must be a whole number of cells along an edge, {OCCUPANCY_CELLS:,} '
+            f"cells at most, not {_short(resolution)}"
         )
     return about
 

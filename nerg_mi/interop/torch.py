@@ -25,13 +25,10 @@ except ImportError:
     ) from None
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.backend import is_cuda, namespace
-from nerg_mi.field.background import Background
-from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.backend import is_cuda
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.field.gaze.product import GazeField
-from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceField
 
 _FIXED = ("prior",)
@@ -43,7 +40,7 @@ class _FieldModule(torch.nn.Module):
 
     def __init__(self, field):
         super().__init__()
-        self._field, self._ns = field, namespace(field.grid.table)
+        self._field, self._ns = field, field.ns
         self.device_type = "cuda" if is_cuda(self._ns) else "cpu"
         for name, value in field.parameters().items():
             tensor = torch.tensor(value.numpy(), device=self.device_type)
@@ -61,7 +58,8 @@ class _FieldModule(torch.nn.Module):
         return out
 
     def _array(self, name: str, value: np.ndarray):
-        return self._ns.Float(value.ravel()) if _is_flat(name) else self._ns.TensorXf(value)
+        kind = type(self._field.parameters()[name])
+        return kind(value) if dr.is_tensor_v(kind) else kind(value.ravel())
 
     def _rows(self, **tensors) -> list:
         """Inputs (N, 3), checked."""
@@ -78,10 +76,11 @@ class _FieldModule(torch.nn.Module):
     def _evaluate(self, function, *inputs):
         """``function(field, *Array3f)``, a list of rows, at torch ``inputs`` (N, 3): a torch tensor (rows, N)."""
         ns, field = self._ns, self._field
+        tensors = {k for k, v in field.parameters().items() if dr.is_tensor_v(v)}
 
         @dr.wrap(source="torch", target="drjit")
         def evaluate(values, *points):
-            arrays = {k: ns.Float(v.array) if _is_flat(k) else ns.TensorXf(v) for k, v in values.items()}
+            arrays = {k: ns.TensorXf(v) if k in tensors else ns.Float(v.array) for k, v in values.items()}
             here = _with(field, arrays)
             columns = [_columns(ns, p) for p in points]
             out = function(here, *columns)
@@ -199,18 +198,6 @@ class GazeModule(_FieldModule):
         return torch.stack([*columns, torch.zeros_like(columns[0])], 1).contiguous()
 
 
-class _Table(HashGrid):
-    """The grid with gradients added to a copy of the table for every thread: cheaper than atomics."""
-
-    def __call__(self, p, active=True, mode: dr.ReduceMode = dr.ReduceMode.Expand) -> list:
-        return super().__call__(p, active, mode)
-
-
-def _is_flat(name: str) -> bool:
-    """Whether a field keeps the array of that name as a Float, and not as a tensor."""
-    return name.endswith("table") or name == "escaped"
-
-
 def _columns(ns, p):
     index = 3 * dr.arange(ns.UInt32, p.shape[0])
     # No two points share a number, so that derivatives need no atomic additions.
@@ -219,29 +206,24 @@ def _columns(ns, p):
 
 def _with(field, values: dict):
     """A copy of ``field`` whose parameters of these names are ``values``, attached to them."""
-    out = copy.copy(field)
-    for name in out.DRJIT_STRUCT:
-        part = getattr(out, name)
-        if isinstance(part, HashGrid):
-            setattr(out, name, _grid(part, values.get(f"{name}.table")))
-        elif isinstance(part, MLP) and not name.startswith("_"):
-            setattr(out, name, _net(part, name, values))
-        elif isinstance(part, Background):
-            grid, net = _grid(part.grid, values.get("background_grid.table")), _net(part.net, "background_net", values)
-            setattr(out, name, Background(part.config, grid, net))
-        elif name in values:
-            setattr(out, name, values[name])
-    out.pack()
+    out = _copied(field)
+    for owner in {name.partition(".")[0] for name in field.parameters()}:
+        if owner.endswith("grid"):
+            getattr(out, owner).mode = dr.ReduceMode.Expand
+    out.set_parameters(values)
     return out
 
 
-def _grid(grid: HashGrid, table) -> HashGrid:
-    return HashGrid(grid.config, type(grid.table)(grid.table)) if table is None else _Table(grid.config, table)
-
-
-def _net(net: MLP, name: str, values: dict) -> MLP:
-    out = MLP(net.weights, net.norms)
-    for key in net.named():
-        if f"{name}.{key}" in values:
-            out.replace(key, values[f"{name}.{key}"])
+def _copied(part):
+    """A copy of a field's part down to its arrays, which both share, and what ``pack`` makes of them."""
+    if isinstance(part, list):
+        return [_copied(p) for p in part]
+    if isinstance(part, dict):
+        return {k: _copied(p) for k, p in part.items()}
+    if not hasattr(part, "DRJIT_STRUCT"):
+        return part
+    out = copy.copy(part)
+    for name in part.DRJIT_STRUCT:
+        if not name.startswith("_"):
+            setattr(out, name, _copied(getattr(part, name)))
     return out

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.extraction import Lattice, Sampler, surface_density
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.formats.surfaces import mesh, points, write_glb, write_ply
@@ -25,9 +24,7 @@ class Ball:
 
     def __init__(self, occupancy=None, speck=False, hole=False, color_space="srgb", sharp=200.0):
         self.box, self.occupancy, self.color_space = Box((0, 0, 0), (2.4, 2, 1.8)), occupancy, color_space
-        self.grid = HashGrid.random(
-            HashGridConfig(levels=1, log2_rows=6, base=2, finest=2), ns, np.random.default_rng(0)
-        )
+        self.ns = ns
         self.speck, self.hole, self.sharp = speck, hole, sharp
 
     def density(self, p, active=True):

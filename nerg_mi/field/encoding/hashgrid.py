@@ -11,26 +11,37 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from types import ModuleType
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.field.backend import namespace
 
+from .protocol import Encoding, EncodingConfig
+from .registry import DEFAULT_KIND, register
+
 _PRIMES = (1, 2654435761, 805459861)
 
 
 @dataclass(frozen=True)
-class HashGridConfig:
-    """Shape of a grid: ``levels`` x ``features``, ``2**log2_rows`` rows a level at
-    most, resolutions growing geometrically from ``base`` to ``finest``, over a
-    cube (or, with 2 ``dimensions``, over a square)."""
+class HashGridConfig(EncodingConfig):
+    """Sizes of a hash grid. Resolutions grow geometrically from the coarsest level to the finest."""
 
+    kind: ClassVar[str] = DEFAULT_KIND
+    limits: ClassVar[dict[str, int]] = {"levels": 64, "features": 4, "log2_rows": 26, "base": 1 << 20, "dimensions": 3}
+
+    # Grids of different resolution, whose features are concatenated.
     levels: int = 16
+    # Numbers at a vertex of a level: 2 or 4.
     features: int = 2
+    # Base 2 logarithm of the rows that a level has at most.
     log2_rows: int = 19
+    # Cells along an edge of the coarsest level.
     base: int = 16
+    # Cells along an edge of the finest level.
     finest: int | float = 2048
+    # 3 for a grid over the unit cube, 2 for one over the unit square.
     dimensions: int = 3
 
     def __post_init__(self):
@@ -51,7 +62,14 @@ class HashGridConfig:
         """Number of features that the grid returns a point."""
         return self.levels * self.features
 
-    def to_dict(self) -> dict:
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        return {"table": (self.offsets()[-1] * self.features,)}
+
+    def describe(self) -> str:
+        return f"{self.levels} x {self.features}, 2^{self.log2_rows} rows, {self.base} to {self.finest}"
+
+    def to_dict(self) -> dict[str, Any]:
+        # Without a kind: so this version's files of hash grids can be read by all earlier ones.
         return asdict(self)
 
     def level_scales(self) -> np.ndarray:
@@ -75,53 +93,44 @@ class HashGridConfig:
         return [0, *np.cumsum(self.level_rows()).tolist()]
 
 
-class HashGrid:
+class HashGrid(Encoding):
     """Trainable features at points of the unit cube.
 
-    ``table`` is the flat parameter array, (rows * features,), the features of
-    one row adjacent and the levels one after another.
+    ``table`` is the flat parameter array (Float), (rows * features,), the features of one row adjacent and the levels
+    one after another; ``mode`` as for `Encoding`.
     """
 
-    DRJIT_STRUCT = {"table": None}
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"table": None}
 
-    def __init__(self, config: HashGridConfig, table):
-        self.config = config
-        self.table = table
-        expected = config.offsets()[-1] * config.features
+    def __init__(self, config: HashGridConfig, table: Any, mode: dr.ReduceMode = dr.ReduceMode.Auto):
+        self.config, self.table, self.mode = config, table, mode
+        (expected,) = config.shapes()["table"]
         if len(table) != expected:
             raise ValueError(f'"grid.table" has {len(table)} entries where its configuration {config} needs {expected}')
         self._scales = config.level_scales()
         self._rows = config.level_rows()
         self._offsets = config.offsets()
 
-    @staticmethod
-    def random(config: HashGridConfig, ns: ModuleType, rng: np.random.Generator, scale: float = 1e-4) -> HashGrid:
+    @classmethod
+    def random(cls, config: HashGridConfig, ns: ModuleType, rng: np.random.Generator, scale: float = 1e-4) -> HashGrid:
         """A grid with entries uniform in ``[-scale, scale]``."""
-        size = config.offsets()[-1] * config.features
-        return HashGrid(config, ns.Float(rng.uniform(-scale, scale, size).astype(np.float32)))
-
-    def require(self, config: HashGridConfig) -> None:
-        """Raise ``ValueError`` unless this is a grid of ``config``."""
-        if self.config != config:
-            raise ValueError(f"this grid is {self.config} where its field needs {config}")
+        (size,) = config.shapes()["table"]
+        return cls(config, ns.Float(rng.uniform(-scale, scale, size).astype(np.float32)))
 
     def is_hashed(self, level: int) -> bool:
+        """Whether the vertices of ``level`` do not fit in its rows."""
         stride = int(np.ceil(self._scales[level])) + 2
         return stride**self.config.dimensions > self._rows[level]
 
-    def __call__(self, p, active=True, mode: dr.ReduceMode = dr.ReduceMode.Auto) -> list:
-        """Features at ``p`` (Array3f in the unit cube, or Array2f): ``levels * features`` Floats.
-
-        Points outside of the cube give zeros. ``mode`` chooses how gradients are
-        added to the table.
-        """
+    def __call__(self, p: Any, active: Any = True) -> list:
+        """Features at ``p`` (Array3f in the unit cube, or Array2f): ``levels * features`` Floats, zero outside."""
         p, inside = self._clamped(p, active)
         out = []
         for level in range(self.config.levels):
-            out += self._level(level, p, inside, mode)
+            out += self._level(level, p, inside)
         return out
 
-    def by_level(self, p, active=True) -> list:
+    def evaluated(self, p: Any, active: Any = True) -> list:
         """The same features, evaluated one level after another: the rows of one level stay in the caches.
 
         Worth it for many scattered points whose features are to be kept in memory anyhow.
@@ -130,7 +139,7 @@ class HashGrid:
         dr.eval(p, inside)
         out = []
         for level in range(self.config.levels):
-            out += self._level(level, p, inside, dr.ReduceMode.Auto)
+            out += self._level(level, p, inside)
             dr.eval(out)
         return out
 
@@ -141,7 +150,7 @@ class HashGrid:
         # A negative coordinate cast to an unsigned cell would extrapolate by 4e9.
         return dr.select(inside, p, 0), inside
 
-    def _level(self, level: int, p, active, mode) -> list:
+    def _level(self, level: int, p, active) -> list:
         ns = namespace(p)
         packet = {2: ns.Array2f, 4: ns.Array4f}[self.config.features]
         scale = float(self._scales[level])
@@ -150,7 +159,7 @@ class HashGrid:
         w = [c - ns.Float(i) for c, i in zip(pos, cell)]
         lo, hi = self._corner_indices(level, cell)
         read = lambda index: dr.gather(
-            packet, self.table, self._combine(level, index) + self._offsets[level], active, mode=mode
+            packet, self.table, self._combine(level, index) + self._offsets[level], active, mode=self.mode
         )
         return list(dr.select(active, _blend(read, lo, hi, w, self.config.dimensions - 1, ()), 0))
 
@@ -183,3 +192,6 @@ def _blend(read, lo: list, hi: list, w: list, axis: int, index: tuple):
         return read(index)
     low, high = (_blend(read, lo, hi, w, axis - 1, (i[axis], *index)) for i in (lo, hi))
     return dr.lerp(low, high, w[axis])
+
+
+register(HashGridConfig, HashGrid)

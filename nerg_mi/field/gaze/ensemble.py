@@ -6,6 +6,8 @@ Members are trained alike on resamples of the people (bagging, Breiman 1996; dee
 
 from __future__ import annotations
 
+from types import ModuleType
+
 from .log_density import LogGazeField
 from .product import GazeField
 from .support import RaySupport
@@ -28,6 +30,11 @@ class GazeEnsemble:
                 "the members of an ensemble of gaze fields differ in kind, variant, output or box; train them alike"
             )
         self.config, self.box, self.grid = self.members[0].config, self.members[0].box, self.members[0].grid
+
+    @property
+    def ns(self) -> ModuleType:
+        """Array types of the members' backend; see ``field.backend.namespace``."""
+        return self.members[0].ns
 
     def parameters(self) -> dict:
         """All members' arrays: ``0.grid.table`` and so on."""

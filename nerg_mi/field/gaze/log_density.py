@@ -17,8 +17,11 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.harmonics import encode_direction
-from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
+from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
 from nerg_mi.maths.box import Box
@@ -50,7 +53,7 @@ class LogGazeConfig:
     holes, as one made of hit points has) emit at the depth of the ``nearest`` directions that do.
     """
 
-    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
+    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
     variant: str = "emit_capture"
     width: int = 64
     layers: int = 2
@@ -92,11 +95,11 @@ class LogGazeConfig:
         return [9 + self.sh_degree**2 + 1, *[self.width] * self.layers, 1]
 
     def to_dict(self) -> dict:
-        return {"kind": "log_density", **asdict(self)}
+        return {"kind": "log_density", **asdict(self), "grid": self.grid.to_dict()}
 
     @staticmethod
     def from_dict(d: dict) -> LogGazeConfig:
-        return LogGazeConfig(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": HashGridConfig(**d["grid"])})
+        return LogGazeConfig(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
 
 
 class LogGazeField:
@@ -107,7 +110,7 @@ class LogGazeField:
     _NETS = ("emit_net", "capture_net")
 
     def __init__(
-        self, config: LogGazeConfig, box: Box, grid: HashGrid, emit_net: MLP, capture_net: MLP, escaped, prior
+        self, config: LogGazeConfig, box: Box, grid: Encoding, emit_net: MLP, capture_net: MLP, escaped, prior
     ):
         grid.require(config.grid)
         emit_net.require(config.emit_sizes, "emit_net")
@@ -135,7 +138,7 @@ class LogGazeField:
         return LogGazeField(
             config,
             box,
-            HashGrid.random(config.grid, ns, rng),
+            random_encoding(config.grid, ns, rng),
             MLP.random(config.emit_sizes, ns, rng),
             MLP.random(config.capture_sizes, ns, rng),
             ns.Float(0.0),
@@ -144,10 +147,16 @@ class LogGazeField:
 
     def parameters(self) -> dict:
         """Arrays by name, as checkpoints and ``mi.traverse`` spell them."""
-        out = {"grid.table": self.grid.table, "escaped": self.escaped, "prior": self.prior}
+        out = {f"grid.{key}": value for key, value in self.grid.named().items()}
+        out |= {"escaped": self.escaped, "prior": self.prior}
         for name in self._NETS:
             out |= {f"{name}.{key}": value for key, value in getattr(self, name).named().items()}
         return out
+
+    @property
+    def ns(self) -> ModuleType:
+        """Array types of the field's backend; see ``field.backend.namespace``."""
+        return namespace(self.escaped)
 
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
@@ -159,10 +168,10 @@ class LogGazeField:
 
     def pack(self) -> None:
         """Refresh what the kernels read; call after any change of the weights."""
-        for name in self._NETS:
+        for name in ("grid", *self._NETS):
             getattr(self, name).pack()
 
-    def emit_inputs(self, p_od, p_o, r_o, active=True, mode: dr.ReduceMode = dr.ReduceMode.Auto) -> list:
+    def emit_inputs(self, p_od, p_o, r_o, active=True) -> list:
         """What emit's network is given (list of Floats): a bias, the log of the distance, the direction, the place."""
         Float = type(p_od.x)
         if self.config.geometry == "none":
@@ -173,7 +182,7 @@ class LogGazeField:
             Float(1),
             log_distance,
             *encode_direction(-r_o, self.config.sh_degree),
-            *self.grid(self.box.to_unit(p_od), active, mode),
+            *self.grid(self.box.to_unit(p_od), active),
         ]
 
     def capture_position(self, p_o) -> list:

@@ -16,8 +16,11 @@ from types import ModuleType
 import drjit as dr
 import numpy as np
 
+from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.harmonics import encode_direction
-from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
+from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
 from nerg_mi.maths.box import Box
@@ -66,7 +69,7 @@ class GazeConfig:
     one). Capture has none.
     """
 
-    grid: HashGridConfig = field(default_factory=lambda: HashGridConfig(finest=512))
+    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(finest=512))
     variant: str = "emit_capture"
     activation: str = "softplus"
     width: int = 64
@@ -111,11 +114,11 @@ class GazeConfig:
         return [self.sh_degree**2 + self.geometry, self.width, self.width]
 
     def to_dict(self) -> dict:
-        return asdict(self)
+        return {**asdict(self), "grid": self.grid.to_dict()}
 
     @staticmethod
     def from_dict(d: dict) -> GazeConfig:
-        return GazeConfig(**{**d, "grid": HashGridConfig(**d["grid"])})
+        return GazeConfig(**{**d, "grid": encoding_config(d["grid"])})
 
 
 class GazeField:
@@ -131,7 +134,7 @@ class GazeField:
         self,
         config: GazeConfig,
         box: Box,
-        grid: HashGrid,
+        grid: Encoding,
         position_net: MLP,
         direction_net: MLP,
         emit_head: MLP,
@@ -163,7 +166,7 @@ class GazeField:
         return GazeField(
             config,
             box,
-            HashGrid.random(config.grid, ns, rng),
+            random_encoding(config.grid, ns, rng),
             MLP.random(config.position_sizes, ns, rng, normalized),
             MLP.random(config.direction_sizes, ns, rng, normalized),
             MLP.random([config.width, 1], ns, rng),
@@ -172,10 +175,16 @@ class GazeField:
 
     def parameters(self) -> dict:
         """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
-        out = {"grid.table": self.grid.table}
-        for name in self._NETS:
-            out |= {f"{name}.{key}": value for key, value in getattr(self, name).named().items()}
-        return out
+        return {
+            f"{name}.{key}": value
+            for name in ("grid", *self._NETS)
+            for key, value in getattr(self, name).named().items()
+        }
+
+    @property
+    def ns(self) -> ModuleType:
+        """Array types of the field's backend; see ``field.backend.namespace``."""
+        return namespace(self.emit_head.weights[0])
 
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""
@@ -184,7 +193,7 @@ class GazeField:
 
     def pack(self) -> None:
         """Refresh what the kernels read; call after any change of the weights."""
-        for name in self._NETS:
+        for name in ("grid", *self._NETS):
             getattr(self, name).pack()
 
     def _trunk(self, p, d, active, semantic=None):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 
-from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.field.gaze.product import softplus
 from nerg_mi.field.mlp import MLP
@@ -20,14 +20,13 @@ def log_gaze(config: LogGazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, 
     gradients reach every entry that the variant uses.
     """
     net = lambda name: MLP([parameters[f"{name}.{i}"] for i in range(config.layers + 1)])
-    # The field's own inputs; Expand: every thread adds to a copy of the table of its own, a fraction of the cost of
-    # atomics.
-    field = _Inputs(config, box, HashGrid(config.grid, parameters["grid.table"]), parameters["prior"])
+    # The field's own inputs.
+    field = _Inputs(config, box, encoding_of(config.grid, parameters, mode=dr.ReduceMode.Expand), parameters["prior"])
     repeats = dr.width(r_o) // dr.width(p_o)
     logit = field.log_blind(r_o)
     each = dr.gather(type(p_o), p_o, dr.arange(ns.UInt32, dr.width(r_o)) // repeats)
     if config.variant != "capture":
-        inputs = field.emit_inputs(p_od, each, r_o, True, dr.ReduceMode.Expand)
+        inputs = field.emit_inputs(p_od, each, r_o)
         emit = net("emit_net").tensor(stack(_full(inputs, r_o), ns)).array
         logit = logit + (
             emit

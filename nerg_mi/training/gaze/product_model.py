@@ -8,7 +8,7 @@ from __future__ import annotations
 import drjit as dr
 
 from nerg_mi.field.encoding.harmonics import encode_direction
-from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.gaze.product import GazeConfig, activate
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import sigmoid
@@ -28,11 +28,8 @@ def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o,
         count = sum(k.startswith(name + ".") for k in parameters)
         return MLP([parameters[f"{name}.{i}"] for i in range(count)])
 
-    grid, position, direction = (
-        HashGrid(config.grid, parameters["grid.table"]),
-        net("position_net"),
-        net("direction_net"),
-    )
+    grid = encoding_of(config.grid, parameters, mode=dr.ReduceMode.Expand)
+    position, direction = net("position_net"), net("direction_net")
     repeats = dr.width(r_o) // dr.width(p_o)
 
     def head(name, geometry, d):
@@ -41,8 +38,7 @@ def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o,
         return net(name).tensor(dr.maximum(hidden, 0)).array
 
     def geometry(p):
-        # Expand: every thread adds to a copy of the table of its own; a fraction of the cost of atomics.
-        return unstack(position.tensor(stack(grid(box.to_unit(p), True, dr.ReduceMode.Expand), ns)), ns)
+        return unstack(position.tensor(stack(grid(box.to_unit(p)), ns)), ns)
 
     def surface():
         if semantic is None:

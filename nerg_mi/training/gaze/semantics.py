@@ -77,5 +77,6 @@ def trunk_of(field: RadianceField, config: GazeConfig) -> dict:
     weights = [dr.detach(w) for w in field.density_net.weights]
     # The first output is the logarithm of the density.
     weights[-1] = weights[-1][1:, :]
-    arrays = {"grid.table": field.grid.table} | {f"position_net.{i}": w for i, w in enumerate(weights)}
+    arrays = {f"grid.{k}": v for k, v in field.grid.named().items()}
+    arrays |= {f"position_net.{i}": w for i, w in enumerate(weights)}
     return {k: type(v)(dr.detach(v)) for k, v in arrays.items()}

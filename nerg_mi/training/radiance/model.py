@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 
 from nerg_mi.field.encoding.harmonics import encode_direction
-from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceConfig, density_from_log, sigmoid
 from nerg_mi.maths.box import Box
@@ -62,8 +62,7 @@ def _head(parameters: dict) -> MLP:
 
 
 def _features(config: RadianceConfig, box: Box, parameters: dict, p, ns, known: list | None = None):
-    # Expand: every thread adds to a copy of the table of its own; a fraction of the cost of atomics.
-    rows = HashGrid(config.grid, parameters["grid.table"])(box.to_unit(p), True, dr.ReduceMode.Expand)
+    rows = encoding_of(config.grid, parameters, mode=dr.ReduceMode.Expand)(box.to_unit(p))
     return stack(rows if known is None else [dr.replace_grad(a, b) for a, b in zip(known, rows)], ns)
 
 

@@ -45,9 +45,7 @@ def render_view(
     ``occupied``: mask of points (Array3f, mask) in cells that may hold density; ``near``: where rays start, scene
     units.
     """
-    from nerg_mi.field.backend import namespace
-
-    ns = namespace(field.grid.table)
+    ns = field.ns
     d = pixel_directions(view.camera.intrinsics)[every // 2 :: every, every // 2 :: every]
     shape = d.shape[:2]
     d = (d.reshape(-1, 3) @ view.camera.to_world[:3, :3].T).astype(np.float32)

@@ -17,7 +17,7 @@ from drjit.opt import Adam
 from nerg_mi.capture.images import View
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
-from nerg_mi.field.encoding.hashgrid import HashGrid
+from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.training.common.step_clock import StepClock
@@ -134,7 +134,7 @@ class RadianceTrainer:
         """Density at ``p`` for the choice of samples, and the grid's features, which need no second look-up."""
         self.clock.count(dr.width(p))
         now = {k: dr.detach(v) for k, v in self._parameters().items()}
-        features = HashGrid(self.config.grid, now["grid.table"]).by_level(self.box.to_unit(p), active)
+        features = encoding_of(self.config.grid, now).evaluated(self.box.to_unit(p), active)
         return density_of(self.config, now, features), features
 
     def _parameters(self) -> dict:
@@ -238,7 +238,8 @@ class RadianceTrainer:
             loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
         loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
-        dr.backward(loss + self._clear(parameters) + s.grid_decay * feature_decay(parameters["grid.table"]))
+        decay = sum(feature_decay(v.array) for k, v in parameters.items() if k.startswith("grid."))
+        dr.backward(loss + self._clear(parameters) + s.grid_decay * decay)
         self.optimiser.set_learning_rate(s.rate(self.progress))
         self.optimiser.step()
         self.loss, self.samples = loss, samples.count

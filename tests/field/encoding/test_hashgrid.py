@@ -130,7 +130,8 @@ def test08_table_gradient_equals_the_interpolation_weights(mode):
     points = np.random.default_rng(3).random((20, 3)).astype(np.float32)
     mix = np.random.default_rng(4).normal(size=(20, SMALL.size)).astype(np.float32)
     dr.enable_grad(grid.table)
-    out = grid(ns.Array3f(points.T), mode=mode)
+    grid.mode = mode
+    out = grid(ns.Array3f(points.T))
     dr.backward(dr.sum(sum(o * ns.Float(m) for o, m in zip(out, mix.T))))
     gradient = dr.grad(grid.table).numpy().reshape(table.shape)
     touched = np.argwhere(gradient)

@@ -9,7 +9,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import write_checkpoint
-from nerg_mi.formats.fields import _dump, load_gaze
+from nerg_mi.formats.arrays import stored
+from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
@@ -171,7 +172,7 @@ def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):  # noqa:
     threads(1)
     path, stages = tmp_path / "a.run", []
     with pytest.raises(NergError, match="fp16.*--resume writes it"):
-        together(state=path, write=lambda field, about: _dump({"grid": ns.Float(1e6)}, True))
+        together(state=path, write=lambda field, about: stored({"grid": ns.Float(1e6)}, True))
     members = sorted(p.name for p in tmp_path.iterdir())
     assert members == [f"a.member{k}.safetensors" for k in range(3)]
     write_checkpoint(path, "gaze run", {"x": np.zeros(1)}, {"about": {"member": [1, 3]}})
