@@ -11,6 +11,7 @@ from nerg_mi.files.bounded import plain, reading
 from nerg_mi.files.exr import read_exr
 from nerg_mi.files.image_header import check_image
 from nerg_mi.files.npy import read_npy
+from nerg_mi.maths.color import encode_srgb
 
 from .posed import DepthFile, MaskFile
 
@@ -51,7 +52,7 @@ def read_image(path: str | Path) -> np.ndarray:
         out[..., :3][out[..., 3] == 0] = 0
     if not np.all(np.isfinite(out)):
         raise NergError(f'the image "{path}" holds values that are not finite; make it again')
-    out[..., :3] = _to_srgb(np.clip(out[..., :3], 0, 1))
+    out[..., :3] = encode_srgb(np.clip(out[..., :3], 0, 1))
     return np.clip(out, 0, 1)
 
 
@@ -99,10 +100,6 @@ def _layer(bitmap, path):
         f'the image "{path}" has no channels R, G and B, only the layers {plain(", ".join(sorted(layers)))}; '
         "save it with these"
     )
-
-
-def _to_srgb(x: np.ndarray) -> np.ndarray:
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def read_depth(source: DepthFile) -> np.ndarray:

@@ -13,6 +13,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.extraction import Lattice, Sampler, crossings, opacity, surface_density
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
+from nerg_mi.maths.color import decode_srgb, encode_srgb
+
+from .ply import write_columns
 
 
 @dataclass
@@ -178,9 +181,7 @@ def points(
 
 def _srgb(field: RadianceField, sampler: Sampler, p, normals) -> np.ndarray:
     c = np.clip(sampler.diffuse(np.asarray(p), np.asarray(normals)), 0, 1)
-    if field.color_space == "linear":
-        c = np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.maximum(c, 0.0031308) ** (1 / 2.4) - 0.055)
-    return c
+    return encode_srgb(c) if field.color_space == "linear" else c
 
 
 # ----------------------------------------------------------------------------
@@ -190,23 +191,9 @@ def _srgb(field: RadianceField, sampler: Sampler, p, normals) -> np.ndarray:
 
 def write_ply(surface: Surface, path: str | Path) -> None:
     """Binary PLY: positions, normals, 8-bit sRGB colours, and faces if there are any."""
-    v = np.zeros(
-        len(surface.vertices),
-        [*((n, "<f4") for n in ("x", "y", "z", "nx", "ny", "nz")), *((n, "u1") for n in ("red", "green", "blue"))],
-    )
-    for i, n in enumerate(v.dtype.names):
-        block = (surface.vertices, surface.normals, np.rint(surface.colors * 255))[i // 3]
-        v[n] = block[:, i % 3]
-    types = {"<f4": "float", "|u1": "uchar"}
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(v)}"]
-    header += [f"property {types[v.dtype[n].str]} {n}" for n in v.dtype.names]
-    data = v.tobytes()
-    if surface.faces is not None:
-        f = np.zeros(len(surface.faces), [("n", "u1"), ("v", "<i4", 3)])
-        f["n"], f["v"] = 3, surface.faces
-        header += [f"element face {len(f)}", "property list uchar int vertex_indices"]
-        data += f.tobytes()
-    write_bytes(path, "\n".join([*header, "end_header", ""]).encode(), data)
+    columns = dict(zip(("x", "y", "z", "nx", "ny", "nz"), np.hstack([surface.vertices, surface.normals]).T))
+    colors = np.rint(surface.colors * 255).astype(np.uint8)
+    write_columns(path, columns | dict(zip(("red", "green", "blue"), colors.T)), surface.faces)
 
 
 def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
@@ -214,8 +201,7 @@ def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
 
     ``up``: axis of the field that is up; glTF's is y, and the node is turned for z.
     """
-    c = surface.colors
-    linear = np.where(c <= 0.04045, c / 12.92, ((np.maximum(c, 0.04045) + 0.055) / 1.055) ** 2.4)
+    linear = decode_srgb(surface.colors)
     rgba = np.full((len(linear), 4), 65535, "<u2")
     rgba[:, :3] = np.rint(linear * 65535)
     position = surface.vertices.astype("<f4")

@@ -11,6 +11,7 @@ import numpy as np
 from nerg_mi.field.extraction import Lattice, Sampler, surface_density
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
+from nerg_mi.maths.color import decode_srgb
 
 # Optical depth of a voxel at most, and the opacity from which on it has a colour.
 _DEEPEST, _FAINT = 5.0, 1e-3
@@ -56,7 +57,7 @@ def density_and_color(field: RadianceField, resolution: int = 256, color: bool =
     normals[np.linalg.norm(normals, axis=1) < 0.5] = [0, 0, 1]
     c = sampler.diffuse(p, normals)
     if field.color_space == "srgb":
-        c = np.where(c <= 0.04045, c / 12.92, ((np.maximum(c, 0.04045) + 0.055) / 1.055) ** 2.4)
+        c = decode_srgb(c)
     out[z, y, x] = c
     away, nearest = distance_transform_edt(alpha <= _FAINT, return_indices=True)
     return density, np.where((away < 2.5)[..., None], out[tuple(nearest)], 0), lower, upper

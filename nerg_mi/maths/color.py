@@ -1,12 +1,26 @@
-"""From composited samples to linear radiance."""
+"""The sRGB transfer function (IEC 61966-2-1) of NumPy and of Dr.Jit arrays, and composited samples as linear radiance.
+
+The one of NumPy keeps the type of its argument; the one of Dr.Jit guards the derivative of its power.
+"""
 
 from __future__ import annotations
 
 import drjit as dr
+import numpy as np
+
+
+def encode_srgb(linear: np.ndarray) -> np.ndarray:
+    """sRGB values of linear ones, any shape of floats; below 0 the curve goes on as a line."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def decode_srgb(srgb: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB ones, any shape of floats; below 0 the curve goes on as a line."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.04045) + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_to_linear(c):
-    """Inverse of the sRGB transfer function (IEC 61966-2-1), per component."""
+    """Linear values of the components of a Dr.Jit array of sRGB ones; with derivatives."""
     low = c <= 0.04045
     return dr.select(low, c / 12.92, dr.power((dr.select(low, 1, c) + 0.055) / 1.055, 2.4))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.files import png
+from nerg_mi.maths.color import encode_srgb
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Weights of linear sRGB for the luminance (Rec. 709)."""
@@ -17,7 +18,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 def srgb(linear) -> np.ndarray:
     """sRGB values in 0..1 (float64) of linear ones of any shape; clipped to 0..1, NaN becomes 0."""
     x = np.clip(np.nan_to_num(np.asarray(linear, np.float64), nan=0.0), 0.0, 1.0)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
+    return encode_srgb(x)
 
 
 def to_bytes(display) -> np.ndarray:

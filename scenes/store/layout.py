@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.files.tables import write_json
+from nerg_mi.maths.color import decode_srgb
 
 ROOM = (8.0, 6.0, 3.0)  # metres
 SOUTH, NORTH, WEST, EAST = (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)
@@ -23,8 +24,7 @@ SOUTH, NORTH, WEST, EAST = (0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0)
 
 def srgb(code: str) -> np.ndarray:
     """Linear reflectance (3,) of an sRGB colour written as six hex digits."""
-    c = np.array([int(code[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0
-    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return decode_srgb(np.array([int(code[i : i + 2], 16) for i in (0, 2, 4)]) / 255.0)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.files.atomic import write_bytes, write_text
+from nerg_mi.files.atomic import write_text
+from nerg_mi.formats.ply import write_columns
 
 HERE = Path(__file__).resolve().parent
 TWIN_XML = HERE / "twin.xml"
@@ -81,20 +82,10 @@ def _write_ply(path: Path, quads: np.ndarray, colors: np.ndarray | None) -> None
     corners = np.round(quads.reshape(-1, 3), 5)
     vertices, index = np.unique(corners, axis=0, return_inverse=True)
     index = index.reshape(-1, 4)
-    triangles = index[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3).astype("<i4")
-    fields = [("n", "u1"), ("v", "<i4", 3)] + ([("c", "<f4", 3)] if colors is not None else [])
-    faces = np.zeros(len(triangles), fields)
-    faces["n"], faces["v"] = 3, triangles
-    if colors is not None:
-        faces["c"] = np.repeat(colors, 2, axis=0)
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property float {k}" for k in "xyz"]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    # Mitsuba groups the face properties color_0..2 into the attribute face_color
-    header += [f"property float color_{k}" for k in range(3)] if colors is not None else []
-    write_bytes(
-        path, "\n".join([*header, "end_header", ""]).encode(), vertices.astype("<f4").tobytes(), faces.tobytes()
-    )
+    triangles = index[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    # Mitsuba groups the face properties color_0..2 into the attribute face_color.
+    tints = {} if colors is None else {f"color_{k}": np.repeat(colors[:, k], 2) for k in range(3)}
+    write_columns(path, dict(zip("xyz", vertices.T)), triangles, tints)
 
 
 def write_twin(layout, folder=HERE) -> list[Path]:

@@ -1,10 +1,10 @@
-"""From composited samples to linear radiance."""
+"""The sRGB transfer function, and composited samples as linear radiance."""
 
 import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.maths.color import composite_to_linear, srgb_to_linear
+from nerg_mi.maths.color import composite_to_linear, decode_srgb, encode_srgb, srgb_to_linear
 
 
 def iec(c):
@@ -57,8 +57,7 @@ def test04_no_opacity_no_nan(rgb, α):
 def test05_derivatives_of_a_composite_are_those_of_its_colour(rgb, alpha):
     """With respect to the weighted sum and to the opacity it is divided by: central differences of a lin(C / a)."""
     shares = np.array([0.01, 0.03, 0.05, 0.3, 0.9])
-    lin = lambda c: np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    value = lambda total, a: a * lin(total / a)
+    value = lambda total, a: a * iec(total / a)
     total, a = rgb.Float((shares * alpha).tolist()), rgb.Float(alpha)
     dr.enable_grad(total, a)
     a_lanes = a + dr.zeros(rgb.Float, 5)
@@ -71,3 +70,14 @@ def test05_derivatives_of_a_composite_are_those_of_its_colour(rgb, alpha):
     by_alpha = ((value(shares * alpha, alpha + h) - value(shares * alpha, alpha - h)) / (2 * h) * weights).sum()
     assert np.allclose(dr.grad(total).numpy(), by_total, rtol=1e-4)
     assert np.isclose(dr.grad(a).numpy()[0], by_alpha, rtol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test06_numpy_values_there_and_back(dtype):
+    c = np.concatenate([np.linspace(0, 1, 101), [0.04045, -0.01]]).astype(dtype)
+    linear = decode_srgb(c)
+    assert linear.dtype == dtype and np.allclose(linear[:-1], iec(c[:-1].astype(float)), rtol=1e-5)
+    assert np.allclose(encode_srgb(linear), c, atol=1e-6) and encode_srgb(linear).dtype == dtype
+    # Values that the standard's own tables give.
+    assert decode_srgb(np.array(0.5)) == pytest.approx(0.214041, abs=1e-6)
+    assert encode_srgb(np.array(0.5)) == pytest.approx(0.735357, abs=1e-6)
