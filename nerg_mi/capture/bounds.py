@@ -6,6 +6,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.ray_box import box_interval
 
 from .cameras import Camera, project
 
@@ -96,9 +97,7 @@ def _samples(camera: Camera, box: Box, grid: int, depths: int) -> np.ndarray:
     u, v = np.meshgrid((np.arange(grid) + 0.5) / grid * i.width, (np.arange(grid) + 0.5) / grid * i.height)
     d = lens.rays(np.stack([(u.ravel() - i.cx) / i.fx, (v.ravel() - i.cy) / i.fy], axis=-1), i) * [1, -1, -1]
     d = d @ camera.to_world[:3, :3].T
-    with np.errstate(divide="ignore"):
-        a, b = ((np.array(x) - camera.center) / np.where(d == 0, 1e-12, d) for x in (box.lower, box.upper))
-    near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    near, far = box_interval(camera.center, d, box.lower, box.upper)
     near = np.maximum(near, 0)
     hit = far > near
     t = near[hit, None] + (far - near)[hit, None] * (np.arange(depths) + 0.5) / depths

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import drjit as dr
+import numpy as np
+from numpy.typing import ArrayLike
 
 
 def intersect_box(o, d, lower, upper):
@@ -22,4 +24,18 @@ def intersect_box(o, d, lower, upper):
         t_in = dr.select(parallel, -dr.inf, dr.minimum(a, b))
         t_out = dr.select(parallel, dr.select(outside, -dr.inf, dr.inf), dr.maximum(a, b))
         near, far = dr.maximum(near, t_in), dr.minimum(far, t_out)
+    return near, far
+
+
+def box_interval(o: ArrayLike, d: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """The same for NumPy rays: ``o``, ``d`` broadcast to (N, 3); ``t_near`` and ``t_far`` (N,), infinite where no
+    component of ``d`` leaves its slab."""
+    o, d = np.asarray(o), np.asarray(d)
+    still = d == 0
+    along = np.where(still, 1, d)
+    with np.errstate(over="ignore"):
+        a, b = (np.asarray(lower) - o) / along, (np.asarray(upper) - o) / along
+    outside = still & ((o < lower) | (o > upper))
+    near = np.where(still, -np.inf, np.minimum(a, b)).max(axis=-1)
+    far = np.where(still, np.where(outside, -np.inf, np.inf), np.maximum(a, b)).min(axis=-1)
     return near, far

@@ -1,19 +1,28 @@
-"""The slab test against the same in float64, on ordinary and on awkward rays."""
+"""The slab tests against the same in float64, on ordinary and on awkward rays."""
 
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.maths.ray_box import intersect_box
+from nerg_mi.maths.ray_box import box_interval, intersect_box
 from tests.reference import march_numpy as reference
 
 LOWER, UPPER = (-1, 0, 2), (3, 2, 4)
 
 
 def intersect(o, d, lower=LOWER, upper=UPPER):
+    """What both slab tests say, which must agree."""
     o, d = np.atleast_2d(np.asarray(o, np.float32)), np.atleast_2d(np.asarray(d, np.float32))
     near, far = intersect_box(ns.Array3f(o.T), ns.Array3f(d.T), lower, upper)
-    return np.broadcast_to(near.numpy(), len(o)), np.broadcast_to(far.numpy(), len(o))
+    near, far = np.broadcast_to(near.numpy(), len(o)), np.broadcast_to(far.numpy(), len(o))
+    first, last = box_interval(o.astype(float), d.astype(float), lower, upper)
+    scale, hit = np.abs(upper).max(), near < far
+    with np.errstate(invalid="ignore"):
+        clear = np.abs(far - near) > 1e-4 * scale
+    assert np.array_equal((first < last)[clear], hit[clear])
+    for float64, float32 in ((first, near), (last, far)):
+        assert np.allclose(float64[hit], float32[hit], rtol=1e-4, atol=1e-5 * scale)
+    return near, far
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1, 1e6])

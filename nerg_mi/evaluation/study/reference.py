@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerg_mi.maths.ray_box import box_interval
+
 from .scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
 
 PANELS, NODES = 32, 16
@@ -54,12 +56,7 @@ class Seen:
 
 def box_distances(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where float64 rays (N, 3) enter and leave the unit cube, from the origin on; equal on a miss."""
-    parallel = d == 0
-    inverse = 1 / np.where(parallel, 1, d)
-    a, b = (0 - o) * inverse, (1 - o) * inverse
-    outside = parallel & ((o < 0) | (o > 1))
-    near = np.where(parallel, -np.inf, np.minimum(a, b)).max(-1)
-    far = np.where(parallel, np.where(outside, -np.inf, np.inf), np.maximum(a, b)).min(-1)
+    near, far = box_interval(o, d, np.zeros(3), np.ones(3))
     near = np.maximum(near, 0)
     miss = ~(near < far)
     return np.where(miss, 0, near), np.where(miss, 0, far)

@@ -15,6 +15,7 @@ from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.density.probes import Probes, person_weights, place_probes
 from nerg_mi.field.gaze.log_density import LogGazeConfig, blind_table, table_directions
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.ray_box import box_interval
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
@@ -192,32 +193,14 @@ def surfaces(
 
 def box_exit(box: Box, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Distance (N,) at which rays leave ``box``; its diagonal for rays that never enter it."""
-    # Adding zero turns -0 into 0: parallel to a pair of planes, a ray between (or on) them never leaves through them.
-    directions = np.asarray(directions) + 0.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = [(np.asarray(c) - origins) / directions for c in (box.lower, box.upper)]
-    t = [np.where(np.isnan(v), forever, v) for v, forever in zip(t, (-np.inf, np.inf))]
-    near, far = np.minimum(*t).max(axis=1), np.maximum(*t).min(axis=1)
+    near, far = box_interval(origins, directions, box.lower, box.upper)
     return np.where((far > 0) & (near <= far) & np.isfinite(far), far, box.diagonal)
 
 
 def rotated_sets(count: int, sets: int, rng: np.random.Generator) -> np.ndarray:
     """``sets`` Fibonacci sets of ``count`` directions, each turned by a uniform random rotation, (sets, count, 3)."""
-    # Unit quaternions from normal numbers are uniform rotations (Shoemake 1992).
-    q = rng.normal(size=(sets, 4))
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rotation = np.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
-        ],
-        axis=1,
-    ).reshape(-1, 3, 3)
+    from scipy.spatial.transform import Rotation
+
+    # Unit quaternions from normal numbers are uniform rotations (Shoemake 1992); the first is the real part.
+    rotation = Rotation.from_quat(np.roll(rng.normal(size=(sets, 4)), -1, axis=1)).as_matrix()
     return np.einsum("dj,pij->pdi", fibonacci_directions(count), rotation)

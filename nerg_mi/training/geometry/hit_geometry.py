@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.ray_box import box_interval
 from nerg_mi.rays.rays import Rays
 
 from .hit_extent import HitExtent, hit_extent
@@ -61,14 +62,8 @@ def _marked(extent: HitExtent, points: np.ndarray, out: np.ndarray | None = None
 
 def _on_shell(origins: np.ndarray, hits: np.ndarray, extent: HitExtent) -> np.ndarray:
     """Where rays to hits beyond the shell leave it, (N, 3); NaN for those that never are within it."""
-    low, high = extent.shell
     way = hits - origins
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.stack([(low - origins) / way, (high - origins) / way])
-        # Along an axis on which a ray does not move it is between the walls for ever, or never.
-        still = (way == 0) & (origins >= low) & (origins <= high)
-        enter = np.where(still, -np.inf, t.min(axis=0)).max(axis=1)
-        leave = np.where(still, np.inf, t.max(axis=0)).min(axis=1)
+    enter, leave = box_interval(origins, way, *extent.shell)
     passes = (leave > np.maximum(enter, 0)) & (leave <= 1)
     return np.where(passes[:, None], origins + way * np.where(passes, leave, 0)[:, None], np.nan)
 
