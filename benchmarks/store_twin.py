@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.maths.psnr import decibels
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -140,7 +141,7 @@ def measure(folder: Path, pair: str, width: int, files: dict, color_spp: int) ->
         first, second = (look(scene, color_spp, seed)["color"] for seed in (1, 2))
         # The paths' noise is not the field's error: that of two renders is independent, and cancels in the product.
         a, first, second = (np.clip(c, 0, 1) for c in (a, first, second))
-        row["colour dB"] = -10 * np.log10(np.mean((a - first) * (a - second)))
+        row["colour dB"] = decibels(np.mean((a - first) * (a - second)))
     return row
 
 

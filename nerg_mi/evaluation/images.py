@@ -16,7 +16,7 @@ from nerg_mi.capture.images import View
 from nerg_mi.capture.undistort import pinhole, through_lens
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import make_folder
-from nerg_mi.training.radiance.preview import psnr
+from nerg_mi.maths.psnr import psnr
 from nerg_mi.view.tonemap import srgb, write_png
 
 # Wang et al. 2004: window of 11 x 11 pixels, a Gaussian of 1.5; constants for values in 0..1.

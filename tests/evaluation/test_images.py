@@ -10,7 +10,7 @@ import pytest
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.images import View
 from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.evaluation.images import Renderer, depth_score, psnr, score_views, ssim
+from nerg_mi.evaluation.images import Renderer, depth_score, score_views, ssim
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_radiance
@@ -21,16 +21,6 @@ def noisy():
     rng = np.random.default_rng(0)
     truth = rng.random((40, 30, 3))
     return np.clip(truth + 0.2 * rng.normal(size=truth.shape), 0, 1), truth
-
-
-def test_psnr_of_a_known_error():
-    truth = np.full((4, 5, 3), 0.5)
-    assert psnr(truth + 0.1, truth) == pytest.approx(20)
-    mask = np.zeros((4, 5), bool)
-    mask[0, 0] = True
-    wrong = truth.copy()
-    wrong[0, 0] += 0.01
-    assert psnr(wrong, truth, mask) == pytest.approx(40)
 
 
 def test_ssim_equals_scikit_image_and_its_definition():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from nerg_mi.maths.psnr import decibels
+
 from nerg_mi.evaluation import saliency as metrics
 
 from .reference import Truth
@@ -45,7 +47,7 @@ def errors(
     out = {}
     if "color" in seen and np.any(seen["color"]):
         out["color_rmse"] = float(np.sqrt(np.mean((seen["color"] - known.color) ** 2)))
-        out["color_psnr"] = float(-20 * np.log10(max(out["color_rmse"], 1e-12)))
+        out["color_psnr"] = decibels(out["color_rmse"] ** 2, 1e-24)
     if "opacity" in seen:
         out["opacity_mae"] = float(np.mean(np.abs(seen["opacity"] - known.opacity)))
     traced = known.opacity >= TRACE

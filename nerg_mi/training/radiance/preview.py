@@ -74,12 +74,3 @@ def _march(field, occupied, table, center, d, near: float, stop: float, ns):
     weight, tau, color, opacity = composite(sigma, list(rgb), samples)
     moment = ray_sum(weight * (samples.t + samples.length * mean_depth_share(tau)), samples.segments)
     return np.stack([c.numpy() for c in color], axis=1), opacity.numpy(), moment.numpy()
-
-
-def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of values in 0..1, (h, w, c), over the pixels of ``mask`` (h, w); NaN if there
-    is none."""
-    error = (np.clip(picture, 0, 1).astype(np.float64) - truth) ** 2
-    if mask is not None:
-        error = error[mask]
-    return float(-10 * np.log10(max(np.mean(error), 1e-12))) if error.size else float("nan")

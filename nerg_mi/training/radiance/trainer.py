@@ -20,6 +20,7 @@ from nerg_mi.field.backend import aligned
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.psnr import psnr
 from nerg_mi.training.common.step_clock import StepClock
 
 from .compositing import damp_near, weights
@@ -28,7 +29,7 @@ from .losses import color_loss, composite, depth_loss, distortion_loss, feature_
 from .model import density, density_color, density_of
 from .pace import adapted_rays, affordable_rays, refined
 from .pixels import PixelBank
-from .preview import Preview, psnr, render_view
+from .preview import Preview, render_view
 from .sampling import StepTable, Thinning, rays_in_box, visible_samples
 from .settings import RadianceSettings
 from .settling import Settling

@@ -12,7 +12,7 @@ from nerg_mi.capture.images import View
 from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance import preview
-from nerg_mi.training.radiance.preview import psnr, render_view
+from nerg_mi.training.radiance.preview import render_view
 from nerg_mi.training.radiance.sampling import StepTable
 
 LENS = Intrinsics(13, 9, 12.0, 12.0, 6.5, 4.5)
@@ -83,13 +83,3 @@ def test_empty_cells_and_pictures_of_nothing():
     table = StepTable(ns, 0.0, 4.4, STEP, 0.0)
     seen = render_view(Lump(), lambda p, active: active & False, table, view(), NEAR)
     assert not seen.color.any() and not seen.opacity.any() and not seen.depth.any() and seen.color.shape == (9, 13, 3)
-
-
-def test_psnr():
-    rng = np.random.default_rng(0)
-    a, b = rng.uniform(-0.2, 1.2, (5, 4, 3)), rng.random((5, 4, 3))
-    error = (np.clip(a, 0, 1) - b) ** 2
-    assert psnr(a, b) == pytest.approx(-10 * np.log10(error.mean()))
-    mask = rng.random((5, 4)) < 0.5
-    assert psnr(a, b, mask) == pytest.approx(-10 * np.log10(error[mask].mean()))
-    assert psnr(b, b) == pytest.approx(120) and np.isnan(psnr(a, b, mask & False))
