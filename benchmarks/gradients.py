@@ -17,9 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numerics import replaced, table
+from numerics import replaced
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.files.tables import markdown_table
 
 QUANTITIES = {
     "colour": "RGB",
@@ -163,7 +164,7 @@ def main(argv=None) -> None:
     # A sensor's pose counts as not differentiable in Mitsuba, which says so on each of its updates.
     mi.set_log_level(mi.LogLevel.Error)
     for title, head, rows in errors(mi, args.case, args.depth):
-        text = table(head, rows)
+        text = markdown_table(head, rows)
         print(f"### {title}\n\n{text}\n", flush=True)
         if args.update:
             args.update.write_text(replaced(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")

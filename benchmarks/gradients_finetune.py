@@ -20,9 +20,10 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numerics import replaced, table
+from numerics import replaced
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
+from nerg_mi.files.tables import markdown_table
 
 STORE = Path(__file__).parents[1] / "scenes" / "store" / "scene.xml"
 SHELF, WIDTH = (4.8, 5.5, 1.4), 0.6
@@ -169,7 +170,7 @@ def main(argv=None) -> None:
             store.train(batches, args.steps, args.lr)
         rows.append([name, *(f"{e:.1%}" for e in store.errors())])
         print(rows[-1], file=sys.stderr, flush=True)
-    title, text = "Errors of gaze", table(["", *store.views], rows)
+    title, text = "Errors of gaze", markdown_table(["", *store.views], rows)
     print(f"### {title}\n\n{text}\n")
     if args.update:
         args.update.write_text(replaced(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")

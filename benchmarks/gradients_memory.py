@@ -22,9 +22,10 @@ from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
-from numerics import replaced, table
+from numerics import replaced
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
+from nerg_mi.files.tables import markdown_table
 
 SIZE, WARM = 64, 4
 COLUMNS = {"field": "field, MB", "everything": "everything, MB", "stored": "stored samples, MB"}
@@ -117,7 +118,7 @@ def main(argv=None) -> None:
     if args.one:
         print("\n".join(f"{peak(args.one, n):,.1f}" for n in counts))
         return
-    title, text = "Peak memory", table(["samples a ray", *COLUMNS.values()], [measured(n) for n in counts])
+    title, text = "Peak memory", markdown_table(["samples a ray", *COLUMNS.values()], [measured(n) for n in counts])
     print(f"### {title}\n\n{text}\n")
     if args.update:
         args.update.write_text(replaced(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")

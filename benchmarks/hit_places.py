@@ -22,6 +22,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import nerg_mi  # noqa: E402, F401 (before Mitsuba, since it chooses the libLLVM)
+from nerg_mi.files.tables import markdown_table  # noqa: E402
 
 
 def row(name: str, rays, seen, far: np.ndarray) -> str:
@@ -52,7 +53,7 @@ def row(name: str, rays, seen, far: np.ndarray) -> str:
         nearer,
         f"{seconds:.1f}",
     ]
-    return "| " + " | ".join(cells) + " |"
+    return cells
 
 
 def supermarket(count: int):
@@ -90,15 +91,12 @@ def main(arguments: list[str] | None = None) -> None:
         "too near, median m",
         "made in, s",
     )
-    print("| " + " | ".join(head) + " |\n|" + " --- |" * len(head))
     seen = office(20_000, seed=1)
-    print(
-        row("room of 8 x 6 x 3 m, window", office(options.rays), seen, looks_out(seen.origin, seen.direction)),
-        flush=True,
-    )
+    rows = [row("room of 8 x 6 x 3 m, window", office(options.rays), seen, looks_out(seen.origin, seen.direction))]
     rays = supermarket(options.rays)
     if rays is not None:
-        print(row("supermarket, recorded", rays, rays, np.zeros(len(rays), bool)))
+        rows.append(row("supermarket, recorded", rays, rays, np.zeros(len(rays), bool)))
+    print(markdown_table(head, rows))
 
 
 if __name__ == "__main__":

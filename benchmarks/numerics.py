@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.files.tables import markdown_table
 
 GROUPS = ("march", "rays", "pictures", "gaze")
 
@@ -33,11 +34,6 @@ class Row:
     def cells(self) -> list[str]:
         shown = self.error if isinstance(self.error, str) else f"{self.error:.1e}"
         return [self.case, self.range, self.quantity, "0" if shown == "0.0e+00" else shown, self.reference]
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(str(c).replace("|", "\\|") for c in line) + " |" for line in lines)
 
 
 def replaced(document: str, title: str, text: str) -> str:
@@ -70,7 +66,7 @@ def main() -> None:
     document = args.update.read_text(encoding="utf-8") if args.update else None
     for name in names:
         for title, head, rows in importlib.import_module(f"numerics_{name}").tables(mi):
-            text = table(head, rows)
+            text = markdown_table(head, rows)
             print(f"### {title}\n\n{text}\n", flush=True)
             if document is not None:
                 document = replaced(document, title, text)

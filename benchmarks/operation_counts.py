@@ -9,16 +9,17 @@ seconds are medians of several runs, and only their ratios mean anything.
 from __future__ import annotations
 
 import argparse
-import csv
 import statistics
 import time
 from pathlib import Path
 
 import mitsuba as mi
 import nerg_mi.scenes.store
+from output import write_rows
 
 import nerg_mi
 from nerg_mi.evaluation.study.operations import traced_operations
+from nerg_mi.files.tables import markdown_table
 
 STORE = Path(nerg_mi.scenes.store.__file__).parent
 CAMERA, OBSERVER, TARGET = [1.0, 0.8, 1.6], [1.0, 2.8, 1.6], [1.2, 5.0, 1.2]
@@ -112,18 +113,15 @@ def main() -> None:
             seconds.append(time.perf_counter() - start)
         rows.append([name, operations, *evaluations(args.width, options), statistics.median(seconds)])
 
+    shown = [
+        [name, f"{operations:,}", f"{density:.1f}", f"{color:.1f}", f"{gaze:.2f}", f"{seconds:.3f}"]
+        for name, operations, density, color, gaze, seconds in rows
+    ]
     print(
-        "| what | operations traced | density evals | colour evals | gaze evals | seconds |\n|---|---|---|---|---|---|"
+        markdown_table(["what", "operations traced", "density evals", "colour evals", "gaze evals", "seconds"], shown)
     )
-    for name, operations, density, color, gaze, seconds in rows:
-        print(f"| {name} | {operations:,} | {density:.1f} | {color:.1f} | {gaze:.2f} | {seconds:.3f} |")
-    out = Path("out/operation_counts.csv")
-    out.parent.mkdir(exist_ok=True)
-    with out.open("w", newline="") as f:
-        writer = csv.writer(f)
-        writer.writerow(["what", "operations", "density_evals", "color_evals", "gaze_evals", "seconds"])
-        writer.writerows(rows)
-    print(f"\nWrote {out}")
+    names = ("what", "operations", "density_evals", "color_evals", "gaze_evals", "seconds")
+    write_rows(Path("out/operation_counts.csv"), [dict(zip(names, row)) for row in rows])
 
 
 if __name__ == "__main__":

@@ -8,6 +8,6 @@ from nerg_mi.files.tables import write_csv
 
 
 def write_rows(path: Path, rows: list[dict]) -> None:
-    """Write ``rows``, all of the keys of the first, as CSV, and say where."""
-    write_csv(path, rows, list(rows[0]))
+    """Write ``rows`` as CSV, and say where."""
+    write_csv(path, rows)
     print(f"wrote {path}")

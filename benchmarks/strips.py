@@ -13,6 +13,7 @@ import statistics
 import time
 
 import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
+from nerg_mi.files.tables import markdown_table
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -53,10 +54,12 @@ def main(arguments: list[str] | None = None) -> None:
             count[name] = way()
             seconds[name].append(time.perf_counter() - start)
     base = statistics.median(seconds["mi.render"])
-    print("| way | strips | seconds, median | from - to | of mi.render |\n| --- | --- | --- | --- | --- |")
+    rows = []
     for name, times in seconds.items():
         median = statistics.median(times)
-        print(f"| {name} | {count[name]} | {median:.2f} | {min(times):.2f} - {max(times):.2f} | {median / base:.2f} |")
+        span = f"{min(times):.2f} - {max(times):.2f}"
+        rows.append([name, count[name], f"{median:.2f}", span, f"{median / base:.2f}"])
+    print(markdown_table(["way", "strips", "seconds, median", "from - to", "of mi.render"], rows))
 
 
 if __name__ == "__main__":

@@ -16,12 +16,13 @@ people at other zones, and on none of the first five.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+
+from output import write_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 SCORES = ("KLD", "CC", "SIM", "MAE", "NSS", "AUC", "sAUC", "bits", "loglik")
@@ -123,11 +124,7 @@ def main(argv=None) -> None:
                 f"  {seed}: KLD {ours['KLD'] - bar['KLD']:+.3f}, CC {ours['CC'] - bar['CC']:+.3f}, bits {ours['bits'] - bar['bits']:+.3f}"
             )
     for name, content in (("folds.csv", rows), ("means.csv", table)):
-        with open(args.out / name, "w", newline="") as file:
-            writer = csv.DictWriter(file, list(dict.fromkeys(k for r in content for k in r)), restval="")
-            writer.writeheader()
-            writer.writerows(content)
-        print(f"wrote {args.out / name}")
+        write_rows(args.out / name, content)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import numpy as np
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.png import write_figure
-from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.recipes import gaze_recipe
@@ -316,20 +316,15 @@ def table(summary: list[dict]) -> str:
         "train_seconds",
         "frame_seconds",
     )
-    lines = [
-        "| recipe | variant | seeds | steps | " + " | ".join(k.replace("_", " ") for k in shown) + " |",
-        "|---|---|" + "---:|" * (len(shown) + 2),
-    ]
+    head, lines = ["recipe", "variant", "seeds", "steps", *(k.replace("_", " ") for k in shown)], []
     for r in summary:
         cells = []
         for k in shown:
             digits = 4 if k.endswith("MAE") else 3
             spread = f" ± {r[f'{k}.spread']:.{digits}f}" if f"{k}.spread" in r else ""
             cells.append(f"{r[k]:.{digits}f}{spread}" if k in r else "")
-        lines.append(
-            f"| {r['recipe']} | {r['variant']} | {r['seeds']} | {r['steps']:.0f} | " + " | ".join(cells) + " |"
-        )
-    return "\n".join(lines) + "\n"
+        lines.append([r["recipe"], r["variant"], r["seeds"], f"{r['steps']:.0f}", *cells])
+    return markdown_table(head, lines, head[2:]) + "\n"
 
 
 def write_ablation(folder: Path, rows: list[dict], notes: str) -> list[Path]:

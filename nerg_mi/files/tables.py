@@ -1,4 +1,4 @@
-"""Tables and documents of results as files: CSV and JSON, whole or absent."""
+"""Tables and documents of results: CSV and JSON files, whole or absent, and Markdown."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from .atomic import write_text
@@ -23,6 +23,16 @@ def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], column
     writer.writeheader()
     writer.writerows(rows)
     write_text(path, text.getvalue())
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]], right: Collection[str] = ()) -> str:
+    """A Markdown table of cells as ``str`` shows them, without a line end; bars and line breaks in cells are escaped.
+
+    ``right``: those columns of ``head`` that are aligned to the right.
+    """
+    cells = [[str(c).replace("|", "\\|").replace("\n", " ") for c in row] for row in (head, *rows)]
+    rule = ["---:" if name in right else "---" for name in head]
+    return "\n".join("| " + " | ".join(line) + " |" for line in (cells[0], rule, *cells[1:]))
 
 
 def write_json(path: str | os.PathLike, value: Any, allow_nan: bool = True) -> None:

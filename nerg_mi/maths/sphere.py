@@ -6,6 +6,8 @@ Directions are (N, 3) float64, unit. Solid angles are in steradian and sum to
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
@@ -24,6 +26,23 @@ def fibonacci_directions(count: int) -> np.ndarray:
     i = np.arange(count)
     z = 1.0 - (2.0 * i + 1.0) / count
     return _from_height(z, i * _GOLDEN_ANGLE)
+
+
+def fibonacci_vectors(count: int):
+    """`fibonacci_directions` as a Vector3f of the Mitsuba variant in use, in its precision.
+
+    Made by its kernels, since frozen functions take no arrays from NumPy.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    i = dr.arange(mi.Float, count)
+    z = 1 - (2 * i + 1) / count
+    # Turns of the golden angle, of which whole ones are dropped in double precision.
+    turns = dr.arange(mi.Float64, count) * (1.5 - 0.5 * math.sqrt(5))
+    sin, cos = dr.sincos(mi.Float(dr.two_pi * (turns - dr.floor(turns))))
+    r = dr.sqrt((1 - z) * (1 + z))
+    return mi.Vector3f(r * cos, r * sin, z)
 
 
 def uniform_directions(count: int, rng: np.random.Generator) -> np.ndarray:

@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.files.tables import markdown_table, write_csv, write_json
 
 
 def test_rows_come_back_and_what_they_lack_is_empty(tmp_path):
@@ -33,3 +33,9 @@ def test_a_table_that_cannot_be_made_leaves_the_old_one(tmp_path):
         "a.csv",
         "a.json",
     ]
+
+
+def test_a_markdown_table():
+    text = markdown_table(["what", "a|b"], [["x", 1.5], ["two\nlines", None]], right=["a|b"])
+    assert text == "| what | a\\|b |\n| --- | ---: |\n| x | 1.5 |\n| two lines | None |"
+    assert markdown_table(["a"], []) == "| a |\n| --- |"

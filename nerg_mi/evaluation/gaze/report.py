@@ -9,7 +9,7 @@ import numpy as np
 
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.png import write_figure
-from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
 
 from .evaluation import SCORES, GazeTest
@@ -20,13 +20,8 @@ _DIGITS = {"MAE": 4}
 def markdown(rows: list[dict], columns: tuple = ("method", *SCORES, "integral")) -> str:
     """A table of ``rows``, with intervals in brackets where they are known."""
     shown = [c for c in columns if any(c in r for r in rows)]
-    lines = [
-        "| " + " | ".join(shown) + " |",
-        "|" + "|".join("---" if c in ("method", "person") else "---:" for c in shown) + "|",
-    ]
-    for row in rows:
-        lines.append("| " + " | ".join(_cell(row, c) for c in shown) + " |")
-    return "\n".join(lines) + "\n"
+    numbers = [c for c in shown if c not in ("method", "person")]
+    return markdown_table(shown, ([_cell(row, c) for c in shown] for row in rows), numbers) + "\n"
 
 
 def _cell(row: dict, column: str) -> str:

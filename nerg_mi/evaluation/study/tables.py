@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.files.tables import markdown_table, write_csv, write_json
 
 from .measure import COLUMNS
 from .settings import PAPER
@@ -132,7 +132,7 @@ def markdown(report: dict) -> str:
     for group in dict.fromkeys(r["group"] for r in rows[1:]):
         mine = [default, *(r for r in rows if r["group"] == group)]
         cells = [[r["setting"], *(f"{r[k] * by:.3g}" if k in r else "" for k, _, by in shown)] for r in mine]
-        text.append(_table(group, head, cells))
+        text.append(f"### {group}\n\n{markdown_table(head, cells)}")
     for clock, unit in (("seconds", "ms"), ("cpu_seconds", "CPU ms")):
         head = ["paper", unit, "depth MAE", "no slower", "times less error", "no worse", "times faster"]
         cells = []
@@ -141,10 +141,6 @@ def markdown(report: dict) -> str:
             cells.append([paper["setting"], f"{1e3 * paper[clock]:.3g}", f"{paper['depth_mae']:.3g}"])
             cells[-1] += [time["setting"], f"{time['error_ratio']:.3g}"] if time else ["none", ""]
             cells[-1] += [error["setting"], f"{error['time_ratio']:.3g}"] if error else ["none", ""]
-        text.append(_table(f"against the paper's marching, by {clock.replace('_', ' ')}", head, cells))
+        title = f"against the paper's marching, by {clock.replace('_', ' ')}"
+        text.append(f"### {title}\n\n{markdown_table(head, cells)}")
     return "\n\n".join(text) + "\n"
-
-
-def _table(title: str, head: list[str], rows: list[list[str]]) -> str:
-    lines = [f"### {title}", "", f"| {' | '.join(head)} |", f"|-{'|-' * (len(head) - 1)}|"]
-    return "\n".join([*lines, *(f"| {' | '.join(r)} |" for r in rows)])

@@ -33,13 +33,13 @@ ROWS = [
 def test_a_table_by_hand():
     assert markdown(ROWS, ("method", "KLD", "CC", "MAE", "NSS", "integral", "AUC")).splitlines() == [
         "| method | KLD | CC | MAE | NSS | integral |",
-        "|---|---:|---:|---:|---:|---:|",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
         "| field | 0.512 [0.400, 0.650] | 0.900 | 0.0123 |  |  |",
         "| uniform | 1.500 | 0.000 | 0.0500 |  | 1.000 |",
         "| split half | 0.250 |  |  |  |  |",
     ]
     people = markdown([{"method": "a", "person": "ann", "rays": 12}], ("method", "person", "rays"))
-    assert people.splitlines()[1:] == ["|---|---|---:|", "| a | ann | 12 |"]
+    assert people.splitlines()[1:] == ["| --- | --- | ---: |", "| a | ann | 12 |"]
 
 
 def test_files(tmp_path):
