@@ -16,6 +16,7 @@ from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.bounded import parse_json, plain, reading, size_of
 
 FORMAT = 1
+"""The version of the files, raised when an earlier version of this package could misread them."""
 
 HEADER_BYTES = 16 << 20
 """The header, which names every array and holds the metadata, may have so many bytes."""
@@ -61,8 +62,8 @@ def _check_header(path: Path) -> None:
         header = int.from_bytes(file.read(8), "little")
     if size < 8 or header > size - 8:
         raise NergError(
-            f'"{path}" is not a readable safetensors file: its header claims {header:,} bytes and the file has {size:,}; '
-            "copy it again, or make it anew"
+            f'"{path}" is not a readable safetensors file: its header claims {header:,} bytes and the file has '
+            f"{size:,}; copy it again, or make it anew"
         )
     if header > HEADER_BYTES:
         raise NergError(f'the header of "{path}" has {header:,} bytes, more than the {HEADER_BYTES:,} that are read')
@@ -79,11 +80,13 @@ def _contents(f, path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
         raise NergError(f'the metadata of "{path}" are damaged: a JSON object is needed; copy it again')
     if metadata.get("kind") != kind:
         raise NergError(
-            f'"{path}" holds a {plain(metadata.get("kind"), 40)} field where a {kind} field is needed; name one of those'
+            f'"{path}" holds a {plain(metadata.get("kind"), 40)} field where a {kind} field is needed; '
+            "name one of those"
         )
     if metadata.get("format") != FORMAT:
         raise NergError(
-            f'"{path}" has checkpoint format {plain(metadata.get("format"), 40)}; this version reads format {FORMAT}'
+            f'"{path}" has checkpoint format {plain(metadata.get("format"), 40)}, and this version reads format {FORMAT}: '
+            "use a newer nerg_mi, or train the field anew"
         )
     if not isinstance(metadata.get("provenance", {}), dict):
         raise NergError(f'the metadata of "{path}" are damaged: "provenance" must be a JSON object; copy it again')

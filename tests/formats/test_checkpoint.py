@@ -104,7 +104,7 @@ def test09_another_kind_and_another_format(tmp_path):
     with pytest.raises(ValueError, match="holds a gaze field where a radiance field is needed"):
         read_checkpoint(path, "radiance")
     save_file(TENSORS, path, metadata={"nerg": json.dumps({"kind": "gaze", "format": 99})})
-    with pytest.raises(ValueError, match="format 99; this version reads format 1"):
+    with pytest.raises(ValueError, match="format 99, and this version reads format 1: use a newer nerg_mi"):
         read_checkpoint(path, "gaze")
 
 
