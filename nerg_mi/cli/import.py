@@ -37,8 +37,9 @@ def command(
     from nerg_mi.field.backend import namespace
     from nerg_mi.files.atomic import check_writable
     from nerg_mi.formats.fields import save_gaze, save_radiance
-    from nerg_mi.formats.torch_ngp.fields import Given, open_checkpoint, read_torch_ngp
+    from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
     from nerg_mi.formats.torch_ngp.nerg import is_nerg, read_nerg
+    from nerg_mi.formats.torch_ngp.state_dict import open_checkpoint
     from nerg_mi.rendering.pictures import activate
 
     if output is None and gaze is None:

@@ -15,22 +15,28 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.cascades import CascadeGrid, levels_of
 from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
 from nerg_mi.field.mlp import MLP
-from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.box import Box
 
-from .unpickling import StoredTensor, read_torch
+from .occupancy import bitfield, read_occupancy
+from .state_dict import (
+    StateDict,
+    averaged_weights,
+    decimals,
+    grid,
+    grid_config,
+    layers,
+    open_checkpoint,
+    origin,
+    sh_degree,
+    whole,
+)
 
 MARCH_STEP = 2 * math.sqrt(3) / 1024
 """torch-ngp's shortest step, at its default of 1,024 steps."""
-
-_CELLS = 128
-# More of either than any network has that is trained.
-_LEVELS, _LAYERS = 64, 64
 
 
 @dataclass(frozen=True)
@@ -46,83 +52,6 @@ class Given:
     background_radius: float | None = None
 
 
-class StateDict:
-    """The tensors of a checkpoint by name, below ``prefix``; ``averaged`` replaces some of them."""
-
-    def __init__(self, path: Path, tensors: dict, prefix: str = "", averaged: dict | None = None):
-        self.path, self.prefix, self._averaged = path, prefix, averaged or {}
-        self._tensors = {
-            k[len(prefix) :]: v
-            for k, v in tensors.items()
-            if isinstance(k, str) and k.startswith(prefix) and isinstance(v, StoredTensor)
-        }
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._tensors
-
-    def names(self) -> list[str]:
-        return list(self._tensors)
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        self.shape(name)
-        return self._averaged.get(name, self._tensors[name]).numpy()
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        """The shape of ``self[name]``, which is not read."""
-        if name not in self._tensors:
-            raise NergError(
-                f'"{self.path}" lacks "{self.prefix}{name}", which its kind of checkpoint holds; copy it again'
-            )
-        return self._tensors[name].shape
-
-    def weights(self, name: str) -> np.ndarray:
-        """``self[name]`` in fp32. Raises `NergError` when it is not finite."""
-        with np.errstate(over="ignore"):  # what fp32 cannot hold is not finite
-            value = self[name].astype(np.float32)
-        if not np.all(np.isfinite(value)):
-            raise NergError(f'"{self.prefix}{name}" in "{self.path}" is not finite: its training has diverged')
-        return value
-
-    def below(self, prefix: str) -> StateDict:
-        return StateDict(self.path, self._tensors, prefix)
-
-
-def open_checkpoint(path: str | Path) -> tuple[dict, dict]:
-    """``(whole file, state dictionary)`` of a checkpoint, or of a bare state dictionary."""
-    whole = read_torch(path)
-    if not isinstance(whole, dict):
-        raise NergError(f'"{path}" holds a {type(whole).__name__}, not a checkpoint')
-    model = whole.get("model", whole)
-    if not isinstance(model, dict) or not any(isinstance(v, StoredTensor) for v in model.values()):
-        raise NergError(f'"{path}" holds no weights: neither a state dictionary nor one under "model"')
-    return whole, model
-
-
-def averaged_weights(path: str | Path, whole: dict, model: dict, wanted: bool | None) -> dict:
-    """Moving averages by name, those of ``ema["shadow_params"]``; {} for the raw weights.
-
-    ``wanted``: True, False, or None for averages where the file has them. torch-ngp's best checkpoint (``ngp.pth``)
-    keeps its averages as the weights themselves.
-    """
-    shadow = (whole.get("ema") or {}).get("shadow_params") or []
-    if (not wanted and wanted is not None) or not shadow:
-        if wanted and not shadow:
-            raise NergError(f'"{path}" holds no moving averages: import its weights with --no-ema')
-        return {}
-    # Buffers are not averaged; parameters come in the order of the state dictionary.
-    names = [k for k in model if k.endswith((".embeddings", ".weight", ".bias"))]
-    if [tuple(model[k].shape) for k in names] != [tuple(v.shape) for v in shadow]:
-        raise NergError(
-            f'the {len(shadow)} moving averages of "{path}" do not fit its {len(names)} weights: import these with --no-ema'
-        )
-    return dict(zip(names, shadow))
-
-
-# ----------------------------------------------------------------------------
-# In
-# ----------------------------------------------------------------------------
-
-
 def read_torch_ngp(
     path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = Given()
 ) -> tuple[RadianceField, dict]:
@@ -132,16 +61,6 @@ def read_torch_ngp(
         averaged = averaged_weights(path, whole, model, ema)
         field = radiance_field(StateDict(Path(path), model, averaged=averaged), ns, given, whole.get("mean_density"))
     return field, origin(path, whole, "torch-ngp", bool(averaged))
-
-
-def origin(path: str | Path, whole: dict, program: str, averaged: bool) -> dict:
-    counts = {k: whole[k] for k in ("epoch", "global_step") if isinstance(whole.get(k), int)}
-    return {
-        "imported_from": Path(path).name,
-        "format": program,
-        "weights": "moving averages" if averaged else "raw",
-        **counts,
-    }
 
 
 def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density: float | None = None) -> RadianceField:
@@ -169,7 +88,7 @@ def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density:
         grid(state, "encoder", config.grid, ns),
         density,
         color,
-        _occupancy(state, bound, ns, mean_density),
+        read_occupancy(state, bound, ns, mean_density),
         given.color_space,
         MARCH_STEP,
         _background(state, ns, given, config.sh_degree),
@@ -183,61 +102,6 @@ def _box(state: StateDict) -> tuple[Box, float]:
     if train.shape != (6,) or aabb.shape != (6,) or not bound >= 1:
         raise NergError(f'the boxes of "{state.path}", {train} and {aabb}, are not those of a bound of at least 1')
     return Box(aabb[:3], aabb[3:], bound), bound
-
-
-def decimals(values: np.ndarray) -> np.ndarray:
-    """The numbers that were typed: a bound of 2.7 stands in the file as the float32 next to it."""
-    return np.array([float(str(v)) for v in values.astype(np.float32).ravel()])
-
-
-def whole(value: float) -> int | float:
-    return int(value) if value == int(value) else value
-
-
-def sh_degree(state: StateDict, inputs: int) -> int:
-    degree = math.isqrt(max(inputs, 0))
-    if degree < 1 or degree**2 != inputs:
-        raise NergError(
-            f'the direction encoding of "{state.path}" has {inputs} numbers, so it is not spherical harmonics'
-        )
-    return degree
-
-
-def grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3) -> HashGridConfig:
-    """Configuration of the hash grid ``name``, whose level sizes are compared with those stored."""
-    offsets, table = (
-        state[f"{name}.offsets"].astype(int).ravel()[: _LEVELS + 2].tolist(),
-        state.shape(f"{name}.embeddings"),
-    )
-    levels, largest = len(offsets) - 1, max(np.diff(offsets), default=0)
-    if not 1 <= levels <= _LEVELS or largest < 8 or len(table) != 2:
-        raise NergError(
-            f'the hash grid "{state.prefix}{name}" of "{state.path}" has no levels, or more than {_LEVELS}; copy it again'
-        )
-    config = HashGridConfig(
-        levels, table[1], max(int(largest) - 1, 1).bit_length(), finest=whole(finest), dimensions=dimensions
-    )
-    if config.offsets() != offsets:
-        raise NergError(
-            f'the levels of "{state.prefix}{name}" in "{state.path}" begin at rows {offsets}, which is not a grid from 16 to '
-            f"{finest:g}: give its finest resolution with --finest"
-        )
-    return config
-
-
-def grid(state: StateDict, name: str, config: HashGridConfig, ns: ModuleType) -> HashGrid:
-    return HashGrid(config, ns.Float(state.weights(f"{name}.embeddings").ravel()))
-
-
-def layers(state: StateDict, name: str, ns: ModuleType) -> MLP:
-    """A network of layers ``name.0.weight``, ``name.1.weight``, ... without biases."""
-    found = [k for k in state.names() if k.startswith(f"{name}.")]
-    names = [f"{name}.{i}.weight" for i in range(max(len(found), 1))]
-    if found and set(found) != set(names):
-        raise NergError(f'"{name}" in "{state.path}" has {", ".join(found)}, where layers without biases are expected')
-    if len(names) > _LAYERS:
-        raise NergError(f'"{name}" in "{state.path}" has {len(names)} layers, and at most {_LAYERS} are read')
-    return MLP([ns.TensorXf(state.weights(k)) for k in names])
 
 
 def _background(state: StateDict, ns: ModuleType, given: Given, degree: int) -> Background | None:
@@ -261,50 +125,14 @@ def _background(state: StateDict, ns: ModuleType, given: Given, degree: int) -> 
     return Background(config, grid(state, "encoder_bg", config.grid, ns), net)
 
 
-def _occupancy(state: StateDict, bound: float, ns: ModuleType, mean_density) -> OccupancyGrid | CascadeGrid | None:
-    """From the bitfield, or else from the density grid; None for a field that was trained without either."""
-    levels = levels_of(bound)
-    density = state["density_grid"].reshape(levels, -1) if "density_grid" in state else None
-    if "density_bitfield" in state:
-        bits = np.unpackbits(state["density_bitfield"], bitorder="little").astype(bool)
-    elif density is not None:
-        # torch-ngp's own rule, with the threshold of its command line.
-        bits = density.ravel() > min(float(np.maximum(density, 0).mean()), 10)
-    else:
-        return None
-    if bits.size != levels * _CELLS**3:
-        raise NergError(f'"{state.path}" has {bits.size} density bits where a bound of {bound:g} has {levels} x 128^3')
-    bits = bits.reshape(levels, -1)
-    if density is not None and not bits.all():
-        # The largest density that the grid calls empty: cells never seen hold -1.
-        threshold = max(float(density[~bits].max()), 0.0)
-    else:
-        threshold = min(float(mean_density or 0.0), 10.0)
-    if not np.isfinite(threshold):
-        raise NergError(f'the densities of "{state.path}" are not finite: its training has diverged')
-    ordered = bits[:, morton_order()].reshape(levels, _CELLS, _CELLS, _CELLS)
-    return OccupancyGrid(ordered[0], ns, threshold) if levels == 1 else CascadeGrid(ordered, bound, ns, threshold)
-
-
-def morton_order(cells: int = _CELLS) -> np.ndarray:
-    """Morton index of every cell of a cube, listed x fastest, then y, then z; bits of x lowest, (cells^3,)."""
-    spread = np.zeros(cells, np.int64)
-    for bit in range(cells.bit_length() - 1):
-        spread |= (np.arange(cells) >> bit & 1) << 3 * bit
-    return (spread[:, None, None] << 2 | spread[:, None] << 1 | spread).ravel()
-
-
-# ----------------------------------------------------------------------------
-# Out
-# ----------------------------------------------------------------------------
-
-
 def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     """State dictionary with which torch-ngp's ``NeRFNetwork(bound)`` renders ``field``.
 
     Raises `NergError` naming what does not fit: torch-ngp fixes the sizes of its networks and grid by the bound.
     """
     c, box = field.config, field.box
+    if not isinstance(c.grid, HashGridConfig):
+        raise NergError(f'this field has no torch-ngp form: its positions go through "{c.grid.kind}", not a hash grid')
     bound = box.side / 2
     expected = HashGridConfig(
         levels=c.grid.levels, features=c.grid.features, log2_rows=c.grid.log2_rows, finest=max(whole(2048 * bound), 16)
@@ -338,7 +166,7 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     state = {
         "aabb_train": cube,
         "aabb_infer": np.float32([*box.lower, *box.upper]),
-        "density_bitfield": _bitfield(field.occupancy, bound),
+        "density_bitfield": bitfield(field.occupancy, bound),
         "step_counter": np.zeros((16, 2), np.int32),
     }
     _put_grid(state, "encoder", field.grid)
@@ -357,36 +185,6 @@ def _put_grid(state: dict, name: str, grid: HashGrid) -> None:
 
 def _put_layers(state: dict, name: str, net: MLP) -> None:
     state |= {f"{name}.{i}.weight": w.numpy() for i, w in enumerate(net.weights)}
-
-
-def _bitfield(occupancy, bound: float) -> np.ndarray:
-    """Bits of all cascades in Morton order, packed; every bit is set where nothing is known."""
-    levels = levels_of(bound)
-    if occupancy is None:
-        bits = np.ones((levels, _CELLS, _CELLS, _CELLS), bool)
-    elif isinstance(occupancy, CascadeGrid) and (occupancy.bound, occupancy.resolution) == (bound, _CELLS):
-        bits = occupancy.bits
-    elif isinstance(occupancy, OccupancyGrid):
-        bits = np.stack([_overlapped(occupancy.bits, min(2.0**k, bound) / bound) for k in range(levels)])
-    else:
-        raise NergError(
-            f"cascades of {occupancy.resolution}^3 cells to a bound of {occupancy.bound:g} have no torch-ngp form"
-        )
-    packed = np.zeros((levels, _CELLS**3), bool)
-    packed[:, morton_order()] = bits.reshape(levels, -1)
-    return np.packbits(packed.ravel(), bitorder="little")
-
-
-def _overlapped(bits: np.ndarray, share: float) -> np.ndarray:
-    """Which cells of 128^3 over the middle ``share`` of the cube overlap an occupied cell of ``bits``."""
-    n = len(bits)
-    edges = (np.linspace(-share, share, _CELLS + 1) + 1) / 2 * n
-    first = np.clip(np.floor(edges[:-1] + 1e-9).astype(int), 0, n - 1)
-    last = np.clip(np.ceil(edges[1:] - 1e-9).astype(int), 1, n)
-    for axis in range(3):
-        counts = np.concatenate([np.zeros_like(bits.take([0], axis), int), np.cumsum(bits, axis, dtype=int)], axis)
-        bits = counts.take(last, axis) > counts.take(first, axis)
-    return bits
 
 
 def write_torch_ngp(field: RadianceField, path: str | Path) -> None:

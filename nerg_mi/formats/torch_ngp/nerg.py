@@ -16,7 +16,8 @@ from nerg_mi.files.bounded import plain
 from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.box import Box
 
-from .fields import Given, StateDict, decimals, grid, grid_config, open_checkpoint, origin, radiance_field, sh_degree
+from .fields import Given, radiance_field
+from .state_dict import StateDict, decimals, grid, grid_config, open_checkpoint, origin, sh_degree
 from .unpickling import NamedValue
 
 _VARIANTS = {"Emit": "emit", "Capture": "capture", "EmitCapture": "emit_capture"}

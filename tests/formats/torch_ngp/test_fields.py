@@ -8,7 +8,8 @@ import pytest
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance, save_radiance
-from nerg_mi.formats.torch_ngp.fields import Given, morton_order, read_torch_ngp, write_torch_ngp
+from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp, write_torch_ngp
+from nerg_mi.formats.torch_ngp.occupancy import bitfield, morton_order
 from nerg_mi.formats.torch_ngp.pickling import write_torch
 from nerg_mi.maths.box import Box
 from tests.reference import torch_ngp_numpy as reference
@@ -252,11 +253,10 @@ def test11_fields_without_a_torch_ngp_form(tmp_path):
 def test12_a_plain_grid_becomes_cascades(tmp_path):
     # Every cell of a cascade that overlaps an occupied one is set, and no other.
     from nerg_mi.field.occupancy import OccupancyGrid
-    from nerg_mi.formats.torch_ngp.fields import _bitfield
 
     bits = np.zeros((6, 6, 6), bool)
     bits[1, 2, 3] = bits[5, 5, 0] = True
-    packed = _bitfield(OccupancyGrid(bits, ns, 0.1), 2.0)
+    packed = bitfield(OccupancyGrid(bits, ns, 0.1), 2.0)
     p = np.random.default_rng(1).uniform(-2, 2, (20000, 3)).astype(np.float32)
     cell = np.clip((p / 4 + 0.5) * 6, 0, 5).astype(int)
     true = bits[cell[:, 2], cell[:, 1], cell[:, 0]]
