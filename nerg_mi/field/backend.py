@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 
 
-def namespace(source: object) -> ModuleType:
+def namespace(source: str | dr.ArrayBase | type[dr.ArrayBase]) -> ModuleType:
     """Module holding the differentiable array types of a backend.
 
     ``source``: a Mitsuba variant name (``"llvm_ad_rgb"``), ``"llvm"``,

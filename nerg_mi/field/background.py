@@ -1,13 +1,14 @@
 """Colour behind everything, on a sphere around the scene: torch-ngp's background network.
 
 The ray's far intersection with the sphere, as two angles, goes through a small 2-D hash grid; its features
-and the harmonics of the direction go through a small network to a colour.
+and the harmonics of the direction go through a small network to a colour (``NeRFNetwork.background`` there).
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from types import ModuleType
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -22,12 +23,17 @@ from .mlp import MLP
 
 @dataclass(frozen=True)
 class BackgroundConfig:
-    """``radius`` of the sphere about the field's origin, in the field's units, and the sizes. Defaults: torch-ngp's."""
+    """Sizes of a background. The defaults are torch-ngp's. Raises ``ValueError`` for sizes that none has."""
 
+    # Of the sphere about the field's origin, in the field's units.
     radius: float
+    # The encoding of the two angles.
     grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=4, dimensions=2))
+    # Neurons of every hidden layer.
     width: int = 64
+    # Hidden layers.
     hidden: int = 1
+    # Degree of the encoding of directions.
     sh_degree: int = 4
 
     def __post_init__(self):
@@ -38,20 +44,26 @@ class BackgroundConfig:
 
     @property
     def sizes(self) -> list[int]:
+        """Sizes of the network's layers, [inputs, ..., 3]."""
         return [self.sh_degree**2 + self.grid.size] + [self.width] * self.hidden + [3]
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object that stands in a checkpoint."""
         return {**asdict(self), "grid": self.grid.to_dict()}
 
     @staticmethod
-    def from_dict(d: dict) -> BackgroundConfig:
+    def from_dict(d: dict[str, Any]) -> BackgroundConfig:
+        """The configuration that ``to_dict`` made ``d`` of. Raises ``KeyError``, ``TypeError`` or ``ValueError``."""
         return BackgroundConfig(**{**d, "grid": encoding_config(d["grid"])})
 
 
 class Background:
-    """Colour (0..1, in the colour space of its radiance field) that rays meet behind the field."""
+    """Colour (0..1, in the colour space of its radiance field) that rays meet behind the field.
 
-    DRJIT_STRUCT = {"grid": None, "net": None}
+    Raises ``ValueError`` for parts that are not those of ``config``.
+    """
+
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"grid": None, "net": None}
 
     def __init__(self, config: BackgroundConfig, grid: Encoding, net: MLP):
         grid.require(config.grid)

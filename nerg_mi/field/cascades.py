@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from types import ModuleType
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
 
-from .occupancy import OccupancyGrid
+from .occupancy import chessboard
 
 _MOST_PARTS = 64
 _MOST_CELLS = 1 << 24
@@ -21,14 +22,14 @@ class CascadeGrid:
     ``OccupancyGrid``.
     """
 
-    DRJIT_STRUCT = {"distance": None}
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"distance": None}
 
     def __init__(self, bits: np.ndarray, bound: float, ns: ModuleType, threshold: float):
         bits = np.asarray(bits, bool)
         if bits.ndim != 4 or len(set(bits.shape[1:])) != 1 or bits.shape[1] % 2 or len(bits) != levels_of(bound):
             raise ValueError(
-                f"cascades of a bound of {bound} are {levels_of(bound)} cubes with an even number of cells along each edge, "
-                f"got shape {bits.shape}"
+                f"cascades of a bound of {bound} are {levels_of(bound)} cubes with an even number of cells along each "
+                f"edge, got shape {bits.shape}"
             )
         self.bits, self.bound, self.threshold = bits, float(bound), float(threshold)
         r = bits.shape[1]
@@ -43,8 +44,8 @@ class CascadeGrid:
         self.cells = (r * self._ratios[-1],) * 3
         if self.cells[0] > _MOST_CELLS:
             raise ValueError(
-                f"cascades of {r} cells to a bound of {bound} need {self.cells[0]} equal cells along an edge, and float32 "
-                f"tells at most {_MOST_CELLS} apart"
+                f"cascades of {r} cells to a bound of {bound} need {self.cells[0]} equal cells along an edge, and "
+                f"float32 tells at most {_MOST_CELLS} apart"
             )
         self.distance = ns.UInt8(np.stack(self._distances()).ravel())
 
@@ -79,7 +80,7 @@ class CascadeGrid:
             last = level + 1 == len(self.bits)
             # What lies around a level is not known to be empty, except around the last.
             padded = np.pad(full, 1, constant_values=not last)
-            reach = OccupancyGrid._chessboard(padded)[1:-1, 1:-1, 1:-1]
+            reach = chessboard(padded)[1:-1, 1:-1, 1:-1]
             out.append(np.where(bits, 0, np.maximum(reach, 1)).astype(np.uint8))
             finer, inner = full, self._halves[level]
         return out
@@ -122,11 +123,13 @@ class CascadeGrid:
         return dr.select(k > 1, (k - 1) * ratio + 1, k)
 
     def packed(self) -> np.ndarray:
-        """The bits as bytes, level by level, x fastest, lowest bit first."""
+        """The bits as bytes, level by level, x fastest, lowest bit first; see ``from_packed``."""
         return np.packbits(self.bits.ravel(), bitorder="little")
 
     @staticmethod
     def from_packed(data: np.ndarray, resolution: int, bound: float, ns: ModuleType, threshold: float) -> CascadeGrid:
+        """The cascades of ``resolution`` cells an edge whose ``packed`` bits are ``data`` (uint8); ``ValueError`` if
+        they are too few."""
         count = levels_of(bound) * resolution**3
         if data.size * 8 < count:
             raise ValueError(
@@ -137,7 +140,7 @@ class CascadeGrid:
 
 
 def levels_of(bound: float) -> int:
-    """Number of cubes that torch-ngp keeps for a scene of [-bound, bound]³."""
+    """Number of cubes that torch-ngp keeps for a scene of [-bound, bound]³; ``ValueError`` for a bound below 1."""
     if not (np.isfinite(bound) and bound >= 1):
         raise ValueError(f"the bound of cascades must be at least 1, got {bound}")
     return 1 + int(np.ceil(np.log2(bound)))

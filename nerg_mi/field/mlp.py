@@ -9,6 +9,7 @@ atomically accumulated outer products of cooperative vectors; best for training)
 from __future__ import annotations
 
 from types import ModuleType
+from typing import Any, ClassVar
 
 import drjit as dr
 import drjit.nn as nn
@@ -16,7 +17,7 @@ import numpy as np
 
 from .backend import is_cuda, namespace
 
-# torch's LayerNorm adds it to the variance.
+# torch's LayerNorm (Ba et al. 2016) adds it to the variance.
 _NORM_EPSILON = 1e-5
 
 
@@ -29,10 +30,10 @@ class MLP:
 
     ``norms``: None, or for each layer ``{"gain", "shift", "bias"}``, TensorXf of shapes (inputs,), (inputs,)
     and (outputs,): its inputs go through torch's LayerNorm (gain and shift included) first, and the bias is
-    added to what it returns.
+    added to what it returns. Raises ``ValueError`` for layers that do not fit together.
     """
 
-    DRJIT_STRUCT = {"weights": list, "norms": None, "_views": None, "buffer": None}
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"weights": list, "norms": None, "_views": None, "buffer": None}
 
     def __init__(self, weights: list, norms: list | None = None):
         self.weights = list(weights)
@@ -99,10 +100,12 @@ class MLP:
 
     @property
     def inputs(self) -> int:
+        """Numbers that the first layer takes."""
         return self.weights[0].shape[1]
 
     @property
     def outputs(self) -> int:
+        """Numbers that the last layer returns."""
         return self.weights[-1].shape[0]
 
     def pack(self) -> None:

@@ -8,6 +8,7 @@ cells with one look-up.
 from __future__ import annotations
 
 from types import ModuleType
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -18,12 +19,12 @@ _FAR = 255
 class OccupancyGrid:
     """Grid over the unit cube, x varying fastest.
 
-    ``bits``: bool array, indexed [z, y, x] (a field's has equal edges, R). ``threshold``: the density
-    (1/unit) below which a cell counts as empty; it is the bound that skipping
-    rests on and is recorded in checkpoints.
+    ``bits``: bool array, indexed [z, y, x] (a field's has equal edges, R). ``threshold``: the density (1/unit) below
+    which a cell counts as empty; it is the bound that skipping rests on and is recorded in checkpoints. Raises
+    ``ValueError`` for bits without three axes.
     """
 
-    DRJIT_STRUCT = {"distance": None}
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {"distance": None}
 
     def __init__(self, bits: np.ndarray, ns: ModuleType, threshold: float):
         bits = np.asarray(bits, bool)
@@ -31,16 +32,7 @@ class OccupancyGrid:
             raise ValueError(f"an occupancy grid has three axes of at least one cell, got shape {bits.shape}")
         self.bits, self.threshold = bits, float(threshold)
         self.cells = bits.shape[::-1]
-        self.distance = ns.UInt8(self._chessboard(bits).ravel())
-
-    @staticmethod
-    def _chessboard(bits: np.ndarray) -> np.ndarray:
-        """Chessboard distance in cells to the nearest occupied cell, 0..255 (0: occupied)."""
-        if not bits.any():
-            return np.full(bits.shape, _FAR, np.uint8)
-        from scipy.ndimage import distance_transform_cdt
-
-        return np.minimum(distance_transform_cdt(~bits, metric="chessboard"), _FAR).astype(np.uint8)
+        self.distance = ns.UInt8(chessboard(bits).ravel())
 
     @property
     def resolution(self) -> int:
@@ -70,9 +62,20 @@ class OccupancyGrid:
 
     @staticmethod
     def from_packed(data: np.ndarray, resolution: int, ns: ModuleType, threshold: float) -> OccupancyGrid:
+        """The cubic grid of ``resolution`` cells an edge whose ``packed`` bits are ``data`` (uint8); ``ValueError`` if
+        they are too few."""
         if data.size * 8 < resolution**3:
             raise ValueError(
                 f"an occupancy grid of resolution {resolution} needs {resolution**3 // 8} bytes, got {data.size}"
             )
         bits = np.unpackbits(data, bitorder="little")[: resolution**3].reshape((resolution,) * 3)
         return OccupancyGrid(bits.astype(bool), ns, threshold)
+
+
+def chessboard(bits: np.ndarray) -> np.ndarray:
+    """Chessboard distance in cells to the nearest occupied one, 0..255 (uint8, 0: occupied), of a bool array."""
+    if not bits.any():
+        return np.full(bits.shape, _FAR, np.uint8)
+    from scipy.ndimage import distance_transform_cdt
+
+    return np.minimum(distance_transform_cdt(~bits, metric="chessboard"), _FAR).astype(np.uint8)

@@ -1,14 +1,16 @@
 """The radiance field: density and view-dependent colour at a point.
 
-Architecture of instant-ngp (Müller et al. 2022) as torch-ngp and the paper use
-it: hash grid -> density net -> (log density, geometry features); spherical
-harmonics of the direction and the geometry features -> colour net -> sigmoid.
+    (h, g) = density_net(encoding(p)),   σ(p) = density_scale · exp(h),   c(p, d) = sigmoid(color_net(Y(d), g))
+
+with Y the spherical harmonics of the direction: NeRF (Mildenhall et al. 2020, section 3) in the architecture of
+instant-ngp (Müller et al. 2022, section 5.4) as torch-ngp and the paper use it.
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from types import ModuleType
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -31,20 +33,21 @@ _MAX_LOG_DENSITY = 30.0
 
 @dataclass(frozen=True)
 class RadianceConfig:
-    """Sizes of the networks. The defaults are the paper's.
+    """Sizes of the networks. The defaults are the paper's. Raises ``ValueError`` for sizes that no field has."""
 
-    ``density_hidden`` / ``color_hidden``: hidden layers of ``width`` neurons;
-    ``geometry``: features handed from the density net to the colour net;
-    ``sh_degree``: degree of the direction encoding (``sh_degree**2`` numbers);
-    ``density_scale``: density, in 1/unit, where the density net returns 0.
-    """
-
+    # The encoding of positions.
     grid: EncodingConfig = field(default_factory=HashGridConfig)
+    # Neurons of every hidden layer.
     width: int = 64
+    # Hidden layers of the density net.
     density_hidden: int = 1
+    # Hidden layers of the colour net.
     color_hidden: int = 2
+    # Features handed from the density net to the colour net.
     geometry: int = 15
+    # Degree of the encoding of directions, which has sh_degree**2 numbers.
     sh_degree: int = 4
+    # Density, in 1/unit, where the density net returns 0.
     density_scale: float = 1.0
 
     def __post_init__(self):
@@ -55,22 +58,26 @@ class RadianceConfig:
 
     @property
     def density_sizes(self) -> list[int]:
+        """Sizes of the density net's layers, [inputs, ..., outputs]: the first output is the log density."""
         return [self.grid.size] + [self.width] * self.density_hidden + [1 + self.geometry]
 
     @property
     def color_sizes(self) -> list[int]:
+        """Sizes of the colour net's layers, [inputs, ..., 3]."""
         return [self.sh_degree**2 + self.geometry] + [self.width] * self.color_hidden + [3]
 
-    def to_dict(self) -> dict:
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object that stands in a checkpoint."""
         return {**asdict(self), "grid": self.grid.to_dict()}
 
     @staticmethod
-    def from_dict(d: dict) -> RadianceConfig:
+    def from_dict(d: dict[str, Any]) -> RadianceConfig:
+        """The configuration that ``to_dict`` made ``d`` of. Raises ``KeyError``, ``TypeError`` or ``ValueError``."""
         return RadianceConfig(**{**d, "grid": encoding_config(d["grid"])})
 
 
 def assign(field, values: dict) -> None:
-    """Replace parameters of a field by name, each by one of the same shape."""
+    """Replace parameters of a field by name, each by one of the same shape. Raises ``ValueError`` for others."""
     known = field.parameters()
     for name, value in values.items():
         if name not in known:
@@ -95,14 +102,14 @@ def sigmoid(x):
 class RadianceField:
     """Density (1/unit) and colour at points of ``box``.
 
-    ``color_space``: ``"srgb"`` or ``"linear"``, the space in which samples are
-    composited because the field was trained in it. ``occupancy``: where density
-    may exceed its threshold; None marches the whole box.
-    ``march_step``: step length, in units, that the field was trained with. ``background``: colour behind
-    the field where it was trained with one: what a ray shows in ``color_space`` is then C + (1 - α) background(o, d).
+    ``color_space``: ``"srgb"`` or ``"linear"``, the space in which samples are composited because the field was trained
+    in it. ``occupancy``: where density may exceed its threshold; None marches the whole box. ``march_step``: step
+    length, in units, that the field was trained with. ``background``: colour behind the field where it was trained with
+    one: what a ray shows in ``color_space`` is then C + (1 - α) background(o, d). Raises ``ValueError`` for parts that
+    are not those of ``config``.
     """
 
-    DRJIT_STRUCT = {
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = {
         "grid": None,
         "density_net": None,
         "color_net": None,
@@ -160,10 +167,12 @@ class RadianceField:
 
     @property
     def background_grid(self) -> Encoding:
+        """The encoding of the background, under the name that its parameters have."""
         return self.background.grid
 
     @property
     def background_net(self) -> MLP:
+        """The network of the background, under the name that its parameters have."""
         return self.background.net
 
     def set_parameters(self, values: dict) -> None:

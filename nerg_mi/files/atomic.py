@@ -20,7 +20,9 @@ from nerg_mi.errors import NergError
 _REMEDIES = {
     errno.ENOSPC: "the disk is full; free some space or choose another folder",
     errno.EDQUOT: "your quota is used up; free some space or choose another folder",
-    errno.EFBIG: "the file would exceed the largest size that is allowed here; raise the limit or choose a smaller output",
+    errno.EFBIG: (
+        "the file would exceed the largest size that is allowed here; raise the limit or choose a smaller output"
+    ),
     errno.EACCES: "you may not write there; choose another folder or change its permissions",
     errno.EPERM: "you may not write there; choose another folder or change its permissions",
     errno.EROFS: "the file system is read-only; choose another folder",

@@ -85,8 +85,8 @@ def _contents(f, path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
         )
     if metadata.get("format") != FORMAT:
         raise NergError(
-            f'"{path}" has checkpoint format {plain(metadata.get("format"), 40)}, and this version reads format {FORMAT}: '
-            "use a newer nerg_mi, or train the field anew"
+            f'"{path}" has checkpoint format {plain(metadata.get("format"), 40)}, and this version reads '
+            f"format {FORMAT}: use a newer nerg_mi, or train the field anew"
         )
     if not isinstance(metadata.get("provenance", {}), dict):
         raise NergError(f'the metadata of "{path}" are damaged: "provenance" must be a JSON object; copy it again')

@@ -67,7 +67,8 @@ def mesh(
         faces = faces[hidden[faces].sum(1) < 2]
         if len(faces) == 0:
             raise NergError(
-                "no face of this surface has free space in front of it: the occupancy grid ends in it everywhere; keep all faces with --unseen"
+                "no face of this surface has free space in front of it: the occupancy grid ends in it everywhere; "
+                "keep all faces with --unseen"
             )
     left = len(faces)
     body = trimesh.Trimesh(vertices, faces[:, ::-1] if _inside_out(vertices, faces, sampler) else faces, process=False)

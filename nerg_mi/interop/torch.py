@@ -1,5 +1,7 @@
 """Fields as ``torch.nn.Module``: forward and backward through Dr.Jit, weights as torch parameters.
 
+::
+
     module = RadianceModule(load_radiance("field.safetensors", namespace("llvm"))[0])
     optimizer = torch.optim.Adam(module.parameters(), 1e-2)
     sigma, color = module(p, d)
@@ -68,8 +70,8 @@ class _FieldModule(torch.nn.Module):
             rows = t.ndim == 2 and t.shape[1] == 3 and len(count) == 1
             if not rows or t.dtype != torch.float32 or t.device.type != self.device_type:
                 raise ValueError(
-                    f"{name} must be a float32 tensor (N, 3) on {self.device_type}, of one N with the others, got {t.dtype} "
-                    f"{tuple(t.shape)} on {t.device.type}"
+                    f"{name} must be a float32 tensor (N, 3) on {self.device_type}, of one N with the others, got "
+                    f"{t.dtype} {tuple(t.shape)} on {t.device.type}"
                 )
         return [t.contiguous() for t in tensors.values()]
 
@@ -124,9 +126,10 @@ class RadianceModule(_FieldModule):
 class GazeModule(_FieldModule):
     """The gaze density of a gaze field, be it normalised over the observer's sphere or not.
 
-        around = GazeIntegral(GazeMedium(field), place, p_o, settings, "median", 0.5)      # directions, their depths,
-        what escapes Z = module.integral(p_od, p_o, r_o, escaped)                                       # at all of its
-        directions gaze = module(p_od, p_o, r_o, Z)
+    A normalised field's integral is found once an observer, over directions of equal area::
+
+        Z = module.integral(p_od, p_o, r_o, escaped)  # everywhere around the observer
+        gaze = module(p_od, p_o, r_o, Z)  # anywhere
 
     Raises `NergError` for an ensemble, whose members are modules each.
     """
@@ -134,7 +137,8 @@ class GazeModule(_FieldModule):
     def __init__(self, field: GazeField | LogGazeField):
         if isinstance(field, GazeEnsemble):
             raise NergError(
-                f"an ensemble of {len(field.members)} gaze fields is no module: make one of each of its members, and average what they return"
+                f"an ensemble of {len(field.members)} gaze fields is no module: make one of each of its members, and "
+                "average what they return"
             )
         super().__init__(field)
 
@@ -154,7 +158,8 @@ class GazeModule(_FieldModule):
         """
         if self._field.config.normalized and integral is None:
             raise ValueError(
-                'this gaze field is normalised over the observer\'s sphere: give its "integral" there, which the method integral finds'
+                'this gaze field is normalised over the observer\'s sphere: give its "integral" there, which the '
+                "method integral finds"
             )
         extra = self._extra(len(p_od), 1.0 if integral is None else integral, escaped)
         evaluate = lambda field, p, o, r, e: [field.evaluate(p, o, r, integral=e.x, escaped=e.y > 0.5)[0]]

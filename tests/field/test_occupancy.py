@@ -72,4 +72,4 @@ def test07_grids_with_unequal_edges():
     centres = (np.stack([x, y, z], -1).reshape(-1, 3) + 0.5) / (7, 5, 2)
     assert np.array_equal(grid.empty_cells(ns.Array3f(centres.T)).numpy(), brute_force(bits).ravel())
     with pytest.raises(ValueError, match="no single resolution"):
-        grid.resolution
+        _ = grid.resolution

@@ -38,13 +38,13 @@ def test_what_a_damaged_file_raises_becomes_one_sentence(error):
 
 def test_programming_errors_and_finished_sentences_pass():
     with pytest.raises(TypeError), reading("a.bin"):
-        None + 1
+        _ = None + 1
     with pytest.raises(NergError, match="^as it is$"), reading("a.bin"):
         raise NergError("as it is")
     with pytest.raises(AttributeError), reading("a.bin"):
-        None.shape
+        _ = None.shape
     with pytest.raises(NergError), reading("a.bin", also=(AttributeError,)):
-        None.shape
+        _ = None.shape
 
 
 def test_the_safetensors_library_is_known_by_name(tmp_path):

@@ -91,8 +91,8 @@ assert dr.thread_count() == 1
 def test_a_scene_with_an_exr_file_is_read_with_one_thread(tmp_path):
     # Nor does its reader.
     write_exr(tmp_path / "sky.exr", {c: np.ones((8, 16), np.float32) for c in "RGB"})
-    text = '<scene version="3.0.0"><emitter type="envmap"><string name="filename" value="sky.exr"/></emitter><sensor type="perspective"/></scene>'
-    (tmp_path / "scene.xml").write_text(text)
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{sky}<sensor type="perspective"/></scene>')
     subprocess.run([sys.executable, "-c", _READ, str(tmp_path / "scene.xml")], check=True, timeout=120)
 
 

@@ -26,7 +26,7 @@ def encode(x, embeddings, offsets, finest, bound):
     for level in range(levels):
         rows = int(offsets[level + 1] - offsets[level])
         scale = F(np.exp2(F(level) * s) * F(16) - F(1))
-        resolution = int(math.ceil(scale)) + 1
+        resolution = math.ceil(scale) + 1
         # fmaf(x, scale, 0.5): float64 holds the product of two float32 exactly.
         pos = (x.astype(np.float64) * np.float64(scale) + 0.5).astype(F)
         cell = np.floor(pos).astype(np.uint32)

@@ -71,8 +71,8 @@ class StoredTensor:
         last = self._offset + sum((n - 1) * s for n, s in zip(self.shape, stride))
         if last >= len(flat) or math.prod(self.shape) > max(len(flat), EXPANDED):
             raise NergError(
-                f'a tensor of "{path}" of shape {plain(self.shape)} lies outside of its storage of {len(flat)} numbers; '
-                "copy the file again"
+                f'a tensor of "{path}" of shape {plain(self.shape)} lies outside of its storage of {len(flat)} '
+                "numbers; copy the file again"
             )
         strides = [s * flat.itemsize for s in stride]
         with reading(path, "checkpoint"):

@@ -41,19 +41,22 @@ MARCH_STEP = 2 * math.sqrt(3) / 1024
 
 @dataclass(frozen=True)
 class Given:
-    """What the user says of a checkpoint because the file does not.
+    """What the user says of a checkpoint because the file does not."""
 
-    ``finest``: resolution of the finest level where it is not 2048 (gaze fields: 256) x bound; ``color_space``:
-    the space that colours were trained in; ``background_radius``: of the background network's sphere.
-    """
-
+    # The space that colours were trained in.
     color_space: str = "srgb"
+    # Resolution of the finest level where it is not 2048 (of gaze fields: 256) x bound.
     finest: int | None = None
+    # Of the background network's sphere, in the field's units; 0 leaves the network out.
     background_radius: float | None = None
 
 
+AS_TRAINED_BY_DEFAULT = Given()
+"""What holds for a checkpoint that torch-ngp's own defaults have trained."""
+
+
 def read_torch_ngp(
-    path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = Given()
+    path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = AS_TRAINED_BY_DEFAULT
 ) -> tuple[RadianceField, dict]:
     """The radiance field in a torch-ngp checkpoint on backend ``ns``, and what to say about its origin (JSON)."""
     whole, model = open_checkpoint(path)

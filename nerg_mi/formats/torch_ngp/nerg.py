@@ -16,7 +16,7 @@ from nerg_mi.files.bounded import plain
 from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.box import Box
 
-from .fields import Given, radiance_field
+from .fields import AS_TRAINED_BY_DEFAULT, Given, radiance_field
 from .state_dict import StateDict, decimals, grid, grid_config, open_checkpoint, origin, sh_degree
 from .unpickling import NamedValue
 
@@ -33,7 +33,7 @@ def is_nerg(model: dict) -> bool:
 
 
 def read_nerg(
-    path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = Given()
+    path: str | Path, ns: ModuleType, ema: bool | None = None, given: Given = AS_TRAINED_BY_DEFAULT
 ) -> tuple[RadianceField | None, GazeField, dict]:
     """Radiance field (None where the file holds none), gaze field and origin (JSON) of a NeRG checkpoint.
 
@@ -61,8 +61,9 @@ def _variant(state: StateDict, stored) -> str:
     if name is None:
         name = {(True, True): "EmitCapture", (True, False): "Emit", (False, True): "Capture"}.get((emit, capture))
     if not isinstance(name, str) or name not in _VARIANTS or any(n.startswith("attend_head.") for n in state.names()):
+        said = plain(name, 40) if isinstance(name, str) else "unknown"
         raise NergError(
-            f'"{state.path}" is of the variant {plain(name, 40) if isinstance(name, str) else "unknown"}; {", ".join(_VARIANTS)} are read, '
+            f'"{state.path}" is of the variant {said}; {", ".join(_VARIANTS)} are read, '
             "the others need the NeRF's features along the ray or an attention block"
         )
     if any(n.startswith("capture_head.") and n != "capture_head.weight" for n in state.names()):

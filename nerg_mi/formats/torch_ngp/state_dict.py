@@ -88,7 +88,8 @@ def averaged_weights(path: str | Path, whole: dict, model: dict, wanted: bool | 
     names = [k for k in model if k.endswith((".embeddings", ".weight", ".bias"))]
     if [tuple(model[k].shape) for k in names] != [tuple(v.shape) for v in shadow]:
         raise NergError(
-            f'the {len(shadow)} moving averages of "{path}" do not fit its {len(names)} weights: import these with --no-ema'
+            f'the {len(shadow)} moving averages of "{path}" do not fit its {len(names)} weights: '
+            "import these with --no-ema"
         )
     return dict(zip(names, shadow))
 
@@ -130,15 +131,16 @@ def grid_config(state: StateDict, name: str, finest: float, dimensions: int = 3)
     levels, largest = len(offsets) - 1, max(np.diff(offsets), default=0)
     if not 1 <= levels <= _LEVELS or largest < 8 or len(table) != 2:
         raise NergError(
-            f'the hash grid "{state.prefix}{name}" of "{state.path}" has no levels, or more than {_LEVELS}; copy it again'
+            f'the hash grid "{state.prefix}{name}" of "{state.path}" has no levels, or more than {_LEVELS}; '
+            "copy it again"
         )
     config = HashGridConfig(
         levels, table[1], max(int(largest) - 1, 1).bit_length(), finest=whole(finest), dimensions=dimensions
     )
     if config.offsets() != offsets:
         raise NergError(
-            f'the levels of "{state.prefix}{name}" in "{state.path}" begin at rows {offsets}, which is not a grid from 16 to '
-            f"{finest:g}: give its finest resolution with --finest"
+            f'the levels of "{state.prefix}{name}" in "{state.path}" begin at rows {offsets}, which is not a grid '
+            f"from 16 to {finest:g}: give its finest resolution with --finest"
         )
     return config
 

@@ -15,6 +15,7 @@ import zipfile
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -154,9 +155,9 @@ class _Machine:
             "SHORT_BINSTRING",
         )
     )
-    _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-    _EMPTY = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple, "MARK": lambda: _Machine._MARK}
-    _TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+    _CONSTANTS: ClassVar = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
+    _EMPTY: ClassVar = {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple, "MARK": lambda: _Machine._MARK}
+    _TUPLES: ClassVar = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
     def __init__(self):
         self.stack: list = []
@@ -297,8 +298,8 @@ def read_torch(path: str | Path):
         zipped = zipfile.is_zipfile(path)
     if not zipped:
         raise NergError(
-            f'"{path}" is not a zip archive, as torch.save writes since version 1.6: load it with the torch that wrote it, '
-            "and save it again with a newer one"
+            f'"{path}" is not a zip archive, as torch.save writes since version 1.6: load it with the torch that '
+            "wrote it, and save it again with a newer one"
         )
     archive, machine = TorchArchive(path), _Machine()
     data = archive.record("data.pkl", PICKLE_BYTES)

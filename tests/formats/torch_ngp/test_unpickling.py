@@ -99,7 +99,8 @@ def test03_nothing_else_is_called(tmp_path, thing, name):
 
 def tensor(shape, stride, offset=0, state=b""):
     """A pickle of one tensor on a storage of 4 floats, and of a state set on it afterwards."""
-    out = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x04tQ"
+    out = b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n((X\x07\x00\x00\x00storagectorch\nFloatStorage\n"
+    out += b"X\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x04tQ"
     numbers = lambda values: b"(" + b"".join(f"I{v}\n".encode() for v in values) + b"t"
     return out + f"I{offset}\n".encode() + numbers(shape) + numbers(stride) + b"\x89NtR" + state + b"."
 
