@@ -17,7 +17,7 @@ from nerg_mi.maths.box import Box
 class Ramp:
     """Density 10 + 4 x + 2 y - z in a flat box; its colour depends on where from it is seen."""
 
-    grid, occupancy = SimpleNamespace(table=ns.Float(0)), None
+    ns, occupancy = ns, None
     box = Box((-1, 0, 0.5), (3, 2, 1.5))
 
     def density(self, p, active=True):

@@ -4,44 +4,16 @@ import json
 import math
 import struct
 
-import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 import trimesh
 
-from nerg_mi.field.extraction import Lattice, Sampler, surface_density
+from nerg_mi.field.extraction import Lattice, surface_density
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.formats.surfaces import mesh, points, write_glb, write_ply
-from nerg_mi.formats.volumes import density_and_color, write_volume
 from nerg_mi.maths.box import Box
-
-CENTER, RADIUS = np.array([1.2, 1.0, 0.9]), 0.6
-
-
-class Ball:
-    """Stands in for a radiance field: density in a ball, a speck beside it, and colour from position and direction."""
-
-    def __init__(self, occupancy=None, speck=False, hole=False, color_space="srgb", sharp=200.0):
-        self.box, self.occupancy, self.color_space = Box((0, 0, 0), (2.4, 2, 1.8)), occupancy, color_space
-        self.ns = ns
-        self.speck, self.hole, self.sharp = speck, hole, sharp
-
-    def density(self, p, active=True):
-        to = lambda c: dr.norm(p - ns.Array3f(*c))
-        sigma = self.sharp * dr.exp(60 * (RADIUS - to(CENTER.tolist())))
-        if self.speck:
-            sigma += 1e3 * dr.exp(200 * (0.1 - to([0.2, 0.2, 0.2])))
-        if self.hole:
-            # A shaft along z about one line of lattice points.
-            sigma = dr.select(dr.sqrt((p.x - 1.225) ** 2 + (p.y - 1.025) ** 2) < 0.02, 0, sigma)
-        return dr.select(active & self.box.contains(p), dr.minimum(sigma, 1e4), 0)
-
-    def density_features(self, p, active=True):
-        return self.density(p, active), [p.x, p.y, p.z]
-
-    def color(self, features, d):
-        return ns.Array3f(features[0] / 2.4, 0.5 + 0.1 * d.z, 0.25)
+from tests.formats.ball import CENTER, RADIUS, Ball
 
 
 def expected_radius(ball, threshold):
@@ -136,31 +108,3 @@ def test05_files(tmp_path):
         np.allclose(rgba[:, 0], triangles.vertices[:, 0] / 2.4, atol=1e-4)
         and len(raw) == struct.unpack("<I", raw[8:12])[0]
     )
-
-
-def test06_voxels_render_as_the_field(rgb, tmp_path):
-    ball = Ball()
-    density, color, lower, upper = density_and_color(ball, 24, samples=3)
-    assert density.shape == (18, 20, 24) and np.allclose(lower, 0) and np.allclose(upper, ball.box.upper)
-    cell = 0.1
-    points_of = lambda x, y, z: (
-        (np.stack(np.meshgrid(*[(np.arange(3) + 0.5) / 3] * 3), -1).reshape(-1, 3) + [x, y, z]) * cell
-    )
-    for x, y, z in ((6, 9, 8), (5, 9, 8), (5, 8, 8), (8, 9, 8)):
-        share = np.mean(-np.expm1(-Sampler(ball).density(points_of(x, y, z)) * cell))
-        assert np.isclose(density[z, y, x], min(-math.log(max(1 - share, 1e-9)), 5) / cell, rtol=1e-3)
-    # On the surface, from the side that the surface faces: its green depends on z of the direction alone.
-    assert np.allclose(color[8, 9, 6, 0], ((1.2 - 0.6) / 2.4 / 1.055 + 0.055 / 1.055) ** 2.4, atol=0.01)
-    assert np.allclose(color[8, 9, 6, 1], ((0.5 + 0.055) / 1.055) ** 2.4, atol=0.01)
-    assert np.array_equal(color[8, 9, 3], color[8, 9, 4]) and not color[0, 0, 0].any()
-    write_volume(tmp_path / "d.vol", density, lower, upper)
-    write_volume(tmp_path / "c.vol", color, lower, upper)
-    for name, data in (("d", density), ("c", color)):
-        volume = rgb.load_dict(
-            {"type": "gridvolume", "filename": str(tmp_path / f"{name}.vol"), "use_grid_bbox": True, "raw": True}
-        )
-        assert np.allclose(volume.bbox().max, upper)
-        it = dr.zeros(rgb.Interaction3f)
-        it.p = rgb.Point3f(*((np.array([6, 9, 8]) + 0.5) * cell).tolist())
-        got = np.ravel(volume.eval_1(it) if name == "d" else volume.eval_3(it))
-        assert np.allclose(got, data[8, 9, 6], rtol=1e-4)

@@ -9,7 +9,6 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_radiance, save_radiance
 from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp, write_torch_ngp
-from nerg_mi.formats.torch_ngp.occupancy import bitfield, morton_order
 from nerg_mi.formats.torch_ngp.pickling import write_torch
 from nerg_mi.maths.box import Box
 from tests.reference import torch_ngp_numpy as reference
@@ -80,44 +79,6 @@ def test01_equals_the_restatement(tmp_path, bound, behind):
     assert field.march_step == pytest.approx(2 * 3**0.5 / 1024)
 
 
-@pytest.mark.parametrize("bound", [1, 2, 5, 2.7])
-def test02_marching_sees_the_kernels_bits(tmp_path, bound):
-    rng = np.random.default_rng(4)
-    state = reference.nerf_state(bound, rng, filled=0.02)
-    field, _ = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns)
-    p = rng.uniform(-bound, bound, (20000, 3)).astype(np.float32)
-    k = field.occupancy.empty_cells(field.box.to_unit(ns.Array3f(p.T))).numpy()
-    # Points within rounding of a cell's face may fall on either side of it: 128 is the finest, 0.5 b the largest cell.
-    cells = (p[:, :, None] / np.minimum(2.0 ** np.arange(4), bound) + 1) * 64
-    clear = np.abs(cells - np.round(cells)).min((1, 2)) > 1e-4
-    assert clear.mean() > 0.95
-    assert np.array_equal((k == 0)[clear], reference.occupied(state["density_bitfield"], bound, p)[clear])
-    assert np.isclose(field.occupancy.fraction, 0.02, rtol=0.05)
-
-
-@pytest.mark.parametrize("bound", [2, 5])
-def test03_what_may_be_leapt_over_is_empty(tmp_path, bound):
-    # Cells less than k away, of the grid that marching sees, hold nothing.
-    rng = np.random.default_rng(5)
-    state = reference.nerf_state(bound, rng, filled=2e-6)
-    grid = read_torch_ngp(save(tmp_path / "ngp.pth", state), ns)[0].occupancy
-    p = rng.uniform(-bound, bound, (3000, 3)).astype(np.float32)
-    u = ((p + bound) / (2 * bound)).astype(np.float32)
-    k, n = grid.empty_cells(ns.Array3f(u.T)).numpy().astype(int), grid.cells[0]
-    assert (k > 20).mean() > 0.3 and n == 128 * bound
-    low = np.floor(u.astype(np.float64) * n) - (k[:, None] - 1)
-    for _ in range(40):
-        inside = (low + rng.random((len(p), 3)) * (2 * k[:, None] - 1)) / n
-        inside = np.clip(inside, 1e-6, 1 - 1e-6)
-        q = ((inside * 2 - 1) * bound).astype(np.float32)
-        assert not reference.occupied(state["density_bitfield"], bound, q)[k > 0].any()
-
-
-def test04_morton_order():
-    z, y, x = np.indices((128, 128, 128)).reshape(3, -1)
-    assert np.array_equal(morton_order(), reference.morton(x, y, z))
-
-
 def test05_there_and_back_is_exact(tmp_path, torch):
     for bound, behind in ((1, False), (2.7, True)):
         state = reference.nerf_state(bound, np.random.default_rng(6), behind)
@@ -132,55 +93,6 @@ def test05_there_and_back_is_exact(tmp_path, torch):
         for name, value in state.items():
             assert np.array_equal(back["model"][name].numpy(), value), name
             assert back["model"][name].numpy().dtype == value.dtype
-
-
-def test06_moving_averages(tmp_path, torch):
-    # As torch itself writes it: with an optimiser, parameters, half-precision and numpy numbers in the statistics.
-    state = reference.nerf_state(1, np.random.default_rng(7))
-    weights = [k for k in state if k.endswith(("embeddings", "weight"))]
-    shadow = [torch.tensor(state[k]) * 2 for k in weights]
-    adam = torch.optim.Adam([torch.nn.Parameter(torch.ones(3))])
-    adam.param_groups[0]["params"][0].sum().backward()
-    adam.step()
-    torch.save(
-        {
-            "epoch": 3,
-            "global_step": 30,
-            "stats": {"loss": [np.float64(0.5)], "best_result": None},
-            "mean_count": 0,
-            "model": {k: torch.tensor(v) for k, v in state.items()},
-            "optimizer": adam.state_dict(),
-            "ema": {"decay": 0.95, "num_updates": 3, "shadow_params": shadow, "collected_params": None},
-        },
-        tmp_path / "ngp_ep0003.pth",
-    )
-    for ema, factor, said in ((None, 2, "moving averages"), (True, 2, "moving averages"), (False, 1, "raw")):
-        field, origin = read_torch_ngp(tmp_path / "ngp_ep0003.pth", ns, ema)
-        assert np.array_equal(field.color_net.weights[2].numpy(), factor * state["color_net.2.weight"])
-        assert np.array_equal(field.grid.table.numpy()[:100], factor * state["encoder.embeddings"].ravel()[:100])
-        assert origin["weights"] == said and origin["global_step"] == 30
-    with pytest.raises(ValueError, match="holds no moving averages.*--no-ema"):
-        read_torch_ngp(save(tmp_path / "raw.pth", state), ns, ema=True)
-    bad = {"shadow_params": [np.zeros((2, 2), np.float32)]}
-    with pytest.raises(ValueError, match="1 moving averages .* do not fit its 6 weights"):
-        read_torch_ngp(save(tmp_path / "bad.pth", state, ema=bad), ns)
-
-
-def test07_a_density_grid_without_its_bits(tmp_path):
-    rng = np.random.default_rng(8)
-    state = reference.nerf_state(1, rng)
-    bits = np.unpackbits(state["density_bitfield"], bitorder="little").astype(bool)
-    state["density_grid"] = np.where(bits, 5 + rng.random(bits.size), rng.random(bits.size) - 0.5).astype(np.float32)[
-        None
-    ]
-    expected = read_torch_ngp(save(tmp_path / "a.pth", state), ns)[0].occupancy
-    assert 0.49 < expected.threshold <= 0.5
-    del state["density_bitfield"]
-    got = read_torch_ngp(save(tmp_path / "b.pth", state), ns)[0].occupancy
-    # min(mean, 10): the mean of the grid, which lies between both kinds of cells here.
-    assert np.array_equal(got.bits, expected.bits)
-    del state["density_grid"]
-    assert read_torch_ngp(save(tmp_path / "c.pth", state), ns)[0].occupancy is None
 
 
 def test08_a_bare_state_dictionary_and_a_smaller_box(tmp_path):
@@ -248,17 +160,3 @@ def test11_fields_without_a_torch_ngp_form(tmp_path):
     with pytest.raises(ValueError, match="no torch-ngp form: its unit cube must be .*; its grid .*; its networks"):
         write_torch_ngp(field, tmp_path / "x.pth")
     assert not list(tmp_path.iterdir())
-
-
-def test12_a_plain_grid_becomes_cascades(tmp_path):
-    # Every cell of a cascade that overlaps an occupied one is set, and no other.
-    from nerg_mi.field.occupancy import OccupancyGrid
-
-    bits = np.zeros((6, 6, 6), bool)
-    bits[1, 2, 3] = bits[5, 5, 0] = True
-    packed = bitfield(OccupancyGrid(bits, ns, 0.1), 2.0)
-    p = np.random.default_rng(1).uniform(-2, 2, (20000, 3)).astype(np.float32)
-    cell = np.clip((p / 4 + 0.5) * 6, 0, 5).astype(int)
-    true = bits[cell[:, 2], cell[:, 1], cell[:, 0]]
-    got = reference.occupied(packed, 2, p)
-    assert np.all(got[true]) and true.any() and (got & ~true).mean() < 0.02

@@ -22,7 +22,7 @@ STEP, NEAR = 0.1, 0.3
 class Lump:
     """A soft ball in a box, brighter to the right, redder to the camera."""
 
-    box, grid = Box((-1, -1, -1), (1, 1, 1)), SimpleNamespace(table=ns.Float(0))
+    box, ns = Box((-1, -1, -1), (1, 1, 1)), ns
 
     def density(self, p, active=True):
         return dr.select(active, 20 * dr.exp(-12 * dr.squared_norm(p)), 0)
