@@ -11,6 +11,21 @@ from tests.reference import fields_numpy as reference
 SIZES = [[3, 1], [8, 16, 5], [6, 16, 16, 3]]
 
 
+def evaluated_backwards(net, x, mix, mode):
+    """Outputs (N, outputs) at ``x`` (N, inputs), as cooperative vectors ("coop") or tensor products; the weights get
+    the derivatives of their sum weighted by ``mix`` (N, outputs)."""
+    dr.enable_grad(list(net.named().values()))
+    net.pack()
+    if mode == "coop":
+        out = net([ns.Float(c) for c in x.T])
+        value, loss = np.array([o.numpy() for o in out]).T, sum(o * ns.Float(m) for o, m in zip(out, mix.T))
+    else:
+        out = net.tensor(ns.TensorXf(x.T.copy()))
+        value, loss = out.numpy().T, out * ns.TensorXf(mix.T.copy())
+    dr.backward(dr.sum(loss, axis=None))
+    return value
+
+
 def make(sizes, n=50):
     rng = np.random.default_rng(0)
     net = MLP.random(sizes, ns, rng)
@@ -105,16 +120,7 @@ def test07_layer_normalisation(mode):
             h = np.maximum(h, 0) if i == "0" else h
         return h
 
-    dr.enable_grad(list(net.named().values()))
-    net.pack()
-    if mode == "coop":
-        out = net([ns.Float(c) for c in x.T])
-        value, loss = np.array([o.numpy() for o in out]).T, sum(o * ns.Float(m) for o, m in zip(out, mix.T))
-    else:
-        out = net.tensor(ns.TensorXf(x.T.copy()))
-        value, loss = out.numpy().T, out * ns.TensorXf(mix.T.copy())
-    assert np.allclose(value, restated(arrays), atol=1e-5)
-    dr.backward(dr.sum(loss, axis=None))
+    assert np.allclose(evaluated_backwards(net, x, mix, mode), restated(arrays), atol=1e-5)
     for name, array in net.named().items():
         direction, ends = rng.normal(size=array.shape), []
         for h in (1e-6, -1e-6):

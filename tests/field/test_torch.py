@@ -9,6 +9,7 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.mlp import MLP
 from nerg_mi.maths.box import Box
+from tests.field.test_mlp import evaluated_backwards
 
 RNG = np.random.default_rng(0)
 
@@ -28,17 +29,9 @@ def test01_values_and_weight_gradients_of_both_modes(torch):
     out = forward(torch, theirs, torch.tensor(x))
     (out * torch.tensor(mix)).sum().backward()
 
-    for mode in ("cooperative vectors", "tensor products"):
-        dr.enable_grad(net.weights)
-        net.pack()
-        if mode == "cooperative vectors":
-            ours = net([ns.Float(c) for c in x.T])
-            value, loss = np.array([c.numpy() for c in ours]).T, sum(c * ns.Float(m) for c, m in zip(ours, mix.T))
-        else:
-            ours = net.tensor(ns.TensorXf(x.T.copy()))
-            value, loss = ours.numpy().T, ours * ns.TensorXf(mix.T.copy())
+    for mode in ("coop", "tensor"):
+        value = evaluated_backwards(net, x, mix, mode)
         assert np.allclose(value, out.detach().numpy(), rtol=1e-5, atol=1e-6), mode
-        dr.backward(dr.sum(loss, axis=None))
         for a, b in zip(net.weights, theirs):
             assert np.allclose(dr.grad(a).numpy(), b.grad.numpy(), rtol=1e-4, atol=1e-5), mode
         dr.clear_grad(net.weights)

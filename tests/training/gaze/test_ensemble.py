@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.arrays import stored
+from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity

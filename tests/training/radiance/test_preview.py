@@ -1,7 +1,5 @@
 """The trainer's own pictures against a march in NumPy, pixel by pixel, and PSNR by its definition."""
 
-from types import SimpleNamespace
-
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
