@@ -37,8 +37,8 @@ class MLP:
 
     def __init__(self, weights: list, norms: list | None = None):
         self.weights = list(weights)
-        self.norms = None if norms is None else [dict(n) for n in norms]
-        self._views = None
+        self.norms: list[dict[str, Any]] | None = None if norms is None else [dict(n) for n in norms]
+        self._views: Any = None
         # What the kernels read: the packed weights of all layers, attached to ``weights``.
         self.buffer = None
         for first, second in zip(self.weights, self.weights[1:]):
@@ -93,7 +93,7 @@ class MLP:
     def replace(self, name: str, value) -> None:
         """Put ``value`` in the place of the array ``name``; ``pack`` makes it count."""
         layer, _, part = name.partition(".")
-        if part:
+        if part and self.norms is not None:
             self.norms[int(layer)][part] = value
         else:
             self.weights[int(layer)] = value
@@ -114,16 +114,12 @@ class MLP:
         weights = self.weights
         if self.norms is not None:
             # Gain and shift are part of the next product: W (g x + s) + b = (W g) x + (W s + b).
-            folded = [self._folded(i) for i in range(len(weights))]
+            folded = [_folded(w, norm) for w, norm in zip(weights, self.norms)]
             weights = [array for pair in folded for array in pair]
         weights = [ns.TensorXf16(w) if is_cuda(ns) else w for w in weights]
-        packed = nn.pack(*weights, layout="training")
+        packed: Any = nn.pack(*weights, layout="training")
         self._views = [packed] if len(weights) == 1 else list(packed)
         self.buffer = self._views[0].buffer
-
-    def _folded(self, layer: int) -> tuple:
-        w, norm = self.weights[layer], self.norms[layer]
-        return w * norm["gain"], norm["bias"] + dr.sum(w * norm["shift"], axis=1)
 
     def __call__(self, x: list) -> list:
         """Outputs (list of Floats) at inputs ``x`` (list of Floats), as cooperative vectors."""
@@ -136,10 +132,11 @@ class MLP:
         x = [c + dr.zeros(ns.Float, width) if dr.width(c) < width else c for c in x]
         if self.norms is not None:
             return self._normalized(x, ns, half)
+        views: Any = self._views
         v = nn.CoopVec(*([ns.Float16(c) for c in x] if half else x))
-        for i, view in enumerate(self._views):
+        for i, view in enumerate(views):
             v = nn.matvec(view, v)
-            if i + 1 < len(self._views):
+            if i + 1 < len(views):
                 v = dr.maximum(v, 0)
         out = list(v)
         return [ns.Float(c) for c in out] if half else out
@@ -163,8 +160,13 @@ class MLP:
             else:
                 x = x - dr.mean(x, axis=0)
                 x = x * dr.rsqrt(dr.mean(x * x, axis=0) + _NORM_EPSILON)
-                w, bias = self._folded(i)
+                w, bias = _folded(w, self.norms[i])
                 x = w @ x + dr.reshape(type(x), bias, (-1, 1))
             if i + 1 < len(self.weights):
                 x = dr.maximum(x, 0)
         return x
+
+
+def _folded(w, norm: dict[str, Any]) -> tuple:
+    """Weights and bias of a layer with the gain and shift of its inputs in them."""
+    return w * norm["gain"], norm["bias"] + dr.sum(w * norm["shift"], axis=1)

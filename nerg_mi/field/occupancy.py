@@ -78,4 +78,5 @@ def chessboard(bits: np.ndarray) -> np.ndarray:
         return np.full(bits.shape, _FAR, np.uint8)
     from scipy.ndimage import distance_transform_cdt
 
-    return np.minimum(distance_transform_cdt(~bits, metric="chessboard"), _FAR).astype(np.uint8)
+    distance: Any = distance_transform_cdt(~bits, metric="chessboard")
+    return np.minimum(distance, _FAR).astype(np.uint8)

@@ -166,14 +166,14 @@ class RadianceField:
         return namespace(self.density_net.weights[0])
 
     @property
-    def background_grid(self) -> Encoding:
+    def background_grid(self) -> Encoding | None:
         """The encoding of the background, under the name that its parameters have."""
-        return self.background.grid
+        return self.background.grid if self.background is not None else None
 
     @property
-    def background_net(self) -> MLP:
+    def background_net(self) -> MLP | None:
         """The network of the background, under the name that its parameters have."""
-        return self.background.net
+        return self.background.net if self.background is not None else None
 
     def set_parameters(self, values: dict) -> None:
         """Replace arrays by name (any subset of ``parameters()``) and repack the networks."""

@@ -120,7 +120,7 @@ def writing(path: str | os.PathLike) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        remedy = _REMEDIES.get(error.errno, "choose another folder")
+        remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
         raise NergError(f'"{path}" could not be written ({error.strerror or error}): {remedy}.') from error
 
 

@@ -13,7 +13,7 @@ import struct
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import IO
+from typing import IO, Any
 
 from nerg_mi.errors import NergError
 
@@ -123,7 +123,8 @@ def open_member(
     with reading(path, what):
         info = archive.getinfo(name)
         stream = archive.open(info)
-        whole = os.fstat(archive.fp.fileno()).st_size
+        file: Any = archive.fp
+        whole = os.fstat(file.fileno()).st_size
     if info.file_size > _DEFLATE * info.compress_size + _DEFLATE or info.header_offset + info.compress_size > whole:
         stream.close()
         raise NergError(

@@ -84,7 +84,7 @@ def _array(stream, size: int, path, what: str) -> np.ndarray:
     with reading(path, what):
         out = np.empty(math.prod(shape), dtype)
         if out.size:
-            member_into(stream, memoryview(out.view(np.uint8)), path, what)
+            member_into(stream, out.view(np.uint8).data, path, what)
         return out.reshape(shape[::-1]).T if columns_first else out.reshape(shape)
 
 

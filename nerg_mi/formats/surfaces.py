@@ -101,7 +101,7 @@ def _closed(volume: np.ndarray, level: float, cells: int) -> tuple[np.ndarray, i
 
     closed = grey_closing(volume, 2 * cells + 1, mode="nearest")
     holes = (volume < level) & (closed >= level)
-    return np.where(holes, closed, volume), np.count_nonzero(holes)
+    return np.where(holes, closed, volume), int(np.count_nonzero(holes))
 
 
 def _inside_out(vertices, faces, sampler: Sampler) -> bool:
@@ -192,9 +192,11 @@ def _srgb(field: RadianceField, sampler: Sampler, p, normals) -> np.ndarray:
 
 def write_ply(surface: Surface, path: str | Path) -> None:
     """Binary PLY: positions, normals, 8-bit sRGB colours, and faces if there are any."""
-    columns = dict(zip(("x", "y", "z", "nx", "ny", "nz"), np.hstack([surface.vertices, surface.normals]).T))
-    colors = np.rint(surface.colors * 255).astype(np.uint8)
-    write_columns(path, columns | dict(zip(("red", "green", "blue"), colors.T)), surface.faces)
+    places = np.hstack([surface.vertices, surface.normals]).T
+    colors = np.rint(surface.colors * 255).astype(np.uint8).T
+    names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
+    columns: dict[str, np.ndarray] = dict(zip(names, [*places, *colors]))
+    write_columns(path, columns, surface.faces)
 
 
 def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:

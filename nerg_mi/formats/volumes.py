@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +60,8 @@ def density_and_color(field: RadianceField, resolution: int = 256, color: bool =
     if field.color_space == "srgb":
         c = decode_srgb(c)
     out[z, y, x] = c
-    away, nearest = distance_transform_edt(alpha <= _FAINT, return_indices=True)
+    found: Any = distance_transform_edt(alpha <= _FAINT, return_indices=True)
+    away, nearest = found
     return density, np.where((away < 2.5)[..., None], out[tuple(nearest)], 0), lower, upper
 
 

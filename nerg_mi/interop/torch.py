@@ -15,6 +15,7 @@ a field of the LLVM backend and on the GPU for one of the CUDA backend.
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -219,7 +220,7 @@ def _with(field, values: dict):
     return out
 
 
-def _copied(part):
+def _copied(part: Any) -> Any:
     """A copy of a field's part down to its arrays, which both share, and what ``pack`` makes of them."""
     if isinstance(part, list):
         return [_copied(p) for p in part]

@@ -18,8 +18,10 @@ class Box:
     (p + bound) / (2 bound), rounded as there: in a fine hash grid the last bit of a coordinate can be seen.
     """
 
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
+    # The three coordinates of either corner; any sequences of numbers become tuples.
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+    # Half the edge of the unit cube, where that is not the box's longest.
     bound: float | None = None
 
     def __post_init__(self):
@@ -40,7 +42,7 @@ class Box:
         return 2 * self.bound if self.bound is not None else max(u - l for l, u in zip(self.lower, self.upper))
 
     @property
-    def center(self) -> tuple[float, float, float]:
+    def center(self) -> tuple[float, ...]:
         """Centre of the unit cube."""
         return (0.0, 0.0, 0.0) if self.bound is not None else tuple((l + u) / 2 for l, u in zip(self.lower, self.upper))
 

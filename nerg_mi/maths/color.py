@@ -5,6 +5,8 @@ The one of NumPy keeps the type of its argument; the one of Dr.Jit guards the de
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import numpy as np
 
@@ -28,7 +30,8 @@ def srgb_to_linear(c):
 def srgb_slope(c):
     """Derivative of ``srgb_to_linear``, per component."""
     low = c <= 0.04045
-    return dr.select(low, 1 / 12.92, 2.4 / 1.055 * dr.power((dr.select(low, 1, c) + 0.055) / 1.055, 1.4))
+    power: Any = dr.power((dr.select(low, 1, c) + 0.055) / 1.055, 1.4)
+    return dr.select(low, 1 / 12.92, 2.4 / 1.055 * power)
 
 
 def composite_to_linear(total, alpha, color_space: str):

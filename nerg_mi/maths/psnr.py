@@ -18,4 +18,4 @@ def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None)
     error = (np.clip(picture, 0, 1).astype(np.float64) - truth) ** 2
     if mask is not None:
         error = error[mask]
-    return decibels(np.mean(error)) if error.size else float("nan")
+    return decibels(float(np.mean(error))) if error.size else float("nan")

@@ -9,6 +9,7 @@ hashed with the primes of the paper.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from types import ModuleType
 from typing import Any, ClassVar
@@ -29,7 +30,13 @@ class HashGridConfig(EncodingConfig):
     """Sizes of a hash grid. Resolutions grow geometrically from the coarsest level to the finest."""
 
     kind: ClassVar[str] = DEFAULT_KIND
-    limits: ClassVar[dict[str, int]] = {"levels": 64, "features": 4, "log2_rows": 26, "base": 1 << 20, "dimensions": 3}
+    limits: ClassVar[Mapping[str, int]] = {
+        "levels": 64,
+        "features": 4,
+        "log2_rows": 26,
+        "base": 1 << 20,
+        "dimensions": 3,
+    }
 
     # Grids of different resolution, whose features are concatenated.
     levels: int = 16

@@ -57,6 +57,8 @@ class StoredTensor:
         """The values, (``shape``); bfloat16 becomes float32. Raises `NergError` when the file does not hold them
         all.
         """
+        if self._archive is None:
+            raise RuntimeError("a tensor is read before its archive is known")
         path = self._archive.path
         raw = self._archive.record(f"data/{self._key}")
         with reading(path, "checkpoint"):

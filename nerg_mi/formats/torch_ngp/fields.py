@@ -15,7 +15,8 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.encoding.protocol import Encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.architecture import building, check_sizes
@@ -76,8 +77,9 @@ def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density:
     box, bound = _box(state)
     density, color = layers(state, "sigma_net", ns), layers(state, "color_net", ns)
     width, geometry = density.weights[0].shape[0], density.outputs - 1
+    sizes = grid_config(state, "encoder", given.finest or 2048 * bound)
     config = RadianceConfig(
-        grid_config(state, "encoder", given.finest or 2048 * bound),
+        sizes,
         width,
         len(density.weights) - 1,
         len(color.weights) - 1,
@@ -88,7 +90,7 @@ def radiance_field(state: StateDict, ns: ModuleType, given: Given, mean_density:
     return RadianceField(
         config,
         box,
-        grid(state, "encoder", config.grid, ns),
+        grid(state, "encoder", sizes, ns),
         density,
         color,
         read_occupancy(state, bound, ns, mean_density),
@@ -104,7 +106,7 @@ def _box(state: StateDict) -> tuple[Box, float]:
     bound = float(np.abs(train).max())
     if train.shape != (6,) or aabb.shape != (6,) or not bound >= 1:
         raise NergError(f'the boxes of "{state.path}", {train} and {aabb}, are not those of a bound of at least 1')
-    return Box(aabb[:3], aabb[3:], bound), bound
+    return Box(tuple(aabb[:3].tolist()), tuple(aabb[3:].tolist()), bound), bound
 
 
 def _background(state: StateDict, ns: ModuleType, given: Given, degree: int) -> Background | None:
@@ -117,15 +119,11 @@ def _background(state: StateDict, ns: ModuleType, given: Given, degree: int) -> 
         )
     if given.background_radius == 0:
         return None
-    net = layers(state, "bg_net", ns)
+    net, sizes = layers(state, "bg_net", ns), grid_config(state, "encoder_bg", 2048, 2)
     config = BackgroundConfig(
-        float(given.background_radius),
-        grid_config(state, "encoder_bg", 2048, 2),
-        net.weights[0].shape[0],
-        len(net.weights) - 1,
-        degree,
+        float(given.background_radius), sizes, net.weights[0].shape[0], len(net.weights) - 1, degree
     )
-    return Background(config, grid(state, "encoder_bg", config.grid, ns), net)
+    return Background(config, grid(state, "encoder_bg", sizes, ns), net)
 
 
 def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
@@ -165,10 +163,10 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     ]
     if wrong:
         raise NergError(f"this field has no torch-ngp form: {'; '.join(wrong)}")
-    cube = np.float32([-bound] * 3 + [bound] * 3)
+    cube = np.array([-bound] * 3 + [bound] * 3, np.float32)
     state = {
         "aabb_train": cube,
-        "aabb_infer": np.float32([*box.lower, *box.upper]),
+        "aabb_infer": np.array([*box.lower, *box.upper], np.float32),
         "density_bitfield": bitfield(field.occupancy, bound),
         "step_counter": np.zeros((16, 2), np.int32),
     }
@@ -181,8 +179,8 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     return state
 
 
-def _put_grid(state: dict, name: str, grid: HashGrid) -> None:
-    state[f"{name}.embeddings"] = grid.table.numpy().reshape(-1, grid.config.features)
+def _put_grid(state: dict, name: str, grid: Encoding) -> None:
+    state[f"{name}.embeddings"] = grid.named()["table"].numpy().reshape(-1, grid.config.features)
     state[f"{name}.offsets"] = np.array(grid.config.offsets(), np.int32)
 
 

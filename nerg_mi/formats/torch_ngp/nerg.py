@@ -84,8 +84,9 @@ def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
     width, geometry = direction.outputs, position.outputs
     if position.weights[0].shape[0] != width or direction.weights[0].shape[0] != width:
         raise NergError(f'the networks of "{state.path}" are not all {width} wide')
+    sizes = grid_config(state, "encoder", 256 * bound)
     config = GazeConfig(
-        grid_config(state, "encoder", 256 * bound),
+        sizes,
         variant,
         "linear",
         width,
@@ -95,7 +96,7 @@ def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
     )
     check_sizes(config.to_dict(), "networks")
     heads = [_head(state, names, width, ns) for names in _HEADS.values()]
-    box, table = Box((-bound,) * 3, (bound,) * 3, bound), grid(state, "encoder", config.grid, ns)
+    box, table = Box((-bound,) * 3, (bound,) * 3, bound), grid(state, "encoder", sizes, ns)
     return GazeField(config, box, table, position, direction, *heads)
 
 

@@ -278,10 +278,10 @@ class _Machine:
 
 def _stored(pid) -> _Storage:
     kind, storage, key = pid[:3] if isinstance(pid, tuple) and len(pid) >= 3 else (None, None, None)
-    known = isinstance(storage, _Global) and storage.module == "torch" and storage.name in _STORAGES
-    if kind != "storage" or not known or not isinstance(key, str) or not re.fullmatch(r"[0-9]{1,12}", key):
+    named = storage.name if isinstance(storage, _Global) and storage.module == "torch" else None
+    if kind != "storage" or named not in _STORAGES or not isinstance(key, str) or not re.fullmatch(r"[0-9]{1,12}", key):
         raise ValueError("it refers to something other than a stored array")
-    return _Storage(key, _STORAGES[storage.name])
+    return _Storage(key, _STORAGES[named])
 
 
 def read_torch(path: str | Path):
