@@ -132,14 +132,13 @@ class GazeModule(_FieldModule):
         Z = module.integral(p_od, p_o, r_o, escaped)  # everywhere around the observer
         gaze = module(p_od, p_o, r_o, Z)  # anywhere
 
-    Raises `NergError` for an ensemble, whose members are modules each.
+    Raises `NergError` for an ensemble, which is a `GazeEnsembleModule`.
     """
 
     def __init__(self, field: GazeField | LogGazeField):
         if isinstance(field, GazeEnsemble):
             raise NergError(
-                f"an ensemble of {len(field.members)} gaze fields is no module: make one of each of its members, and "
-                "average what they return"
+                f"an ensemble of {len(field.members)} gaze fields is no GazeModule; make a GazeEnsembleModule of it"
             )
         super().__init__(field)
 
@@ -202,6 +201,58 @@ class GazeModule(_FieldModule):
                 )
         columns = [number.reshape(-1).expand(count), gone.reshape(-1).expand(count)]
         return torch.stack([*columns, torch.zeros_like(columns[0])], 1).contiguous()
+
+
+class GazeEnsembleModule(torch.nn.Module):
+    """The mean of the gaze densities of an ensemble's members, of which ``members`` are modules (`GazeModule`).
+
+    Each member of a normalised ensemble has an integral of its own::
+
+        Z = module.integral(p_od, p_o, r_o, escaped)  # everywhere around the observer: (members,)
+        gaze = module(p_od, p_o, r_o, Z)  # anywhere
+        spread = module.each(p_od, p_o, r_o, Z).std(0)
+    """
+
+    def __init__(self, field: GazeEnsemble):
+        super().__init__()
+        self._field = field
+        self.members = torch.nn.ModuleList(GazeModule(member) for member in field.members)
+
+    def field(self) -> GazeEnsemble:
+        """An ensemble of its own with the weights as they are now."""
+        return GazeEnsemble([member.field() for member in self.members], self._field.support)
+
+    def each(
+        self,
+        p_od: torch.Tensor,
+        p_o: torch.Tensor,
+        r_o: torch.Tensor,
+        integral: torch.Tensor | None = None,
+        escaped: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Gaze (members, N) of every member. ``integral``: of a normalised ensemble, (members,) or (members, N); the
+        other arguments, and what is raised, as for `GazeModule`."""
+        if integral is not None and len(integral) != len(self.members):
+            raise ValueError(f"give the integral of each of the {len(self.members)} members, got {len(integral)}")
+        integrals = [None] * len(self.members) if integral is None else integral
+        return torch.stack([member(p_od, p_o, r_o, z, escaped) for member, z in zip(self.members, integrals)])
+
+    def forward(
+        self,
+        p_od: torch.Tensor,
+        p_o: torch.Tensor,
+        r_o: torch.Tensor,
+        integral: torch.Tensor | None = None,
+        escaped: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Gaze (N,) in 1/sr, the mean of ``each``."""
+        return self.each(p_od, p_o, r_o, integral, escaped).mean(0)
+
+    def integral(
+        self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """The integrals of the members (members,) over the sphere of one observer; see ``GazeModule.integral``."""
+        return torch.stack([member.integral(p_od, p_o, r_o, escaped) for member in self.members])
 
 
 def _columns(ns, p):

@@ -276,9 +276,29 @@ def test04c_gradients_pass_the_integral(torch, interop, kind):
     central_differences(torch, module, loss, names[kind])
 
 
-def test04d_members_of_an_ensemble_are_modules_each(torch, interop):
-    with pytest.raises(NergError, match="make one of each of its members"):
-        interop.GazeModule(GazeEnsemble([normalised("log"), normalised("log")]))
+@pytest.mark.parametrize("kind", ["product", "log"])
+def test04d_an_ensemble_is_the_mean_of_its_members(torch, interop, kind):
+    ensemble = GazeEnsemble([normalised(kind), normalised(kind)])
+    with pytest.raises(NergError, match="make a GazeEnsembleModule of it"):
+        interop.GazeModule(ensemble)
+    module = interop.GazeEnsembleModule(ensemble)
+    p_od, r_o = (t[:64].contiguous() for t in rays(torch))
+    p_o = torch.tensor([[0.1, -0.2, 0.3]]).expand(64, 3).contiguous()
+    Z = module.integral(p_od, p_o, r_o)
+    assert Z.shape == (2,) and Z[0] != Z[1]
+    gaze, points = module(p_od, p_o, r_o, Z), [ns.Array3f(t.numpy().T.copy()) for t in (p_od, p_o, r_o)]
+    each = [m.evaluate(*points, integral=ns.Float(z))[0].numpy() for m, z in zip(ensemble.members, Z.tolist())]
+    np.testing.assert_allclose(module.each(p_od, p_o, r_o, Z).detach().numpy(), each, rtol=1e-5)
+    np.testing.assert_allclose(gaze.detach().numpy(), np.mean(each, axis=0), rtol=1e-5)
+    with pytest.raises(ValueError, match="integral of each of the 2 members, got 1"):
+        module(p_od, p_o, r_o, Z[:1])
+    gaze.sum().backward()
+    for i in range(2):
+        assert module.get_parameter(f"members.{i}.grid__table").grad.abs().max() > 0
+    again = module.field()
+    names = ensemble.parameters()
+    assert all(np.array_equal(again.parameters()[k].numpy(), v.numpy()) for k, v in names.items())
+    assert again.members[0] is not ensemble.members[0]
 
 
 def test05_training_in_torch_and_back(torch, interop, tmp_path):
