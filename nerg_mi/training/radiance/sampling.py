@@ -69,7 +69,7 @@ class Rays:
 
 def rays_in_box(o, d, box: Box, near: float) -> Rays:
     """Rays clipped to ``box``, from ``near`` on."""
-    # Not maths.ray_box: without its selects for rays along a face, of which a batch loses none that counts.
+    # Not maths.ray_box: of rays along a face a training may lose some, and is spared the selects that keep them.
     Float = type(d.x)
     t0, t1 = Float(near), Float(dr.inf)
     for axis in range(3):
