@@ -395,7 +395,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         if "features" in asked:
             seen = Place(Featured(self.medium, lit), scene)
             paint = seen.medium.blank
-        view = seen.look(ray, active, self.settings, offset=offset, count=count, color=paint)
+        view = seen.trace(ray, active, self.settings, offset=offset, count=count, color=paint)
         if "features" in asked:
             painted = list(view.march.color)
             view.march.color = mi.Color3f(painted[:3]) if lit else None
@@ -417,7 +417,7 @@ class NergIntegrator(mi.SamplingIntegrator):
             if "features_at" in asked:
                 out["features_at"] = snapshot(self.medium, p_d, surface & (out["depth"] < view.distance))
             if asked & (_GAZE_AOVS | _OBSERVER_AOVS):
-                fuzz = view.fuzz(self.depth_kind, out["depth"])
+                fuzz = view.penetration(self.depth_kind, out["depth"])
                 more = self._gaze(scene, place, ray, p_d, fuzz, surface, asked, count, out)
                 density_evals = density_evals + more if more is not None else density_evals
         if count:

@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-from .march.depth import surface_depth, way_out
+from .march.depth import escape_distance, surface_depth
 from .march.primal import MarchResult, scouted_march
 
 
@@ -41,9 +41,9 @@ class View:
         """Whether there is a surface: matter at all, and as much of it as ``surface_opacity``, which may be 0."""
         return (self.opacity > 0) & (self.opacity >= surface_opacity)
 
-    def fuzz(self, kind: str, depth):
+    def penetration(self, kind: str, depth):
         """How far light goes into the matter before the surface at ``depth``; 0 on a shape."""
-        return 0 if self.march is None else way_out(kind, self.march, depth)
+        return 0 if self.march is None else escape_distance(kind, self.march, depth)
 
 
 class Place:
@@ -69,8 +69,8 @@ class Place:
         corners = [_corners(shape) for shape in self.scene.shapes()]
         return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
 
-    def look(self, ray, active, settings, *, far=dr.inf, **options) -> View:
-        """Look along ``ray`` (a Mitsuba ray; its ``maxt`` counts) up to the distance ``far``.
+    def trace(self, ray, active, settings, *, far=dr.inf, **options) -> View:
+        """Trace ``ray`` (a Mitsuba ray; its ``maxt`` counts) up to the distance ``far``.
 
         ``options``: those of ``march.march``. Differentiable in the ray, in the medium's parameters and, through
         the distances of ray casts, in the positions of shapes (not over their silhouettes).

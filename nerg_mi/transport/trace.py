@@ -85,7 +85,7 @@ def _types(medium):
 
 def _trace(medium, o, d, settings, kind):
     if isinstance(medium, Place):
-        return _looked(medium, o, d, settings, kind)
+        return _traced_in(medium, o, d, settings, kind)
     with dr.suspend_grad():
         ray = medium.local(o, d)
         t0, t1 = dr.maximum(ray.t_near, 0), ray.t_far
@@ -98,12 +98,12 @@ def _trace(medium, o, d, settings, kind):
     return depth, opacity
 
 
-def _looked(place, o, d, settings, kind):
+def _traced_in(place, o, d, settings, kind):
     import mitsuba as mi
 
     with dr.suspend_grad():
         everywhere = dr.full(mi.Bool, True, max(dr.width(o), dr.width(d)))
-        view = place.look(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), everywhere, settings)
+        view = place.trace(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), everywhere, settings)
         opacity = view.opacity + dr.zeros(mi.Float, dr.width(everywhere))
         depth = view.depth(kind, opacity > 0)
     dr.eval(depth, opacity)

@@ -13,7 +13,7 @@ SETTINGS = MarchSettings(0.01)
 
 def look(mi, place, o):
     """Along +z from the points ``o``, a row a ray."""
-    return place.look(mi.Ray3f(mi.Point3f(np.asarray(o, np.float32).T), mi.Vector3f(0, 0, 1)), True, SETTINGS)
+    return place.trace(mi.Ray3f(mi.Point3f(np.asarray(o, np.float32).T), mi.Vector3f(0, 0, 1)), True, SETTINGS)
 
 
 @pytest.mark.parametrize("sigma", [0.3, 2.0])
@@ -37,7 +37,7 @@ def test_distances_follow_the_ray_where_no_shape_moves(rgb):
     x, z = np.float32([-1.0, 0.0, 0.5, 1.2]), rgb.Float([0, 0, 0, 0])
     across = rgb.Float(x)
     dr.enable_grad(across, z)
-    distance = place.look(rgb.Ray3f(rgb.Point3f(across, 0, z), rgb.Vector3f(0, 0, 1)), True, SETTINGS).distance
+    distance = place.trace(rgb.Ray3f(rgb.Point3f(across, 0, z), rgb.Vector3f(0, 0, 1)), True, SETTINGS).distance
     dr.backward(dr.sum(distance))
     assert np.allclose(distance.numpy(), 5 - np.sqrt(4 - x**2), rtol=1e-5)
     assert np.allclose(dr.grad(across).numpy(), x / np.sqrt(4 - x**2), rtol=1e-4, atol=1e-6)

@@ -72,7 +72,7 @@ def surface_depth(kind: str, result: MarchResult, medium, ray, t0, t1, active, s
     return depth + moved
 
 
-def way_out(kind: str, result: MarchResult, depth):
+def escape_distance(kind: str, result: MarchResult, depth):
     """How far light goes into the matter before it meets the surface at ``depth`` (of ``kind``).
 
     In mean free paths where transmittance is 1/2: 1 for the expected depth of thick matter, ln 2 for its median.

@@ -71,5 +71,5 @@ def accumulated(place, ray, active, settings) -> list:
     colours are."""
     settings = replace(settings, color_cutoff=MarchSettings.color_cutoff)
     featured = Featured(place.medium, False)
-    march = Place(featured, place.scene).look(ray, active, settings, color=featured.blank).march
+    march = Place(featured, place.scene).trace(ray, active, settings, color=featured.blank).march
     return [dr.select(active, f, 0) for f in march.color]

@@ -32,7 +32,7 @@ class ObserverMap:
         with dr.suspend_grad():
             self.center = type(p_o)(dr.detach(p_o))
             everywhere = dr.full(mi.Bool, True, self.width * height)
-            view = place.look(mi.Ray3f(self.center, self._directions()), everywhere, settings)
+            view = place.trace(mi.Ray3f(self.center, self._directions()), everywhere, settings)
             met = view.meets(surface_opacity)
             self.depth = dr.select(met, view.depth(kind, met), dr.inf)
             dr.eval(self.depth)

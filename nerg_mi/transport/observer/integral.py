@@ -121,7 +121,7 @@ class Surroundings:
         import mitsuba as mi
 
         everywhere = dr.full(mi.Bool, True, dr.width(directions))
-        view = self.place.look(mi.Ray3f(self.center, directions), everywhere, self.settings)
+        view = self.place.trace(mi.Ray3f(self.center, directions), everywhere, self.settings)
         met = everywhere & view.meets(self.surface_opacity)
         return met, dr.select(met, view.depth(self.kind, met), self._beyond(directions))
 

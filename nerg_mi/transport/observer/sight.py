@@ -109,10 +109,10 @@ class ObserverPass:
             towards_point = mi.Ray3f(p_o, r_o)
             if self.kind == "transmittance":
                 towards_point.maxt = distance
-                between = place.look(towards_point, active, self.settings, count=count)
+                between = place.trace(towards_point, active, self.settings, count=count)
                 seen = dr.select(between.hit, 0, 1 if between.march is None else dr.exp(-between.march.tau))
                 return Sight(p_d, distance, seen, _evals(between))
-            view = place.look(towards_point, active, self.settings, count=count)
+            view = place.trace(towards_point, active, self.settings, count=count)
             met = dr.select(active & view.meets(self.surface_opacity), view.depth(self.depth, active), dr.inf)
             seen, evals = visibility(distance, met, falloff, tolerance), _evals(view)
         # An observer who meets nothing before the point sees the point itself.

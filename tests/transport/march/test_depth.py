@@ -6,7 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.depth import KINDS, surface_depth, way_out
+from nerg_mi.transport.march.depth import KINDS, escape_distance, surface_depth
 from nerg_mi.transport.march.primal import MarchSettings, march
 from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
@@ -93,14 +93,14 @@ def test05_median_gradient_equals_central_differences(rgb):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test06_the_way_out_ends_at_the_face(rgb, kind):
+def test06_the_escape_distance_ends_at_the_face(rgb, kind):
     # The surface of thick matter lies as deep in it as light goes; in fog the way is kept short.
     for sigma, near in ((200, 1), (1e3, 1), (1e6, 2), (20, 1), (0.5, 1)):
         medium = slab(rgb, sigma, near)
         ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
         result = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64))
         d = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), MarchSettings(1 / 64))
-        out, d = way_out(kind, result, d).numpy()[0], d.numpy()[0]
+        out, d = escape_distance(kind, result, d).numpy()[0], d.numpy()[0]
         if sigma >= 200:
             assert abs(d - out - near) < 1e-5
         else:
