@@ -11,9 +11,9 @@ from numerics import Row
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.field.radiance import density_from_log
 from nerg_mi.transport.march.depth import surface_depth
-from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.march.quadrature import absorbed_share, mean_depth_share
-from nerg_mi.transport.march.rules import linear_crossing, linear_share
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.quadrature import absorbed_share, linear_crossing, linear_share, mean_depth_share
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.protocol import LocalRay
 from nerg_mi.transport.media.volume import VolumeMedium
 

@@ -27,8 +27,9 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 from nerg_mi.field.radiance import sigmoid
 from nerg_mi.maths.elementary import log1p, one_minus_exp
 from nerg_mi.maths.ray_box import intersect_box
-from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.march.rules import KINDS
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.rules import RULES
+from nerg_mi.transport.march.settings import MarchSettings
 
 
 def tables(mi):
@@ -72,7 +73,7 @@ def odd_rays(mi):
             for i in range(len(rays))
         ]
     )
-    for kind in KINDS:
+    for kind in RULES.names():
         r, *_ = through(mi, grid(mi, data), o, d, MarchSettings(STEP, quadrature=kind, stop=0))
         yield Row(
             "",

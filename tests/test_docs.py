@@ -13,7 +13,7 @@ import nerg_mi.cli
 from nerg_mi.evaluation.study import subject as study_subject
 from nerg_mi.formats.torch_ngp import unpickling
 from nerg_mi.training.gaze.recipes import gaze_recipe
-from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.integral import COUNT
 from tests.conftest import ROOT
 

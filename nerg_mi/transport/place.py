@@ -7,50 +7,77 @@ to infinity, and every kind of depth means the same with and without one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f
 
-from .march.depth import escape_distance, surface_depth
-from .march.primal import MarchResult, scouted_march
+from .march.depth import DEPTHS, escape_distance, surface_depth
+from .march.march import scouted_march
+from .march.settings import MarchResult, MarchSettings
+from .media.protocol import Medium
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+@dataclass
+class SceneRay:
+    """A ray for a place without shapes, which needs no Mitsuba: origin, unit direction and greatest distance, in the
+    scene's frame."""
+
+    o: Point3f
+    d: Vector3f
+    maxt: Float
 
 
 @dataclass
 class View:
-    """What one ray meets. ``march``: the medium's part (None without one); ``hit``: whether a shape ends the ray;
-    ``distance``: to that shape (infinite without one); ``opacity``: of everything, 1 where a shape is hit;
-    ``front``: opacity of the medium in front of it; ``cast``: Mitsuba's preliminary intersection (None without shapes).
-    """
+    """What one ray meets. Attached to whatever carries derivatives."""
 
+    # The medium's part; None without a medium.
     march: MarchResult | None
-    hit: object
-    distance: object
-    opacity: object
-    front: object
-    cast: object
-    _depth: object
+    # Whether a shape ends the ray, and its distance in scene units, infinite without one.
+    hit: Bool
+    distance: Float
+    # Opacity of everything: 1 where a shape is hit.
+    opacity: Float
+    # Opacity of the medium in front of the shape.
+    front: Float
+    # Mitsuba's preliminary intersection; None without shapes.
+    cast: mi.PreliminaryIntersection3f | None
+    # What `depth` does.
+    find_depth: Callable[[str, Bool], Float]
 
-    def depth(self, kind: str, active):
-        """Depth of ``kind`` (``depth.KINDS``), 0 where nothing is met."""
-        return self._depth(kind, active)
+    def depth(self, kind: str, active: Bool) -> Float:
+        """Depth of ``kind`` (a name in ``depth.DEPTHS``) in scene units from the ray's origin; 0 where nothing is
+        met."""
+        return self.find_depth(kind, active)
 
-    def meets(self, surface_opacity: float):
+    def meets(self, surface_opacity: float) -> Bool:
         """Whether there is a surface: matter at all, and as much of it as ``surface_opacity``, which may be 0."""
         return (self.opacity > 0) & (self.opacity >= surface_opacity)
 
-    def penetration(self, kind: str, depth):
-        """How far light goes into the matter before the surface at ``depth``; 0 on a shape."""
+    def penetration(self, kind: str, depth: Float) -> Float:
+        """How far light goes into the matter before the surface at ``depth`` (of ``kind``), in scene units; 0 on a
+        shape."""
         return 0 if self.march is None else escape_distance(kind, self.march, depth)
 
 
 class Place:
-    """``medium``: a ``media`` medium or None; ``scene``: the Mitsuba scene whose shapes are met, or None. Raises
-    ``NergError`` for meshes that have no faces."""
+    """A medium, the shapes of a Mitsuba scene, or both: all that rays are traced through.
 
-    def __init__(self, medium, scene=None):
+    Positions and distances are the scene's. ``medium``: or None; ``scene``: the scene whose shapes are met, or None,
+    which is what ``self.scene`` is for a scene without any. Holds nothing that a change of the medium's parameters or
+    of a shape would make wrong. Raises ``NergError`` for meshes that have no faces.
+    """
+
+    def __init__(self, medium: Medium | None, scene: mi.Scene | None = None):
         self.medium = medium
         shapes = [] if scene is None else scene.shapes()
         self.scene = scene if len(shapes) > 0 else None
@@ -65,18 +92,18 @@ class Place:
         return float(np.linalg.norm(np.subtract(*self.corners())))
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner of the bounding box of all shapes."""
+        """Lower and upper corner of the bounding box of all shapes, (3,) each. There must be shapes."""
         corners = [_corners(shape) for shape in self.scene.shapes()]
         return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
 
-    def trace(self, ray, active, settings, *, far=dr.inf, **options) -> View:
-        """Trace ``ray`` (a Mitsuba ray; its ``maxt`` counts) up to the distance ``far``.
+    def trace(self, ray: Ray3f | SceneRay, active: Bool, settings: MarchSettings, **options: Any) -> View:
+        """What ``ray`` meets up to its ``maxt``; without shapes a ``SceneRay`` will do.
 
-        ``options``: those of ``march.march``. Differentiable in the ray, in the medium's parameters and, through
-        the distances of ray casts, in the positions of shapes (not over their silhouettes).
+        ``settings``: of the march; ``options``: those of ``march.march``. Differentiable in the ray, in the medium's
+        parameters and, through the distances of ray casts, in the positions of shapes (not over their silhouettes).
         """
         Float = type(ray.maxt)
-        end = dr.minimum(ray.maxt, far)
+        end = ray.maxt
         hit, distance, cast = dr.mask_t(Float)(False), Float(dr.inf), None
         if self.scene is not None:
             cast, distance = self._cast(ray, active)
@@ -84,38 +111,27 @@ class Place:
             distance = dr.select(hit, distance, dr.inf)
         if self.medium is None:
             opacity = dr.select(hit, Float(1), 0)
-            return View(
-                None, hit, distance, opacity, Float(0), cast, lambda kind, active: dr.select(active & hit, distance, 0)
-            )
+            at_shape = lambda kind, active: dr.select(active & hit, distance, 0)
+            return View(None, hit, distance, opacity, Float(0), cast, at_shape)
 
-        local = self.medium.local(ray.o, ray.d)
+        medium = self.medium
+        local = medium.local(ray.o, ray.d)
         t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(dr.minimum(local.t_far, end), distance)
-        result = scouted_march(self.medium, local, t0, t1, active, settings, **options)
+        result = scouted_march(medium, local, t0, t1, active, settings, **options)
         front = result.opacity
         if self.scene is None:
-            return View(
-                result,
-                hit,
-                distance,
-                front,
-                front,
-                None,
-                lambda kind, active: surface_depth(kind, result, self.medium, local, t0, t1, active, settings),
-            )
+            in_medium = lambda kind, active: surface_depth(kind, result, medium, local, t0, t1, active, settings)
+            return View(result, hit, distance, front, front, None, in_medium)
 
-        def depth(kind, active):
-            inside = surface_depth(kind, result, self.medium, local, t0, t1, active & (front > 0), settings, backed=hit)
-            # Half of the light, which is all absorbed, may pass the medium: the shape is then the median.
-            through = distance
-            if kind == "expected":
-                through = dr.select(hit, (1 - front) * distance, 0) + front * inside
-            elif kind in ("median", "refined"):
-                through = dr.select(dr.isfinite(result.half), inside, distance)
-            return dr.select(active & hit, through, dr.select(active & (front > 0), inside, 0))
+        def in_both(kind, active):
+            some = active & (front > 0)
+            inside = surface_depth(kind, result, medium, local, t0, t1, some, settings, backed=hit)
+            through = DEPTHS.find(kind).with_shape(result, front, inside, hit, distance)
+            return dr.select(active & hit, through, dr.select(some, inside, 0))
 
-        return View(result, hit, distance, dr.select(hit, 1, front), front, cast, depth)
+        return View(result, hit, distance, dr.select(hit, 1, front), front, cast, in_both)
 
-    def _cast(self, ray, active):
+    def _cast(self, ray: Ray3f, active: Bool) -> tuple[mi.PreliminaryIntersection3f, Float]:
         """The nearest intersection with a shape, and its distance with derivatives where any are tracked."""
         import mitsuba as mi
 
@@ -127,14 +143,13 @@ class Place:
             distance = cast.compute_surface_interaction(ray, mi.RayFlags.Minimal, active).t
         return cast, distance
 
-    def blocked(self, ray, active):
-        """Whether a shape stands within ``ray.maxt``; False without shapes."""
-        if self.scene is None:
-            return dr.mask_t(type(ray.maxt))(False)
-        return self.scene.ray_test(ray, active)
+
+def as_place(subject: Medium | Place) -> Place:
+    """``subject`` itself, or the place that consists of this medium alone."""
+    return subject if isinstance(subject, Place) else Place(subject)
 
 
-def _corners(shape):
+def _corners(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     box = shape.bbox()
     if box.valid():
         return np.array(box.min), np.array(box.max)

@@ -2,109 +2,107 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+from typing import Any
+
 import drjit as dr
 import numpy as np
 
 from nerg_mi.field.backend import namespace
+from nerg_mi.maths.types import Float, Point3f, Vector3f
 
-from .march.depth import KINDS, surface_depth
-from .march.primal import MarchSettings, march
-from .place import Place
+from .march.depth import DEPTHS
+from .march.settings import MarchSettings, default_step
+from .media.protocol import Medium
+from .place import Place, SceneRay, as_place
 
 BATCH = 1 << 19
+"""Rays that are marched in one launch."""
 
 
-def default_settings(medium) -> MarchSettings:
-    """The march of the integrator ``nerg`` with nothing set: the medium's own step, or a 1024th of its diagonal."""
-    if isinstance(medium, Place):
-        return default_settings(medium.medium) if medium.medium is not None else MarchSettings(step=1)
-    return MarchSettings(step=medium.step or medium.length_scale / 1024)
+def default_settings(subject: Medium | Place) -> MarchSettings:
+    """The march of the integrator ``nerg`` with nothing set."""
+    return MarchSettings(step=default_step(as_place(subject).medium))
 
 
 def trace_depth(
-    medium, origins, directions, settings: MarchSettings | None = None, kind: str = "median", batch: int = BATCH
-):
-    """Depth of the surface along rays through a medium, and the opacity that they meet: a density-only march.
+    subject: Medium | Place,
+    origins: np.ndarray | Point3f,
+    directions: np.ndarray | Vector3f,
+    settings: MarchSettings | None = None,
+    kind: str = "median",
+    batch: int = BATCH,
+) -> tuple[Any, Any]:
+    """Depth of the surface along rays, and the opacity that they meet: a density-only march, and a ray cast.
 
-    ``medium``: a ``FieldMedium`` or ``VolumeMedium``, or a ``Place`` (of shapes, whose rays are cast exactly, or of
-    both). ``origins``, ``directions``: N rays in the scene's frame, directions unit, either as NumPy arrays (N, 3) or
-    as Dr.Jit 3-arrays of N lanes. ``settings``: see ``default_settings``.
-    ``kind``: ``median``, ``expected`` or ``refined`` (``transport.march.depth``). Returns ``(depth, opacity)`` of the
-    kind that the rays came in (float32 (N,), or Dr.Jit Floats, evaluated): depth is the distance from the origin in
+    ``subject``: a medium, or a ``Place`` (of shapes, which are met exactly, or of both). ``origins``, ``directions``:
+    N rays in the scene's frame, directions unit, either as NumPy arrays (N, 3) or as Dr.Jit 3-arrays of N lanes.
+    ``settings``: see ``default_settings``. ``kind``: a name in ``march.depth.DEPTHS``. Returns ``(depth, opacity)`` of
+    the kind that the rays came in (float32 (N,), or Dr.Jit Floats, evaluated): depth is the distance from the origin in
     scene units, 0 where nothing absorbs; which opacity makes a surface is the caller's to say. At most ``batch`` rays
-    are marched in one launch. Carries no derivatives. Raises ``ValueError`` for an unknown kind and for shapes that do
-    not fit.
+    are marched in one launch. Carries no derivatives. Raises ``NergError`` for an unknown kind and ``ValueError`` for
+    shapes that do not fit.
     """
-    if kind not in KINDS:
-        raise ValueError(f'the depth must be one of {", ".join(KINDS)}, got "{kind}"')
+    DEPTHS.find(kind)
     if batch < 1:
         raise ValueError(f"a batch must hold at least 1 ray, got {batch}")
-    settings = settings or default_settings(medium)
+    place = as_place(subject)
+    settings = settings or default_settings(place)
     if dr.is_array_v(origins):
-        return _traced_jit(medium, origins, directions, settings, kind, batch)
+        return _traced_jit(place, origins, directions, settings, kind, batch)
     o, d = (np.asarray(v, np.float32) for v in (origins, directions))
     if o.shape != d.shape or o.ndim != 2 or o.shape[1] != 3:
         raise ValueError(f"origins {o.shape} and directions {d.shape} must both have shape (N, 3)")
-    ns, array = _types(medium)
+    ns, array = _types(place)
     depth, opacity = np.empty((2, len(o)), np.float32)
     for a in range(0, len(o), batch):
         part = slice(a, a + batch)
-        found = _trace(
-            medium, array(np.ascontiguousarray(o[part].T)), array(np.ascontiguousarray(d[part].T)), settings, kind
-        )
-        depth[part], opacity[part] = (np.asarray(ns.Float(x)) for x in found)
+        rays = (array(np.ascontiguousarray(v[part].T)) for v in (o, d))
+        depth[part], opacity[part] = (np.asarray(ns.Float(x)) for x in _trace(place, *rays, settings, kind))
     return depth, opacity
 
 
-def _traced_jit(medium, origins, directions, settings, kind, batch):
+def _traced_jit(
+    place: Place, origins: Point3f, directions: Vector3f, settings: MarchSettings, kind: str, batch: int
+) -> tuple[Float, Float]:
     count = max(dr.width(origins), dr.width(directions))
     array, Float = type(origins), type(origins.x)
     ns = namespace(Float)
     if count <= batch:
-        return _trace(medium, origins, array(directions), settings, kind)
+        return _trace(place, origins, array(directions), settings, kind)
     depth, opacity = dr.empty(Float, count), dr.empty(Float, count)
     origins, directions = (v + dr.zeros(array, count) for v in (origins, array(directions)))
     for a in range(0, count, batch):
         index = dr.arange(ns.UInt32, min(batch, count - a)) + dr.opaque(ns.UInt32, a)
-        found = _trace(medium, dr.gather(array, origins, index), dr.gather(array, directions, index), settings, kind)
-        for out, value in zip((depth, opacity), found):
+        rays = (dr.gather(array, v, index) for v in (origins, directions))
+        for out, value in zip((depth, opacity), _trace(place, *rays, settings, kind)):
             dr.scatter(out, value, index)
     dr.eval(depth, opacity)
     return depth, opacity
 
 
-def _types(medium):
-    """Namespace and 3-array of the backend that a medium's arrays belong to."""
-    if isinstance(medium, Place):
-        import mitsuba as mi
-
-        return namespace(mi.variant()), mi.Point3f
-    ns = namespace(next(v for v in medium.parameters() if dr.is_array_v(v)))
-    return ns, ns.Array3f
-
-
-def _trace(medium, o, d, settings, kind):
-    if isinstance(medium, Place):
-        return _traced_in(medium, o, d, settings, kind)
-    with dr.suspend_grad():
-        ray = medium.local(o, d)
-        t0, t1 = dr.maximum(ray.t_near, 0), ray.t_far
-        active = t0 < t1
-        result = march(medium, ray, t0, t1, active, settings)
-        depth = surface_depth(kind, result, medium, ray, t0, t1, active, settings)
-        opacity = dr.select(active, result.opacity, 0)
-        depth = dr.select(active, depth, 0)
-    dr.eval(depth, opacity)
-    return depth, opacity
-
-
-def _traced_in(place, o, d, settings, kind):
+def _types(place: Place) -> tuple[ModuleType, type]:
+    """Namespace and 3-array of the backend that a place's arrays belong to."""
+    if place.scene is None and place.medium is not None:
+        for value in place.medium.parameters():
+            if dr.is_array_v(value):
+                ns = namespace(value)
+                return ns, ns.Array3f
     import mitsuba as mi
 
+    return namespace(mi.variant()), mi.Point3f
+
+
+def _trace(place: Place, o: Point3f, d: Vector3f, settings: MarchSettings, kind: str) -> tuple[Float, Float]:
+    Float, count = type(o.x), max(dr.width(o), dr.width(d))
     with dr.suspend_grad():
-        everywhere = dr.full(mi.Bool, True, max(dr.width(o), dr.width(d)))
-        view = place.trace(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)), everywhere, settings)
-        opacity = view.opacity + dr.zeros(mi.Float, dr.width(everywhere))
+        ray = SceneRay(o, d, Float(dr.inf))
+        if place.scene is not None:
+            import mitsuba as mi
+
+            ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+        view = place.trace(ray, dr.full(dr.mask_t(Float), True, count), settings)
+        opacity = view.opacity + dr.zeros(Float, count)
         depth = view.depth(kind, opacity > 0)
     dr.eval(depth, opacity)
     return depth, opacity

@@ -17,7 +17,7 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.box import Box
-from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.gaze_medium import GazeMedium
 from nerg_mi.transport.observer.integral import GazeIntegral
 from nerg_mi.transport.place import Place

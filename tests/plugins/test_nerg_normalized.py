@@ -94,7 +94,7 @@ def test02_what_escapes_counts(rgb, tmp_path):
     share = (angle * ~seen).sum() / (4 * np.pi)
     assert share == pytest.approx(1 / 6, abs=0.02)
     medium = rgb.load_dict(gaze).gaze_medium()
-    from nerg_mi.transport.march.primal import MarchSettings
+    from nerg_mi.transport.march.settings import MarchSettings
     from nerg_mi.transport.place import Place
 
     scene = rgb.load_dict({"type": "scene", **room(rgb, True)})

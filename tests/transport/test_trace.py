@@ -11,7 +11,7 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.media.volume import VolumeMedium
 from nerg_mi.transport.trace import default_settings, trace_depth

@@ -6,6 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from nerg_mi.transport.march.depth import DEPTHS
+from nerg_mi.transport.march.rules import RULES
+
 from .paper import DT_GAMMA, STEPS, as_in_the_paper
 
 STEP_COUNTS = (16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
@@ -47,7 +50,7 @@ def settings(subject, quick: bool = False) -> list[Setting]:
         return {"step": subject.extent / n}
 
     rows = [Setting("default", "default")]
-    for rule in ("constant", "linear"):
+    for rule in (r.name for r in RULES if not r.in_cells):
         for n in (64, 512) if quick else STEP_COUNTS:
             rows.append(Setting(f"{rule}, {n} steps", f"steps, {rule}", {"quadrature": rule, **steps(n)}))
     for g in some((1 / 1024, 1 / 512, 1 / 256, 1 / 128)):
@@ -58,7 +61,7 @@ def settings(subject, quick: bool = False) -> list[Setting]:
         rows.append(Setting(f"stop {s:g}", "stop", {"stop": s}))
     for c in some((0.0, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2)):
         rows.append(Setting(f"color_cutoff {c:g}", "color_cutoff", {"color_cutoff": c}))
-    for k in ("expected", "median", "refined"):
+    for k in DEPTHS.names():
         rows.append(Setting(f"depth {k}", "depth", {"depth": k}))
         for n in () if quick else (128, 256, 512, 1024):
             rows.append(Setting(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
@@ -66,10 +69,10 @@ def settings(subject, quick: bool = False) -> list[Setting]:
     rows += _visibility(quick) + _left_out(subject) + _samples(quick)
     if hasattr(subject, "analytic"):
         for r in RESOLUTIONS[:1] if quick else RESOLUTIONS:
-            for rule in ("constant", "linear", "cells"):
+            for rule in RULES.names():
                 rows.append(Setting(f"grid {r}, {rule}", "resolution", {"quadrature": rule}, resolution=r))
         for n in () if quick else (16, 64, 256):
-            for rule in ("constant", "linear", "cells"):
+            for rule in RULES.names():
                 rows.append(
                     Setting(
                         f"grid 64, {rule}, {n} steps", "resolution", {"quadrature": rule, **steps(n)}, resolution=64

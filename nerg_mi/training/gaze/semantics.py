@@ -13,8 +13,8 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.product import GazeConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.transport.media.features import accumulated, snapshot
-from nerg_mi.transport.place import Place
+from nerg_mi.transport.features import accumulated, snapshot
+from nerg_mi.transport.place import as_place
 from nerg_mi.transport.trace import default_settings
 
 from .settings import uniform_scale
@@ -30,7 +30,8 @@ def semantic_features(medium, origins, directions, distance, kind: str) -> np.nd
     """
     import mitsuba as mi
 
-    if not hasattr(medium, "feature_count"):
+    place = as_place(medium)
+    if place.scene is not None or place.medium is None or place.medium.feature_count == 0:
         raise NergError("semantic features are those of a radiance field; give one with --field")
     out = np.empty((len(origins), medium.feature_count), np.float16)
     with dr.suspend_grad():
@@ -44,7 +45,7 @@ def semantic_features(medium, origins, directions, distance, kind: str) -> np.nd
                 t = mi.Float(np.ascontiguousarray(distance[part], np.float32))
                 found = snapshot(medium, o + d * t, mi.Bool(True))
             else:
-                found = accumulated(Place(medium), mi.Ray3f(o, d), mi.Bool(True), default_settings(medium))
+                found = accumulated(place, mi.Ray3f(o, d), mi.Bool(True), default_settings(medium))
             # At once: each by itself would march, or evaluate the network, again.
             dr.eval(found)
             out[part] = np.stack([np.array(f) for f in found], axis=-1)

@@ -24,7 +24,7 @@ class StepTable:
     """Edges t_0 < t_1 < ... from ``near`` to ``far``, in scene units.
 
     A step is ``step`` long, or ``growth`` times its distance where that is longer: pixels widen with
-    distance, and so may steps. The rule is scale-free, as ``transport.march.primal`` has it.
+    distance, and so may steps. The rule is scale-free, as ``transport.march.stepping`` has it.
     """
 
     def __init__(self, ns, near: float, far: float, step: float, growth: float):

@@ -22,22 +22,38 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from nerg_mi.transport.media.protocol import LocalRay
+from nerg_mi.maths.types import Bool, Color, Float
+from nerg_mi.transport.media.painting import Painter
+from nerg_mi.transport.media.protocol import LocalRay, Medium
 
-from .primal import MarchResult, add, advance, limits, march_primal
+from .primal import add, limits, march_primal
 from .quadrature import absorbed_share
-from .rules import rule
+from .rules import RULES, boundaries
+from .settings import MarchResult, MarchSettings
+from .stepping import advance
 
 _INPUTS = ("o", "d", "w", "t0", "t1")
 
 
-def attached(medium, ray, t0, t1) -> bool:
+def attached(medium: Medium, ray: LocalRay, t0: Float, t1: Float) -> bool:
     """Whether any derivative is to be tracked through a march."""
     return any(dr.grad_enabled(x) for x in (ray.o, ray.d, ray.w, t0, t1, *medium.parameters()))
 
 
-def differentiable_march(medium, ray, t0, t1, active, settings, offset, color, count, until, fine_from) -> MarchResult:
-    """``march_primal`` as one differentiable operation."""
+def differentiable_march(
+    medium: Medium,
+    ray: LocalRay,
+    t0: Float,
+    t1: Float,
+    active: Bool,
+    settings: MarchSettings,
+    offset: Float | None,
+    color: Painter | None,
+    count: bool,
+    until: Float | None,
+    fine_from: Float | None,
+) -> MarchResult:
+    """``march_primal`` as one differentiable operation; the arguments are those of ``march.march``."""
     # Every sample gets its own colour: a shared one would hand its derivative to the wrong samples.
     settings = replace(settings, color_cutoff=0.0)
     fixed = (medium, active, settings, offset, color, count, until, fine_from)
@@ -52,27 +68,30 @@ def differentiable_march(medium, ray, t0, t1, active, settings, offset, color, c
 class _State:
     """Where a repeated march is: the primal's loop state as far as derivatives need it."""
 
-    active: object
-    t: object
-    share: object
-    tau: object
-    moment: object
-    lost: object
-    color: object
+    active: Bool
+    t: Float
+    share: Float
+    tau: Float
+    moment: Float
+    lost: tuple[Float, Float]
+    color: Color | None
 
 
 @dataclass
 class _Replayed:
-    """One repeated step. ``before``: the looked-for crossing lies behind it; ``crosses``: in it."""
+    """One repeated step, attached to what derivatives are asked of."""
 
-    active: object
-    dtau: object
-    mean: object
-    color: object
-    transmittance: object
-    before: object
-    crosses: object
-    crossing: object
+    active: Bool
+    dtau: Float
+    mean: Float
+    color: Color | None
+    # Detached, in front of the step.
+    transmittance: Float
+    # Whether the crossing that is looked for lies behind the step, and whether it lies in it.
+    before: Bool
+    crosses: Bool
+    # Distance of that crossing, where it lies in the step.
+    crossing: Float
 
 
 class _March(dr.CustomOp):
@@ -157,7 +176,7 @@ class _March(dr.CustomOp):
                 color_dot = color_dot + own[3] - dr.select(step.active, tau_dot * dr.detach(outputs[3]), 0)
             return state, (tau_dot + own[0], moment_dot, half_dot, color_dot)
 
-        zero = (Float(0), Float(0), Float(0), None if color is None else color(0))
+        zero = (Float(0), Float(0), Float(0), None if color is None else color.zero())
         tau_dot, moment_dot, half_dot, color_dot = self._march_again(body, active, zero)
         nothing = Float(0)
         counts = [None if x is None else nothing for x in (primal.density_evals, primal.color_evals)]
@@ -174,15 +193,10 @@ class _March(dr.CustomOp):
             Float(0),
             Float(0),
             (Float(0), Float(0)),
-            None if color is None else color(0),
+            None if color is None else color.zero(),
         )
         with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-            _, extra = dr.while_loop(
-                (start, extra),
-                lambda state, _: state.active,
-                lambda state, extra: body(state, extra),
-                label="march adjoint",
-            )
+            _, extra = dr.while_loop((start, extra), lambda state, _: state.active, body, label="march adjoint")
         return extra
 
     def _replay(self, leaves, state):
@@ -190,11 +204,12 @@ class _March(dr.CustomOp):
         medium, _, settings, _, color, _, until, fine_from = self.fixed
         primal_t0, primal_t1 = self.inputs[3:]
         Float = type(primal_t0)
-        quadrature = rule(settings.quadrature, medium)
+        quadrature = RULES.find(settings.quadrature)
+        cells = boundaries(quadrature, medium)
         goal, end = limits(Float, settings, until)
         ray = LocalRay(*self.inputs)
         active, t, delta, t_next = advance(
-            medium, ray, state.t, primal_t1, state.share, settings, state.active, quadrature.planes, fine_from
+            medium, ray, state.t, primal_t1, state.share, settings, state.active, cells, fine_from
         )
         o, d, w, t0, t1 = leaves
         begin = t0 + (t - primal_t0)

@@ -1,47 +1,107 @@
-"""Quadrature rules: how density samples become a step's optical depth and mean depth.
+"""Quadrature rules: how samples of the density become a step's optical depth and its mean depth.
 
-``constant``: one sample at the middle, density constant over the step (Mildenhall et
-al. 2020). ``linear``: one sample at each end, shared between neighbours, density
-linear in between (Uy et al. 2023, "NeRF Revisited: Fixing Quadrature Instability in
-Volume Rendering"). ``cells``: steps end at the voxel boundaries of a grid, where its
-interpolant is a cubic along the ray that two Gauss-Legendre samples integrate exactly.
-Opacity is then exact, depth to a hundredth of a voxel: it takes the density between as
-the line through both samples.
+A rule is one object of the protocol ``Rule``, registered in ``RULES``: the integrator's parameter ``quadrature``, its
+manual and the study offer whatever stands there. Another rule is a class like those below and one line
+``RULES.register(...)``, here or in any module that is imported.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import drjit as dr
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.elementary import quotient
+from nerg_mi.maths.types import Bool, Color, Float
+from nerg_mi.transport.media.cells import VoxelCells
+from nerg_mi.transport.media.painting import Painter
+from nerg_mi.transport.media.protocol import LocalRay, Medium
 
 from .quadrature import linear_crossing, linear_share, mean_depth_share
+from .registry import Registry
 
-KINDS = ("constant", "linear", "cells")
-
+# Where the two Gauss-Legendre samples of an interval lie, from its middle and as a share of its length.
 _GAUSS = 0.5 / 3**0.5
 
 
 @dataclass
 class Step:
-    """One evaluated step of length δ.
+    """One evaluated step, ``delta`` long in scene units. Attached to whatever carries derivatives."""
 
-    ``dtau``: its optical depth; ``share``: mean distance of absorption into it, as a share of δ;
-    ``crossing(missing)``: distance into it at which the optical depth ``missing`` (at most ``dtau``) is
-    reached; ``color(lit)``: its colour on the lanes ``lit``; ``carry``: what the next step reuses;
-    ``evals``: density evaluations made, a lane.
-    """
+    # Its optical depth, 0 on lanes that are not active.
+    dtau: Float
+    # Mean distance of absorption into it, as a share of `delta`.
+    share: Float
+    # Distance into it, in scene units, at which an optical depth (at most `dtau`) is reached.
+    crossing: Callable[[Float], Float]
+    # What it contributes to the sum of colours, evaluated on the lanes of a mask only.
+    color: Callable[[Bool], Color]
+    # What the next step reuses: a PyTree like the one of `Rule.start`.
+    carry: Any
+    # Density evaluations made.
+    evals: Float
 
-    dtau: object
-    share: object
-    crossing: Callable
-    color: Callable
-    carry: object
-    evals: object
+
+class Rule(Protocol):
+    """A quadrature rule. It holds no state: one object serves every march."""
+
+    @property
+    def name(self) -> str:
+        """Value of the parameter ``quadrature`` that chooses it."""
+        ...
+
+    @property
+    def summary(self) -> str:
+        """What it does, in a sentence without its full stop: for the manual."""
+        ...
+
+    @property
+    def in_cells(self) -> bool:
+        """Whether steps end where the ray leaves a voxel, which asks for a medium with ``cells``. Otherwise they are
+        as long as the settings say."""
+        ...
+
+    def start(self, Float: type) -> Any:
+        """What the first step finds as its ``carry``: a PyTree of arrays of one lane, or None. ``Float``: array type
+        of distances."""
+        ...
+
+    def step(
+        self,
+        medium: Medium,
+        ray: LocalRay,
+        t: Float,
+        delta: Float,
+        t_next: Float,
+        carry: Any,
+        active: Bool,
+        color: Painter | None,
+    ) -> Step:
+        """Evaluate the step from the distance ``t`` on, ``delta`` long.
+
+        ``t_next``: where it ends, detached; equal to the next step's ``t`` unless something is leapt over in between.
+        ``carry``: that of the step before, or None, from which nothing is known: derivatives are found so, step by
+        step. Densities and colours are to be attached to ``ray``, ``t``, ``delta`` and the medium. ``color``: what
+        samples contribute; None for a march that gathers none.
+        """
+        ...
+
+
+RULES: Registry[Rule] = Registry("quadrature")
+
+
+def boundaries(rule: Rule, medium: Medium) -> VoxelCells | None:
+    """Where steps of ``rule`` end in ``medium``; None where they are as long as the settings say. Raises ``NergError``
+    for a medium that has no voxels where the rule needs them."""
+    if not rule.in_cells:
+        return None
+    if medium.cells is None:
+        others = " or ".join(f'"{other.name}"' for other in RULES if not other.in_cells)
+        raise NergError(f'the quadrature "{rule.name}" needs an axis-aligned "gridvolume" as density; use {others}')
+    return medium.cells
 
 
 def color_share(first, last, share):
@@ -56,9 +116,11 @@ def color_share(first, last, share):
 
 
 class Constant:
-    """Density constant over a step: its value at the middle."""
+    """Density constant over a step: its value at the middle (Mildenhall et al. 2020, eq. 3)."""
 
-    planes = None
+    name = "constant"
+    summary = "density is constant over a step, sampled at its middle"
+    in_cells = False
 
     def start(self, Float):
         return None
@@ -72,7 +134,7 @@ class Constant:
         dtau = dr.select(active, sigma * delta, 0)
 
         def paint(lit):
-            return color(medium.color(features, p, ray.w, lit))
+            return color.paint(medium, features, p, ray.w, lit)
 
         return Step(
             dtau,
@@ -85,9 +147,12 @@ class Constant:
 
 
 class Linear:
-    """Density linear over a step, between samples at its ends."""
+    """Density linear over a step, between samples at its ends, which neighbours share (Uy et al. 2023, "NeRF
+    Revisited: Fixing Quadrature Instability in Volume Rendering")."""
 
-    planes = None
+    name = "linear"
+    summary = "linear between samples at the steps' ends"
+    in_cells = False
 
     def start(self, Float):
         # Density at the end of the step before, and where that was (distances are not negative).
@@ -113,7 +178,7 @@ class Linear:
 
         def paint(lit):
             p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
-            return color(medium.color(medium.density_features(p, lit)[1], p, ray.w, lit))
+            return color.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
 
         return Step(
             dtau,
@@ -126,10 +191,17 @@ class Linear:
 
 
 class Cells:
-    """Steps inside one voxel of a grid volume: two Gauss-Legendre samples, exact for its cubic."""
+    """Steps inside one voxel of a grid, whose interpolant is a cubic along the ray that two Gauss-Legendre samples
+    integrate exactly. Opacity is then exact, depth to a hundredth of a voxel: it takes the density between as the line
+    through both samples."""
 
-    def __init__(self, planes):
-        self.planes = planes
+    name = "cells"
+    summary = (
+        "for an axis-aligned ``gridvolume`` as density, steps end at voxel boundaries only, where two samples "
+        "integrate its interpolant exactly (opacity to rounding, depth to a hundredth of a voxel); a ``step`` that is "
+        "given bounds them, ``dt_gamma``, ``coarse`` and ``jitter`` do not apply"
+    )
+    in_cells = True
 
     def start(self, Float):
         return None
@@ -146,7 +218,7 @@ class Cells:
 
         def paint(lit):
             p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
-            return color(medium.color(medium.density_features(p, lit)[1], p, ray.w, lit))
+            return color.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
 
         return Step(
             dtau,
@@ -158,16 +230,5 @@ class Cells:
         )
 
 
-def rule(kind: str, medium):
-    """The rule ``kind`` for ``medium``; ``cells`` needs a medium that is a grid."""
-    if kind == "constant":
-        return Constant()
-    if kind == "linear":
-        return Linear()
-    if kind != "cells":
-        raise NergError(f'"quadrature" must be one of {", ".join(KINDS)}, got "{kind}"')
-    if medium.cells is None:
-        raise NergError(
-            'the quadrature "cells" needs an axis-aligned "gridvolume" as density; use "constant" or "linear"'
-        )
-    return Cells(medium.cells)
+for _rule in (Constant(), Linear(), Cells()):
+    RULES.register(_rule)

@@ -1,16 +1,22 @@
-"""What the marcher asks of a place: its extent, its density and its colour.
+"""What the marcher asks of a medium: its extent, its density and its colour.
 
-A trained field and any pair of Mitsuba volumes answer the same questions, so that
-analytic cases, grids from other tools and neural fields run through one code path.
-Rays are handed over once (``local``), then every sample is ``o + t d`` in the
-medium's own coordinates while ``t`` stays the distance in the scene.
+A trained field and any pair of Mitsuba volumes answer the same questions, so that analytic cases, grids from other
+tools and neural fields run through one code path. Rays are handed over once (``local``), then every sample is
+``o + t d`` in the medium's own coordinates while ``t`` stays the distance in the scene.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import drjit as dr
+import numpy as np
+
+from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
+
+from .cells import VoxelCells
 
 MAX_DENSITY = 1e30
 """Infinite densities count as this one, which is opaque over any length."""
@@ -18,15 +24,111 @@ MAX_DENSITY = 1e30
 
 @dataclass
 class LocalRay:
-    """A ray in a medium's coordinates: point ``o + t d`` at scene distance ``t``; ``w`` is the unit direction."""
+    """A ray in a medium's coordinates: the point at scene distance ``t`` is ``o + t d``."""
 
-    o: object
-    d: object
-    w: object
-    t_near: object
-    t_far: object
+    # Origin.
+    o: Point3f
+    # Displacement that one scene unit along the ray makes: of any length.
+    d: Vector3f
+    # Unit direction.
+    w: Vector3f
+    # Scene distances at which the ray enters and leaves the medium's box; it misses where `t_near >= t_far`. `t_near`
+    # may be negative.
+    t_near: Float
+    t_far: Float
 
 
-def bounded(sigma):
+class Medium(Protocol):
+    """Density, colour and features in a box, placed in the scene.
+
+    Two frames: the scene's, in scene units, and the medium's own ("local"), to which ``local`` and ``to_local`` lead.
+    Lanes that are not ``active`` may return anything. What is evaluated is attached to the positions, and to the arrays
+    of ``parameters``, wherever these carry derivatives; ``occupancy`` and ``cells`` never carry any.
+    """
+
+    @property
+    def has_color(self) -> bool:
+        """Whether there is a colour to be asked for."""
+        ...
+
+    @property
+    def color_space(self) -> str:
+        """What colours are: ``srgb``, ``linear``, or ``spectrum``, a linear spectrum of the variant in use."""
+        ...
+
+    @property
+    def feature_count(self) -> int:
+        """Geometry features of a point, as ``density_features`` returns them; 0 for a medium that has none."""
+        ...
+
+    @property
+    def length_scale(self) -> float:
+        """Diagonal of the box, in scene units."""
+        ...
+
+    @property
+    def step(self) -> float | None:
+        """Length of a step that suits the medium, in scene units; None where it knows none."""
+        ...
+
+    @property
+    def occupancy(self) -> OccupancyGrid | None:
+        """Cells outside of which there certainly is no density; None: nothing may be skipped."""
+        ...
+
+    @property
+    def cells(self) -> VoxelCells | None:
+        """Voxels between which the density has no kinks, in the local frame; None for a medium that is no grid."""
+        ...
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the axis-aligned box around the medium, (3,) each, in the scene's frame."""
+        ...
+
+    def parameters(self) -> list[Any]:
+        """Arrays that densities and colours depend on: those by which derivatives may be asked for."""
+        ...
+
+    def refresh(self, anyway: bool = False) -> None:
+        """Renew what is derived from ``parameters`` where these are other arrays than before, or ``anyway``; to be
+        called after they may have changed."""
+        ...
+
+    def local(self, o: Point3f, d: Vector3f) -> LocalRay:
+        """The ray of the scene from ``o`` along unit ``d``."""
+        ...
+
+    def to_local(self, p: Point3f) -> Point3f:
+        """Points of the scene in the local frame."""
+        ...
+
+    def to_unit(self, p: Point3f) -> Array3f:
+        """Local points in the coordinates of ``occupancy``, whose cells fill the unit cube."""
+        ...
+
+    def vector_to_unit(self, v: Vector3f) -> Array3f:
+        """Local displacements in the coordinates of ``occupancy``."""
+        ...
+
+    def density(self, p: Point3f, active: Bool) -> Float:
+        """Density at local points, in 1 / scene unit: finite and not negative."""
+        ...
+
+    def density_features(self, p: Point3f, active: Bool) -> tuple[Float, list[Float]]:
+        """``density``, and the ``feature_count`` features of the same points, which ``color`` needs."""
+        ...
+
+    def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
+        """Colour in ``color_space`` at local points ``p`` in the unit local direction ``w`` of the ray. Only to be
+        called where ``has_color``."""
+        ...
+
+    def background(self, o: Point3f, d: Vector3f) -> Color | None:
+        """Colour in ``color_space`` behind the medium along rays of the scene; None for a medium that knows none."""
+        ...
+
+
+def bounded(sigma: Float) -> Float:
+    """``sigma`` as a density: 0 where it is negative or NaN, at most ``MAX_DENSITY``."""
     # A negative value of an interpolated or fitted grid would create light; comparing also drops NaN.
     return dr.select(sigma > 0, dr.minimum(sigma, MAX_DENSITY), 0)

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any, ClassVar
+
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
+from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.maths.ray_box import intersect_box
+from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
 from nerg_mi.transport.fingerprint import Fingerprint
 from nerg_mi.transport.freezing import recording
 
-from .cells import bound, describe
+from .cells import VoxelCells, bound, describe
 from .protocol import LocalRay, bounded
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 
 class VolumeMedium:
-    """Any Mitsuba volume as density (1/scene unit), optionally with a second one as colour.
+    """Any Mitsuba volume as density (1/scene unit), optionally with a second one as colour: a ``protocol.Medium`` in
+    the scene's own coordinates.
 
     Outside of the density volume's ``bbox()`` there is vacuum. Empty voxels of an axis-aligned
     ``gridvolume`` are skipped, under the bound that its voxels give; any other volume states no bound and
-    is marched unskipped. Colours are spectra of the variant in use.
+    is marched unskipped. Colours are spectra of the variant in use. Raises ``NergError`` for a density without a
+    finite extent, and for a grid with values that are not finite.
     """
 
     color_space = "spectrum"
+    feature_count = 0
 
-    def __init__(self, density, color=None):
+    def __init__(self, density: mi.Volume, color: mi.Volume | None = None):
         import mitsuba as mi
 
         self._interaction, self._variant = mi.Interaction3f, mi.variant()
@@ -38,15 +48,17 @@ class VolumeMedium:
                 f'the volume "density" has no finite extent (its bounding box is {self._lower} to {self._upper}); '
                 "give it a to_world that places it in the scene"
             )
+        self.cells: VoxelCells | None = None
+        self.step: float | None = None
+        self.bound: OccupancyGrid | None = None
         self._read: Fingerprint | None = None
         self.refresh()
 
     def refresh(self, anyway: bool = False) -> None:
-        """Read the grid's voxels again if they are other arrays than before, or ``anyway``; call after they may have
-        changed."""
+        """Read the grid's voxels again if they are other arrays than before, or ``anyway``."""
         if recording():
             # A bound would be that of these voxels, and not of those of the replays.
-            self._bound = self._read = None
+            self.bound = self._read = None
             return
         import mitsuba as mi
 
@@ -54,31 +66,30 @@ class VolumeMedium:
         if arrays == self._read and not anyway:
             return
         described = describe(self._density)
-        self.cells, self._bound, self.step = None, None, None
+        self.cells, self.bound, self.step = None, None, None
         if described is not None:
             self.cells, data = described
             # A step that is longer than a voxel can pass over a sheet.
             self.step = min(self.length_scale / 1024, 0.5 * self.cells.edge)
-            self._bound = bound(data, namespace(self._variant))
+            self.bound = bound(data, namespace(self._variant))
         # At the end: what was refused is looked at again.
         self._read = arrays
 
     @property
-    def occupancy(self):
+    def occupancy(self) -> OccupancyGrid | None:
         """Where there may be density; None while derivatives of it are tracked, which empty voxels have too."""
-        if self._bound is None or any(dr.grad_enabled(v) for v in self.parameters()):
+        if self.bound is None or any(dr.grad_enabled(v) for v in self.parameters()):
             return None
-        return self._bound
+        return self.bound
 
     @property
     def length_scale(self) -> float:
         return float(np.linalg.norm(self._upper - self._lower))
 
-    def bounds(self):
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         return self._lower, self._upper
 
-    def parameters(self) -> list:
-        """Arrays that densities and colours depend on, for derivatives."""
+    def parameters(self) -> list[Any]:
         import mitsuba as mi
 
         values = []
@@ -87,15 +98,17 @@ class VolumeMedium:
                 values += [v for v in dict(mi.traverse(volume)).values() if dr.is_array_v(v) and dr.is_float_v(v)]
         return values
 
-    def local(self, o, d) -> LocalRay:
+    def local(self, o: Point3f, d: Vector3f) -> LocalRay:
         near, far = intersect_box(o, d, self._lower, self._upper)
         return LocalRay(o, d, d, near, far)
 
-    def to_unit(self, p):
-        """Occupancy-grid coordinates (the volume as the unit cube) of points."""
+    def to_local(self, p: Point3f) -> Point3f:
+        return p
+
+    def to_unit(self, p: Point3f) -> Array3f:
         return (p - type(p)(*self._lower.tolist())) * self._inverse_size(p)
 
-    def vector_to_unit(self, v):
+    def vector_to_unit(self, v: Vector3f) -> Array3f:
         return v * self._inverse_size(v)
 
     def _inverse_size(self, v):
@@ -106,16 +119,17 @@ class VolumeMedium:
         it.p = p
         return it
 
-    def density(self, p, active):
+    def density(self, p: Point3f, active: Bool) -> Float:
         return bounded(self._density.eval_1(self._at(p), active))
 
-    def density_features(self, p, active):
+    def density_features(self, p: Point3f, active: Bool) -> tuple[Float, list[Float]]:
         return self.density(p, active), []
 
-    def color(self, features, p, w, active):
+    def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         return self._color.eval(self._at(p), active)
 
-    def background(self, o, d):
+    def background(self, o: Point3f, d: Vector3f) -> None:
+        """None: what is behind a volume is the scene's."""
         return None
 
 
@@ -123,15 +137,15 @@ class KnownEmpty:
     """What a ``VolumeMedium`` skips, as dr.freeze finds it among an integrator's attributes. (The medium itself is
     handed to custom operations, which would have to make another one of its kind.)"""
 
-    DRJIT_STRUCT = {"bound": None}
+    DRJIT_STRUCT: ClassVar[dict] = {"bound": None}
 
     def __init__(self, medium: VolumeMedium):
         self.medium = medium
 
     @property
-    def bound(self):
-        return self.medium._bound
+    def bound(self) -> OccupancyGrid | None:
+        return self.medium.bound
 
     @bound.setter
-    def bound(self, value):
-        self.medium._bound = value
+    def bound(self, value: OccupancyGrid | None) -> None:
+        self.medium.bound = value

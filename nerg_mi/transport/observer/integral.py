@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from nerg_mi.transport.features import observed_features
 from nerg_mi.transport.fingerprint import Fingerprint, of_shapes
-from nerg_mi.transport.media.features import what_gaze_wants
 
 COUNT = 1 << 17
 """Directions of an integral: enough for a thousandth at depths that jump from surface to surface."""
@@ -167,7 +167,7 @@ def gaze_around(gaze, place, p_o, r_o, settings, kind: str, surface_opacity: flo
         distance, escaped = Surroundings(gaze, place, center, settings, kind, surface_opacity).along(r_o)
         o = center + dr.zeros(mi.Point3f, dr.width(r_o))
         p_od, everywhere = o + r_o * distance, dr.full(mi.Bool, True, dr.width(r_o))
-        semantic = what_gaze_wants(gaze.field.config.semantic, place, p_od, o, r_o, everywhere, settings)
+        semantic = observed_features(gaze.field.config.semantic, place, p_od, o, r_o, everywhere, settings)
         # A constant variant returns one lane for all.
         return gaze.evaluate(p_od, o, r_o, everywhere, semantic, escaped)[0] + dr.zeros(mi.Float, dr.width(r_o))
 

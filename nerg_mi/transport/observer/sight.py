@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import drjit as dr
 
 from nerg_mi.transport.freezing import recording
-from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.place import Place
 
 from .depth_map import ObserverMap

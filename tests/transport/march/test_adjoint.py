@@ -9,8 +9,11 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march import adjoint
-from nerg_mi.transport.march.primal import MarchSettings, march, march_primal
+from nerg_mi.transport.march import march as front
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.primal import march_primal
+from nerg_mi.transport.march.settings import MarchSettings
+from nerg_mi.transport.media.painting import ColorPainter
 from nerg_mi.transport.media.protocol import LocalRay
 
 
@@ -75,7 +78,7 @@ def test01_equal_to_derivatives_through_the_loop(rgb, monkeypatch, quadrature):
             return march_primal(medium, ray, t0, t1, active, replace(settings, color_cutoff=0.0), *more)
 
     called = []
-    monkeypatch.setattr(adjoint, "differentiable_march", lambda *a: called.append(1) or through_the_loop(*a))
+    monkeypatch.setattr(front, "differentiable_march", lambda *a: called.append(1) or through_the_loop(*a))
     expected = gradients(rgb, scene)
     assert called
     for g, e in zip(got, expected):
@@ -134,7 +137,7 @@ def slopes(medium, value, mode, settings, offset=None):
         dr.enable_grad(*(x if mode == "backward" else [x[k]]))
         medium.base = x[3]
         ray = LocalRay(ns.Array3f(0, 0, x[2]), z, z, dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 2))
-        result = value(march(medium, ray, x[0], x[1], True, settings, color=ns.Array3f, offset=offset))
+        result = value(march(medium, ray, x[0], x[1], True, settings, color=ColorPainter(ns.Array3f), offset=offset))
         if mode == "backward":
             dr.backward(result)
             medium.base = dr.detach(x[3])

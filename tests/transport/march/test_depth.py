@@ -6,8 +6,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.depth import KINDS, escape_distance, surface_depth
-from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.march.depth import DEPTHS, escape_distance, surface_depth
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
 
@@ -92,7 +93,7 @@ def test05_median_gradient_equals_central_differences(rgb):
             assert np.isclose(dr.grad(s).numpy()[0], difference, rtol=2e-3, atol=1e-5), (kind, sigma)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", DEPTHS.names())
 def test06_the_escape_distance_ends_at_the_face(rgb, kind):
     # The surface of thick matter lies as deep in it as light goes; in fog the way is kept short.
     for sigma, near in ((200, 1), (1e3, 1), (1e6, 2), (20, 1), (0.5, 1)):
@@ -112,7 +113,7 @@ def test07_evaluations_that_a_depth_takes_are_added(rgb, sigma):
     medium, settings = slab(rgb, sigma), MarchSettings(0.01, stop=1e-3)
     ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
     counts = {}
-    for kind in KINDS:
+    for kind in DEPTHS.names():
         result = march(medium, ray, ray.t_near, ray.t_far, True, settings, count=True)
         first = result.density_evals[0]
         surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, rgb.Bool(True), settings)

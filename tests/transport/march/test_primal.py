@@ -10,8 +10,10 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
-from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.media.painting import ColorPainter
 from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
 
@@ -175,7 +177,7 @@ def test12_colour(rgb):
         rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(tint.astype(np.float32)), "raw": True}),
     )
     o, d = rays(20)
-    r = run(rgb, medium, o, d, MarchSettings(1 / 64, stop=1e-9, color_cutoff=0), color=rgb.Color3f)
+    r = run(rgb, medium, o, d, MarchSettings(1 / 64, stop=1e-9, color_cutoff=0), color=ColorPainter(rgb.Color3f))
     for i in range(len(o)):
         near, far = reference.box(o[i].astype(float), d[i].astype(float), (0, 0, 0), (1, 1, 1))
         total = reference.march(
@@ -286,7 +288,7 @@ def test17_leaping_equals_marching_every_step(rgb, share, offset, dt_gamma):
     d[0], o[0] = (0, 0, 1), (0.4, 0.6, -1)  # along an axis
     d[1], o[1] = (-1, 0, 0), (0.5, 0.6, 0.2)  # from inside
     settings = MarchSettings(1 / 200, dt_gamma=dt_gamma, stop=0)
-    kwargs = dict(color=rgb.Color3f, count=True, offset=None if offset is None else rgb.Float(offset))
+    kwargs = dict(color=ColorPainter(rgb.Color3f), count=True, offset=None if offset is None else rgb.Float(offset))
     a = run(rgb, leaping, o, d, settings, **kwargs)
     b = run(rgb, Masked(plain, bits), o, d, settings, **kwargs)
     # Rounding of t may move a midpoint across the wall of a cell now and then. Growing steps start elsewhere
@@ -312,7 +314,7 @@ def test18_colour_only_where_the_weight_counts(rgb):
     medium, _ = field_with(bits)
     o, d = rays(16)
     settings = {c: MarchSettings(1 / 64, color_cutoff=c) for c in (0, 1e-2, 1)}
-    r = {c: run(rgb, medium, o, d, s, color=rgb.Color3f, count=True) for c, s in settings.items()}
+    r = {c: run(rgb, medium, o, d, s, color=ColorPainter(rgb.Color3f), count=True) for c, s in settings.items()}
     assert np.array_equal(r[0].color_evals.numpy(), r[0].density_evals.numpy())
     assert 0 < r[1e-2].color_evals.numpy().sum() < r[0].color_evals.numpy().sum()
     assert not np.array(r[1].color).any() and not r[1].color_evals.numpy().any()

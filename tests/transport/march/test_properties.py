@@ -9,8 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nerg_mi.transport.march.depth import KINDS, surface_depth
-from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.march.depth import DEPTHS, surface_depth
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.settings import MarchSettings
+from nerg_mi.transport.media.painting import ColorPainter
 from nerg_mi.transport.media.protocol import LocalRay
 from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
@@ -105,7 +107,9 @@ def test01_a_march_is_its_float64_reference(rgb, table):
 @given(table=densities, cutoff=st.sampled_from([0.0, 1e-4]))
 @few
 def test02_weights_sum_to_opacity(rgb, table, cutoff):
-    _, r = through(rgb, pieces(rgb, table), MarchSettings(1 / 64, stop=0, color_cutoff=cutoff), color=rgb.Color3f)
+    _, r = through(
+        rgb, pieces(rgb, table), MarchSettings(1 / 64, stop=0, color_cutoff=cutoff), color=ColorPainter(rgb.Color3f)
+    )
     # What is fainter than the cut-off as a whole has no colour.
     if one(r.opacity) > 64 * cutoff:
         assert np.isclose(one(r.color.x), one(r.opacity), rtol=2e-6)
@@ -146,7 +150,7 @@ def test06_more_matter_hides_more(rgb, table, gain):
 
 @given(
     table=densities,
-    kind=st.sampled_from(KINDS),
+    kind=st.sampled_from(DEPTHS.names()),
     quadrature=st.sampled_from(["constant", "linear"]),
     stop=st.sampled_from([0.0, 1e-6, 1e-2]),
 )

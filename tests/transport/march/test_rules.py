@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.transport.march.primal import MarchSettings, march
-from nerg_mi.transport.march.rules import KINDS, color_share, linear_crossing, linear_share, rule
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.quadrature import linear_crossing, linear_share
+from nerg_mi.transport.march.rules import RULES, boundaries, color_share
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.cells import VoxelCells
+from nerg_mi.transport.media.painting import ColorPainter
 from nerg_mi.transport.media.protocol import LocalRay
 from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
@@ -79,7 +82,7 @@ def test04_cells_are_exact_in_opacity_for_any_grid(rgb):
         )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", RULES.names())
 def test05_homogeneous_matter_is_exact_for_every_rule(rgb, kind):
     medium = VolumeMedium(
         rgb.load_dict({"type": "gridvolume", "grid": rgb.VolumeGrid(np.full((4, 4, 4), 3, np.float32))})
@@ -94,9 +97,9 @@ def test05_homogeneous_matter_is_exact_for_every_rule(rgb, kind):
 def test06_wrong_rules(rgb):
     medium = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 1.0}))
     with pytest.raises(ValueError, match='axis-aligned "gridvolume"'):
-        rule("cells", medium)
+        boundaries(RULES.find("cells"), medium)
     with pytest.raises(ValueError, match='"quadrature" must be one of constant, linear, cells, got "simpson"'):
-        rule("simpson", medium)
+        RULES.find("simpson")
 
 
 class Colored:
@@ -124,7 +127,15 @@ class Colored:
 def along_z(medium, n, **controls):
     z, t0, t1 = ns.Array3f(0, 0, 1), dr.opaque(ns.Float, 0), dr.opaque(ns.Float, 1)
     ray = LocalRay(ns.Array3f(0), z, z, t0, t1)
-    return march(medium, ray, t0, t1, True, MarchSettings(1 / n, stop=0, color_cutoff=0, **controls), color=ns.Array3f)
+    return march(
+        medium,
+        ray,
+        t0,
+        t1,
+        True,
+        MarchSettings(1 / n, stop=0, color_cutoff=0, **controls),
+        color=ColorPainter(ns.Array3f),
+    )
 
 
 @pytest.mark.parametrize("n", [1, 3, 10, 64])
@@ -211,14 +222,15 @@ def test12_a_leap_forgets_the_density_before_it(offset):
     assert got.density_evals[0] == kept.sum() + np.count_nonzero(kept & ~np.concatenate([[False], kept[:-1]]))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", RULES.names())
 def test07_every_march_ends(kind):
     # Far away the voxels are as small as the spacing of floats. In a process of its own, which can be ended.
     code = f"""
 import nerg_mi, numpy as np, mitsuba as mi, drjit as dr
 mi.set_variant("llvm_ad_rgb")
 from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.protocol import LocalRay
 from nerg_mi.transport.media.volume import VolumeMedium
 data = np.full((64, 64, 64), 1.5, np.float32)
@@ -230,7 +242,8 @@ for distance in (3, 30, 300, 3e4):
     d = rng.random((3, 500)) - o
     d = (d / np.linalg.norm(d, axis=0)).astype(np.float32)
     ray = medium.local(mi.Point3f(o), mi.Vector3f(d))
-    r = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, MarchSettings(1 / 64, quadrature="{kind}", stop=0))
+    settings = MarchSettings(1 / 64, quadrature="{kind}", stop=0)
+    r = march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, True, settings)
     length = np.maximum(ray.t_far.numpy() - ray.t_near.numpy(), 0)
     mean = r.tau.numpy().sum() / length.sum()
     assert 0.95 < mean < 1.05, (distance, mean)

@@ -11,8 +11,10 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.transport.march.primal import MarchSettings, march
+from nerg_mi.transport.march.march import march
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.media.painting import ColorPainter
 from nerg_mi.transport.media.volume import VolumeMedium
 from nerg_mi.transport.observer.gaze_medium import GazeMedium, at_nearest
 
@@ -87,7 +89,7 @@ def test03_other_transforms_are_refused(matrix):
 def gather(mi, medium, o, d, scale):
     ray = medium.local(mi.Point3f(o.tolist()), mi.Vector3f(d.tolist()))
     t0 = dr.maximum(ray.t_near, 0)
-    result = march(medium, ray, t0, ray.t_far, True, MarchSettings(0.05 * scale), color=mi.Color3f)
+    result = march(medium, ray, t0, ray.t_far, True, MarchSettings(0.05 * scale), color=ColorPainter(mi.Color3f))
     return result.opacity.numpy()[0], result.expected_depth.numpy()[0], np.array(result.color).ravel()
 
 

@@ -4,7 +4,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.depth_map import ObserverMap
 from nerg_mi.transport.place import Place
 

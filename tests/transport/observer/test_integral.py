@@ -14,7 +14,7 @@ from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.places import place_of_volume
-from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.gaze_medium import GazeMedium
 from nerg_mi.transport.observer.integral import GazeIntegral, nearest_depth
 from nerg_mi.transport.place import Place

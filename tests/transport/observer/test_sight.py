@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.primal import MarchSettings
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.volume import VolumeMedium
 from nerg_mi.transport.observer.sight import ObserverPass
 from nerg_mi.transport.place import Place

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.primal import MarchSettings, advance, fine_start
+from nerg_mi.transport.march.march import fine_start
+from nerg_mi.transport.march.settings import MarchSettings
+from nerg_mi.transport.march.stepping import advance
 from nerg_mi.transport.media.cells import VoxelCells
 
 from .test_primal import grid

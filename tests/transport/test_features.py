@@ -8,8 +8,8 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.transport.march.primal import MarchSettings
-from nerg_mi.transport.media.features import what_gaze_wants
+from nerg_mi.transport.features import observed_features
+from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.place import Place
 
@@ -28,7 +28,7 @@ def place(rgb):
 def asked(rgb, place, kind, p, active=True):
     vector = lambda of, v: of(*map(float, v))
     settings = MarchSettings(1 / 128, stop=0.0, color_cutoff=1e-2)
-    found = what_gaze_wants(
+    found = observed_features(
         kind, place, vector(rgb.Point3f, p), vector(rgb.Point3f, O), vector(rgb.Vector3f, D), rgb.Bool(active), settings
     )
     return None if found is None else np.array([f[0] for f in found])
