@@ -14,7 +14,7 @@ from nerg_mi.transport.march.depth import surface_depth
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.quadrature import absorbed_share, linear_crossing, linear_share, mean_depth_share
 from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.protocol import LocalRay
+from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.volume import VolumeMedium
 
 HEAD = ["case", "range", "quantity", "largest error", "reference"]

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
 
+from .types import Array3f, Point3f, Vector3f
+
 
 class Similarity:
     """A rotation, uniform scale and translation: a field's ``to_world``.
 
-    ``matrix``: (4, 4), field to scene. Raises ``NergError`` when it shears, mirrors or scales
+    ``matrix``: (4, 4), local (the field's) to world (the scene's); the identity by default. ``scale``: length in the
+    scene of one unit of the field. Raises ``NergError`` when it shears, mirrors or scales
     unevenly: densities and directions would then have no single scale.
     """
 
-    def __init__(self, matrix=None):
+    def __init__(self, matrix: np.ndarray | None = None):
         m = np.eye(4) if matrix is None else np.asarray(matrix, float)
         linear = m[:3, :3]
         determinant = np.linalg.det(linear) if np.all(np.isfinite(m)) else np.nan
@@ -33,19 +38,21 @@ class Similarity:
         self.inverse = np.linalg.inv(m)
         self.identity = bool(np.array_equal(m, np.eye(4)))
 
-    def point_to_local(self, p):
+    def point_to_local(self, p: Point3f) -> Point3f:
+        """A scene point in field coordinates."""
         return p if self.identity else self._apply(self.inverse, p, 1)
 
-    def vector_to_local(self, v):
+    def vector_to_local(self, v: Vector3f) -> Vector3f:
         """A scene vector in field coordinates; a unit vector becomes 1 / scale long."""
         return v if self.identity else self._apply(self.inverse, v, 0)
 
-    def direction_to_local(self, v):
+    def direction_to_local(self, v: Vector3f) -> Vector3f:
         """A unit scene direction as a unit field direction."""
         return v if self.identity else self._apply(self.inverse * self.scale, v, 0)
 
-    def bounds(self, lower, upper):
-        """Scene-space axis-aligned bounds of a field-space box."""
+    def bounds(self, lower: Sequence[float], upper: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner, (3,) each, of the scene's axis-aligned box around the field's box with the corners
+        ``lower`` and ``upper``."""
         corners = np.array(
             [[x, y, z, 1] for x in (lower[0], upper[0]) for y in (lower[1], upper[1]) for z in (lower[2], upper[2])]
         )
@@ -53,6 +60,7 @@ class Similarity:
         return p.min(0), p.max(0)
 
     @staticmethod
-    def _apply(m, v, w):
+    def _apply(m: np.ndarray, v: Array3f, w: float) -> Array3f:
+        """``m`` (4, 4) times ``v``, whose fourth coordinate is ``w``."""
         rows = [dr.fma(a, v.x, dr.fma(b, v.y, dr.fma(c, v.z, w * e))) for a, b, c, e in m[:3].tolist()]
         return type(v)(*rows)

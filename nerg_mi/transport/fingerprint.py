@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
+
+if TYPE_CHECKING:
+    from .place import Place
 
 
 class Fingerprint(list):
@@ -13,14 +17,14 @@ class Fingerprint(list):
     Copies are held, so that no later variable can take the place of one: the objects that ``mi.traverse`` gives are
     assigned to, and hold other variables then."""
 
-    def __init__(self, values: Iterable):
+    def __init__(self, values: Iterable[Any]):
         held = [dr.copy(v) for v in values]
         super().__init__(i for v in held for i in dr.detail.collect_indices(v))
         self._held = held
 
 
-def of_shapes(place) -> Fingerprint:
-    """Of all shapes of a ``place.Place``, those that instances repeat among them."""
+def of_shapes(place: Place) -> Fingerprint:
+    """Of all shapes of ``place``, those that instances repeat among them; of a place without any, that of nothing."""
     import mitsuba as mi
 
     if place.scene is None:
@@ -29,7 +33,7 @@ def of_shapes(place) -> Fingerprint:
     return Fingerprint(v for shape in shapes for v in dict(mi.traverse(shape)).values())
 
 
-def _groups(mi, scene) -> list:
+def _groups(mi: Any, scene: Any) -> list[Any]:
     """What instances repeat: no shapes of the scene itself."""
     found = []
 

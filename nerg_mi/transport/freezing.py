@@ -4,6 +4,7 @@ them."""
 from __future__ import annotations
 
 import gc
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import drjit as dr
@@ -15,7 +16,7 @@ def recording() -> bool:
 
 
 @contextmanager
-def no_collection():
+def no_collection() -> Iterator[None]:
     """Keep Python's garbage while a function is recorded: Dr.Jit 1.5 ends the process where an array that lies in
     NumPy's memory is freed."""
     paused = recording() and gc.isenabled()

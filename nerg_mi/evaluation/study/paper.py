@@ -114,7 +114,7 @@ def _integrator_class(variant: str):
 
 
 def march(medium, ray, t0, t1, active, color, *, steps, shortest, longest, dt_gamma):
-    """``(opacity, depth, weighted colour sum, samples)`` of ``ray`` (``media.protocol.LocalRay``) between ``t0`` and ``t1``.
+    """``(opacity, depth, weighted colour sum, samples)`` of ``ray`` (``media.local_ray.LocalRay``) between ``t0`` and ``t1``.
 
     ``color``: array type of the medium's colour, or None for a density-only pass.
     """

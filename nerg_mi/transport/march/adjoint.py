@@ -23,8 +23,9 @@ from dataclasses import dataclass, replace
 import drjit as dr
 
 from nerg_mi.maths.types import Bool, Color, Float
+from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import Painter
-from nerg_mi.transport.media.protocol import LocalRay, Medium
+from nerg_mi.transport.media.protocol import Medium
 
 from .primal import add, limits, march_primal
 from .quadrature import absorbed_share

@@ -13,7 +13,8 @@ import drjit as dr
 
 from nerg_mi.maths.elementary import log1p
 from nerg_mi.maths.types import Bool, Float
-from nerg_mi.transport.media.protocol import LocalRay, Medium
+from nerg_mi.transport.media.local_ray import LocalRay
+from nerg_mi.transport.media.protocol import Medium
 
 from .march import march
 from .primal import LOG2

@@ -12,8 +12,9 @@ from typing import Any
 import drjit as dr
 
 from nerg_mi.maths.types import Bool, Float
+from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import Painter
-from nerg_mi.transport.media.protocol import LocalRay, Medium
+from nerg_mi.transport.media.protocol import Medium
 
 from .adjoint import attached, differentiable_march
 from .primal import march_primal

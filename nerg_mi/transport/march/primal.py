@@ -11,8 +11,9 @@ from __future__ import annotations
 import drjit as dr
 
 from nerg_mi.maths.types import Bool, Float
+from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import Painter
-from nerg_mi.transport.media.protocol import LocalRay, Medium
+from nerg_mi.transport.media.protocol import Medium
 
 from .quadrature import absorbed_share
 from .rules import RULES, boundaries

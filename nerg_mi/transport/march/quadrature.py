@@ -13,9 +13,12 @@ erfcx where density rises, Dawson's integral where it falls.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 
 from nerg_mi.maths.elementary import one_minus_exp
+from nerg_mi.maths.types import Float
 
 # Below it the closed form cancels; the series is then exact to 1e-8.
 _SERIES_BELOW = 0.5
@@ -23,12 +26,12 @@ _SERIES_BELOW = 0.5
 _EXP_LIMIT = 80.0
 
 
-def absorbed_share(tau):
+def absorbed_share(tau: Float) -> Float:
     """Share 1 - exp(-τ) of the light that a step of optical depth ``tau`` absorbs."""
     return one_minus_exp(tau)
 
 
-def mean_depth_share(tau):
+def mean_depth_share(tau: Float) -> Float:
     """Mean distance into a step at which light is absorbed, as a share of its length.
 
     h(τ) = 1/τ - 1/expm1(τ): 1/2 for thin steps, 1/τ for opaque ones. ``tau``: optical depth
@@ -96,7 +99,7 @@ _FALLING_Q = (1, -8.84594733, 120.000291, -160.558328, 3061.92745, 7555.4792, 42
 _DENSEST = 1e18
 
 
-def linear_share(first, last):
+def linear_share(first: Float, last: Float) -> Float:
     """Mean absorption distance, as a share of the step, of a density that is linear over it.
 
     ``first``, ``last``: density at the ends times the step's length, >= 0. Good to 1e-6 (relative); equals
@@ -132,18 +135,18 @@ def linear_share(first, last):
     return dr.select(thin, series, closed)
 
 
-def linear_crossing(first, last, length, missing):
+def linear_crossing(first: Float, last: Float, length: Float, missing: Float) -> Float:
     """Distance into a step of linear density at which the optical depth ``missing`` is reached.
 
-    ``first``, ``last``: density at its ends. The stable root of first s + (last - first) s²/(2 length) =
-    missing.
+    ``first``, ``last``: density at its ends; ``length``: of the step. The stable root s of
+    first s + (last - first) s² / (2 length) = missing, at most ``length``.
     """
     root = dr.sqrt(dr.maximum(first * first + 2 * (last - first) / length * missing, 1e-30))
     total = first + root
     return dr.minimum(2 * missing / dr.select(total > 0, total, 1), length)
 
 
-def _horner(coefficients, x):
+def _horner(coefficients: Sequence[Float], x: Float) -> Float:
     """Σ c_i x^i."""
     value = coefficients[-1]
     for c in reversed(coefficients[:-1]):

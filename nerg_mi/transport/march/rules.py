@@ -17,8 +17,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.elementary import quotient
 from nerg_mi.maths.types import Bool, Color, Float
 from nerg_mi.transport.media.cells import VoxelCells
+from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import Painter
-from nerg_mi.transport.media.protocol import LocalRay, Medium
+from nerg_mi.transport.media.protocol import Medium
 
 from .quadrature import linear_crossing, linear_share, mean_depth_share
 from .registry import Registry
@@ -104,10 +105,11 @@ def boundaries(rule: Rule, medium: Medium) -> VoxelCells | None:
     return medium.cells
 
 
-def color_share(first, last, share):
+def color_share(first: Float, last: Float, share: Float) -> Float:
     """Where a step of linear density takes its colour, as a share of its length.
 
-    At the mean absorption, ``share``, which is exact for a linear colour, where both ends are nearly as dense; at the
+    ``first``, ``last``: density at its ends; ``share``: mean distance of absorption, as a share of the length. At the
+    mean absorption, ``share``, which is exact for a linear colour, where both ends are nearly as dense; at the
     denser end where one is nearly empty: in the air before a wall a trained field's colour means nothing. The square
     of the relative difference decides, so that colour stays of second order in the step.
     """

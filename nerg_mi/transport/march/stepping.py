@@ -8,7 +8,8 @@ import drjit as dr
 
 from nerg_mi.maths.types import Bool, Float
 from nerg_mi.transport.media.cells import VoxelCells
-from nerg_mi.transport.media.protocol import LocalRay, Medium
+from nerg_mi.transport.media.local_ray import LocalRay
+from nerg_mi.transport.media.protocol import Medium
 
 from .settings import MarchSettings
 

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.maths.types import Float
+
+from .local_ray import LocalRay
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 # Share of a voxel by which a point on a boundary counts as beyond it; far below what a sample can tell.
 _NUDGE = 1e-4
@@ -19,18 +27,20 @@ _ASKED = 1 << 20
 class VoxelCells:
     """Axis-aligned cells between which a grid's interpolant has no kink.
 
-    ``lower``, ``upper``: corners of the volume; ``resolution``: voxels along x, y, z; ``shift``: 0.5 for
-    trilinear interpolation, whose pieces meet at voxel centres, 0 for nearest neighbours.
+    ``lower``, ``upper``: corners of the volume in the scene; ``resolution``: voxels along x, y, z; ``shift``: 0.5 for
+    trilinear interpolation, whose pieces meet at voxel centres, 0 for nearest neighbours. ``edge``: of the smallest
+    cell, in scene units.
     """
 
-    def __init__(self, lower, upper, resolution, shift: float):
+    def __init__(self, lower: Sequence[float], upper: Sequence[float], resolution: Sequence[int], shift: float):
         self._lower = [float(v) for v in lower]
         self._scale = [r / (u - l) for r, l, u in zip(resolution, lower, upper)]
         self._shift = shift
         self.edge = min(1 / s for s in self._scale)
 
-    def next_boundary(self, ray, t):
-        """Distance at which ``ray`` leaves the cell that it is in just beyond ``t``."""
+    def next_boundary(self, ray: LocalRay, t: Float) -> Float:
+        """Distance at which ``ray`` leaves the cell that it is in just beyond ``t``; rounding may put it before
+        ``t``."""
         end = type(t)(dr.inf)
         for o, d, lower, scale in zip(
             (ray.o.x, ray.o.y, ray.o.z), (ray.d.x, ray.d.y, ray.d.z), self._lower, self._scale
@@ -42,11 +52,12 @@ class VoxelCells:
         return end
 
 
-def describe(volume) -> tuple[VoxelCells, np.ndarray] | None:
+def describe(volume: mi.Volume) -> tuple[VoxelCells, np.ndarray] | None:
     """Cells and voxel values (z, y, x) of an axis-aligned Mitsuba ``gridvolume``; None for any other volume.
 
     Mitsuba does not tell a volume's transform or interpolation, so both are found by asking for values and
-    comparing them with the grid's: what does not match is treated as any other volume.
+    comparing them with the grid's: what does not match is treated as any other volume. Raises ``NergError`` for a
+    grid with values that are not finite.
     """
     import mitsuba as mi
 
@@ -66,7 +77,7 @@ def describe(volume) -> tuple[VoxelCells, np.ndarray] | None:
     size = (upper - lower) / resolution
     scale = max(float(np.abs(data).max()), 1e-30)
 
-    def matches(shift, tolerance):
+    def matches(shift: float, tolerance: float) -> bool:
         """Whether the volume has the grid's values at ``shift`` of a voxel from every voxel's lower corner."""
         # Every voxel is asked for: few of them tell a grid that is mostly empty from its mirror image. Some layers at a
         # time: positions take thirty times the memory of values.

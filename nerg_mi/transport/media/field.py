@@ -13,7 +13,8 @@ from nerg_mi.maths.ray_box import intersect_box
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
 
-from .protocol import LocalRay, bounded
+from .local_ray import LocalRay
+from .protocol import bounded
 
 
 class FieldMedium:

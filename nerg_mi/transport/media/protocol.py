@@ -7,7 +7,6 @@ tools and neural fields run through one code path. Rays are handed over once (``
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import drjit as dr
@@ -17,32 +16,17 @@ from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
 
 from .cells import VoxelCells
+from .local_ray import LocalRay
 
 MAX_DENSITY = 1e30
 """Infinite densities count as this one, which is opaque over any length."""
-
-
-@dataclass
-class LocalRay:
-    """A ray in a medium's coordinates: the point at scene distance ``t`` is ``o + t d``."""
-
-    # Origin.
-    o: Point3f
-    # Displacement that one scene unit along the ray makes: of any length.
-    d: Vector3f
-    # Unit direction.
-    w: Vector3f
-    # Scene distances at which the ray enters and leaves the medium's box; it misses where `t_near >= t_far`. `t_near`
-    # may be negative.
-    t_near: Float
-    t_far: Float
 
 
 class Medium(Protocol):
     """Density, colour and features in a box, placed in the scene.
 
     Two frames: the scene's, in scene units, and the medium's own ("local"), to which ``local`` and ``to_local`` lead.
-    Lanes that are not ``active`` may return anything. What is evaluated is attached to the positions, and to the arrays
+    On lanes that are not ``active`` anything finite may be returned. What is evaluated is attached to the positions, and to the arrays
     of ``parameters``, wherever these carry derivatives; ``occupancy`` and ``cells`` never carry any.
     """
 

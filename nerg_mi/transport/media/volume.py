@@ -16,7 +16,8 @@ from nerg_mi.transport.fingerprint import Fingerprint
 from nerg_mi.transport.freezing import recording
 
 from .cells import VoxelCells, bound, describe
-from .protocol import LocalRay, bounded
+from .local_ray import LocalRay
+from .protocol import bounded
 
 if TYPE_CHECKING:
     import mitsuba as mi

@@ -12,7 +12,7 @@ import pytest
 from nerg_mi.evaluation.study import paper as study_paper
 from nerg_mi.evaluation.study.subject import open_subject
 from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.transport.media.protocol import LocalRay
+from nerg_mi.transport.media.local_ray import LocalRay
 
 
 @pytest.fixture

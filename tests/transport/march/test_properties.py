@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from nerg_mi.transport.march.depth import DEPTHS, surface_depth
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.settings import MarchSettings
+from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import ColorPainter
-from nerg_mi.transport.media.protocol import LocalRay
 from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
 

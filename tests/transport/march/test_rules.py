@@ -15,8 +15,8 @@ from nerg_mi.transport.march.quadrature import linear_crossing, linear_share
 from nerg_mi.transport.march.rules import RULES, boundaries, color_share
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.cells import VoxelCells
+from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import ColorPainter
-from nerg_mi.transport.media.protocol import LocalRay
 from nerg_mi.transport.media.volume import VolumeMedium
 from tests.reference import march_numpy as reference
 
@@ -231,7 +231,7 @@ mi.set_variant("llvm_ad_rgb")
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.media.protocol import LocalRay
+from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.volume import VolumeMedium
 data = np.full((64, 64, 64), 1.5, np.float32)
 data[::2] = 0.5
