@@ -1,11 +1,14 @@
-"""Single steps of a march: that each moves on, and where fine ones begin."""
+"""Single steps of a march: how long they are, that each moves on, and what is leapt over."""
 
+from types import SimpleNamespace
+
+import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.transport.march.march import fine_start
+from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.march.stepping import advance
+from nerg_mi.transport.march.stepping import advance, leap, step_length
 from nerg_mi.transport.media.cells import VoxelCells
 
 from .test_primal import grid
@@ -26,21 +29,7 @@ def test01_every_step_moves_on(rgb, distance):
         assert (after.numpy() > begin.numpy()).all() and np.array_equal(delta.numpy(), after.numpy() - begin.numpy())
 
 
-def test02_fine_steps_begin_before_matter_does(rgb):
-    """A step of the scout before where it found the first trace, so that none of the matter is marched coarsely."""
-    for face in (0.3, 0.55, 0.9):
-        data = np.zeros((200, 1, 1))
-        data[round(200 * face) :] = 30
-        medium = grid(rgb, data, filter_type="nearest")
-        ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
-        settings = MarchSettings(0.01, coarse=8)
-        start, evals = fine_start(medium, ray, rgb.Float(0), rgb.Float(1), rgb.Bool(True), settings)
-        assert face - 2.1 * 0.08 < start[0] < face and 1 <= evals[0] <= 14
-    vacuum = grid(rgb, np.zeros((4, 1, 1)))
-    assert fine_start(vacuum, ray, rgb.Float(0), rgb.Float(1), rgb.Bool(True), settings)[0][0] == np.inf
-
-
-def test03_a_march_goes_on_where_it_begins_on_a_wall(rgb):
+def test02_a_march_goes_on_where_it_begins_on_a_wall(rgb):
     """Whatever rounding says of the boundary that has just been reached, also at the ray's very start."""
 
     class Reached:
@@ -58,3 +47,34 @@ def test03_a_march_goes_on_where_it_begins_on_a_wall(rgb):
     assert (after.numpy() > begin.numpy()).all() and (delta.numpy() > 0).all()
     # Nothing that counts is passed over.
     assert (delta.numpy() <= 2e-6 * np.maximum(t.numpy(), 0.01)).all()
+
+
+def test03_how_long_a_step_is(rgb):
+    t = rgb.Float([0, 1, 10, 1e6])
+    assert np.allclose(step_length(t, MarchSettings(0.1)).numpy(), [0.1, 0.1, 0.1, 1e6 * 2.0**-21])
+    assert np.allclose(step_length(t, MarchSettings(0.1, dt_gamma=0.02)).numpy(), [0.1, 0.1, 0.2, 2e4])
+    # Coarse ones end at the last moment where fine ones are to begin.
+    fine_from = rgb.Float(1.45)
+    t = rgb.Float([0, 1, 1.1, 2])
+    assert np.allclose(step_length(t, MarchSettings(0.1, coarse=4), fine_from).numpy(), [0.4, 0.4, 0.1, 0.1])
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test04_leaps_pass_the_steps_whose_middle_lies_in_an_empty_cell_and_no_others(rgb, share):
+    bits = np.zeros((16, 1, 1), bool)
+    bits[11] = True
+    same = lambda v: v
+    medium = SimpleNamespace(occupancy=OccupancyGrid(bits, ns, 0), to_unit=same, vector_to_unit=same)
+    ray = SimpleNamespace(o=ns.Array3f(0.5, 0.5, 0), d=ns.Array3f(0, 0, 1))
+    step = 1 / 40
+    borders = np.concatenate([[0], (share + np.arange(41)) * step])
+    middles = 0.5 * (borders[:-1] + borders[1:])
+    want = borders[np.argmax(np.floor(16 * middles) == 11)]
+    t, first = leap(medium, ray, ns.Float(0), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None)
+    assert np.isclose(t[0], want, atol=1e-6) and first[0] == 1
+    # From inside matter nothing is passed, and the first step stays as short as it was.
+    t, first = leap(medium, ray, ns.Float(0.7), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None)
+    assert np.isclose(t[0], 0.7) and np.isclose(first[0], share)
+    # Behind all matter they lead out of the box.
+    t, _ = leap(medium, ray, ns.Float(0.8), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None)
+    assert t[0] >= 1
