@@ -66,8 +66,8 @@ def test04_leaps_pass_the_steps_whose_middle_lies_in_an_empty_cell_and_no_others
     same = lambda v: v
     medium = SimpleNamespace(occupancy=OccupancyGrid(bits, ns, 0), to_unit=same, vector_to_unit=same)
     ray = SimpleNamespace(o=ns.Array3f(0.5, 0.5, 0), d=ns.Array3f(0, 0, 1))
-    step = 1 / 40
-    borders = np.concatenate([[0], (share + np.arange(41)) * step])
+    step = 1 / 43
+    borders = np.concatenate([[0], (share + np.arange(44)) * step])
     middles = 0.5 * (borders[:-1] + borders[1:])
     want = borders[np.argmax(np.floor(16 * middles) == 11)]
     t, first = leap(medium, ray, ns.Float(0), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None)
