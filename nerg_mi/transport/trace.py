@@ -57,8 +57,9 @@ def trace_depth(
     depth, opacity = np.empty((2, len(o)), np.float32)
     for a in range(0, len(o), batch):
         part = slice(a, a + batch)
-        rays = (array(np.ascontiguousarray(v[part].T)) for v in (o, d))
-        depth[part], opacity[part] = (np.asarray(ns.Float(x)) for x in _trace(place, *rays, settings, kind))
+        start, along = (array(np.ascontiguousarray(v[part].T)) for v in (o, d))
+        found = _trace(place, start, along, settings, kind)
+        depth[part], opacity[part] = (np.asarray(ns.Float(x)) for x in found)
     return depth, opacity
 
 
@@ -74,8 +75,8 @@ def _traced_jit(
     origins, directions = (v + dr.zeros(array, count) for v in (origins, array(directions)))
     for a in range(0, count, batch):
         index = dr.arange(ns.UInt32, min(batch, count - a)) + dr.opaque(ns.UInt32, a)
-        rays = (dr.gather(array, v, index) for v in (origins, directions))
-        for out, value in zip((depth, opacity), _trace(place, *rays, settings, kind)):
+        start, along = (dr.gather(array, v, index) for v in (origins, directions))
+        for out, value in zip((depth, opacity), _trace(place, start, along, settings, kind)):
             dr.scatter(out, value, index)
     dr.eval(depth, opacity)
     return depth, opacity

@@ -105,12 +105,12 @@ def march_primal(
         Float(0) if count and color is not None else None,
     )
     state = dr.while_loop(start, lambda active, *_: active, body, label="march")
-    *sums, total, pending, n, m = state[5:]
+    tau, moment, half, slope, enter, enter_tau, total, pending, n, m = state[5:]
     if color is not None:
         # What never gathered enough weight for a colour of its own takes that of the rest.
-        painted = absorbed_share(sums[0]) - pending
+        painted = absorbed_share(tau) - pending
         total *= dr.select(painted > 0, 1 + pending / dr.select(painted > 0, painted, 1), 0)
-    return MarchResult(*sums, total, n, m)
+    return MarchResult(tau, moment, half, slope, enter, enter_tau, total, n, m)
 
 
 def add(total: Float, lost: Float, term: Float) -> tuple[Float, Float]:

@@ -33,7 +33,7 @@ class VoxelCells:
     """
 
     def __init__(self, lower: Sequence[float], upper: Sequence[float], resolution: Sequence[int], shift: float):
-        self._lower = [float(v) for v in lower]
+        self._lower = list(lower)
         self._scale = [r / (u - l) for r, l, u in zip(resolution, lower, upper)]
         self._shift = shift
         self.edge = min(1 / s for s in self._scale)
@@ -97,8 +97,8 @@ def describe(volume: mi.Volume) -> tuple[VoxelCells, np.ndarray] | None:
     # A quarter voxel off the centre, nearest neighbours still return the centre's value.
     nearest = matches(0.25, 1e-6)
     if nearest and not np.allclose(data, data.flat[0]):
-        return VoxelCells(lower, upper, resolution, 0.0), data
-    return VoxelCells(lower, upper, resolution, 0.5), data
+        return VoxelCells(lower.tolist(), upper.tolist(), resolution, 0.0), data
+    return VoxelCells(lower.tolist(), upper.tolist(), resolution, 0.5), data
 
 
 def bound(data: np.ndarray, ns: ModuleType) -> OccupancyGrid | None:

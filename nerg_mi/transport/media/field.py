@@ -7,14 +7,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.maths.ray_box import intersect_box
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
 
 from .local_ray import LocalRay
-from .protocol import bounded
+from .protocol import Occupancy, bounded
 
 
 class FieldMedium:
@@ -31,7 +30,7 @@ class FieldMedium:
         # A field scaled by s is s times longer, so its density per scene unit is s times lower.
         self._per_unit = 1 / self.to_world.scale
         self.color_space = field.color_space
-        self.occupancy: OccupancyGrid | None = field.occupancy
+        self.occupancy: Occupancy | None = field.occupancy
 
     @property
     def feature_count(self) -> int:

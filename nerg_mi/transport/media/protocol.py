@@ -12,14 +12,27 @@ from typing import Any, Protocol
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, Vector3f
+from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, UInt32, Vector3f
 
 from .cells import VoxelCells
 from .local_ray import LocalRay
 
 MAX_DENSITY = 1e30
 """Infinite densities count as this one, which is opaque over any length."""
+
+
+class Occupancy(Protocol):
+    """Where there may be density: equal cells of the unit cube."""
+
+    @property
+    def cells(self) -> tuple[int, ...]:
+        """Cells along x, y and z."""
+        ...
+
+    def empty_cells(self, u: Array3f, active: Bool = True) -> UInt32:
+        """How far the cell of ``u`` is from an occupied one, in cells by the chessboard's measure, or less; 0 in an
+        occupied one. Points outside of the cube belong to its nearest cell."""
+        ...
 
 
 class Medium(Protocol):
@@ -56,7 +69,7 @@ class Medium(Protocol):
         ...
 
     @property
-    def occupancy(self) -> OccupancyGrid | None:
+    def occupancy(self) -> Occupancy | None:
         """Cells outside of which there certainly is no density; None: nothing may be skipped."""
         ...
 

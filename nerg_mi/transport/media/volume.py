@@ -138,7 +138,7 @@ class KnownEmpty:
     """What a ``VolumeMedium`` skips, as dr.freeze finds it among an integrator's attributes. (The medium itself is
     handed to custom operations, which would have to make another one of its kind.)"""
 
-    DRJIT_STRUCT: ClassVar[dict] = {"bound": None}
+    DRJIT_STRUCT: ClassVar[dict[str, None]] = {"bound": None}
 
     def __init__(self, medium: VolumeMedium):
         self.medium = medium
