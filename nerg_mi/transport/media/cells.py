@@ -61,7 +61,7 @@ def describe(volume: mi.Volume) -> tuple[VoxelCells, np.ndarray] | None:
     """
     import mitsuba as mi
 
-    if not hasattr(volume, "class_name") or volume.class_name() != "GridVolume":
+    if volume.class_name() != "GridVolume":
         return None
     data = np.array(mi.traverse(volume)["data"], np.float32)
     data = data.reshape(data.shape[:3] + (-1,))[..., 0]

@@ -39,8 +39,8 @@ class Medium(Protocol):
     """Density, colour and features in a box, placed in the scene.
 
     Two frames: the scene's, in scene units, and the medium's own ("local"), to which ``local`` and ``to_local`` lead.
-    On lanes that are not ``active`` anything finite may be returned. What is evaluated is attached to the positions, and to the arrays
-    of ``parameters``, wherever these carry derivatives; ``occupancy`` and ``cells`` never carry any.
+    On lanes that are not ``active`` anything finite may be returned. What is evaluated is attached to the positions,
+    and to the arrays of ``parameters``, wherever these carry derivatives; ``occupancy`` and ``cells`` never carry any.
     """
 
     @property
