@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import drjit as dr
 
 if TYPE_CHECKING:
-    from .place import Place
+    import mitsuba as mi
 
 
 class Fingerprint(list):
@@ -23,7 +23,13 @@ class Fingerprint(list):
         self._held = held
 
 
-def of_shapes(place: Place) -> Fingerprint:
+class HasShapes(Protocol):
+    """A ``place.Place``, of which only the shapes count here."""
+
+    scene: mi.Scene | None
+
+
+def of_shapes(place: HasShapes) -> Fingerprint:
     """Of all shapes of ``place``, those that instances repeat among them; of a place without any, that of nothing."""
     import mitsuba as mi
 
