@@ -48,7 +48,7 @@ def accumulated(place: Place, ray: Ray3f, active: Bool, settings: MarchSettings)
     What gathers them is always the default's, in training as in every picture: ``color_cutoff`` chooses how exact
     colours are."""
     settings = replace(settings, color_cutoff=MarchSettings.color_cutoff)
-    march = place.trace(ray, active, settings, color=FeaturePainter(place.medium, False)).march
+    march: Any = place.trace(ray, active, settings, color=FeaturePainter(_featured(place), False)).march
     return [dr.select(active, f, 0) for f in march.color]
 
 
@@ -60,7 +60,13 @@ def observed_features(
     import mitsuba as mi
 
     if kind == "snapshot":
-        return snapshot(place.medium, p_od, active)
+        return snapshot(_featured(place), p_od, active)
     if kind == "accumulated":
         return accumulated(place, mi.Ray3f(p_o, r_o), active, settings)
     return None
+
+
+def _featured(place: Place) -> Medium:
+    if place.medium is None:
+        raise ValueError("a place without a medium has no features")
+    return place.medium

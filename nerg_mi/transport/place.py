@@ -93,7 +93,7 @@ class Place:
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the bounding box of all shapes, (3,) each. There must be shapes."""
-        corners = [_corners(shape) for shape in self.scene.shapes()]
+        corners = [_corners(shape) for shape in ([] if self.scene is None else self.scene.shapes())]
         return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
 
     def trace(self, ray: Ray3f | SceneRay, active: Bool, settings: MarchSettings, **options: Any) -> View:
@@ -106,7 +106,7 @@ class Place:
         end = ray.maxt
         hit, distance, cast = dr.mask_t(Float)(False), Float(dr.inf), None
         if self.scene is not None:
-            cast, distance = self._cast(ray, active)
+            cast, distance = _cast(self.scene, ray, active)
             hit = active & (distance < end)
             distance = dr.select(hit, distance, dr.inf)
         if self.medium is None:
@@ -131,18 +131,6 @@ class Place:
 
         return View(result, hit, distance, dr.select(hit, 1, front), front, cast, in_both)
 
-    def _cast(self, ray: Ray3f, active: Bool) -> tuple[mi.PreliminaryIntersection3f, Float]:
-        """The nearest intersection with a shape, and its distance with derivatives where any are tracked."""
-        import mitsuba as mi
-
-        ray = mi.Ray3f(ray)
-        with dr.suspend_grad():
-            cast = self.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        distance = cast.t
-        if dr.grad_enabled(ray.o, ray.d) or self.scene.shapes_grad_enabled():
-            distance = cast.compute_surface_interaction(ray, mi.RayFlags.Minimal, active).t
-        return cast, distance
-
 
 def as_place(subject: Medium | Place) -> Place:
     """``subject`` itself, or the place that consists of this medium alone."""
@@ -156,5 +144,18 @@ def _corners(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
     # Mitsuba 3.9.1 leaves the boxes of meshes that it has merged unset.
     import mitsuba as mi
 
-    vertices = np.reshape(mi.traverse(shape)["vertex_positions"], (-1, 3))
+    vertices = np.asarray(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)
     return vertices.min(0), vertices.max(0)
+
+
+def _cast(scene: Any, ray: Ray3f, active: Bool) -> tuple[mi.PreliminaryIntersection3f, Float]:
+    """The nearest intersection with a shape, and its distance with derivatives where any are tracked."""
+    import mitsuba as mi
+
+    ray = mi.Ray3f(ray)
+    with dr.suspend_grad():
+        cast = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    distance = cast.t
+    if dr.grad_enabled(ray.o, ray.d) or scene.shapes_grad_enabled():
+        distance = cast.compute_surface_interaction(ray, mi.RayFlags.Minimal, active).t
+    return cast, distance

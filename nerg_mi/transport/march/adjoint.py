@@ -18,7 +18,9 @@ Steps keep their lengths and move with the ray's entry t0; the last one ends at 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 
@@ -96,6 +98,8 @@ class _Replayed:
 
 
 class _March(dr.CustomOp):
+    """A march as one node of the graph: ``march_primal`` forwards, and once more for the derivatives."""
+
     def eval(self, o, d, w, t0, t1, fixed):
         self.fixed = fixed
         self.inputs = (o, d, w, t0, t1)
@@ -125,8 +129,10 @@ class _March(dr.CustomOp):
 
     def backward(self):
         active, color = self.fixed[1], self.fixed[4]
-        d_tau, d_moment, d_half, _, _, _, d_color, _, _ = self.grad_out()
-        primal = self.result
+        adjoints: Any = self.grad_out()
+        d_tau, d_moment, d_half, _, _, _, d_color, _, _ = adjoints
+        # Colours are there wherever a painter is.
+        primal: Any = self.result
         d_half = dr.select(dr.isfinite(primal.half), d_half, 0)
 
         def body(state, grads):
@@ -183,7 +189,7 @@ class _March(dr.CustomOp):
         counts = [None if x is None else nothing for x in (primal.density_evals, primal.color_evals)]
         self.set_grad_out((tau_dot, moment_dot, half_dot, nothing, nothing, nothing, color_dot, *counts))
 
-    def _march_again(self, body, active, extra):
+    def _march_again(self, body: Callable[[_State, Any], tuple[_State, Any]], active: Bool, extra: Any) -> Any:
         """Repeat the primal's steps, threading ``extra`` through ``body(state, extra)``."""
         offset, color = self.fixed[3], self.fixed[4]
         Float = type(self.inputs[3])
@@ -200,7 +206,7 @@ class _March(dr.CustomOp):
             _, extra = dr.while_loop((start, extra), lambda state, _: state.active, body, label="march adjoint")
         return extra
 
-    def _replay(self, leaves, state):
+    def _replay(self, leaves: list[Any], state: _State) -> tuple[_Replayed, _State]:
         """The next step, attached to ``leaves`` and the medium, and the state after it."""
         medium, _, settings, _, color, _, until, fine_from = self.fixed
         primal_t0, primal_t1 = self.inputs[3:]
@@ -215,7 +221,9 @@ class _March(dr.CustomOp):
         o, d, w, t0, t1 = leaves
         begin = t0 + (t - primal_t0)
         length = dr.select(t_next >= primal_t1, t1 - begin, delta)
-        step = quadrature.step(medium, LocalRay(o, d, w, t0, t1), begin, length, t_next, None, active, color)
+        step = quadrature.step(
+            medium, LocalRay(o, d, w, t0, t1), begin, length, t_next, None, active, color is not None
+        )
         tau = state.tau
         dtau = dr.detach(step.dtau)
         transmittance = dr.exp(-tau)
@@ -226,7 +234,7 @@ class _March(dr.CustomOp):
         tau_after, lost_tau = add(tau, state.lost[0], dtau)
         if color is not None:
             lit = active & (weight > 0)
-            painted = dr.select(lit, step.color(lit), 0)
+            painted = dr.select(lit, step.paint(color, lit), 0)
             total = total + weight * dr.detach(painted)
         before = active & (tau_after < goal)
         crosses = active & ~before & (tau < goal)

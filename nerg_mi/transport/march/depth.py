@@ -147,8 +147,7 @@ class Refined(Median):
             until=dr.select(found, missing, 1),
             count=half.count,
         )
-        if half.count:
-            result.density_evals = result.density_evals + fine.density_evals
+        result.count_in(fine)
         # A finer march may find a little less in the step than the coarse one did.
         return dr.select(found & dr.isfinite(fine.half), fine.half - half.depth, 0)
 
@@ -173,8 +172,7 @@ class _Half:
         self.again = march(
             marched.medium, marched.ray, marched.t0, marched.t1, rest, settings, until=until, count=self.count
         )
-        if self.count:
-            result.density_evals = result.density_evals + self.again.density_evals
+        result.count_in(self.again)
         # Rounding can leave the second march a hair short of its goal: the crossing is then the far end.
         crossing = dr.minimum(self.again.half, marched.t1)
         self.depth = dr.select(rest, crossing, dr.select(opaque & active, result.half, 0))

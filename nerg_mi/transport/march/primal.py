@@ -47,7 +47,7 @@ def march_primal(
 
     def body(active, t, share, carry, lost, tau, moment, half, slope, enter, enter_tau, total, pending, n, m):
         active, t, delta, t_next = advance(medium, ray, t, t1, share, settings, active, cells, fine_from)
-        step = quadrature.step(medium, ray, t, delta, t_next, carry, active, color)
+        step = quadrature.step(medium, ray, t, delta, t_next, carry, active, color is not None)
         weight = dr.exp(-tau) * absorbed_share(step.dtau)
         moment, lost_moment = add(moment, lost[1], weight * dr.fma(delta, step.share, t - t0))
         # The sum that the next step starts from: a goal between it and a plain sum would be crossed by no step.
@@ -58,9 +58,13 @@ def march_primal(
         enter, enter_tau = dr.select(crosses, t, enter), dr.select(crosses, tau, enter_tau)
 
         if color is not None:
+            painter = color
             pending = pending + weight
             lit = active & (pending > settings.color_cutoff)
-            total = total + pending * dr.if_stmt((lit,), lit, step.color, lambda lit: color.zero(), label="colour")
+            shown = dr.if_stmt(
+                (lit,), lit, lambda lit: step.paint(painter, lit), lambda lit: painter.zero(), label="colour"
+            )
+            total = total + pending * shown
             pending = dr.select(lit, 0, pending)
             if count:
                 m = m + dr.select(lit, 1, 0)

@@ -38,8 +38,8 @@ class Step:
     share: Float
     # Distance into it, in scene units, at which an optical depth (at most `dtau`) is reached.
     crossing: Callable[[Float], Float]
-    # What it contributes to the sum of colours, evaluated on the lanes of a mask only.
-    color: Callable[[Bool], Color]
+    # What a painter makes it contribute to the sum of colours, on the lanes of a mask.
+    paint: Callable[[Painter, Bool], Color]
     # What the next step reuses: a PyTree like the one of `Rule.start`.
     carry: Any
     # Density evaluations made.
@@ -79,14 +79,14 @@ class Rule(Protocol):
         t_next: Float,
         carry: Any,
         active: Bool,
-        color: Painter | None,
+        colored: bool,
     ) -> Step:
         """Evaluate the step from the distance ``t`` on, ``delta`` long.
 
         ``t_next``: where it ends, detached; equal to the next step's ``t`` unless something is leapt over in between.
         ``carry``: that of the step before, or None, from which nothing is known: derivatives are found so, step by
-        step. Densities and colours are to be attached to ``ray``, ``t``, ``delta`` and the medium. ``color``: what
-        samples contribute; None for a march that gathers none.
+        step. Densities and colours are to be attached to ``ray``, ``t``, ``delta`` and the medium. ``colored``:
+        whether the step may be asked to ``paint``.
         """
         ...
 
@@ -127,16 +127,13 @@ class Constant:
     def start(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, color) -> Step:
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
         p = ray.o + ray.d * (t + 0.5 * delta)
-        if color is None:
-            sigma, features = medium.density(p, active), []
-        else:
-            sigma, features = medium.density_features(p, active)
+        sigma, features = medium.density_features(p, active) if colored else (medium.density(p, active), [])
         dtau = dr.select(active, sigma * delta, 0)
 
-        def paint(lit):
-            return color.paint(medium, features, p, ray.w, lit)
+        def paint(painter, lit):
+            return painter.paint(medium, features, p, ray.w, lit)
 
         return Step(
             dtau,
@@ -160,7 +157,7 @@ class Linear:
         # Density at the end of the step before, and where that was (distances are not negative).
         return Float(0), Float(-1)
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, color) -> Step:
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
         fresh = active if carry is None else active & (carry[1] != t)
         if carry is None:
             first = medium.density(ray.o + ray.d * t, active)
@@ -178,9 +175,9 @@ class Linear:
         dtau = dr.select(active, 0.5 * (first + last) * delta, 0)
         share = linear_share(first * delta, last * delta)
 
-        def paint(lit):
+        def paint(painter, lit):
             p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
-            return color.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
+            return painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
 
         return Step(
             dtau,
@@ -208,7 +205,7 @@ class Cells:
     def start(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, color) -> Step:
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
         a = medium.density(ray.o + ray.d * (t + (0.5 - _GAUSS) * delta), active)
         b = medium.density(ray.o + ray.d * (t + (0.5 + _GAUSS) * delta), active)
         mean = 0.5 * (a + b)
@@ -218,9 +215,9 @@ class Cells:
         first, last = mean - tilt, mean + tilt
         share = linear_share(first * delta, last * delta)
 
-        def paint(lit):
+        def paint(painter, lit):
             p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
-            return color.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
+            return painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
 
         return Step(
             dtau,

@@ -72,6 +72,11 @@ class MarchResult:
     # Distance at which the march began.
     origin: Float = 0
 
+    def count_in(self, other: MarchResult) -> None:
+        """Add the density evaluations of another march to this one's, if they are counted."""
+        if self.density_evals is not None:
+            self.density_evals = self.density_evals + other.density_evals
+
     @property
     def opacity(self) -> Float:
         """1 - transmittance."""

@@ -9,7 +9,7 @@ import drjit as dr
 from nerg_mi.maths.types import Bool, Float
 from nerg_mi.transport.media.cells import VoxelCells
 from nerg_mi.transport.media.local_ray import LocalRay
-from nerg_mi.transport.media.protocol import Medium
+from nerg_mi.transport.media.protocol import Medium, Occupancy
 
 from .settings import MarchSettings
 
@@ -38,8 +38,9 @@ def advance(
         # Empty cells are left by strides that are too short to pass over any matter beside them.
         stride = min(settings.step, 0.5 * cells.edge, settings.cell_step)
         settings, fine_from = replace(settings, step=stride, dt_gamma=0.0), None
-    if medium.occupancy is not None:
-        t, share = leap(medium, ray, t, t1, share, settings, active, fine_from)
+    grid = medium.occupancy
+    if grid is not None:
+        t, share = leap(medium, grid, ray, t, t1, share, settings, active, fine_from)
         active = active & (t < t1)
     if cells is None:
         t_next = t + step_length(t, settings, fine_from) * share
@@ -64,6 +65,7 @@ def step_length(t: Float, settings: MarchSettings, fine_from: Float | None = Non
 
 def leap(
     medium: Medium,
+    grid: Occupancy,
     ray: LocalRay,
     t: Float,
     t1: Float,
@@ -73,8 +75,7 @@ def leap(
     fine_from: Float | None,
 ) -> tuple[Float, Float]:
     """``(t, share)`` of the first step whose midpoint lies in an occupied cell, or from ``t1`` on: ``t`` advanced by
-    whole steps, of which the first is ``share`` of a full one long."""
-    grid = medium.occupancy
+    whole steps, of which the first is ``share`` of a full one long. ``grid``: the medium's occupancy."""
     o, d = medium.to_unit(ray.o), medium.vector_to_unit(ray.d)
 
     def body(seeking, t, share):

@@ -127,6 +127,8 @@ class VolumeMedium:
         return self.density(p, active), []
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
+        if self._color is None:
+            raise ValueError("a medium without colour was asked for its colour")
         return self._color.eval(self._at(p), active)
 
     def background(self, o: Point3f, d: Vector3f) -> None:

@@ -28,7 +28,7 @@ class Simpson:
     def start(self, Float):
         return None
 
-    def step(self, medium, ray, t, delta, t_next, carry, active, color) -> Step:
+    def step(self, medium, ray, t, delta, t_next, carry, active, colored) -> Step:
         first, middle, last = (medium.density(ray.o + ray.d * (t + s * delta), active) for s in (0, 0.5, 1))
         dtau = dr.select(active, (first + 4 * middle + last) * delta / 6, 0)
         p = ray.o + ray.d * (t + 0.5 * delta)
@@ -36,7 +36,7 @@ class Simpson:
             dtau,
             linear_share(first * delta, last * delta),
             lambda missing: delta * quotient(missing, dr.select(dtau > 0, dtau, 1)),
-            lambda lit: color.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit),
+            lambda painter, lit: painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit),
             None,
             dr.select(active, 3.0, 0.0),
         )

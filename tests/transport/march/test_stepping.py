@@ -64,17 +64,23 @@ def test04_leaps_pass_the_steps_whose_middle_lies_in_an_empty_cell_and_no_others
     bits = np.zeros((16, 1, 1), bool)
     bits[11] = True
     same = lambda v: v
-    medium = SimpleNamespace(occupancy=OccupancyGrid(bits, ns, 0), to_unit=same, vector_to_unit=same)
+    medium, grid = SimpleNamespace(to_unit=same, vector_to_unit=same), OccupancyGrid(bits, ns, 0)
     ray = SimpleNamespace(o=ns.Array3f(0.5, 0.5, 0), d=ns.Array3f(0, 0, 1))
     step = 1 / 43
     borders = np.concatenate([[0], (share + np.arange(44)) * step])
     middles = 0.5 * (borders[:-1] + borders[1:])
     want = borders[np.argmax(np.floor(16 * middles) == 11)]
-    t, first = leap(medium, ray, ns.Float(0), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None)
+    t, first = leap(
+        medium, grid, ray, ns.Float(0), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None
+    )
     assert np.isclose(t[0], want, atol=1e-6) and first[0] == 1
     # From inside matter nothing is passed, and the first step stays as short as it was.
-    t, first = leap(medium, ray, ns.Float(0.7), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None)
+    t, first = leap(
+        medium, grid, ray, ns.Float(0.7), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None
+    )
     assert np.isclose(t[0], 0.7) and np.isclose(first[0], share)
     # Behind all matter they lead out of the box.
-    t, _ = leap(medium, ray, ns.Float(0.8), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None)
+    t, _ = leap(
+        medium, grid, ray, ns.Float(0.8), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None
+    )
     assert t[0] >= 1
