@@ -171,6 +171,8 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
             "gaze",
             str(folder / "gaze_default.safetensors"),
             rays,
+            "--field",
+            str(STORE / "store.safetensors"),
             "--min-rays",
             "8",
             "--resamples",
