@@ -7,20 +7,10 @@ import ast
 import json
 import subprocess
 import sys
-from pathlib import Path
 
-import pytest
-
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
-
-
-@pytest.fixture
-def sites(monkeypatch):
-    monkeypatch.syspath_prepend(str(TOOLS))
-    from mutation import sites
-
-    return sites
-
+from tests.conftest import ROOT
+from tools import mutants
+from tools.mutation import sites
 
 SOURCE = '''\
 """A docstring 1 + 1."""
@@ -50,12 +40,12 @@ def work(x, *, twice=True, power: int = 2):
 '''
 
 
-def changes(sites, source=SOURCE):
+def changes(source=SOURCE):
     return {(m.function, m.kind, m.before, m.after) for m in sites.find("a.py", source)}
 
 
-def test_mistakes_of_every_kind(sites):
-    found = changes(sites)
+def test_mistakes_of_every_kind():
+    found = changes()
     assert {
         ("module", "integer", "5", "6"),
         ("module", "integer", "5", "4"),
@@ -79,15 +69,15 @@ def test_mistakes_of_every_kind(sites):
     } <= found
 
 
-def test_what_no_test_should_look_at_is_left_alone(sites):
+def test_what_no_test_should_look_at_is_left_alone():
     """Docstrings, annotations, messages, what prints an object, and what only schedules."""
-    for function, kind, before, _ in changes(sites):
+    for function, _, before, _ in changes():
         assert "__repr__" not in function and "ring" not in before
         assert "below" not in before and before not in ("LIMIT * 2", "np.eval(total)", "int")
     assert sum(m.before == "x + 1" and m.kind == "arithmetic" for m in sites.find("a.py", SOURCE)) == 1
 
 
-def test_mutants_are_single_changes_and_python(sites):
+def test_mutants_are_single_changes_and_python():
     for mutant in sites.find("a.py", SOURCE):
         changed = mutant.apply(SOURCE)
         assert sites.compiles(mutant, SOURCE) and changed.count("\n") == SOURCE.count("\n")
@@ -96,15 +86,13 @@ def test_mutants_are_single_changes_and_python(sites):
         assert changed.splitlines()[mutant.last :] == SOURCE.splitlines()[mutant.last :]
 
 
-def test_names_stay_when_lines_move(sites):
+def test_names_stay_when_lines_move():
     moved = SOURCE.replace("LIMIT = 5\n", "LIMIT = 5\n\n\ndef more(x):\n    return x * 2 + 1\n")
     before, after = ({m.key for m in sites.find("a.py", s)} for s in (SOURCE, moved))
     assert before < after and len(before) == len(sites.find("a.py", SOURCE))
 
 
-def test_the_sample_is_of_the_size_that_it_says(sites):
-    import mutants
-
+def test_the_sample_is_of_the_size_that_it_says():
     for package, count in mutants.QUOTAS.items():
         chosen = mutants.sample(package)
         assert len({m.key for m in chosen}) == len(chosen) == count
@@ -124,7 +112,7 @@ def test_a_trial_runs_on_its_own_tree_and_says_what_failed(tmp_path):
     )
     code = (
         "import json, sys\nfrom pathlib import Path\n"
-        f"sys.path.insert(0, {str(TOOLS / 'mutation')!r})\n"
+        f"sys.path.insert(0, {str(ROOT / 'tools' / 'mutation')!r})\n"
         "import worker\n"
         f"worker.serve(Path({str(tmp_path)!r}), sys.stdin, sys.stdout)\n"
     )

@@ -73,7 +73,7 @@ class Reach:
 
     def _reaching(self, source: str, lines: set[int] | None) -> list[str]:
         found = set()
-        for file, record in self.records.items():
+        for record in self.records.values():
             if source not in record["lines"]:
                 continue
             then = self._moved(source, record["sources"][source])

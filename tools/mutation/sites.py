@@ -12,96 +12,20 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-_SIGNS = {
-    ast.Lt: "<",
-    ast.LtE: "<=",
-    ast.Gt: ">",
-    ast.GtE: ">=",
-    ast.Eq: "==",
-    ast.NotEq: "!=",
-    ast.Is: "is",
-    ast.IsNot: "is not",
-    ast.In: "in",
-    ast.NotIn: "not in",
-}
-_COMPARE = {"<": ">", "<=": ">=", "==": "!=", "is": "is not", "in": "not in"}
-_COMPARE |= {b: a for a, b in _COMPARE.items()}
-_BOUNDARY = {"<": "<=", "<=": "<", ">": ">=", ">=": ">"}
-_ARITHMETIC = {
-    ast.Add: ("+", "-"),
-    ast.Sub: ("-", "+"),
-    ast.Mult: ("*", "/"),
-    ast.Div: ("/", "*"),
-    ast.FloorDiv: ("//", "/"),
-    ast.Mod: ("%", "*"),
-    ast.Pow: ("**", "*"),
-    ast.BitAnd: ("&", "|"),
-    ast.BitOr: ("|", "&"),
-    ast.LShift: ("<<", ">>"),
-    ast.RShift: (">>", "<<"),
-    ast.BitXor: ("^", "&"),
-    ast.MatMult: ("@", "*"),
-}
-_TWINS = {
-    "min": "max",
-    "minimum": "maximum",
-    "fmin": "fmax",
-    "argmin": "argmax",
-    "any": "all",
-    "nanmin": "nanmax",
-    "sin": "cos",
-    "floor": "ceil",
-    "cumsum": "cumprod",
-    "zeros": "ones",
-    "zeros_like": "ones_like",
-    "isfinite": "isnan",
-    "left": "right",
-}
-_TWINS |= {b: a for a, b in _TWINS.items()}
-_MATHS = {"dr", "np", "math", "mi", "numpy"}
-# What only decides when and where something is computed: without it values are the same.
-_SCHEDULING = {"eval", "schedule", "sync_thread", "make_opaque", "flush_malloc_cache"}
-# A call of these is no function of its first argument that could be left out, or only converts it.
-_MAKERS = {
-    "asarray",
-    "array",
-    "ascontiguousarray",
-    "opaque",
-    "zeros",
-    "ones",
-    "full",
-    "empty",
-    "arange",
-    "linspace",
-    "eye",
-    "width",
-    "shape",
-    "ndim",
-    "array_t",
-    "uint32_array_t",
-    "load_file",
-    "load_dict",
-    "traverse",
-    "Log",
-    "set_variant",
-    "custom",
-    "while_loop",
-    "if_stmt",
-    "scoped_set_flag",
-    "make_opaque",
-    "eval",
-    "sync_thread",
-    "schedule",
-    "enable_grad",
-    "hint",
-    "errstate",
-    "random",
-    "load",
-    "save",
-}
-_UNTOUCHED_FUNCTIONS = {"__repr__", "__str__", "to_string", "name", "label"}
-_MESSAGE_CALLS = {"Log", "warn", "print", "log", "debug", "info", "echo"}
-_SMALL, _LARGE = 1e-5, 1e5
+from .changes import (
+    ARITHMETIC,
+    BOUNDARY,
+    COMPARE,
+    LARGE,
+    MAKERS,
+    MATHS,
+    MESSAGE_CALLS,
+    SCHEDULING,
+    SIGNS,
+    SMALL,
+    TWINS,
+    UNTOUCHED_FUNCTIONS,
+)
 
 
 @dataclass(frozen=True)
@@ -184,7 +108,7 @@ class _Finder:
 
     def visit_statement(self, s: ast.stmt) -> None:
         if isinstance(s, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
-            if s.name in _UNTOUCHED_FUNCTIONS:
+            if s.name in UNTOUCHED_FUNCTIONS:
                 return
             self.scope.append(s.name)
             if not isinstance(s, ast.ClassDef):
@@ -198,7 +122,7 @@ class _Finder:
         if isinstance(s, ast.Expr) and isinstance(s.value, ast.Call):
             if self.is_message(s.value):
                 return
-            if getattr(s.value.func, "attr", "") not in _SCHEDULING:
+            if getattr(s.value.func, "attr", "") not in SCHEDULING:
                 self.put("removed statement", s, "pass")
         if isinstance(s, ast.AugAssign):
             self.put("removed statement", s, "pass")
@@ -234,7 +158,7 @@ class _Finder:
 
     def is_message(self, call: ast.Call) -> bool:
         name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
-        return name in _MESSAGE_CALLS
+        return name in MESSAGE_CALLS
 
     def expression(self, node: ast.expr) -> None:
         if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Call) and self.is_message(node)):
@@ -242,11 +166,11 @@ class _Finder:
         text = self.text
         if isinstance(node, ast.Compare) and len(node.ops) == 1:
             op, left, right = node.ops[0], node.left, node.comparators[0]
-            sign = _SIGNS[type(op)]
-            self.put("comparison", node, self.exchanged(node, left, right, sign, _COMPARE[sign]))
+            sign = SIGNS[type(op)]
+            self.put("comparison", node, self.exchanged(node, left, right, sign, COMPARE[sign]))
             # Two floats are equal with a probability of nil: a boundary is only told from the next one among integers.
-            if sign in _BOUNDARY and (_is_integer(left) or _is_integer(right)):
-                self.put("boundary", node, self.exchanged(node, left, right, sign, _BOUNDARY[sign]))
+            if sign in BOUNDARY and (_is_integer(left) or _is_integer(right)):
+                self.put("boundary", node, self.exchanged(node, left, right, sign, BOUNDARY[sign]))
         elif isinstance(node, ast.BinOp):
             self.arithmetic(node)
         elif isinstance(node, ast.BoolOp):
@@ -283,7 +207,7 @@ class _Finder:
             for side in (node.left, node.right)
         ):
             return
-        sign, swapped = _ARITHMETIC[type(node.op)]
+        sign, swapped = ARITHMETIC[type(node.op)]
         self.put("arithmetic", node, self.exchanged(node, node.left, node.right, sign, swapped))
         if sign in ("+", "-", "*", "/"):
             self.put("dropped term", node, f"({left})")
@@ -299,7 +223,7 @@ class _Finder:
             if value > 0:
                 self.put("integer", node, str(value - 1))
         elif isinstance(value, float):
-            factor = 1000 if value and not _SMALL < abs(value) < _LARGE else 1.5
+            factor = 1000 if value and not SMALL < abs(value) < LARGE else 1.5
             self.put("number", node, repr(value * factor) if value else "1.0")
 
     def call(self, node: ast.Call) -> None:
@@ -308,17 +232,17 @@ class _Finder:
         owner = (
             function.value.id if isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name) else ""
         )
-        if name in _TWINS:
+        if name in TWINS:
             old = text(function)
-            self.put("twin", function, old[: len(old) - len(name)] + _TWINS[name])
-        if owner in _MATHS and node.args and name.islower() and name not in _MAKERS:
+            self.put("twin", function, old[: len(old) - len(name)] + TWINS[name])
+        if owner in MATHS and node.args and name.islower() and name not in MAKERS:
             if name in ("select", "where") and len(node.args) == 3:
                 a, b, c = map(text, node.args)
                 self.put("branches", node, f"{text(function)}({a}, {c}, {b})")
                 self.put("argument", node, f"({b})")
             elif not isinstance(node.args[0], ast.Starred):
                 self.put("argument", node, f"({text(node.args[0])})")
-        for k, keyword in enumerate(node.keywords):
+        for keyword in node.keywords:
             if keyword.arg is None or keyword.arg in ("label", "name", "message"):
                 continue
             rest = [*map(text, node.args), *(text(w) for w in node.keywords if w is not keyword)]
