@@ -6,6 +6,9 @@
 # While working, and before a release:
 #
 #   make check     the quick tests of every part (a minute or so on two cores); ARGS as above
+#   make lint      format, style, import rules and types, all of which have to be right; nothing is changed
+#   make format    put right what of it can be put right by itself
+#   make docs      write what the pages say about the code: tables, pictures
 #   make onecore   the tests that render, write pictures and train, on one core, where Dr.Jit has one thread
 #   make coverage  all tests, and which branches of the package they reach
 #   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
@@ -26,7 +29,7 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
-.PHONY: demo test check onecore coverage fuzz mutants faults soak packages setup
+.PHONY: demo test check lint format docs onecore coverage fuzz mutants faults soak packages setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
@@ -36,6 +39,22 @@ test check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
 test: setup
 	$(PYTEST) $(ARGS)
 
+lint format: EXTRAS = lint
+
+lint: setup
+	$(RUN) -m ruff check
+	$(RUN) -m ruff format --check
+	$(RUN) -m tools.import_rules
+	$(RUN) -m basedpyright
+
+format: setup
+	$(RUN) -m ruff check --fix
+	$(RUN) -m ruff format
+
+docs: setup
+	$(RUN) -m tools.generated
+	$(RUN) -m tools.architecture
+
 check: setup
 	$(PYTEST) -q -m "not slow" $(ARGS)
 
@@ -44,10 +63,10 @@ onecore: setup
 	else echo "One core is not tried: taskset (of util-linux) is not installed."; fi
 
 coverage: setup
-	$(RUN) tools/branches.py $(ARGS)
+	$(RUN) -m tools.branches $(ARGS)
 
 fuzz mutants faults soak packages: setup
-	$(RUN) tools/$@.py $(ARGS)
+	$(RUN) -m tools.$@ $(ARGS)
 
 setup:
 	@$(PYTHON) tools/setup.py $(EXTRAS)

@@ -21,7 +21,8 @@ SITE = Path(numpy.__file__).parents[1]
 
 def uninstalled(code: str, folder: Path, **environment):
     """Run ``code`` in ``folder`` by a Python that knows the dependencies, and no installation of the package."""
-    begin = f"import sys\nsys.path.append({str(SITE)!r})\nassert not any('editable' in repr(f).lower() for f in sys.meta_path)\n"
+    begin = f"import sys\nsys.path.append({str(SITE)!r})\n"
+    begin += "assert not any('editable' in repr(f).lower() for f in sys.meta_path)\n"
     kept = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     return subprocess.run(
         [sys.executable, "-S", "-c", begin + textwrap.dedent(code)],
@@ -63,7 +64,8 @@ def test02_nothing_else_becomes_part_of_the_package():
 
 def test03_an_installation_is_left_alone():
     """Where something else finds the plugins, as here, or where they lie in the package, no finder is added."""
-    code = "import nerg_mi, importlib, sys; importlib.reload(nerg_mi); print(sum(type(f).__name__ == 'Beside' for f in sys.meta_path))"
+    code = "import nerg_mi, importlib, sys; importlib.reload(nerg_mi); "
+    code += "print(sum(type(f).__name__ == 'Beside' for f in sys.meta_path))"
     here = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/")
     assert here.stdout.strip() == "0", here.stderr
     assert uninstalled(code, ROOT).stdout.strip() == "1"

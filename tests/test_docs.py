@@ -61,10 +61,8 @@ def test04_the_default_recipe_is_as_described():
     c, s, p = plan.config, plan.settings, plan.probes
     assert f"{NUMBERS[c.grid.levels].capitalize()} levels of a grid ({c.grid.base} to {c.grid.finest})" in row
     assert f"up to degree {c.sh_degree - 1}, two networks {c.width} wide" in row and c.layers == 2
-    assert (
-        f"weight decay {s['weight_decay']:g}, {s['steps']} steps, kernels of kappa {p['kappa']:g}, a share of {c.mix:g} of the blind"
-        in row
-    )
+    assert f"weight decay {s['weight_decay']:g}, {s['steps']} steps, kernels of kappa {p['kappa']:g}" in row
+    assert f"a share of {c.mix:g} of the blind" in row
 
 
 def test05_numbers_that_are_constants():

@@ -34,7 +34,8 @@ def run(code):
         "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import nerg_mi; check()",
         "import drjit; import nerg_mi; import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); check()",
         "import nerg_mi; from mitsuba import set_variant; set_variant('llvm_ad_mono'); check()",
-        "import nerg_mi, importlib; importlib.reload(nerg_mi); import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); check()",
+        "import nerg_mi, importlib; importlib.reload(nerg_mi); import mitsuba as mi; "
+        "mi.set_variant('llvm_ad_rgb'); check()",
     ],
 )
 def test01_every_order(code):

@@ -1,6 +1,6 @@
 """Which branches of the package the tests reach: `make coverage`.
 
-    python tools/branches.py [--update docs/trust.md] [-- ARGUMENTS OF PYTEST]
+    python -m tools.branches [--update docs/trust.md] [-- ARGUMENTS OF PYTEST]
 
 Runs the tests under coverage.py, those that start processes of their own included, and prints lines and branches of
 each part, and the files that are reached least. What Dr.Jit traces counts as reached when Python has recorded it,
@@ -17,6 +17,8 @@ import sys
 import tempfile
 from collections import defaultdict
 from pathlib import Path
+
+from tools.page import table, update
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAD = ("Part", "Statements", "reached", "Branches", "reached", "Together")
@@ -80,9 +82,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--update", type=Path, help="page whose table is exchanged")
     parser.add_argument("tests", nargs="*", help="arguments of pytest, behind --")
     options = parser.parse_args(arguments)
-    sys.path.insert(0, str(ROOT))
-    from tools.page import table, update
-
     code, report = measure(options.tests)
     update(options.update, "Coverage", table(HEAD, summarise(report)))
     print("\nReached least:", *least(report), sep="\n  ")

@@ -1,6 +1,6 @@
 """Kills, full disks and forbidden folders: whatever happens to a command, files that were whole stay whole.
 
-    python tools/faults.py [--tries 100] [--only WORD] [--update docs/trust.md]
+    python -m tools.faults [--tries 100] [--only WORD] [--update docs/trust.md]
 
 Commands run in a folder with an earlier result of each. Every second try is killed (SIGKILL) at a moment of its usual
 run, spread from its begin to its end; the others are killed as soon as a file is being written. After each, every file
@@ -21,11 +21,10 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import nerg_mi  # noqa: E402, F401 (before Mitsuba, since it chooses the libLLVM)
-from tools.child_commands import become_nobody, fill, kill_at, kill_while_writing, small_disk, start, wait  # noqa: E402
-from tools.whole_files import contents, lost_files, part  # noqa: E402
+import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
+from tools.child_commands import become_nobody, fill, kill_at, kill_while_writing, small_disk, start, wait
+from tools.page import table, update
+from tools.whole_files import contents, lost_files, part
 
 
 @dataclass(frozen=True)
@@ -293,8 +292,6 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     # Children have what is loaded here; nothing may be begun with it.
     import matplotlib  # noqa: F401
-
-    from tools.page import table, update
 
     with tempfile.TemporaryDirectory(prefix="nerg-faults-") as made:
         work, inputs = Path(made), Path(made) / "inputs"

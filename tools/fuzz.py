@@ -1,6 +1,6 @@
 """Damage what every reader reads, many times, and count what comes of it.
 
-Usage: python tools/fuzz.py [--cases 20000] [--start 1] [--only NAME] [--keep] [--update docs/trust.md]
+    python -m tools.fuzz [--cases 20000] [--start 1] [--only NAME] [--keep] [--update docs/trust.md]
 
 Each reader gets as many cases, drawn by hypothesis (see tests/fuzz/mutations.py) and the same for the same ``--start``.
 A child process reads them under a limit of memory, with an audit hook that sees whatever is run or written. Printed is
@@ -17,16 +17,12 @@ import tempfile
 from collections import Counter, defaultdict
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
-
-from page import table, update  # noqa: E402
-
-import nerg_mi  # noqa: E402, F401  (chooses the libLLVM, so it comes before mitsuba)
-from tests.fuzz.cases import draw_cases, make_inputs  # noqa: E402
-from tests.fuzz.keeping import CORPUS, kept  # noqa: E402
-from tests.fuzz.readers import READERS  # noqa: E402
-from tests.fuzz.watch import BREACHES, run_cases  # noqa: E402
+import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
+from tests.fuzz.cases import draw_cases, make_inputs
+from tests.fuzz.keeping import CORPUS, kept
+from tests.fuzz.readers import READERS
+from tests.fuzz.watch import BREACHES, run_cases
+from tools.page import table, update
 
 HEAD = (
     "reader",

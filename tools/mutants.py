@@ -1,10 +1,10 @@
 """Small mistakes put into the source, one at a time: which of them the tests notice.
 
-    make mutants                                    the fixed sample of 400, resumed where it stopped
-    python tools/mutants.py --package field         those of one package
-    python tools/mutants.py --only FILE:LINE[:KIND] every mutant of a line, in the sample or not
-    python tools/mutants.py --survivors             read those that survived; nothing is run
-    python tools/mutants.py --update docs/trust.md  put the table of all results on the page; nothing is run
+    make mutants                                      the fixed sample of 400, resumed where it stopped
+    python -m tools.mutants --package nerg_mi/field   those of one package
+    python -m tools.mutants --only FILE:LINE[:KIND]   every mutant of a line, in the sample or not
+    python -m tools.mutants --survivors               read those that survived; nothing is run
+    python -m tools.mutants --update docs/trust.md    put the table of all results on the page; nothing is run
 
 A mutant is made in a copy of the repository, never in the working tree, and judged by the tests that execute its line:
 those of the file of tests that mirrors its module first, then the others, the quickest first, up to a bound of recorded
@@ -27,12 +27,11 @@ import json
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-import page
-from mutation.bench import BUILD, ROOT, Bench
-from mutation.reach import Reach, digest
-from mutation.sites import Mutant, compiles, find
+from tools import page
+from tools.mirror import is_test_of
+from tools.mutation.bench import BUILD, ROOT, Bench
+from tools.mutation.reach import Reach, digest
+from tools.mutation.sites import Mutant, compiles, find
 
 SEED = "nerg"
 QUOTAS = {
@@ -78,12 +77,9 @@ def sample(package: str, tree: Path = ROOT) -> list[Mutant]:
 
 def in_order(mutant: Mutant, tests: list[str], reach: Reach, first: str | None) -> list[str]:
     """The tests, nearest first: the last killer, the mirroring file, then the quickest."""
-    folder, name = str(Path(mutant.file).parent).removeprefix("nerg_mi/"), Path(mutant.file).stem
-    mirror = f"tests/{folder}/test_{name}"
 
-    def rank(test: str):
-        near = test.startswith((mirror + ".py", mirror + "_"))
-        return test != first, not near, reach.tests[test]["seconds"]
+    def rank(test: str) -> tuple[bool, bool, float]:
+        return test != first, not is_test_of(test, mutant.file), reach.tests[test]["seconds"]
 
     return sorted(tests, key=rank)
 

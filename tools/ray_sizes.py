@@ -1,6 +1,6 @@
 """Time and memory of `nerg rays` on ten million rays.
 
-    python tools/ray_sizes.py [--rays 10000000] [--folder FOLDER] [--update docs/trust.md]
+    python -m tools.ray_sizes [--rays 10000000] [--folder FOLDER] [--update docs/trust.md]
 
 The rays are those of 500 people who walk about for as long as it takes at 50 Hz, with hit points. Each command runs in
 a process of its own, whose peak memory is compared with the columns of its input: 92 bytes a ray.
@@ -17,9 +17,11 @@ import time
 from pathlib import Path
 
 import numpy as np
-from page import table, update
 
 from nerg_mi.rays.rays import Rays
+from tools.page import table, update
+
+ROOT = Path(__file__).resolve().parents[1]
 
 PEOPLE = 500
 
@@ -74,29 +76,14 @@ def main() -> None:
         source = folder / f"rays-{options.rays}.npz"
         if not source.is_file():
             # In another process: a child begins with the peak of its parent.
-            made = f"import ray_sizes; ray_sizes.walks({options.rays}).save({str(source)!r})"
-            subprocess.run([sys.executable, "-c", made], check=True, cwd=Path(__file__).parent)
+            made = f"from tools.ray_sizes import walks; walks({options.rays}).save({str(source)!r})"
+            subprocess.run([sys.executable, "-c", made], check=True, cwd=ROOT)
         columns = 92 * options.rays
+        keep = lambda name, least: ["rays", "filter", str(source), "-o", str(folder / name), "--min-confidence", least]
         commands = {
             "rays show": ["rays", "show", str(source)],
-            "rays filter, half of them": [
-                "rays",
-                "filter",
-                str(source),
-                "-o",
-                str(folder / "half.npz"),
-                "--min-confidence",
-                "0.5",
-            ],
-            "rays filter, all but a few": [
-                "rays",
-                "filter",
-                str(source),
-                "-o",
-                str(folder / "most.npz"),
-                "--min-confidence",
-                "0.001",
-            ],
+            "rays filter, half of them": keep("half.npz", "0.5"),
+            "rays filter, all but a few": keep("most.npz", "0.001"),
         }
         rows = []
         for name, command in commands.items():

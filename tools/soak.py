@@ -1,6 +1,6 @@
 """Long use: memory stays flat over thousands of frames and training steps, changes of variant, and with two threads.
 
-    python tools/soak.py [--part NAME ...] [--share 1.0] [--update docs/trust.md]
+    python -m tools.soak [--part NAME ...] [--share 1.0] [--update docs/trust.md]
 
 Each part runs in a process of its own. Its resident memory is sampled between units of work, the first third is let
 pass (kernels are compiled and caches filled), and a line is fitted to the rest by least squares. A part fails, and the
@@ -23,9 +23,11 @@ from pathlib import Path
 
 import numpy as np
 
+import nerg_mi  # noqa: F401 (before Mitsuba, since it chooses the libLLVM)
+from tools import tiny
+from tools.page import table, update
+
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
-import nerg_mi  # noqa: E402, F401 (before Mitsuba, since it chooses the libLLVM)
 
 _SAMPLES = 120
 _SIZES = {"width": "36", "height": "24"}
@@ -139,7 +141,6 @@ def radiance_steps() -> Callable[[int], None]:
     from nerg_mi.maths.box import Box
     from nerg_mi.training.radiance.settings import RadianceSettings
     from nerg_mi.training.radiance.trainer import RadianceTrainer
-    from tools import tiny
 
     assert mi.variant()
     lens = Intrinsics(tiny.SIDE, tiny.SIDE, 30.0, 30.0, tiny.SIDE / 2, tiny.SIDE / 2)
@@ -173,7 +174,6 @@ def gaze_steps() -> Callable[[int], None]:
     from nerg_mi.training.gaze.supervision import supervise_rays
     from nerg_mi.training.gaze.trainer import GazeTrainer
     from nerg_mi.training.geometry.places import place_of_nothing
-    from tools import tiny
 
     rays = tiny.looks()
     place = place_of_nothing(rays.origin)
@@ -256,8 +256,8 @@ def run_part(name: str, share: float = 1.0) -> Course:
 
 def run_apart(name: str, share: float) -> Course | str:
     """The part called ``name`` in a process of its own; what went wrong where it did not come to its end."""
-    command = [sys.executable, __file__, "--only", name, "--share", str(share)]
-    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    command = [sys.executable, "-m", "tools.soak", "--only", name, "--share", str(share)]
+    done = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)
     if done.returncode != 0:
         return f"ended with {done.returncode}: {(done.stderr.strip().splitlines() or ['nothing said'])[-1]}"
     return Course(**json.loads(done.stdout.splitlines()[-1]))
@@ -273,7 +273,6 @@ def main(arguments: list[str] | None = None) -> int:
     if options.only:
         print(json.dumps(asdict(run_part(options.only, options.share))))
         return 0
-    from tools.page import table, update
 
     rows, good = [], True
     for name in options.part or PARTS:

@@ -4,25 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.conftest import ROOT
 
 
 def test_a_row_for_each_command(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A page\n\n## Millions of rays\n\nSome words.\n")
     done = subprocess.run(
-        [
-            sys.executable,
-            ROOT / "tools" / "ray_sizes.py",
-            "--rays",
-            "5000",
-            "--folder",
-            tmp_path / "made",
-            "--update",
-            page,
-        ],
+        [sys.executable, "-m", "tools.ray_sizes", "--rays", "5000", "--folder", tmp_path / "made", "--update", page],
+        cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=300,
