@@ -1,0 +1,122 @@
+"""The tree as a whole: tests mirror it, and no file grows past what one can read."""
+
+from __future__ import annotations
+
+import subprocess
+
+from tests.conftest import ROOT
+from tools.mirror import is_test_of, test_file_of, without_tests
+
+LONGEST = 350
+
+TO_SPLIT = {
+    "benchmarks/numerics_march.py",
+    "nerg_mi/cli/rays.py",
+    "nerg_mi/cli/train_gaze.py",
+    "nerg_mi/evaluation/ablation.py",
+    "nerg_mi/formats/torch_ngp/fields.py",
+    "plugins/nerg.py",
+    "tests/capture/test_dataset.py",
+    "tests/capture/test_transforms.py",
+    "tests/cli/outputs.py",
+    "tests/evaluation/study/test_run.py",
+    "tests/plugins/test_nerg.py",
+    "tests/training/gaze/test_trainer.py",
+    "tests/training/radiance/test_trainer.py",
+    "tools/mutation/sites.py",
+    "tools/packages.py",
+}
+"""Files that are longer, and to be split."""
+
+TO_WRITE = "to be written"
+
+TESTED_ELSEWHERE: dict[str, str] = {
+    "nerg_mi/__init__.py": TO_WRITE,
+    "nerg_mi/capture/intrinsics.py": TO_WRITE,
+    "nerg_mi/capture/posed.py": TO_WRITE,
+    "nerg_mi/capture/resize.py": TO_WRITE,
+    "nerg_mi/capture/sources.py": TO_WRITE,
+    "nerg_mi/cli/__init__.py": TO_WRITE,
+    "nerg_mi/cli/ablate.py": TO_WRITE,
+    "nerg_mi/cli/eval_gaze.py": TO_WRITE,
+    "nerg_mi/cli/study.py": TO_WRITE,
+    "nerg_mi/cli/train_gaze.py": TO_WRITE,
+    "nerg_mi/diagnosis.py": TO_WRITE,
+    "nerg_mi/errors.py": TO_WRITE,
+    "nerg_mi/evaluation/study/errors.py": TO_WRITE,
+    "nerg_mi/evaluation/study/operations.py": TO_WRITE,
+    "nerg_mi/evaluation/study/reference.py": TO_WRITE,
+    "nerg_mi/evaluation/study/scenes.py": TO_WRITE,
+    "nerg_mi/evaluation/study/tables.py": TO_WRITE,
+    "nerg_mi/field/backend.py": TO_WRITE,
+    "nerg_mi/formats/architecture.py": TO_WRITE,
+    "nerg_mi/formats/torch_ngp/archive.py": TO_WRITE,
+    "nerg_mi/formats/torch_ngp/pickling.py": TO_WRITE,
+    "nerg_mi/formats/volumes.py": TO_WRITE,
+    "nerg_mi/jobs/reporter.py": TO_WRITE,
+    "nerg_mi/maths/similarity.py": TO_WRITE,
+    "nerg_mi/properties.py": TO_WRITE,
+    "nerg_mi/rays/metadata.py": TO_WRITE,
+    "nerg_mi/rays/readers/poses.py": TO_WRITE,
+    "nerg_mi/rendering/pictures.py": TO_WRITE,
+    "nerg_mi/training/gaze/log_density_model.py": TO_WRITE,
+    "nerg_mi/training/gaze/product_model.py": TO_WRITE,
+    "nerg_mi/training/gaze/recipes.py": TO_WRITE,
+    "nerg_mi/training/gaze/run.py": TO_WRITE,
+    "nerg_mi/training/gaze/supervision.py": TO_WRITE,
+    "nerg_mi/training/geometry/hit_geometry.py": TO_WRITE,
+    "nerg_mi/training/radiance/run.py": TO_WRITE,
+    "nerg_mi/training/radiance/settings.py": TO_WRITE,
+    "nerg_mi/transport/freezing.py": TO_WRITE,
+    "nerg_mi/transport/media/field.py": TO_WRITE,
+    "nerg_mi/transport/media/protocol.py": TO_WRITE,
+    "nerg_mi/transport/media/volume.py": TO_WRITE,
+    "nerg_mi/transport/observer/ensemble.py": TO_WRITE,
+    "nerg_mi/transport/observer/gaze_medium.py": TO_WRITE,
+    "nerg_mi/transport/shading.py": TO_WRITE,
+    "nerg_mi/view/demo.py": TO_WRITE,
+    "tools/child_commands.py": TO_WRITE,
+    "tools/fuzz.py": TO_WRITE,
+    "tools/import_rules.py": TO_WRITE,
+    "tools/imports.py": TO_WRITE,
+    "tools/mirror.py": TO_WRITE,
+    "tools/mutation/bench.py": TO_WRITE,
+    "tools/mutation/reach.py": TO_WRITE,
+    "tools/mutation/sites.py": TO_WRITE,
+    "tools/mutation/worker.py": TO_WRITE,
+    "tools/tiny.py": TO_WRITE,
+    "tools/unchanged.py": TO_WRITE,
+    "tools/whole_files.py": TO_WRITE,
+}
+"""Modules without a file of tests of their own -> where and why."""
+
+
+def python_files() -> list[str]:
+    """Every Python file of the checkout that git does not ignore."""
+    listed = ["git", "-C", str(ROOT), "ls-files", "--cached", "--others", "--exclude-standard", "*.py"]
+    files = subprocess.run(listed, capture_output=True, text=True, check=True).stdout.split()
+    return [name for name in files if (ROOT / name).is_file()]
+
+
+def test_every_module_has_its_tests():
+    assert [m for m in without_tests(("nerg_mi", "plugins", "tools")) if m not in TESTED_ELSEWHERE] == []
+
+
+def test_no_file_is_longer_than_one_can_read():
+    lengths = {name: len((ROOT / name).read_text(encoding="utf-8").splitlines()) for name in python_files()}
+    assert len(lengths) > 300 and {name: n for name, n in lengths.items() if n > LONGEST and name not in TO_SPLIT} == {}
+
+
+def test_nothing_is_kept_from_the_formatter():
+    marks = [f"# fmt: {word}" for word in ("skip", "off")]
+    assert [n for n in python_files() if any(m in (ROOT / n).read_text(encoding="utf-8") for m in marks)] == []
+
+
+def test_names_of_the_mirror():
+    assert test_file_of("nerg_mi/field/gaze/product.py") == "tests/field/gaze/test_product.py"
+    assert test_file_of("nerg_mi/llvm.py") == "tests/test_llvm.py"
+    assert test_file_of("plugins/nerg.py") == "tests/plugins/test_nerg.py"
+    assert test_file_of("nerg_mi/api/__init__.py") == "tests/api/test_init.py"
+    assert is_test_of("tests/plugins/test_nerg_shapes.py::test_a", "plugins/nerg.py")
+    assert not is_test_of("tests/plugins/test_nerg_shapes.py::test_a", "plugins/nerf.py")
+    assert not is_test_of("tests/plugins/test_nergy.py::test_a", "plugins/nerg.py")
