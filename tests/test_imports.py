@@ -5,8 +5,6 @@ That they run down from room to room is checked by `make lint` (import-linter, p
 
 from __future__ import annotations
 
-import pytest
-
 from tools.imports import Import, all_imports, circles, modules
 
 PACKAGE = all_imports()
@@ -102,34 +100,3 @@ def test_names_with_an_underscore_stay_where_they_are():
 
 def test_imports_within_functions_have_a_reason():
     assert [f"{i.source}:{i.line} imports {i.target}" for i in late() if (i.source, i.target) not in LATE_HERE] == []
-
-
-@pytest.mark.parametrize(
-    "text, when, target, names",
-    [
-        ("from nerg_mi.field import mlp", "load", "nerg_mi.field.mlp", ()),
-        ("from . import mlp as m", "load", "nerg_mi.field.mlp", ()),
-        ("from .mlp import Mlp, _width", "load", "nerg_mi.field.mlp", ("Mlp", "_width")),
-        ("import nerg_mi.field.mlp", "load", "nerg_mi.field.mlp", ()),
-        ("def f():\n    if True:\n        from .mlp import Mlp", "call", "nerg_mi.field.mlp", ("Mlp",)),
-        (
-            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from .mlp import Mlp",
-            "types",
-            "nerg_mi.field.mlp",
-            ("Mlp",),
-        ),
-    ],
-)
-def test_what_an_import_statement_says(tmp_path, text, when, target, names):
-    from tools.imports import imports_of
-
-    path = tmp_path / "a.py"
-    path.write_text(text)
-    known = {"nerg_mi": path, "nerg_mi.field": path, "nerg_mi.field.mlp": path}
-    (found,) = imports_of("nerg_mi.field.a", path, known)
-    assert (found.when, found.target, found.names, found.source) == (when, target, names, "nerg_mi.field.a")
-
-
-def test_circles_are_found():
-    assert circles({("a", "b"), ("b", "c"), ("c", "a"), ("c", "d"), ("e", "e")}) == [["a", "b", "c"], ["e"]]
-    assert circles({("a", "b"), ("a", "c"), ("b", "d"), ("c", "d")}) == []

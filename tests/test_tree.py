@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 
 from tests.conftest import ROOT
-from tools.mirror import is_test_of, test_file_of, without_tests
+from tools.mirror import without_tests
 
 LONGEST = 350
 
@@ -110,13 +110,3 @@ def test_no_file_is_longer_than_one_can_read():
 def test_nothing_is_kept_from_the_formatter():
     marks = [f"# fmt: {word}" for word in ("skip", "off")]
     assert [n for n in python_files() if any(m in (ROOT / n).read_text(encoding="utf-8") for m in marks)] == []
-
-
-def test_names_of_the_mirror():
-    assert test_file_of("nerg_mi/field/gaze/product.py") == "tests/field/gaze/test_product.py"
-    assert test_file_of("nerg_mi/llvm.py") == "tests/test_llvm.py"
-    assert test_file_of("plugins/nerg.py") == "tests/plugins/test_nerg.py"
-    assert test_file_of("nerg_mi/api/__init__.py") == "tests/api/test_init.py"
-    assert is_test_of("tests/plugins/test_nerg_shapes.py::test_a", "plugins/nerg.py")
-    assert not is_test_of("tests/plugins/test_nerg_shapes.py::test_a", "plugins/nerf.py")
-    assert not is_test_of("tests/plugins/test_nergy.py::test_a", "plugins/nerg.py")

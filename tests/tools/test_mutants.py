@@ -1,95 +1,11 @@
-"""The mutation tester: what it changes and what not, names that outlive other changes, and trials on a tree of their
-own."""
+"""The sample of mutants, and the order in which tests judge one."""
 
 from __future__ import annotations
 
-import ast
-import json
-import subprocess
-import sys
+from types import SimpleNamespace
 
-from tests.conftest import ROOT
 from tools import mutants
 from tools.mutation import sites
-
-SOURCE = '''\
-"""A docstring 1 + 1."""
-from __future__ import annotations
-import numpy as np
-
-LIMIT = 5
-
-
-class Thing:
-    size: int = 1 + 2
-
-    def __repr__(self):
-        return "a" + str(3 * self.size)
-
-
-def work(x, *, twice=True, power: int = 2):
-    """Docstring: x - 1."""
-    if x < 0 and power > 1:
-        raise ValueError(f"{x + 1} is below {LIMIT * 2}")
-    total = (x - 1) * (x + 1)
-    total = total / power
-    total += 3.5
-    np.eval(total)
-    scale(total, by=LIMIT)
-    return np.where(twice, -total, max(x, total))
-'''
-
-
-def changes(source=SOURCE):
-    return {(m.function, m.kind, m.before, m.after) for m in sites.find("a.py", source)}
-
-
-def test_mistakes_of_every_kind():
-    found = changes()
-    assert {
-        ("module", "integer", "5", "6"),
-        ("module", "integer", "5", "4"),
-        ("Thing", "arithmetic", "1 + 2", "(1 - 2)"),
-        ("work", "boolean", "True", "False"),
-        ("work", "integer", "2", "3"),
-        ("work", "comparison", "x < 0", "(x > 0)"),
-        ("work", "boundary", "x < 0", "(x <= 0)"),
-        ("work", "logic", "x < 0 and power > 1", "((x < 0) or (power > 1))"),
-        ("work", "condition", "x < 0 and power > 1", "(not (x < 0 and power > 1))"),
-        ("work", "arithmetic", "(x - 1) * (x + 1)", "((x - 1) / (x + 1))"),
-        ("work", "dropped term", "(x - 1) * (x + 1)", "(x - 1)"),
-        ("work", "dropped term", "(x - 1) * (x + 1)", "(x + 1)"),
-        ("work", "removed statement", "total = total / power", "pass"),
-        ("work", "sign", "total += 3.5", "total -= 3.5"),
-        ("work", "number", "3.5", "5.25"),
-        ("work", "keyword", "scale(total, by=LIMIT)", "scale(total)"),
-        ("work", "sign", "-total", "(total)"),
-        ("work", "branches", "np.where(twice, -total, max(x, total))", "np.where(twice, max(x, total), -total)"),
-        ("work", "twin", "max", "min"),
-    } <= found
-
-
-def test_what_no_test_should_look_at_is_left_alone():
-    """Docstrings, annotations, messages, what prints an object, and what only schedules."""
-    for function, _, before, _ in changes():
-        assert "__repr__" not in function and "ring" not in before
-        assert "below" not in before and before not in ("LIMIT * 2", "np.eval(total)", "int")
-    assert sum(m.before == "x + 1" and m.kind == "arithmetic" for m in sites.find("a.py", SOURCE)) == 1
-
-
-def test_mutants_are_single_changes_and_python():
-    for mutant in sites.find("a.py", SOURCE):
-        changed = mutant.apply(SOURCE)
-        assert sites.compiles(mutant, SOURCE) and changed.count("\n") == SOURCE.count("\n")
-        assert ast.dump(ast.parse(changed)) != ast.dump(ast.parse(SOURCE))
-        assert changed.splitlines()[: mutant.line - 1] == SOURCE.splitlines()[: mutant.line - 1]
-        assert changed.splitlines()[mutant.last :] == SOURCE.splitlines()[mutant.last :]
-
-
-def test_names_stay_when_lines_move():
-    moved = SOURCE.replace("LIMIT = 5\n", "LIMIT = 5\n\n\ndef more(x):\n    return x * 2 + 1\n")
-    before, after = ({m.key for m in sites.find("a.py", s)} for s in (SOURCE, moved))
-    assert before < after and len(before) == len(sites.find("a.py", SOURCE))
 
 
 def test_the_sample_is_of_the_size_that_it_says():
@@ -100,36 +16,27 @@ def test_the_sample_is_of_the_size_that_it_says():
     assert all(" :: " in key and len(reason) > 20 for key, reason in mutants.equivalents().items())
 
 
-def test_a_trial_runs_on_its_own_tree_and_says_what_failed(tmp_path):
-    """Pass, failure, hang and the end of the process, and a module that comes from elsewhere."""
-    (tmp_path / "test_a.py").write_text(
-        "import os, time\n"
-        "def test_good(): pass\n"
-        "def test_bad(): assert 1 == 2\n"
-        "def test_hangs(): time.sleep(60)\n"
-        "def test_dies(): os.kill(os.getpid(), 9)\n"
-        "def test_stray():\n    import nerg_mi\n    assert 'nerg_mi' in nerg_mi.__file__\n"
-    )
-    code = (
-        "import json, sys\nfrom pathlib import Path\n"
-        f"sys.path.insert(0, {str(ROOT / 'tools' / 'mutation')!r})\n"
-        "import worker\n"
-        f"worker.serve(Path({str(tmp_path)!r}), sys.stdin, sys.stdout)\n"
-    )
-    names = ["test_good", "test_bad", "test_hangs", "test_dies", "test_stray"]
-    requests = [
-        {"tests": [f"test_a.py::{n}"], "limit": 3 if n == "test_hangs" else 60, "log": str(tmp_path / "log")}
-        for n in names
+def test_nearest_tests_judge_first():
+    """What killed it last, then the file that mirrors its module, then the quickest."""
+    (mutant,) = (m for m in sites.find("nerg_mi/field/mlp.py", "x = 1 < 2\n") if m.kind == "comparison")
+    seconds = {
+        "tests/a.py::slow": 9.0,
+        "tests/a.py::quick": 0.1,
+        "tests/field/test_mlp.py::near": 5.0,
+        "tests/field/test_mlp_wide.py::near_too": 6.0,
+        "tests/b.py::killer": 30.0,
+    }
+    reach = SimpleNamespace(tests={name: {"seconds": s} for name, s in seconds.items()})
+    assert mutants.in_order(mutant, list(seconds), reach, "tests/b.py::killer") == [
+        "tests/b.py::killer",
+        "tests/field/test_mlp.py::near",
+        "tests/field/test_mlp_wide.py::near_too",
+        "tests/a.py::quick",
+        "tests/a.py::slow",
     ]
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        input="\n".join(map(json.dumps, requests)),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    answers = [json.loads(line) for line in run.stdout.splitlines()]
-    assert [a["outcome"] for a in answers] == ["passed", "failed", "hang", "crash"]
-    assert answers[1]["by"] == "test_a.py::test_bad"
-    assert run.returncode != 0 and "another tree" in run.stderr and "nerg_mi" in (tmp_path / "log").read_text()
+
+
+def test_groups_of_tests_grow_up_to_the_bound():
+    seconds = dict.fromkeys("abcdefgh", 2.0)
+    assert list(mutants.batches(list("abcdefgh"), seconds, 13.0)) == [["a", "b"], ["c", "d", "e", "f"]]
+    assert list(mutants.batches(["a"], {"a": 100.0}, 1.0)) == [["a"]]

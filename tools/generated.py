@@ -1,0 +1,72 @@
+"""Parts of the documentation that are made of the code: tables of presets, recipes, rules, AOVs and parameters.
+
+    python -m tools.generated [--check]
+
+In a page such a part stands between `<!-- made by make docs: NAME -->` and `<!-- end -->`; what stands there is
+replaced. With `--check` nothing is written: exit code 1 where a part is not what the code says now.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from tools import manual
+from tools.imports import ROOT
+
+PLUGINS = ("nerg", "nerf", "gazefield", "gazekde", "panorama")
+
+
+def plugins() -> str:
+    """A section for each plugin: its parameters and its manual."""
+    sections = []
+    for name in PLUGINS:
+        page = manual.read(ROOT / "plugins" / f"{name}.py")
+        sections += [f"## {page.title}", page.parameter_table(), page.body]
+    return "\n\n".join(sections)
+
+
+PARTS: dict[str, Callable[[], str]] = {"plugins": plugins}
+"""Name of a part -> what makes its text."""
+
+_PART = re.compile(r"(<!-- made by make docs: (\w+) -->\n)(.*?)(<!-- end -->)", re.S)
+
+
+def pages() -> list[Path]:
+    """The pages that may hold such parts."""
+    return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def renewed(text: str) -> str:
+    """`text`, a page, with each of its parts made anew. Raises `KeyError` for a part that nothing makes."""
+    return _PART.sub(lambda m: f"{m[1]}\n{PARTS[m[2]]().strip()}\n\n{m[4]}", text)
+
+
+def stale(write: bool = False) -> list[str]:
+    """The pages of which a part is not what the code says now; `write` mends them."""
+    found = []
+    for page in pages():
+        before = page.read_text(encoding="utf-8")
+        after = renewed(before)
+        if after != before:
+            found.append(str(page.relative_to(ROOT)))
+            if write:
+                page.write_text(after, encoding="utf-8")
+    return found
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing, and fail where a page is out of date")
+    options = parser.parse_args(arguments)
+    found = stale(write=not options.check)
+    for page in found:
+        print(f"{page} is out of date: run make docs" if options.check else f"wrote {page}")
+    return int(options.check and bool(found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

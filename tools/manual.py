@@ -1,0 +1,100 @@
+"""The manual pages of the plugins, which are the docstrings of their files, as Markdown.
+
+Read is as much of reStructuredText as Mitsuba's plugin manuals use: the list of parameters, inline roles, formulas,
+bullets and examples in tabs. Anything else raises `ValueError`, so that no page shows it raw.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+from tools.page import table
+
+FLAGS = {
+    "exposed": "set through `mi.traverse`",
+    "differentiable": "differentiable",
+    "discontinuous": "moves edges, whose derivatives are missing",
+}
+"""What Mitsuba's manual calls a property of a parameter -> what it means."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a plugin; `flags`: what Mitsuba may do with it besides setting it."""
+
+    name: str
+    type: str
+    meaning: str
+    flags: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Manual:
+    """A plugin's page: `title`, `parameters`, and `body`, the rest as Markdown."""
+
+    title: str
+    parameters: list[Parameter]
+    body: str
+
+    def parameter_table(self) -> str:
+        flags = lambda p: f" *({', '.join(FLAGS[f] for f in p.flags)})*" if p.flags else ""
+        rows = [(f"`{p.name}`", p.type, p.meaning + flags(p)) for p in self.parameters]
+        return table(("parameter", "type", "meaning"), rows)
+
+
+def inline(text: str) -> str:
+    """reStructuredText within a line as Markdown."""
+    text = re.sub(r":math:`([^`]+)`", r"$\1$", text)
+    text = re.sub(r":ref:`([^`<]+?) <[^`>]+>`", r"`\1`", text)
+    text = re.sub(r":(?:paramtype|monosp):`([^`]+)`", r"`\1`", text)
+    text = re.sub(r"\|(\w+)\|", r"\1", text)
+    text = re.sub(r"``([^`]+)``", r"`\1`", text)
+    if unknown := re.search(r":\w+:`", text):
+        raise ValueError(f"the role {unknown[0]}...` of a manual page is not known here; add it to tools/manual.py")
+    return text
+
+
+def parameters(block: str) -> list[Parameter]:
+    """The entries of a ``pluginparameters`` list."""
+    found = []
+    for entry in re.split(r"^ \* - ", block, flags=re.M)[1:]:
+        name, kind, meaning, *flags = (" ".join(part.split()) for part in re.split(r"^   - ", entry, flags=re.M))
+        marks = tuple(re.findall(r"\|(\w+)\|", " ".join(flags)))
+        found.append(Parameter(name, inline(kind).replace("`", ""), inline(meaning), marks))
+    return found
+
+
+def examples(block: str) -> str:
+    """The examples of a ``tabs`` block as fenced code."""
+    fences = []
+    for language, code in re.findall(r"^ {4}\.\. code-tab:: (\w+)\n((?:(?: {8}.*)?\n)+)", block + "\n", flags=re.M):
+        code = re.sub(r"^\s*:name:.*\n", "", code).strip("\n")
+        fences.append(f"```{language}\n{textwrap.dedent(code).rstrip()}\n```")
+    return "\n\n".join(fences)
+
+
+def read(path: Path) -> Manual:
+    """The manual page of the plugin in this file."""
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    blocks = re.split(r"\n\n(?=\S)", text)
+    title, listed, body = "", [], []
+    for block in blocks:
+        if block.startswith(".. _"):
+            continue
+        if re.fullmatch(r".+\n-{3,}", block):
+            title = inline(block.splitlines()[0])
+        elif block.startswith(".. pluginparameters::"):
+            listed = parameters(block)
+        elif block.startswith(".. tabs::"):
+            body.append(examples(block))
+        elif block.startswith(".. math::"):
+            body.append(f"```math\n{textwrap.dedent(block.split('::', 1)[1].strip(chr(10))).rstrip()}\n```")
+        elif block.startswith(".. "):
+            raise ValueError(f"{path} has the directive {block.split()[1]}, which tools/manual.py does not know")
+        else:
+            body.append(inline(block))
+    return Manual(title, listed, "\n\n".join(body))
