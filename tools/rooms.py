@@ -19,6 +19,10 @@ MODULES = "errors ..."
 """What the picture calls the modules that lie in no room."""
 
 
+UPWARD = "#c81e1e"
+"""Colour of what should not be."""
+
+
 def layers() -> list[str]:
     """The rooms from top to bottom, as the import rules of pyproject.toml have them."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
@@ -31,11 +35,11 @@ def layers() -> list[str]:
 
 
 def purpose(name: str) -> str:
-    """The first sentence of a room's docstring."""
+    """The first sentence of a room's docstring, up to a semicolon."""
     if name == MODULES:
         return "What every room may use: errors told in one sentence, Ctrl-C, libLLVM, registration with Mitsuba."
     text = ast.get_docstring(ast.parse(modules()[f"{PACKAGE}.{name}"].read_text(encoding="utf-8"))) or ""
-    return " ".join(text.split("\n\n")[0].split()).split(". ")[0].rstrip(".") + "."
+    return " ".join(text.split("\n\n")[0].split()).split(". ")[0].split("; ")[0].rstrip(".") + "."
 
 
 def inner(name: str) -> list[str]:
@@ -70,14 +74,15 @@ def draw() -> str:
         drawing.rectangle(left, y, dots - left - 20, row - 6, fill="#f0f4f8", line=FAINT)
         drawing.words(left + 10, y + 21, name, size=13, bold=True)
         drawing.words(left + 112, y + 15, purpose(name), size=10)
-        drawing.words(left + 112, y + 28, "  ".join(inner(name)), size=9, color=PALE)
+        drawing.words(left + 112, y + 28, " · ".join(inner(name)), size=9, color=PALE)
         drawing.words(x + 4, 102, name, size=10, turned=-60)
         drawing.line(dots, y + row / 2 - 3, dots + column * len(rooms), y + row / 2 - 3)
         drawing.line(x, 110, x, 110 + row * len(rooms) - 6)
         drawing.rectangle(x - 5, y + row / 2 - 8, 10, 10, fill=FAINT)
     for (source, target), when in sorted(pairs.items()):
         x, y = dots + column * (rooms.index(target) + 0.5), 110 + row * rooms.index(source) + row / 2 - 3
-        drawing.dot(x, y, 5, fill=INK if when == "load" else "#ffffff", line=INK)
+        color = INK if rooms.index(target) > rooms.index(source) else UPWARD
+        drawing.dot(x, y, 5, fill=color if when == "load" else "#ffffff", line=color)
     y = 110 + row * len(rooms) + 18
     drawing.dot(dots + 6, y, 5)
     drawing.words(dots + 18, y + 4, "imports when it is loaded", size=10, color=PALE)
