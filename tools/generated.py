@@ -12,6 +12,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 from tools import manual
@@ -22,9 +23,14 @@ PLUGINS = ("nerg", "nerf", "gazefield", "gazekde", "panorama")
 
 def plugins() -> str:
     """A section for each plugin: its parameters and its manual."""
+    import mitsuba as mi
+
+    # A plugin's module belongs to a variant. Its manual does not, but lists what is registered when it is loaded.
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
     sections = []
     for name in PLUGINS:
-        page = manual.read(ROOT / "plugins" / f"{name}.py")
+        page = manual.read(import_module(f"nerg_mi.plugins.{name}").__doc__ or "")
         sections += [f"## {page.title}", page.parameter_table(), page.body]
     return "\n\n".join(sections)
 

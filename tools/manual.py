@@ -1,4 +1,4 @@
-"""The manual pages of the plugins, which are the docstrings of their files, as Markdown.
+"""The manual pages of the plugins, which are the docstrings of their modules, as Markdown.
 
 Read is as much of reStructuredText as Mitsuba's plugin manuals use: the list of parameters, inline roles, formulas,
 bullets and examples in tabs. Anything else raises `ValueError`, so that no page shows it raw.
@@ -6,11 +6,10 @@ bullets and examples in tabs. Anything else raises `ValueError`, so that no page
 
 from __future__ import annotations
 
-import ast
+import inspect
 import re
 import textwrap
 from dataclasses import dataclass
-from pathlib import Path
 
 from tools.page import table
 
@@ -77,10 +76,9 @@ def examples(block: str) -> str:
     return "\n\n".join(fences)
 
 
-def read(path: Path) -> Manual:
-    """The manual page of the plugin in this file."""
-    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-    blocks = re.split(r"\n\n(?=\S)", text)
+def read(docstring: str) -> Manual:
+    """The manual page that a plugin's docstring is. Raises `ValueError` for what cannot be read."""
+    blocks = re.split(r"\n\n(?=\S)", inspect.cleandoc(docstring))
     title, listed, body = "", [], []
     for block in blocks:
         if block.startswith(".. _"):
@@ -94,7 +92,7 @@ def read(path: Path) -> Manual:
         elif block.startswith(".. math::"):
             body.append(f"```math\n{textwrap.dedent(block.split('::', 1)[1].strip(chr(10))).rstrip()}\n```")
         elif block.startswith(".. "):
-            raise ValueError(f"{path} has the directive {block.split()[1]}, which tools/manual.py does not know")
+            raise ValueError(f'the manual page "{title}" has a {block.split()[1]}, which tools/manual.py does not know')
         else:
             body.append(inline(block))
     return Manual(title, listed, "\n\n".join(body))

@@ -1,13 +1,13 @@
 """What the commands make, compared bit for bit with what they made before: for changes that are to change nothing.
 
-    python tools/unchanged.py record FOLDER [--only NAME]     run every command below, keep what it writes and digests
-    python tools/unchanged.py compare FOLDER [--only NAME]    run them again, and name what differs
+    python tools/unchanged.py record FOLDER [--only NAME]     run every command below, keep what it writes and its
+    digest python tools/unchanged.py compare FOLDER [--only NAME]    run them again, and name what differs; exit code 1
+    where anything does
 
-Exit code 1 where anything differs. Pictures of the demo store with every kind of depth, visibility, quadrature, gaze
-field and AOV, of shapes and through a panorama; trainings of radiance and gaze at one thread; a study's errors;
-tables and exports. Everything is made of the demo store and of seeds, by the command line alone, so that it can be
-recorded by one version and compared by another. The bits depend on the machine, on libLLVM and on Mitsuba: record and
-compare on the same one.
+Pictures of the demo store with every kind of depth, visibility, quadrature, gaze field and AOV, of shapes and through a
+panorama; trainings of radiance and gaze at one thread; a study's errors; tables and exports. Everything is made of the
+demo store and of seeds, by the command line alone, so that it can be recorded by one version and compared by another.
+The bits depend on the machine, on libLLVM and on Mitsuba: record and compare on the same one.
 """
 
 from __future__ import annotations
