@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 from nerg_mi import diagnosis, llvm
 
@@ -33,17 +32,3 @@ def test02_unusable_llvm(tmp_path):
     assert "llvm_ad_rgb" not in done.stdout
     if not llvm.has_cuda():
         assert done.returncode == 1 and "nothing can be rendered" in done.stdout
-
-
-def test03_a_dying_backend_is_reported(monkeypatch):
-    monkeypatch.setattr(
-        diagnosis, "_TRIAL", "import os, sys; print('LLVM ERROR: no', file=sys.stderr, flush=True); os.abort()"
-    )
-    assert diagnosis.try_backend("llvm") == {"variants": [], "failed": {"llvm": "LLVM ERROR: no"}}
-
-
-def test04_extras_by_their_names(monkeypatch):
-    """The names are those of distributions, as pyproject.toml has them: that of scikit-image is not that of its
-    module."""
-    project = (Path(__file__).parents[2] / "pyproject.toml").read_text()
-    assert all(f'["{name}>=' in project for name in diagnosis.EXTRAS)

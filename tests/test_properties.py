@@ -1,0 +1,55 @@
+"""Properties of plugins: what is taken, and that a wrong one is named with what it may be."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from nerg_mi import properties
+from nerg_mi.errors import NergError
+
+
+@pytest.mark.parametrize(
+    "read, given, found",
+    [
+        (lambda p: properties.number(p, "x", 1.5), {}, 1.5),
+        (lambda p: properties.number(p, "x", 1.5, low=0), {"x": 2}, 2.0),
+        (lambda p: properties.integer(p, "x", 4, 1, 9), {"x": 9.0}, 9),
+        (lambda p: properties.boolean(p, "x", True), {"x": False}, False),
+        (lambda p: properties.choice(p, "x", "a", ("a", "b")), {"x": "b"}, "b"),
+        (lambda p: properties.text(p, "x"), {"x": "name"}, "name"),
+        (lambda p: properties.text(p, "x", "other"), {}, "other"),
+        (lambda p: properties.color(p, "x", 0.25), {}, [0.25, 0.25, 0.25]),
+        (lambda p: properties.color(p, "x", 0.0), {"x": [0.1, 2.0, 0.0]}, [0.1, 2.0, 0.0]),
+    ],
+)
+def test_values(read, given, found):
+    assert read(given) == found and type(read(given)) is type(found)
+
+
+def test_a_colour_of_a_texture(rgb):
+    texture = rgb.load_dict({"type": "rgb", "value": [0.1, 0.2, 0.4]})
+    assert properties.color({"x": texture}, "x", 0.0) == pytest.approx([0.1, 0.2, 0.4])
+
+
+@pytest.mark.parametrize(
+    "read, value, words",
+    [
+        (lambda p: properties.number(p, "x", 1, low=0, high=2), 3, "0 .. 2, got 3"),
+        (lambda p: properties.number(p, "x", 1), math.nan, "nan"),
+        (lambda p: properties.number(p, "x", 1), True, "must be a number"),
+        (lambda p: properties.number(p, "x", 1), "1", "must be a number, got '1'"),
+        (lambda p: properties.integer(p, "x", 1, 0, 9), 2.5, "whole number"),
+        (lambda p: properties.boolean(p, "x", True), 1, "true or false"),
+        (lambda p: properties.choice(p, "x", "a", ("a", "b")), "c", "one of a, b, got 'c'"),
+        (lambda p: properties.text(p, "x"), None, "a string, got nothing"),
+        (lambda p: properties.color(p, "x", 0), [1, 2], "one number or three"),
+        (lambda p: properties.color(p, "x", 0), [1, -2, 0], "not negative"),
+        (lambda p: properties.color(p, "x", 0), "red", "an rgb colour, got 'red'"),
+    ],
+)
+def test_a_wrong_value_is_named(read, value, words):
+    with pytest.raises(NergError) as said:
+        read({"x": value})
+    assert '"x"' in str(said.value) and words in str(said.value)
