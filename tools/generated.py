@@ -35,7 +35,14 @@ def plugins() -> str:
     return "\n\n".join(sections)
 
 
-PARTS: dict[str, Callable[[], str]] = {"plugins": plugins}
+def presets() -> str:
+    """The readers of tracking files that know their columns."""
+    from nerg_mi.rays.readers.registry import preset_table
+
+    return preset_table()
+
+
+PARTS: dict[str, Callable[[], str]] = {"plugins": plugins, "presets": presets}
 """Name of a part -> what makes its text."""
 
 _PART = re.compile(r"(<!-- made by make docs: (\w+) -->\n)(.*?)(<!-- end -->)", re.S)
