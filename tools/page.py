@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from nerg_mi.files.tables import markdown_table as table
 
-def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A Markdown table; a bar within a cell is escaped."""
-    cells = [[str(c).replace("|", "\\|").replace("\n", " ") for c in row] for row in rows]
-    lines = [list(map(str, head)), ["---"] * len(head), *cells]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+__all__ = ["replace_table", "table", "update"]
 
 
 def replace_table(document: str, title: str, text: str) -> str:
-    """``document`` with the first table below the heading ``## title`` exchanged for ``text``, or ``text`` added there.
+    """``document`` with the first table below the heading ``title`` exchanged for ``text``, or ``text`` added there.
 
-    Raises ``ValueError`` where there is no such heading.
+    The heading is of the second or third level. Raises ``ValueError`` where there is no such heading.
     """
     lines = document.split("\n")
-    if f"## {title}" not in lines:
+    mark = next((mark for mark in ("##", "###") if f"{mark} {title}" in lines), None)
+    if mark is None:
         raise ValueError(f'the document has no heading "## {title}" to put a table under; add it')
-    start = lines.index(f"## {title}") + 1
-    stop = next((k for k in range(start, len(lines)) if lines[k].startswith("## ")), len(lines))
+    start = lines.index(f"{mark} {title}") + 1
+    # What ends its part of the page: a heading of its own level or above.
+    ends = tuple(f"{'#' * level} " for level in range(2, len(mark) + 1))
+    stop = next((k for k in range(start, len(lines)) if lines[k].startswith(ends)), len(lines))
     first = next((k for k in range(start, stop) if lines[k].startswith("|")), None)
     if first is None:
         last = stop

@@ -30,3 +30,9 @@ def test_a_table_is_added_where_there_is_none():
 def test_a_heading_that_is_missing_is_named():
     with pytest.raises(ValueError, match='"## C"'):
         page.replace_table(DOCUMENT, "C", "| z |")
+
+
+def test_headings_of_the_third_level_are_found_too():
+    parts = "## A\n\n### B\n\n| b |\n\n### C\n\nwords\n\n## D\n"
+    assert page.replace_table(parts, "B", "| z |") == parts.replace("| b |", "| z |")
+    assert page.replace_table(parts, "C", "| z |") == parts.replace("words\n", "words\n\n| z |\n")
