@@ -75,8 +75,8 @@ def make_rays(folder: Path) -> Path:
     lines = ["person,time,x,y,z,dx,dy,dz"]
     for person in range(3):
         begin, end = rng.uniform([1.5, 1.0, 1.5], [8.5, 5.5, 1.7], (2, 3))
-        for k in range(400):
-            place = begin + (end - begin) * (k / 400) + rng.normal(0, 0.1, 3) * [1, 1, 0.1]
+        for k in range(2000):
+            place = begin + (end - begin) * (k / 2000) + rng.normal(0, 0.1, 3) * [1, 1, 0.1]
             to = np.array([4.8, 4.2, 1.0]) + rng.normal(0, 0.5, 3) - place
             to /= np.linalg.norm(to)
             lines.append(",".join([f"p{person}", f"{k * 0.1:.1f}", *(f"{v:.6f}" for v in (*place, *to))]))
