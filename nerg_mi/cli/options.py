@@ -1,0 +1,86 @@
+"""Options of commands, made of the typed options of jobs; and those that every command shares.
+
+A job's options are a dataclass whose fields tell their defaults and meanings (``nerg_mi.jobs.options``). A command that
+takes it as one parameter shows an option for each of its fields.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import Field, fields
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+import typer
+
+Mode = Annotated[str, typer.Option("-m", "--mode", help="Mitsuba variant.")]
+"""Variant in which a command computes."""
+Threads = Annotated[int | None, typer.Option(help="CPU threads. Default: all.")]
+"""How many threads a command computes with."""
+
+
+def start(mode: str | None, threads: int | None = None) -> str:
+    """Activate the Mitsuba variant ``mode`` (None: the best that works here) and choose the number of ``threads``.
+
+    Returns the variant's name. Raises `NergError` for a variant that is unknown or does not work here.
+    """
+    import drjit as dr
+
+    from nerg_mi.rendering.pictures import activate
+
+    name = activate(mode)
+    if threads is not None:
+        dr.set_thread_count(threads)
+    return name
+
+
+def takes(kind: type, *leave_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorator of a command with a parameter of the dataclass ``kind``: in its place the command line has one option
+    for each field, but for those called ``leave_out``, which keep their defaults.
+
+    A field that is True or False and False by default is a flag that sets it; one that is True by default can be
+    unset by ``--no-``. A field of type ``tuple[X, ...]`` may be given several times.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        own = inspect.signature(command, eval_str=True).parameters
+        given_as = next(name for name, p in own.items() if p.annotation is kind)
+        generated = {f.name: _parameter(f, kind) for f in fields(kind) if f.name not in leave_out}
+        parameters: list[inspect.Parameter] = []
+        for name, parameter in own.items():
+            shown = generated.values() if name == given_as else [parameter]
+            parameters += [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in shown]
+
+        def call(**given: Any) -> None:
+            chosen = {name: given.pop(name) for name in generated}
+            several = {k for k, p in generated.items() if _listed(p.annotation)}
+            command(
+                **given, **{given_as: kind(**{k: tuple(v or ()) if k in several else v for k, v in chosen.items()})}
+            )
+
+        call.__name__, call.__qualname__, call.__module__ = command.__name__, command.__qualname__, command.__module__
+        call.__doc__ = command.__doc__
+        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call.__annotations__ = {p.name: p.annotation for p in parameters}
+        return call
+
+    return decorate
+
+
+def _parameter(field: Field, kind: type) -> inspect.Parameter:
+    """The parameter that typer makes the option of ``field`` of."""
+    hint, about, default = get_type_hints(kind)[field.name], field.metadata, field.default
+    names = about["names"]
+    if get_origin(hint) is tuple:
+        hint, default = list[get_args(hint)[0]] | None, None  # type: ignore[misc]
+    if hint is bool and default is False and not names:
+        names = ("--" + field.name.replace("_", "-"),)
+    info = typer.Option(*names, help=about["help"], **about["more"])
+    return inspect.Parameter(
+        field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, info]
+    )
+
+
+def _listed(annotation: Any) -> bool:
+    """Whether an annotation that ``_parameter`` made is one of an option that may be given several times."""
+    return any(get_origin(kind) is list for kind in get_args(get_args(annotation)[0]))
