@@ -20,7 +20,6 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,11 +100,12 @@ def main(argv=None) -> list[dict]:
     from nerg_mi.evaluation.gaze.scores import gaze_field, print_scores, score_rows
     from nerg_mi.field.backend import namespace
     from nerg_mi.field.gaze.log_density import look_up
+    from nerg_mi.jobs.gaze import train_planned
+    from nerg_mi.jobs.gaze_plan import plan_gaze
+    from nerg_mi.jobs.options.gaze import GazeOptions
     from nerg_mi.maths.sphere import fibonacci_directions
-    from nerg_mi.training.gaze.recipes import gaze_recipe
-    from nerg_mi.training.gaze.run import train_gaze
-    from nerg_mi.training.gaze.salience import blind_of_views
-    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
+    from nerg_mi.training.gaze.blind import blind_of_views
+    from nerg_mi.training.gaze.supervision import Supervision
     from nerg_mi.training.geometry.places import place_of_scene
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -141,22 +141,19 @@ def main(argv=None) -> list[dict]:
         "blind, of the law": lambda p, d: np.tile(of_law, (len(p), 1)),
         "4,096 nearest rays": baselines.nearest_rays(rays, 4096),
     }
-    recipe = gaze_recipe(args.recipe)
-    # As the command does where there are no rays; and the scores of the others then compare.
-    config = place.told(recipe.config if args.recipe == "default" else replace(recipe.config, normalized=True))
-    given = {"seed": args.seed} | ({"steps": args.steps} if args.steps else {})
-    how, spent = ProbeSettings(**recipe.probes | {"radius": RADIUS}), {}
+    # As the command does where there are no rays; the scores of the others then compare. A log density is anyway.
+    options = GazeOptions(recipe=args.recipe, normalized=True, radius=RADIUS, steps=args.steps, seed=args.seed)
+    spent = {}
     for label, r, v in (
         (f"rays, {len(rays):,}", rays, ()),
         (f"views, {len(views)}", None, views),
         ("both", rays, views),
     ):
         started = time.process_time()
-        controls = GazeSettings(**recipe.settings | (recipe.views_alone if r is None else {}) | given)
-        field, about = train_gaze(r, place.medium, place.box, config, controls, how, ns, views=v)
+        trained = train_planned(Supervision(r, v), place, plan_gaze(options, place, views_alone=r is None), ns)
         spent[label] = time.process_time() - started
-        print(f"{label}: {about['steps']} steps, {spent[label]:.0f} s of CPU")
-        methods[label] = gaze_field(field, place.medium)
+        print(f"{label}: {trained.provenance['steps']} steps, {spent[label]:.0f} s of CPU")
+        methods[label] = gaze_field(trained.field, place.medium)
     rows = score_rows(truth, tests, directions, methods)
     print_scores(
         rows, f"{len(tests)} held-out positions against the law, over the sphere ({len(stood)} places trained on)"

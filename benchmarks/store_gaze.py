@@ -75,20 +75,20 @@ def main(argv=None) -> None:
     directions = fibonacci_directions(DIRECTIONS)
     truth = law.density(positions, directions)
 
-    how = about["probes"]
+    probe_settings = about["probes"]
     # Of the silverman and loo rules there is no single kappa; the default stands for them.
-    narrow = how["kappa"]
+    narrow = probe_settings["kappa"]
     methods = {
-        "gaze field": gaze_field(gaze, medium, kind=how["depth"]),
+        "gaze field": gaze_field(gaze, medium, kind=probe_settings["depth"]),
         "position-blind, kappa 50": baselines.position_blind(train, kappa=50),
     }
     for kappa in (narrow, args.wide):
         probes = place_probes(
             train,
             radius,
-            count=how["count"],
-            cap=how["cap"],
-            min_rays=how["min_rays"],
+            count=probe_settings["count"],
+            cap=probe_settings["cap"],
+            min_rays=probe_settings["min_rays"],
             kappa_rule="fixed",
             kappa=kappa,
             seed=0,
@@ -97,7 +97,9 @@ def main(argv=None) -> None:
             f"{k} nearest probe{'s' * (k > 1)}, kappa {kappa:g}": baselines.nearest_probes(probes, k) for k in (1, 16)
         }
         methods[f"4,096 nearest rays, kappa {kappa:g}"] = baselines.nearest_rays(train, 4096, kappa=kappa)
-    methods[f"law, seen by {how['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(law, how["cap"], narrow)
+    methods[f"law, seen by {probe_settings['cap']:,} rays, kappa {narrow:g}"] = fresh_draws(
+        law, probe_settings["cap"], narrow
+    )
     rows = score_rows(truth, positions, directions, methods)
     print_scores(
         rows, f"{len(positions)} held-out positions against the law ({len(train):,} of {len(rays):,} rays trained on)"

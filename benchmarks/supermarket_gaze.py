@@ -4,8 +4,8 @@ scores.
     python benchmarks/supermarket_gaze.py [--data FOLDER] [--recipe default] [--folds 5] [--first 0] [--out
     out/benchmarks/supermarket_gaze]
 
-Runs, as a user would, `nerg rays import --preset vr_supermarket` and for each fold
-`nerg train gaze --geometry hits --test-zones 3 --test-people 0.5` and `nerg eval gaze` for each split. Half of the
+Runs what the commands `nerg rays import --preset vr_supermarket` and, for each fold,
+`nerg train gaze --geometry hits --test-zones 3 --test-people 0.5` and `nerg eval gaze` for each split do. Half of the
 people train, and the other half are scored at 60 positions in three zones; every ray within 2R of a test position is
 left out of training, of the place and of the baselines. Splits: `both`, people and positions are new; `pos`, the
 training people at new positions; `people`, new people elsewhere. What the columns mean is in each fold's `gaze.md`.
@@ -16,7 +16,6 @@ people at other zones, and on none of the first five.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -35,37 +34,32 @@ def nerg(*arguments) -> None:
     subprocess.run([sys.executable, "-c", code, *map(str, arguments)], check=True, cwd=ROOT)
 
 
-def run_fold(rays: Path, seed: int, args) -> list[dict]:
+def run_fold(rays: Path, seed: int, args: argparse.Namespace) -> list[dict]:
     """Train one fold, and score it in every split."""
+    from nerg_mi.cli.progress import TerminalReporter
+    from nerg_mi.jobs.evaluation import evaluate_gaze
+    from nerg_mi.jobs.gaze import train_gaze
+    from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
+    from nerg_mi.jobs.options.gaze import GazeOptions
+
     file, rows = args.out / f"fold_{seed}.safetensors", []
-    threads = ["--threads", args.threads] if args.threads else []
-    nerg(
-        "train",
-        "gaze",
-        rays,
-        "--geometry",
-        "hits",
-        "-o",
-        file,
-        "--recipe",
-        args.recipe,
-        "--test-zones",
-        3,
-        "--test-positions",
-        60,
-        "--test-people",
-        0.5,
-        "--seed",
-        seed,
-        *(["--steps", args.steps] if args.steps else []),
-        *threads,
+    options = GazeOptions(
+        geometry="hits",
+        recipe=args.recipe,
+        test_zones=3,
+        test_positions=60,
+        test_people=0.5,
+        seed=seed,
+        steps=args.steps,
+        threads=args.threads,
     )
+    with TerminalReporter() as reporter:
+        train_gaze(rays, file, options, reporter)
     for split in args.splits.split(","):
         folder = args.out / f"fold_{seed}_{split}"
-        nerg(
-            "eval", "gaze", file, rays, "--split", split, "-o", folder, "--kappa", args.kappa, "--seed", seed, *threads
-        )
-        rows += [{"fold": seed, "split": split, **r} for r in json.loads((folder / "gaze.json").read_text())["methods"]]
+        scored = GazeEvaluationOptions(split=split, kappa=args.kappa, seed=seed, threads=args.threads)
+        found = evaluate_gaze(file, rays, folder, scored)
+        rows += [{"fold": seed, "split": split, **row} for row in found.rows]
     return rows
 
 
@@ -120,9 +114,7 @@ def main(argv=None) -> None:
             ours, bar = (
                 next(r for r in rows if (r["fold"], r["split"], r["method"]) == (seed, split, m)) for m in (OURS, BAR)
             )
-            print(
-                f"  {seed}: KLD {ours['KLD'] - bar['KLD']:+.3f}, CC {ours['CC'] - bar['CC']:+.3f}, bits {ours['bits'] - bar['bits']:+.3f}"
-            )
+            print(f"  {seed}: " + ", ".join(f"{name} {ours[name] - bar[name]:+.3f}" for name in ("KLD", "CC", "bits")))
     for name, content in (("folds.csv", rows), ("means.csv", table)):
         write_rows(args.out / name, content)
 

@@ -12,7 +12,7 @@ import typer
 import nerg_mi.cli
 from nerg_mi.evaluation.study import subject as study_subject
 from nerg_mi.formats.torch_ngp import unpickling
-from nerg_mi.training.gaze.recipes import gaze_recipe
+from nerg_mi.training.gaze.recipes import FieldChoices, gaze_recipe
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.integral import COUNT
 from tests.conftest import ROOT
@@ -58,7 +58,7 @@ def test04_the_default_recipe_is_as_described():
         line for line in (ROOT / "docs" / "gaze-training.md").read_text().splitlines() if line.startswith("| `default`")
     )
     plan = gaze_recipe()
-    c, s, p = plan.config, plan.settings, plan.probes
+    c, s, p = plan.config(FieldChoices()), plan.settings, plan.probes
     assert f"{NUMBERS[c.grid.levels].capitalize()} levels of a grid ({c.grid.base} to {c.grid.finest})" in row
     assert f"up to degree {c.sh_degree - 1}, two networks {c.width} wide" in row and c.layers == 2
     assert f"weight decay {s['weight_decay']:g}, {s['steps']} steps, kernels of kappa {p['kappa']:g}" in row

@@ -170,19 +170,18 @@ def gaze_steps() -> Callable[[int], None]:
 
     from nerg_mi.field.encoding.hashgrid import HashGridConfig
     from nerg_mi.field.gaze.product import GazeConfig
+    from nerg_mi.training.gaze.product import ProductTrainer
+    from nerg_mi.training.gaze.ray_targets import targets_of_rays
     from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
-    from nerg_mi.training.gaze.supervision import supervise_rays
-    from nerg_mi.training.gaze.trainer import GazeTrainer
     from nerg_mi.training.geometry.places import place_of_nothing
 
     rays = tiny.looks()
     place = place_of_nothing(rays.origin)
     probes = ProbeSettings(radius=0.5, count=16, cap=64, min_rays=8, kappa=20.0, directions=64)
     config = GazeConfig(grid=HashGridConfig(levels=2, log2_rows=10, base=4, finest=8), width=16, geometry=4)
-    supervision = supervise_rays(rays, place.medium, place.box, probes)
-    trainer = GazeTrainer(
-        supervision, place.box, config, GazeSettings(steps=20_000, probes=4, directions=32, zones=0), ns
-    )
+    targets = targets_of_rays(rays, place, probes)
+    settings = GazeSettings(steps=20_000, probes=4, directions=32, zones=0)
+    trainer = ProductTrainer(targets, place.box, config, settings, ns)
 
     def step(k: int) -> None:
         trainer.step()

@@ -1,4 +1,4 @@
-"""Options of commands, made of the typed options of jobs; and those that every command shares.
+"""Options of commands, made of the typed options of jobs.
 
 A job's options are a dataclass whose fields tell their defaults and meanings (``nerg_mi.jobs.options``). A command that
 takes it as one parameter shows an option for each of its fields.
@@ -12,26 +12,6 @@ from dataclasses import Field, fields
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
-
-Mode = Annotated[str, typer.Option("-m", "--mode", help="Mitsuba variant.")]
-"""Variant in which a command computes."""
-Threads = Annotated[int | None, typer.Option(help="CPU threads. Default: all.")]
-"""How many threads a command computes with."""
-
-
-def start(mode: str | None, threads: int | None = None) -> str:
-    """Activate the Mitsuba variant ``mode`` (None: the best that works here) and choose the number of ``threads``.
-
-    Returns the variant's name. Raises `NergError` for a variant that is unknown or does not work here.
-    """
-    import drjit as dr
-
-    from nerg_mi.rendering.pictures import activate
-
-    name = activate(mode)
-    if threads is not None:
-        dr.set_thread_count(threads)
-    return name
 
 
 def takes(kind: type, *leave_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

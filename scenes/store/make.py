@@ -84,31 +84,26 @@ def make_gaze(job: Job) -> list[Path]:
     it."""
     import mitsuba as mi
 
-    from nerg_mi.field.backend import namespace
-    from nerg_mi.files.checksum import file_sha256
-    from nerg_mi.formats.fields import load_radiance, save_gaze
-    from nerg_mi.rays.rays import Rays
-    from nerg_mi.training.gaze.run import hold_out, train_gaze
-    from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings, sized_gaze_config
-    from nerg_mi.transport.media.field import FieldMedium
+    from nerg_mi.jobs.gaze import train_gaze
+    from nerg_mi.jobs.options.gaze import GazeOptions
 
     source, place = job.build / "rays.npz", job.store / "store.safetensors"
     _require(source, "rays")
     _require(place, "field")
-    ns = namespace(mi.variant())
-    field, _ = load_radiance(place, ns)
-    # Heads are drawn from the law at 5 Hz, so rays are independent and a narrow kernel is not noise.
-    probes = ProbeSettings(kappa=100.0)
-    rays, test = hold_out(Rays.load(source), probes.radius, zones=8, positions=64, seed=job.seed)
-    gaze, about = train_gaze(
-        rays, FieldMedium(field), field.box, sized_gaze_config(), GazeSettings(steps=800, seed=job.seed), probes, ns
-    )
-    if about["interrupted"]:
-        raise KeyboardInterrupt
-    files = {"rays_file": source, "field_file": place}
-    about |= {k: {"file": p.name, "sha256": file_sha256(p)} for k, p in files.items()} | {"test": test}
     path = job.store / "shoppers.safetensors"
-    save_gaze(gaze, path, about, half=True)
+    options = GazeOptions(
+        field=place,
+        recipe="small",
+        steps=800,
+        # Heads are drawn from the law at 5 Hz, so rays are independent and a narrow kernel is not noise.
+        kappa=100.0,
+        test_zones=8,
+        test_positions=64,
+        seed=job.seed,
+        half=True,
+        mode=mi.variant(),
+    )
+    train_gaze(source, path, options)
     return [path]
 
 

@@ -197,9 +197,9 @@ CASES = (
         _below("eval", ("gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.png")),
         ("eval",),
         (
-            "evaluation.gaze_evaluation.evaluate_gaze",
-            "evaluation.gaze_evaluation.split_half",
-            "evaluation.gaze_evaluation.person_rows",
+            "evaluation.gaze.evaluation.evaluate_gaze",
+            "evaluation.gaze.evaluation.split_half",
+            "evaluation.gaze.evaluation.person_rows",
         ),
     ),
     Case(
@@ -313,7 +313,7 @@ CASES = (
         ],
         _below("study", STUDY),
         ("study",),
-        ("evaluation.study_measure.measure", "evaluation.study_measure.scaling"),
+        ("evaluation.study.measure.measure", "evaluation.study.measure.scaling"),
     ),
 )
 

@@ -58,7 +58,7 @@ WARM_UP = 4
 
 def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
     done = interrupted(
-        "training.gaze_likelihood.LikelihoodTrainer.step",
+        "training.gaze.likelihood.LikelihoodTrainer.step",
         4,
         "train",
         "gaze",
@@ -95,7 +95,7 @@ def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
 def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
     some = ["--steps", 3, "--ensemble", 2, "--save-every", 0]
     done = interrupted(
-        "training.gaze_likelihood.LikelihoodTrainer.step",
+        "training.gaze.likelihood.LikelihoodTrainer.step",
         5,
         "train",
         "gaze",
@@ -137,7 +137,7 @@ def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
             ],
         ),
         (
-            "training.gaze_likelihood.LikelihoodTrainer.step",
+            "training.gaze.likelihood.LikelihoodTrainer.step",
             3,
             lambda i, o: [
                 "ablate",

@@ -1,4 +1,4 @@
-"""Options made of a dataclass: names, defaults, flags, help, what is handed on, and what every command shares."""
+"""Options made of a dataclass: names, defaults, flags, help, and what is handed on."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from nerg_mi.cli.options import Mode, Threads, start, takes
-from nerg_mi.errors import NergError
+from nerg_mi.cli.options import takes
 from nerg_mi.jobs.options import option
 
 
@@ -38,11 +37,10 @@ def serve():
     def tea(
         cup: Annotated[str, typer.Argument(help="What it is poured into.")],
         brew: Brew,
-        threads: Threads = None,
-        mode: Mode = "llvm_ad_rgb",
+        table: Annotated[int, typer.Option(help="Where it is served.")] = 1,
     ) -> None:
         """Make tea."""
-        handed.append((cup, brew, threads, mode))
+        handed.append((cup, brew, table))
 
     def run(*line):
         done = CliRunner().invoke(app, list(line))
@@ -52,15 +50,15 @@ def serve():
 
 
 def test_defaults_are_those_of_the_dataclass(serve):
-    assert serve("mug")[1] == ("mug", Brew(), None, "llvm_ad_rgb")
+    assert serve("mug")[1] == ("mug", Brew(), 1)
 
 
 def test_every_option_arrives(serve):
-    line = "mug --leaves black --kettle-file k.txt --sugar --no-stir -t 4.5 --guests a --guests b --threads 2 -m cuda"
+    line = "mug --leaves black --kettle-file k.txt --sugar --no-stir -t 4.5 --guests a --guests b --table 2"
     expected = Brew(
         leaves="black", kettle_file=Path("k.txt"), sugar=True, stir=False, minutes=4.5, guests=("a", "b"), secret=7
     )
-    assert serve(*line.split())[1] == ("mug", expected, 2, "cuda")
+    assert serve(*line.split())[1] == ("mug", expected, 2)
 
 
 @pytest.mark.parametrize("wrong", [("--secret", "1"), ("--no-sugar",), ("--minutes", "4"), ("--time", "0.1")])
@@ -71,7 +69,7 @@ def test_what_is_no_option_is_refused(serve, wrong):
 
 def test_help_tells_what_each_field_means(serve):
     shown = " ".join(serve("--help")[0].stdout.split())
-    assert "Make tea." in shown and "Mitsuba variant." in shown
+    assert "Make tea." in shown and "Where it is served." in shown
     for f in fields(Brew):
         assert (f.metadata["help"] in shown) == (f.name != "secret")
 
@@ -83,14 +81,3 @@ def test_a_command_shows_its_options_to_whoever_asks_for_its_types():
 
     assert set(get_type_hints(tea)) == {f.name for f in fields(Brew)}
 
-
-def test_a_start_chooses_the_variant_and_the_threads(rgb):
-    import drjit as dr
-
-    before = dr.thread_count()
-    try:
-        assert start("llvm_ad_rgb", 1) == "llvm_ad_rgb" and dr.thread_count() == 1 and rgb.variant() == "llvm_ad_rgb"
-    finally:
-        dr.set_thread_count(before)
-    with pytest.raises(NergError, match="no variant"):
-        start("abacus")

@@ -8,9 +8,7 @@ import json
 import numpy as np
 import pytest
 
-from nerg_mi.evaluation.ablation import COLUMNS, all_variants, summarise, table, write_ablation
-
-from .gaze.test_evaluation import crowd
+from nerg_mi.evaluation.ablation import COLUMNS, all_variants, relate, score, summarise, table, write_ablation
 
 
 def rows():
@@ -48,6 +46,20 @@ def test_variants():
     assert len(all_variants(False)) == 6 and len(all_variants(True, ("small",))) == 9
 
 
+def test_each_has_a_file_of_its_own():
+    variants = all_variants(True, ("small", "paper"))
+    names = {v.file_name(seed) for v in variants for seed in (0, 1)}
+    assert len(names) == 36 and "paper_begins_as_the_field_frozen_0.safetensors" in names
+
+
+def test_losses_are_related_to_those_of_the_whole_field():
+    made = [r for r in rows() if r["recipe"] == "default"] + [{**rows()[0], "recipe": "small"}]
+    for r in made:
+        r.pop("test_relative"), r.pop("train_relative")
+    relate(made)
+    assert [r.get("test_relative") for r in made] == [pytest.approx(x / 1.1) for x in (2.0, 1.0, 1.2)] + [None]
+
+
 def test_spreads_are_over_seeds():
     emit, both, paper = summarise(rows())
     assert both["test_loss"] == pytest.approx(1.1) and both["test_loss.spread"] == pytest.approx(
@@ -83,78 +95,12 @@ def test_the_plot_has_as_much_room_for_each_variant_however_many_there_are(tmp_p
     assert np.allclose([b.get_height() for b in axis.patches], [1.0] * 6 + [1.0 / 1.1] * 6)
 
 
-@pytest.mark.slow
-def test_the_command(rgb, tmp_path, capsys, monkeypatch):
-    """With two variants, for the time that compiling takes; the trainers know all of them."""
-    from nerg_mi.cli import main
-    from nerg_mi.evaluation import ablation
+def test_the_loss_is_the_papers():
+    from types import SimpleNamespace
 
-    monkeypatch.setattr(
-        ablation,
-        "all_variants",
-        lambda semantic, recipes: [v for v in all_variants(semantic, recipes) if v.gaze != "emit"],
-    )
-    crowd(3000).save(tmp_path / "rays.npz")
-    command = [
-        str(a)
-        for a in (
-            "ablate",
-            tmp_path / "rays.npz",
-            "-o",
-            tmp_path / "out",
-            "--geometry",
-            "hits",
-            "--recipes",
-            "default",
-            "--seeds",
-            2,
-            "--default-steps",
-            2,
-            "--zones",
-            2,
-            "--positions",
-            6,
-            "--min-rays",
-            8,
-            "--radius",
-            0.5,
-            "--cameras",
-            1,
-            "--size",
-            "16x8",
-            "--probes",
-            12,
-        )
-    ]
-    with pytest.raises(SystemExit) as end:
-        main(command)
-    assert not end.value.code, capsys.readouterr().err
-    found = json.loads((tmp_path / "out" / "ablation.json").read_text())
-    assert len(found["rows"]) == 4 and {r["seed"] for r in found["rows"]} == {0, 1}
-    whole = [r["test_relative"] for r in found["rows"] if r["variant"] == "emit_capture"]
-    assert np.mean(whole) == pytest.approx(1)
-    assert all(r["frame_seconds"] > 0 and np.isfinite(r["test_loss"]) for r in found["rows"])
-    assert (tmp_path / "out" / "default_capture_0.safetensors").exists()
-    # What is there already is not trained again; what would be another training is.
-    trained = []
-    monkeypatch.setattr(ablation, "_train", lambda *given: trained.append(given[-1].stem) or found["rows"][0])
-    other = ["--law", "tests.evaluation.test_ablation:Uniform", "--seeds", "1", "--variant", "capture"]
-    for more in ([], other):
-        with pytest.raises(SystemExit) as end:
-            main(command + more)
-        assert not end.value.code, capsys.readouterr().err
-        assert trained == (["default_capture_0"] if more else [])
-    for more, words in (
-        (["--law", "nowhere"], "MODULE:CLASS"),
-        (["--variant", "emitt"], 'emit_capture here, got "emitt"'),
-    ):
-        with pytest.raises(SystemExit) as end:
-            main([*command, *more])
-        assert end.value.code and words in " ".join(capsys.readouterr().err.split())
-
-
-class Uniform:
-    """A law under which people look anywhere."""
-
-    def density(self, positions, directions):
-        return np.full((len(positions), len(directions)), 1 / (4 * np.pi))
+    rng = np.random.default_rng(0)
+    truth, found = rng.random((2, 3, 50)) / 8
+    test = SimpleNamespace(truth=truth, centres=None, directions=None)
+    row = score({"test": test}, lambda centres, directions: found)
+    assert row["test_loss"] == pytest.approx(row["test_KLD"] + 1 - row["test_CC"] + row["test_MAE"])
+    assert row["test_MAE"] == pytest.approx(np.abs(truth - found).mean()) and row["test_KLD"] > 0

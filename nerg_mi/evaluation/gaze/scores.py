@@ -12,7 +12,7 @@ from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.field.gaze.product import GazeField
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.training.gaze.supervision import SURFACE_OPACITY
+from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
 from nerg_mi.transport.observer.ensemble import EnsembleMedium
 from nerg_mi.transport.observer.gaze_medium import GazeMedium
 from nerg_mi.transport.observer.integral import gaze_around
@@ -43,7 +43,8 @@ def gaze_field(
     """
     if medium is None and getattr(field.config, "geometry", "surface") != "none":
         raise NergError(
-            "this gaze field was trained among surfaces, and there is no place that has any: give it the field, the scene or the geometry"
+            "this gaze field was trained among surfaces, and there is no place that has any: "
+            "give it the field, the scene or the geometry"
         )
     align = align or Similarity()
     gaze = (EnsembleMedium if isinstance(field, GazeEnsemble) else GazeMedium)(field)

@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,10 +23,15 @@ from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.common.run_state import kept_unless, require_same
+from nerg_mi.training.geometry.places import GazePlace
 
-from .run import GazeProgress, identity, support_of, train_gaze
-from .settings import GazeSettings, ProbeSettings
+from .fit import GazeProgress, Listener
+from .plan import GazePlan, TrainedField
+from .run import train_gaze
+from .settings import GazeSettings
 from .state import KIND as RUN
+from .state import StateSettings
+from .supervision import Supervision
 
 FEW = 5
 """Blocks that a resample needs at least; people are the blocks where there are as many of them."""
@@ -45,12 +52,13 @@ def blocks_of(rays: Rays) -> tuple[np.ndarray, str]:
     _, block = np.unique(np.stack([block, stretch]), axis=1, return_inverse=True)
     if block.max() + 1 < FEW:
         raise NergError(
-            f"{block.max() + 1} stretches of {BLOCK:g} s of {len(persons)} people are too few to resample; leave out --ensemble"
+            f"{block.max() + 1} stretches of {BLOCK:g} s of {len(persons)} people are too few to resample; "
+            "leave out --ensemble"
         )
     return block.ravel(), f"blocks of {BLOCK:g} s"
 
 
-def resample(rays: Rays, seed) -> Rays:
+def resample(rays: Rays, seed: int | tuple[int, int]) -> Rays:
     """As many blocks as ``rays`` has, drawn with replacement: a block that is drawn twice counts twice (Efron 1979).
 
     A person who is drawn twice is two people then, so that weights by person count both.
@@ -67,117 +75,119 @@ def resample(rays: Rays, seed) -> Rays:
     return replace(drawn, person=drawn.person + known * again, persons=tuple(names))
 
 
+class TrainedEnsemble(NamedTuple):
+    """What the training of an ensemble came to: the fields, and their provenance (JSON)."""
+
+    field: GazeEnsemble
+    provenance: dict
+
+
 def train_ensemble(
     members: int,
-    rays: Rays | None,
-    medium,
-    box,
-    config,
-    settings: GazeSettings,
-    probes: ProbeSettings,
-    ns,
-    align=None,
-    on_progress=None,
-    initial: dict | None = None,
+    supervision: Supervision,
+    place: GazePlace,
+    plan: GazePlan,
+    ns: ModuleType,
     *,
-    state: Path | None = None,
-    resume: bool = False,
-    save_every: float = 60.0,
-    about: dict | None = None,
-    views: list | tuple = (),
+    state: StateSettings | None = None,
+    tell: Listener | None = None,
     write: Callable[[GazeEnsemble, dict], None] | None = None,
-) -> tuple[GazeEnsemble, dict]:
-    """Train ``members`` gaze fields, each on a resample and with a seed of its own; returns them and their provenance
-    (JSON).
+) -> TrainedEnsemble:
+    """Train ``members`` gaze fields as ``run.train_gaze`` does, each on a resample of the rays and with a seed of its
+    own.
 
-    The other arguments are those of ``gaze_run.train_gaze``; minutes are those of all members together. With ``state``,
-    what is done is kept beside it, one file a member, and removed once ``write`` has put the ensemble into a file;
-    without it the members stay. Raises `KeyboardInterrupt`, whose message says how to go on, where it is interrupted.
+    Minutes are those of all members together. With a file in ``state``, what is done is kept beside it, one file a
+    member, and removed once ``write`` has put the ensemble into a file; without ``write`` the members stay. Raises
+    `NergError` for what cannot be resampled, and `KeyboardInterrupt`, whose message says how to go on, where it is
+    interrupted.
     """
-    if members < 2:
-        raise NergError(f"an ensemble needs at least two members, got {members}")
-    if rays is None or views:
-        raise NergError("an ensemble resamples people: it is trained on rays alone; leave out --ensemble or --views")
-    if probes.kappa_rule == "loo":
-        raise NergError(
-            'an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"'
-        )
-    if settings.minutes is not None:
-        settings = replace(settings, minutes=settings.minutes / members)
+    state = state or StateSettings()
+    _check(members, supervision, plan)
+    if plan.settings.minutes is not None:
+        plan = plan.with_settings(minutes=plan.settings.minutes / members)
+    rays, path = supervision.rays, state.path
     _, kind = blocks_of(rays)
-    parts = [
-        state.with_name(f"{state.stem}.member{k}.safetensors") if state is not None else None for k in range(members)
-    ]
-    if resume and not (state.is_file() or any(p.is_file() for p in parts)):
-        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
+    parts = [path and path.with_name(f"{path.stem}.member{k}.safetensors") for k in range(members)]
+    if state.resume and not any(p is not None and p.is_file() for p in (path, *parts)):
+        raise NergError(f'there is nothing to resume: "{path}" does not exist; leave out --resume to start')
     fields, each = [], []
     for k, part in enumerate(parts):
-        mine, same = replace(settings, seed=settings.seed + 100 * k), {**(about or {}), "member": [k, members]}
+        own = replace(state, about={**state.about, "member": [k, members]})
+        member_plan = plan.with_settings(seed=plan.settings.seed + 100 * k)
         # All that a state of the run compares, of the rays that the resamples are drawn from.
-        whole = identity(rays, (), mine, probes, config, box, align, same)
-        say = lambda s, k=k: (
-            on_progress
-            and on_progress(
-                GazeProgress(f"{k + 1}/{members} {s.stage}", (k + s.done) / members, s.steps, s.seconds, s.scores)
-            )
-        )
-        if resume and part.is_file():
-            field, meta = load_gaze(part, ns)
-            done = meta["provenance"]
-            require_same(part, done["about"], whole)
-            done = done["trained"]
-            if state.is_file() and read_checkpoint(state, RUN)[1]["about"].get("member") == same["member"]:
-                # Killed between the writing of the member and the removal of its state.
-                state.unlink()
+        identity = member_plan.identity(supervision, place, own)
+        if state.resume and part.is_file():
+            field, provenance = _finished(part, identity, own, ns)
         else:
-            keep = None if part is None else _keeper(part, whole)
-            field, done = train_gaze(
-                resample(rays, (settings.seed, k)),
-                medium,
-                box,
-                config,
-                mine,
-                probes,
+            field, provenance = train_gaze(
+                Supervision(resample(rays, (plan.settings.seed, k))),
+                place,
+                member_plan,
                 ns,
-                align,
-                say,
-                initial,
-                state=state,
-                resume=resume and state.is_file(),
-                save_every=save_every,
-                about=same,
-                write=keep,
+                state=replace(own, resume=state.resume and path.is_file()),
+                tell=tell and _of_member(tell, k, members),
+                write=None if part is None else _writer(part, identity),
             )
-            if done["interrupted"]:
-                kept = f"go on with --resume (state in {state})" if state is not None else "nothing was kept"
+            if provenance["interrupted"]:
+                kept = "nothing was kept" if path is None else f"go on with --resume (state in {path})"
                 raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {kept}")
         fields.append(field)
-        each.append(done)
-    ensemble, provenance = (
-        GazeEnsemble(fields, support_of(rays, probes.radius, align)),
-        _together(each, settings, rays, kind),
-    )
+        each.append(provenance)
+    ensemble = GazeEnsemble(fields, supervision.support(plan.probes.radius, place))
+    provenance = _account(each, plan.settings, rays, kind)
     if write is not None:
         # Every member is in its file by now: there is nothing more to keep if this fails.
-        with kept_unless(state, lambda: None, done=False):
+        with kept_unless(path, lambda: None, done=False):
             write(ensemble, provenance)
         for part in parts:
             if part is not None:
                 part.unlink(missing_ok=True)
-    return ensemble, provenance
+    return TrainedEnsemble(ensemble, provenance)
 
 
-def _keeper(part: Path, about: dict):
+def _check(members: int, supervision: Supervision, plan: GazePlan) -> None:
+    if members < 2:
+        raise NergError(f"an ensemble needs at least two members, got {members}")
+    if supervision.rays is None or supervision.views:
+        raise NergError("an ensemble resamples people: it is trained on rays alone; leave out --ensemble or --views")
+    if plan.probes.kappa_rule == "loo":
+        raise NergError(
+            'an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"'
+        )
+
+
+def _of_member(tell: Listener, k: int, members: int) -> Listener:
+    """Tells how an ensemble goes by how its member ``k`` does."""
+
+    def told(progress: GazeProgress) -> None:
+        done = (k + progress.done) / members
+        tell(replace(progress, stage=f"{k + 1}/{members} {progress.stage}", done=done))
+
+    return told
+
+
+def _finished(part: Path, identity: dict, state: StateSettings, ns: ModuleType) -> tuple[TrainedField, dict]:
+    """A member that an earlier process has finished, and its provenance. Raises `NergError` for one of another run."""
+    field, meta = load_gaze(part, ns)
+    kept = meta["provenance"]
+    require_same(part, kept["about"], identity)
+    if state.path.is_file() and read_checkpoint(state.path, RUN)[1]["about"].get("member") == state.about["member"]:
+        # Killed between the writing of the member and the removal of its state.
+        state.path.unlink()
+    return field, kept["trained"]
+
+
+def _writer(part: Path, identity: dict) -> Callable[[TrainedField, dict], None]:
     """Writes a member into ``part``; one that was interrupted has its state, and is none yet."""
 
-    def keep(field, done: dict) -> None:
-        if not done["interrupted"]:
-            save_gaze(field, part, {"trained": done, "about": about})
+    def write(field: TrainedField, provenance: dict) -> None:
+        if not provenance["interrupted"]:
+            save_gaze(field, part, {"trained": provenance, "about": identity})
 
-    return keep
+    return write
 
 
-def _together(each: list[dict], settings: GazeSettings, rays: Rays, kind: str) -> dict:
+def _account(each: list[dict], settings: GazeSettings, rays: Rays, kind: str) -> dict:
     """One account of all members: means of their scores, sums of their seconds."""
     total = lambda name: round(sum(d[name] for d in each), 1)
     mean = lambda name: round(float(np.mean([d[name] for d in each])), 6)

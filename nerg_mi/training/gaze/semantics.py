@@ -7,72 +7,70 @@ fine-tuned.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.product import GazeConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.features import accumulated, snapshot
-from nerg_mi.transport.place import as_place
+from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
 
-from .settings import uniform_scale
-
 BATCH = 1 << 18
+"""Rays whose features are computed in one launch."""
 
 
-def semantic_features(medium, origins, directions, distance, kind: str) -> np.ndarray:
+def semantic_features(
+    place: GazePlace, origins: np.ndarray, directions: np.ndarray, distance: np.ndarray, kind: str
+) -> np.ndarray:
     """Features (N, F), float16, of what rays see: ``accumulated`` along them, or the ``snapshot`` at ``distance`` (N,).
 
-    ``medium``: a ``FieldMedium``; ``origins``, ``directions`` (N, 3) in its frame, unit. Raises ``NergError`` for
-    another medium.
+    ``origins``, ``directions`` (N, 3) in the frame of ``place``, unit. Raises `NergError` for a place that is no
+    radiance field.
     """
     import mitsuba as mi
 
-    place = as_place(medium)
-    if place.scene is not None or place.medium is None or place.medium.feature_count == 0:
+    if place.radiance is None:
         raise NergError("semantic features are those of a radiance field; give one with --field")
+    medium = place.medium
     out = np.empty((len(origins), medium.feature_count), np.float16)
     with dr.suspend_grad():
         for a in range(0, len(out), BATCH):
             part = slice(a, a + BATCH)
             o, d = (
-                kind_(np.ascontiguousarray(np.asarray(v[part], np.float32).T))
-                for kind_, v in ((mi.Point3f, origins), (mi.Vector3f, directions))
+                array(np.ascontiguousarray(np.asarray(v[part], np.float32).T))
+                for array, v in ((mi.Point3f, origins), (mi.Vector3f, directions))
             )
             if kind == "snapshot":
                 t = mi.Float(np.ascontiguousarray(distance[part], np.float32))
                 found = snapshot(medium, o + d * t, mi.Bool(True))
             else:
-                found = accumulated(place, mi.Ray3f(o, d), mi.Bool(True), default_settings(medium))
+                found = accumulated(Place(medium), mi.Ray3f(o, d), mi.Bool(True), default_settings(medium))
             # At once: each by itself would march, or evaluate the network, again.
             dr.eval(found)
             out[part] = np.stack([np.array(f) for f in found], axis=-1)
     return out
 
 
-def config_like(radiance: RadianceConfig, variant: str, activation: str, **more) -> GazeConfig:
-    """Architecture of a gaze field whose trunk begins as that of a radiance field of the configuration ``radiance``."""
-    return GazeConfig(
-        grid=radiance.grid,
-        variant=variant,
-        activation=activation,
-        width=radiance.width,
-        geometry=radiance.geometry,
-        sh_degree=radiance.sh_degree,
-        emit_scale=uniform_scale(variant, activation),
-        **more,
+def trunk_config(config: GazeConfig, radiance: RadianceConfig) -> GazeConfig:
+    """``config`` with the sizes that let its trunk begin as that of a radiance field of the configuration
+    ``radiance``."""
+    return replace(
+        config, grid=radiance.grid, width=radiance.width, geometry=radiance.geometry, sh_degree=radiance.sh_degree
     )
 
 
-def trunk_of(field: RadianceField, config: GazeConfig) -> dict:
+def initial_weights(field: RadianceField, config: GazeConfig) -> dict:
     """Grid and position network of ``field`` by the names of a gaze field: what its features, but not its density, come
     from.
 
-    Raises ``NergError`` where ``config`` has other sizes.
+    Raises `NergError` where ``config`` has other sizes.
     """
-    like = config_like(field.config, config.variant, config.activation)
+    like = trunk_config(config, field.config)
     if (config.grid, config.position_sizes) != (like.grid, like.position_sizes):
         raise NergError("a gaze field that begins with a radiance field's weights must have its sizes")
     weights = [dr.detach(w) for w in field.density_net.weights]

@@ -1,127 +1,104 @@
-"""What a gaze field is trained with."""
+"""What a gaze field is trained with: how rays become probes, and how the weights are moved."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.gaze.product import GazeConfig
 
-from . import losses as gaze_losses
+from . import losses
 
-# The likelihood has a trainer of its own; what is here weighs the parts of a validation.
-LOSSES = {"paper": gaze_losses.PAPER, "code": gaze_losses.CODE, "likelihood": {"kld": 1.0, "cc": 0.0, "mae": 0.0}}
-
-# (levels, log2 rows, base and finest resolution, width, geometry features). "paper" has the paper's sizes, 10.6 million
-# entries; "small" is what generalises to positions that nobody trained on, and stores in 0.4 MB as fp16.
-_SIZES = {"small": (8, 14, 4, 128, 64, 15), "paper": (16, 19, 16, 512, 64, 15)}
-SIZES = tuple(_SIZES)
-
-
-def sized_gaze_config(size: str = "small", variant: str = "emit_capture", activation: str = "softplus") -> GazeConfig:
-    """Architecture of a ``size``: ``small`` or ``paper``. Raises ``NergError`` for unknown words."""
-    if size not in _SIZES:
-        raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
-    levels, rows, base, finest, width, geometry = _SIZES[size]
-    grid = HashGridConfig(levels=levels, log2_rows=rows, base=base, finest=finest)
-    return GazeConfig(
-        grid=grid,
-        variant=variant,
-        activation=activation,
-        width=width,
-        geometry=geometry,
-        emit_scale=uniform_scale(variant, activation),
-    )
-
-
-def uniform_scale(variant: str, activation: str) -> float:
-    """The ``emit_scale`` with which weights of zero are the uniform density, 1/(4π).
-
-    Networks without biases fall to zero under weight decay. Were that a density of another integral, they would have to
-    spend weight on the scale alone, and do: fields that must fight for it follow their probes much less well.
-    """
-    at_zero = {"softplus": math.log(2.0), "exp": 1.0}.get(activation)
-    if at_zero is None:
-        return 1.0
-    return 1 / (4 * math.pi * at_zero * (0.5 if variant == "emit_capture" else 1.0))
+LOSSES = {"paper": losses.PAPER, "code": losses.CODE, "likelihood": {"kld": 1.0, "cc": 0.0, "mae": 0.0}}
+"""Weights of the parts of each loss; of the likelihood, which rays give, those by which a validation is judged."""
 
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How rays become supervision; lengths in metres, in the rays' frame.
+    """How rays become probes, and probes targets; lengths in metres, in the rays' frame."""
 
-    ``radius``, ``placement``, ``count``, ``spacing``, ``cap``, ``min_rays``, ``kappa_rule``, ``kappa``, ``weights``:
-    see ``density.probes.place_probes``. ``directions``: how many of equal area each probe has, turned at random, fixed
-    for the whole training, so that depths are traced once; ``fresh``: turned anew, and traced again, for every epoch
-    (as many steps as draw as many probes as there are). ``depth``: kind of depth that is the surface
-    (``transport.march.depth``).
-    """
-
+    # Radius R of a probe.
     radius: float = 0.25
+    # Probes at most.
     count: int = 2048
+    # Rays in a probe at most, the nearest.
     cap: int = 1024
+    # Rays in a probe at least.
     min_rays: int = 64
+    # How a probe chooses the concentration of its rays' kernels (`density.probes.place_probes`).
     kappa_rule: str = "fixed"
+    # Concentration of the rule "fixed".
     kappa: float = 50.0
+    # Directions of equal area of each probe, turned at random and fixed, so that depths are traced once.
     directions: int = 1024
+    # Kind of depth that is the surface (`transport.march.depth`).
     depth: str = "median"
+    # Where probes are placed (`density.placement`).
     placement: str = "data"
+    # Distance between probes, of placements that have one.
     spacing: float | None = None
+    # Whether directions are turned anew, and depths traced again, for every epoch.
     fresh: bool = False
+    # What a probe's rays count by (`density.probes.place_probes`).
     weights: str = "equal"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.directions < 16 or self.count < 1:
             raise NergError(
-                f"supervision needs at least one probe and 16 directions, got {self.count} probes and {self.directions} directions"
+                "supervision needs at least one probe and 16 directions, "
+                f"got {self.count} probes and {self.directions} directions"
             )
 
     def to_dict(self) -> dict:
+        """As JSON, for the provenance."""
         return asdict(self)
 
 
 @dataclass(frozen=True)
 class GazeSettings:
-    """Controls of a training run.
+    """How weights are moved, for how long, and what a validation watches. Of ``steps`` and ``minutes`` one is given."""
 
-    ``steps`` or ``minutes``: how long, exactly one of them. ``loss``: ``paper`` (KLD + (1 - CC) + MAE), ``code`` (MAE +
-    0.1 (1 - CC), as the authors published) or, for a log density, ``likelihood`` (``gaze_likelihood``), for which a
-    step draws ``rays`` rays of each probe besides; ``integral``: weight of the squared error of a probe's integral,
-    which the authors compute and do not train (0: not here either; KLD and CC do not see the scale, and MAE alone pulls
-    it towards the median, far below a peaked density's mean). ``probes``, ``directions``: of a step, drawn at random.
-    ``learning_rate``: held for the share ``hold`` of the run, then decayed exponentially to ``final_rate`` times
-    itself; ``weight_decay``: decoupled (AdamW), a share of the weights a step a unit of learning rate; ``average``:
-    decay a step of the averaged weights, which are the result. ``looks``: how often in a run the validation is looked
-    at; ``patience``: looks without an improvement after which the run ends (0: never). ``zones``, ``watched``,
-    ``watched_rays``: of the validation, groups of positions, probes in them, and rays that each has at least (default:
-    as many as those of the training); no zones, no validation. ``refit``: train again on all rays, the validation's
-    too, for as many steps as were best. ``frozen``: weights that were given to begin with are not trained.
-    """
-
+    # Steps of the run.
     steps: int | None = None
+    # Or its length in minutes.
     minutes: float | None = None
+    # Of probes, directions, weights, batches and the validation's split.
     seed: int = 0
+    # "paper" (KLD + (1 - CC) + MAE), "code" (MAE + 0.1 (1 - CC), as published) or "likelihood", of a log density.
     loss: str = "paper"
+    # Weight of the squared error of a probe's integral, which KLD and CC do not see; MAE alone pulls it to the median.
     integral: float = 1.0
+    # Probes of a step, drawn at random.
     probes: int = 16
+    # Directions of each, drawn at random.
     directions: int = 256
+    # Rays of each, drawn from its density, for the likelihood.
     rays: int = 64
+    # Learning rate at the start.
     learning_rate: float = 1e-2
+    # What it comes to at the end, a share of that at the start; it decays exponentially.
     final_rate: float = 0.03
+    # Share of the run for which the rate is held before it decays.
     hold: float = 0.3
+    # Decoupled (AdamW): share of the weights a step, a unit of learning rate.
     weight_decay: float = 0.3
+    # Decay a step of the averaged weights, which are the result.
     average: float = 0.98
+    # How often in a run the validation is looked at.
     looks: int = 20
+    # Looks without an improvement after which the run ends; 0: it never ends early.
     patience: int = 6
+    # Groups of positions that the validation watches; 0: there is none.
     zones: int = 3
+    # Probes in all of them.
     watched: int = 60
+    # Rays that each of these has at least; None: as many as those of the training.
     watched_rays: int | None = None
+    # Whether to train again on everything, the validation's part too, for as many steps as were best.
     refit: bool = True
+    # Whether weights that were given to begin with stay as they are.
     frozen: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (self.steps is None) == (self.minutes is None):
             raise NergError("give the length of the training either in steps or in minutes")
         if (self.steps if self.steps is not None else self.minutes) <= 0:
@@ -141,4 +118,5 @@ class GazeSettings:
         return self.learning_rate * self.final_rate ** min(late, 1.0)
 
     def to_dict(self) -> dict:
+        """As JSON, for the provenance."""
         return asdict(self)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
-
-import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
 from nerg_mi.formats.checkpoint import read_checkpoint, write_checkpoint
-from nerg_mi.rays.rays import Rays
 from nerg_mi.training.common.run_state import (
     count_of,
     optimiser_state,
@@ -21,8 +18,24 @@ from nerg_mi.training.common.run_state import (
     restoring,
 )
 
+from .trainer import GazeTrainer
+
 KIND = "gaze run"
 STAGES = ("fit", "refit")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateSettings:
+    """Whether a run can be gone on with, and from where."""
+
+    # File that holds the whole state of the run; None: none is kept.
+    path: Path | None = None
+    # Go on from the state in that file; probes and depths are made again.
+    resume: bool = False
+    # Seconds between two states; it is also written when the run is interrupted.
+    every: float = 60.0
+    # What else a run must agree on to be gone on with (JSON), such as the files of its place.
+    about: dict = field(default_factory=dict)
 
 
 class GazeRunFile:
@@ -53,7 +66,7 @@ class GazeRunFile:
         """Wall time of the run in seconds, without that between an interruption and its resumption."""
         return self.seconds + time.perf_counter() - self._started
 
-    def restore(self, stage: str, trainer) -> dict:
+    def restore(self, stage: str, trainer: GazeTrainer) -> dict:
         """Set ``trainer`` to the state of ``stage``, where that is what was read; returns the weights that ``keep`` was
         given."""
         if stage != self.stage or "random" not in self._meta:
@@ -67,7 +80,7 @@ class GazeRunFile:
                 require_shape(self._tensors, f"best.{k}", v)
             return {k: type(v)(self._tensors[f"best.{k}"]) for k, v in best.items()}
 
-    def keep(self, stage: str, trainer, found: dict, weights: dict, now: bool = False) -> None:
+    def keep(self, stage: str, trainer: GazeTrainer | None, found: dict, weights: dict, now: bool = False) -> None:
         """Write the state, atomically, when it is time (or ``now``). ``trainer``: None between two fits; ``found``:
         what validation has come to (JSON); ``weights``: the best ones so far."""
         if self.path is None or not (now or time.perf_counter() - self._kept > self.every):
@@ -86,9 +99,3 @@ class GazeRunFile:
             self.path, KIND, tensors, {"about": self.about, "stage": stage, "found": found, "spent": self.spent, **meta}
         )
         self._kept = time.perf_counter()
-
-
-def digest(rays: Rays) -> str:
-    """SHA-256 of what a training takes from ``rays``."""
-    parts = [np.ascontiguousarray(v).tobytes() for v in (rays.person, rays.origin, rays.direction)]
-    return hashlib.sha256(b"".join(parts)).hexdigest()

@@ -104,7 +104,8 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
         if voxel is not None:
             size = " x ".join(f"{s:.3g}" for s in core[1] - core[0])
             raise NergError(
-                f"people were in {size} m, which is more than {most:,} voxels of {voxel:g} m; enlarge the voxel (--voxel) or leave it out"
+                f"people were in {size} m, which is more than {most:,} voxels of {voxel:g} m; "
+                "enlarge the voxel (--voxel) or leave it out"
             )
         # Half as many voxels.
         edge *= 2 ** (1 / 3)

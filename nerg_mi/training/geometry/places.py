@@ -1,20 +1,23 @@
-"""Where people looked around: what a gaze field's depths are traced in, and what it is told where there is nothing."""
+"""Where people looked around: what a gaze field's depths are traced in, and the frame that it lives in."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.field.gaze.log_density import LogGazeConfig
-from nerg_mi.field.gaze.product import GazeConfig
+from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.checksum import file_sha256
+from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.mesh_file import check_vol
+from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.media.volume import VolumeMedium
 from nerg_mi.transport.place import Place
@@ -22,49 +25,53 @@ from nerg_mi.transport.place import Place
 from .hit_extent import hit_extent
 from .hit_geometry import volume_dict, voxelise_hits
 
-# How far people without any geometry are taken to look.
-_NOWHERE = 2.0
+NOWHERE = 2.0
+"""How far away everything is taken to be where no geometry is known, in the field's units."""
 
 
 @dataclass(frozen=True, eq=False)
 class GazePlace:
-    """``medium``: what ``transport.trace.trace_depth`` traces, None where nothing is known; ``box``: where a gaze field
-    lives; ``about``: for the provenance (JSON); ``kind``: ``field``, ``scene``, ``hits`` or ``none``."""
+    """Where people looked around, and how their frame lies in it."""
 
-    medium: object
+    # What depths are traced in, in the field's frame (`transport.trace.trace_depth`); None where nothing is known.
+    medium: FieldMedium | VolumeMedium | Place | None
+    # Where a gaze field lives, in that frame.
     box: Box
+    # What it was made of: "field", "scene", "hits" or "none".
     kind: str
+    # For the provenance (JSON): the file, and what it is.
     about: dict = field(default_factory=dict)
+    # From the rays' frame, in metres, to the field's.
+    align: Similarity = field(default_factory=Similarity)
+    # The radiance field that the medium shows, where it is one.
+    radiance: RadianceField | None = None
 
-    def told(self, config: GazeConfig | LogGazeConfig) -> GazeConfig | LogGazeConfig:
-        """``config`` of a gaze field that knows what such a place is: one of hit points has holes, which were seen
-        through by nobody that it was made from; no place has no surfaces. Raises ``ValueError`` for a field that needs
-        surfaces."""
-        if isinstance(config, LogGazeConfig):
-            return replace(
-                config,
-                escaped="nearest" if self.kind == "hits" else "constant",
-                geometry="none" if self.kind == "none" else "surface",
-            )
-        if self.kind == "none":
-            raise NergError(
-                "a gaze field of this recipe needs surfaces; without any geometry only the default recipe trains"
-            )
-        return config
+    def points_from_rays(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) of the rays' frame in the field's."""
+        return points @ self.align.matrix[:3, :3].T + self.align.matrix[:3, 3]
+
+    def directions_from_rays(self, directions: np.ndarray) -> np.ndarray:
+        """Unit directions (..., 3) of the rays' frame in the field's."""
+        return directions @ (self.align.matrix[:3, :3] / self.align.scale).T
+
+    def directions_to_rays(self, directions: np.ndarray) -> np.ndarray:
+        """Unit directions (..., 3) of the field's frame in the rays'."""
+        # The inverse of a rotation is its transpose.
+        return directions @ (self.align.matrix[:3, :3] / self.align.scale)
 
 
-def place_of_field(path: Path, ns) -> GazePlace:
-    """A trained radiance field."""
-    from nerg_mi.formats.fields import load_radiance
-
+def place_of_field(path: Path, ns: ModuleType) -> GazePlace:
+    """A trained radiance field, read from ``path`` with arrays of the backend ``ns``."""
     radiance, _ = load_radiance(path, ns)
-    return GazePlace(FieldMedium(radiance), radiance.box, "field", {"field_file": _file(path)})
+    about = {"field_file": file_identity(path)}
+    return GazePlace(FieldMedium(radiance), radiance.box, "field", about, radiance=radiance)
 
 
 def place_of_scene(path: Path) -> GazePlace:
-    """The shapes of a Mitsuba scene, and the field or volume of its integrator where that is a ``nerg``."""
-    from nerg_mi.rendering.pictures import load_scene
+    """The shapes of a Mitsuba scene, and the field or volume of its integrator where that is a ``nerg``.
 
+    Raises `NergError` for a scene with neither.
+    """
     scene = load_scene(path)
     place = Place(getattr(scene.integrator(), "medium", None), scene)
     bounds = [] if place.medium is None else [place.medium.bounds()]
@@ -75,7 +82,7 @@ def place_of_scene(path: Path) -> GazePlace:
     lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
     # A plane has no thickness, and a field needs some.
     pad = 0.01 * max(upper - lower)
-    return GazePlace(place, Box(tuple(lower - pad), tuple(upper + pad)), "scene", {"scene_file": _file(path)})
+    return GazePlace(place, Box(tuple(lower - pad), tuple(upper + pad)), "scene", {"scene_file": file_identity(path)})
 
 
 def place_of_hits(rays: Rays, path: Path, voxel: float | None = None) -> GazePlace:
@@ -110,15 +117,16 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
         medium,
         Box(tuple(lower.tolist()), tuple(upper.tolist())),
         "hits",
-        {"geometry_file": {**_file(path), **(about or {})}},
+        {"geometry_file": {**file_identity(path), **(about or {})}},
     )
 
 
 def place_of_nothing(origins: np.ndarray) -> GazePlace:
-    """No geometry: everything is two metres away from whoever looks from one of ``origins`` (N, 3)."""
-    lower, upper = origins.min(axis=0) - _NOWHERE, origins.max(axis=0) + _NOWHERE
+    """No geometry: everything is ``NOWHERE`` away from whoever looks from one of ``origins`` (N, 3)."""
+    lower, upper = origins.min(axis=0) - NOWHERE, origins.max(axis=0) + NOWHERE
     return GazePlace(None, Box(tuple(lower.tolist()), tuple(upper.tolist())), "none", {"geometry": "none"})
 
 
-def _file(path: Path) -> dict:
+def file_identity(path: Path) -> dict[str, str]:
+    """Name and SHA-256 of a file, for the provenance (JSON)."""
     return {"file": path.name, "sha256": file_sha256(path)}

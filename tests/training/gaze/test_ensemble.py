@@ -1,4 +1,6 @@
-"""Ensembles: what is resampled, members by themselves, going on, the command."""
+"""Ensembles: what is resampled, members by themselves, going on."""
+
+from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,20 +10,20 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.arrays import stored
 from nerg_mi.formats.checkpoint import write_checkpoint
-from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.ensemble import blocks_of, resample, train_ensemble
-from nerg_mi.training.gaze.run import train_gaze
+from nerg_mi.training.gaze.state import StateSettings
+from nerg_mi.training.gaze.supervision import Supervision
 
-from .test_state import LIKELIHOOD, LOG, PROBES, threads  # noqa: F401  (fixture)
-from .test_trainer import BOX, looking_at
+from .looks import LIKELIHOOD, LOG, NOWHERE, PROBES, looking_at, planned, train
+from .views import around
 
 PLACE = replace(LOG, geometry="none")
 SHORT = replace(LIKELIHOOD, steps=4, zones=0)
+MOVED = replace(NOWHERE, align=Similarity([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
 
 
 def crowd(people=6, n=1200, seconds=100.0):
@@ -32,9 +34,17 @@ def crowd(people=6, n=1200, seconds=100.0):
     return Rays(t, who, tuple("abcdefgh"[:people]), rays.origin, rays.direction, np.ones(n))
 
 
-def together(members=3, rays=None, **options):
+def together(members=3, rays=None, *, place=NOWHERE, config=PLACE, settings=SHORT, probes=PROBES, **options):
+    tell, write = options.pop("tell", None), options.pop("write", None)
     return train_ensemble(
-        members, rays or crowd(), None, BOX, PLACE, SHORT, options.pop("probes", PROBES), ns, **options
+        members,
+        Supervision(rays or crowd()),
+        place,
+        planned(config, settings, probes),
+        ns,
+        state=StateSettings(**options),
+        tell=tell,
+        write=write,
     )
 
 
@@ -71,14 +81,13 @@ def test_a_resample_holds_whole_people_as_often_as_they_were_drawn():
     assert (times == 0).mean() == pytest.approx((5 / 6) ** 6, abs=0.03)
 
 
-def test_members_are_trainings_of_resamples(threads):  # noqa: F811
+def test_members_are_trainings_of_resamples(threads):
     threads(1)
     rays = crowd()
     ensemble, about = together(3, rays)
     for k, member in enumerate(ensemble.members):
-        alone, _ = train_gaze(
-            resample(rays, (SHORT.seed, k)), None, BOX, PLACE, replace(SHORT, seed=100 * k), PROBES, ns
-        )
+        own = Supervision(resample(rays, (SHORT.seed, k)))
+        alone, _ = train(NOWHERE, replace(SHORT, seed=100 * k), PLACE, supervision=own)
         for name, value in arrays(alone).items():
             np.testing.assert_array_equal(arrays(member)[name], value, err_msg=name)
     assert about["ensemble"] == {"members": 3, "resampled": "people", "seeds": [0, 100, 200]} and about["steps"] == 12
@@ -86,7 +95,7 @@ def test_members_are_trainings_of_resamples(threads):  # noqa: F811
     assert ensemble.support.cells[:, 3].sum() == len(rays) == about["rays"] and ensemble.support.radius == PROBES.radius
 
 
-def test_an_interrupted_ensemble_goes_on(threads, tmp_path):  # noqa: F811
+def test_an_interrupted_ensemble_goes_on(threads, tmp_path):
     """In the second member: the first is not trained again, and all come out as if nothing had happened."""
     threads(1)
     path, seen = tmp_path / "a.run", []
@@ -97,17 +106,17 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):  # noqa: F811
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt, match="interrupted while training member 2 of 3; go on with --resume"):
-        together(state=path, on_progress=stop)
+        together(path=path, tell=stop)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.member0.safetensors", "a.run"]
     with pytest.raises(NergError, match="started with other probes"):
-        together(state=path, resume=True, probes=replace(PROBES, kappa=9.0))
+        together(path=path, resume=True, probes=replace(PROBES, kappa=9.0))
     seen.clear()
     written = []
     shares = []
     got, about = together(
-        state=path,
+        path=path,
         resume=True,
-        on_progress=lambda s: (seen.append(s.stage), shares.append(s.done)),
+        tell=lambda s: (seen.append(s.stage), shares.append(s.done)),
         write=lambda *_: written.append(sorted(p.name for p in tmp_path.iterdir())),
     )
     assert set(seen) == {"2/3 probes", "2/3 fit", "3/3 probes", "3/3 fit"} and seen.count("2/3 fit") == 2
@@ -129,54 +138,44 @@ def test_an_interrupted_ensemble_goes_on(threads, tmp_path):  # noqa: F811
     [
         ({"config": replace(PLACE, width=8)}, "architecture"),
         ({"config": replace(PLACE, variant="emit")}, "architecture"),
-        ({"box": Box((-3, -3, 0), (3, 3, 3))}, "box"),
+        ({"place": replace(NOWHERE, box=Box((-3, -3, 0), (3, 3, 3)))}, "box"),
         ({"rays": crowd(people=7)}, "rays"),
         ({"settings": replace(SHORT, steps=5)}, "settings"),
-        ({"align": Similarity([[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])}, "align"),
+        ({"place": MOVED}, "align"),
     ],
 )
 def test_members_of_another_run_are_refused(tmp_path, change, said):
     """Finished members count as members only of the run that they are of: of another architecture they would be
     averaged with it."""
-    path, run = tmp_path / "a.run", {"rays": crowd(), "box": BOX, "config": PLACE, "settings": SHORT, "align": None}
-    train = lambda **more: train_ensemble(
-        2,
-        more["rays"],
-        None,
-        more["box"],
-        more["config"],
-        more["settings"],
-        PROBES,
-        ns,
-        more["align"],
-        state=path,
-        resume="stop" not in more,
-        on_progress=more.get("stop"),
-    )
+    path = tmp_path / "a.run"
 
     def stop(state):
         if state.stage == "2/2 fit":
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(**run, stop=stop)
+        together(2, path=path, tell=stop)
     assert (tmp_path / "a.member0.safetensors").is_file()
     with pytest.raises(NergError, match=f"a.member0.safetensors.*started with other .*{said}"):
-        train(**{**run, **change})
+        together(2, **change, path=path, resume=True)
     assert (tmp_path / "a.member0.safetensors").is_file()
 
 
-def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):  # noqa: F811
+def test_an_ensemble_that_cannot_be_written_is_kept(threads, tmp_path):
     """Refused at the end: the next start trains no member again; nor does one that was killed before it removed a
     state."""
     threads(1)
     path, stages = tmp_path / "a.run", []
+
+    def refuse(field, about):
+        raise NergError("a weight does not fit into fp16; leave out --half")
+
     with pytest.raises(NergError, match="fp16.*--resume writes it"):
-        together(state=path, write=lambda field, about: stored({"grid": ns.Float(1e6)}, True))
+        together(path=path, write=refuse)
     members = sorted(p.name for p in tmp_path.iterdir())
     assert members == [f"a.member{k}.safetensors" for k in range(3)]
     write_checkpoint(path, "gaze run", {"x": np.zeros(1)}, {"about": {"member": [1, 3]}})
-    _, about = together(state=path, resume=True, on_progress=lambda s: stages.append(s.stage), write=lambda *_: None)
+    _, about = together(path=path, resume=True, tell=lambda s: stages.append(s.stage), write=lambda *_: None)
     assert not stages and about["steps"] == 12 and not list(tmp_path.iterdir())
 
 
@@ -188,25 +187,6 @@ def test_what_cannot_be_resampled_is_refused():
         with pytest.raises(ValueError, match=said):
             together(members, **options)
     with pytest.raises(ValueError, match="trained on rays alone"):
-        train_ensemble(2, None, None, BOX, PLACE, SHORT, PROBES, ns)
+        train_ensemble(2, Supervision(None, around(2)), NOWHERE, planned(PLACE, SHORT), ns)
     with pytest.raises(NergError, match="nothing to resume"):
-        together(state=Path("nowhere.run"), resume=True)
-
-
-def test_the_command(rgb, tmp_path, capsys):
-    import typer
-
-    from nerg_mi.cli.train_gaze import train_gaze as command
-
-    crowd().save(tmp_path / "rays.npz")
-    out, app = tmp_path / "gaze.safetensors", typer.Typer()
-    app.command()(command)
-    app(
-        f"{tmp_path / 'rays.npz'} --geometry none -o {out} --radius 0.5 --probes 6 --steps 2 --directions 64 --zones 1 --min-rays 8 --ensemble 2 --half".split(),
-        standalone_mode=False,
-    )
-    assert "held-out positions" in capsys.readouterr().out
-    field, meta = load_gaze(out, ns)
-    about = meta["provenance"]["ensemble"]
-    assert len(field.members) == 2 and about["members"] == 2 and len(about["validation"]) == 2
-    assert field.support.cells[:, 3].sum() == 1200 and [p.name for p in tmp_path.glob("gaze.*")] == ["gaze.safetensors"]
+        together(path=Path("nowhere.run"), resume=True)

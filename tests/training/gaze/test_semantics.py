@@ -15,11 +15,14 @@ from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
 from nerg_mi.maths.box import Box
 from nerg_mi.rays.rays import Rays
+from nerg_mi.training.gaze.product import ProductTrainer
 from nerg_mi.training.gaze.product_model import gaze_density
-from nerg_mi.training.gaze.semantics import config_like, semantic_features, trunk_of
+from nerg_mi.training.gaze.ray_targets import targets_of_rays
+from nerg_mi.training.gaze.semantics import initial_weights, semantic_features, trunk_config
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
-from nerg_mi.training.gaze.supervision import supervise_rays
-from nerg_mi.training.gaze.trainer import GazeTrainer
+from nerg_mi.training.gaze.sizes import sized_gaze_config
+from nerg_mi.training.gaze.targets import TargetNeeds
+from nerg_mi.training.geometry.places import GazePlace, place_of_field
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.trace import default_settings
 
@@ -27,8 +30,17 @@ BOX = Box((-2, -2, 0), (2, 2, 3))
 PROBES = ProbeSettings(radius=0.5, count=12, cap=64, min_rays=8, kappa=20.0, directions=64)
 
 
+def gaze_config(radiance, variant="emit_capture", **more):
+    """Of a gaze field that can begin as the radiance field."""
+    return replace(trunk_config(sized_gaze_config("small", variant), radiance.config), **more)
+
+
+def place_of(field):
+    return GazePlace(FieldMedium(field), BOX, "field", radiance=field)
+
+
 @pytest.fixture
-def place(rgb):
+def radiance(rgb):
     """A random radiance field, dense enough to have surfaces."""
     ns = namespace("llvm")
     config = RadianceConfig(
@@ -55,24 +67,24 @@ def rays():
     )
 
 
-def test01_the_trunk_gives_the_fields_features(place):
+def test01_the_trunk_gives_the_fields_features(radiance):
     ns = namespace("llvm")
-    gaze = GazeField.random(config_like(place.config, "emit_capture", "softplus"), BOX, ns, 3)
-    gaze.set_parameters(trunk_of(place, gaze.config))
+    gaze = GazeField.random(gaze_config(radiance), BOX, ns, 3)
+    gaze.set_parameters(initial_weights(radiance, gaze.config))
     p = ns.Array3f(np.random.default_rng(2).uniform(BOX.lower, BOX.upper, (50, 3)).astype(np.float32).T)
-    expected = place.density_features(p)[1]
+    expected = radiance.density_features(p)[1]
     got = gaze.position_net(gaze.grid(gaze.box.to_unit(p)))
     assert len(got) == 5
     for a, b in zip(got, expected):
         assert np.allclose(np.array(a), np.array(b), atol=1e-6)
     with pytest.raises(ValueError, match="must have its sizes"):
-        trunk_of(place, replace(gaze.config, geometry=6))
+        initial_weights(radiance, replace(gaze.config, geometry=6))
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test02_the_fast_path_is_the_field(place, own):
+def test02_the_fast_path_is_the_field(radiance, own):
     ns, rng = namespace("llvm"), np.random.default_rng(3)
-    config = config_like(place.config, "emit_capture", "softplus", semantic="snapshot", semantic_own=own)
+    config = gaze_config(radiance, semantic="snapshot", semantic_own=own)
     gaze = GazeField.random(config, BOX, ns, 3)
     gaze.set_parameters({"grid.table": ns.Float(rng.normal(size=len(gaze.grid.table)).astype(np.float32))})
     B, D = 3, 32
@@ -86,51 +98,53 @@ def test02_the_fast_path_is_the_field(place, own):
     assert np.allclose(np.array(fast), np.array(slow), rtol=1e-5) and np.ptp(np.array(slow)) > 0
 
 
-def test03_snapshots_and_accumulations(rgb, place):
+def test03_snapshots_and_accumulations(rgb, radiance):
     """A snapshot is the field at the point; in a single dense slab of equal features both agree."""
-    medium = FieldMedium(place)
+    medium = FieldMedium(radiance)
     o = np.tile([0.0, 0.0, 1.5], (20, 1))
     d = np.random.default_rng(4).normal(size=(20, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     t = np.full(20, 0.5)
-    got = semantic_features(medium, o, d, t, "snapshot")
+    got = semantic_features(place_of(radiance), o, d, t, "snapshot")
     p = rgb.Point3f((o + d * 0.5).astype(np.float32).T)
-    expected = np.stack([np.array(f) for f in place.density_features(p)[1]], -1)
+    expected = np.stack([np.array(f) for f in radiance.density_features(p)[1]], -1)
     assert got.dtype == np.float16 and np.allclose(got, expected, atol=2e-3 * np.abs(expected).max())
 
     # The same everywhere: what is accumulated is the opacity times it.
-    uniform = namespace("llvm").Float(np.full(len(place.grid.table), 0.3, np.float32))
-    place.set_parameters({"grid.table": uniform})
-    medium = FieldMedium(place)
+    uniform = namespace("llvm").Float(np.full(len(radiance.grid.table), 0.3, np.float32))
+    radiance.set_parameters({"grid.table": uniform})
+    medium = FieldMedium(radiance)
     from nerg_mi.transport.trace import trace_depth
 
     _, opacity = trace_depth(medium, o, d)
-    here = semantic_features(medium, o, d, t, "snapshot").astype(float)
-    along = semantic_features(medium, o, d, t, "accumulated").astype(float)
+    here = semantic_features(place_of(radiance), o, d, t, "snapshot").astype(float)
+    along = semantic_features(place_of(radiance), o, d, t, "accumulated").astype(float)
     assert opacity.min() > 0.2
     assert np.allclose(along, here * opacity[:, None], atol=3e-3 * np.abs(here).max())
 
 
 @pytest.mark.parametrize("frozen", [True, False])
-def test04_frozen_trunks_stay_and_others_move(rgb, place, rays, frozen):
-    ns, medium = namespace("llvm"), FieldMedium(place)
-    config = config_like(place.config, "emit_capture", "softplus", semantic="accumulated", semantic_own=True)
-    data = supervise_rays(rays, medium, BOX, PROBES, semantic="accumulated")
+def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays, frozen):
+    ns = namespace("llvm")
+    config = gaze_config(radiance, semantic="accumulated", semantic_own=True)
+    data = targets_of_rays(rays, place_of(radiance), PROBES, TargetNeeds(semantic="accumulated"))
     assert data.semantic.shape == (*data.truth.shape, 5)
-    trainer = GazeTrainer(data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial=trunk_of(place, config))
+    trainer = ProductTrainer(
+        data, BOX, config, GazeSettings(steps=30, frozen=frozen), ns, initial=initial_weights(radiance, config)
+    )
     before = trainer.measure(data).loss
     while trainer.progress < 1:
         trainer.step()
-    field, start = trainer.field().parameters(), trunk_of(place, config)
+    field, start = trainer.field().parameters(), initial_weights(radiance, config)
     for name, value in start.items():
         assert np.array_equal(np.array(field[name]), np.array(value)) == frozen, name
     assert trainer.measure(data).loss < 0.9 * before
 
 
-def test05_the_command(rgb, place, rays, tmp_path, capsys):
+def test05_the_command(rgb, radiance, rays, tmp_path, capsys):
     from nerg_mi.cli import main
 
-    save_radiance(place, tmp_path / "field.safetensors", {"test": 0})
+    save_radiance(radiance, tmp_path / "field.safetensors", {"test": 0})
     rays.save(tmp_path / "rays.npz")
     arguments = [
         "train",
@@ -165,7 +179,7 @@ def test05_the_command(rgb, place, rays, tmp_path, capsys):
     assert not end.value.code, capsys.readouterr().err
     gaze, about = load_gaze(tmp_path / "gaze.safetensors", namespace("llvm"))
     assert gaze.config.semantic == "snapshot" and about["provenance"]["begins_as"] == "field.safetensors"
-    assert np.array_equal(np.array(gaze.grid.table), np.array(place.grid.table))
+    assert np.array_equal(np.array(gaze.grid.table), np.array(radiance.grid.table))
     for wrong, said in (
         (["--freeze"], "add it, or leave --freeze out"),
         (["--begin", "nerf"], 'must be "random" or "field"'),
@@ -177,10 +191,10 @@ def test05_the_command(rgb, place, rays, tmp_path, capsys):
 
 @pytest.mark.parametrize("cutoff", [None, 0.0, 0.05])
 @pytest.mark.parametrize("kind", ["snapshot", "accumulated"])
-def test_features_of_training_are_those_of_rendering(rgb, place, tmp_path, monkeypatch, kind, cutoff):
+def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, monkeypatch, kind, cutoff):
     """Whatever the picture's colours are cut off at: a field must be shown what it was trained on."""
-    save_radiance(place, tmp_path / "field.safetensors", {})
-    config = config_like(place.config, "emit", "softplus", semantic=kind)
+    save_radiance(radiance, tmp_path / "field.safetensors", {})
+    config = gaze_config(radiance, "emit", semantic=kind)
     save_gaze(GazeField.random(config, BOX, namespace("llvm"), 3), tmp_path / "gaze.safetensors", {})
     integrator = {
         "type": "nerg",
@@ -210,7 +224,11 @@ def test_features_of_training_are_those_of_rendering(rgb, place, tmp_path, monke
     way = picture[:, 1:4] - eye
     distance = np.linalg.norm(way, axis=1)
     trained = semantic_features(
-        made.medium, np.broadcast_to(eye, way.shape)[met], (way / distance[:, None])[met], distance[met], kind
+        place_of_field(tmp_path / "field.safetensors", namespace("llvm")),
+        np.broadcast_to(eye, way.shape)[met],
+        (way / distance[:, None])[met],
+        distance[met],
+        kind,
     )
     assert met.sum() > 30 and np.ptp(rendered[met]) > 0.1
     # Half precision, and directions that were read back from positions.

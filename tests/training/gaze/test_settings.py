@@ -1,9 +1,13 @@
 """Settings of a gaze training: their limits, and the learning rate over a run."""
 
+from __future__ import annotations
+
+import json
+
 import pytest
 
-from nerg_mi.training.gaze.recipes import gaze_recipe
-from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings, sized_gaze_config
+from nerg_mi.errors import NergError
+from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
 
 
 def test_limits_are_where_they_are_said_to_be():
@@ -36,19 +40,12 @@ def test_the_learning_rate_is_held_and_then_falls_to_its_last():
     assert s.rate(0.625) == pytest.approx(0.02 * 0.2) and s.rate(1) == s.rate(1.5) == pytest.approx(0.02 * 0.04)
 
 
-def test_a_larger_field_has_more_of_everything():
-    small, paper = sized_gaze_config("small"), sized_gaze_config("paper")
-    assert (
-        small.grid.size < paper.grid.size
-        and small.grid.levels < paper.grid.levels
-        and small.grid.log2_rows < paper.grid.log2_rows
-    )
+@pytest.mark.parametrize("wrong", [{}, {"steps": 1, "minutes": 1.0}, {"steps": 1, "loss": "mse"}])
+def test_settings_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(NergError):
+        GazeSettings(**wrong)
 
 
-def test_the_papers_recipe_is_fifty_epochs_at_a_rate_that_falls_from_the_start():
-    """Each probe is drawn fifty times; the rate is lower with every step, down to a tenth."""
-    recipe = gaze_recipe("paper")
-    assert recipe.settings["steps"] * recipe.settings["probes"] == 50 * recipe.probes["count"]
-    settings = GazeSettings(**recipe.settings)
-    assert settings.rate(0) == 1e-3 and settings.rate(0.01) < 1e-3
-    assert settings.rate(0.5) == pytest.approx(1e-3 * 0.1**0.5) and settings.rate(1) == pytest.approx(1e-4)
+def test_settings_are_kept_as_json():
+    for settings in (GazeSettings(steps=3, loss="code"), ProbeSettings(radius=0.3, spacing=0.1)):
+        assert type(settings)(**json.loads(json.dumps(settings.to_dict()))) == settings

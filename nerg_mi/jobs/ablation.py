@@ -1,0 +1,209 @@
+"""The paper's ablation: every variant of a gaze field, trained alike, scored on what it saw and on what it did not."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation import ablation
+from nerg_mi.evaluation.ablation import Density, Variant
+from nerg_mi.evaluation.frame_time import frame_timer
+from nerg_mi.evaluation.gaze.evaluation import GazeTest, held_out_rays
+from nerg_mi.evaluation.gaze.scores import gaze_field
+from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.bounded import read_json
+from nerg_mi.files.tables import write_json
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.rays.rays import Rays
+from nerg_mi.training.gaze.plan import GazePlan
+from nerg_mi.training.gaze.recipes import gaze_recipe
+from nerg_mi.training.gaze.splits import hold_out
+from nerg_mi.training.gaze.supervision import Supervision, digest_rays
+from nerg_mi.training.geometry.places import GazePlace
+
+from .backend import select_backend
+from .gaze import train_planned
+from .gaze_places import make_place, place_kind
+from .gaze_plan import plan_gaze
+from .options.ablation import AblationOptions
+from .options.gaze import GazeOptions
+from .reporter import SILENT, Reporter
+
+
+@dataclass(frozen=True)
+class AblationResult:
+    """What every variant scored."""
+
+    # A row a variant and seed (`evaluation.ablation.COLUMNS`).
+    rows: list[dict]
+    # Tables and plot that were written.
+    files: list[Path]
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """What all variants have in common."""
+
+    train: Rays
+    tests: dict[str, GazeTest]
+    place: GazePlace
+    folder: Path
+    ns: ModuleType
+    # Seconds a frame of a checkpoint; None: frames are not timed.
+    frame_seconds: Callable[[Path], float] | None
+    options: AblationOptions
+
+
+def ablate(
+    rays: Rays | str | Path, output: str | Path, options: AblationOptions | None = None, reporter: Reporter = SILENT
+) -> AblationResult:
+    """Train and score every variant of the recipes in one place, on ``rays`` of attention or their file.
+
+    Checkpoints go to the folder ``output``, each with its row: what an earlier run with the same rays, place, tests and
+    settings has left there is not trained again. Raises `NergError` for what the user can mend.
+    """
+    options, output = options or AblationOptions(), Path(output)
+    place_kind(options)
+    width, height = _size(options.size)
+    recipes = options.recipes.split(",")
+    known = ablation.all_variants(options.field is not None, recipes)
+    variants = _chosen(known, options.variant)
+    truth = _law(options.law) if options.law else None
+    check_folder(output)
+    ns = select_backend(options.mode, options.threads)
+    data = rays if isinstance(rays, Rays) else Rays.load(rays)
+    _, account = hold_out(data, options.radius, options.zones, options.positions, 0, options.min_rays, options.people)
+    train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")
+    place = make_place(options, train, (), output / "place.vol", ns, reporter=reporter)
+    render = None
+    if options.cameras:
+        folder = output if options.field is None else Path(options.field).parent
+        render = frame_timer(place, np.asarray(centres), folder, options.cameras, width, height)
+    tests = ablation.make_tests(scored, train, centres, options.radius, options.kappa, options.min_rays, truth)
+    bench = _Bench(train, tests, place, output, ns, render, options)
+    due = [(v, seed) for v in variants for seed in range(options.seeds if gaze_recipe(v.recipe).quick else 1)]
+    rows = []
+    for k, (variant, seed) in enumerate(due):
+        reporter.progress(k / len(due), f"{variant.recipe} {variant.name}, seed {seed}")
+        rows.append(_row(variant, seed, bench))
+        reporter.message(
+            f"{variant.recipe:8s} {variant.name:28s} seed {seed}: test KLD {rows[-1]['test_KLD']:.3f}, "
+            f"CC {rows[-1]['test_CC']:.3f}; {rows[-1]['train_seconds']:.0f} s"
+        )
+    ablation.relate(rows)
+    notes = _notes(len(centres), len(account["people"]), (len(train), len(data)), options, render is not None)
+    files = ablation.write_ablation(output, rows, notes)
+    for path in files:
+        reporter.message(f"wrote {path}")
+    return AblationResult(rows, files)
+
+
+def _row(variant: Variant, seed: int, bench: _Bench) -> dict:
+    """Scores and times of one training, which an earlier run may have left."""
+    plan = _plan(variant, seed, bench)
+    path = bench.folder / variant.file_name(seed)
+    identity = {
+        "architecture": plan.config.to_dict(),
+        "settings": plan.settings.to_dict(),
+        "probes": plan.probes.to_dict(),
+        "rays": digest_rays(bench.train),
+        "tests": {k: hashlib.sha256(t.truth.tobytes()).hexdigest() for k, t in bench.tests.items()},
+        "begin": variant.begin,
+        **bench.place.about,
+    }
+    kept = path.with_suffix(".json")
+    found = read_json(kept, "kept row") if path.exists() and kept.exists() else None
+    if isinstance(found, dict) and "row" in found and found.get("same") == json.loads(json.dumps(identity)):
+        row = found["row"]
+    else:
+        row = _train({"recipe": variant.recipe, "variant": variant.name, "seed": seed}, plan, path, bench)
+        write_json(kept, {"row": row, "same": identity})
+    if bench.frame_seconds is not None:
+        row["frame_seconds"] = bench.frame_seconds(path)
+    return row
+
+
+def _plan(variant: Variant, seed: int, bench: _Bench) -> GazePlan:
+    options, quick = bench.options, gaze_recipe(variant.recipe).quick
+    plan = plan_gaze(
+        GazeOptions(
+            recipe=variant.recipe,
+            variant=variant.gaze,
+            semantic=variant.semantic,
+            semantic_own=variant.semantic_own,
+            begin="field" if variant.begin else "random",
+            freeze=variant.frozen,
+            steps=(options.default_steps if quick else options.steps) or None,
+            probes=options.probes or None,
+            refit=options.refit or quick,
+            seed=seed,
+        ),
+        bench.place,
+    )
+    # Positions that validate are to be had wherever there are some that test.
+    watched = plan.settings.watched_rays or plan.probes.min_rays
+    return plan.with_settings(watched_rays=min(watched, options.min_rays))
+
+
+def _train(made: dict, plan: GazePlan, path: Path, bench: _Bench) -> dict:
+    """Train, write the checkpoint (``made``: what it is), and score. Raises ``KeyboardInterrupt`` after Ctrl-C."""
+    started = time.perf_counter()
+    result = train_planned(Supervision(bench.train), bench.place, plan, bench.ns)
+    if result.interrupted:
+        raise KeyboardInterrupt
+    seconds = time.perf_counter() - started
+    save_gaze(result.field, path, {**bench.place.about, **result.provenance, **made})
+    density = gaze_field(result.field, bench.place.medium, bench.place.align, plan.probes.depth)
+    times = {"steps": result.provenance["steps"], "train_seconds": seconds}
+    return {**made, **times, **ablation.score(bench.tests, density)}
+
+
+def _chosen(variants: list[Variant], names: tuple[str, ...]) -> list[Variant]:
+    """Those of ``variants`` that are called one of ``names``; all without any."""
+    known = list(dict.fromkeys(v.name for v in variants))
+    if unknown := sorted(set(names) - set(known)):
+        raise NergError(f'--variant must be one of {", ".join(known)} here, got "{unknown[0]}"')
+    return [v for v in variants if not names or v.name in names]
+
+
+def _law(name: str) -> Density:
+    """The density of an instance of the class that ``MODULE:CLASS`` names."""
+    module, _, kind = name.partition(":")
+    try:
+        return getattr(importlib.import_module(module), kind)().density
+    except (ImportError, AttributeError, ValueError) as error:
+        raise NergError(
+            "--law needs MODULE:CLASS that can be imported, such as nerg_mi.scenes.store.attention_law:AttentionLaw, "
+            f'got "{name}"'
+        ) from error
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(x) for x in text.lower().split("x"))
+    except ValueError as error:
+        raise NergError(f'--size needs WIDTHxHEIGHT, got "{text}"') from error
+    return width, height
+
+
+def _notes(centres: int, people: int, count: tuple[int, int], options: AblationOptions, timed: bool) -> str:
+    """What the tables say, for whoever reads them later; ``count``: of the rays that were trained on, and of all."""
+    trained, whole = count
+    without = f", {people} people held out" if people else ""
+    source = f"that of {options.law}" if options.law else f"with kappa {options.kappa:g}"
+    width, height = _size(options.size)
+    frame = f" A frame: {width} x {height}, mean of {options.cameras} cameras." if timed else ""
+    return (
+        f"{centres} held-out positions in {options.zones} zones{without}; {trained:,} of {whole:,} rays trained on. "
+        f"Losses: KLD + (1 - CC) + MAE over 2,048 directions, truth {source}; relative to emit_capture of the same "
+        f"recipe; ± is the standard deviation over seeds.{frame}"
+    )

@@ -1,0 +1,127 @@
+"""The evaluation of a gaze field, at positions and of people that it was not trained on, beside what needs no field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation.gaze import evaluation
+from nerg_mi.evaluation.gaze.baselines import standard_baselines
+from nerg_mi.evaluation.gaze.report import side_by_side, write_report
+from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
+from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.checksum import file_sha256
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.rays.rays import Rays
+
+from .backend import select_backend
+from .gaze_places import place_of_training
+from .options.evaluation import GazeEvaluationOptions
+from .reporter import SILENT, Reporter
+
+# Methods whose scores are told for each person, and those that are drawn.
+_BY_PERSON = ("gaze field", "4,096 nearest rays")
+_DRAWN = ("gaze field", "position-blind", "16 nearest probes", "4,096 nearest rays")
+
+
+@dataclass(frozen=True)
+class GazeEvaluation:
+    """What a gaze field scored."""
+
+    # A row a method, the gaze field's first; scores by `evaluation.SCORES`, intervals with ".low" and ".high".
+    rows: list[dict]
+    # A row a method and person.
+    persons: list[dict]
+    # "both", "pos" or "people": what was new to the field.
+    split: str
+    # Test positions, and people in the test.
+    positions: int
+    people: int
+    # Tables and pictures that were written.
+    files: list[Path]
+
+
+def evaluate_gaze(
+    gaze: str | Path,
+    rays: Rays | str | Path,
+    output: str | Path | None = None,
+    options: GazeEvaluationOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> GazeEvaluation:
+    """Score the gaze field in the checkpoint ``gaze`` beside uniform, position-blind, nearest probes, nearest rays and
+    the other half of the people.
+
+    ``rays``: those that it was trained on, or their file; ``output``: folder for tables and pictures, None: none are
+    written. Raises `NergError` where nothing was held out of the training, and for other rays or another place than
+    those of the training.
+    """
+    options, gaze = options or GazeEvaluationOptions(), Path(gaze)
+    output = None if output is None else Path(output)
+    if output is not None:
+        check_folder(output)
+    ns = select_backend(options.mode, options.threads)
+    field, metadata = load_gaze(gaze, ns)
+    about = metadata["provenance"]
+    data = _rays_of_training(gaze, about, rays)
+    account, seed = about["test"], options.seed
+    split = options.split or ("both" if account.get("people") else "pos")
+    reporter.progress(0.0, "test")
+    train, scored, centres = evaluation.held_out_rays(data, account, split, seed)
+    test = evaluation.make_test(
+        scored, centres, account["radius"], options.kappa, options.directions, options.min_rays, seed=seed
+    )
+    place = place_of_training(gaze, about, field.box, options, ns)
+    blind, others = standard_baselines(train, account["radius"], options.kappa, options.blind_kappa, seed)
+    density = gaze_field(field, place.medium, place.align, about.get("probes", {}).get("depth", "median"))
+    methods = {"gaze field": density, **others}
+    reporter.progress(0.1, "scores")
+    rows = evaluation.evaluate_gaze(test, methods, blind, options.resamples, seed)
+    half = evaluation.split_half(scored, test.centres, account["radius"], options.kappa, blind, options.min_rays, seed)
+    rows += [half] if half else []
+    reporter.progress(0.7, "each person")
+    persons = evaluation.person_rows(test, {k: methods[k] for k in _BY_PERSON}, blind, options.min_rays)
+    files = []
+    if output is not None:
+        summary = {"gaze": gaze.name, "split": split, "kappa": options.kappa, "positions": len(test.centres)}
+        notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options)
+        files = write_report(output, rows, persons, summary, notes)
+        if options.pictures:
+            reporter.progress(0.9, "pictures")
+            files.append(output / "positions.png")
+            side_by_side(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures)
+    return GazeEvaluation(rows, persons, split, len(test.centres), len(test.persons), files)
+
+
+def _rays_of_training(gaze: Path, about: dict, rays: Rays | str | Path) -> Rays:
+    """The rays that the field was trained on. Raises `NergError` for others, and where none were held out of it."""
+    if "test" not in about:
+        raise NergError(
+            f'"{gaze}" was trained on all positions, so that none is left to score; train it with --test-zones 3'
+        )
+    if isinstance(rays, Rays):
+        return rays
+    if about.get("rays_file", {}).get("sha256") not in (None, file_sha256(Path(rays))):
+        raise NergError(f'"{gaze}" was trained on other rays than "{rays}"; give the file {about["rays_file"]["file"]}')
+    return Rays.load(rays)
+
+
+def _notes(
+    name: str,
+    split: str,
+    test: evaluation.GazeTest,
+    count: tuple[int, int],
+    radius: float,
+    options: GazeEvaluationOptions,
+) -> str:
+    """What the tables say, for whoever reads them later; ``count``: of the rays that were trained on, and of all."""
+    trained, whole = count
+    return (
+        f"# {name}: {split}\n\n{len(test.centres)} positions, {len(test.persons)} persons; {trained:,} of {whole:,} "
+        f"rays trained on. Truth: rays within {radius:g} m, kappa {options.kappa:g}, {options.directions} directions "
+        f"of equal area; KLD in nats with {EPS:g} of the uniform density added; MAE in 1/sr; AUC against all "
+        "directions, sAUC against rays of other positions; bits a ray beyond the position-blind density of kappa "
+        f"{options.blind_kappa:g}; loglik in nats of 1/sr. Brackets: 1.96 standard errors either way, from "
+        f"{options.resamples} resamples of the persons. Split half: half of the people predict the other half, where "
+        "both have enough rays; a reference, no bound."
+    )

@@ -1,0 +1,218 @@
+"""The training of a gaze field: from rays of attention, salience images or both to a checkpoint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from nerg_mi.capture.salience.views import SalienceSet, open_salience
+from nerg_mi.errors import NergError
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.files.atomic import check_writable
+from nerg_mi.files.checksum import file_sha256
+from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.rays import Rays
+from nerg_mi.training.gaze import run
+from nerg_mi.training.gaze.ensemble import train_ensemble
+from nerg_mi.training.gaze.fit import GazeProgress
+from nerg_mi.training.gaze.plan import GazePlan, TrainedField
+from nerg_mi.training.gaze.settings import ProbeSettings
+from nerg_mi.training.gaze.splits import far_views, hold_out
+from nerg_mi.training.gaze.state import StateSettings
+from nerg_mi.training.gaze.supervision import Supervision
+from nerg_mi.training.geometry.places import GazePlace
+
+from .backend import select_backend
+from .gaze_places import make_place, read_similarity
+from .gaze_plan import check_plan, plan_gaze
+from .options.gaze import GazeOptions
+from .reporter import SILENT, Reporter
+
+
+@dataclass(frozen=True)
+class GazeResult:
+    """A gaze field that was trained."""
+
+    # The field, or the ensemble.
+    field: TrainedField | GazeEnsemble
+    # What its checkpoint says about the training (JSON).
+    provenance: dict
+    # The checkpoint; None where none was asked for.
+    output: Path | None
+    # Whether the run was ended early.
+    interrupted: bool
+
+
+def train_gaze(
+    rays: Rays | str | Path | None,
+    output: str | Path | None = None,
+    options: GazeOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> GazeResult:
+    """Train a gaze field on ``rays`` of attention, or their file (.npz or .parquet); None: on salience images alone.
+
+    ``output``: checkpoint to write (.safetensors). Beside it are kept the state of the run while that is not done
+    (.run), from which it can be resumed, and a place of hit points (.vol). After Ctrl-C the result so far and the state
+    are written and ``KeyboardInterrupt`` is raised; without ``output`` the result so far is returned, as
+    ``interrupted``.
+
+    Raises `NergError` for what the user can mend, before any time is spent on it.
+    """
+    options = options or GazeOptions()
+    output = None if output is None else Path(output)
+    probes = check_plan(options, views_alone=rays is None)
+    state = None if output is None else output.with_suffix(".run")
+    _check_outputs(options, output, state)
+    ns = select_backend(options.mode, options.threads)
+    if options.resume and not options.ensemble and (state is None or not state.is_file()):
+        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
+    align = Similarity() if options.align is None else read_similarity(options.align, "--align", "rays to field")
+    supervision, about = _supervision(rays, options, probes, align, reporter)
+    volume = None if output is None else output.with_suffix(".vol")
+    place = make_place(options, supervision.rays, supervision.views, volume, ns, options.voxel, reporter)
+    place = replace(place, align=align)
+    about |= place.about
+    plan = plan_gaze(options, place, views_alone=supervision.rays is None)
+    if plan.initial:
+        about["begins_as"] = Path(options.field).name
+    result = train_planned(
+        supervision,
+        place,
+        plan,
+        ns,
+        output,
+        ensemble=options.ensemble,
+        state=StateSettings(
+            path=state, resume=options.resume, every=options.save_every or float("inf"), about=dict(about)
+        ),
+        half=options.half,
+        reporter=reporter,
+    )
+    _tell(result, reporter)
+    if result.interrupted and output is not None:
+        raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")
+    return result
+
+
+def train_planned(
+    supervision: Supervision,
+    place: GazePlace,
+    plan: GazePlan,
+    ns: ModuleType,
+    output: Path | None = None,
+    *,
+    ensemble: int = 0,
+    state: StateSettings | None = None,
+    half: bool = False,
+    reporter: Reporter = SILENT,
+) -> GazeResult:
+    """Train a field as ``plan`` says, or an ``ensemble`` of so many, and write it to ``output``, with ``state.about``
+    among its provenance. Without ``output`` nothing is written but the state."""
+    state = state or StateSettings()
+    write = None
+    if output is not None:
+        write = lambda field, provenance: save_gaze(field, output, {**state.about, **provenance}, half)
+    train = partial(train_ensemble, ensemble) if ensemble else run.train_gaze
+    tell = lambda progress: reporter.progress(progress.done, _progress(progress))
+    field, provenance = train(supervision, place, plan, ns, state=state, tell=tell, write=write)
+    return GazeResult(field, {**state.about, **provenance}, output, provenance["interrupted"])
+
+
+def _check_outputs(options: GazeOptions, output: Path | None, state: Path | None) -> None:
+    if output is None:
+        if options.resume or options.geometry == "hits":
+            raise NergError(
+                "a run that is resumed, and a place of hit points, need a file for the gaze field: give one"
+            )
+        return
+    check_writable(output, ".safetensors")
+    check_writable(state)
+    if options.geometry == "hits":
+        check_writable(output.with_suffix(".vol"))
+
+
+def _supervision(
+    rays: Rays | str | Path | None, options: GazeOptions, probes: ProbeSettings, align: Similarity, reporter: Reporter
+) -> tuple[Supervision, dict]:
+    """What is learnt from, without what a test holds out; and what the provenance says of it (JSON)."""
+    about: dict = {"recipe": options.recipe}
+    data = rays if rays is None or isinstance(rays, Rays) else Rays.load(rays)
+    if data is not rays:
+        path = Path(rays)
+        about["rays_file"] = {"file": path.name, "sha256": file_sha256(path), "persons": len(data.persons)}
+    views = []
+    if options.views is not None:
+        found, similarity = _open_views(options)
+        views = found.views
+        about |= {"salience": found.about, **similarity}
+        _tell_views(found, reporter)
+    if options.test_zones:
+        data, test = hold_out(
+            data,
+            probes.radius,
+            options.test_zones,
+            options.test_positions,
+            options.seed,
+            max(64, probes.min_rays),
+            options.test_people,
+        )
+        about["test"] = test
+        reporter.message(
+            f"{len(test['centres'])} test positions held out, {test['rays_to_train']:,} of {test['rays']:,} rays left"
+        )
+        centres = np.array(test["centres"]) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+        views = far_views(views, centres, 2 * probes.radius * align.scale)
+    return Supervision(data, tuple(views)), about
+
+
+def _open_views(options: GazeOptions) -> tuple[SalienceSet, dict]:
+    """Salience images in the frame of the place, and what the provenance says of their alignment (JSON)."""
+    matrix = None
+    if options.align_views is not None:
+        matrix = read_similarity(options.align_views, "--align-views", "photos to field").matrix
+    trained = None
+    if options.field is not None:
+        trained = read_checkpoint(options.field, "radiance")[1].get("provenance")
+    found = open_salience(options.views, options.salience, options.salience_per, matrix, trained, options.allow_outside)
+    return found, {} if matrix is None else {"align_views": matrix.tolist()}
+
+
+def _tell_views(found: SalienceSet, reporter: Reporter) -> None:
+    for line in found.unused:
+        reporter.message(line)
+    without = f"; without: {', '.join(found.missing)}" if found.missing else ""
+    stray = f"; images of no frame: {', '.join(found.stray)}" if found.stray else ""
+    reporter.message(f"{len(found.views)} views with salience{without}{stray}")
+
+
+def _progress(now: GazeProgress) -> str:
+    scores = "" if now.scores is None else f", held out KLD {now.scores.kld:.3f}, CC {now.scores.cc:.3f}"
+    return f"{now.stage}: step {now.steps}{scores}" if now.steps else now.stage
+
+
+def _tell(result: GazeResult, reporter: Reporter) -> None:
+    about = result.provenance
+    views = about["salience_views"]
+    counts = f"{about['probes_made'] - views} probes" + (f" and {views} views" if views else "")
+    reporter.message(
+        f"{counts}; {100 * about['escaped_directions']:.2f} % of the directions meet no surface, "
+        f"and {100 * about['escaped_gaze']:.2f} % of the gaze"
+    )
+    if "validation" in about:
+        v = about["validation"]
+        reporter.message(
+            f"held-out positions: KLD {v['kld']:.3f}, CC {v['cc']:.3f}, MAE {v['mae']:.4f} /sr, "
+            f"integral {v['integral']:.3f}, best after {v['best_step']} steps"
+        )
+    reporter.message(
+        f"{about['steps']} steps; {about['seconds']:.0f} s in all, of it {about['seconds_preparing']:.0f} s for the "
+        f"probes{'; interrupted' if result.interrupted else ''}"
+    )
+    if result.output is not None:
+        reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")

@@ -1,0 +1,115 @@
+"""The places of jobs on gaze: made of a field, a scene, hit points or nothing, and found again for an evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from nerg_mi.capture.salience.views import SalienceView
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import plain, read_json
+from nerg_mi.files.checksum import file_sha256
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.rays import Rays
+from nerg_mi.training.geometry import places
+from nerg_mi.training.geometry.places import GazePlace
+
+from .options.evaluation import GazeEvaluationOptions
+from .options.place import PlaceOptions
+from .reporter import SILENT, Reporter
+
+
+def place_kind(options: PlaceOptions) -> str:
+    """Kind of the place (`GazePlace.kind`) that is asked for. Raises `NergError` unless it is exactly one."""
+    if sum(v is not None for v in (options.field, options.scene, options.geometry)) != 1:
+        raise NergError(
+            "say where people looked around: one of --field FILE, --scene FILE, --geometry hits, --geometry none"
+        )
+    if options.geometry not in (None, "hits", "none"):
+        raise NergError(f'--geometry must be "hits" or "none", got "{options.geometry}"')
+    return options.geometry or ("field" if options.field is not None else "scene")
+
+
+def make_place(
+    options: PlaceOptions,
+    rays: Rays | None,
+    views: Sequence[SalienceView],
+    volume: Path | None,
+    ns: ModuleType,
+    voxel: float | None = None,
+    reporter: Reporter = SILENT,
+) -> GazePlace:
+    """The place that is asked for, with arrays of the backend ``ns``; one of hit points is written to ``volume``
+    (.vol), in voxels of edge ``voxel`` metres.
+
+    Raises `NergError` for a file that cannot be used, and for rays without hits.
+    """
+    kind = place_kind(options)
+    if kind == "field":
+        return places.place_of_field(Path(options.field), ns)
+    if kind == "scene":
+        return places.place_of_scene(Path(options.scene))
+    if kind == "none":
+        origins = [v.camera.center[None] for v in views] + ([] if rays is None else [rays.origin])
+        return places.place_of_nothing(np.concatenate(origins))
+    if rays is None or volume is None:
+        raise NergError(
+            "a place of hit points is made of rays and written beside the gaze field: give both, or a field"
+        )
+    place = places.place_of_hits(rays, volume, voxel)
+    made = place.about["geometry_file"]
+    reporter.message(
+        f"wrote {volume}: {' x '.join(map(str, made['shape']))} voxels of {made['voxel']:.3g} m, "
+        f"{100 * made['solid']:.1f} % solid"
+    )
+    if made["beyond"]:
+        reporter.message(
+            f"{100 * made['beyond']:.1f} % of the hit points lie beyond this box and stand on its shell, in their true "
+            "directions but too near"
+        )
+    return place
+
+
+def place_of_training(
+    gaze: Path, provenance: dict, box: Box, options: GazeEvaluationOptions, ns: ModuleType
+) -> GazePlace:
+    """What the field in the checkpoint ``gaze`` was trained in: the file that is named, or the one of the checkpoint's
+    beside it, with the alignment of the training.
+
+    ``box``: of the gaze field. Raises `NergError` for a file that is missing or another one.
+    """
+    align = Similarity() if provenance.get("align") is None else Similarity(provenance["align"])
+    if provenance.get("geometry") == "none":
+        return GazePlace(None, box, "none", align=align)
+    makers: dict[str, tuple[Path | None, str, Callable[[Path], GazePlace]]] = {
+        "field_file": (options.field, "--field", lambda path: places.place_of_field(path, ns)),
+        "scene_file": (options.scene, "--scene", places.place_of_scene),
+        "geometry_file": (options.geometry, "--geometry", places.place_of_volume),
+    }
+    key = next((k for k in makers if k in provenance), None)
+    if key is None:
+        raise NergError(f'"{gaze}" does not say what it was trained in')
+    given, name, make = makers[key]
+    path = gaze.parent / provenance[key]["file"] if given is None else Path(given)
+    if not path.is_file():
+        raise NergError(f'"{path}", which the field was trained in, does not exist; say where it is with {name}')
+    if file_sha256(path) != provenance[key]["sha256"]:
+        raise NergError(f'"{path}" is not the file that "{gaze}" was trained in; give that one with {name}')
+    return replace(make(path), align=align)
+
+
+def read_similarity(path: Path, option: str, frames: str) -> Similarity:
+    """The similarity in a JSON file of four rows, which was given by ``option`` and leads from and to what ``frames``
+    says ("rays to field"). Raises `NergError` for a file that holds none."""
+    matrix = read_json(path, f"similarity of {option}")
+    try:
+        return Similarity([[float(x) for x in row] for row in matrix])
+    except (TypeError, ValueError, IndexError, OverflowError) as error:
+        raise NergError(
+            f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": {plain(error)}'
+        ) from error

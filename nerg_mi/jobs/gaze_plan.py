@@ -1,0 +1,139 @@
+"""What the options of a gaze training come to: whether they go together, and the plan that they make of a recipe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from nerg_mi.errors import NergError, chosen
+from nerg_mi.training.gaze.plan import GazePlan
+from nerg_mi.training.gaze.recipes import FieldChoices, Recipe, gaze_recipe
+from nerg_mi.training.gaze.settings import ProbeSettings
+from nerg_mi.training.geometry.places import GazePlace
+
+from .gaze_places import place_kind
+from .options.gaze import GazeOptions
+
+
+def plan_gaze(options: GazeOptions, place: GazePlace, views_alone: bool = False) -> GazePlan:
+    """How ``options`` have a field trained in ``place``; ``views_alone``: there are no rays.
+
+    Raises `NergError` for what does not go together.
+    """
+    with chosen(_named(options)):
+        return gaze_recipe(options.recipe).plan(
+            place,
+            _choices(options, place.kind, views_alone),
+            settings=_settings(options),
+            probes=_probes(options),
+            begin=options.begin == "field",
+            views_alone=views_alone,
+        )
+
+
+def check_plan(options: GazeOptions, views_alone: bool = False) -> ProbeSettings:
+    """Find what cannot be trained before any time is spent on it; returns the settings of the probes, which do not
+    depend on the place. Raises `NergError` for options that do not go together, and for values that are wrong."""
+    recipe = gaze_recipe(options.recipe)
+    _check(options, recipe, views_alone)
+    with chosen(_named(options)):
+        recipe.config(_choices(options, place_kind(options), views_alone))
+    recipe.gaze_settings(_settings(options), views_alone)
+    return recipe.probe_settings(_probes(options))
+
+
+def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
+    """Raise `NergError` for options that do not go together."""
+    kind = place_kind(options)
+    if views_alone and options.views is None:
+        raise NergError("say what to learn from: a rays file, or --views with --salience, or both")
+    if views_alone and (options.test_zones or kind == "hits" or options.align or options.semantic):
+        raise NergError(
+            "--test-zones, --geometry hits, --align and --semantic belong to rays; give a rays file besides --views "
+            "(or hold views out by leaving their images out of the folder, and align them with --align-views)"
+        )
+    if options.geometry is not None and options.align is not None:
+        raise NergError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
+    if options.test_people and not options.test_zones:
+        raise NergError("--test-people leaves people out at test positions: say where, with --test-zones")
+    if (options.views is None or options.salience is None) and (
+        options.views or options.salience or options.align_views
+    ):
+        raise NergError(
+            "salience needs both: --views, the posed photos, and --salience, the images' folder or spectral-residual"
+        )
+    if options.begin not in ("random", "field"):
+        raise NergError(f'--begin must be "random" or "field", got "{options.begin}"')
+    if options.freeze and options.begin != "field":
+        raise NergError("--freeze keeps the weights that --begin field gives; add it, or leave --freeze out")
+    if options.field is None and (options.semantic or options.begin == "field"):
+        raise NergError(
+            f"{'--semantic' if options.semantic else '--begin field'} needs a radiance field: give it with --field"
+        )
+    asked = {
+        "activation": options.activation,
+        "size": options.size,
+        "semantic": options.semantic,
+        "begin": options.begin == "field",
+        "loss": options.loss,
+        "integral": options.integral is not None,
+        "normalized": options.normalized,
+    }
+    recipe.require([name for name, given in asked.items() if given])
+    if options.loss and options.loss not in recipe.losses:
+        raise NergError(f'the loss must be one of {", ".join(recipe.losses)}, got "{options.loss}"')
+
+
+def _named(options: GazeOptions) -> str:
+    """By which options the architecture was chosen."""
+    given = options.semantic or options.begin == "field"
+    return "--semantic, --variant and --begin" if given else "--variant and --activation"
+
+
+def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldChoices:
+    return FieldChoices(
+        variant=options.variant,
+        activation=options.activation,
+        size=options.size,
+        # Views alone do not say how much is looked altogether.
+        normalized=options.normalized or views_alone,
+        semantic=options.semantic,
+        semantic_own=options.semantic_own,
+        place=kind,
+    )
+
+
+def _settings(options: GazeOptions) -> Mapping[str, Any]:
+    """Keywords of `GazeSettings` that are given."""
+    return _given(
+        minutes=options.minutes,
+        steps=options.steps,
+        seed=options.seed,
+        loss=options.loss,
+        zones=options.zones,
+        refit=options.refit,
+        frozen=options.freeze,
+        learning_rate=options.learning_rate,
+        weight_decay=options.weight_decay,
+        integral=options.integral,
+    )
+
+
+def _probes(options: GazeOptions) -> Mapping[str, Any]:
+    """Keywords of `ProbeSettings` that are given."""
+    return _given(
+        radius=options.radius,
+        count=options.probes,
+        placement=options.placement,
+        cap=options.cap,
+        min_rays=options.min_rays,
+        kappa_rule=options.kappa_rule,
+        kappa=options.kappa,
+        weights=options.weights,
+        directions=options.directions,
+        fresh=options.fresh or None,
+    )
+
+
+def _given(**options: Any) -> Mapping[str, Any]:
+    return {k: v for k, v in options.items() if v is not None}

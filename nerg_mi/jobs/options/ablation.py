@@ -1,0 +1,42 @@
+"""Options of the ablation of gaze fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from . import option
+from .place import PlaceOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class AblationOptions(PlaceOptions):
+    """Which variants are trained, on what they are scored, and how a frame is timed. Lengths are metres."""
+
+    recipes: str = option("default,paper", "Recipes to ablate, separated by commas.")
+    variant: tuple[str, ...] = option(
+        (), 'Only this one, such as emit_capture or "semantic snapshot"; may be given several times.'
+    )
+    seeds: int = option(3, "Seeds of the default recipe; the others have one.")
+    steps: int | None = option(None, "Steps of every recipe but the default one. Default: the recipe's.")
+    default_steps: int | None = option(None, "Steps of the default recipe. Default: its own.")
+    probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.")
+    zones: int = option(3, "Zones of test positions.")
+    positions: int = option(60, "Test positions.")
+    people: float = option(0.0, "Share of the people who are held out besides.")
+    radius: float = option(0.25, "Radius of the test's probes in metres.")
+    kappa: float = option(20.0, "Concentration of the truth's kernel.")
+    min_rays: int = option(64, "Rays at a test position at least.")
+    law: str | None = option(
+        None,
+        'Truth in closed form, where it is known: "MODULE:CLASS", whose instances have density(positions, directions) '
+        "in 1/sr.",
+    )
+    refit: bool = option(
+        True,
+        "Train every recipe but the default one, which always does, again on all rays for as many steps as were best "
+        "on some.",
+    )
+    cameras: int = option(4, "Cameras that a frame is timed over (the paper: 32); 0: none.")
+    size: str = option("320x180", "Of a frame (the paper: 1280x720).")
+    threads: int | None = option(None, "CPU threads. Default: all.")
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

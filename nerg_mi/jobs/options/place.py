@@ -1,0 +1,19 @@
+"""Options that say where people looked around."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaceOptions:
+    """Exactly one of them is given."""
+
+    field: Path | None = option(None, "Radiance field in which people looked around.")
+    scene: Path | None = option(None, "Or: a Mitsuba scene, whose shapes they looked at.")
+    geometry: str | None = option(
+        None, 'Or: "hits" makes a place from the rays\' own hit points, "none" does without any.'
+    )

@@ -1,0 +1,62 @@
+"""The evaluation of a gaze field as a job: its rows, files, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation.gaze.evaluation import SCORES
+from nerg_mi.jobs.evaluation import evaluate_gaze
+from nerg_mi.jobs.gaze import train_gaze
+from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
+from nerg_mi.jobs.options.gaze import GazeOptions
+from tests.evaluation.gaze.test_evaluation import crowd
+
+OPTIONS = GazeEvaluationOptions(min_rays=8, directions=128, resamples=2, pictures=1)
+TRAINING = GazeOptions(
+    geometry="none", radius=0.5, probes=8, steps=2, directions=64, zones=0, min_rays=8, test_zones=1, test_positions=3
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder with rays and a gaze field that was trained on some of them."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    folder = tmp_path_factory.mktemp("trained")
+    crowd(3000).save(folder / "rays.npz")
+    train_gaze(folder / "rays.npz", folder / "gaze.safetensors", TRAINING)
+    return folder
+
+
+def test_scores_stand_beside_the_baselines(trained, tmp_path):
+    found = evaluate_gaze(trained / "gaze.safetensors", trained / "rays.npz", tmp_path / "eval", OPTIONS)
+    names = [row["method"] for row in found.rows]
+    assert names[0] == "gaze field" and "uniform" in names and "4,096 nearest rays" in names and found.split == "pos"
+    assert all(set(SCORES) <= set(row) for row in found.rows) and 1 <= found.positions <= 3 and found.people >= 2
+    assert {row["method"] for row in found.persons} == {"gaze field", "4,096 nearest rays"}
+    assert {p.name for p in found.files} == {"gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.png"}
+    assert json.loads((tmp_path / "eval" / "gaze.json").read_text())["methods"][0]["KLD"] == found.rows[0]["KLD"]
+    assert "directions of equal area" in (tmp_path / "eval" / "gaze.md").read_text()
+
+
+def test_without_a_folder_nothing_is_written(trained):
+    before = set(trained.iterdir())
+    found = evaluate_gaze(trained / "gaze.safetensors", crowd(3000), options=OPTIONS)
+    assert found.files == [] and set(trained.iterdir()) == before and found.rows[0]["method"] == "gaze field"
+
+
+def test_what_cannot_be_scored_is_refused(trained, tmp_path):
+    gaze = trained / "gaze.safetensors"
+    crowd(2000).save(tmp_path / "rays.npz")
+    with pytest.raises(NergError, match=r"other rays than .*; give the file rays\.npz"):
+        evaluate_gaze(gaze, tmp_path / "rays.npz", options=OPTIONS)
+    with pytest.raises(NergError, match="no people were held out"):
+        evaluate_gaze(gaze, trained / "rays.npz", options=replace(OPTIONS, split="both"))
+    train_gaze(crowd(1000), tmp_path / "gaze.safetensors", replace(TRAINING, test_zones=0))
+    with pytest.raises(NergError, match="trained on all positions"):
+        evaluate_gaze(tmp_path / "gaze.safetensors", crowd(1000), options=OPTIONS)

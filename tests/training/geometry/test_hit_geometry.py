@@ -1,0 +1,39 @@
+"""Places made of hit points: their surfaces are where rays ended."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.formats.volumes import write_volume
+from nerg_mi.training.geometry.hit_geometry import volume_dict, voxelise_hits
+from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.trace import trace_depth
+from tests.training.gaze.looks import looking_at
+
+
+@pytest.fixture
+def rays():
+    return looking_at((1.5, 0.4, 1.2))
+
+
+def test_a_place_made_of_hits(rgb, rays, tmp_path):
+    density, box = voxelise_hits(rays, 0.1)
+    assert density.dtype == np.float32 and (density > 0).any()
+    write_volume(tmp_path / "place.vol", density, box.lower, box.upper)
+    medium = VolumeMedium(rgb.load_dict(volume_dict(tmp_path / "place.vol")))
+    np.testing.assert_allclose(medium.bounds(), [box.lower, box.upper], atol=1e-5)
+    central = np.abs(rays.hit - np.median(rays.hit, axis=0)).max(axis=1) < 0.1
+    depth, opacity = trace_depth(medium, rays.origin[central], rays.direction[central])
+    truth = np.linalg.norm(rays.hit - rays.origin, axis=1)[central]
+    assert central.sum() > 5 and (opacity > 0.99).all() and np.abs(depth - truth).max() < 0.15
+
+
+def test_a_place_needs_hits(rays):
+    with pytest.raises(NergError, match="--field"):
+        voxelise_hits(replace(rays, hit=None))
+    with pytest.raises(NergError, match="enlarge the voxel"):
+        voxelise_hits(rays, 1e-3)
