@@ -7,7 +7,7 @@ render of the gaze by the integrator, observer and camera in one place.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,10 +19,8 @@ from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.recipes import gaze_recipe
 
+from .gaze.baselines import Baseline
 from .gaze.evaluation import GazeTest, make_test, map_scores
-
-Density = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3)."""
 
 COLUMNS = (
     "recipe",
@@ -95,7 +93,7 @@ def make_tests(
     radius: float,
     kappa: float,
     min_rays: int,
-    truth: Density | None = None,
+    truth: Baseline | None = None,
 ) -> dict[str, GazeTest]:
     """What every variant is scored on: ``train``, positions of the training, and ``test``, the ``centres`` (T, 3).
 
@@ -112,7 +110,7 @@ def make_tests(
     return tests
 
 
-def score(tests: dict[str, GazeTest], density: Density) -> dict[str, float]:
+def score(tests: dict[str, GazeTest], density: Baseline) -> dict[str, float]:
     """Scores of a ``density(positions, directions)`` in 1/sr on each of ``tests``, and the paper's loss."""
     row = {}
     for side, test in tests.items():

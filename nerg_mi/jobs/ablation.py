@@ -15,8 +15,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
-from nerg_mi.evaluation.ablation import Density, Variant
+from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.evaluation.frame_time import frame_timer
+from nerg_mi.evaluation.gaze.baselines import Baseline
 from nerg_mi.evaluation.gaze.evaluation import GazeTest, held_out_rays
 from nerg_mi.evaluation.gaze.scores import gaze_field
 from nerg_mi.files.atomic import check_folder
@@ -175,7 +176,7 @@ def _chosen(variants: list[Variant], names: tuple[str, ...]) -> list[Variant]:
     return [v for v in variants if not names or v.name in names]
 
 
-def _law(name: str) -> Density:
+def _law(name: str) -> Baseline:
     """The density of an instance of the class that ``MODULE:CLASS`` names."""
     module, _, kind = name.partition(":")
     try:

@@ -16,6 +16,7 @@ from nerg_mi.density.probes import Probes, place_probes
 from nerg_mi.rays.rays import Rays
 
 Baseline = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Densities (P, D), 1/sr, of positions (P, 3) in directions (D, 3) or (P, D, 3)."""
 
 UNIFORM = 1.0 / (4.0 * np.pi)  # 1/sr
 
@@ -62,10 +63,10 @@ def nearest_probes(probes: Probes, k: int = 16, *, backend: object = None) -> Ba
         # The probes used, once each when the directions are common to all.
         if np.ndim(directions) == 2:
             used, back = np.unique(found, return_inverse=True)
-            density = _of(probes, rays, used, backend).evaluate(directions)
+            density = _some(probes, rays, used, backend).evaluate(directions)
             return _mean_rows(density, back.reshape(found.shape))
         density = [
-            _of(probes, rays, near, backend).evaluate(d).mean(axis=0, dtype=np.float64)
+            _some(probes, rays, near, backend).evaluate(d).mean(axis=0, dtype=np.float64)
             for near, d in zip(found, directions)
         ]
         return np.stack(density)
@@ -113,7 +114,8 @@ def standard_baselines(
     }
 
 
-def _of(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: object) -> SphericalKde:
+def _some(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: object) -> SphericalKde:
+    """The densities of the probes ``which`` of ``probes``, whose rays are at ``rays``."""
     runs = [rays[p] for p in which]
     offsets = np.concatenate([[0], np.cumsum([len(r) for r in runs])])
     flat = np.concatenate(runs)
@@ -122,4 +124,5 @@ def _of(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: obje
 
 
 def _mean_rows(density: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Mean (P, D) of the ``rows`` (P, k) of ``density`` (n, D)."""
     return np.stack([density[r].mean(axis=0, dtype=np.float64) for r in rows])

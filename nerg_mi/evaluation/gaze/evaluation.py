@@ -23,29 +23,37 @@ from .baselines import Baseline
 from .scores import EPS
 
 SPLITS = ("both", "pos", "people")
+"""What may be new to a field: positions and people, positions, or people."""
 MAPS, RAYS = ("KLD", "CC", "SIM", "MAE"), ("NSS", "AUC", "sAUC", "bits", "loglik")
 SCORES = MAPS + RAYS
 """KLD in nats and CC, SIM of densities normalised over the sphere; MAE in 1/sr of densities as they are; NSS; AUC-Judd;
 sAUC against rays of other test positions; bits a ray beyond the blind density; mean log density (nats of 1/sr) of a
 ray."""
+# Rays that are drawn at each test position, and scored one by one.
 _PER_POSITION = 128
 
 
 @dataclass(frozen=True, eq=False)
 class GazeTest:
-    """``centres`` (P, 3), where ``rays`` (of the test) are scored within ``radius``; ``truth`` (P, D) in ``directions``
-    (D, 3); ``parts`` (P, N, D) densities of each of the N ``persons`` alone and ``counts`` (P, N), their rays; ``at``
-    (P, K, 3), rays drawn from each position and ``who`` (P, K) they are of (indices of ``persons``); ``others`` (P, K,
-    3), rays drawn at the other ones."""
+    """What a density is scored on at P positions, of N persons, in D directions and by K rays each."""
 
+    # Positions (P, 3), metres, in the rays' frame.
     centres: np.ndarray
+    # Directions (D, 3) of equal area, in which maps are compared.
     directions: np.ndarray
+    # True densities (P, D), 1/sr.
     truth: np.ndarray
+    # Those of each person alone (P, N, D).
     parts: np.ndarray
+    # Rays of each person at each position (P, N).
     counts: np.ndarray
-    persons: tuple
+    # Names of the persons.
+    persons: tuple[str, ...]
+    # Rays drawn at each position (P, K, 3).
     at: np.ndarray
+    # Whose they are (P, K), indices of the persons.
     who: np.ndarray
+    # Rays drawn at other positions (P, K, 3).
     others: np.ndarray
 
 
@@ -85,7 +93,9 @@ def make_test(
     """Truth around those of ``centres`` that have ``min_rays`` rays within ``radius`` metres, with a kernel of
     ``kappa``.
 
-    Raises ``NergError`` where none has."""
+    ``directions``: that maps are compared in; ``cap``: rays that a truth is made of at most, the nearest; ``seed``: of
+    the rays that are drawn. Raises `NergError` where none has.
+    """
     enough = _enough(rays, centres, radius, min_rays)
     if not enough.any():
         raise NergError(f"none of {len(centres)} test positions has {min_rays} rays within {radius} m; lower min_rays")
@@ -143,26 +153,26 @@ def evaluate_gaze(
     intervals.
     """
     rng, N = np.random.default_rng(seed), len(test.persons)
-    found = _answers(test, methods, blind)
+    answers = _answers(test, methods, blind)
     rows = [
         {"method": name, **map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
-        for name, maps, values in found
+        for name, maps, values in answers
     ]
-    boot = [[] for _ in found]
+    boot = [[] for _ in answers]
     for _ in range(resamples if N >= 3 else 0):
         times = rng.multinomial(N, np.full(N, 1 / N))
         share = test.counts * times
-        there = share.sum(axis=1) > 0
-        share = share[there] / share[there].sum(axis=1, keepdims=True)
-        truth, weight = np.einsum("pn,pnd->pd", share, test.parts[there]), times[test.who].astype(float)
-        for kept, (_, maps, values) in zip(boot, found):
+        held = share.sum(axis=1) > 0
+        share = share[held] / share[held].sum(axis=1, keepdims=True)
+        truth, weight = np.einsum("pn,pnd->pd", share, test.parts[held]), times[test.who].astype(float)
+        for kept, (_, maps, values) in zip(boot, answers):
             kept.append(
                 {
-                    **map_scores(truth, maps[there]),
+                    **map_scores(truth, maps[held]),
                     **{k: float((v * weight).sum() / weight.sum()) for k, v in values.items()},
                 }
             )
-    for row, kept, (_, maps, _) in zip(rows, boot, found):
+    for row, kept, (_, maps, _) in zip(rows, boot, answers):
         for k in SCORES if kept else ():
             reach = 1.96 * np.std([b[k] for b in kept])
             row[f"{k}.low"], row[f"{k}.high"] = float(row[k] - reach), float(row[k] + reach)
@@ -177,8 +187,10 @@ def evaluate_gaze(
     return rows
 
 
-def _answers(test: GazeTest, methods: dict, blind: Baseline) -> list[tuple]:
-    """``(name, maps (P, D), ray scores)`` of each method."""
+def _answers(
+    test: GazeTest, methods: dict[str, Baseline], blind: Baseline
+) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
+    """``(name, maps (P, D), ray scores (P, K) by name)`` of each method."""
     rays, K = np.concatenate([test.at, test.others], axis=1), test.at.shape[1]
     ask = lambda method: [np.asarray(method(test.centres, v), np.float64) for v in (test.directions, rays)]
     maps, at = ask(blind)
@@ -195,8 +207,10 @@ def person_rows(test: GazeTest, methods: dict[str, Baseline], blind: Baseline, m
     rows = []
     for name, maps, values in _answers(test, methods, blind):
         for i, person in enumerate(test.persons):
-            own, there = test.who == i, test.counts[:, i] >= min_rays
-            scores = map_scores(test.parts[there, i], maps[there]) if there.any() else dict.fromkeys(MAPS, float("nan"))
+            own, enough = test.who == i, test.counts[:, i] >= min_rays
+            scores = dict.fromkeys(MAPS, float("nan"))
+            if enough.any():
+                scores = map_scores(test.parts[enough, i], maps[enough])
             rays = {k: float(v[own].mean()) if own.any() else float("nan") for k, v in values.items()}
             rows.append({"method": name, "person": person, "rays": int(test.counts[:, i].sum()), **scores, **rays})
     return rows
@@ -211,8 +225,8 @@ def split_half(
     min_rays: int = 64,
     seed: int = 0,
 ) -> dict | None:
-    """Scores of one half of the people at the other's expense, where both have ``min_rays`` rays: a reference and no
-    bound. None where there is no such position, or only one person."""
+    """Scores of one half of the people of ``test_side`` as predicted by the other, where both have ``min_rays`` rays: a
+    reference and no bound. None where there is no such position, or only one person."""
     if len(np.unique(test_side.person)) < 2:
         return None
     halves = [test_side.select(mask) for mask in split_by_person(test_side, seed=seed)]

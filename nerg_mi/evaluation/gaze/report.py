@@ -12,12 +12,14 @@ from nerg_mi.files.png import write_figure
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
 
+from .baselines import Baseline
 from .evaluation import SCORES, GazeTest
 
+# Digits of the scores that have others than three.
 _DIGITS = {"MAE": 4}
 
 
-def markdown(rows: list[dict], columns: tuple = ("method", *SCORES, "integral")) -> str:
+def markdown(rows: list[dict], columns: tuple[str, ...] = ("method", *SCORES, "integral")) -> str:
     """A table of ``rows``, with intervals in brackets where they are known."""
     shown = [c for c in columns if any(c in r for r in rows)]
     numbers = [c for c in shown if c not in ("method", "person")]
@@ -38,15 +40,17 @@ def _cell(row: dict, column: str) -> str:
 
 
 def write_report(folder: Path, rows: list[dict], persons: list[dict], about: dict, notes: str) -> list[Path]:
-    """``gaze.md``, ``gaze.csv``, ``persons.csv`` and ``gaze.json`` in ``folder``; returns their paths."""
+    """Write ``gaze.md``, ``gaze.csv``, ``persons.csv`` and ``gaze.json`` into ``folder``; returns their paths.
+
+    ``rows``, ``persons``: a row a method, and a method and person; ``about``: what was scored (JSON); ``notes``: what
+    the Markdown begins with.
+    """
     files = [folder / name for name in ("gaze.md", "gaze.csv", "persons.csv", "gaze.json")]
     ours, bar = rows[0], next(r["method"] for r in reversed(rows) if r["method"] != "split half")
-    less = [
-        {"method": f"{ours['method']} less {bar}"}
-        | {k.replace(".less", ""): v for k, v in ours.items() if ".less" in k}
-    ]
+    difference = {k.replace(".less", ""): v for k, v in ours.items() if ".less" in k}
+    differences = [{"method": f"{ours['method']} less {bar}", **difference}]
     each = markdown(persons, ("method", "person", "rays", "KLD", "CC", "NSS", "AUC", "bits", "loglik"))
-    write_text(files[0], f"{notes}\n\n{markdown(rows)}\n{markdown(less)}\n## Each person\n\n{each}")
+    write_text(files[0], f"{notes}\n\n{markdown(rows)}\n{markdown(differences)}\n## Each person\n\n{each}")
     for path, table in zip(files[1:3], (rows, persons)):
         write_csv(path, table)
     clean = lambda table: [
@@ -56,7 +60,7 @@ def write_report(folder: Path, rows: list[dict], persons: list[dict], about: dic
     return files
 
 
-def side_by_side(test: GazeTest, methods: dict, path: Path, count: int = 4, height: int = 48) -> None:
+def side_by_side(test: GazeTest, methods: dict[str, Baseline], path: Path, count: int = 4, height: int = 48) -> None:
     """Truth and each of ``methods`` at ``count`` test positions, as panoramas (z up) on one scale a row, in 1/sr."""
     import matplotlib
 

@@ -20,7 +20,8 @@ from tests.plugins.scenes import channels
 BOX = Box((-1, -1, -1), (1, 1, 1))
 EYES = [(0.1, -0.2, 0.3), (-0.4, 0.3, -0.1)]
 ROOM = """<scene version="3.0.0">
-  <shape type="cube"><boolean name="flip_normals" value="true"/><transform name="to_world"><scale value="0.9"/></transform></shape>
+  <shape type="cube"><boolean name="flip_normals" value="true"/>
+    <transform name="to_world"><scale value="0.9"/></transform></shape>
   <shape type="cube"><transform name="to_world"><scale value="0.2"/><translate x="0.5"/></transform></shape></scene>"""
 
 
