@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+from typing import Any
+
 import drjit as dr
 
 from nerg_mi.field.encoding.registry import encoding_of
@@ -12,7 +15,9 @@ from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.model import stack
 
 
-def log_gaze(config: LogGazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, escaped, ns):
+def log_gaze(
+    config: LogGazeConfig, box: Box, parameters: dict, p_od: Any, p_o: Any, r_o: Any, escaped: Any, ns: ModuleType
+) -> Any:
     """Log of the unnormalised density of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D
     for each in turn) at ``p_od``, ``escaped`` (Bool, as many) where there is no surface.
 
@@ -49,12 +54,12 @@ def log_gaze(config: LogGazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, 
 class _Inputs(LogGazeField):
     """The part of a field that has no networks."""
 
-    def __init__(self, config, box, grid, prior):
+    def __init__(self, config: LogGazeConfig, box: Box, grid: HashGrid, prior: Any):
         self.config, self.box, self.grid, self.prior = config, box, grid, prior
 
 
-def _full(rows: list, like) -> list:
-    # Constants would be rows of one lane.
+def _full(rows: list, like: Any) -> list:
+    """``rows`` of as many lanes as ``like``: constants have one."""
     return [r + dr.zeros(type(r), dr.width(like)) if dr.width(r) == 1 else r for r in rows]
 
 

@@ -5,6 +5,9 @@ An observer looks in many directions from one position: what capture needs of th
 
 from __future__ import annotations
 
+from types import ModuleType
+from typing import Any
+
 import drjit as dr
 
 from nerg_mi.field.encoding.harmonics import encode_direction
@@ -16,7 +19,16 @@ from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.model import stack, unstack
 
 
-def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o, ns, semantic: list | None = None):
+def gaze_density(
+    config: GazeConfig,
+    box: Box,
+    parameters: dict,
+    p_od: Any,
+    p_o: Any,
+    r_o: Any,
+    ns: ModuleType,
+    semantic: list | None = None,
+) -> Any:
     """Gaze (1/sr) of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D for each in turn) at
     ``p_od``.
 
@@ -24,7 +36,7 @@ def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o,
     entry that the variant uses. ``semantic``: features (Floats, a lane a direction) where ``config`` wants them.
     """
 
-    def net(name):
+    def net(name: str) -> MLP:
         count = sum(k.startswith(name + ".") for k in parameters)
         return MLP([parameters[f"{name}.{i}"] for i in range(count)])
 
@@ -32,15 +44,15 @@ def gaze_density(config: GazeConfig, box: Box, parameters: dict, p_od, p_o, r_o,
     position, direction = net("position_net"), net("direction_net")
     repeats = dr.width(r_o) // dr.width(p_o)
 
-    def head(name, geometry, d):
+    def head(name: str, geometry: list, d: Any) -> Any:
         # Every direction of r_o is there, so that stack sees rows of one length.
         hidden = direction.tensor(stack(encode_direction(d, config.sh_degree) + geometry, ns))
         return net(name).tensor(dr.maximum(hidden, 0)).array
 
-    def geometry(p):
+    def geometry(p: Any) -> list:
         return unstack(position.tensor(stack(grid(box.to_unit(p)), ns)), ns)
 
-    def surface():
+    def surface() -> list:
         if semantic is None:
             return geometry(p_od)
         return [g + s for g, s in zip(geometry(p_od), semantic)] if config.semantic_own else semantic

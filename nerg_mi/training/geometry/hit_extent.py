@@ -7,7 +7,7 @@ beyond it are drawn where their rays leave it (its shell), in their true directi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,20 +39,22 @@ _WORTH = 0.01
 
 @dataclass(frozen=True)
 class HitExtent:
-    """Voxels of a place of hit points, in the rays' frame.
+    """Voxels of a place of hit points, in the rays' frame."""
 
-    ``lower``: corner (3,) in metres; ``shape``: voxels along x, y, z; ``voxel``: their edge in metres; ``cut``: whether
-    hit points beyond the box stand on its shell; ``beyond``: their share of the hit points.
-    """
-
+    # Lower corner (3,) of the box in metres.
     lower: np.ndarray
+    # Voxels along x, y and z.
     shape: tuple[int, int, int]
+    # Their edge in metres.
     voxel: float
+    # Whether hit points beyond the box stand on its shell.
     cut: bool = False
+    # Their share of the hit points.
     beyond: float = 0.0
 
     @property
     def upper(self) -> np.ndarray:
+        """Upper corner (3,) of the box in metres."""
         return self.lower + np.array(self.shape) * self.voxel
 
     @property
@@ -74,9 +76,10 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
 
     It holds all origins and the hits but for half a percent at each end of each axis. Where these are too many voxels
     it is cut to where most of them are worth their room, at the least to where people were (all but half a percent at
-    each end of each axis) and a metre around. Where that is not
-    enough, or less than three quarters of the hit points would be left, voxels become larger; not so a ``voxel`` that
-    was asked for. Raises `NergError` for rays without hit points and for a ``voxel`` that is too small or not positive.
+    each end of each axis) and a metre around. Where that is not enough, or less than three quarters of the hit points
+    would be left, voxels become larger; not so a ``voxel`` that was asked for.
+
+    Raises `NergError` for rays without hit points and for a ``voxel`` that is too small or not positive.
     """
     known = None if rays.hit is None else np.isfinite(rays.hit).all(axis=1)
     if known is None or not known.any():
@@ -87,9 +90,8 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
     first, last = np.quantile(hits, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
     low, high = np.minimum(first, rays.origin.min(axis=0)), np.maximum(last, rays.origin.max(axis=0))
     edge = VOXEL if voxel is None else voxel
-    whole = _padded(low, high, edge)
     if np.prod(_count(low, high, edge)) <= most:
-        return whole()
+        return _padded(low, high, edge)
     core = np.quantile(rays.origin, [_OUTLIERS, 1 - _OUTLIERS], axis=0) + [[-_MARGIN], [_MARGIN]]
     core = np.clip(core, low, high)
     rng = np.random.default_rng(0)
@@ -99,8 +101,8 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
         box = _cut(low, high, core, points, edge, most)
         kept = 0.0 if box is None else ((sample >= box[0]) & (sample <= box[1])).all(axis=1).mean()
         if box is not None and (voxel is not None or kept >= _KEPT):
-            made = _padded(*box, edge)(cut=True)
-            return _padded(*box, edge)(cut=True, beyond=float(made.beyond_shell(hits).mean()))
+            extent = replace(_padded(*box, edge), cut=True)
+            return replace(extent, beyond=float(extent.beyond_shell(hits).mean()))
         if voxel is not None:
             size = " x ".join(f"{s:.3g}" for s in core[1] - core[0])
             raise NergError(
@@ -116,11 +118,9 @@ def _count(low: np.ndarray, high: np.ndarray, voxel: float) -> np.ndarray:
     return np.ceil((high - (low - PAD * voxel)) / voxel) + PAD
 
 
-def _padded(low: np.ndarray, high: np.ndarray, voxel: float):
-    """The extent of the box around ``low`` and ``high``; a function of its other fields."""
-    return lambda **more: HitExtent(
-        low - PAD * voxel, tuple(_count(low, high, voxel).astype(int).tolist()), voxel, **more
-    )
+def _padded(low: np.ndarray, high: np.ndarray, voxel: float) -> HitExtent:
+    """The extent of the box around ``low`` and ``high``."""
+    return HitExtent(low - PAD * voxel, tuple(_count(low, high, voxel).astype(int).tolist()), voxel)
 
 
 def _cut(
