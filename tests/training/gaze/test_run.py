@@ -1,4 +1,4 @@
-"""Whole runs: validation, patience, the second fit, equal seeds, fresh directions."""
+"""Whole runs: validation, the second fit, equal seeds, fresh directions, rays and views in one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from nerg_mi.training.gaze.run import make_targets
 from nerg_mi.training.gaze.settings import GazeSettings
@@ -47,29 +46,6 @@ def test_validation_stops_and_the_best_is_fitted_again(rgb):
     assert field.config == SMALL
 
 
-@pytest.mark.parametrize("patience, looks", [(3, 4), (1, 2), (0, 10)])
-def test_a_run_ends_when_looking_has_been_in_vain_for_long_enough(wall, patience, looks):
-    """Nothing is learnt at a rate of next to nothing: the first look is the best, and ``patience`` more are taken."""
-    settings = GazeSettings(
-        steps=20,
-        looks=10,
-        patience=patience,
-        zones=2,
-        watched=6,
-        probes=4,
-        directions=32,
-        learning_rate=1e-30,
-        refit=False,
-    )
-    _, about = train(wall, settings, SMALL)
-    v = about["validation"]
-    assert (
-        [h["steps"] for h in v["history"]] == [2 * k for k in range(1, looks + 1)]
-        and v["best_step"] == 2
-        and about["steps"] == 2 * looks
-    )
-
-
 def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
     """16 probes, 4 a step: an epoch is four steps. Without it there is one set of directions."""
     from nerg_mi.training.gaze import ray_targets
@@ -82,19 +58,6 @@ def test_directions_are_fresh_in_every_epoch(wall, monkeypatch):
     drawn.clear()
     train(wall, settings, SMALL)
     assert len(drawn) == 1
-
-
-def test_minutes_are_those_of_both_fits(wall, monkeypatch):
-    """The first fit has half of them; the second follows its schedule, in steps."""
-    from nerg_mi.training.gaze.trainer import GazeTrainer
-
-    # A clock that goes on by six seconds a step.
-    monkeypatch.setattr(GazeTrainer, "seconds", property(lambda trainer: 6.0 * trainer.steps))
-    settings = replace(PRODUCT, steps=None, minutes=1.0, looks=5)
-    _, about = train(wall, settings, SMALL)
-    v = about["validation"]
-    assert [h["steps"] for h in v["history"]] == [1, 2, 3, 4, 5] and about["refitted"]
-    assert about["steps"] == v["best_step"] <= 5
 
 
 def test_the_blind_density_of_rays_and_views_is_that_of_the_rays():
