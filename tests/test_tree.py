@@ -13,7 +13,6 @@ LONGEST = 350
 
 TO_SPLIT = {
     "benchmarks/numerics_march.py",
-    "nerg_mi/cli/rays.py",
     "nerg_mi/cli/train_gaze.py",
     "nerg_mi/evaluation/ablation.py",
     "plugins/nerg.py",
@@ -49,8 +48,6 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/evaluation/study/tables.py": TO_WRITE,
     "nerg_mi/jobs/reporter.py": TO_WRITE,
     "nerg_mi/maths/similarity.py": TO_WRITE,
-    "nerg_mi/rays/metadata.py": TO_WRITE,
-    "nerg_mi/rays/readers/poses.py": TO_WRITE,
     "nerg_mi/rendering/pictures.py": TO_WRITE,
     "nerg_mi/training/gaze/log_density_model.py": TO_WRITE,
     "nerg_mi/training/gaze/product_model.py": TO_WRITE,

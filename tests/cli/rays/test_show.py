@@ -1,8 +1,5 @@
-"""``nerg rays show``, and what the sub-commands have in common."""
+"""``nerg rays show``."""
 
-import pytest
-
-from nerg_mi.cli.rays.arguments import parse_numbers
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.tracking import SplitOptions, split_rays
 from tests.cli.rays.running import run, write_walk
@@ -17,10 +14,3 @@ def test_the_card(tmp_path):
     split_rays(walk, SplitOptions(people=0.5, test_output=tmp_path / "test.npz"))
     assert "then split test: 6,000 of 12,000 rays kept" in " ".join(run("show", tmp_path / "test.npz").output.split())
     assert isinstance(run("show", tmp_path / "absent.npz").exception, NergError)
-
-
-def test_numbers():
-    assert parse_numbers("1,-2.5,3e2", "--box") == [1.0, -2.5, 300.0]
-    for text in ("", "1,,2", "a"):
-        with pytest.raises(NergError, match="--box is numbers with commas between them"):
-            parse_numbers(text, "--box")
