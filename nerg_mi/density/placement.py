@@ -68,7 +68,7 @@ PLACEMENTS = {"data": _origins, "grid": _lattice, "random": _uniform, "blue": bl
 
 
 def _darts(origin: np.ndarray, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     # One candidate for each cell much smaller than the discs: of millions of origins some ten thousand.
     cell = np.floor((origin - origin.min(axis=0)) / (0.25 * spacing)).astype(np.int64)
@@ -76,7 +76,7 @@ def _darts(origin: np.ndarray, spacing: float, rng: np.random.Generator) -> np.n
     size = cell.max(axis=0) + 1
     key = (cell[order, 0] * size[1] + cell[order, 1]) * size[2] + cell[order, 2]
     candidates = origin[order[np.sort(np.unique(key, return_index=True)[1])]]
-    tree = cKDTree(candidates)
+    tree = KDTree(candidates)
     free = np.ones(len(candidates), bool)
     taken = []
     for i, place in enumerate(candidates):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import io
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from typing import IO
 
@@ -24,7 +24,7 @@ OnBadLine = Callable[[int, str], None]
 """Told of a line that cannot be read: its number, from 1, and why. Readers that are given none raise `NergError`."""
 
 
-def line_blocks(path: str | os.PathLike, what: str, most: int) -> Iterator[list[str]]:
+def line_blocks(path: str | os.PathLike, what: str, most: int) -> Generator[list[str], None, None]:
     """Lines of the UTF-8 file ``path`` (inflated where its name ends in ``.gz``) with their ends, in blocks of at most
     ``most`` lines and some 16 million characters.
 

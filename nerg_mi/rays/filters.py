@@ -42,12 +42,12 @@ def select_mask(
             raise NergError("these rays have no cohorts; import them with a cohort column (--map cohort=...)")
         keep &= np.isin(rays.cohort, _codes(cohorts, rays.cohorts, "cohort"))
     if box is not None:
-        box = np.asarray(box, dtype=np.float64)
-        if box.shape != (6,) or not (box[0::2] < box[1::2]).all():
+        sides = np.asarray(box, dtype=np.float64)
+        if sides.shape != (6,) or not (sides[0::2] < sides[1::2]).all():
             raise NergError(
-                f"a box is x0, x1, y0, y1, z0, z1 in metres with each first below its second, got {box.tolist()}"
+                f"a box is x0, x1, y0, y1, z0, z1 in metres with each first below its second, got {sides.tolist()}"
             )
-        keep &= ((rays.origin >= box[0::2]) & (rays.origin <= box[1::2])).all(axis=1)
+        keep &= ((rays.origin >= sides[0::2]) & (rays.origin <= sides[1::2])).all(axis=1)
     if min_confidence is not None:
         keep &= rays.confidence >= min_confidence
     if with_hit:

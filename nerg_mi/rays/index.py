@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,12 +23,12 @@ class RayIndex:
     """A k-d tree of ray origins. ``rays``: a set of rays, or origins (N, 3) in metres."""
 
     def __init__(self, rays: Rays | np.ndarray) -> None:
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         origin = rays.origin if isinstance(rays, Rays) else np.asarray(rays, dtype=np.float64)
         self.count = len(origin)
         # Without balancing: half the time to build, and as fast to ask.
-        self._tree = cKDTree(origin, balanced_tree=False)
+        self._tree = KDTree(origin, balanced_tree=False)
 
     def nearest(self, places: np.ndarray, most: int, radius: float = np.inf) -> Neighbours:
         """The ``most`` nearest rays of each of ``places`` (Q, 3), within ``radius`` metres (those at exactly R
@@ -41,10 +41,9 @@ class RayIndex:
         bound = np.nextafter(radius, np.inf) if np.isfinite(radius) else np.inf
         step = max(1, _BLOCK // most)
         indices, distances, counts = [], [], []
+        query: Any = self._tree.query  # in scipy's stubs it knows of one neighbour only
         for start in range(0, len(places), step):
-            d, i = self._tree.query(
-                places[start : start + step], k=np.arange(1, most + 1), distance_upper_bound=bound, workers=-1
-            )
+            d, i = query(places[start : start + step], k=np.arange(1, most + 1), distance_upper_bound=bound, workers=-1)
             found = np.isfinite(d)
             indices.append(i[found])
             distances.append(d[found])

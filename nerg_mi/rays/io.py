@@ -109,7 +109,7 @@ def _read_npz(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], str]:
 def _read_parquet(path: str | os.PathLike) -> tuple[dict[str, np.ndarray], bytes]:
     pa, pq = pyarrow_modules()
     size = size_of(path, "rays file")
-    with reading(path, "rays file", also=(pa.lib.ArrowException,)), pq.ParquetFile(path) as table:
+    with reading(path, "rays file", also=(pa.ArrowException,)), pq.ParquetFile(path) as table:
         about, schema = table.metadata, table.schema_arrow
         claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
         if claimed > inflated_limit(size):

@@ -138,7 +138,7 @@ class Rays:
             ) from error
 
 
-def _refuse(bad: np.ndarray, what: str, remedy: str) -> None:
+def _refuse(bad: np.ndarray | np.bool_, what: str, remedy: str) -> None:
     rows = np.flatnonzero(bad)
     if rows.size:
         listed = ", ".join(map(str, rows[:5])) + (", ..." if rows.size > 5 else "")

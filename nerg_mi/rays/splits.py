@@ -194,6 +194,6 @@ def _enough(index: RayIndex, places: np.ndarray, radius: float, least: int) -> n
 
 
 def _distance_to(centres: np.ndarray, points: np.ndarray) -> np.ndarray:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    return cKDTree(centres).query(points)[0]
+    return KDTree(centres).query(points)[0]

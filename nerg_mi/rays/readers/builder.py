@@ -187,7 +187,7 @@ class RaysBuilder:
             "dropped": self._dropped,
             **self._notes,
         }
-        columns = {name: self._column(name) for name in COLUMNS}
+        columns: dict[str, Any] = {name: self._column(name) for name in COLUMNS}
         columns["person"], persons = self._persons.sorted(columns["person"])
         cohorts: tuple[str, ...] = ()
         if columns["cohort"] is not None:

@@ -158,9 +158,10 @@ class _Rows:
             drop[f"{name} is not {' or '.join(words)}"] = ~known
         builder.add(
             t * options.tick,
-            person_from_filename(path) if self.by_file else word[columns.person],
-            origin,
-            direction,
+            # The column map was found to name these.
+            person_from_filename(path) if self.by_file else word[columns.person],  # pyright: ignore[reportArgumentType]
+            origin,  # pyright: ignore[reportArgumentType]
+            direction,  # pyright: ignore[reportArgumentType]
             rows=block.lines,
             confidence=confidence,
             hit=vector(columns.hit) if columns.hit else None,

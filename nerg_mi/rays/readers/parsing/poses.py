@@ -79,7 +79,7 @@ def rotate(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nj->ni", rotations, vectors)
 
 
-def _where(good: np.ndarray, values: np.ndarray, make) -> np.ndarray:
+def _where(good: np.ndarray | np.bool_, values: np.ndarray, make) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
     out = np.full((len(values), 3, 3), np.nan)

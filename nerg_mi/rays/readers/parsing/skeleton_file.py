@@ -99,8 +99,9 @@ def iterate_skeleton(
             if isinstance(found, str):
                 _refuse(path, number, found, on_bad)
                 continue
-            for column, value in zip((ids, times, texts), found):
-                column.append(value)
+            ids.append(found[0])
+            times.append(found[1])
+            texts.append(found[2])
             lines.append(number)
         before += len(block)
         if ids:

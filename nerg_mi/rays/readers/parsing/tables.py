@@ -63,6 +63,8 @@ def iterate_table(
         yield from _iterate_parquet(path, numbers, texts)
         return
     columns, separator, count, convert = list(header or ()), ",", 0, None
+    number_at: list[int] = []
+    text_at: list[int] = []
     for raw in line_blocks(path, "table", BLOCK):
         if convert is None:
             if header is None:
@@ -132,7 +134,7 @@ def _fast_reader(
     def convert(rows: list[str]) -> tuple[np.ndarray, np.ndarray] | None:
         try:
             table = pc.read_csv(pa.BufferReader("".join(rows).encode()), **options)
-        except pa.lib.ArrowException:
+        except pa.ArrowException:
             return None
         if table.num_rows != len(rows):  # a quoted cell with a line break
             return None
@@ -166,7 +168,7 @@ def _convert(
             r.replace(gap, f"{separator}nan{separator}").replace(gap, f"{separator}nan{separator}") if gap in r else r
             for r in rows
         ]
-    options = dict(delimiter=separator, comments=None, quotechar='"', ndmin=2)
+    options: dict[str, Any] = dict(delimiter=separator, comments=None, quotechar='"', ndmin=2)
     try:
         values = np.loadtxt(filled, usecols=number_at, dtype=np.float64, **options)
         words = (
@@ -237,7 +239,7 @@ def _parquet(path: str | os.PathLike) -> Any:
 
     pa, pq = pyarrow_modules()
     size = size_of(path, "table")
-    with reading(path, "table", also=(pa.lib.ArrowException,)):
+    with reading(path, "table", also=(pa.ArrowException,)):
         table = pq.ParquetFile(path)
         about = table.metadata
         claimed = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
@@ -261,10 +263,10 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
                 f'the table "{path}" has several columns called {plain(twice[0], 40)!r}; rename all but one'
             )
         first, wanted = 1, list(dict.fromkeys([*numbers, *texts]))
-        with reading(path, "table", also=(pa.lib.ArrowException,)):
+        with reading(path, "table", also=(pa.ArrowException,)):
             batches = table.iter_batches(batch_size=BLOCK, columns=wanted)
         while True:
-            with reading(path, "table", also=(pa.lib.ArrowException,)):
+            with reading(path, "table", also=(pa.ArrowException,)):
                 batch = next(batches, None)
                 if batch is None:
                     return
