@@ -30,7 +30,7 @@ OURS, BAR = "gaze field", "4,096 nearest rays"
 
 def nerg(*arguments) -> None:
     """Run the command `nerg`, as a user would."""
-    code = "import sys; from nerg_command import main; sys.exit(main())"
+    code = "import sys; from nerg_mi.cli import main; sys.exit(main())"
     subprocess.run([sys.executable, "-c", code, *map(str, arguments)], check=True, cwd=ROOT)
 
 

@@ -2,7 +2,8 @@
 
 A Mitsuba plugin written in Python is bound to the variant that was active when its class was made, and is registered
 for that variant alone. So each plugin module is imported again after every change of variant. Mitsuba itself is not
-imported from here: where it is not loaded yet, registration waits until somebody imports it.
+imported from here: where it is not loaded yet, registration waits until somebody imports it. Likewise the libLLVM that
+Dr.Jit would load is looked at when Dr.Jit is imported, which is when an unusable one begins to matter.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def register(kind: str, name: str, cls: type) -> None:
         if kind not in _REGISTRY:
             put(name, _refusal(name, mi.variant()))
     else:
-        put(name, lambda props: cls(props))
+        put(name, cls)
 
 
 def _excuse(variant: str, what: str) -> str:
@@ -89,11 +90,12 @@ def _attach() -> None:
     _on_variant(None, mi.variant())
 
 
-class _Awaiter:
-    """An entry of `sys.meta_path` that lets Mitsuba be found as ever, and attaches to it once it is loaded."""
+class _Watcher:
+    """An entry of `sys.meta_path` that lets Dr.Jit and Mitsuba be found as ever: the one is loaded only after its libLLVM
+    was checked, and the plugins are attached to the other once it is loaded."""
 
     def find_spec(self, fullname, path=None, target=None):
-        if fullname != "mitsuba":
+        if fullname not in ("drjit", "mitsuba"):
             return None
         sys.meta_path.remove(self)
         try:
@@ -105,6 +107,10 @@ class _Awaiter:
         execute = spec.loader.exec_module
 
         def exec_module(module):
+            if fullname == "drjit":
+                llvm.require()
+                execute(module)
+                return
             execute(module)
             if self in sys.meta_path:
                 sys.meta_path.remove(self)
@@ -117,9 +123,12 @@ class _Awaiter:
 def install() -> None:
     """Register the plugins now if Mitsuba is loaded, else as soon as it is. Calling it again does nothing new.
 
-    Raises `nerg_mi.errors.UnusableLLVM` where Dr.Jit is loaded with a libLLVM on which its kernels cannot run.
+    Raises `nerg_mi.errors.UnusableLLVM` where Dr.Jit is loaded with a libLLVM on which its kernels cannot run; where it
+    is not loaded yet, importing it does.
     """
+    if "drjit" in sys.modules:
+        llvm.require()
     if "mitsuba" in sys.modules:
         _attach()
-    elif not any(isinstance(entry, _Awaiter) for entry in sys.meta_path):
-        sys.meta_path.insert(0, _Awaiter())
+    elif not any(isinstance(entry, _Watcher) for entry in sys.meta_path):
+        sys.meta_path.insert(0, _Watcher())

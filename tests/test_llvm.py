@@ -122,7 +122,8 @@ def test10_real_old_library_is_refused_and_never_aborts():
     old = next((library for library in llvm.installed() if library.version[0] in (15, 16)), None)
     if old is None:
         pytest.skip("no libLLVM 15 or 16 on this machine")
-    for code in ("import nerg_mi", "import drjit, nerg_mi", "import mitsuba, nerg_mi"):
+    orders = "import nerg_mi, drjit", "import nerg_mi, mitsuba", "import drjit, nerg_mi", "import mitsuba, nerg_mi"
+    for code in orders:
         run = subprocess.run(
             [sys.executable, "-c", code], env={**os.environ, llvm.VARIABLE: old.path}, capture_output=True, text=True
         )
@@ -138,3 +139,17 @@ def test11_loaded_version_counts(monkeypatch):
     # What is set after Dr.Jit was loaded has no effect on it.
     monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM-15.so.1")
     assert llvm.problem() is None
+
+
+@pytest.mark.parametrize("late", ["drjit", "mitsuba"])
+def test12_refused_when_drjit_is_imported_and_not_before(late, tmp_path):
+    """What needs no kernel works without them, `nerg doctor` for one; a second import is refused like the first."""
+    fake(tmp_path, "libLLVM-15.so.1")
+    code = (
+        "import nerg_mi.diagnosis\nprint('imported')\n"
+        f"try: import {late}\nexcept ImportError as error: print(type(error).__name__)\nimport {late}"
+    )
+    bad = {**os.environ, llvm.VARIABLE: str(tmp_path / "libLLVM-15.so.1")}
+    run = subprocess.run([sys.executable, "-c", code], env=bad, capture_output=True, text=True)
+    assert run.returncode == 1 and run.stdout.split() == ["imported", "UnusableLLVM"]
+    assert run.stderr.strip().splitlines()[-1].startswith("nerg_mi.errors.UnusableLLVM: LLVM 15")

@@ -52,7 +52,7 @@ def measured(command: list[str], says: str) -> tuple[float, int]:
     start = time.perf_counter()
     with tempfile.TemporaryFile("w+") as said:
         process = subprocess.Popen(
-            [sys.executable, "-c", "from nerg_command import main; main()", *command], stdout=said
+            [sys.executable, "-c", "from nerg_mi.cli import main; main()", *command], stdout=said
         )
         _, status, used = os.wait4(process.pid, 0)
         said.seek(0)

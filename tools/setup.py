@@ -57,10 +57,7 @@ def administrator() -> list[str] | None:
 
 def provide_llvm() -> None:
     """Have a libLLVM on which Dr.Jit's kernels run, installing one with apt if need be and allowed."""
-    # With the command's module loaded, an unusable libLLVM is ours to mend and no reason for nerg_mi to refuse its
-    # import.
     sys.path.insert(0, str(ROOT))
-    import nerg_command  # noqa: F401
     from nerg_mi import llvm
 
     trouble = llvm.problem()

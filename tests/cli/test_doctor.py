@@ -9,7 +9,7 @@ from nerg_mi import diagnosis, llvm
 
 def doctor(**environment):
     return subprocess.run(
-        [sys.executable, "-c", "import sys; sys.argv[1:] = ['doctor']\nfrom nerg_command import main; main()"],
+        [sys.executable, "-c", "import sys; sys.argv[1:] = ['doctor']\nfrom nerg_mi.cli import main; main()"],
         env={**os.environ, **environment},
         capture_output=True,
         text=True,

@@ -14,7 +14,7 @@ HEAVY = {"mitsuba", "drjit", "numpy", "scipy", "matplotlib", "torch", "trimesh",
 
 
 def nerg(*arguments, after=""):
-    code = f"import sys; sys.argv[1:] = {list(arguments)!r}\nfrom nerg_command import main\ntry: main()\nfinally:\n    {after or 'pass'}"
+    code = f"import sys; sys.argv[1:] = {list(arguments)!r}\nfrom nerg_mi.cli import main\ntry: main()\nfinally:\n    {after or 'pass'}"
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
 
 
@@ -124,7 +124,7 @@ def test07b_nothing_is_said_where_nobody_reads(lines):
     code = (
         "import sys\nimport nerg_mi.cli.doctor as doctor\n"
         f"def command():\n    for i in range({lines}): print('a line of output')\n"
-        "doctor.command = command\nfrom nerg_command import main\nsys.argv[1:] = ['doctor']\nmain()"
+        "doctor.command = command\nfrom nerg_mi.cli import main\nsys.argv[1:] = ['doctor']\nmain()"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.close()

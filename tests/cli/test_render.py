@@ -29,7 +29,7 @@ SCENE = """
 </scene>
 """
 
-NERG = [sys.executable, "-c", "import nerg_command; nerg_command.main()"]
+NERG = [sys.executable, "-c", "from nerg_mi.cli import main; main()"]
 """The command in a process of its own."""
 
 

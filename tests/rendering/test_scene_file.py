@@ -61,7 +61,7 @@ def test_what_would_end_the_process_is_a_sentence(tmp_path, name):
     run = [
         sys.executable,
         "-c",
-        "import nerg_command; nerg_command.main()",
+        "from nerg_mi.cli import main; main()",
         "render",
         "s.xml",
         "-o",

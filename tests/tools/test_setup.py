@@ -18,8 +18,6 @@ def setup(tmp_path, monkeypatch):
     spec = importlib.util.spec_from_file_location("nerg_setup", ROOT / "tools" / "setup.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    # The script's import of the command's module would switch off the check of libLLVM for the tests after it.
-    monkeypatch.setitem(sys.modules, "nerg_command", None)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(module, "VENV", tmp_path / ".venv")
     monkeypatch.setattr(module, "STAMP", tmp_path / "stamp.json")
@@ -40,7 +38,6 @@ def commands(setup, monkeypatch):
 
 
 def without_llvm(monkeypatch):
-    monkeypatch.setitem(sys.modules, "nerg_command", type(sys)("nerg_command"))
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
     monkeypatch.setattr(llvm, "problem", lambda: "No libLLVM was found.")
     monkeypatch.delenv(llvm.VARIABLE, raising=False)

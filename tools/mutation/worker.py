@@ -100,7 +100,7 @@ def stray_modules(tree: Path) -> list[str]:
     return [
         f"{name} ({module.__file__})"
         for name, module in list(sys.modules.items())
-        if name.split(".")[0] in ("nerg_mi", "nerg_command")
+        if name.split(".")[0] == "nerg_mi"
         and getattr(module, "__file__", None)
         and not Path(module.__file__).resolve().is_relative_to(tree)
     ]
