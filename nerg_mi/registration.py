@@ -91,8 +91,8 @@ def _attach() -> None:
 
 
 class _Watcher:
-    """An entry of `sys.meta_path` that lets Dr.Jit and Mitsuba be found as ever: the one is loaded only after its libLLVM
-    was checked, and the plugins are attached to the other once it is loaded."""
+    """An entry of `sys.meta_path` that lets Dr.Jit and Mitsuba be found as ever: the one is loaded only after its
+    libLLVM was checked, and the plugins are attached to the other once it is loaded."""
 
     def find_spec(self, fullname, path=None, target=None):
         if fullname not in ("drjit", "mitsuba"):
