@@ -1,15 +1,16 @@
-"""``nerg train``: fields from recordings."""
+"""`nerg train`: the command line of `nerg_mi.jobs.radiance`, and of the training of gaze fields."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from nerg_mi.errors import NergError, chosen
+from nerg_mi.errors import NergError
 
+from .mode import Mode, OldMode, mode_of
+from .progress import TerminalReporter
 from .train_gaze import train_gaze
 
 app = typer.Typer(no_args_is_help=True, help="Train fields from recordings.")
@@ -52,101 +53,41 @@ def train_radiance(
     save_every: Annotated[
         float, typer.Option(help="Seconds between two states for --resume; 0: only one, when it ends early.")
     ] = 60.0,
-    variant: Annotated[str, typer.Option(help="Mitsuba variant.")] = "llvm_ad_rgb",
+    mode: Mode = "llvm_ad_rgb",
+    variant: OldMode = None,
 ) -> None:
     """Train a radiance field on posed pictures, and report the error on those held out."""
-    import drjit as dr
+    from nerg_mi.jobs import radiance
 
-    from nerg_mi.capture.dataset import open_dataset
-    from nerg_mi.field.backend import namespace
-    from nerg_mi.files.atomic import check_writable
-    from nerg_mi.rendering.pictures import activate
-    from nerg_mi.training.radiance.run import save_trained, train_radiance
-    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
-
-    state, preview = output.with_suffix(".run"), output.with_suffix(".preview.png")
-    check_writable(output, ".safetensors")
-    check_writable(state)
-    check_writable(preview)
-    activate(variant)
-    if threads is not None:
-        dr.set_thread_count(threads)
-    if minutes is None and steps is None:
-        minutes = 5.0
-    weights = {"distortion_weight": distortion_weight}
-    if depth_weight is not None:
-        weights["depth_weight"] = depth_weight
-    settings = RadianceSettings(steps=steps, minutes=minutes, seed=seed, **weights)
-    if resume and not state.is_file():
-        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
-    with chosen("--aabb") if aabb else nullcontext():
-        data = open_dataset(
-            dataset, holdout, width, downscale, _numbers(aabb), depth, scale, coordinates, allow_outside
-        )
-    config = sized_config(size, data.box)
-    for line in (*data.unused, *data.notes):
-        typer.echo(line)
-    show = lambda corner: ", ".join(f"{x:.3g}" for x in corner)
-    typer.echo(f"box: ({show(data.box.lower)}) to ({show(data.box.upper)}), {data.box_from}")
-    typer.echo(data.unit)
-    typer.echo(
-        f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
-        f"{data.source['width']} x {data.source['height']} pixels"
+    options = radiance.RadianceOptions(
+        holdout=holdout,
+        size=size,
+        width=width,
+        downscale=downscale,
+        minutes=minutes,
+        steps=steps,
+        aabb=_numbers(aabb),
+        scale=scale,
+        coordinates=coordinates,
+        allow_outside=allow_outside,
+        seed=seed,
+        threads=threads,
+        half=half,
+        depth=depth,
+        depth_weight=depth_weight,
+        distortion_weight=distortion_weight,
+        resume=resume,
+        save_every=save_every,
+        mode=mode_of(mode, variant),
     )
-    with _Bar() as bar:
-        _, provenance = train_radiance(
-            data,
-            config,
-            settings,
-            namespace(variant),
-            depth,
-            bar.update,
-            state=state,
-            resume=resume,
-            save_every=save_every or float("inf"),
-            preview=preview,
-            write=lambda field, provenance: save_trained(field, provenance, output, half),
-        )
-    speed = f"; {provenance['evaluations_a_second']:.3g} field evaluations a second" if provenance["steps"] else ""
-    typer.echo(f"{provenance['steps']} steps in {provenance['seconds']:.0f} s{speed}")
-    if data.held_out:
-        typer.echo(f"held-out PSNR: {provenance['psnr_held_out']['mean']:.2f} dB")
-    for line in provenance["complaints"]:
-        typer.echo(f"warning: {line}", err=True)
-    typer.echo(f"wrote {output} ({output.stat().st_size / 1e6:.2f} MB)")
-    if provenance["interrupted"]:
-        raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")
+    with TerminalReporter() as reporter:
+        radiance.train_radiance(dataset, output, options, reporter)
 
 
-def _numbers(text: str | None) -> tuple | None:
+def _numbers(text: str | None) -> tuple[float, ...] | None:
     if text is None:
         return None
     try:
         return tuple(float(x) for x in text.replace(",", " ").split())
     except ValueError as e:
         raise NergError(f'--aabb needs numbers x0,y0,z0,x1,y1,z1, got "{text}"') from e
-
-
-class _Bar:
-    """Progress of a training, with the time left and the last held-out error."""
-
-    def __enter__(self):
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-        self._progress = Progress(
-            BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(), TextColumn("{task.description}")
-        )
-        self._task = self._progress.add_task("compiling", total=1.0)
-        self._progress.start()
-        return self
-
-    def update(self, state) -> None:
-        # Rich's own estimate follows the speed of the last moments, which pauses for looks upset.
-        left = state.seconds * (1 - state.done) / max(state.done, 1e-6)
-        error = f", held out {state.psnr:.2f} dB" if state.psnr is not None else ""
-        self._progress.update(
-            self._task, completed=state.done, description=f"{left:.0f} s left, step {state.steps}{error}"
-        )
-
-    def __exit__(self, *error):
-        self._progress.stop()

@@ -6,7 +6,8 @@ left as it is; the rendering is bent to its lens.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -138,14 +139,48 @@ class Renderer:
         return Rendered(np.clip(stacked[..., :3], 0, 1), stacked[..., 3], np.clip(stacked[..., 4], 0, 1), mask)
 
 
-def score_views(
-    field: str | Path, views: list[View], spp: int = 16, pictures: Path | None = None, on_view=None
-) -> dict:
-    """Scores (JSON) of the field in a checkpoint on ``views``; writes each picture beside its truth into ``pictures``.
+@dataclass(frozen=True)
+class ViewScores:
+    """Scores of a field on posed pictures."""
 
-    ``psnr``, ``ssim``: a list with one entry a view, in the order of ``views`` (names); ``*_mean``: their means;
-    ``depth``: where a view has true depth, see `DepthScore`, means over the views. ``on_view(name, psnr, ssim)``.
-    """
+    # Names of the views; the lists below are in their order.
+    views: list[str]
+    # Of the first view's picture, in pixels.
+    width: int
+    height: int
+    # Rays a pixel.
+    spp: int
+    # Of each view, in dB.
+    psnr: list[float]
+    # Of each view.
+    ssim: list[float]
+    # Means over the views with true depth; None where there are none.
+    depth: DepthScore | None
+
+    @property
+    def psnr_mean(self) -> float:
+        return float(np.mean(self.psnr))
+
+    @property
+    def ssim_mean(self) -> float:
+        return float(np.mean(self.ssim))
+
+    def to_dict(self) -> dict:
+        """For JSON: the fields and the means; without ``depth`` where it is None."""
+        names = "views", "width", "height", "spp", "psnr", "psnr_mean", "ssim", "ssim_mean"
+        out = {name: getattr(self, name) for name in names}
+        return out if self.depth is None else out | {"depth": asdict(self.depth)}
+
+
+def score_views(
+    field: str | Path,
+    views: list[View],
+    spp: int = 16,
+    pictures: Path | None = None,
+    on_view: Callable[[str, float, float], None] = lambda name, psnr, ssim: None,
+) -> ViewScores:
+    """Scores of the field in a checkpoint on ``views``; writes each picture beside its truth into the folder
+    ``pictures``. ``on_view`` is told each view's name, PSNR in dB and SSIM. Raises `NergError` without any view."""
     if not views:
         raise NergError("there are no views to score; the data set holds none out, so give --holdout 8 or --train")
     render, rows, depths = Renderer(field, spp), [], []
@@ -159,19 +194,18 @@ def score_views(
             depths.append(depth_score(seen.depth, seen.opacity, np.where(mask, view.depth, 0)))
         if pictures is not None:
             write_png(pictures / f"{Path(view.name).stem}.png", np.concatenate([seen.color, truth], axis=1))
-        if on_view is not None:
-            on_view(view.name, *rows[-1])
-    out = {
-        "views": [v.name for v in views],
-        "width": views[0].shape[1],
-        "height": views[0].shape[0],
-        "spp": spp,
-        "psnr": [p for p, _ in rows],
-        "psnr_mean": float(np.mean([p for p, _ in rows])),
-        "ssim": [s for _, s in rows],
-        "ssim_mean": float(np.mean([s for _, s in rows])),
-    }
-    depths = [d for d in depths if d is not None]
-    if depths:
-        out["depth"] = {k: float(np.mean([getattr(d, k) for d in depths])) for k in DepthScore.__dataclass_fields__}
-    return out
+        on_view(view.name, *rows[-1])
+    known = [d for d in depths if d is not None]
+    return ViewScores(
+        views=[v.name for v in views],
+        width=views[0].shape[1],
+        height=views[0].shape[0],
+        spp=spp,
+        psnr=[p for p, _ in rows],
+        ssim=[s for _, s in rows],
+        depth=_mean_depth_score(known) if known else None,
+    )
+
+
+def _mean_depth_score(scores: list[DepthScore]) -> DepthScore:
+    return DepthScore(**{f.name: float(np.mean([getattr(d, f.name) for d in scores])) for f in fields(DepthScore)})

@@ -52,20 +52,13 @@ def make_field(job: Job) -> list[Path]:
     """The radiance field, trained on the pictures and their exact depth; the test views are held out."""
     import mitsuba as mi
 
-    from nerg_mi.capture.dataset import open_dataset
-    from nerg_mi.field.backend import namespace
-    from nerg_mi.training.radiance.run import save_trained, train_radiance
-    from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+    from nerg_mi.jobs.radiance import RadianceOptions, train_radiance
 
     _require(job.build / "transforms.json", "views")
-    data = open_dataset(job.build, None, None, None, None, True)
-    settings = RadianceSettings(steps=6500, minutes=None, seed=job.seed)
-    field, about = train_radiance(data, sized_config("small", data.box), settings, namespace(mi.variant()))
-    if about["interrupted"]:
-        raise KeyboardInterrupt
-    path = job.store / "store.safetensors"
-    save_trained(field, about, path, True)
-    return [path]
+    path = job.build / "store.safetensors"
+    train_radiance(job.build, path, RadianceOptions(steps=6500, seed=job.seed, half=True, mode=mi.variant()))
+    # The run's preview and its state stay with what can be made again.
+    return [path.replace(job.store / path.name)]
 
 
 def make_rays(job: Job) -> list[Path]:

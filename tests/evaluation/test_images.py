@@ -100,11 +100,13 @@ def test_scores_of_views_and_what_is_written(fog, tmp_path):
     seen = Renderer(fog)(camera())
     view = View("frame.png", camera(), (seen.color + 0.1).astype(np.float32), seen.depth.astype(np.float32))
     scores = score_views(fog, [view, view], pictures=tmp_path / "out")
-    assert scores["psnr_mean"] == pytest.approx(20, abs=0.2) and len(scores["psnr"]) == 2
-    assert (scores["width"], scores["height"], scores["views"]) == (16, 12, ["frame.png", "frame.png"])
-    assert scores["depth"]["off"] == 0 and scores["depth"]["median"] < 0.02
+    assert scores.psnr_mean == pytest.approx(20, abs=0.2) and len(scores.psnr) == 2
+    assert (scores.width, scores.height, scores.views) == (16, 12, ["frame.png", "frame.png"])
+    assert scores.depth.off == 0 and scores.depth.median < 0.02
     assert (tmp_path / "out" / "frame.png").is_file()
-    json.dumps(scores)
+    written = json.loads(json.dumps(scores.to_dict()))
+    assert written["psnr_mean"] == scores.psnr_mean and written["depth"]["median"] == scores.depth.median
+    assert "depth" not in score_views(fog, [View("frame.png", view.camera, view.color)]).to_dict()
     with pytest.raises(ValueError, match="--holdout"):
         score_views(fog, [])
 

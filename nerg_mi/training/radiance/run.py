@@ -14,7 +14,6 @@ from nerg_mi.capture.dataset import Dataset
 from nerg_mi.capture.images import View
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.files.png import write_png
-from nerg_mi.formats.fields import save_radiance
 from nerg_mi.interruption import Interruption
 from nerg_mi.training.common.run_state import kept_unless, load_run, save_run
 
@@ -45,7 +44,7 @@ class Progress:
     psnr: float | None
 
 
-def train_radiance(
+def train_field(
     dataset: Dataset,
     config: RadianceConfig,
     settings: RadianceSettings,
@@ -168,8 +167,3 @@ def _write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
     seen = trainer.render(view, every)
     both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)[every // 2 :: every, every // 2 :: every]], axis=1)
     write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)))
-
-
-def save_trained(field: RadianceField, provenance: dict, output: str | Path, half: bool = False) -> None:
-    """Write the checkpoint of a training, with ``provenance`` in its metadata."""
-    save_radiance(field, output, provenance, half)

@@ -14,7 +14,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.training.common.run_state import load_run, save_run
-from nerg_mi.training.radiance.run import save_trained, train_radiance
+from nerg_mi.formats.fields import save_radiance
+from nerg_mi.training.radiance.run import train_field
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.training.radiance.test_trainer import BOX, TINY, dataset, settings  # noqa: F401  (fixture)
 
@@ -78,9 +79,9 @@ def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):  # no
         "on_progress": stop,
         "write": lambda field, about: written.append((about["steps"], path.is_file())),
     }
-    _, about = train_radiance(dataset, TINY, settings(steps=12), ns, **how)
+    _, about = train_field(dataset, TINY, settings(steps=12), ns, **how)
     assert about["interrupted"] and path.is_file()
-    _, about = train_radiance(dataset, TINY, settings(steps=12), ns, resume=True, **how)
+    _, about = train_field(dataset, TINY, settings(steps=12), ns, resume=True, **how)
     assert not about["interrupted"] and seen[5].steps == 6 and (tmp_path / "a.png").stat().st_size > 100
     assert written == [(5, True), (12, True)] and not path.exists()
 
@@ -92,20 +93,20 @@ def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
     def refuse(field, about):
         parameters = field.parameters()
         field.set_parameters(parameters | {"grid.table": parameters["grid.table"] * 0 + 1e6})
-        save_trained(field, about, tmp_path / "a.safetensors", half=True)
+        save_radiance(field, about, tmp_path / "a.safetensors", half=True)
 
     how = {"state": path, "save_every": 1e9, "on_progress": seen.append}
     with pytest.raises(NergError, match="fp16.*leave out --half.*--resume writes it"):
-        train_radiance(dataset, TINY, settings(steps=6), ns, write=refuse, **how)
+        train_field(dataset, TINY, settings(steps=6), ns, write=refuse, **how)
     assert [p.name for p in tmp_path.iterdir()] == ["a.run"]
     seen.clear()
-    _, about = train_radiance(
+    _, about = train_field(
         dataset,
         TINY,
         settings(steps=6),
         ns,
         resume=True,
-        write=lambda f, a: save_trained(f, a, tmp_path / "a.safetensors"),
+        write=lambda f, a: save_radiance(f, a, tmp_path / "a.safetensors"),
         **how,
     )
     assert about["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
@@ -124,7 +125,7 @@ def test_a_second_ctrl_c_leaves_the_state_before_the_step(dataset, one_thread, m
 
     monkeypatch.setattr(RadianceTrainer, "_descend", twice)
     with pytest.raises(KeyboardInterrupt):
-        train_radiance(dataset, TINY, settings(steps=12), ns, state=path, save_every=0.0)
+        train_field(dataset, TINY, settings(steps=12), ns, state=path, save_every=0.0)
     assert read_checkpoint(path, "radiance run")[1]["steps"] == 4
 
 
@@ -133,13 +134,13 @@ import sys
 import drjit as dr, drjit.llvm.ad as ns
 from pathlib import Path
 from tests.training.radiance.test_trainer import *
-from nerg_mi.training import radiance_run
+from nerg_mi.training.radiance import run as radiance_run
 dr.set_thread_count(1)
 rng = np.random.default_rng(0)
 centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
 views = [ball(looking_at_origin(2 * c / np.linalg.norm(c))) for c in centers]
 data = Dataset(views[4:], views[:4], BOX, "as given", None, {"dataset": "ball"})
-radiance_run.train_radiance(data, TINY, settings(steps=10**6), ns, state=Path(sys.argv[1]), save_every=0.0)
+radiance_run.train_field(data, TINY, settings(steps=10**6), ns, state=Path(sys.argv[1]), save_every=0.0)
 """
 
 

@@ -7,7 +7,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.training.common.step_clock import StepClock
-from nerg_mi.training.radiance.run import train_radiance
+from nerg_mi.training.radiance.run import train_field
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.training.common.test_run_state import one_thread, state, trainer  # noqa: F401  (fixture)
 
@@ -89,7 +89,7 @@ def test_the_clock_of_a_long_run_stays_small():
 
 
 def test_the_result_tells_its_steps_speed_and_what_is_wrong(dataset):  # noqa: F811
-    _, about = train_radiance(dataset, TINY, settings(steps=8), ns)
+    _, about = train_field(dataset, TINY, settings(steps=8), ns)
     assert about["evaluations_a_second"] > 0 and set(about["step_ms"]) == {"min", "median", "max"}
     assert any("only 8 steps" in x for x in about["complaints"])
     # The last look is that of the result.

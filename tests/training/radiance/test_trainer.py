@@ -13,14 +13,14 @@ from nerg_mi.capture.images import View
 from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.formats.fields import load_radiance
+from nerg_mi.formats.fields import load_radiance, save_radiance
 from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.compositing import damp_near, ray_sum
 from nerg_mi.training.radiance.losses import color_loss, composite, depth_loss, feature_decay
 from nerg_mi.training.radiance.model import density_color
 from nerg_mi.training.radiance.pixels import PixelBank
 from nerg_mi.training.radiance.preview import render_view
-from nerg_mi.training.radiance.run import save_trained, train_radiance
+from nerg_mi.training.radiance.run import train_field
 from nerg_mi.training.radiance.sampling import StepTable, Thinning, rays_in_box, visible_samples
 from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 from nerg_mi.training.radiance.trainer import RadianceTrainer
@@ -86,10 +86,10 @@ def settings(**changes):
 def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
     """20 dB on held-out views after 300 small steps; the checkpoint says how."""
     seen = []
-    field, provenance = train_radiance(dataset, TINY, settings(), ns, on_progress=seen.append)
+    field, provenance = train_field(dataset, TINY, settings(), ns, on_progress=seen.append)
     assert provenance["psnr_held_out"]["mean"] > 20
     assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].done == 1
-    save_trained(field, provenance, tmp_path / "ball.safetensors", half=True)
+    save_radiance(field, provenance, tmp_path / "ball.safetensors", half=True)
     loaded, meta = load_radiance(tmp_path / "ball.safetensors", ns)
     assert meta["provenance"]["settings"]["seed"] == 1
     assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
@@ -97,7 +97,7 @@ def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
 
 @pytest.mark.slow
 def test_learns_without_depth(dataset):
-    _, provenance = train_radiance(dataset, TINY, settings(), ns, depth=False)
+    _, provenance = train_field(dataset, TINY, settings(), ns, depth=False)
     assert provenance["psnr_held_out"]["mean"] > 19 and not provenance["depth_supervision"]
 
 
@@ -394,5 +394,5 @@ def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
     shown = []
     monkeypatch.setattr(radiance_run, "_write_preview", lambda trainer, view, path: shown.append(view))
     monkeypatch.setattr(radiance_run, "_LOOK_GAP", 1)
-    train_radiance(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
+    train_field(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
     assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)

@@ -1,0 +1,188 @@
+"""Radiance fields for other tools, in the field's own units: meshes, points, grid volumes, torch-ngp checkpoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.radiance import RadianceField
+from nerg_mi.files.atomic import check_writable
+from nerg_mi.formats.fields import load_radiance
+from nerg_mi.formats.surfaces import Surface, mesh, points, write_glb, write_ply
+from nerg_mi.formats.torch_ngp.fields import write_torch_ngp
+from nerg_mi.formats.volumes import density_and_color, write_volume
+
+from .backend import select_backend
+from .reporter import SILENT, Reporter
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshOptions:
+    """Where the surface of a mesh lies, and what is left out of it."""
+
+    # Lattice cells along the longest edge of the field's box.
+    resolution: int = 256
+    # Density, 1/unit, at which the surface lies; None: half of the light absorbed in a cell.
+    density: float | None = None
+    # Close holes of up to twice so many cells; 0: none.
+    fill: int = 1
+    # Drop pieces with less than this share of the largest one's area.
+    keep: float = 0.001
+    # Keep the backs and insides that training never looked at.
+    unseen: bool = False
+    # Up axis of the field, for .glb: z or y.
+    up: str = "z"
+    # Mitsuba variant.
+    mode: str = "llvm_ad_rgb"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PointOptions:
+    """Which points of a surface are written."""
+
+    # Lattice cells along the longest edge of the field's box.
+    resolution: int = 256
+    # Density, 1/unit, at which the surface lies; None: half of the light absorbed in a cell.
+    density: float | None = None
+    # Points at most; None: all.
+    count: int | None = None
+    # Up axis of the field, for .glb: z or y.
+    up: str = "z"
+    # Mitsuba variant.
+    mode: str = "llvm_ad_rgb"
+
+
+@dataclass(frozen=True, kw_only=True)
+class VolumeOptions:
+    """What a grid volume holds."""
+
+    # Voxels along the longest edge of the field's box.
+    resolution: int = 256
+    # Also write the colour, to this .vol file.
+    color: Path | None = None
+    # Mitsuba variant.
+    mode: str = "llvm_ad_rgb"
+
+
+@dataclass(frozen=True)
+class Export:
+    """``files`` written; ``surface``: what a mesh or a cloud of points holds, None for other kinds."""
+
+    files: list[Path]
+    surface: Surface | None = None
+
+
+def export_mesh(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: MeshOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write a mesh by marching cubes, with vertex colours: .ply or .glb. Needs scikit-image; raises `NergError` for what
+    the user can mend."""
+    options, output, start = options or MeshOptions(), Path(output), time.perf_counter()
+    write = _surface_writer(output, options.up)
+    found = mesh(
+        _load(field, options.mode), options.resolution, options.density, options.fill, options.keep, options.unseen
+    )
+    write(found, output)
+    r = found.report
+    reporter.message(
+        f"surface at a density of {r['threshold']:.4g} / unit, cells of {r['cell']:.4g} units ({_by(r['lattice'])})"
+    )
+    reporter.message(
+        f"{r['cells_filled']:,} cells of holes filled; dropped {r['unseen_faces']:,} faces that training never looked "
+        f"at, and {r['floater_faces']:,} of {r['pieces'] - r['pieces_kept']:,} floaters; {r['pieces_kept']} pieces kept"
+    )
+    reporter.message(
+        f"{len(found.vertices):,} vertices, {len(found.faces):,} faces; open edges: {r['edges_at_the_box']:,} where the "
+        f"box cuts, {r['edges_of_holes']:,} around holes"
+    )
+    return _written([output], start, reporter, found)
+
+
+def export_points(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: PointOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write a cloud of surface points with normals and colours: .ply or .glb. Raises `NergError` for what the user can
+    mend."""
+    options, output, start = options or PointOptions(), Path(output), time.perf_counter()
+    write = _surface_writer(output, options.up)
+    found = points(_load(field, options.mode), options.resolution, options.density, options.count)
+    write(found, output)
+    reporter.message(f"{len(found.vertices):,} points, at a density of {found.report['threshold']:.4g} / unit")
+    return _written([output], start, reporter, found)
+
+
+def export_volume(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: VolumeOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write density, and colour, as Mitsuba grid volumes (.vol). Raises `NergError` for what the user can mend."""
+    options, output, start = options or VolumeOptions(), Path(output), time.perf_counter()
+    files = [output] if options.color is None else [Path(options.color), output]
+    for path in reversed(files):
+        check_writable(path, ".vol")
+    loaded = _load(field, options.mode)
+    density, color, lower, upper = density_and_color(loaded, options.resolution, options.color is not None)
+    write_volume(output, density, lower, upper)
+    reporter.message(
+        f"{_by(density.shape[::-1])} voxels from {_corner(lower)} to {_corner(upper)}; "
+        f"density up to {density.max():.4g} / unit"
+    )
+    if options.color is not None:
+        write_volume(options.color, color, lower, upper)
+    done = _written(files, start, reporter)
+    reporter.message(
+        'use: <volume type="gridvolume"> with <boolean name="use_grid_bbox" value="true"/>, '
+        'and "raw" true for the colour'
+    )
+    return done
+
+
+def export_torch_ngp(
+    field: str | Path | RadianceField, output: str | Path, mode: str = "llvm_ad_rgb", reporter: Reporter = SILENT
+) -> Export:
+    """Write a torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes; raises
+    `NergError` for another."""
+    output, start = Path(output), time.perf_counter()
+    check_writable(output, ".pth")
+    write_torch_ngp(_load(field, mode), output)
+    return _written([output], start, reporter)
+
+
+def _load(field: str | Path | RadianceField, mode: str) -> RadianceField:
+    ns = select_backend(mode)
+    return field if isinstance(field, RadianceField) else load_radiance(field, ns)[0]
+
+
+def _surface_writer(output: Path, up: str) -> Callable[[Surface, Path], None]:
+    if up not in ("y", "z"):
+        raise NergError(f'--up must be z or y, not "{up}".')
+    check_writable(output, ".ply", ".glb")
+    if output.suffix.lower() == ".ply":
+        return write_ply
+    return lambda surface, path: write_glb(surface, path, up)
+
+
+def _written(files: list[Path], start: float, reporter: Reporter, surface: Surface | None = None) -> Export:
+    for path in files:
+        size, seconds = path.stat().st_size / 1e6, time.perf_counter() - start
+        reporter.message(f"wrote {path} ({size:.1f} MB, {seconds:.1f} s)")
+    return Export(files, surface)
+
+
+def _by(shape) -> str:
+    return " x ".join(map(str, shape))
+
+
+def _corner(values) -> str:
+    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"

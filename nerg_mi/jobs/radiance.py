@@ -1,0 +1,277 @@
+"""Radiance fields from posed photos: training, and scores on the photos that were held out."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerg_mi.capture.dataset import Dataset, open_dataset
+from nerg_mi.errors import NergError, chosen
+from nerg_mi.evaluation.images import ViewScores, score_views
+from nerg_mi.field.radiance import RadianceField
+from nerg_mi.files.atomic import check_folder, check_writable
+from nerg_mi.files.tables import write_json
+from nerg_mi.formats.checkpoint import read_checkpoint
+from nerg_mi.formats.fields import save_radiance
+from nerg_mi.training.radiance import run
+from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+
+from .backend import select_backend
+from .reporter import SILENT, Reporter
+
+
+@dataclass(frozen=True, kw_only=True)
+class RadianceOptions:
+    """How a radiance field is trained."""
+
+    # Hold out every so many frames, 0: none; None: those of transforms_test.json, else every eighth.
+    holdout: int | None = None
+    # Architecture: small, medium or paper.
+    size: str = "small"
+    # Width of the pictures in pixels; None: as they are.
+    width: int | None = None
+    # Or: divide their size by this.
+    downscale: float | None = None
+    # Train for this long; None: 5, unless steps are given.
+    minutes: float | None = None
+    # Or: train for so many steps.
+    steps: int | None = None
+    # Bounds of what is seen, x0, y0, z0, x1, y1, z1, in the coordinates of the field; None: found.
+    aabb: tuple[float, ...] | None = None
+    # What all lengths are multiplied by: what a unit of the data set measures, in metres.
+    scale: float = 1.0
+    # Of the field: file, original (applied_transform undone), or a dataparser_transforms.json.
+    coordinates: str = "file"
+    # Read files outside of the data set's folder too, where it names them.
+    allow_outside: bool = False
+    # Of the weights, rays and jitter.
+    seed: int = 0
+    # Of the CPU; None: all.
+    threads: int | None = None
+    # Store the weights in fp16.
+    half: bool = False
+    # Supervise with the data set's depth, where it has any.
+    depth: bool = True
+    # Weight of the depth's loss; None: the default of `RadianceSettings`.
+    depth_weight: float | None = None
+    # Weight of mip-NeRF 360's distortion loss, against fog; 0: none.
+    distortion_weight: float = 0.0
+    # Go on with the interrupted run of this output.
+    resume: bool = False
+    # Seconds between two states to resume from; 0: only one, when the run ends early.
+    save_every: float = 60.0
+    # Mitsuba variant.
+    mode: str = "llvm_ad_rgb"
+
+
+@dataclass(frozen=True)
+class RadianceResult:
+    """``field``, with its occupancy; ``provenance``: what its checkpoint says about the training (JSON); ``output``:
+    the checkpoint, None where none was asked for; ``interrupted``: the run was ended early."""
+
+    field: RadianceField
+    provenance: dict
+    output: Path | None
+    interrupted: bool
+
+    @property
+    def psnr(self) -> float | None:
+        """Mean PSNR in dB on the held-out views; None where none are held out."""
+        held_out = self.provenance.get("psnr_held_out")
+        return None if held_out is None else held_out["mean"]
+
+
+def train_radiance(
+    photos: str | Path,
+    output: str | Path | None = None,
+    options: RadianceOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> RadianceResult:
+    """Train a radiance field on posed ``photos``: a folder, its transforms.json, or a COLMAP model.
+
+    ``output``: checkpoint to write (.safetensors). Beside it a preview (.preview.png) is kept up to date, and while the
+    run is not done its state (.run), from which it can be resumed. After Ctrl-C the result so far and the state are
+    written and ``KeyboardInterrupt`` is raised; without ``output`` the result so far is returned, as ``interrupted``.
+
+    Raises `NergError` for what the user can mend, before any time is spent on it.
+    """
+    options = options or RadianceOptions()
+    output = None if output is None else Path(output)
+    state = preview = None
+    if output is not None:
+        state, preview = output.with_suffix(".run"), output.with_suffix(".preview.png")
+        check_writable(output, ".safetensors")
+        check_writable(state)
+        check_writable(preview)
+    ns = select_backend(options.mode, options.threads)
+    settings = _settings(options)
+    if options.resume and (state is None or not state.is_file()):
+        raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
+    data = _open(photos, options)
+    _tell_about(data, reporter)
+    field, provenance = run.train_field(
+        data,
+        sized_config(options.size, data.box),
+        settings,
+        ns,
+        options.depth,
+        lambda now: reporter.progress(now.done, _progress(now)),
+        state=state,
+        resume=options.resume,
+        save_every=options.save_every or float("inf"),
+        preview=preview,
+        write=None if output is None else lambda field, about: save_radiance(field, output, about, options.half),
+    )
+    result = RadianceResult(field, provenance, output, provenance["interrupted"])
+    _tell_result(result, reporter)
+    if result.interrupted and output is not None:
+        raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {state})")
+    return result
+
+
+def _settings(options: RadianceOptions) -> RadianceSettings:
+    minutes = 5.0 if options.minutes is None and options.steps is None else options.minutes
+    weights = {"distortion_weight": options.distortion_weight}
+    if options.depth_weight is not None:
+        weights["depth_weight"] = options.depth_weight
+    return RadianceSettings(steps=options.steps, minutes=minutes, seed=options.seed, **weights)
+
+
+def _open(photos: str | Path, options: RadianceOptions) -> Dataset:
+    with chosen("--aabb") if options.aabb else nullcontext():
+        return open_dataset(
+            photos,
+            options.holdout,
+            options.width,
+            options.downscale,
+            options.aabb,
+            options.depth,
+            options.scale,
+            options.coordinates,
+            options.allow_outside,
+        )
+
+
+def _tell_about(data: Dataset, reporter: Reporter) -> None:
+    corner = lambda values: ", ".join(f"{x:.3g}" for x in values)
+    for line in (*data.unused, *data.notes):
+        reporter.message(str(line))
+    reporter.message(f"box: ({corner(data.box.lower)}) to ({corner(data.box.upper)}), {data.box_from}")
+    reporter.message(data.unit)
+    reporter.message(
+        f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
+        f"{data.source['width']} x {data.source['height']} pixels"
+    )
+
+
+def _progress(now: run.Progress) -> str:
+    left = now.seconds * (1 - now.done) / max(now.done, 1e-6)
+    error = f", held out {now.psnr:.2f} dB" if now.psnr is not None else ""
+    return f"{left:.0f} s left, step {now.steps}{error}"
+
+
+def _tell_result(result: RadianceResult, reporter: Reporter) -> None:
+    about = result.provenance
+    speed = f"; {about['evaluations_a_second']:.3g} field evaluations a second" if about["steps"] else ""
+    reporter.message(f"{about['steps']} steps in {about['seconds']:.0f} s{speed}")
+    if result.psnr is not None:
+        reporter.message(f"held-out PSNR: {result.psnr:.2f} dB")
+    for complaint in about["complaints"]:
+        reporter.warn(complaint)
+    if result.output is not None:
+        reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RadianceScoreOptions:
+    """On which views a radiance field is scored, and how they are rendered."""
+
+    # As it was trained with; None: transforms_test.json, else every eighth frame.
+    holdout: int | None = None
+    # Score the training views instead.
+    train: bool = False
+    # Width of the pictures in pixels; None: as it was trained.
+    width: int | None = None
+    # As it was trained with.
+    scale: float = 1.0
+    # As it was trained with.
+    coordinates: str = "file"
+    # Read files outside of the data set's folder too, where it names them.
+    allow_outside: bool = False
+    # Rays a pixel; the scatter of few is part of the score.
+    spp: int = 16
+    # Folder for the pictures, each beside its photo; None: none are written.
+    pictures: Path | None = None
+    # File for the scores as JSON; None: none is written.
+    json_file: Path | None = None
+    # Of the CPU; None: all.
+    threads: int | None = None
+    # Mitsuba variant.
+    mode: str = "llvm_ad_rgb"
+
+
+def evaluate_radiance(
+    field: str | Path,
+    photos: str | Path,
+    options: RadianceScoreOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> ViewScores:
+    """PSNR, SSIM and, where the ``photos`` have depth, its error, of the ``field`` in a checkpoint as rendered by the
+    integrator.
+
+    Raises `NergError` for what the user can mend, among it views that the field was trained on.
+    """
+    options = options or RadianceScoreOptions()
+    if options.pictures is not None:
+        check_folder(options.pictures)
+    if options.json_file is not None:
+        check_writable(options.json_file)
+    select_backend(options.mode, options.threads)
+    about = read_checkpoint(field, "radiance")[1].get("provenance", {})
+    trained_width = about.get("width") if isinstance(about.get("width"), int) else None
+    data = open_dataset(
+        photos,
+        options.holdout,
+        options.width or trained_width,
+        None,
+        None,
+        True,
+        options.scale,
+        options.coordinates,
+        options.allow_outside,
+    )
+    if not options.train:
+        _refuse_trained(field, about, data)
+    views = data.train if options.train else data.held_out
+    row = lambda name, psnr, ssim: reporter.message(f"{name[-32:]:32s} {psnr:8.2f} {ssim:7.4f}")
+    reporter.message(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")
+    scores = score_views(field, views, options.spp, options.pictures, row)
+    row("mean", scores.psnr_mean, scores.ssim_mean)
+    if scores.depth is not None:
+        d = scores.depth
+        reporter.message(
+            f"depth: median error {d.median:.4f} units, {d.off:.1%} of the pixels off by more than 10 %; "
+            f"opacity {d.opacity:.3f}, {d.translucent:.1%} of the pixels below 0.9"
+        )
+    if options.pictures is not None:
+        reporter.message(f"wrote {len(views)} pictures to {options.pictures}")
+    if options.json_file is not None:
+        about = {"field": Path(field).name, "dataset": data.source["dataset"]}
+        write_json(options.json_file, about | scores.to_dict())
+        reporter.message(f"wrote {options.json_file}")
+    return scores
+
+
+def _refuse_trained(field: str | Path, about: dict, data: Dataset) -> None:
+    """Raise `NergError` where views would be scored that the field in ``field`` was trained on."""
+    held_out = about.get("held_out")
+    trained = held_out.get("frames") if isinstance(held_out, dict) else None
+    if trained is None or about.get("sha256") != data.source["sha256"]:
+        return
+    seen = sorted({v.name for v in data.held_out} - set(trained))
+    if seen:
+        raise NergError(
+            f'"{field}" was trained on {seen[0]} and {len(seen) - 1} other of the views that would be scored; '
+            "give --holdout as it was trained with"
+        )
