@@ -266,7 +266,7 @@ def main(argv=None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.view.demo import store_scene
+    from nerg_mi.jobs.demo import store_scene
 
     folder = store_scene().parent
     files = {k: str(v.resolve()) for k, v in (("field", args.field), ("gaze", args.gaze)) if v is not None}

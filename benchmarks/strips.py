@@ -25,8 +25,8 @@ def main(arguments: list[str] | None = None) -> None:
     import mitsuba as mi
     import numpy as np
 
+    from nerg_mi.jobs.demo import store_scene
     from nerg_mi.rendering.bands import render_bands
-    from nerg_mi.view.demo import store_scene
 
     mi.set_variant("llvm_ad_rgb")
     scene = mi.load_file(str(store_scene()), width=options.width, height=options.width * 9 // 16)

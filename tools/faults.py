@@ -116,7 +116,7 @@ def prepare(folder: Path) -> None:
 
     import mitsuba as mi
 
-    from nerg_mi.view.demo import store_scene
+    from nerg_mi.jobs.demo import store_scene
     from tools import tiny
 
     mi.set_variant("scalar_rgb")

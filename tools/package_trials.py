@@ -76,7 +76,7 @@ def try_commands(there: Environment, out: Path) -> str:
     there.run("nerg", "--version")
     there.run("nerg", "doctor")
     there.run("nerg", "demo", "--out", out / "demo", "--width", 48, "--spp", 1, "-m", "llvm_ad_rgb")
-    scene = there.python("from nerg_mi.view.demo import store_scene; print(store_scene())")
+    scene = there.python("from nerg_mi.jobs.demo import store_scene; print(store_scene())")
     sizes = ("-D", "width=36", "-D", "height=24", "-D", "aovs=depth,gaze,visibility")
     there.run("nerg", "render", scene, "-o", out / "scene.exr", "--spp", 1, "-m", "llvm_ad_rgb", *sizes)
     probe = (
@@ -89,7 +89,7 @@ def try_commands(there: Environment, out: Path) -> str:
 
 def try_missing_extras(there: Environment, out: Path) -> str:
     """The commands that need an extra say its name and how to get it, in one line; how many did."""
-    field = there.python("from nerg_mi.view.demo import store_scene; print(store_scene().parent / 'store.safetensors')")
+    field = there.python("from nerg_mi.jobs.demo import store_scene; print(store_scene().parent / 'store.safetensors')")
     asked = {
         "nerg-mi[mesh]": ("nerg", "export", "mesh", field, "-o", out / "field.ply", "--resolution", 8),
         "nerg-mi[parquet]": ("nerg", "rays", "show", out / "rays.parquet"),

@@ -97,7 +97,7 @@ def record() -> list[Call]:
     """The calls of one render, from the integrator's sample on. To be called once in a process."""
     import mitsuba as mi
 
-    from nerg_mi.view.demo import store_scene
+    from nerg_mi.jobs.demo import store_scene
 
     mi.set_variant("llvm_ad_rgb")
     scene = mi.load_file(str(store_scene()), width=8, height=6, aovs=AOVS)

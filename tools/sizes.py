@@ -18,8 +18,9 @@ SIZES = {"1080p": (1920, 1080), "4K": (3840, 2160), "8K": (7680, 4320)}
 
 _CHILD = """
 import json, resource, sys, time
-from nerg_mi.rendering import bands, pictures
-from nerg_mi.view.demo import store_scene
+from nerg_mi.jobs.demo import store_scene
+from nerg_mi.jobs.pictures import PictureOptions, render_file
+from nerg_mi.rendering import bands
 
 output, width, height, memory = sys.argv[1], *map(int, sys.argv[2:4]), float(sys.argv[4])
 counted = []
@@ -33,7 +34,7 @@ def count(*args, **kwargs):
 bands.render_bands = count
 start = time.perf_counter()
 size = {"width": str(width), "height": str(height)}
-pictures.render_file(store_scene(), output, defaults=size, spp=1, memory=memory)
+render_file(store_scene(), output, PictureOptions(defaults=size, spp=1, memory=memory))
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 print(json.dumps({"bands": len(counted), "peak": peak, "seconds": time.perf_counter() - start}))
 """

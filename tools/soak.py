@@ -100,7 +100,7 @@ def _variant(name: str = "llvm_ad_rgb"):
 
 
 def _store(mi, **values: str):
-    from nerg_mi.view.demo import store_scene
+    from nerg_mi.jobs.demo import store_scene
 
     return mi.load_file(str(store_scene()), **(_SIZES | values))
 

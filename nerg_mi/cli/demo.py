@@ -1,11 +1,17 @@
-"""`nerg demo`: the command line of `nerg_mi.view.demo`."""
+"""`nerg demo`: the command line of `nerg_mi.jobs.demo`."""
 
 from __future__ import annotations
 
+import shutil
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from .defines import Defines, parse_defines
+from .mode import BestMode
+from .progress import TerminalReporter
 
 
 def command(
@@ -13,36 +19,24 @@ def command(
     width: Annotated[int, typer.Option(help="Width of a picture in pixels; pictures are 3:2.")] = 600,
     spp: Annotated[int, typer.Option("--spp", help="Samples a pixel.")] = 8,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random numbers.")] = 0,
-    define: Annotated[
-        list[str] | None,
-        typer.Option(
-            "-D", "--define", metavar="KEY=VALUE", help="Value for a <default> of the scene, such as eye or falloff."
-        ),
-    ] = None,
-    variant: Annotated[
-        str | None,
-        typer.Option("-m", "--mode", help="Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]"),
-    ] = None,
+    define: Defines = None,
+    mode: BestMode = None,
 ) -> None:
     """Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, EXR, run.json."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    defaults = parse_defines(define)
+    from nerg_mi.jobs import demo
 
-    from nerg_mi.rendering import pictures as rendering
-    from nerg_mi.view import demo
+    options = demo.DemoOptions(defaults=defaults, width=width, spp=spp, seed=seed, mode=mode)
+    with TerminalReporter() as reporter:
+        demo.make_demo(out, options, reporter)
+    print(f"Look at them with: {_viewer(out)}")
 
-    columns = TextColumn("{task.description:<18}"), BarColumn(), TimeElapsedColumn()
-    with Progress(*columns) as progress:
-        bar = progress.add_task("start", total=len(demo.STAGES))
-        result = demo.run_demo(
-            out,
-            defaults=rendering.parse_defines(define or []),
-            width=width,
-            spp=spp,
-            seed=seed,
-            variant=variant,
-            on_stage=lambda name: progress.update(bar, description=name, completed=demo.STAGES.index(name)),
-        )
-        progress.update(bar, description="done", completed=len(demo.STAGES))
-    for path in result.files:
-        print(f"wrote {path}")
-    print(f"Look at them with: {demo.look(out)}")
+
+def _viewer(out: Path) -> str:
+    """The command with which this machine shows the pictures in ``out``."""
+    first = out / "occlusion.png"
+    opener = "open" if sys.platform == "darwin" else "xdg-open"
+    if shutil.which(opener):
+        return f"{opener} {first}"
+    # A machine without a desktop: any browser that reaches it will do.
+    return f"python3 -m http.server --bind 127.0.0.1 --directory {out} 8000, then http://127.0.0.1:8000/{first.name}"

@@ -47,13 +47,7 @@ def export_mesh(
     from nerg_mi.jobs import export
 
     options = export.MeshOptions(
-        resolution=resolution,
-        density=density,
-        fill=fill,
-        keep=keep,
-        unseen=unseen,
-        up=up,
-        mode=mode_of(mode, variant),
+        resolution=resolution, density=density, fill=fill, keep=keep, unseen=unseen, up=up, mode=mode_of(mode, variant)
     )
     with TerminalReporter() as reporter:
         export.export_mesh(field, output, options, reporter)
@@ -98,9 +92,7 @@ def export_volume(
 
 
 @app.command("torch-ngp")
-def export_torch_ngp(
-    field: _Field, output: _Output, mode: Mode = "llvm_ad_rgb", variant: OldMode = None
-) -> None:
+def export_torch_ngp(field: _Field, output: _Output, mode: Mode = "llvm_ad_rgb", variant: OldMode = None) -> None:
     """A torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes."""
     from nerg_mi.jobs import export
 

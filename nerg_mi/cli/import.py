@@ -44,12 +44,7 @@ def command(
     if output is None and gaze is None:
         raise NergError("nothing is asked for: give -o FIELD.safetensors, --gaze GAZE.safetensors, or both.")
     options = checkpoints.ImportOptions(
-        ema=ema,
-        color_space=color_space,
-        bg_radius=bg_radius,
-        finest=finest,
-        half=half,
-        mode=mode_of(mode, variant),
+        ema=ema, color_space=color_space, bg_radius=bg_radius, finest=finest, half=half, mode=mode_of(mode, variant)
     )
     with TerminalReporter() as reporter:
         checkpoints.import_checkpoint(file, output, gaze, options, reporter)

@@ -212,10 +212,7 @@ class RadianceScoreOptions:
 
 
 def evaluate_radiance(
-    field: str | Path,
-    photos: str | Path,
-    options: RadianceScoreOptions | None = None,
-    reporter: Reporter = SILENT,
+    field: str | Path, photos: str | Path, options: RadianceScoreOptions | None = None, reporter: Reporter = SILENT
 ) -> ViewScores:
     """PSNR, SSIM and, where the ``photos`` have depth, its error, of the ``field`` in a checkpoint as rendered by the
     integrator.

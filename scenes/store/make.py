@@ -124,14 +124,14 @@ def main(argv=None) -> None:
     parser.add_argument(
         "--stage", action="append", choices=list(STAGES), help="only this one; may be given several times"
     )
-    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
     args = parser.parse_args(argv)
 
     import mitsuba as mi
 
     from nerg_mi.files.atomic import check_folder
 
-    mi.set_variant(args.variant)
+    mi.set_variant(args.mode)
     job = Job(args.seed)
     check_folder(job.store)
     check_folder(job.build)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks import store_twin
-from nerg_mi.view.demo import store_scene
+from nerg_mi.jobs.demo import store_scene
 from tests.view.standins import write_standins
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.store_visibility import PAIRS, measure, near_edges
-from nerg_mi.view.demo import store_scene
+from nerg_mi.jobs.demo import store_scene
 from tests.view.standins import write_standins
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import nerg_mi.cli
-from nerg_mi.view import demo
+from nerg_mi.jobs import demo
+from nerg_mi.rendering.channels import render_channels
 from tests.cli.test_render import NERG, interrupt
 from tests.pictures import mitsuba_bitmap
 from tests.view.standins import write_standins
@@ -66,10 +67,8 @@ def test01_writes_and_names_everything(rgb, standins, tmp_path, capsys):
 
 def test02_equal_seeds_equal_files(rgb, standins, tmp_path):
     def outputs(name, seed):
-        sizes = {"width": 36, "spp": 1}
-        return demo.run_demo(tmp_path / name, defaults=standins, seed=seed, variant="llvm_ad_rgb", **sizes).report[
-            "outputs"
-        ]
+        options = demo.DemoOptions(defaults=standins, seed=seed, mode="llvm_ad_rgb", width=36, spp=1)
+        return demo.make_demo(tmp_path / name, options).report["outputs"]
 
     first, second, other = outputs("a", 3), outputs("b", 3), outputs("c", 4)
     assert first == second
@@ -97,18 +96,17 @@ def test05_the_store_itself(rgb, tmp_path):
         pytest.skip(f"{', '.join(missing)} of the store are not made yet: {demo.MAKE}")
     scene = rgb.load_file(str(demo.store_scene()), width="60", height="40")
     without = rgb.load_file(str(demo.store_scene()), width="60", height="40", occlusion="false", radiance="false")
-    hidden, plain = (demo._render(rgb, s, demo.CAMERA, 1, 0) for s in (scene, without))
+    hidden, plain = (render_channels(s, s.sensors()[demo.CAMERA], 1) for s in (scene, without))
     assert hidden.mask.mean() > 0.99
     seen = hidden.aovs["visibility"]
     assert 0.15 < seen.mean() < 0.6
     # The observer's point and the camera's agree where it is seen; elsewhere gaze is gone.
     assert np.all(hidden.aovs["gaze"][seen == 0] == 0) and plain.aovs["gaze"][seen == 0].max() > 0
-    x, y = demo._pixel_of_observer(rgb, scene)
+    x, y = demo.observer_pixel(scene)
     assert 0 < x < 60 and 0 < y < 40
-    sphere = demo._render(
-        rgb, rgb.load_file(str(demo.store_scene()), sphere_width="64", sphere_height="32"), demo.SPHERE, 1, 0
-    )
-    assert 0.7 < demo._integral(sphere) < 1.3  # a density over the sphere
+    small = rgb.load_file(str(demo.store_scene()), sphere_width="64", sphere_height="32")
+    sphere = render_channels(small, small.sensors()[demo.SPHERE], 1)
+    assert 0.7 < demo.sphere_integral(sphere) < 1.3  # a density over the sphere
 
 
 def test06_ctrl_c_ends_it_and_leaves_nothing(standins, tmp_path):

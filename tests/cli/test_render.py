@@ -109,7 +109,7 @@ def test05b_a_mistake_of_the_program_while_it_renders_is_told_as_one(scene, tmp_
             'in a plugin:\nTraceback (most recent call last):\n  File "x.py", line 1, in f\nTypeError: no len()'
         )
 
-    monkeypatch.setattr("nerg_mi.rendering.pictures.bands.render_bands", broken)
+    monkeypatch.setattr("nerg_mi.rendering.bands.render_bands", broken)
     assert nerg("render", scene, "-o", tmp_path / "out.exr") == 70
     assert "internal error" in capsys.readouterr().err and not (tmp_path / "out.exr").exists()
 

@@ -156,16 +156,16 @@ def test_pictures_of_a_scene_are_looked_at(tmp_path, name):
 
 
 def test_samples_of_the_option_are_bounded(tmp_path):
-    from nerg_mi.rendering.pictures import render_file
+    from nerg_mi.jobs.pictures import PictureOptions, render_file
 
     with pytest.raises(NergError, match="1 to 16,777,216"):
-        render_file(tmp_path / "s.xml", tmp_path / "a.exr", spp=1 << 31)
+        render_file(tmp_path / "s.xml", tmp_path / "a.exr", PictureOptions(spp=1 << 31))
 
 
 def test_the_other_ways_in_are_guarded(tmp_path):
     from nerg_mi.evaluation.study import subject as study_subject
+    from nerg_mi.jobs.demo import DemoOptions, make_demo
     from nerg_mi.training.geometry.places import place_of_scene
-    from nerg_mi.view.demo import run_demo
     from tests.view.standins import write_standins
 
     (tmp_path / "s.xml").write_text(scene(DEEP))
@@ -176,4 +176,5 @@ def test_the_other_ways_in_are_guarded(tmp_path):
     with pytest.raises(NergError, match="deep"):
         study_subject._load(tmp_path / "s.xml", 8, 8, {})
     with pytest.raises(NergError, match="deep"):
-        run_demo(tmp_path / "out", scene=tmp_path / "s.xml", defaults=write_standins(tmp_path), variant="llvm_ad_rgb")
+        options = DemoOptions(scene=tmp_path / "s.xml", defaults=write_standins(tmp_path), mode="llvm_ad_rgb")
+        make_demo(tmp_path / "out", options)

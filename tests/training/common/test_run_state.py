@@ -13,8 +13,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_checkpoint
-from nerg_mi.training.common.run_state import load_run, save_run
 from nerg_mi.formats.fields import save_radiance
+from nerg_mi.training.common.run_state import load_run, save_run
 from nerg_mi.training.radiance.run import train_field
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.training.radiance.test_trainer import BOX, TINY, dataset, settings  # noqa: F401  (fixture)

@@ -8,32 +8,30 @@ the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field
 from __future__ import annotations
 
 import hashlib
-import platform
-import shutil
-import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from nerg_mi import __version__, llvm
+from nerg_mi import __version__
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.files.tables import write_json
 from nerg_mi.interruption import Interruption
-from nerg_mi.rendering.bands import render_bands
+from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import activate, load_scene
+from nerg_mi.view import figures
+from nerg_mi.view.overlay import Heat, top_of
+from nerg_mi.view.tonemap import srgb, write_png
 
-from . import figures
-from .overlay import Heat, top_of
-from .tonemap import srgb, write_png
+from .reporter import SILENT, Reporter
+from .versions import versions
 
 CAMERA, OWN, SPHERE = range(3)
-SURFACE = 0.5
-"""Opacity from which on a pixel shows a surface, as the integrator has it."""
+"""Index of each sensor."""
 
 CHECKPOINTS = {"field": "store.safetensors", "gaze": "shoppers.safetensors"}
 MAKE = "python -m nerg_mi.scenes.store.make"
@@ -41,18 +39,22 @@ MAKE = "python -m nerg_mi.scenes.store.make"
 STAGES = ("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures")
 
 
-@dataclass(frozen=True)
-class Render:
-    """A render taken apart: ``color`` (h, w, 3) linear, ``aovs`` each (h, w), ``bitmap`` with all channels."""
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """Which pictures the demo makes."""
 
-    color: np.ndarray
-    aovs: dict[str, np.ndarray]
-    bitmap: object
-
-    @property
-    def mask(self) -> np.ndarray:
-        """Where there is a surface (h, w), bool."""
-        return self.aovs["opacity"] >= SURFACE
+    # Scene file; None: the demo store's.
+    scene: Path | None = None
+    # Values for its `<default>`s, such as eye or falloff.
+    defaults: Mapping[str, str] = field(default_factory=dict)
+    # Of a picture in pixels; pictures are 3:2, the sphere's is 2:1 and as wide.
+    width: int = 600
+    # Samples a pixel.
+    spp: int = 8
+    # Seed of the random numbers.
+    seed: int = 0
+    # Mitsuba variant; None: cuda_ad_rgb if it works, else llvm_ad_rgb.
+    mode: str | None = None
 
 
 @dataclass(frozen=True)
@@ -64,36 +66,24 @@ class DemoResult:
     report: dict
 
 
-def run_demo(
-    out: str | Path,
-    *,
-    scene: str | Path | None = None,
-    defaults: Mapping[str, str] | None = None,
-    width: int = 600,
-    spp: int = 8,
-    seed: int = 0,
-    variant: str | None = None,
-    on_stage: Callable[[str], None] | None = None,
-) -> DemoResult:
+def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Reporter = SILENT) -> DemoResult:
     """Render all pictures of the demo into the folder ``out``, which is made.
 
-    ``scene``: another file than the store's scene.xml; ``defaults``: values for its `<default>`s; ``width`` in pixels
-    of a picture (3:2; the sphere's is 2:1 and as wide); ``spp``: samples a pixel; ``variant`` None: the best that
-    works; ``on_stage`` is told the name of each of `STAGES` as it begins. Raises NergError where a checkpoint is
-    missing, and KeyboardInterrupt, between two steps of less than a second, after Ctrl-C.
+    The reporter's progress names each of `STAGES` as it begins. Raises `NergError` where a checkpoint is missing, and
+    ``KeyboardInterrupt``, between two steps of less than a second, after Ctrl-C.
     """
+    options = options or DemoOptions()
+    width, spp, seed = options.width, options.spp, options.seed
     if width < 12 or spp < 1:
         raise NergError(f"the demo needs pictures of at least 12 pixels and 1 sample a pixel, got {width} and {spp}.")
     out = Path(out)
     check_folder(out)
-    scene = store_scene() if scene is None else Path(scene)
-    inputs = _inputs(scene, defaults or {})
-    active = activate(variant)
-    import mitsuba as mi
-
-    clock = _Clock(on_stage)
+    scene = store_scene() if options.scene is None else Path(options.scene)
+    inputs = _inputs(scene, options.defaults)
+    mode = activate(options.mode)
+    clock = _Clock(reporter)
     sizes = {"width": width, "height": 2 * width // 3, "sphere_width": width // 2 * 2, "sphere_height": width // 2}
-    values = {k: str(v) for k, v in sizes.items()} | dict(defaults or {})
+    values = {k: str(v) for k, v in sizes.items()} | dict(options.defaults)
     values |= {"aovs": "depth,opacity,gaze,visibility"}
 
     with Interruption() as stop:
@@ -104,19 +94,19 @@ def run_demo(
             raise NergError(
                 f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama.'
             )
+        render = lambda of, index: render_channels(of, of.sensors()[index], spp, seed, lambda done, total: stop.check())
         clock.start("camera")
-        camera = _render(mi, seen, CAMERA, spp, seed, stop.check)
+        camera = render(seen, CAMERA)
         clock.start("own view")
-        own = _render(mi, seen, OWN, spp, seed, stop.check)
+        own = render(seen, OWN)
         clock.start("gaze sphere")
-        sphere = _render(mi, seen, SPHERE, spp, seed, stop.check)
+        sphere = render(seen, SPHERE)
         clock.start("without occlusion")
-        without = _render(mi, unhidden, CAMERA, spp, seed, stop.check)
+        without = render(unhidden, CAMERA)
         stop.check()
 
     clock.start("pictures")
-    versions = _versions(active)
-    header = {"Software": f"nerg_mi {__version__}", "Comment": f"seed {seed}, {spp} samples a pixel, {active}"}
+    header = {"Software": f"nerg_mi {__version__}", "Comment": f"seed {seed}, {spp} samples a pixel, {mode}"}
     # One scale for all pictures of gaze, so that a colour means the same in each of them.
     tops = [top_of(r.aovs["gaze"], r.mask) for r in (own, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)]
     if not tops:
@@ -124,8 +114,7 @@ def run_demo(
             f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer.'
         )
     heat = Heat(max(tops))
-    marker = _pixel_of_observer(mi, seen)
-    files = _write_pictures(out, camera, own, sphere, without, heat, marker, header)
+    files = _write_pictures(out, camera, own, sphere, without, heat, observer_pixel(seen), header)
     camera.bitmap.metadata()["seed"] = seed
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
@@ -133,20 +122,23 @@ def run_demo(
 
     report = {
         "command": "nerg demo",
-        "versions": versions,
-        "variant": active,
+        "versions": versions(mode),
+        "variant": mode,
         "seed": seed,
         "spp": spp,
         **sizes,
-        "defaults": dict(defaults or {}),
+        "defaults": dict(options.defaults),
         "gaze_scale_top_per_sr": heat.top,
-        "gaze_sphere_integral": _integral(sphere),
+        "gaze_sphere_integral": sphere_integral(sphere),
         "seconds": {k: round(v, 2) for k, v in clock.seconds.items()},
         "inputs": {p.name: checksum(p) for p in inputs},
         "outputs": {p.name: checksum(p) for p in files},
     }
     write_json(out / "run.json", report)
-    return DemoResult([*files, out / "run.json"], clock.seconds, report)
+    files.append(out / "run.json")
+    for path in files:
+        reporter.message(f"wrote {path}")
+    return DemoResult(files, clock.seconds, report)
 
 
 def store_scene() -> Path:
@@ -178,20 +170,11 @@ def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
     return paths
 
 
-def _render(mi, scene, index: int, spp: int, seed: int, check: Callable[[], None] | None = None) -> Render:
-    """``check`` is called between two steps, and may raise."""
-    names = scene.integrator().aov_names()
-    on_strip = None if check is None else lambda done, total: check()
-    (band,) = render_bands(scene, scene.sensors()[index], spp=spp, seed=seed, on_strip=on_strip)
-    pixels = np.array(band.film.develop())
-    color = pixels[..., : pixels.shape[2] - len(names)]
-    aovs = {n.split(".")[0]: pixels[..., color.shape[2] + k] for k, n in enumerate(names)}
-    # Mono variants render one channel.
-    return Render(np.broadcast_to(color[..., :3], (*color.shape[:2], 3)), aovs, band.film.bitmap())
+def observer_pixel(scene) -> tuple[float, float] | None:
+    """Where the observer of ``scene`` stands in the camera's picture: (x, y) in pixels, counted from the first one's
+    centre; None outside of it."""
+    import mitsuba as mi
 
-
-def _pixel_of_observer(mi, scene):
-    """Where the observer stands in the picture of the camera, in pixels (x, y); None outside of it."""
     from nerg_mi.transport.observer.viewpoint import center
 
     camera = scene.sensors()[CAMERA]
@@ -205,10 +188,10 @@ def _pixel_of_observer(mi, scene):
     if depth <= 0 or not (0 < x < 1 and 0 < y < 1):
         return None
     width, height = film.crop_size()
-    return x * width - 0.5, y * height - 0.5  # imshow counts from the first pixel's centre
+    return x * width - 0.5, y * height - 0.5
 
 
-def _integral(sphere: Render) -> float:
+def sphere_integral(sphere: Channels) -> float:
     """What the gaze density adds up to over the observer's sphere: 1 for a density that is one."""
     from nerg_mi.transport.panorama import pixel_solid_angles
 
@@ -221,8 +204,17 @@ def _integral(sphere: Render) -> float:
 # ----------------------------------------------------------------------------
 
 
-def _write_pictures(out: Path, camera, own, sphere, without, heat: Heat, marker, header) -> list[Path]:
-    total = _integral(sphere)
+def _write_pictures(
+    out: Path,
+    camera: Channels,
+    own: Channels,
+    sphere: Channels,
+    without: Channels,
+    heat: Heat,
+    marker: tuple[float, float] | None,
+    header: dict[str, str],
+) -> list[Path]:
+    total = sphere_integral(sphere)
     drawn = {
         "occlusion": lambda: figures.occlusion_figure(
             (own.color, own.aovs["gaze"], own.mask),
@@ -253,49 +245,19 @@ def _write_pictures(out: Path, camera, own, sphere, without, heat: Heat, marker,
     return files
 
 
-def _versions(variant: str) -> dict[str, str]:
-    import drjit
-    import mitsuba
-
-    versions = {
-        "nerg_mi": __version__,
-        "mitsuba": mitsuba.__version__,
-        "drjit": drjit.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
-    library = llvm.current()
-    if variant.startswith("llvm") and library is not None:
-        versions["libLLVM"] = ".".join(map(str, library.version))
-    if variant.startswith("cuda"):
-        versions["cuda"] = ".".join(map(str, drjit.detail.cuda_version()))
-    return versions
-
-
 class _Clock:
     """Seconds of one stage after the other."""
 
-    def __init__(self, on_stage):
+    def __init__(self, reporter: Reporter):
         self.seconds: dict[str, float] = {}
-        self._on_stage, self._name, self._since = on_stage, None, 0.0
+        self._reporter, self._name, self._since = reporter, "", 0.0
 
     def start(self, name: str) -> None:
         self.stop()
         self._name, self._since = name, time.perf_counter()
-        if self._on_stage is not None:
-            self._on_stage(name)
+        self._reporter.progress(STAGES.index(name) / len(STAGES), name)
 
     def stop(self) -> None:
-        if self._name is not None:
+        if self._name:
             self.seconds[self._name] = time.perf_counter() - self._since
-            self._name = None
-
-
-def look(out: str | Path) -> str:
-    """The command with which this machine shows the pictures in ``out``."""
-    first = Path(out) / "occlusion.png"
-    opener = "open" if sys.platform == "darwin" else "xdg-open"
-    if shutil.which(opener):
-        return f"{opener} {first}"
-    # A machine without a desktop: any browser that reaches it will do.
-    return f"python3 -m http.server --bind 127.0.0.1 --directory {out} 8000, then http://127.0.0.1:8000/{first.name}"
+            self._name = ""
