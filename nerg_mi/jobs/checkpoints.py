@@ -56,8 +56,8 @@ def import_checkpoint(
 ) -> ImportedFields:
     """Read a checkpoint (.pth) of torch-ngp, or of the NeRG paper's authors; nothing in the file is run.
 
-    ``output``, ``gaze``: files for the radiance and the gaze field (.safetensors), None: not written. Raises `NergError`
-    where the file does not hold what is to be written, and for what the user can mend.
+    ``output``, ``gaze``: files for the radiance and the gaze field (.safetensors), None: not written. Raises
+    `NergError` where the file does not hold what is to be written, and for what the user can mend.
     """
     options = options or ImportOptions()
     output, gaze = (None if path is None else Path(path) for path in (output, gaze))

@@ -81,8 +81,10 @@ def export_mesh(
     options: MeshOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> Export:
-    """Write a mesh by marching cubes, with vertex colours: .ply or .glb. Needs scikit-image; raises `NergError` for what
-    the user can mend."""
+    """Write a mesh by marching cubes, with vertex colours: .ply or .glb. Needs scikit-image.
+
+    Raises `NergError` for what the user can mend.
+    """
     options, output, start = options or MeshOptions(), Path(output), time.perf_counter()
     write = _surface_writer(output, options.up)
     found = mesh(
@@ -98,8 +100,8 @@ def export_mesh(
         f"at, and {r['floater_faces']:,} of {r['pieces'] - r['pieces_kept']:,} floaters; {r['pieces_kept']} pieces kept"
     )
     reporter.message(
-        f"{len(found.vertices):,} vertices, {len(found.faces):,} faces; open edges: {r['edges_at_the_box']:,} where the "
-        f"box cuts, {r['edges_of_holes']:,} around holes"
+        f"{len(found.vertices):,} vertices, {len(found.faces):,} faces; open edges: {r['edges_at_the_box']:,} where "
+        f"the box cuts, {r['edges_of_holes']:,} around holes"
     )
     return _written([output], start, reporter, found)
 

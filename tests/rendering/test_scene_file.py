@@ -174,7 +174,7 @@ def test_the_other_ways_in_are_guarded(tmp_path):
     with pytest.raises(NergError, match="there is no scene file"):
         place_of_scene(tmp_path / "missing.xml")
     with pytest.raises(NergError, match="deep"):
-        study_subject._load(tmp_path / "s.xml", 8, 8, {})
+        study_subject.load_subject(tmp_path / "s.xml", 8, 8, {})
     with pytest.raises(NergError, match="deep"):
         options = DemoOptions(scene=tmp_path / "s.xml", defaults=write_standins(tmp_path), mode="llvm_ad_rgb")
         make_demo(tmp_path / "out", options)

@@ -67,7 +67,7 @@ def settings(subject, quick: bool = False) -> list[Setting]:
             rows.append(Setting(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
     rows.append(Setting("jitter", "jitter", {"jitter": True}))
     rows += _visibility(quick) + _left_out(subject) + _samples(quick)
-    if hasattr(subject, "analytic"):
+    if subject.resampled:
         for r in RESOLUTIONS[:1] if quick else RESOLUTIONS:
             for rule in RULES.names():
                 rows.append(Setting(f"grid {r}, {rule}", "resolution", {"quadrature": rule}, resolution=r))

@@ -6,7 +6,8 @@ reference is a render with much smaller steps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from nerg_mi.transport.place import Place
 from . import reference as study_reference
 from . import scenes as study_scenes
 from . import shapes as study_shapes
+from .errors import errors
 from .reference import Truth
 
 KINDS = ("auto", "analytic", "file")
@@ -37,9 +39,33 @@ _CONVERGED = {
 }
 
 
-def open_subject(scene: str, kind: str, width: int, height: int, defaults: Mapping[str, str] | None = None) -> Subject:
-    """The scene called, or in the file, ``scene``, with a picture of ``width`` x ``height``. Raises NergError for what
-    the user can mend."""
+@dataclass(frozen=True)
+class ExactSurfaces:
+    """Where the surfaces of a place exactly are; arrays (N, 3) float64, in scene units. ``cast(origins, directions)``:
+    distances (N,) along unit rays, inf on a miss; ``visible(eye, points)``: whether (N,) nothing lies between."""
+
+    cast: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    visible: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def no_surfaces(scene: Path) -> ExactSurfaces | None:
+    """Of scene files of whose surfaces nothing is known."""
+    return None
+
+
+def open_subject(
+    scene: str,
+    kind: str,
+    width: int,
+    height: int,
+    defaults: Mapping[str, str] | None = None,
+    surfaces: Callable[[Path], ExactSurfaces | None] = no_surfaces,
+) -> Subject:
+    """The scene called, or in the file, ``scene``, with a picture of ``width`` x ``height`` pixels.
+
+    ``kind``: one of `KINDS`; ``defaults``: of a scene file; ``surfaces``: what is known of the surfaces that the field
+    in a scene file stands for. Raises NergError for what the user can mend.
+    """
     if kind not in KINDS:
         raise NergError(f'there is no kind of scene "{kind}": choose one of {", ".join(KINDS)}.')
     if kind == "analytic" or (kind == "auto" and scene in study_scenes.SCENES):
@@ -49,7 +75,7 @@ def open_subject(scene: str, kind: str, width: int, height: int, defaults: Mappi
     if not Path(scene).is_file():
         names = ", ".join(study_scenes.SCENES)
         raise NergError(f'there is no scene file "{scene}", and no analytic scene of that name; those are {names}.')
-    return _load(Path(scene), width, height, defaults or {})
+    return load_subject(Path(scene), width, height, defaults or {}, surfaces)
 
 
 class Subject:
@@ -62,6 +88,8 @@ class Subject:
     has_gaze = True
     marched = True
     """Whether there is a medium, whose marching can be set."""
+    resampled = False
+    """Whether its density can be had as a grid of other resolutions."""
 
     def _set_up(self, scene, sensor, base: dict) -> None:
         self.scene, self.sensor, self.base = scene, sensor, base
@@ -149,6 +177,8 @@ class Subject:
 class AnalyticSubject(Subject):
     """A scene of `study_scenes`."""
 
+    resampled = True
+
     def __init__(self, scene: study_scenes.AnalyticScene, width: int, height: int):
         import mitsuba as mi
 
@@ -197,16 +227,13 @@ class AnalyticSubject(Subject):
 class FileSubject(Subject):
     """A scene file whose integrator is ``nerg`` and whose first sensor takes the picture.
 
-    Where a ``twin.xml`` lies beside it, its shapes say where surfaces exactly are.
+    ``surfaces``: where its surfaces exactly are; None where that is not known.
     """
 
-    def __init__(self, path: Path, loaded, width: int, height: int):
+    def __init__(self, path: Path, loaded, width: int, height: int, surfaces: ExactSurfaces | None = None):
         integrator, sensor = loaded.integrator(), loaded.sensors()[0]
-        self.name, self.twin = (
-            path.stem if path.stem != "scene" else path.resolve().parent.name,
-            path.parent / "twin.xml",
-        )
-        self.opaque = self.twin.is_file()
+        self.name = path.stem if path.stem != "scene" else path.resolve().parent.name
+        self.surfaces, self.opaque = surfaces, surfaces is not None
         children = integrator.children
         self.has_gaze = "gaze" in children
         self._set_up(loaded, sensor, {**children, **parameters(integrator), "aovs": self.aovs()})
@@ -221,8 +248,6 @@ class FileSubject(Subject):
 
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
         """A render with steps `FINER` times shorter, and how far one with steps twice as long is from it."""
-        from .errors import errors
-
         kinds = {**_CONVERGED, "depth": depth, "visibility": visibility, "radiance": True}
         fine, half = (
             self.channels(self.integrator({**kinds, "step": self.step / n}), 1, seed) for n in (FINER, FINER // 2)
@@ -235,18 +260,14 @@ class FileSubject(Subject):
         return Truth(*(fine[n] for n in names), known.gaze, known.source, errors(half, known))
 
     def exact(self, seed: int):
-        if not self.opaque:
+        if self.surfaces is None:
             return None
-        from nerg_mi.scenes.store import twin
-
         o, d = self.rays(seed)
-        shapes = twin.load_twin(self.twin)
-        t = twin.cast(o, d, shapes)
-        eye = self.eye()
+        t = self.surfaces.cast(o, d)
         hit = np.isfinite(t)
         seen = np.zeros(len(t), bool)
         # A millimetre before the surface: the point itself must not hide itself.
-        seen[hit] = twin.visible(eye, o[hit] + d[hit] * (t[hit, None] - 1e-3), shapes)
+        seen[hit] = self.surfaces.visible(self.eye(), o[hit] + d[hit] * (t[hit, None] - 1e-3))
         return t, seen
 
 
@@ -288,7 +309,14 @@ class ShapesSubject(FileSubject):
         return t, hit & (met > distance - 1e-6)
 
 
-def _load(path: Path, width: int, height: int, defaults: Mapping[str, str]) -> FileSubject:
+def load_subject(
+    path: Path,
+    width: int,
+    height: int,
+    defaults: Mapping[str, str],
+    surfaces: Callable[[Path], ExactSurfaces | None] = no_surfaces,
+) -> FileSubject:
+    """The scene in the file ``path``, of a field or of shapes; as `open_subject` has it."""
     loaded = load_scene(path, defaults)
     if type(loaded.integrator()).__name__ != "NergIntegrator":
         raise NergError(f'the integrator of "{path}" is not "nerg": name a scene whose integrator is.')
@@ -300,7 +328,9 @@ def _load(path: Path, width: int, height: int, defaults: Mapping[str, str]) -> F
         )
     if loaded.integrator().medium is not None and len(loaded.shapes()) > 0:
         raise NergError(f'"{path}" holds a field and shapes, of which there is no reference: study each alone.')
-    return (ShapesSubject if loaded.integrator().medium is None else FileSubject)(path, loaded, width, height)
+    if loaded.integrator().medium is None:
+        return ShapesSubject(path, loaded, width, height)
+    return FileSubject(path, loaded, width, height, surfaces(path))
 
 
 def parameters(integrator) -> dict:

@@ -99,6 +99,33 @@ def write_tables(out: Path, report: dict) -> list[Path]:
     return paths
 
 
+def summary(report: dict) -> list[str]:
+    """The default beside the paper's marching, in words: a line each."""
+    lines = []
+    for pair in report["against_paper"]:
+        paper, default = pair["paper"], pair["default"]
+        if not lines:
+            lines.append(_line(default))
+        lines.append(_line(paper))
+        if pair["equal_time"]:
+            lines.append(
+                f"  no slower: {pair['equal_time']['setting']}, "
+                f"depth error {pair['equal_time']['error_ratio']:.1f} times less"
+            )
+        if pair["equal_error"]:
+            lines.append(
+                f"  no worse: {pair['equal_error']['setting']}, {pair['equal_error']['time_ratio']:.1f} times faster"
+            )
+    return lines
+
+
+def _line(row: dict) -> str:
+    return (
+        f"{row['setting']}: {1000 * row['seconds']:.0f} ms, {row['density_evals']:.0f} density evaluations a pixel, "
+        f"depth error {row['depth_mae']:.2g} (99 %: {row['depth_p99']:.2g})"
+    )
+
+
 # Column of study.csv, its heading to read, and what it is multiplied with.
 _SHOWN = (
     ("seconds", "ms", 1e3),
@@ -124,7 +151,8 @@ def markdown(report: dict) -> str:
     default = rows[0]
     head = ["setting", *(title for _, title, _ in shown)]
     text = [
-        f"{report['scene']}, {report['size'][0]} x {report['size'][1]}, {report['variant']}, reference: {report['reference']}"
+        f"{report['scene']}, {report['size'][0]} x {report['size'][1]}, {report['variant']}, "
+        f"reference: {report['reference']}"
     ]
     if report["reference_change_when_step_halved"]:
         change = ", ".join(f"{k} {v:.2g}" for k, v in report["reference_change_when_step_halved"].items())

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.study import shapes as study_shapes
-from nerg_mi.evaluation.study.run import run_study
 from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.jobs.study import StudyOptions, run_study
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.geometry.surfaces import box_exit
@@ -76,9 +76,8 @@ def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
 def test03_the_study_of_a_default_recipe(rgb, tmp_path, shapes):
     path = scene(tmp_path, "default recipe", shapes)
     only = "transmittance" if shapes else "paper, 64 steps$|jitter"
-    report = run_study(
-        str(path), tmp_path / "out", width=12, height=8, quick=True, only=only, variant="llvm_ad_rgb"
-    ).report
+    options = StudyOptions(width=12, height=8, quick=True, only=only, mode="llvm_ad_rgb")
+    report = run_study(path, tmp_path / "out", options).report
     rows = {r["setting"]: r for r in report["rows"]}
     assert len(rows) >= 2 and all(r["gaze_mae"] < 0.05 and np.isfinite(r["gaze_kld"]) for r in rows.values())
     assert rows["default"]["gaze_mae"] < 1e-3

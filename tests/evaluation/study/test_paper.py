@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import drjit as dr
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.study import paper as study_paper
+from nerg_mi.evaluation.study import scenes as study_scenes
 from nerg_mi.evaluation.study.subject import open_subject
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.transport.media.local_ray import LocalRay
+from tests.reference import march_numpy
 
 
 @pytest.fixture
@@ -88,3 +91,30 @@ def test_empty_cells_are_left_without_a_loss(dt_gamma):
         inside = (p[2] < 1) & (p[2] >= 0)
         full = grid.bits[np.clip(cell[2], 0, 4), np.clip(cell[1], 0, 3), np.clip(cell[0], 0, 5)] & inside
         assert np.abs(leaping[2] - full.sum(0)).max() <= 3 and np.median(np.abs(leaping[2] - full.sum(0))) == 0
+
+
+def test_the_papers_depth_is_unnormalised_and_at_the_steps_end():
+    subject = open_subject("slab", "auto", 12, 8)
+    o, d = subject.rays(1)
+    steps = 64
+    step = subject.extent / steps
+    seen = subject.channels(
+        study_paper.as_in_the_paper(subject.integrator(), subject.sensor, subject.tolerance, steps), 1, 1
+    )
+    for i in range(0, len(o), 7):
+        hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
+        depth, T = 0.0, 1.0
+        if hit is not None:
+            t = hit[0]
+            while t < hit[1]:
+                w = T * -math.expm1(-study_scenes.SLAB_DENSITY * step)
+                t += step
+                depth, last = depth + w * t, T < study_paper.STOP
+                T -= w
+                if last:
+                    break
+        assert abs(seen["depth"][i] - depth) < 2e-2 * step + 0.04 * (1 - seen["opacity"][i])
+        assert abs(seen["opacity"][i] - (1 - T)) < 2e-2
+    half = (seen["opacity"] > 0.3) & (seen["opacity"] < 0.9)
+    known = subject.truth(1, "expected", "depth")
+    assert half.any() and np.all(seen["depth"][half] < 0.95 * known.depth[half])

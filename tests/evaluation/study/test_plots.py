@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
@@ -88,3 +90,8 @@ def test_both_pictures_are_as_wide_and_their_lines_as_thin(drawn):
     assert pixels[0] == pixels[1] and errors.get_size_inches()[1] > cost.get_size_inches()[1]
     widths = {line.get_linewidth() for f in drawn for a in f.axes for line in a.lines}
     assert widths == {cost.axes[0].lines[0].get_linewidth()}
+
+
+def test_exponent():
+    x = np.array([1.0, 2, 8, 64])
+    assert math.isclose(study_plots.exponent(x, 3 * x**1.5), 1.5)

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.study.settings import RESOLUTIONS, STEP_COUNTS, settings
+from nerg_mi.evaluation.study.subject import open_subject
 
 
 @pytest.fixture(scope="module")
 def rows():
-    return settings(SimpleNamespace(marched=True, extent=2.0, has_gaze=True, analytic=None))
+    return settings(SimpleNamespace(marched=True, extent=2.0, has_gaze=True, resampled=True))
 
 
 def test_sweeps_are_even_on_a_log_axis(rows):
@@ -50,3 +51,36 @@ def test_rows_do_what_their_names_say(rows):
             assert gamma == 1 / int(found[1]), row.name
         elif row.paper:
             assert row.paper[1] == 0, row.name
+
+
+def test_settings_vary_one_factor_at_a_time():
+    subject = open_subject("slab", "auto", 12, 8)
+    rows = settings(subject)
+    assert rows[0].name == "default" and not rows[0].params
+    names = [r.name for r in rows]
+    assert len(set(names)) == len(names)
+    for rule in ("constant", "linear"):
+        assert {r.params["step"] for r in rows if r.group == f"steps, {rule}"} == {
+            subject.extent / n for n in STEP_COUNTS
+        }
+    groups = {r.group for r in rows}
+    assert groups >= {
+        "dt_gamma",
+        "coarse",
+        "stop",
+        "color_cutoff",
+        "depth",
+        "visibility",
+        "jitter",
+        "leave out",
+        "spp",
+        "resolution",
+        "paper",
+    }
+
+
+def test_a_quick_study_is_a_part_of_a_whole_one():
+    subject = open_subject("slab", "auto", 12, 8)
+    whole = {r.name for r in settings(subject)}
+    quick = [r for r in settings(subject, quick=True) if r.group not in ("visibility", "spp", "paper")]
+    assert len(quick) > 15 and {r.name for r in quick} <= whole

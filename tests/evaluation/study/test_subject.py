@@ -1,10 +1,14 @@
-"""What a study knows exactly of a scene file: the surfaces of the twin beside it."""
+"""What a study knows of its subjects: where surfaces are, and the limit that a scene file is compared with."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from nerg_mi.evaluation.study import scenes as study_scenes
 from nerg_mi.evaluation.study.subject import open_subject
+from nerg_mi.jobs.study import twin_beside
+from tests.reference import march_numpy
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="40"/></volume>
@@ -24,7 +28,7 @@ def test_the_twin_says_what_the_observer_sees(rgb, tmp_path):
     eye = np.array([-2.0, -1.0, 3.0])
     (tmp_path / "scene.xml").write_text(SCENE.format(eye=", ".join(map(str, eye))))
     (tmp_path / "twin.xml").write_text(TWIN)
-    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 24, 16)
+    subject = open_subject(str(tmp_path / "scene.xml"), "auto", 24, 16, surfaces=twin_beside)
     assert np.allclose(subject.eye(), eye)
     t, visible = subject.exact(1)
     o, d = subject.rays(1)
@@ -34,3 +38,47 @@ def test_the_twin_says_what_the_observer_sees(rgb, tmp_path):
     assert 50 < hit.sum() < hit.size and np.allclose(np.abs(p - 0.5).max(axis=1), 0.5, atol=1e-5)
     # A convex body hides the faces that look away: of the three in the picture x = 1, from an eye at x < 0.
     assert set(face) == {0, 1, 2} and np.array_equal(visible[hit], face != 0) and not visible[~hit].any()
+
+
+def test_solids_are_met_where_geometry_says():
+    subject = open_subject("sphere", "auto", 24, 16)
+    t, visible = subject.exact(1)
+    o, d = subject.rays(1)
+    hit = np.isfinite(t)
+    center, radius = study_scenes.SPHERE_CENTER, study_scenes.SPHERE_RADIUS
+    p = o[hit] + d[hit] * t[hit, None]
+    normal = (p - center) / radius
+    assert hit.any() and np.allclose(np.linalg.norm(normal, axis=-1), 1, atol=1e-6)
+    # A convex body hides from an observer what faces away.
+    towards = np.asarray(subject.analytic.observer) - p
+    assert np.array_equal(visible[hit], (towards * normal).sum(-1) > 0) and 0 < visible[hit].mean() < 1
+    assert not visible[~hit].any() and open_subject("fog", "auto", 4, 4).exact(1) is None
+
+
+def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text("""<scene version="3.0.0">
+      <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="4"/></volume></integrator>
+      <sensor type="perspective"><float name="fov" value="30"/>
+        <transform name="to_world"><lookat origin="0.5, 0.5, -2" target="0.5, 0.5, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="99"/><rfilter type="box"/><string name="component_format" value="float32"/></film>
+      </sensor></scene>""")
+    subject = open_subject(str(path), "auto", 12, 8)
+    known = subject.truth(1, "median", "depth")
+    assert known.depth.shape == (96,) and not subject.has_gaze and subject.exact(1) is None
+    o, d = subject.rays(1)
+    slab = study_scenes.SCENES["slab"]
+    for i in range(0, 96, 13):
+        hit = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
+        median = 0 if hit is None else march_numpy.slab(4.0, *hit)[2]
+        assert abs(known.depth[i] - median) < 1e-5
+    assert slab.name == "slab" and known.convergence["depth_mae"] < 1e-5
+    bad = (
+        path.read_text()
+        .replace('<integrator type="nerg">', '<integrator type="path">')
+        .replace("<volume", "<!--")
+        .replace("</volume>", "-->")
+    )
+    path.write_text(bad)
+    with pytest.raises(ValueError, match='is not "nerg"'):
+        open_subject(str(path), "file", 12, 8)

@@ -1,0 +1,154 @@
+"""The study of error against run time: a scene at many settings, each compared with what is true."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation.study import errors, measure, plots, tables
+from nerg_mi.evaluation.study.settings import Setting, settings
+from nerg_mi.evaluation.study.subject import ExactSurfaces, Subject, open_subject
+from nerg_mi.files.atomic import check_folder
+from nerg_mi.rendering.pictures import activate
+
+from .reporter import SILENT, Reporter
+from .versions import versions
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """What a study renders, and how often."""
+
+    # What the scene is: analytic, file, or auto to find out.
+    scene_kind: str = "auto"
+    # Of a picture in pixels.
+    width: int = 192
+    # Of a picture in pixels.
+    height: int = 128
+    # Timed renders of each setting; their median counts.
+    repeats: int = 5
+    # A few settings only, each timed once.
+    quick: bool = False
+    # Regular expression that the names of further settings than the default match.
+    only: str = ""
+    # Values for the `<default>`s of a scene file.
+    defaults: Mapping[str, str] = field(default_factory=dict)
+    # Mitsuba variant; None: cuda_ad_rgb if it works, else llvm_ad_rgb.
+    mode: str | None = None
+
+
+@dataclass(frozen=True)
+class StudyResult:
+    """``files`` written; ``report``: what study.json holds, ``rows`` and ``against_paper`` in it."""
+
+    files: list[Path]
+    report: dict
+
+
+def run_study(
+    scene: str | Path, out: str | Path, options: StudyOptions | None = None, reporter: Reporter = SILENT
+) -> StudyResult:
+    """Study ``scene``, a scene file or the name of an analytic scene, and write tables and plots into the folder
+    ``out``: study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots.
+
+    Raises `NergError` for what the user can mend, before anything is written.
+    """
+    options = options or StudyOptions()
+    width, height = options.width, options.height
+    if min(width, height) < 4 or options.repeats < 1:
+        raise NergError(
+            "a study needs pictures of at least 4 x 4 pixels and one timed render, "
+            f"got {width} x {height} and {options.repeats}."
+        )
+    wanted = _expression(options.only)
+    out = Path(out)
+    check_folder(out)
+    mode = activate(options.mode)
+    import drjit as dr
+
+    begin = time.perf_counter()
+    reporter.progress(0.0, "open")
+    subject = open_subject(str(scene), options.scene_kind, width, height, options.defaults, twin_beside)
+    rows = _chosen(settings(subject, options.quick), wanted, options.only)
+    repeats = 1 if options.quick else options.repeats
+    done = 0
+
+    def step(name: str) -> None:
+        nonlocal done
+        # The rows' first renders and their times, and the scaling, which is about a tenth of it.
+        reporter.progress(min(done / (2.2 * len(rows)), 0.99), name)
+        done += 1
+
+    table = measure.measure(subject, rows, repeats, 16 if options.quick else measure.PIXEL_SPP, step)
+    tables.mark_fronts(table)
+    scaling = measure.scaling(subject, min(repeats, 3), options.quick, step)
+    known = subject.truth(measure.SEED, "expected", "depth")
+    report = {
+        "scene": subject.name,
+        "variant": mode,
+        "size": [width, height],
+        "extent": subject.extent,
+        "step": subject.step,
+        "tolerance": subject.tolerance,
+        "reference": known.source,
+        "reference_change_when_step_halved": known.convergence,
+        "precision": measure.precision(),
+        "gaze_kld_eps": errors.KLD_EPS,
+        "repeats": repeats,
+        "threads": dr.thread_count(),
+        "peak_mb": "what Dr.Jit allocated at most during a first render, in MiB, beyond scene and field",
+        "seconds_of_study": time.perf_counter() - begin,
+        "versions": versions(mode),
+        "against_paper": tables.against_paper(table),
+        "rows": table,
+        "scaling": scaling,
+    }
+    files = _write(out, subject, report)
+    for line in tables.summary(report):
+        reporter.message(line)
+    for path in files:
+        reporter.message(f"wrote {path}")
+    return StudyResult(files, report)
+
+
+def _expression(only: str) -> re.Pattern:
+    try:
+        return re.compile(only)
+    except re.error as error:
+        raise NergError(f'"{only}" is no regular expression ({error}): name settings as in "depth|paper".') from error
+
+
+def _chosen(all_settings: list[Setting], wanted: re.Pattern, only: str) -> list[Setting]:
+    """The first of the settings, which is the default, and those whose names match."""
+    default, *others = all_settings
+    rows = [default, *(row for row in others if wanted.search(row.name))]
+    if only and len(rows) == 1:
+        raise NergError(
+            f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}".'
+        )
+    return rows
+
+
+def twin_beside(scene: Path) -> ExactSurfaces | None:
+    """The surfaces of the ``twin.xml`` beside a scene file; None where there is none."""
+    file = scene.parent / "twin.xml"
+    if not file.is_file():
+        return None
+    from nerg_mi.scenes.store import twin
+
+    shapes = twin.load_twin(file)
+    return ExactSurfaces(partial(twin.cast, scene=shapes), partial(twin.visible, scene=shapes))
+
+
+def _write(out: Path, subject: Subject, report: dict) -> list[Path]:
+    files = tables.write_tables(out, report)
+    width, height = report["size"]
+    title = f"{subject.name}, {width} x {height}, {report['variant']}"
+    plots.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}")
+    plots.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}")
+    return [*files, out / "errors.png", out / "scaling.png"]

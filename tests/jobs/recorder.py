@@ -1,0 +1,23 @@
+"""A reporter that keeps what it is told."""
+
+from __future__ import annotations
+
+
+class Recorder:
+    def __init__(self):
+        self.messages: list[str] = []
+        self.warnings: list[str] = []
+        self.steps: list[tuple[float, str]] = []
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(text)
+
+    def progress(self, share: float, text: str = "") -> None:
+        self.steps.append((share, text))
+
+    def share_at(self, text: str) -> float:
+        """The share that was told with ``text`` last."""
+        return {t: share for share, t in self.steps}[text]
