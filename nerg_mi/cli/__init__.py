@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import importlib
 import os
-import signal
 import sys
-import threading
 import traceback
 from typing import Annotated
 
 import typer
 
 from nerg_mi import __version__
-from nerg_mi.errors import expected, sentence
+
+from .ending import INTERRUPTED, CtrlC, end_of, flush_output
 
 COMMANDS = {
     "demo": "Render the demo store: pictures of what a gaze field is.",
@@ -36,8 +35,7 @@ COMMANDS = {
 """Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""
 
 
-FAULT = 70
-"""Exit code of a mistake in the program (EX_SOFTWARE of sysexits.h)."""
+_DEBUG = ("--debug", "--traceback")
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -50,82 +48,29 @@ def main(arguments: list[str] | None = None) -> None:
     has one, says how to go on.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    debug = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0") or not {"--debug", "--traceback"}.isdisjoint(
-        arguments
-    )
+    asked_by_environment = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0")
+    debug = asked_by_environment or not set(_DEBUG).isdisjoint(arguments)
     # Allowed anywhere on the line: it is added after something went wrong, at the end.
-    arguments = [a for a in arguments if a not in ("--debug", "--traceback")]
-    with _Listening() as ctrl_c:
+    arguments = [a for a in arguments if a not in _DEBUG]
+    with CtrlC() as ctrl_c:
         try:
-            _app(next((a for a in arguments if not a.startswith("-")), None))(arguments, prog_name="nerg")
+            build_app(next((a for a in arguments if not a.startswith("-")), None))(arguments, prog_name="nerg")
         except BaseException as error:
             interrupt = ctrl_c.behind(error)
             if interrupt is not None:
                 print(str(interrupt) or "Interrupted.", file=sys.stderr)
-                sys.exit(130)
-            _flush()
+                sys.exit(INTERRUPTED)
+            flush_output()
             if not isinstance(error, Exception):  # the end of a command
                 raise
             if debug:
                 traceback.print_exception(error)
-            mendable = expected(error)
-            print(f"nerg: {sentence(error) if mendable else _fault(error)}", file=sys.stderr)
-            sys.exit(1 if mendable else FAULT)
+            code, text = end_of(error)
+            print(f"nerg: {text}", file=sys.stderr)
+            sys.exit(code)
 
 
-def _fault(error: Exception) -> str:
-    said = " ".join(str(error).split())
-    return (
-        f"internal error ({type(error).__name__}{': ' + said if said else ''}): this is a fault of nerg_mi and not of your input; "
-        "run again with --debug and report the traceback."
-    )
-
-
-def _flush() -> None:
-    """Write what is left for the standard output; where nobody reads it any more, the interpreter must not try
-    again."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-class _Listening:
-    """Ctrl-C as `KeyboardInterrupt`, and afterwards whether it was what ended a command."""
-
-    def __enter__(self) -> _Listening:
-        self._heard = False
-        # Only where Python's own handler is at work: elsewhere Ctrl-C is somebody else's business.
-        self._mine = (
-            threading.current_thread() is threading.main_thread()
-            and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        )
-        if self._mine:
-            signal.signal(signal.SIGINT, self._hear)
-        return self
-
-    def _hear(self, *_) -> None:
-        self._heard = True
-        raise KeyboardInterrupt
-
-    def behind(self, end: BaseException) -> KeyboardInterrupt | None:
-        """The interrupt that led to ``end``; None where it is another error, or the command was done.
-
-        Typer makes an exit with code 130 of it, which has it as its cause. Mitsuba makes an error of its own of it
-        where it is raised in a plugin, with nothing but text.
-        """
-        link: BaseException | None = end
-        while link is not None and not isinstance(link, KeyboardInterrupt):
-            link = link.__cause__ or link.__context__
-        done = isinstance(end, SystemExit) and not end.code
-        return link if link is not None or not self._heard or done else KeyboardInterrupt()
-
-    def __exit__(self, *_) -> None:
-        if self._mine:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _app(asked: str | None) -> typer.Typer:
+def build_app(asked: str | None) -> typer.Typer:
     """All commands, of which only the one `asked` for is more than its name and its line of help."""
     app = typer.Typer(
         name="nerg",
@@ -162,8 +107,6 @@ def _global_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
-    debug: Annotated[
-        bool, typer.Option("--debug", "--traceback", help="Show where an error arose (also: NERG_TRACEBACK=1).")
-    ] = False,
+    debug: Annotated[bool, typer.Option(*_DEBUG, help="Show where an error arose (also: NERG_TRACEBACK=1).")] = False,
 ) -> None:
     pass

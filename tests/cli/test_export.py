@@ -6,7 +6,7 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
-from nerg_mi.cli import _app, main
+from nerg_mi.cli import build_app, main
 from tests.plugins import fields
 
 
@@ -17,7 +17,7 @@ def field(tmp_path):
 
 
 def run(*arguments):
-    return CliRunner().invoke(_app("export"), ["export", *map(str, arguments)], catch_exceptions=False)
+    return CliRunner().invoke(build_app("export"), ["export", *map(str, arguments)], catch_exceptions=False)
 
 
 def test01_mesh_and_points(tmp_path, field):

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from nerg_mi.cli import _app, main
+from nerg_mi.cli import build_app, main
 from nerg_mi.formats.torch_ngp.pickling import write_torch
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
 
 
 def run(*arguments):
-    return CliRunner().invoke(_app("import"), ["import", *map(str, arguments)])
+    return CliRunner().invoke(build_app("import"), ["import", *map(str, arguments)])
 
 
 def test01_a_nerf(tmp_path):

@@ -77,7 +77,7 @@ def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
 
 def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
     done = interrupted(
-        "training.radiance.RadianceTrainer.step",
+        "training.radiance.trainer.RadianceTrainer.step",
         WARM_UP + 4,
         "train",
         "radiance",
@@ -113,12 +113,12 @@ def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
     "name, calls, arguments",
     [
         (
-            "evaluation.radiance_scores.Renderer.__call__",
+            "evaluation.images.Renderer.__call__",
             2,
             lambda i, o: ["eval", "radiance", i / "field.safetensors", i / "photos", "--holdout", 2, "-o", o],
         ),
         (
-            "evaluation.study_measure.measure",
+            "evaluation.study.measure.measure",
             1,
             lambda i, o: [
                 "study",
@@ -165,7 +165,7 @@ def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
             ],
         ),
         (
-            "attention.tables.rays_from_table",
+            "rays.readers.tables.rays_from_table",
             1,
             lambda i, o: [
                 "rays",
