@@ -4,7 +4,7 @@ makes."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,297 +20,103 @@ from tests.view.standins import write_standins
 
 from .test_render import SCENE
 
-DEMO = (
-    "occlusion.png",
-    "gaze.png",
-    "gaze_sphere.png",
-    "depth.png",
-    "visibility.png",
-    "color.png",
-    "scene.exr",
-    "run.json",
+DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr run.json"
+STUDY = "study.csv study.md scaling.csv study.json errors.png scaling.png"
+ABLATION = (
+    "ablation.md ablation.csv ablation.json ablation.png place.vol "
+    "default_emit_capture_0.safetensors default_emit_capture_0.json"
 )
-STUDY = ("study.csv", "study.md", "scaling.csv", "study.json", "errors.png", "scaling.png")
-GAZE = (
-    "--radius",
-    "0.6",
-    "--probes",
-    "8",
-    "--steps",
-    "2",
-    "--directions",
-    "64",
-    "--zones",
-    "0",
-    "--min-rays",
-    "8",
-    "--seed",
-    "1",
-)
+EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.png"
+GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8 --seed 1"
 
 
 @dataclass(frozen=True)
 class Case:
-    """``arguments(inputs, out)``: the command line; ``files``: all that it makes below the folder ``out``; ``blocked``:
-    what of it a file or folder may stand in the way of, and is found before any work; ``once``: functions that take
-    seconds and write nothing."""
+    """``line``: the command line, with the folders ``{i}`` of the inputs and ``{o}`` of the outputs; ``files``: all
+    that it makes below the latter; ``blocked``: what of it a file or folder may stand in the way of, and is found before
+    any work; ``once``: functions that take seconds and write nothing."""
 
     name: str
-    arguments: Callable[[Path, Path], list]
+    line: str
     files: tuple[str, ...]
     blocked: tuple[str, ...] = ()
     once: tuple[str, ...] = ()
+
+    def arguments(self, inputs: Path, out: Path) -> list[str]:
+        """The command line for these folders."""
+        words = [word.format(i=inputs, o=out) for word in [*self.name.split(), *shlex.split(self.line)]]
+        if self.name == "demo":
+            names = json.loads((inputs / "demo.json").read_text())
+            words += [word for key, value in names.items() for word in ("-D", f"{key}={value}")]
+        return words
 
     @property
     def targets(self) -> tuple[str, ...]:
         return self.blocked or self.files
 
 
-def _below(folder: str, names) -> tuple[str, ...]:
-    return tuple(f"{folder}/{name}" for name in names)
-
-
-def _demo(i: Path, out: Path) -> list:
-    names = json.loads((i / "demo.json").read_text())
-    return [
-        "demo",
-        "-o",
-        out / "demo",
-        "--width",
-        24,
-        "--spp",
-        1,
-        "-m",
-        "llvm_ad_rgb",
-        *(a for k, v in names.items() for a in ("-D", f"{k}={v}")),
-    ]
+def _below(folder: str, names: str) -> tuple[str, ...]:
+    return tuple(f"{folder}/{name}" for name in names.split())
 
 
 CASES = (
-    Case("demo", _demo, _below("demo", DEMO), ("demo",)),
-    Case("render", lambda i, o: ["render", i / "scene.xml", "-o", o / "a.exr", "-m", "llvm_ad_rgb"], ("a.exr",)),
-    Case("render", lambda i, o: ["render", i / "scene.xml", "-o", o / "a.png", "-m", "llvm_ad_rgb"], ("a.png",)),
-    Case(
-        "rays import",
-        lambda i, o: [
-            "rays",
-            "import",
-            i / "day.csv",
-            "-o",
-            o / "a.npz",
-            "--map",
-            "origin=x,y,z direction=a,b,c t=t person=p",
-        ],
-        ("a.npz",),
-    ),
-    Case(
-        "rays filter", lambda i, o: ["rays", "filter", i / "rays.npz", "-o", o / "a.npz", "--person", "a"], ("a.npz",)
-    ),
-    Case(
-        "rays filter",
-        lambda i, o: ["rays", "filter", i / "rays.npz", "-o", o / "a.parquet", "--person", "a"],
-        ("a.parquet",),
-    ),
-    Case(
-        "rays split",
-        lambda i, o: ["rays", "split", i / "rays.npz", "-o", o / "a.npz", "--people", 0.5],
-        ("a-train.npz", "a-test.npz"),
-    ),
-    Case("rays plot", lambda i, o: ["rays", "plot", i / "rays.npz", "-o", o / "a.png"], ("a.png",)),
-    Case("rays plot", lambda i, o: ["rays", "plot", i / "rays.npz", "-o", o / "a.png", "--kind", "layout"], ("a.png",)),
+    Case("demo", "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb", _below("demo", DEMO), ("demo",)),
+    Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
+    Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
+    Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
+    Case("rays filter", "{i}/rays.npz -o {o}/a.npz --person a", ("a.npz",)),
+    Case("rays filter", "{i}/rays.npz -o {o}/a.parquet --person a", ("a.parquet",)),
+    Case("rays split", "{i}/rays.npz -o {o}/a.npz --people 0.5", ("a-train.npz", "a-test.npz")),
+    Case("rays plot", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
+    Case("rays plot", "{i}/rays.npz -o {o}/a.png --kind layout", ("a.png",)),
     Case(
         "train radiance",
-        lambda i, o: [
-            "train",
-            "radiance",
-            i / "photos",
-            "-o",
-            o / "a.safetensors",
-            "--steps",
-            2,
-            "--holdout",
-            2,
-            "--half",
-        ],
+        "{i}/photos -o {o}/a.safetensors --steps 2 --holdout 2 --half",
         ("a.safetensors", "a.preview.png"),
         ("a.safetensors", "a.preview.png", "a.run"),
-        ("training.density_grid.DensityGrid.bound",),
+        ("training.radiance.density_grid.DensityGrid.bound",),
     ),
     Case(
         "train gaze",
-        lambda i, o: ["train", "gaze", i / "rays.npz", "-o", o / "a.safetensors", "--geometry", "hits", *GAZE],
+        "{i}/rays.npz -o {o}/a.safetensors --geometry hits " + GAZE,
         ("a.safetensors", "a.vol"),
         ("a.safetensors", "a.vol", "a.run"),
     ),
     Case(
         "train gaze",
-        lambda i, o: [
-            "train",
-            "gaze",
-            i / "rays.npz",
-            "-o",
-            o / "a.safetensors",
-            "--geometry",
-            "none",
-            "--ensemble",
-            2,
-            *GAZE,
-        ],
+        "{i}/rays.npz -o {o}/a.safetensors --geometry none --ensemble 2 " + GAZE,
         ("a.safetensors",),
         ("a.safetensors", "a.run"),
     ),
     Case(
         "eval radiance",
-        lambda i, o: [
-            "eval",
-            "radiance",
-            i / "field.safetensors",
-            i / "photos",
-            "--holdout",
-            2,
-            "-o",
-            o / "eval",
-            "--json",
-            o / "a.json",
-        ],
+        "{i}/field.safetensors {i}/photos --holdout 2 -o {o}/eval --json {o}/a.json",
         ("eval/0.png", "eval/2.png", "a.json"),
         ("eval", "a.json"),
     ),
     Case(
         "eval gaze",
-        lambda i, o: [
-            "eval",
-            "gaze",
-            i / "gaze.safetensors",
-            i / "rays.npz",
-            "-o",
-            o / "eval",
-            "--min-rays",
-            8,
-            "--directions",
-            128,
-            "--resamples",
-            2,
-            "--pictures",
-            1,
-        ],
-        _below("eval", ("gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.png")),
+        "{i}/gaze.safetensors {i}/rays.npz -o {o}/eval --min-rays 8 --directions 128 --resamples 2 --pictures 1",
+        _below("eval", EVALUATION),
         ("eval",),
-        (
-            "evaluation.gaze.evaluation.evaluate_gaze",
-            "evaluation.gaze.evaluation.split_half",
-            "evaluation.gaze.evaluation.person_rows",
-        ),
+        tuple(f"evaluation.gaze.evaluation.{name}" for name in ("evaluate_gaze", "split_half", "person_rows")),
     ),
-    Case(
-        "import",
-        lambda i, o: ["import", i / "nerg.pth", "-o", o / "a.safetensors", "-g", o / "g.safetensors"],
-        ("a.safetensors", "g.safetensors"),
-    ),
-    Case(
-        "export mesh",
-        lambda i, o: ["export", "mesh", i / "field.safetensors", "-o", o / "a.ply", "--resolution", 8, "--density", 3],
-        ("a.ply",),
-    ),
-    Case(
-        "export mesh",
-        lambda i, o: ["export", "mesh", i / "field.safetensors", "-o", o / "a.glb", "--resolution", 8, "--density", 3],
-        ("a.glb",),
-    ),
-    Case(
-        "export points",
-        lambda i, o: [
-            "export",
-            "points",
-            i / "field.safetensors",
-            "-o",
-            o / "a.ply",
-            "--resolution",
-            8,
-            "--density",
-            3,
-        ],
-        ("a.ply",),
-    ),
-    Case(
-        "export volume",
-        lambda i, o: [
-            "export",
-            "volume",
-            i / "field.safetensors",
-            "-o",
-            o / "a.vol",
-            "--color",
-            o / "c.vol",
-            "--resolution",
-            8,
-        ],
-        ("a.vol", "c.vol"),
-    ),
-    Case(
-        "export torch-ngp", lambda i, o: ["export", "torch-ngp", i / "ngp.safetensors", "-o", o / "a.pth"], ("a.pth",)
-    ),
+    Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
+    Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
+    Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
+    Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
+    Case("export volume", "{i}/field.safetensors -o {o}/a.vol --color {o}/c.vol --resolution 8", ("a.vol", "c.vol")),
+    Case("export torch-ngp", "{i}/ngp.safetensors -o {o}/a.pth", ("a.pth",)),
     Case(
         "ablate",
-        lambda i, o: [
-            "ablate",
-            i / "rays.npz",
-            "-o",
-            o / "rows",
-            "--geometry",
-            "hits",
-            "--recipes",
-            "default",
-            "--variant",
-            "emit_capture",
-            "--seeds",
-            1,
-            "--default-steps",
-            2,
-            "--zones",
-            1,
-            "--positions",
-            4,
-            "--min-rays",
-            8,
-            "--radius",
-            0.5,
-            "--cameras",
-            0,
-            "--probes",
-            8,
-        ],
-        _below(
-            "rows",
-            (
-                "ablation.md",
-                "ablation.csv",
-                "ablation.json",
-                "ablation.png",
-                "place.vol",
-                "default_emit_capture_0.safetensors",
-                "default_emit_capture_0.json",
-            ),
-        ),
+        "{i}/rays.npz -o {o}/rows --geometry hits --recipes default --variant emit_capture --seeds 1 --default-steps 2 "
+        "--zones 1 --positions 4 --min-rays 8 --radius 0.5 --cameras 0 --probes 8",
+        _below("rows", ABLATION),
         ("rows",),
     ),
     Case(
         "study",
-        lambda i, o: [
-            "study",
-            "slab",
-            "-o",
-            o / "study",
-            "--quick",
-            "--width",
-            12,
-            "--height",
-            8,
-            "--only",
-            "jitter",
-            "-m",
-            "llvm_ad_rgb",
-        ],
+        "slab -o {o}/study --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
         _below("study", STUDY),
         ("study",),
         ("evaluation.study.measure.measure", "evaluation.study.measure.scaling"),
@@ -368,15 +174,7 @@ def make_inputs(folder: Path) -> Path:
         pose = np.eye(4)
         pose[:3, 3] = 0.05 * k, 0, 3
         frames.append({"file_path": f"{k}.png", "transform_matrix": pose.tolist()})
-    about = {
-        "w": 16,
-        "h": 14,
-        "fl_x": 60.0,
-        "fl_y": 60.0,
-        "cx": 8.0,
-        "cy": 7.0,
-        "frames": frames,
-        "aabb": [[-1, -1, -1], [1, 1, 1]],
-    }
+    lens = {"w": 16, "h": 14, "fl_x": 60.0, "fl_y": 60.0, "cx": 8.0, "cy": 7.0}
+    about = {**lens, "frames": frames, "aabb": [[-1, -1, -1], [1, 1, 1]]}
     (photos / "transforms.json").write_text(json.dumps(about))
     return folder

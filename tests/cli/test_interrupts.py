@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 
@@ -48,8 +49,8 @@ def inputs(tmp_path_factory):
     return make_inputs(tmp_path_factory.mktemp("inputs"))
 
 
-ENDLESS = ("--steps", 10**6, "--save-every", 0)
-GAZE = ("--geometry", "none", "--radius", 0.6, "--probes", 8, "--directions", 64, "--zones", 0, "--min-rays", 8)
+ENDLESS = "--steps 1000000 --save-every 0"
+GAZE = "--geometry none --radius 0.6 --probes 8 --directions 64 --zones 0 --min-rays 8"
 
 
 # Steps that a radiance training takes, and forgets, before its first.
@@ -57,17 +58,8 @@ WARM_UP = 4
 
 
 def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
-    done = interrupted(
-        "training.gaze.likelihood.LikelihoodTrainer.step",
-        4,
-        "train",
-        "gaze",
-        inputs / "rays.npz",
-        "-o",
-        tmp_path / "a.safetensors",
-        *GAZE,
-        *ENDLESS,
-    )
+    line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {ENDLESS}"
+    done = interrupted("training.gaze.likelihood.LikelihoodTrainer.step", 4, *line.split())
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.run", "a.safetensors"]
     # The step during which it came is finished.
@@ -76,16 +68,8 @@ def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
 
 
 def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
-    done = interrupted(
-        "training.radiance.trainer.RadianceTrainer.step",
-        WARM_UP + 4,
-        "train",
-        "radiance",
-        inputs / "photos",
-        "-o",
-        tmp_path / "a.safetensors",
-        *ENDLESS,
-    )
+    line = f"train radiance {inputs}/photos -o {tmp_path}/a.safetensors {ENDLESS}"
+    done = interrupted("training.radiance.trainer.RadianceTrainer.step", WARM_UP + 4, *line.split())
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.preview.png", "a.run", "a.safetensors"]
     assert read_checkpoint(tmp_path / "a.run", "radiance run")[1]["steps"] == 4
@@ -93,100 +77,44 @@ def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
 
 
 def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
-    some = ["--steps", 3, "--ensemble", 2, "--save-every", 0]
-    done = interrupted(
-        "training.gaze.likelihood.LikelihoodTrainer.step",
-        5,
-        "train",
-        "gaze",
-        inputs / "rays.npz",
-        "-o",
-        tmp_path / "a.safetensors",
-        *GAZE,
-        *some,
-    )
+    some = "--steps 3 --ensemble 2 --save-every 0"
+    line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {some}"
+    done = interrupted("training.gaze.likelihood.LikelihoodTrainer.step", 5, *line.split())
     assert done.returncode == 130 and "member 2 of 2; go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.member0.safetensors", "a.run"]
 
 
-@pytest.mark.parametrize(
-    "name, calls, arguments",
-    [
-        (
-            "evaluation.images.Renderer.__call__",
-            2,
-            lambda i, o: ["eval", "radiance", i / "field.safetensors", i / "photos", "--holdout", 2, "-o", o],
-        ),
-        (
-            "evaluation.study.measure.measure",
-            1,
-            lambda i, o: [
-                "study",
-                "slab",
-                "-o",
-                o,
-                "--quick",
-                "--width",
-                12,
-                "--height",
-                8,
-                "--only",
-                "jitter",
-                "-m",
-                "llvm_ad_rgb",
-            ],
-        ),
-        (
-            "training.gaze.likelihood.LikelihoodTrainer.step",
-            3,
-            lambda i, o: [
-                "ablate",
-                i / "rays.npz",
-                "-o",
-                o,
-                "--geometry",
-                "none",
-                "--recipes",
-                "default",
-                "--variant",
-                "emit",
-                "--zones",
-                1,
-                "--positions",
-                4,
-                "--min-rays",
-                8,
-                "--radius",
-                0.5,
-                "--cameras",
-                0,
-                "--probes",
-                8,
-            ],
-        ),
-        (
-            "rays.readers.tables.rays_from_table",
-            1,
-            lambda i, o: [
-                "rays",
-                "import",
-                i / "day.csv",
-                "-o",
-                o / "a.npz",
-                "--map",
-                "origin=x,y,z direction=a,b,c t=t person=p",
-            ],
-        ),
-        (
-            "field.extraction.Sampler.on",
-            1,
-            lambda i, o: ["export", "points", i / "field.safetensors", "-o", o / "a.ply", "--resolution", 16],
-        ),
-    ],
-    ids=["eval", "study", "ablate", "rays import", "export"],
-)
-def test_a_command_ends_at_once(name, calls, arguments, inputs, tmp_path):
-    done = interrupted(name, calls, *arguments(inputs, tmp_path / "out"))
+ENDS = {
+    "eval": (
+        "evaluation.images.Renderer.__call__",
+        2,
+        "eval radiance {i}/field.safetensors {i}/photos --holdout 2 -o {o}",
+    ),
+    "study": (
+        "evaluation.study.measure.measure",
+        1,
+        "study slab -o {o} --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
+    ),
+    "ablate": (
+        "training.gaze.likelihood.LikelihoodTrainer.step",
+        3,
+        "ablate {i}/rays.npz -o {o} --geometry none --recipes default --variant emit --zones 1 --positions 4 "
+        "--min-rays 8 --radius 0.5 --cameras 0 --probes 8",
+    ),
+    "rays import": (
+        "rays.readers.tables.rays_from_table",
+        1,
+        "rays import {i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'",
+    ),
+    "export": ("field.extraction.Sampler.on", 1, "export points {i}/field.safetensors -o {o}/a.ply --resolution 16"),
+}
+"""Function during whose so-many-th call Ctrl-C comes, and the command line with its folders of inputs and outputs."""
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_a_command_ends_at_once(name, inputs, tmp_path):
+    function, calls, line = ENDS[name]
+    done = interrupted(function, calls, *shlex.split(line.format(i=inputs, o=tmp_path / "out")))
     assert done.returncode == 130 and "Interrupted." in done.stderr and "Traceback" not in done.stderr, done.stderr
     found = sorted(p.name for p in tmp_path.rglob("*") if p.is_file())
-    assert found == (["0.png"] if "Renderer" in name else [])
+    assert found == (["0.png"] if name == "eval" else [])

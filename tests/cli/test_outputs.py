@@ -32,33 +32,10 @@ def inputs(tmp_path_factory):
 
     mi.set_variant("llvm_ad_rgb")
     folder = make_inputs(tmp_path_factory.mktemp("inputs"))
-    arguments = [
-        "train",
-        "gaze",
-        folder / "rays.npz",
-        "-o",
-        folder / "gaze.safetensors",
-        "--geometry",
-        "hits",
-        "--radius",
-        0.5,
-        "--probes",
-        8,
-        "--steps",
-        2,
-        "--directions",
-        64,
-        "--zones",
-        0,
-        "--min-rays",
-        8,
-        "--test-zones",
-        1,
-        "--test-positions",
-        3,
-    ]
+    place = "--geometry hits --radius 0.5 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8"
+    line = f"train gaze {folder}/rays.npz -o {folder}/gaze.safetensors {place} --test-zones 1 --test-positions 3"
     with pytest.raises(SystemExit) as end:
-        nerg_mi.cli.main(list(map(str, arguments)))
+        nerg_mi.cli.main(line.split())
     assert not end.value.code
     return folder
 

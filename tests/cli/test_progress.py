@@ -1,0 +1,48 @@
+"""What a job tells, on a terminal and elsewhere."""
+
+import io
+import sys
+
+import pytest
+
+from nerg_mi.cli.progress import TerminalReporter
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def streams(monkeypatch):
+    """Standard output and error, of which only the latter is a terminal."""
+    out, err = io.StringIO(), Terminal()
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", err)
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    return out, err
+
+
+def test_the_bar_is_on_the_terminal_and_messages_are_where_they_are_piped(streams):
+    out, err = streams
+    with TerminalReporter() as reporter:
+        reporter.message("[before]")
+        assert err.getvalue() == ""
+        reporter.progress(0.25, "3 s left [x]")
+        reporter.message("a line with [brackets] of " + 40 * "words ")
+        reporter.warn("thin")
+        reporter.progress(0.5, "2 s left")
+    shown = err.getvalue()
+    assert out.getvalue() == "[before]\na line with [brackets] of " + 40 * "words " + "\n"
+    assert "25%" in shown and "50%" in shown and "3 s left [x]" in shown and "warning: thin" in shown
+    # The bar is taken away again: its line is erased.
+    assert "\x1b[2K" in shown
+
+
+def test_nothing_but_messages_where_there_is_no_terminal(capsys):
+    with TerminalReporter() as reporter:
+        reporter.progress(0.5, "half")
+        reporter.message("done")
+        reporter.warn("thin")
+    assert capsys.readouterr() == ("done\n", "warning: thin\n")

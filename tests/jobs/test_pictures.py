@@ -1,0 +1,42 @@
+"""A scene file rendered by a job: the result, and what is told meanwhile."""
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.jobs.pictures import PictureOptions, render_file
+from tests.cli.test_render import SCENE
+from tests.jobs.recorder import Recorder
+from tests.pictures import mitsuba_bitmap
+
+
+@pytest.fixture
+def scene(tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    return tmp_path / "scene.xml"
+
+
+def test_the_result_is_what_was_written(scene, tmp_path):
+    told = Recorder()
+    options = PictureOptions(defaults={"level": "0.5"}, sensor=0, spp=2, mode="llvm_ad_rgb")
+    result = render_file(scene, tmp_path / "new" / "a.exr", options, told)
+    bitmap = mitsuba_bitmap(result.path)
+    assert tuple(bitmap.size()) == result.size == (16, 8) and bitmap.channel_count() == result.channels
+    assert result.mode == "llvm_ad_rgb" and result.whole is None
+    assert told.steps[-1][0] == 1 and "samples/s" in told.steps[-1][1]
+    (line,) = told.messages
+    assert line.startswith(f"Wrote {result.path} (16 x 8, {result.channels} channels, llvm_ad_rgb")
+
+
+def test_a_reporter_may_end_it(scene, tmp_path):
+    class Impatient(Recorder):
+        def progress(self, share, text=""):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_file(scene, tmp_path / "a.exr", PictureOptions(mode="llvm_ad_rgb"), Impatient())
+    assert [p.name for p in tmp_path.iterdir()] == ["scene.xml"]
+
+
+def test_a_sensor_that_is_not_there(scene, tmp_path):
+    with pytest.raises(NergError, match="has 2 sensor"):
+        render_file(scene, tmp_path / "a.exr", PictureOptions(sensor=2, mode="llvm_ad_rgb"))
