@@ -72,7 +72,7 @@ def _half_angle_tangent(camera: Camera) -> float:
     return min(i.width / (2 * i.fx), i.height / (2 * i.fy))
 
 
-def lonely(cameras: list[Camera], box: Box, grid: int = 4, depths: int = 12) -> list[int]:
+def unmatched(cameras: list[Camera], box: Box, grid: int = 4, depths: int = 12) -> list[int]:
     """Cameras that share nothing within ``box`` with any other: no sample point of their pictures is in another's.
 
     ``grid`` by ``grid`` pixels of each are followed through the box and looked for at ``depths`` places.

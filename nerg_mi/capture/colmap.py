@@ -7,14 +7,16 @@ quaternion (w, x, y, z) and a translation; cameras look along +z with y down; th
 from __future__ import annotations
 
 import hashlib
+import io
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, sentence
-from nerg_mi.files.bounded import plain, read_bytes, text_lines
+from nerg_mi.files.bounded import plain, read_bytes
 
 from .posed import FARTHEST, Frame, MaskFile, PosedImages, Unused, drop_repeated, inside, none_usable
 
@@ -54,12 +56,16 @@ _LONGEST = 1 << 20
 
 @dataclass(frozen=True)
 class _Camera:
+    """A record of ``cameras``: the ``model``'s name, the size of its pictures in pixels, and the model's parameters in
+    COLMAP's order."""
+
     model: str
     width: int
     height: int
     parameters: tuple
 
-    def lens(self) -> dict:
+    def lens(self) -> dict[str, float]:
+        """The same by the keys of `posed.LENS_KEYS`; `NergError` for a model that no lens here is."""
         names = _PARAMETERS.get(self.model)
         if names is None:
             raise NergError(
@@ -103,8 +109,10 @@ def read_colmap(
     if files is None:
         raise MissingFile(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
     binary = files["cameras"].suffix == ".bin"
-    cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"])
-    poses = (_images_bin if binary else _images_txt)(files["images"])
+    # Both are digested as well, and images.bin may have gigabytes of observations.
+    raw = {name: read_bytes(files[name], "COLMAP file") for name in ("cameras", "images")}
+    cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"], raw["cameras"])
+    poses = (_images_bin if binary else _images_txt)(files["images"], raw["images"])
     frames, unused = [], []
     root = None if allow_outside else images.parent
     for name, camera, q, t in poses:
@@ -118,8 +126,12 @@ def read_colmap(
     unused = sorted(unused + repeated, key=lambda u: u.name)
     if not frames:
         raise none_usable(files["images"], unused)
-    points = (_points_bin if binary else _points_txt)(files["points3D"]) if "points3D" in files else None
-    digest = hashlib.sha256(b"".join(hashlib.sha256(read_bytes(files[n])).digest() for n in ("cameras", "images")))
+    digest = hashlib.sha256(b"".join(hashlib.sha256(raw[name]).digest() for name in ("cameras", "images")))
+    points = None
+    if "points3D" in files:
+        points = (_points_bin if binary else _points_txt)(
+            files["points3D"], read_bytes(files["points3D"], "COLMAP file")
+        )
     return PosedImages(files["images"], frames, unused, None, digest.hexdigest(), points=points)
 
 
@@ -160,8 +172,8 @@ def _to_world(q, t) -> np.ndarray:
 class _Reader:
     """Little-endian records of a file; an end that comes too early is told with its place."""
 
-    def __init__(self, path: Path):
-        self.path, self.data, self.at = path, read_bytes(path, "COLMAP file"), 0
+    def __init__(self, path: Path, data: bytes):
+        self.path, self.data, self.at = path, data, 0
 
     def take(self, form: str, what: str) -> tuple:
         size = struct.calcsize("<" + form)
@@ -188,8 +200,8 @@ class _Reader:
         return out.decode("utf-8", errors="surrogateescape")
 
 
-def _cameras_bin(path: Path) -> dict[int, _Camera]:
-    r, out = _Reader(path), {}
+def _cameras_bin(path: Path, raw: bytes) -> dict[int, _Camera]:
+    r, out = _Reader(path, raw), {}
     for k in range(r.take("Q", "its header")[0]):
         number, model, width, height = r.take("iiQQ", f"camera record {k + 1}")
         if model not in _MODELS:
@@ -202,8 +214,8 @@ def _cameras_bin(path: Path) -> dict[int, _Camera]:
     return out
 
 
-def _images_bin(path: Path) -> list[tuple]:
-    r, out = _Reader(path), []
+def _images_bin(path: Path, raw: bytes) -> list[tuple]:
+    r, out = _Reader(path, raw), []
     for k in range(r.take("Q", "its header")[0]):
         what = f"image record {k + 1}"
         values = r.take("i7di", what)
@@ -214,8 +226,8 @@ def _images_bin(path: Path) -> list[tuple]:
     return out
 
 
-def _points_bin(path: Path) -> np.ndarray:
-    r, out = _Reader(path), []
+def _points_bin(path: Path, raw: bytes) -> np.ndarray:
+    r, out = _Reader(path, raw), []
     for k in range(r.take("Q", "its header")[0]):
         what = f"point record {k + 1}"
         values = r.take("Q3d3BdQ", what)
@@ -224,16 +236,18 @@ def _points_bin(path: Path) -> np.ndarray:
     return _trusted(out, path)
 
 
-def _lines(path: Path):
+def _lines(raw: bytes) -> Iterator[tuple[int, str]]:
     """Line numbers and lines; comments left out."""
-    for number, line in enumerate(text_lines(path, "COLMAP file"), 1):
+    # Names of images may be in any encoding.
+    text = io.TextIOWrapper(io.BytesIO(raw), encoding="utf-8", errors="surrogateescape")
+    for number, line in enumerate(text, 1):
         if not line.startswith("#"):
-            yield number, line
+            yield number, line.rstrip("\n")
 
 
-def _rows(path: Path):
+def _rows(path: Path, raw: bytes) -> Iterator[tuple[int, list[str]]]:
     """Numbers and words of the lines that are not empty."""
-    for number, line in _lines(path):
+    for number, line in _lines(raw):
         if len(line) > _LONGEST:
             raise NergError(
                 f'line {number} of "{path}" has {len(line):,} characters, and at most {_LONGEST:,} are read; '
@@ -243,9 +257,9 @@ def _rows(path: Path):
             yield number, line.split()
 
 
-def _cameras_txt(path: Path) -> dict[int, _Camera]:
+def _cameras_txt(path: Path, raw: bytes) -> dict[int, _Camera]:
     out = {}
-    for number, words in _rows(path):
+    for number, words in _rows(path, raw):
         try:
             out[int(words[0])] = _Camera(words[1], int(words[2]), int(words[3]), tuple(map(float, words[4:])))
         except (ValueError, IndexError) as e:
@@ -253,9 +267,9 @@ def _cameras_txt(path: Path) -> dict[int, _Camera]:
     return out
 
 
-def _images_txt(path: Path) -> list[tuple]:
+def _images_txt(path: Path, raw: bytes) -> list[tuple]:
     out, observations = [], False
-    for number, line in _lines(path):
+    for number, line in _lines(raw):
         # Every second line lists observations, and may be empty.
         if observations:
             observations = False
@@ -274,9 +288,9 @@ def _images_txt(path: Path) -> list[tuple]:
     return out
 
 
-def _points_txt(path: Path) -> np.ndarray:
+def _points_txt(path: Path, raw: bytes) -> np.ndarray:
     out = []
-    for number, words in _rows(path):
+    for number, words in _rows(path, raw):
         try:
             out.append((*map(float, words[1:4]), float(words[7]), (len(words) - 8) // 2))
         except (ValueError, IndexError) as e:

@@ -10,7 +10,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
 
-from .bounds import lonely, scene_box
+from .bounds import scene_box, unmatched
 from .cameras import pixel_directions
 from .images import View, load_usable
 from .posed import PosedImages, Unused
@@ -25,18 +25,23 @@ _DEPTH_POINTS = 2000
 
 @dataclass(frozen=True)
 class Dataset:
-    """``train``, ``held_out``: views in the coordinates asked for; ``box``: where density may be, and ``box_from``
-    how that was found; ``unused``: frames that were left out, each with its reason; ``source``: for provenance;
-    ``notes``: sentences about frames that are used with something missing; ``unit``: a sentence on the length of a
-    unit."""
+    """Views in the coordinates asked for, and what is known of the place that they show."""
 
+    # To train on.
     train: list[View]
+    # To score on, never to learn from.
     held_out: list[View]
+    # Where density may be.
     box: Box
+    # How the box was found, the end of a sentence.
     box_from: str
+    # Frames that were left out, each with its reason.
     unused: list[Unused]
+    # For provenance (JSON).
     source: dict
+    # Sentences about frames that are used with something missing.
     notes: list[str] | tuple = ()
+    # A sentence on the length of a unit.
     unit: str = ""
 
 
@@ -69,11 +74,12 @@ def open_dataset(
         )
     held_out, bad_held = load_usable(split.held_out, width, downscale, depth)
     box, box_from = _box(split.posed, train, aabb)
-    alone = lonely([v.camera for v in train], box) if len(train) > 1 else []
+    alone = unmatched([v.camera for v in train], box) if len(train) > 1 else []
     if len(alone) == len(train):
         raise NergError(
-            f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") look at the '
-            f"same place within the box {_corners(box)}; check the poses, or give a box that holds what they show with --aabb"
+            f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") look '
+            f"at the same place within the box {_corners(box)}; check the poses, or give a box that holds what they show "
+            "with --aabb"
         )
     if alone:
         bad += [Unused(train[k].name, "no other frame looks at what it shows") for k in alone]
@@ -85,7 +91,7 @@ def open_dataset(
         "transforms": split.posed.path.name,
         "sha256": split.posed.sha256,
         "training_frames": len(train),
-        "held_out": {"how": split.how, "frames": [v.name for v in held_out]},
+        "held_out": {"how": split.rule, "frames": [v.name for v in held_out]},
         "unused": {u.name: u.reason for u in unused},
         "width": train[0].shape[1],
         "height": train[0].shape[0],
@@ -100,15 +106,15 @@ def _box(posed: PosedImages, views: list[View], aabb) -> tuple[Box, str]:
     if aabb is not None:
         if len(aabb) != 6:
             raise NergError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
-        given, how = np.reshape(np.asarray(aabb, float), (2, 3)), "as given"
+        given, source = np.reshape(np.asarray(aabb, float), (2, 3)), "as given"
     elif posed.aabb is not None:
-        given, how = posed.aabb, f'"aabb" of {posed.path.name}'
+        given, source = posed.aabb, f'"aabb" of {posed.path.name}'
     else:
         points = posed.points if posed.points is not None else _depth_points(views)
         return scene_box([v.camera for v in views], all(v.has_alpha for v in views), points)
     tight = Box(tuple(given[0]), tuple(given[1]))
     pad = _PAD * tight.side
-    return Box(tuple(given[0] - pad), tuple(given[1] + pad)), f"{how}, grown by {pad:.3g} on every side"
+    return Box(tuple(given[0] - pad), tuple(given[1] + pad)), f"{source}, grown by {pad:.3g} on every side"
 
 
 def _depth_points(views: list[View]) -> np.ndarray | None:
@@ -133,9 +139,9 @@ def _unit(posed: PosedImages, views: list[View], box: Box, scale: float) -> str:
     centers = np.array([v.camera.center for v in views])
     size = " x ".join(f"{u - l:.3g}" for l, u in zip(box.lower, box.upper))
     spread = " x ".join(f"{x:.3g}" for x in np.ptp(centers, axis=0))
-    said = f"the box measures {size} units, the cameras spread over {spread}"
+    extent = f"the box measures {size} units, the cameras spread over {spread}"
     if scale != 1:
-        return f"{said}; a unit of the data set counts {scale:g}"
+        return f"{extent}; a unit of the data set counts {scale:g}"
     if any(f.depth is not None and f.depth.along_axis and f.depth.path.suffix.lower() == ".png" for f in posed.frames):
-        return f"{said}; a unit is a metre if the depth files count millimetres"
-    return f"{said}; if a unit is not a metre, give its length in metres with --scale"
+        return f"{extent}; a unit is a metre if the depth files count millimetres"
+    return f"{extent}; if a unit is not a metre, give its length in metres with --scale"

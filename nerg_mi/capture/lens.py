@@ -63,9 +63,9 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
         good = np.all(np.abs(distort(u, lens) - goal) < 1e-6) and np.all(a * d - b * b > 0) and np.all(a + d > 0)
     if not good:
         names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        said = ", ".join(f"{k}={v:g}" for k, v in zip(names, lens.distortion) if v)
+        listed = ", ".join(f"{k}={v:g}" for k, v in zip(names, lens.distortion) if v)
         raise NergError(
-            f"the distortion {said} cannot be inverted over the whole image; undistort the images beforehand, "
+            f"the distortion {listed} cannot be inverted over the whole image; undistort the images beforehand, "
             "or crop them"
         )
     return u

@@ -17,7 +17,6 @@ from nerg_mi.files.bounded import plain
 
 from .intrinsics import Intrinsics
 
-# Keys of `Frame.lens`, all floats; "fisheye" is 1 for fisheye lenses.
 LENS_KEYS = (
     "w",
     "h",
@@ -37,7 +36,8 @@ LENS_KEYS = (
     "camera_angle_y",
     "fisheye",
 )
-
+"""Keys of `Frame.lens`, all floats: pixels, radians, and coefficients as `Intrinsics` has them; "fisheye" is 1 for
+fisheye lenses."""
 
 FARTHEST = 1e12
 """Nothing may lie farther from the origin, in units: beyond, differences of positions are lost."""
@@ -54,8 +54,8 @@ def inside(root: Path | None, path: Path, what: str) -> Path:
     """
     if root is not None and not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):
         raise NergError(
-            f'its {what} "{plain(path)}" lies outside of the data set\'s folder "{root}"; move it there, or allow this with '
-            "--allow-outside"
+            f'its {what} "{plain(path)}" lies outside of the data set\'s folder "{root}"; move it there, or allow this '
+            "with --allow-outside"
         )
     return path
 
@@ -112,7 +112,8 @@ class Frame:
         fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
         if fx is None or not all(_FOCAL[0] * w <= f <= _FOCAL[1] * w for f in (fx, fy)):
             raise NergError(
-                f'frame "{plain(self.name)}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in radians'
+                f'frame "{plain(self.name)}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in '
+                "radians"
             )
         if not (abs(lens.get("cx", 0)) <= 100 * w and abs(lens.get("cy", 0)) <= 100 * h):
             raise NergError(
@@ -144,26 +145,28 @@ class Unused:
 
 @dataclass(frozen=True)
 class PosedImages:
-    """What a file says about its frames, sorted by file name.
+    """What a file says about its frames, sorted by file name."""
 
-    ``unused``: frames that cannot be used; ``notes``: sentences about frames that can, with something missing;
-    ``aabb``: (2, 3) scene box from the file, or None; ``points``: (N, 3) points on surfaces, or None;
-    ``held_out``: names of the frames that the file itself holds out, or None; ``spare``: of frames that it sets apart
-    from both; ``original``: (4, 4) similarity from these coordinates to those before the writer turned them
-    (``applied_transform``), or None; ``to_file``: (4, 4) similarity from these coordinates to those of the file;
-    ``sha256``: of the file, for provenance.
-    """
-
+    # The file.
     path: Path
     frames: list[Frame]
+    # Frames that cannot be used.
     unused: list[Unused]
+    # (2, 3) corners of the scene box, from the file, or None.
     aabb: np.ndarray | None
+    # Of the file, for provenance.
     sha256: str
+    # Sentences about frames that are used with something missing.
     notes: list[str] = field(default_factory=list)
+    # (N, 3) on surfaces, or None.
     points: np.ndarray | None = None
+    # Names of the frames that the file itself holds out, or None.
     held_out: list[str] | None = None
+    # Names of the frames that it sets apart from both.
     spare: list[str] = field(default_factory=list)
+    # (4, 4) similarity from these coordinates to those before the writer turned them (applied_transform), or None.
     original: np.ndarray | None = None
+    # (4, 4) similarity from these coordinates to those of the file.
     to_file: np.ndarray = field(default_factory=lambda: np.eye(4))
 
     def moved(self, similarity: np.ndarray) -> PosedImages:
@@ -243,8 +246,8 @@ def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
             kept.append(frame)
             continue
         same = np.allclose(first[key].to_world, frame.to_world, atol=1e-6)
-        said = "" if same else ", with another pose; the first counts"
-        unused.append(Unused(frame.name, f"its image is listed twice{said}"))
+        more = "" if same else ", with another pose; the first counts"
+        unused.append(Unused(frame.name, f"its image is listed twice{more}"))
     return kept, unused
 
 

@@ -20,11 +20,12 @@ COORDINATES = ("file", "original")
 
 @dataclass(frozen=True)
 class Split:
-    """``posed``: the training file, its frames those to train on; ``held_out``: frames; ``how`` they were chosen."""
+    """``posed``: the training file, its frames those to train on; ``held_out``: frames, chosen by the ``rule``, a few
+    words for provenance."""
 
     posed: PosedImages
     held_out: list[Frame]
-    how: str
+    rule: str
 
 
 def find_source(dataset: str | Path) -> Path:
@@ -41,8 +42,8 @@ def find_source(dataset: str | Path) -> Path:
         if model_files(dataset / name) is not None:
             return dataset / name
     raise MissingFile(
-        f'"{dataset}" holds neither transforms.json nor transforms_train.json nor a COLMAP model (sparse/0/cameras.bin); '
-        "name the folder of a posed image set"
+        f'"{dataset}" holds neither transforms.json nor transforms_train.json nor a COLMAP model '
+        "(sparse/0/cameras.bin); name the folder of a posed image set"
     )
 
 

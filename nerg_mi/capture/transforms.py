@@ -202,8 +202,8 @@ def _lens(data: dict) -> dict:
         or any(str(k).startswith("ftheta") for k in data)
     ):
         raise NergError(
-            f'its lens model "{plain(model, 60)}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, p2, '
-            'to "OPENCV_FISHEYE" with k1 to k4, or to "PINHOLE"'
+            f'its lens model "{plain(model, 60)}" is not supported; undistort the images to "OPENCV" with k1, k2, p1, '
+            'p2, to "OPENCV_FISHEYE" with k1 to k4, or to "PINHOLE"'
         )
     lens = {k: _number(data, k) for k in LENS_KEYS if k != "fisheye" and data.get(k) is not None}
     if not all(np.isfinite(v) for v in lens.values()):

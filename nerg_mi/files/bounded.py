@@ -34,9 +34,6 @@ JSON_VALUES = 8_000_000
 JSON_DEPTH = 64
 """So deep may arrays and objects be nested; what this package reads is six deep at most."""
 
-LINE_CHARACTERS = 16 << 20
-"""A line of a text file may be so long: COLMAP lists all observations of an image on one."""
-
 _DAMAGED = (
     OSError,
     EOFError,
@@ -177,22 +174,3 @@ def _check_json(text: str, path, what: str) -> None:
         raise NergError(
             f'the {what} "{path}" is nested {depth:,} deep, and at most {JSON_DEPTH} deep is read; make it anew'
         )
-
-
-def text_lines(
-    path: str | os.PathLike, what: str = "file", errors: str = "surrogateescape", most: int = LINE_CHARACTERS
-) -> Iterator[str]:
-    """Lines of the text file ``path`` (UTF-8) without their ends; `NergError` for a line of more than ``most``
-    characters.
-    """
-    size_of(path, what)
-    with reading(path, what), open(path, encoding="utf-8", errors=errors) as file:
-        number = 0
-        while line := file.readline(most + 1):
-            number += 1
-            if len(line) > most:
-                raise NergError(
-                    f'line {number} of the {what} "{path}" has more than the {most:,} characters that are read; '
-                    "is it a text file?"
-                )
-            yield line.rstrip("\n")

@@ -146,7 +146,8 @@ def _check_faces(path: Path, element: _Element, rows, vertices: int) -> None:
                 corner = part[f"{name}.{k}"]
                 if np.any(corner < 0) or np.any(corner >= vertices):
                     raise NergError(
-                        f'the mesh "{path}" has a face with a corner that is none of its {vertices:,} vertices; export it again.'
+                        f'the mesh "{path}" has a face with a corner that is none of its {vertices:,} vertices; '
+                        "export it again."
                     )
 
 

@@ -35,8 +35,8 @@ def activate(variant: str | None = None) -> str:
             raise
         except ImportError as error:  # Mitsuba says so where the backend of a variant cannot start
             failed = error
-    said = sentence(failed)
-    raise NergError(f'the variant "{wanted[-1]}" does not work here ({said}); "nerg doctor" says how to mend it.')
+    reason = sentence(failed)
+    raise NergError(f'the variant "{wanted[-1]}" does not work here ({reason}); "nerg doctor" says how to mend it.')
 
 
 def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.capture.bounds import lonely, scene_box
+from nerg_mi.capture.bounds import scene_box, unmatched
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.maths.box import Box
@@ -77,9 +77,9 @@ def test_few_points_are_no_evidence():
 
 def test_a_camera_that_sees_what_no_other_does_is_found():
     box = Box((-3, -3, -3), (5, 7, 9))
-    assert lonely(AROUND, box) == []
+    assert unmatched(AROUND, box) == []
     away = looking(np.array([1, 2, 8.9]), [1, 2, 30])
     ring = [looking(np.array([1 + 4 * np.cos(a), 2 + 4 * np.sin(a), 3]), [1, 2, 3]) for a in np.arange(0, 6, 0.5)]
-    assert lonely([*ring[:4], away, *ring[4:]], Box((-3, -3, -3), (5, 7, 40))) == [4]
+    assert unmatched([*ring[:4], away, *ring[4:]], Box((-3, -3, -3), (5, 7, 40))) == [4]
     outside = looking(np.array([100.0, 0, 0]), [200, 0, 0])
-    assert lonely([*AROUND, outside], box) == [20]
+    assert unmatched([*AROUND, outside], box) == [20]

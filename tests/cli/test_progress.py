@@ -3,8 +3,6 @@
 import io
 import sys
 
-import pytest
-
 from nerg_mi.cli.progress import TerminalReporter
 
 
@@ -13,9 +11,8 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture
-def streams(monkeypatch):
-    """Standard output and error, of which only the latter is a terminal."""
+def replace_streams(monkeypatch):
+    """Another standard output and error, of which only the latter is a terminal."""
     out, err = io.StringIO(), Terminal()
     monkeypatch.setattr(sys, "stdout", out)
     monkeypatch.setattr(sys, "stderr", err)
@@ -24,18 +21,18 @@ def streams(monkeypatch):
     return out, err
 
 
-def test_the_bar_is_on_the_terminal_and_messages_are_where_they_are_piped(streams):
-    out, err = streams
+def test_the_bar_is_on_the_terminal_and_messages_are_where_they_are_piped(monkeypatch):
+    out, err = replace_streams(monkeypatch)
     with TerminalReporter() as reporter:
         reporter.message("[before]")
         assert err.getvalue() == ""
-        reporter.progress(0.25, "3 s left [x]")
+        reporter.progress(0.25, "3 s left")
         reporter.message("a line with [brackets] of " + 40 * "words ")
         reporter.warn("thin")
-        reporter.progress(0.5, "2 s left")
+        reporter.progress(0.5, "2 s left [x]")
     shown = err.getvalue()
     assert out.getvalue() == "[before]\na line with [brackets] of " + 40 * "words " + "\n"
-    assert "25%" in shown and "50%" in shown and "3 s left [x]" in shown and "warning: thin" in shown
+    assert "50%" in shown and "2 s left [x]" in shown and "warning: thin" in shown
     # The bar is taken away again: its line is erased.
     assert "\x1b[2K" in shown
 

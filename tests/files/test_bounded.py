@@ -10,7 +10,7 @@ import pytest
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files import bounded
-from nerg_mi.files.bounded import parse_json, plain, read_bytes, read_json, reading, size_of, text_lines
+from nerg_mi.files.bounded import parse_json, plain, read_bytes, read_json, reading, size_of
 
 
 @pytest.mark.parametrize(
@@ -105,15 +105,6 @@ def test_what_is_no_json_is_told_with_the_file(tmp_path, raw):
     (tmp_path / "a.json").write_bytes(raw)
     with pytest.raises(NergError, match=r"a\.json"):
         read_json(tmp_path / "a.json")
-
-
-def test_lines_are_bounded(tmp_path):
-    (tmp_path / "a.txt").write_bytes(b"one\r\ntwo \xff\n\nlast")
-    assert list(text_lines(tmp_path / "a.txt")) == ["one", "two \udcff", "", "last"]
-    with pytest.raises(NergError, match="line 2 .* more than the 4 characters"):
-        list(text_lines(tmp_path / "a.txt", most=4))
-    with pytest.raises(NergError, match="a.txt"):
-        list(text_lines(tmp_path / "a.txt", errors="strict"))
 
 
 def test_words_of_a_file_are_made_fit_for_a_message():

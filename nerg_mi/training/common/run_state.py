@@ -113,8 +113,8 @@ def kept_unless(path: Path | None, keep: Callable[[], None], done: bool) -> Iter
             # The same full disk: an older state stays, and what could not be written first is what is told.
             raise error from None
         if isinstance(error, NergError):
-            said = str(error).rstrip(".")
-            raise NergError(f"{said}; the training is kept: once that is mended, --resume writes it") from error
+            reason = str(error).rstrip(".")
+            raise NergError(f"{reason}; the training is kept: once that is mended, --resume writes it") from error
         if isinstance(error, KeyboardInterrupt):
             raise KeyboardInterrupt(f"interrupted; go on with --resume (state in {path})") from error
         raise
@@ -160,6 +160,6 @@ def require_same(path: str | Path, then: dict, now: dict) -> None:
     different = [k for k in now if then.get(k) != now[k]]
     if different:
         raise NergError(
-            f'the run in "{path}" cannot go on: it was started with other {", ".join(different)}; give the options and the '
-            "data set that it was started with, or start anew without --resume"
+            f'the run in "{path}" cannot go on: it was started with other {", ".join(different)}; give the options and '
+            "the data set that it was started with, or start anew without --resume"
         )
