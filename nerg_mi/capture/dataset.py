@@ -78,8 +78,8 @@ def open_dataset(
     if len(alone) == len(train):
         raise NergError(
             f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") look '
-            f"at the same place within the box {_corners(box)}; check the poses, or give a box that holds what they show "
-            "with --aabb"
+            f"at the same place within the box {_corners(box)}; check the poses, or give a box that holds what they "
+            "show with --aabb"
         )
     if alone:
         bad += [Unused(train[k].name, "no other frame looks at what it shows") for k in alone]

@@ -8,47 +8,7 @@ import pytest
 from nerg_mi.capture.posed import DepthFile, MaskFile
 from nerg_mi.capture.transforms import read_dataparser, read_transforms
 from nerg_mi.errors import NergError
-
-POSE = np.eye(4).tolist()
-
-
-@pytest.fixture
-def write(tmp_path):
-    """`write(content, images)`: a transforms file beside empty files of the names given; its path."""
-
-    def make(content, images=("b.png", "a.png"), name="transforms.json"):
-        for image in images:
-            (tmp_path / image).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / image).write_bytes(b"")
-        (tmp_path / name).write_text(json.dumps(content))
-        return tmp_path / name
-
-    return make
-
-
-def frame(name, **keys):
-    return {"file_path": name, "transform_matrix": POSE, **keys}
-
-
-def test_shared_intrinsics_prefer_the_focal_length(write):
-    t = read_transforms(
-        write(
-            {
-                "w": 20.0,
-                "h": 10.0,
-                "fl_x": 30.0,
-                "camera_angle_x": 1.0,
-                "cx": 9.0,
-                "k1": 0.1,
-                "frames": [frame("b.png"), frame("a.png")],
-            }
-        )
-    )
-    assert [f.name for f in t.frames] == ["a.png", "b.png"]
-    i = t.frames[0].intrinsics(20, 10)
-    assert (i.fx, i.fy, i.cx, i.cy, i.distortion[:4]) == (30.0, 30.0, 9.0, 5.0, (0.1, 0, 0, 0))
-    half = t.frames[0].intrinsics(10, 5)
-    assert (half.fx, half.cx, half.width) == (15.0, 4.5, 10)
+from tests.capture.written_sets import POSE, frame
 
 
 def test_intrinsics_of_a_frame_overrule_shared_ones(write):
@@ -167,13 +127,6 @@ def test_a_missing_depth_file_costs_the_depth_only(write):
     assert t.frames[0].depth is None and "a.png" in t.notes[0] and "d.npy" in t.notes[0]
 
 
-def test_a_scale_within_a_pose_is_taken_out(write):
-    scaled = np.diag([2.0, 2, 2, 1])
-    scaled[:3, 3] = 5
-    f = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", transform_matrix=scaled.tolist())]})).frames[0]
-    assert np.allclose(f.to_world[:3, :3], np.eye(3)) and np.allclose(f.to_world[:3, 3], 5)
-
-
 @pytest.mark.parametrize(
     "content, message",
     [
@@ -190,15 +143,6 @@ def test_a_scale_within_a_pose_is_taken_out(write):
 def test_bad_files_are_named(write, content, message):
     with pytest.raises(ValueError, match=message):
         read_transforms(write(content))
-
-
-def test_bad_intrinsics_name_the_frame(write):
-    t = read_transforms(write({"frames": [frame("a.png")]}))
-    with pytest.raises(ValueError, match="a.png.*focal length"):
-        t.frames[0].intrinsics(8, 8)
-    t = read_transforms(write({"w": 8, "h": 4, "fl_x": 3.0, "frames": [frame("a.png")]}))
-    with pytest.raises(ValueError, match="a.png.*8 x 8"):
-        t.frames[0].intrinsics(8, 8)
 
 
 def test_broken_json_is_named(tmp_path):
@@ -238,12 +182,6 @@ def test_dataparser_transforms(tmp_path):
     path.write_text(json.dumps({"transform": [[0, -1, 0, 1]], "scale": 0.5}))
     with pytest.raises(ValueError, match="dataparser_transforms.json"):
         read_dataparser(path)
-
-
-def test_a_mirroring_change_of_coordinates_is_refused(write):
-    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png")]}))
-    with pytest.raises(ValueError, match="mirroring"):
-        t.moved(np.diag([1.0, 1, -1, 1]))
 
 
 def test_nerfstudios_lists_of_files_split(write):
@@ -335,13 +273,6 @@ def test_numbers_and_names_that_nothing_can_hold_cost_their_frame(write, keys):
     assert len(t.frames) == len(t.unused) == 1 and str(t.unused[0]).isprintable()
 
 
-@pytest.mark.parametrize("keys", [{"fl_x": 1e-300}, {"fl_x": 1e300}, {"cx": 1e300}, {"cy": -1e9}, {"k2": 1e200}])
-def test_lenses_that_no_camera_has_are_refused(write, keys):
-    t = read_transforms(write({"fl_x": 30.0, **keys, "frames": [frame("a.png")]}))
-    with pytest.raises(NergError, match="a.png"):
-        t.frames[0].intrinsics(8, 8)
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -361,8 +292,3 @@ def test_a_file_nested_deep_is_refused(tmp_path):
     (tmp_path / "transforms.json").write_text('{"frames": ' + "[" * 200_000)
     with pytest.raises(NergError, match="transforms.json.*nested"):
         read_transforms(tmp_path / "transforms.json")
-
-
-def test_a_distortion_of_nothing_is_none(write):
-    t = read_transforms(write({"fl_x": 30.0, "k1": 1e-320, "k3": -1e-300, "frames": [frame("a.png")]}))
-    assert not t.frames[0].intrinsics(8, 8).is_distorted

@@ -25,8 +25,8 @@ from .warm_up import warm_up
 # Shares of the run at which the held-out error is looked at.
 _LOOKS = (0.05, 0.1, 0.2, 0.4, 0.6, 0.8)
 _LOOK_VIEWS = 4
-# Steps at least between two looks, one of which takes as long as several.
-_LOOK_GAP = 50
+LOOK_GAP = 50
+"""Steps at least between two looks, one of which takes as long as several."""
 # Samples at most of a look and of a preview, and of the error at the end: fog has hundreds on each ray.
 _LOOK_SAMPLES, _FINAL_SAMPLES = 2**20, 2**24
 
@@ -90,11 +90,11 @@ def train_field(
     with Interruption() as stop:
         while trainer.progress < 1 and not interrupted:
             trainer.step()
-            if looks and trainer.progress >= looks[0] and trainer.steps >= looked + _LOOK_GAP:
+            if looks and trainer.progress >= looks[0] and trainer.steps >= looked + LOOK_GAP:
                 looks, looked = [x for x in looks if x > trainer.progress], trainer.steps
                 last = _look(trainer, watched, history)
                 if preview is not None:
-                    _write_preview(trainer, watched[0], preview)
+                    write_preview(trainer, watched[0], preview)
             if state is not None and trainer.seconds - saved > save_every:
                 save_run(trainer, state, about, history)
                 saved = trainer.seconds
@@ -109,7 +109,7 @@ def train_field(
                 interrupted = True
         if preview is not None and watched:
             with kept_unless(state, keep, done=False):
-                _write_preview(trainer, watched[0], preview)
+                write_preview(trainer, watched[0], preview)
         # One that came while the last preview was made.
         interrupted = interrupted or stop.asked
     seconds = trainer.seconds
@@ -160,7 +160,8 @@ def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: R
     return psnr
 
 
-def _write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
+def write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
+    """PNG of ``view`` as the field shows it now, beside what is true, on as many pixels as take little time."""
     import mitsuba as mi
 
     every = trainer.pixels_within([view], _LOOK_SAMPLES)

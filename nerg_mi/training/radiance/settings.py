@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
@@ -30,66 +30,74 @@ def sized_config(size: str, box: Box) -> RadianceConfig:
 
 @dataclass(frozen=True)
 class RadianceSettings:
-    """Controls of a training run; lengths are shares of the scene box's side.
+    """Controls of a training run; lengths are shares of the scene box's side. Exactly one of ``steps`` and ``minutes``
+    says how long it takes."""
 
-    ``steps`` or ``minutes``: how long, exactly one of them. ``batch``: samples a step. ``learning_rate``: held for the
-    share ``hold`` of the run, then decayed exponentially to ``final_rate`` times itself. ``average``: decay a step of
-    the averaged weights, which are the result. ``march_step``: shortest step (instant-ngp's √3/1024); ``growth``: steps
-    are at least this share of their distance; ``near``: where rays start, and distance to every camera within which
-    nothing is;
-    ``reach``: the derivatives of samples nearer than this are scaled by the square of their share of it (Philip and
-    Deschaintre 2023, "Floaters No More"), 0: none are; it falls to 0 over ``reach_share`` of the run, as surfaces come
-    to stand where fog was; ``stop``: samples that less light reaches are left out; ``thin_sure``: weight from which on
-    a sample is always kept, others by chance in proportion to their weight, with ``thin_least`` at least (1: all are
-    kept).
-    ``resolution``: of the density grid, which is looked over every ``grid_every`` steps; ``min_views``: cells that
-    fewer cameras see stay empty; ``settle``: share of the run from which on the cells that rendering will visit
-    are found, all of which are then sampled.
-    ``look_most``: samples of the density-only pass, in batches: what it costs is then of the order of the rest of a
-    step.
-    ``strides``: the first ``stride_share`` of the run marches this many times coarser, each for a like part of it,
-    which clears early fog cheaply; while the pass has no room for enough rays at the next, it waits, for as long again.
-    ``huber``: error at which the colour loss turns linear (colours are in 0..1);
-    ``empty_weight``: weight of the penalty on density in cells that are not sampled; ``grid_decay``: of the mean square
-    of the grid's features, which lets go of what few rays have shaped (Barron et al. 2023, Zip-NeRF, there level by
-    level);
-    ``depth_weight``: of the depth terms
-    where depth is known, falling to ``final_depth`` times itself; ``depth_margin``: distance from the true surface, in
-    march steps, within which a ray's weight should lie; ``replay``: share of the rays drawn from those whose depth was
-    wrong; ``distortion_weight``: of the loss that draws a ray's weight together (0: none).
-    """
-
+    # How many steps.
     steps: int | None = None
+    # Or: how many minutes.
     minutes: float | None = None
+    # Of the weights, rays and jitter.
     seed: int = 0
-    # Not a power of two: arrays that many bytes apart share their place in the caches, which costs a factor of two.
+    # Samples a step. Not a power of two: arrays that many bytes apart share their place in the caches, which costs a
+    # factor of two.
     batch: int = 2**14 + 240
+    # Held for the share ``hold`` of the run.
     learning_rate: float = 1.5e-2
+    # What it decays to exponentially after that, times itself.
     final_rate: float = 0.03
+    # Share of the run for which the learning rate is held.
     hold: float = 0.4
+    # Decay a step of the averaged weights, which are the result.
     average: float = 0.99
+    # Shortest step, as instant-ngp has it.
     march_step: float = 3**0.5 / 1024
+    # Steps are at least this share of their distance.
     growth: float = 1 / 128
+    # Where rays start, and distance to every camera within which nothing is.
     near: float = 0.02
+    # Derivatives of samples nearer than this are scaled by the square of their share of it (Philip and Deschaintre
+    # 2023, "Floaters No More"); 0: none are.
     reach: float = 0.4
+    # Share of the run over which ``reach`` falls to 0, as surfaces come to stand where fog was.
     reach_share: float = 0.5
+    # Samples that less light reaches are left out.
     stop: float = 2e-3
+    # Weight from which on a sample is always kept; others are by chance, in proportion to their weight.
     thin_sure: float = 1 / 32
+    # Least chance of a sample to be kept; 1: all are.
     thin_least: float = 1 / 32
+    # Cells of the density grid along an edge.
     resolution: int = 128
+    # Steps after which the density grid is looked over.
     grid_every: int = 16
+    # Cells that fewer cameras see stay empty.
     min_views: int = 2
+    # Share of the run from which on the cells that rendering will visit are found, all of which are then sampled.
     settle: float = 0.8
+    # Samples of the density-only pass, in batches: what it costs is then of the order of the rest of a step.
     look_most: float = 8.0
-    strides: tuple[int, ...] = field(default=(16, 8, 4, 2))
+    # How many times coarser the run marches at first, each for a like part of ``stride_share``, which clears early fog
+    # cheaply; while the pass has no room for enough rays at the next, it waits, for as long again.
+    strides: tuple[int, ...] = (16, 8, 4, 2)
+    # Share of the run that is marched coarser.
     stride_share: float = 0.33
+    # Error at which the colour loss turns linear; colours are in 0..1.
     huber: float = 1.0
+    # Weight of the penalty on density in cells that are not sampled.
     empty_weight: float = 0.003
+    # Weight of the mean square of the hash grid's features, which lets go of what few rays have shaped (Barron et al.
+    # 2023, Zip-NeRF, there level by level).
     grid_decay: float = 0.1
+    # Weight of the depth terms where depth is known.
     depth_weight: float = 0.02
+    # What ``depth_weight`` falls to, times itself.
     final_depth: float = 0.25
+    # Distance from the true surface, in march steps, within which a ray's weight should lie.
     depth_margin: float = 1.5
+    # Share of the rays drawn from those whose depth was wrong.
     replay: float = 0.25
+    # Weight of the loss that draws a ray's weight together (mip-NeRF 360); 0: none.
     distortion_weight: float = 0.0
 
     def __post_init__(self):

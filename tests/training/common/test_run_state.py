@@ -6,7 +6,6 @@ import subprocess
 import sys
 import time
 
-import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -17,30 +16,10 @@ from nerg_mi.formats.fields import save_radiance
 from nerg_mi.training.common.run_state import load_run, save_run
 from nerg_mi.training.radiance.run import train_field
 from nerg_mi.training.radiance.trainer import RadianceTrainer
-from tests.training.radiance.test_trainer import BOX, TINY, dataset, settings  # noqa: F401  (fixture)
+from tests.training.radiance.ball import TINY, settings, state, trainer
 
 
-@pytest.fixture
-def one_thread():
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(threads)
-
-
-def trainer(dataset, **changes):
-    depth = changes.pop("depth", True)
-    return RadianceTrainer(dataset.train, BOX, TINY, settings(**{"steps": 40, "settle": 0.75, **changes}), ns, depth)
-
-
-def state(t):
-    arrays = {k: v[0].numpy() for k, v in t.optimiser.state.items()}
-    arrays |= {f"first.{k}": v[3][1].numpy() for k, v in t.optimiser.state.items()}
-    arrays |= {f"averaged.{k}": v.numpy() for k, v in t.averaged.items()}
-    return arrays | {"bits": t.grid.bits.numpy(), "value": t.grid.value.numpy(), "hard": t.hard, "rays": t.rays}
-
-
-def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thread, tmp_path):  # noqa: F811
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thread, tmp_path):
     """Past updates of the grid, its settling and the drawing of hard pixels, on either side of the interruption."""
     whole, first, second = (trainer(dataset) for _ in range(3))
     while whole.progress < 1:
@@ -58,14 +37,14 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(dataset, one_thre
     assert whole.settling.at == second.settling.at > 0
 
 
-def test_another_run_is_not_resumed(dataset, tmp_path):  # noqa: F811
+def test_another_run_is_not_resumed(dataset, tmp_path):
     t = trainer(dataset)
     save_run(t, tmp_path / "a.run", {"sha": 1, "width": 24}, [])
     with pytest.raises(NergError, match="other width"):
         load_run(t, tmp_path / "a.run", {"sha": 1, "width": 48})
 
 
-def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):  # noqa: F811
+def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):
     path, seen, written = tmp_path / "a.run", [], []
 
     def stop(progress):
@@ -86,7 +65,7 @@ def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):  # no
     assert written == [(5, True), (12, True)] and not path.exists()
 
 
-def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):  # noqa: F811
+def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
     """Weights beyond fp16, and then without --half: no step is trained again."""
     path, seen = tmp_path / "a.run", []
 
@@ -112,7 +91,7 @@ def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
     assert about["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
 
-def test_a_second_ctrl_c_leaves_the_state_before_the_step(dataset, one_thread, monkeypatch, tmp_path):  # noqa: F811
+def test_a_second_ctrl_c_leaves_the_state_before_the_step(dataset, one_thread, monkeypatch, tmp_path):
     """Raised in the middle of a step, when weights and random numbers are of different steps: that state is not
     kept."""
     path, descend = tmp_path / "a.run", RadianceTrainer._descend
@@ -133,19 +112,15 @@ _CHILD = """
 import sys
 import drjit as dr, drjit.llvm.ad as ns
 from pathlib import Path
-from tests.training.radiance.test_trainer import *
-from nerg_mi.training.radiance import run as radiance_run
+from tests.training.radiance.ball import TINY, ball_dataset, settings
+from nerg_mi.training.radiance.run import train_field
 dr.set_thread_count(1)
-rng = np.random.default_rng(0)
-centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
-views = [ball(looking_at_origin(2 * c / np.linalg.norm(c))) for c in centers]
-data = Dataset(views[4:], views[:4], BOX, "as given", None, {"dataset": "ball"})
-radiance_run.train_field(data, TINY, settings(steps=10**6), ns, state=Path(sys.argv[1]), save_every=0.0)
+train_field(ball_dataset(), TINY, settings(steps=10**6), ns, state=Path(sys.argv[1]), save_every=0.0)
 """
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thread, how, tmp_path):  # noqa: F811
+def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thread, how, tmp_path):
     """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
     path = tmp_path / "a.run"
     child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
@@ -179,7 +154,7 @@ def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thre
         lambda tensors, meta: meta.update(history=3),
     ],
 )
-def test_a_damaged_state_is_told_with_its_name(dataset, tmp_path, change):  # noqa: F811
+def test_a_damaged_state_is_told_with_its_name(dataset, tmp_path, change):
     from nerg_mi.formats.checkpoint import write_checkpoint
 
     t = trainer(dataset)

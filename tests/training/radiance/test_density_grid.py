@@ -122,7 +122,7 @@ def test_an_update_turns_cells_on_where_density_is_and_off_where_it_was():
         looked = np.minimum(np.maximum(turn + 8 - np.arange(R**3) % 8, 0) // 8, 2)
         assert np.allclose(grid.value.numpy(), np.where(left.ravel(), 0.5 * 0.6**looked, 0), atol=1e-6)
     # Back again, at once.
-    for turn in range(8):
+    for _ in range(8):
         grid.update(here, rng())
     assert np.allclose(cube(grid.value), np.where(left, 0.5, 0))
 
@@ -216,7 +216,10 @@ def test_the_bound_finds_what_fills_a_small_part_of_a_cell():
 def test_density_at_the_threshold_is_what_a_step_absorbs():
     grid = DensityGrid(ns, BOX, R, 0.1, above(), 1, threshold=0.02)
     for sigma, on in ((0.19, False), (0.21, True)):
-        assert grid.bound(lambda p, a: dr.full(ns.Float, sigma, dr.width(p)), rng(), everything).bits.all() == on
+        assert (
+            grid.bound(lambda p, a, sigma=sigma: dr.full(ns.Float, sigma, dr.width(p)), rng(), everything).bits.all()
+            == on
+        )
 
 
 def test_what_is_kept_stays():

@@ -9,12 +9,11 @@ import numpy as np
 from nerg_mi.training.common.step_clock import StepClock
 from nerg_mi.training.radiance.run import train_field
 from nerg_mi.training.radiance.trainer import RadianceTrainer
-from tests.training.common.test_run_state import one_thread, state, trainer  # noqa: F401  (fixture)
 
-from .test_trainer import BOX, TINY, dataset, ns, settings  # noqa: F401  (fixture)
+from .ball import BOX, TINY, ns, settings, state, trainer
 
 
-def test_a_run_by_steps_does_not_see_the_clock(dataset, one_thread):  # noqa: F811
+def test_a_run_by_steps_does_not_see_the_clock(dataset, one_thread):
     """Bit for bit the same where steps take longer, some of them much."""
     quick, slow = (trainer(dataset, steps=40) for _ in range(2))
     for k in range(40):
@@ -26,7 +25,7 @@ def test_a_run_by_steps_does_not_see_the_clock(dataset, one_thread):  # noqa: F8
         assert np.array_equal(value, got[name]), name
 
 
-def test_a_run_by_minutes_is_the_run_of_as_many_steps(dataset, one_thread, monkeypatch):  # noqa: F811
+def test_a_run_by_minutes_is_the_run_of_as_many_steps(dataset, one_thread, monkeypatch):
     """A slow machine's few steps in its minutes go through the same schedules: strides, rates, damping and settling."""
     by_steps, by_minutes = trainer(dataset, steps=40), trainer(dataset, steps=None, minutes=2.0)
     monkeypatch.setattr(RadianceTrainer, "seconds", property(lambda self: self.steps * 3.0))
@@ -39,7 +38,7 @@ def test_a_run_by_minutes_is_the_run_of_as_many_steps(dataset, one_thread, monke
         assert np.array_equal(value, got[name]), name
 
 
-def test_no_pass_of_a_run_is_larger_than_its_bound(dataset, monkeypatch):  # noqa: F811
+def test_no_pass_of_a_run_is_larger_than_its_bound(dataset, monkeypatch):
     """A field that never clears: its density-only pass stays within the bound at every stride, down to the finest."""
     t = RadianceTrainer(
         dataset.train,
@@ -88,7 +87,7 @@ def test_the_clock_of_a_long_run_stays_small():
     assert abs(clock.seconds - seconds.sum()) < 1e-6
 
 
-def test_the_result_tells_its_steps_speed_and_what_is_wrong(dataset):  # noqa: F811
+def test_the_result_tells_its_steps_speed_and_what_is_wrong(dataset):
     _, about = train_field(dataset, TINY, settings(steps=8), ns)
     assert about["evaluations_a_second"] > 0 and set(about["step_ms"]) == {"min", "median", "max"}
     assert any("only 8 steps" in x for x in about["complaints"])

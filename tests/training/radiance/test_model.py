@@ -8,7 +8,7 @@ import numpy as np
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.training.radiance.model import density, density_color, density_of, stack, unstack
 
-from .test_trainer import BOX, TINY
+from .ball import BOX, TINY
 
 
 def field():
@@ -53,3 +53,15 @@ def test_rows_are_stacked_and_taken_apart():
     a, b = unstack(x, ns)
     dr.backward(dr.sum(a * ns.Float([1, 10, 100]) + 2 * b))
     assert np.array_equal(dr.grad(x).numpy(), [[1, 10, 100], [2, 2, 2]])
+
+
+def test_tensor_products_equal_the_fields_own_evaluation():
+    rng = np.random.default_rng(2)
+    field = RadianceField.random(TINY, BOX, ns, 0)
+    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    p = ns.Array3f(rng.uniform(-0.99, 0.99, (3, 200)).astype(np.float32))
+    d = dr.normalize(ns.Array3f(rng.normal(size=(3, 200)).astype(np.float32)))
+    sigma, rgb = density_color(TINY, BOX, field.parameters(), p, d, ns)
+    expected, features = field.density_features(p)
+    assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4)
+    assert np.allclose(np.array([c.numpy() for c in rgb]), field.color(features, d).numpy(), atol=1e-5)

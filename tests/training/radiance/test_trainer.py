@@ -1,4 +1,4 @@
-"""The radiance trainer on a tiny place: it learns, repeats itself, and its gradients are right."""
+"""The radiance trainer on a tiny place: it repeats itself, and its gradients are right."""
 
 from dataclasses import replace
 
@@ -7,98 +7,17 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import Camera, pixel_directions
-from nerg_mi.capture.dataset import Dataset
-from nerg_mi.capture.images import View
-from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.formats.fields import load_radiance, save_radiance
+from nerg_mi.field.radiance import RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.compositing import damp_near, ray_sum
 from nerg_mi.training.radiance.losses import color_loss, composite, depth_loss, feature_decay
 from nerg_mi.training.radiance.model import density_color
 from nerg_mi.training.radiance.pixels import PixelBank
 from nerg_mi.training.radiance.preview import render_view
-from nerg_mi.training.radiance.run import train_field
 from nerg_mi.training.radiance.sampling import StepTable, Thinning, rays_in_box, visible_samples
-from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 
-BOX = Box((-1, -1, -1), (1, 1, 1))
-RADIUS = 0.6
-TINY = RadianceConfig(
-    grid=HashGridConfig(levels=4, log2_rows=12, base=8, finest=64), width=16, color_hidden=1, density_scale=0.5
-)
-LENS = Intrinsics(24, 24, 30.0, 30.0, 12.0, 12.0)
-
-
-def looking_at_origin(center):
-    z = center / np.linalg.norm(center)
-    x = np.cross([0, 0, 1.0], z)
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), center
-    return pose
-
-
-def ball(pose, depth=True):
-    """A ball of radius RADIUS, coloured by its normal, before nothing (alpha 0)."""
-    d = (pixel_directions(LENS) @ pose[:3, :3].T).reshape(-1, 3)
-    o = pose[:3, 3]
-    b, c = d @ o, o @ o - RADIUS**2
-    hit = b * b - c > 0
-    t = np.where(hit, -b - np.sqrt(np.where(hit, b * b - c, 0)), 0)
-    rgb = 0.5 + 0.4 * (o + d * t[:, None]) / RADIUS
-    color = np.concatenate([np.where(hit[:, None], rgb, 0), hit[:, None]], axis=1)
-    return View(
-        "ball",
-        Camera(LENS, pose),
-        color.reshape(24, 24, 4).astype(np.float32),
-        t.reshape(24, 24).astype(np.float32) if depth else None,
-    )
-
-
-@pytest.fixture(scope="module")
-def dataset():
-    rng = np.random.default_rng(0)
-    centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
-    views = [ball(looking_at_origin(2 * c / np.linalg.norm(c))) for c in centers]
-    return Dataset(views[4:], views[:4], BOX, "as given", [], {"dataset": "ball"})
-
-
-def settings(**changes):
-    given = {
-        "steps": 300,
-        "batch": 2**12,
-        "resolution": 32,
-        "march_step": 1 / 64,
-        "stride_share": 0.2,
-        "seed": 1,
-        "depth_weight": 2e-3,
-        "grid_decay": 1e-3,
-        **changes,
-    }
-    return RadianceSettings(**given)
-
-
-@pytest.mark.slow
-def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
-    """20 dB on held-out views after 300 small steps; the checkpoint says how."""
-    seen = []
-    field, provenance = train_field(dataset, TINY, settings(), ns, on_progress=seen.append)
-    assert provenance["psnr_held_out"]["mean"] > 20
-    assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].done == 1
-    save_radiance(field, provenance, tmp_path / "ball.safetensors", half=True)
-    loaded, meta = load_radiance(tmp_path / "ball.safetensors", ns)
-    assert meta["provenance"]["settings"]["seed"] == 1
-    assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
-
-
-@pytest.mark.slow
-def test_learns_without_depth(dataset):
-    _, provenance = train_field(dataset, TINY, settings(), ns, depth=False)
-    assert provenance["psnr_held_out"]["mean"] > 19 and not provenance["depth_supervision"]
+from .ball import BOX, TINY, settings
 
 
 def test_equal_seeds_give_equal_fields_to_rounding(dataset):
@@ -147,18 +66,6 @@ def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
         )
         assert np.mean(np.abs(with_grid.opacity - without.opacity)) < 0.02
         assert np.mean(np.abs(with_grid.color - without.color)) < 0.02
-
-
-def test_tensor_products_equal_the_fields_own_evaluation():
-    rng = np.random.default_rng(2)
-    field = RadianceField.random(TINY, BOX, ns, 0)
-    field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
-    p = ns.Array3f(rng.uniform(-0.99, 0.99, (3, 200)).astype(np.float32))
-    d = dr.normalize(ns.Array3f(rng.normal(size=(3, 200)).astype(np.float32)))
-    sigma, rgb = density_color(TINY, BOX, field.parameters(), p, d, ns)
-    expected, features = field.density_features(p)
-    assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4)
-    assert np.allclose(np.array([c.numpy() for c in rgb]), field.color(features, d).numpy(), atol=1e-5)
 
 
 def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
@@ -231,27 +138,6 @@ def test_thinned_samples_stand_for_all():
     assert abs(np.mean(slopes) - slope) < 4 * np.std(slopes) / 20 and np.std(slopes) > 0
 
 
-def test_settings_and_sizes_are_checked():
-    for wrong in (
-        {},
-        {"steps": 5, "minutes": 1.0},
-        {"steps": 0},
-        {"steps": 5, "resolution": 100},
-        {"steps": 5, "thin_least": 0},
-        {"steps": 5, "reach_share": 0},
-    ):
-        with pytest.raises(ValueError):
-            RadianceSettings(**wrong)
-    with pytest.raises(ValueError, match="small, medium, paper"):
-        sized_config("huge", BOX)
-    assert sized_config("paper", BOX).grid.log2_rows == 19
-
-
-def test_damping_near_cameras_ends_when_surfaces_stand():
-    s = RadianceSettings(steps=5, reach=0.4, reach_share=0.5)
-    assert [s.damped_within(p) for p in (0, 0.25, 0.5, 1)] == pytest.approx([0.4, 0.2, 0, 0])
-
-
 def test_damping_near_cameras(dataset):
     """Derivatives nearer than the reach fall with the square of the distance, values stay; a trainer's step follows."""
     t, x = ns.Float([0.1, 0.2, 0.4, 3]), ns.Float([1, 2, 3, 4])
@@ -313,11 +199,6 @@ def test_features_that_no_ray_shapes_are_let_go(dataset):
         settings(grid_decay=-1.0)
 
 
-def test_a_march_takes_1024_steps_through_the_box():
-    """From corner to corner of a cube, as the paper's."""
-    assert RadianceSettings(steps=1).march_step * BOX.side * 1024 == pytest.approx(BOX.diagonal)
-
-
 @pytest.mark.parametrize("depth", [True, False])
 def test_free_space_is_carved_where_all_depth_is_known(dataset, depth):
     """Cells far in front of the surface are then empty from the start; without depth nothing is known of them."""
@@ -368,31 +249,3 @@ def test_weights_move_however_faint_their_gradient(dataset):
         optimiser.step()
         moved.append(np.abs(optimiser[name].numpy() - before))
     assert moved[0].min() > 0 and np.allclose(moved[1], moved[0], rtol=0.05)
-
-
-def test_a_preview_shows_colours_within_their_range_beside_the_truth(dataset, tmp_path, rgb):
-    """What is brighter than white is white, and not dark again."""
-    from types import SimpleNamespace
-
-    from nerg_mi.training.radiance.run import _write_preview
-
-    seen = np.zeros((12, 12, 3), np.float32)
-    seen[:, :4], seen[:, 4:8], seen[:, 8:] = 1.7, -0.4, 0.5
-    found = SimpleNamespace(color=seen)
-    trainer = SimpleNamespace(pixels_within=lambda views, most: 2, render=lambda view, every: found)
-    _write_preview(trainer, dataset.held_out[0], tmp_path / "a.png")
-    picture = np.array(rgb.Bitmap(str(tmp_path / "a.png")))
-    assert picture.shape == (12, 24, 3)
-    assert (picture[:, :4] == 255).all() and (picture[:, 4:8] == 0).all() and (picture[:, 8:12] == 128).all()
-    truth = 255 * dataset.held_out[0].over(0)[1::2, 1::2]
-    assert np.abs(picture[:, 12:] - truth).max() <= 1
-
-
-def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
-    from nerg_mi.training.radiance import run as radiance_run
-
-    shown = []
-    monkeypatch.setattr(radiance_run, "_write_preview", lambda trainer, view, path: shown.append(view))
-    monkeypatch.setattr(radiance_run, "_LOOK_GAP", 1)
-    train_field(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
-    assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)

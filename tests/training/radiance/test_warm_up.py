@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.training.radiance.warm_up import warm_up
-from tests.training.common.test_run_state import one_thread, state, trainer  # noqa: F401  (fixture)
 
-from .test_trainer import dataset, settings  # noqa: F401  (fixture)
+from .ball import state, trainer
 
 
 def kernels_of_a_run(t) -> list[tuple[int, int, int]]:
@@ -27,7 +26,7 @@ def kernels_of_a_run(t) -> list[tuple[int, int, int]]:
 
 
 @pytest.mark.parametrize("depth", [True, False])
-def test_a_run_is_the_same_bit_for_bit(dataset, one_thread, depth):  # noqa: F811
+def test_a_run_is_the_same_bit_for_bit(dataset, one_thread, depth):
     plain, warm = (trainer(dataset, steps=24, depth=depth) for _ in range(2))
     warm_up(warm)
     assert warm.steps == warm.settling.at == 0 and not warm.clock.durations
@@ -40,7 +39,7 @@ def test_a_run_is_the_same_bit_for_bit(dataset, one_thread, depth):  # noqa: F81
 
 
 @pytest.mark.parametrize("depth", [True, False])
-def test_nothing_is_compiled_in_a_run(dataset, depth):  # noqa: F811
+def test_nothing_is_compiled_in_a_run(dataset, depth):
     """Through all strides, grid updates, the drawing of hard pixels, the end of damping near cameras, and settling."""
     t = trainer(dataset, steps=120, depth=depth, settle=0.4)
     # Other trainings of this process have made most kernels already.
