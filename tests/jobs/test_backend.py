@@ -5,7 +5,6 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.backend import select_backend
-from nerg_mi.jobs.versions import versions
 
 
 def test_variant_and_threads(rgb):
@@ -24,9 +23,3 @@ def test_variant_and_threads(rgb):
 def test_what_no_field_can_be_computed_on(mode, said):
     with pytest.raises(NergError, match=said):
         select_backend(mode)
-
-
-def test_versions_of_what_has_a_part():
-    found = versions("llvm_ad_rgb")
-    assert set(found) == {"nerg_mi", "mitsuba", "drjit", "numpy", "python", "libLLVM"} and all(found.values())
-    assert "libLLVM" not in versions("scalar_rgb")

@@ -106,7 +106,7 @@ def test_an_integrator_that_renders_in_a_way_of_its_own_is_asked_to(rgb):
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
             return super().render(scene, sensor, seed, spp, develop, evaluate)
 
-    rgb.register_integrator("own_render", lambda props: Own(props))
+    rgb.register_integrator("own_render", Own)
     scene = rgb.load_dict({"type": "scene", "integrator": {"type": "own_render"}, "sensor": {"type": "perspective"}})
     assert "a way of its own" in bands.why_whole(scene, scene.sensors()[0])
 

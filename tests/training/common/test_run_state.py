@@ -52,15 +52,15 @@ def test_ctrl_c_keeps_the_state_and_writing_removes_it(dataset, tmp_path):
         if progress.steps == 5 and len(seen) == 5:
             raise KeyboardInterrupt
 
-    how = {
+    options = {
         "state": path,
         "preview": tmp_path / "a.png",
         "on_progress": stop,
         "write": lambda field, about: written.append((about["steps"], path.is_file())),
     }
-    _, about = train_field(dataset, TINY, settings(steps=12), ns, **how)
+    _, about = train_field(dataset, TINY, settings(steps=12), ns, **options)
     assert about["interrupted"] and path.is_file()
-    _, about = train_field(dataset, TINY, settings(steps=12), ns, resume=True, **how)
+    _, about = train_field(dataset, TINY, settings(steps=12), ns, resume=True, **options)
     assert not about["interrupted"] and seen[5].steps == 6 and (tmp_path / "a.png").stat().st_size > 100
     assert written == [(5, True), (12, True)] and not path.exists()
 
@@ -74,9 +74,9 @@ def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
         field.set_parameters(parameters | {"grid.table": parameters["grid.table"] * 0 + 1e6})
         save_radiance(field, about, tmp_path / "a.safetensors", half=True)
 
-    how = {"state": path, "save_every": 1e9, "on_progress": seen.append}
+    options = {"state": path, "save_every": 1e9, "on_progress": seen.append}
     with pytest.raises(NergError, match="fp16.*leave out --half.*--resume writes it"):
-        train_field(dataset, TINY, settings(steps=6), ns, write=refuse, **how)
+        train_field(dataset, TINY, settings(steps=6), ns, write=refuse, **options)
     assert [p.name for p in tmp_path.iterdir()] == ["a.run"]
     seen.clear()
     _, about = train_field(
@@ -86,7 +86,7 @@ def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
         ns,
         resume=True,
         write=lambda f, a: save_radiance(f, a, tmp_path / "a.safetensors"),
-        **how,
+        **options,
     )
     assert about["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]
 
@@ -119,8 +119,8 @@ train_field(ball_dataset(), TINY, settings(steps=10**6), ns, state=Path(sys.argv
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thread, how, tmp_path):
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thread, sent, tmp_path):
     """Killed at any moment, the state is one that an uninterrupted run has been in; Ctrl-C is heard between steps."""
     path = tmp_path / "a.run"
     child = subprocess.Popen([sys.executable, "-c", _CHILD, str(path)], env={**os.environ, "PYTHONPATH": os.getcwd()})
@@ -128,8 +128,8 @@ def test_a_run_that_is_ended_from_outside_leaves_a_whole_state(dataset, one_thre
     while not path.exists() and child.poll() is None and time.time() < until:
         time.sleep(0.05)
     time.sleep(0.3)
-    child.send_signal(how)
-    assert child.wait(120) == (0 if how == signal.SIGINT else -how)
+    child.send_signal(sent)
+    assert child.wait(120) == (0 if sent == signal.SIGINT else -sent)
     about = dict.fromkeys(("sha256", "training_frames", "width", "height"))
     killed = trainer(dataset, steps=10**6)
     load_run(killed, path, about)

@@ -1,0 +1,53 @@
+"""Variants that work and that do not, and scenes that are loaded."""
+
+import pytest
+
+from nerg_mi import llvm
+from nerg_mi.errors import NergError, UnusableLLVM
+from nerg_mi.rendering.pictures import activate, load_scene
+
+
+def test_the_best_variant_that_works(rgb, monkeypatch):
+    tried = []
+    monkeypatch.setattr(rgb, "set_variant", tried.append)
+    monkeypatch.setattr(llvm, "has_cuda", lambda: True)
+    assert activate() == "cuda_ad_rgb" and activate("llvm_ad_mono") == "llvm_ad_mono"
+    monkeypatch.setattr(llvm, "has_cuda", lambda: False)
+    assert activate() == "llvm_ad_rgb" and tried == ["cuda_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"]
+
+
+def test_a_backend_that_cannot_start_is_followed_by_the_next(rgb, monkeypatch):
+    def only_llvm(name):
+        if name.startswith("cuda"):
+            raise ImportError("no device")
+
+    monkeypatch.setattr(rgb, "set_variant", only_llvm)
+    monkeypatch.setattr(llvm, "has_cuda", lambda: True)
+    assert activate() == "llvm_ad_rgb"
+    with pytest.raises(NergError, match=r'"cuda_ad_rgb" does not work here \(no device\)'):
+        activate("cuda_ad_rgb")
+
+
+def test_an_unusable_libllvm_is_told_as_such(rgb, monkeypatch):
+    def refuse(name):
+        raise UnusableLLVM("LLVM 15 cannot")
+
+    monkeypatch.setattr(rgb, "set_variant", refuse)
+    with pytest.raises(UnusableLLVM):
+        activate()
+
+
+def test_values_of_a_scene(rgb, tmp_path):
+    (tmp_path / "s.xml").write_text(
+        '<scene version="3.0.0"><default name="wide" value="6"/><sensor type="perspective"><film type="hdrfilm">'
+        '<integer name="width" value="$wide"/></film></sensor></scene>'
+    )
+    width = lambda scene: scene.sensors()[0].film().size()[0]
+    assert width(load_scene(tmp_path / "s.xml")) == 6 and width(load_scene(tmp_path / "s.xml", {"wide": "9"})) == 9
+    with pytest.raises(NergError, match=r'asks for no "\$tall"'):
+        load_scene(tmp_path / "s.xml", {"tall": "2"})
+
+
+def test_a_scene_that_is_not_there(tmp_path):
+    with pytest.raises(NergError, match="there is no scene file"):
+        load_scene(tmp_path / "s.xml")
