@@ -80,7 +80,8 @@ def main(argv=None) -> None:
     settings = RadianceSettings(minutes=stops[-1], seed=args.seed, **parse_settings(args.set))
     args.out.mkdir(parents=True, exist_ok=True)
     print(
-        f"{len(data.train)} views to train on, {len(data.held_out)} to score, width {args.width}; load {os.getloadavg()[0]:.1f}"
+        f"{len(data.train)} views to train on, {len(data.held_out)} to score, width {args.width}; "
+        f"load {os.getloadavg()[0]:.1f}"
     )
     begin = time.perf_counter()
     trainer = RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
@@ -112,7 +113,7 @@ def main(argv=None) -> None:
     print(f"{'minutes':>8s} {'steps':>7s} {'ms/step':>8s} {'PSNR dB':>8s} {'SSIM':>7s} {'training dB':>12s}")
     for row in rows:
         scores = score_views(row["file"], data.held_out, args.spp, args.out / f"{args.width}_{row['minutes']:g}")
-        row |= {"psnr": round(scores["psnr_mean"], 3), "ssim": round(scores["ssim_mean"], 4), "file": row["file"].name}
+        row |= {"psnr": round(scores.psnr_mean, 3), "ssim": round(scores.ssim_mean, 4), "file": row["file"].name}
         print(
             f"{row['minutes']:8g} {row['steps']:7d} {row['ms_a_step']:8.1f} {row['psnr']:8.2f} {row['ssim']:7.4f} "
             f"{row['psnr_train']:12.2f}",

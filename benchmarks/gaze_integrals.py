@@ -15,14 +15,15 @@ import argparse
 import time
 from pathlib import Path
 
-import numpy as np
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
 
 
 def main(argv=None) -> None:
-    import mitsuba as mi
     from output import write_rows
+
+    import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
     from nerg_mi.field.backend import namespace
@@ -55,7 +56,8 @@ def main(argv=None) -> None:
         rows.append({"x": p[0], "y": p[1], "z": p[2], "integral": fine / ours, "seconds": seconds})
     off = np.abs([r["integral"] - 1 for r in rows])
     print(
-        f"{len(rows)} positions: off by {off.mean():.1e} in the mean, {np.quantile(off, 0.99):.1e} for 99 %, {off.max():.1e} at most; "
+        f"{len(rows)} positions: off by {off.mean():.1e} in the mean, {np.quantile(off, 0.99):.1e} for 99 %, "
+        f"{off.max():.1e} at most; "
         f"{np.mean(off <= 1e-3):.1%} within 1e-3; "
         f"{np.median([r['seconds'] for r in rows]):.3f} s an integral of {COUNT:,} directions (median)"
     )

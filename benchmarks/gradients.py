@@ -16,11 +16,11 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numerics import replaced
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.files.tables import markdown_table
+from numerics import replaced
+
+import numpy as np
 
 QUANTITIES = {
     "colour": "RGB",

@@ -9,9 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import drjit as dr
-import numpy as np
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
@@ -20,6 +17,9 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.box import Box
+
+import drjit as dr
+import numpy as np
 
 AOVS = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth"
 SIZE = 12

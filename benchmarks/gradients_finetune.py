@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
+from nerg_mi.files.tables import markdown_table
+from numerics import replaced
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numerics import replaced
-
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
-from nerg_mi.files.tables import markdown_table
 
 STORE = Path(__file__).parents[1] / "scenes" / "store" / "scene.xml"
 SHELF, WIDTH = (4.8, 5.5, 1.4), 0.6

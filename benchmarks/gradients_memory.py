@@ -20,12 +20,12 @@ import sys
 import tempfile
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
-from numerics import replaced
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 from nerg_mi.files.tables import markdown_table
+from numerics import replaced
+
+import drjit as dr
+import mitsuba as mi
 
 SIZE, WARM = 64, 4
 COLUMNS = {"field": "field, MB", "everything": "everything, MB", "stored": "stored samples, MB"}

@@ -74,7 +74,6 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
 
     import mitsuba as mi
-
     from tests.reference.office import looks_out, office
 
     mi.set_variant("llvm_ad_rgb")

@@ -18,6 +18,9 @@ from pathlib import Path
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.files.tables import markdown_table
 
+HEAD = ["case", "range", "quantity", "largest error", "reference"]
+"""Of tables whose lines are `Row`s."""
+
 GROUPS = ("march", "rays", "pictures", "gaze")
 
 

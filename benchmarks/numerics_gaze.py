@@ -5,11 +5,6 @@ from __future__ import annotations
 
 import math
 
-import drjit as dr
-import numpy as np
-from numerics import Row
-from numerics_march import HEAD, gradient, said, values, worst
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.evaluation import saliency as metrics
@@ -17,6 +12,11 @@ from nerg_mi.field.gaze.product import activate, softplus
 from nerg_mi.maths import vmf
 from nerg_mi.maths.sphere import direction_to_latlong, latlong_to_direction, logsumexp
 from nerg_mi.training.gaze.losses import gaze_loss, probe_cc, probe_kld
+from numerics import HEAD, Row
+from numerics_media import all_finite, gradient, values, worst
+
+import drjit as dr
+import numpy as np
 
 KAPPAS = np.logspace(-8, 8, 33)
 LONG = np.longdouble
@@ -125,7 +125,9 @@ def kernels(mi):
         y = kde.density(ns.UInt32([0, 0]), d)
         dr.set_grad(d, ns.Array3f(0.3, 0.4, 0.5))
         finite.append(np.array(dr.forward_to(y)))
-    yield Row("", "at the ray and opposite to it", "derivative with respect to the direction", said(*finite), "finite")
+    yield Row(
+        "", "at the ray and opposite to it", "derivative with respect to the direction", all_finite(*finite), "finite"
+    )
 
 
 def log_sums(mi):
@@ -179,7 +181,9 @@ def scores(mi):
     got = np.array(
         [[f(a, b) for f in (metrics.kld, metrics.cc, metrics.sim)] for a in pairs.values() for b in pairs.values()]
     )
-    yield Row("KLD, CC and SIM", "maps of zeros, one direction, constants, 1e±150", "all pairs", said(got), "finite")
+    yield Row(
+        "KLD, CC and SIM", "maps of zeros, one direction, constants, 1e±150", "all pairs", all_finite(got), "finite"
+    )
     yield Row(
         "",
         "any scale 1e-300 .. 1e300",
@@ -234,7 +238,7 @@ def losses(mi):
         "gaze loss and its derivative",
         "zeros, constants, one direction, 1e-30, 1e12 1/sr",
         "all pairs",
-        said(*results, *finite),
+        all_finite(*results, *finite),
         "finite",
     )
     q = rng.random(256)

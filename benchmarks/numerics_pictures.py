@@ -6,11 +6,6 @@ import math
 import tempfile
 from pathlib import Path
 
-import drjit as dr
-import numpy as np
-from numerics import Row
-from numerics_march import HEAD, gradient, said, share, values, worst
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.harmonics import encode_direction
@@ -21,6 +16,11 @@ from nerg_mi.maths.box import Box
 from nerg_mi.maths.color import composite_to_linear
 from nerg_mi.transport.observer.sight import towards
 from nerg_mi.transport.observer.visibility import visibility
+from numerics import HEAD, Row
+from numerics_media import all_finite, gradient, share, values, worst
+
+import drjit as dr
+import numpy as np
 
 AOVS = "depth,opacity,position,gaze,visibility,observer_depth"
 
@@ -115,7 +115,7 @@ def observers(mi):
             finite.append(np.stack([out[k] for k in out if k != "rgb"]))
             share_seen[name, kind] = f"{out['visibility.Y'].mean():.0%}"
     yield Row(
-        "observer elsewhere", ", ".join(places), "all channels, every kind of visibility", said(*finite), "finite"
+        "observer elsewhere", ", ".join(places), "all channels, every kind of visibility", all_finite(*finite), "finite"
     )
     for name, expected in (("inside solid matter", "0 %"), ("behind the camera", "100 %"), ("on the surface", "100 %")):
         got = ", ".join(f"{k} {share_seen[name, k]}" for k in ("depth", "transmittance", "map"))
@@ -136,7 +136,7 @@ def observers(mi):
         "norm at zero",
         "d_o* = 0, 1e-18, 1e-9",
         "distance, direction and their derivatives",
-        said(values(distance), values(r_o), values(dr.grad(v))),
+        all_finite(values(distance), values(r_o), values(dr.grad(v))),
         "finite",
     )
 
@@ -155,7 +155,7 @@ def falloffs(mi):
         seen = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))
         wrong = max(wrong, worst(values(y), seen, False))
     yield Row("falloff d_f", "0, 1e-38 .. 1e30", "visibility (absolute)", wrong, "closed form")
-    yield Row("", "", "its derivative", said(*finite), "finite")
+    yield Row("", "", "its derivative", all_finite(*finite), "finite")
 
 
 def acne(mi):
@@ -286,7 +286,7 @@ def colours(mi):
         "",
         "α 1e-36 .. 1",
         "derivative with respect to α",
-        worst(dy[1:], np.full(100, linear)) if said(dy) == "finite" else math.inf,
+        worst(dy[1:], np.full(100, linear)) if all_finite(dy) == "finite" else math.inf,
         "closed form",
     )
 
@@ -300,6 +300,6 @@ def harmonics(mi):
         "directions along the axes",
         "poles and equator",
         "harmonics and their derivatives",
-        said(values(total), values(dr.grad(d))),
+        all_finite(values(total), values(dr.grad(d))),
         "finite",
     )

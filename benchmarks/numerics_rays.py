@@ -4,25 +4,6 @@ from __future__ import annotations
 
 import math
 
-import drjit as dr
-import numpy as np
-from numerics import Row
-from numerics_march import (
-    HEAD,
-    STEP,
-    Profile,
-    along_z,
-    box,
-    exact_box,
-    gradient,
-    grid,
-    said,
-    share,
-    through,
-    values,
-    worst,
-)
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.field.radiance import sigmoid
 from nerg_mi.maths.elementary import log1p, one_minus_exp
@@ -30,6 +11,24 @@ from nerg_mi.maths.ray_box import intersect_box
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.rules import RULES
 from nerg_mi.transport.march.settings import MarchSettings
+from numerics import HEAD, Row
+from numerics_media import (
+    STEP,
+    Profile,
+    all_finite,
+    along_z,
+    box,
+    exact_box,
+    gradient,
+    grid,
+    share,
+    through,
+    values,
+    worst,
+)
+
+import drjit as dr
+import numpy as np
 
 
 def tables(mi):
@@ -164,7 +163,7 @@ def hidden_matter(mi):
         max(errors),
         "closed form",
     )
-    yield Row("", "", "derivatives of expected and median depth", said(finite), "finite")
+    yield Row("", "", "derivatives of expected and median depth", all_finite(finite), "finite")
 
 
 def ends_of_functions(mi):

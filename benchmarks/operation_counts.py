@@ -11,15 +11,16 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
+from functools import partial
 from pathlib import Path
 
-import mitsuba as mi
-import nerg_mi.scenes.store
-from output import write_rows
-
 import nerg_mi
+import nerg_mi.scenes.store
 from nerg_mi.evaluation.study.operations import traced_operations
 from nerg_mi.files.tables import markdown_table
+from output import write_rows
+
+import mitsuba as mi
 
 STORE = Path(nerg_mi.scenes.store.__file__).parent
 CAMERA, OBSERVER, TARGET = [1.0, 0.8, 1.6], [1.0, 2.8, 1.6], [1.2, 5.0, 1.2]
@@ -94,16 +95,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--width", type=int, default=240)
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
     args = parser.parse_args()
-    mi.set_variant(args.variant)
+    mi.set_variant(args.mode)
 
     rows = []
     for name, options in configurations().items():
         place = scene(args.width, options)
         if "first" not in name:
             mi.render(place, spp=1).numpy()
-        operations = traced_operations(lambda: mi.render(place, spp=1))
+        operations = traced_operations(partial(mi.render, place, spp=1))
         seconds = []
         for run in range(args.runs):
             if "first" in name:

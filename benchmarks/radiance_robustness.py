@@ -4,7 +4,7 @@
                                              [--update docs/radiance-training.md]
 
 ``--rows``: minutes, or steps with an "s". Each is run once for each number of ``--threads`` and of ``--busy`` loops
-beside it, in a process of its own, by ``train_radiance`` as the command runs it; held-out photos are rendered by the
+beside it, in a process of its own, by ``train_field`` as the command runs it; held-out photos are rendered by the
 trainer. ``--validate`` never opens them: every 8th of the training photos takes their place. The CSV keeps the rows of
 earlier calls (``--new``: drops them), so that the table can be measured in parts, and the table of all is printed.
 """
@@ -42,16 +42,18 @@ dr.set_thread_count(job["threads"])
 from fox_radiance import validation
 from nerg_mi.capture.dataset import open_dataset
 from nerg_mi.field.backend import namespace
-from nerg_mi.training.radiance.run import save_trained, train_radiance
+from nerg_mi.files.tables import write_json
+from nerg_mi.formats.fields import save_radiance
+from nerg_mi.training.radiance.run import train_field
 from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 data = open_dataset(Path(job["data"]), None, job["width"])
 data = validation(data) if job["validate"] else data
 out = Path(job["out"])
 settings = RadianceSettings(minutes=job["minutes"], steps=job["steps"], seed=job["seed"], **job["set"])
-_, about = train_radiance(data, sized_config("small", data.box), settings, namespace("llvm_ad_rgb"), depth=False,
-                          state=out.with_suffix(".run"), preview=out.with_suffix(".preview.png"),
-                          write=lambda field, about: save_trained(field, about, out))
-out.with_suffix(".json").write_text(json.dumps(about))
+_, about = train_field(data, sized_config("small", data.box), settings, namespace("llvm_ad_rgb"), depth=False,
+                       state=out.with_suffix(".run"), preview=out.with_suffix(".preview.png"),
+                       write=lambda field, about: save_radiance(field, out, about))
+write_json(out.with_suffix(".json"), about)
 """
 
 

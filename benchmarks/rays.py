@@ -15,6 +15,7 @@ import argparse
 import os
 import resource
 import time
+from functools import partial
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
@@ -40,7 +41,8 @@ def write_resampled(source, count: int, path: Path) -> None:
             )
             for t, person, o, v, c in rows:
                 out.write(
-                    "%.3f,%s_%d,%.5f,%.5f,%.5f,%.6f,%.6f,%.6f,%.2f\n" % (t, source.persons[person], copy, *o, *v, c)
+                    f"{t:.3f},{source.persons[person]}_{copy},"
+                    + ",".join([*(f"{x:.5f}" for x in o), *(f"{x:.6f}" for x in v), f"{c:.2f}\n"])
                 )
 
 
@@ -104,10 +106,10 @@ def main() -> None:
     index = timed("index: build", lambda: RayIndex(rays))
     queries = rays.origin[np.random.default_rng(1).choice(len(rays), min(4096, len(rays)), replace=False)]
     for radius in (0.1, 0.25):
-        timed(f"index: 4,096 queries, R {radius} m, 1,024 rays", lambda: index.nearest(queries, 1024, radius), 3)
+        timed(f"index: 4,096 queries, R {radius} m, 1,024 rays", partial(index.nearest, queries, 1024, radius), 3)
         timed(
             f"4,096 probes, R {radius} m",
-            lambda: place_probes(rays, radius, queries=queries, index=index, kappa_rule="fixed"),
+            partial(place_probes, rays, radius, queries=queries, index=index, kappa_rule="fixed"),
             3,
         )
     directions = picture()
@@ -117,7 +119,7 @@ def main() -> None:
         frames = {}
         for method in ("exact", "table"):
             name = f"720p density of {probe.counts[0]:,} rays, {method}"
-            frames[method] = timed(name, lambda: kde_frame(probe, directions, method=method), 4)
+            frames[method] = timed(name, partial(kde_frame, probe, directions, method=method), 4)
         off = np.abs(frames["table"] - frames["exact"]).max() / frames["exact"].max()
         print(f"  table against exact: {off:.1e} of the largest density")
     write_rows(options.out, table)

@@ -20,26 +20,18 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import numpy as np
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from fox_radiance import default_data
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+import numpy as np
 
 _RUN = """
 import sys
-from pathlib import Path
-import nerg_mi, drjit as dr, mitsuba as mi
-mi.set_variant("llvm_ad_rgb")
-from nerg_mi.capture.dataset import open_dataset
-from nerg_mi.field.backend import namespace
-from nerg_mi.training.radiance.run import save_trained, train_radiance
-from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
+from nerg_mi.jobs.radiance import RadianceOptions, train_radiance
 data, width, steps, threads, out, resume = sys.argv[1:]
-dr.set_thread_count(int(threads))
-data = open_dataset(data, None, int(width))
-train_radiance(data, sized_config("small", data.box), RadianceSettings(steps=int(steps)), namespace("llvm_ad_rgb"),
-               state=Path(out).with_suffix(".run"), resume=resume == "1", save_every=2.0,
-               write=lambda field, about: save_trained(field, about, out))
+options = RadianceOptions(width=int(width), steps=int(steps), threads=int(threads), resume=resume == "1",
+                          save_every=2.0, depth=False)
+train_radiance(data, out, options)
 """
 
 

@@ -22,9 +22,9 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 37.0
 DIRECTIONS = 2048
@@ -56,11 +56,11 @@ def look(position, angle: float, down: float) -> np.ndarray:
 
 def write_views(folder: Path, law, positions: np.ndarray, rng) -> None:
     """transforms.json and maps/*.npy of one view at each of ``positions``; the maps' pictures stand for the photos."""
-    import mitsuba as mi
-
     from nerg_mi.capture.cameras import pixel_directions
     from nerg_mi.capture.intrinsics import Intrinsics
     from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
+
+    import mitsuba as mi
 
     lens = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
     local, solid = pixel_directions(lens).reshape(-1, 3), pixel_solid_angles(lens)
@@ -88,13 +88,11 @@ def draw_rays(law, positions: np.ndarray, count: int, rng):
 
 
 def main(argv=None) -> list[dict]:
-    import mitsuba as mi
     from output import write_rows
 
-    mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.scenes import store
-    from nerg_mi.scenes.store.attention_law import AttentionLaw
+    import mitsuba as mi
 
+    mi.set_variant("llvm_ad_rgb")
     from nerg_mi.capture.salience.views import open_salience
     from nerg_mi.evaluation.gaze import baselines
     from nerg_mi.evaluation.gaze.scores import gaze_field, print_scores, score_rows
@@ -104,6 +102,8 @@ def main(argv=None) -> list[dict]:
     from nerg_mi.jobs.gaze_plan import plan_gaze
     from nerg_mi.jobs.options.gaze import GazeOptions
     from nerg_mi.maths.sphere import fibonacci_directions
+    from nerg_mi.scenes import store
+    from nerg_mi.scenes.store.attention_law import AttentionLaw
     from nerg_mi.training.gaze.blind import blind_of_views
     from nerg_mi.training.gaze.supervision import Supervision
     from nerg_mi.training.geometry.places import place_of_scene

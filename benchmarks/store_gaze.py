@@ -18,9 +18,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
 
 DIRECTIONS = 2048
 
@@ -38,13 +38,11 @@ def fresh_draws(law, count: int, kappa: float):
 
 
 def main(argv=None) -> None:
-    import mitsuba as mi
     from output import write_rows
 
-    mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.scenes import store
-    from nerg_mi.scenes.store.attention_law import AttentionLaw
+    import mitsuba as mi
 
+    mi.set_variant("llvm_ad_rgb")
     from nerg_mi.density.probes import place_probes
     from nerg_mi.evaluation.gaze import baselines
     from nerg_mi.evaluation.gaze.scores import EPS, gaze_field, print_scores, score_rows
@@ -53,6 +51,8 @@ def main(argv=None) -> None:
     from nerg_mi.maths.sphere import fibonacci_directions
     from nerg_mi.rays.rays import Rays
     from nerg_mi.rays.splits import purge
+    from nerg_mi.scenes import store
+    from nerg_mi.scenes.store.attention_law import AttentionLaw
     from nerg_mi.transport.media.field import FieldMedium
 
     here = Path(store.__file__).resolve().parent

@@ -47,7 +47,6 @@ def main(argv=None) -> None:
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
     from fox_radiance import parse_settings, validation
-
     from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
@@ -65,7 +64,8 @@ def main(argv=None) -> None:
     settings = RadianceSettings(minutes=args.minutes, seed=args.seed, **parse_settings(args.set))
     args.out.mkdir(parents=True, exist_ok=True)
     print(
-        f"{len(data.train)} views to train on, {len(data.held_out)} to score, {data.source['width']} x {data.source['height']}"
+        f"{len(data.train)} views to train on, {len(data.held_out)} to score, "
+        f"{data.source['width']} x {data.source['height']}"
     )
     print(
         f"{'from':>7s} {'minutes':>8s} {'steps':>6s} {'PSNR dB':>8s} {'SSIM':>6s} {'median cm':>10s} {'mean cm':>8s} "
@@ -89,7 +89,7 @@ def main(argv=None) -> None:
         path = args.out / f"{source}.safetensors"
         save_radiance(trainer.field(), path, {"minutes": minutes, "settings": settings.to_dict()})
         scores = score_views(path, data.held_out, args.spp, args.out / source)
-        depth = scores["depth"]
+        depth = scores.depth
         rows.append(
             {
                 "from": source,
@@ -97,20 +97,20 @@ def main(argv=None) -> None:
                 "minutes": minutes,
                 "cpu_minutes": cpu / 60,
                 "steps": trainer.steps,
-                "psnr": scores["psnr_mean"],
-                "ssim": scores["ssim_mean"],
-                "depth_median": depth["median"],
-                "depth_mean": depth["mean"],
-                "depth_off": depth["off"],
-                "opacity": depth["opacity"],
-                "translucent": depth["translucent"],
+                "psnr": scores.psnr_mean,
+                "ssim": scores.ssim_mean,
+                "depth_median": depth.median,
+                "depth_mean": depth.mean,
+                "depth_off": depth.off,
+                "opacity": depth.opacity,
+                "translucent": depth.translucent,
                 "load": load,
             }
         )
         print(
-            f"{source:>7s} {minutes:8.1f} {trainer.steps:6d} {scores['psnr_mean']:8.2f} {scores['ssim_mean']:6.3f} "
-            f"{100 * depth['median']:10.2f} {100 * depth['mean']:8.2f} {depth['off']:7.2%} {depth['opacity']:8.4f} "
-            f"{depth['translucent']:6.2%} {load:5.1f}",
+            f"{source:>7s} {minutes:8.1f} {trainer.steps:6d} {scores.psnr_mean:8.2f} {scores.ssim_mean:6.3f} "
+            f"{100 * depth.median:10.2f} {100 * depth.mean:8.2f} {depth.off:7.2%} {depth.opacity:8.4f} "
+            f"{depth.translucent:6.2%} {load:5.1f}",
             flush=True,
         )
     table = args.out / "store_radiance.csv"

@@ -21,9 +21,9 @@ import argparse
 import time
 from pathlib import Path
 
-import numpy as np
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
 
 # name: (camera, target, eye). Cameras see over or around shelves; eyes are a shopper's.
 PAIRS = {
@@ -58,8 +58,9 @@ def near_edges(depth: np.ndarray, visible: np.ndarray, margin: int) -> np.ndarra
 
 def measure(scene: Path, pair: str, kind: str, visibility: str, files: dict, width: int, margin: int) -> dict:
     """One row of the table."""
-    import mitsuba as mi
     from nerg_mi.scenes.store import twin
+
+    import mitsuba as mi
 
     camera, target, eye = PAIRS[pair]
     values = {

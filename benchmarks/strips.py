@@ -22,11 +22,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args(arguments)
 
-    import mitsuba as mi
-    import numpy as np
-
     from nerg_mi.jobs.demo import store_scene
     from nerg_mi.rendering.bands import render_bands
+
+    import mitsuba as mi
+    import numpy as np
 
     mi.set_variant("llvm_ad_rgb")
     scene = mi.load_file(str(store_scene()), width=options.width, height=options.width * 9 // 16)

@@ -20,10 +20,10 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import numpy as np
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from fox_radiance import default_data, validation
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+import numpy as np
 
 _PRIMES = (1, 2654435761, 805459861)
 
@@ -136,7 +136,11 @@ class TorchTrainer:
         self.lower = self.model.center - ours.box.side / 2
         self.low, self.high = (torch.tensor(x, dtype=torch.float32) for x in (ours.box.lower, ours.box.upper))
         self.generator = torch.Generator().manual_seed(self.s.seed)
-        self.steps, self.rays, self.begin = 0, 256, time.perf_counter()
+        self.steps, self.rays = 0, 256
+        self.start()
+
+    def start(self):
+        self.begin = time.perf_counter()
 
     @property
     def seconds(self):
@@ -233,10 +237,10 @@ class TorchTrainer:
 
 def same_model(trainer, peer) -> float:
     """Largest relative difference of densities, and of colours, at random points."""
+    from nerg_mi.training.radiance.model import density_color
+
     import drjit as dr
     import torch
-
-    from nerg_mi.training.radiance.model import density_color
 
     rng = np.random.default_rng(0)
     p = rng.uniform(trainer.box.lower, trainer.box.upper, (4096, 3)).astype(np.float32)
@@ -302,7 +306,7 @@ def main(argv=None) -> None:
         load = os.getloadavg()[0]
         for _ in range(3):  # compiled, and warm
             trainer.step()
-        trainer._started = trainer.begin = time.perf_counter() - 1e-3
+        trainer.start()
         while trainer.progress < 1:
             trainer.step()
         seconds, steps = trainer.seconds, trainer.steps
@@ -317,8 +321,8 @@ def main(argv=None) -> None:
                 "minutes": args.minutes,
                 "steps": steps,
                 "steps_per_s": round(steps / seconds, 2),
-                "psnr": round(scores["psnr_mean"], 2),
-                "ssim": round(scores["ssim_mean"], 4),
+                "psnr": round(scores.psnr_mean, 2),
+                "ssim": round(scores.ssim_mean, 4),
                 "load_before": round(load, 1),
             }
         )

@@ -16,9 +16,9 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
 
 SIZE = (0.24, 0.12, 0.25)  # along, into and above the shelf, metres
 JUTS_OUT = 0.06  # metres that the box stands in front of the shelf's edge
@@ -97,11 +97,11 @@ class Attention:
     """Expected attention of a stream of observers to a box on a shelf, and its derivative."""
 
     def __init__(self, shelf: Shelf, heads: np.ndarray, settings: Settings, falloff: float = 0.05):
-        import mitsuba as mi
-        from nerg_mi.scenes.store.attention_law import HERE
-
         from nerg_mi.density.received import patches
+        from nerg_mi.scenes.store.attention_law import HERE
         from nerg_mi.transport.place import Place
+
+        import mitsuba as mi
 
         self.shelf, self.falloff = shelf, falloff
         self.scene = mi.load_file(str(HERE / "shapes.xml"))
@@ -113,9 +113,9 @@ class Attention:
         return self.gaze.evaluate(p_od, p_o, r_o, active)[0]
 
     def _each(self, at, density):
-        import mitsuba as mi
-
         from nerg_mi.density.received import contributions
+
+        import mitsuba as mi
 
         offset = [mi.Float(0)] * 3
         offset[self.shelf.along] = at
@@ -187,12 +187,12 @@ def uphill(values: np.ndarray, start: int, window: int = 2) -> int:
 def elevation(attention: Attention, at: float, spacing: float):
     """The shelf seen from the front with the box at ``at``: albedo (h, w, 3), attention (h, w) in 1/m², extent in
     metres."""
+    from nerg_mi.density.received import Patches, contributions
+    from nerg_mi.scenes.store.attention_law import HERE
+    from nerg_mi.transport.place import Place
+
     import drjit as dr
     import mitsuba as mi
-    from nerg_mi.scenes.store.attention_law import HERE
-
-    from nerg_mi.density.received import Patches, contributions
-    from nerg_mi.transport.place import Place
 
     shelf = attention.shelf
     store = {
@@ -233,9 +233,9 @@ def elevation(attention: Attention, at: float, spacing: float):
 
 def figure(attention: Attention, sweep, paths, checks, settings: Settings):
     """The shelf before and after, the sweep with the ascents, and the derivatives, above one common axis."""
-    from matplotlib.figure import Figure
-
     from nerg_mi.view.overlay import Heat, overlay, top_of
+
+    from matplotlib.figure import Figure
 
     at, values = sweep
     # Of the ascents the one that gained most.
@@ -292,7 +292,8 @@ def main(argv=None) -> dict:
             f"not one of {settings.observers} observers sees a place on {args.shelf}; take another --seed or shelf"
         )
     print(
-        f"sweep of {len(at)} positions: {100 * values.min():.3f} to {100 * values.max():.3f} % of looks, most at {top:.2f} m"
+        f"sweep of {len(at)} positions: {100 * values.min():.3f} to {100 * values.max():.3f} % of looks, "
+        f"most at {top:.2f} m"
     )
 
     starts = shelf.range[0] + (np.arange(settings.starts) + 0.5) / settings.starts * (shelf.range[1] - shelf.range[0])

@@ -20,9 +20,9 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
 
 OBSERVER = "integrator.observer.to_world"
 CAMERAS = [(x, y, 2.7) for x in (0.5, 7.5) for y in (0.8, 5.2)]
@@ -54,8 +54,9 @@ class Pictures:
     """Gaze of an observer at a position, as cameras in the demo store see it: (cameras, h, w) in 1/sr."""
 
     def __init__(self, size, cameras=CAMERAS, file="shapes.xml"):
-        import mitsuba as mi
         from nerg_mi.scenes.store.attention_law import HERE
+
+        import mitsuba as mi
 
         self.scene = mi.load_file(str(HERE / file), aovs="gaze", radiance="false")
         self.params = mi.traverse(self.scene)
@@ -223,9 +224,10 @@ def search(pictures: Pictures, given, guesses, known, settings: Settings) -> lis
 def figure(shown, truths, searches):
     """The first observer's given pictures, those of the best descent before and after, and a floor plan with all of
     them."""
+    from nerg_mi.scenes.store import layout
+
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
-    from nerg_mi.scenes.store import layout
 
     sheet = Figure(figsize=(9, 6.4), layout="constrained")
     axes = sheet.subplot_mosaic(
@@ -293,8 +295,8 @@ def main(argv=None) -> dict:
         off.append([100 * np.linalg.norm(p - truth) for p in (best.path[0], end)])
         shown = shown or {"given": given, "before": pictures.at(best.path[0]), "after": pictures.at(end)}
         print(
-            f"{_text(truth)}  {off[-1][0]:12.1f}  ->  {_text(end)}  {off[-1][1]:8.2f}  {least:.4f}  {len(best.path) - 1:5}"
-            f"  {time.process_time() - began:7.0f}",
+            f"{_text(truth)}  {off[-1][0]:12.1f}  ->  {_text(end)}  {off[-1][1]:8.2f}  {least:.4f}  "
+            f"{len(best.path) - 1:5}  {time.process_time() - began:7.0f}",
             flush=True,
         )
     off = np.array(off)

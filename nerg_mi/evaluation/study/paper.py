@@ -18,7 +18,7 @@ import functools
 import drjit as dr
 
 from nerg_mi.maths.color import composite_to_linear
-from nerg_mi.transport.media.features import what_gaze_wants
+from nerg_mi.transport.features import observed_features
 from nerg_mi.transport.observer import viewpoint
 from nerg_mi.transport.observer.visibility import visibility
 from nerg_mi.transport.place import Place
@@ -103,7 +103,7 @@ def _integrator_class(variant: str):
                 place, attended = Place(like.medium), surface & (seen > 0)
                 like.gaze.face([p_o], place, like.settings, like.depth_kind, like.surface_opacity)
                 p_od = p_o + r_o * d_o
-                semantic = what_gaze_wants(
+                semantic = observed_features(
                     like.gaze.field.config.semantic, place, p_od, p_o, r_o, attended, like.settings
                 )
                 out["gaze"] = dr.select(attended, like.gaze.evaluate(p_od, p_o, r_o, attended, semantic)[0] * seen, 0)

@@ -72,7 +72,7 @@ def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
     def refuse(field, about):
         parameters = field.parameters()
         field.set_parameters(parameters | {"grid.table": parameters["grid.table"] * 0 + 1e6})
-        save_radiance(field, about, tmp_path / "a.safetensors", half=True)
+        save_radiance(field, tmp_path / "a.safetensors", about, half=True)
 
     options = {"state": path, "save_every": 1e9, "on_progress": seen.append}
     with pytest.raises(NergError, match="fp16.*leave out --half.*--resume writes it"):
@@ -85,7 +85,7 @@ def test_a_result_that_cannot_be_written_is_kept(dataset, one_thread, tmp_path):
         settings(steps=6),
         ns,
         resume=True,
-        write=lambda f, a: save_radiance(f, a, tmp_path / "a.safetensors"),
+        write=lambda f, a: save_radiance(f, tmp_path / "a.safetensors", a),
         **options,
     )
     assert about["steps"] == 6 and not seen and [p.name for p in tmp_path.iterdir()] == ["a.safetensors"]

@@ -20,7 +20,7 @@ def test_learns_a_ball_it_has_not_seen_from_there(dataset, tmp_path):
     field, provenance = train_field(dataset, TINY, settings(), ns, on_progress=seen.append)
     assert provenance["psnr_held_out"]["mean"] > 20
     assert provenance["depth_supervision"] and provenance["steps"] == 300 and seen[-1].done == 1
-    save_radiance(field, provenance, tmp_path / "ball.safetensors", half=True)
+    save_radiance(field, tmp_path / "ball.safetensors", provenance, half=True)
     loaded, meta = load_radiance(tmp_path / "ball.safetensors", ns)
     assert meta["provenance"]["settings"]["seed"] == 1
     assert loaded.color_space == "srgb" and loaded.march_step == pytest.approx(2 / 64)
