@@ -262,7 +262,7 @@ def furnish(place: Place, rng) -> None:
             *frame.box((0, 1.6), (0, 0.6), (1.9, 2.2)),
             sign[0],
             skip={frame.back},
-            fronts={frame.front: ((8, 2), lambda i, j, k=k: sign[(i // 2 + j + k) % 2])},
+            fronts={frame.front: ((8, 2), lambda i, j, k=k, sign=sign: sign[(i // 2 + j + k) % 2])},
         )
     rack = Frame((1.1, 0.0), NORTH)
     shelf_unit(place, rng, rack, 2.2, 0.28, (0.12, 0.55, 0.95), 1.35, ("magazines", "magazines"), "5a5f66", "rack")

@@ -33,8 +33,8 @@ GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8
 @dataclass(frozen=True)
 class Case:
     """``line``: the command line, with the folders ``{i}`` of the inputs and ``{o}`` of the outputs; ``files``: all
-    that it makes below the latter; ``blocked``: what of it a file or folder may stand in the way of, and is found before
-    any work; ``once``: functions that take seconds and write nothing."""
+    that it makes below the latter; ``blocked``: what of it a file or folder may stand in the way of, and is found
+    before any work; ``once``: functions that take seconds and write nothing."""
 
     name: str
     line: str

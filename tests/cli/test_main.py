@@ -14,7 +14,10 @@ HEAVY = {"mitsuba", "drjit", "numpy", "scipy", "matplotlib", "torch", "trimesh",
 
 
 def nerg(*arguments, after=""):
-    code = f"import sys; sys.argv[1:] = {list(arguments)!r}\nfrom nerg_mi.cli import main\ntry: main()\nfinally:\n    {after or 'pass'}"
+    code = (
+        f"import sys; sys.argv[1:] = {list(arguments)!r}\n"
+        f"from nerg_mi.cli import main\ntry: main()\nfinally:\n    {after or 'pass'}"
+    )
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
 
 
@@ -114,7 +117,8 @@ def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, capsys, error, 
     out = capsys.readouterr()
     assert end.value.code == 70 and not out.out
     assert out.err == (
-        f"nerg: internal error ({said}): this is a fault of nerg_mi and not of your input; run again with --debug and report the traceback.\n"
+        f"nerg: internal error ({said}): this is a fault of nerg_mi and not of your input; run again with --debug and "
+        "report the traceback.\n"
     )
 
 
@@ -147,7 +151,10 @@ def test07c_what_a_contract_refuses_is_the_users_where_they_chose_it():
             raise TypeError("a bug")
 
 
-QUOTED = '[parser.cpp:1718] At string: failed to instantiate: Traceback (most recent call last):\n  File "a.py", line 15, in f\n    g()\n'
+QUOTED = (
+    "[parser.cpp:1718] At string: failed to instantiate: "
+    'Traceback (most recent call last):\n  File "a.py", line 15, in f\n    g()\n'
+)
 
 
 @pytest.mark.parametrize(
@@ -195,7 +202,8 @@ def test07f_a_plugin_with_a_mistake(rgb, tmp_path, capsys, monkeypatch):
 def test08_sentence_of_a_mitsuba_error():
     error = RuntimeError(
         '[parser.cpp:1718] At string (line 1, col 49): failed to instantiate volume plugin of type "nerf": '
-        'Traceback (most recent call last):\n  File "a.py", line 15, in <module>\n    f()\nValueError: "filename" must\n be given.'
+        'Traceback (most recent call last):\n  File "a.py", line 15, in <module>\n    f()\n'
+        'ValueError: "filename" must\n be given.'
     )
     assert sentence(error) == (
         'At string (line 1, col 49): failed to instantiate volume plugin of type "nerf": "filename" must be given.'

@@ -71,7 +71,8 @@ def test03_parameters_of_a_scene(rgb, tmp_path, capsys):
     """A plugin's sentence arrives through Mitsuba's own exception, which quotes the traceback of ours."""
     path = tmp_path / "scene.xml"
     path.write_text(
-        '<scene version="3.0.0"><integrator type="nerg"><string name="depth" value="deep"/></integrator><sensor type="perspective"/></scene>'
+        '<scene version="3.0.0"><integrator type="nerg"><string name="depth" value="deep"/></integrator>'
+        '<sensor type="perspective"/></scene>'
     )
     code, lines = ended(capsys, "render", path, "-o", tmp_path / "a.exr", "-m", "llvm_ad_rgb")
     assert code == 1 and lines[-1].endswith("\"depth\" must be one of expected, median, refined, got 'deep'")

@@ -20,11 +20,13 @@ SCENE = """
     <shape type="sphere"><float name="radius" value="0.3"/></shape>
     <sensor type="perspective">
         <transform name="to_world"><lookat origin="0, 0, -4" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="8"/><rfilter type="box"/></film>
+        <film type="hdrfilm"><rfilter type="box"/>
+            <integer name="width" value="16"/><integer name="height" value="8"/></film>
         <sampler type="independent"><integer name="sample_count" value="2"/></sampler>
     </sensor>
     <sensor type="panorama">
-        <film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="6"/><rfilter type="box"/></film>
+        <film type="hdrfilm"><rfilter type="box"/>
+            <integer name="width" value="12"/><integer name="height" value="6"/></film>
     </sensor>
 </scene>
 """

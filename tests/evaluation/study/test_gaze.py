@@ -17,15 +17,19 @@ BOX = Box((-3, -3, -3), (3, 3, 3))
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg">
     {medium}<volume name="gaze" type="gazefield"><string name="filename" value="gaze.safetensors"/></volume>
-    <sensor name="observer" type="perspective"><transform name="to_world"><lookat origin="-2, 1, 1" target="0, 0, 0" up="0, 0, 1"/></transform></sensor>
+    <sensor name="observer" type="perspective">
+      <transform name="to_world"><lookat origin="-2, 1, 1" target="0, 0, 0" up="0, 0, 1"/></transform></sensor>
     <float name="falloff" value="0.3"/><string name="aovs" value="depth,opacity,gaze,visibility"/>
   </integrator>
   <sensor type="perspective"><float name="fov" value="50"/>
     <transform name="to_world"><lookat origin="1, -4, 2" target="0, 0, 0" up="0, 0, 1"/></transform>
-    <film type="hdrfilm"><rfilter type="box"/><string name="component_format" value="float32"/><string name="pixel_format" value="rgb"/></film></sensor>
+    <film type="hdrfilm"><rfilter type="box"/>
+      <string name="component_format" value="float32"/>
+      <string name="pixel_format" value="rgb"/></film></sensor>
   {shapes}
 </scene>"""
-SHAPES = """<shape type="cube"><transform name="to_world"><rotate x="0.3" y="1" z="0.5" angle="40"/><scale value="0.6"/></transform></shape>
+SHAPES = """<shape type="cube"><transform name="to_world">
+    <rotate x="0.3" y="1" z="0.5" angle="40"/><scale value="0.6"/></transform></shape>
   <shape type="cube"><transform name="to_world"><scale x="3" y="3" z="0.1"/><translate z="-1.2"/></transform></shape>"""
 MEDIUM = """<volume name="density" type="constvolume"><float name="value" value="400"/>
     <transform name="to_world"><translate x="-0.5" y="-0.5" z="-0.5"/></transform></volume>"""

@@ -20,7 +20,8 @@ class Recorded:
     def __init__(self):
         self.renders, self.steps = [], []
 
-    def integrator(self, params={}, resolution=0):
+    def integrator(self, params=None, resolution=0):
+        params = params or {}
         self.steps.append(params.get("step"))
         return SimpleNamespace(params=params)
 

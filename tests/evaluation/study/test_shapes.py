@@ -11,13 +11,17 @@ from nerg_mi.evaluation.study import subject as study_subject
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg">
-    <sensor name="observer" type="perspective"><transform name="to_world"><lookat origin="-3, 1, 1" target="0, 0, 0" up="0, 0, 1"/></transform></sensor>
+    <sensor name="observer" type="perspective">
+      <transform name="to_world"><lookat origin="-3, 1, 1" target="0, 0, 0" up="0, 0, 1"/></transform></sensor>
     <float name="falloff" value="{falloff}"/><string name="depth" value="median"/>
   </integrator>
   <sensor type="perspective"><float name="fov" value="50"/>
     <transform name="to_world"><lookat origin="1, -4, 2" target="0, 0, 0" up="0, 0, 1"/></transform>
-    <film type="hdrfilm"><rfilter type="box"/><string name="component_format" value="float32"/><string name="pixel_format" value="rgb"/></film></sensor>
-  <shape type="cube"><transform name="to_world"><rotate x="0.3" y="1" z="0.5" angle="40"/><scale value="0.6"/></transform></shape>
+    <film type="hdrfilm"><rfilter type="box"/>
+      <string name="component_format" value="float32"/>
+      <string name="pixel_format" value="rgb"/></film></sensor>
+  <shape type="cube"><transform name="to_world">
+    <rotate x="0.3" y="1" z="0.5" angle="40"/><scale value="0.6"/></transform></shape>
   <shape type="cube"><transform name="to_world"><scale x="3" y="3" z="0.1"/><translate z="-1.2"/></transform></shape>
   {more}
 </scene>"""

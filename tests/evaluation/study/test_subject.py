@@ -58,10 +58,12 @@ def test_solids_are_met_where_geometry_says():
 def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text("""<scene version="3.0.0">
-      <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="4"/></volume></integrator>
+      <integrator type="nerg">
+        <volume name="density" type="constvolume"><float name="value" value="4"/></volume></integrator>
       <sensor type="perspective"><float name="fov" value="30"/>
         <transform name="to_world"><lookat origin="0.5, 0.5, -2" target="0.5, 0.5, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm"><integer name="width" value="99"/><rfilter type="box"/><string name="component_format" value="float32"/></film>
+        <film type="hdrfilm"><integer name="width" value="99"/><rfilter type="box"/>
+          <string name="component_format" value="float32"/></film>
       </sensor></scene>""")
     subject = open_subject(str(path), "auto", 12, 8)
     known = subject.truth(1, "median", "depth")
