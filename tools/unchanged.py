@@ -27,7 +27,8 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 STORE = ROOT / "scenes" / "store"
-NERG = str(Path(sys.executable).with_name("nerg"))
+# Not the installed script, so that a tree whose entry point has moved is run as well.
+NERG = [sys.executable, "-c", "from nerg_mi.cli import main; main()"]
 SIZE = ["-D", "width=96", "-D", "height=64", "-D", "sphere_width=96", "-D", "sphere_height=48", "-D", "spp=2"]
 ALL_AOVS = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth,features,features_at"
 COUNTS = "depth,gaze,gaze_evals,density_evals,color_evals"
@@ -218,7 +219,7 @@ def run(folder: Path, only: str | None) -> dict[str, str]:
         if only is not None and only not in name:
             continue
         out = folder / name
-        answer = subprocess.run([NERG, *line, "-o", str(out)], capture_output=True, text=True)
+        answer = subprocess.run([*NERG, *line, "-o", str(out)], capture_output=True, text=True)
         if answer.returncode != 0:
             found[name] = f"exit code {answer.returncode}: {answer.stderr.strip()[-400:]}"
         elif name == "study":

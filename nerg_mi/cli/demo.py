@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from nerg_mi.jobs.options.pictures import DemoOptions
+
 from .defines import Defines, parse_defines
-from .mode import BestMode
+from .options import takes
 from .progress import TerminalReporter
 
 
+@takes(DemoOptions, "scene", "defaults")
 def command(
+    options: DemoOptions,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write into; it is made.")] = Path("out/demo"),
-    width: Annotated[int, typer.Option(help="Width of a picture in pixels; pictures are 3:2.")] = 600,
-    spp: Annotated[int, typer.Option("--spp", help="Samples a pixel.")] = 8,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random numbers.")] = 0,
     define: Defines = None,
-    mode: BestMode = None,
 ) -> None:
     """Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, EXR, run.json."""
-    defaults = parse_defines(define)
+    options = replace(options, defaults=parse_defines(define))
     from nerg_mi.jobs import demo
 
-    options = demo.DemoOptions(defaults=defaults, width=width, spp=spp, seed=seed, mode=mode)
     with TerminalReporter() as reporter:
         demo.make_demo(out, options, reporter)
     print(f"Look at them with: {_viewer(out)}")

@@ -1,4 +1,4 @@
-"""The option that names the Mitsuba variant, the same for every command."""
+"""The former name of the option that names the Mitsuba variant, which is --mode for every command."""
 
 from __future__ import annotations
 
@@ -6,15 +6,6 @@ import sys
 from typing import Annotated
 
 import typer
-
-Mode = Annotated[str, typer.Option("-m", "--mode", help="Mitsuba variant.")]
-"""For what is computed on the CPU unless another variant is asked for."""
-
-BestMode = Annotated[
-    str | None,
-    typer.Option("-m", "--mode", help="Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]"),
-]
-"""For what is rendered, on a GPU where there is one."""
 
 OldMode = Annotated[str | None, typer.Option("--variant", hidden=True, help="Former name of --mode.")]
 """For commands whose --mode was called --variant, which means the factors of a gaze field elsewhere."""

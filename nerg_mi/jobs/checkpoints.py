@@ -15,25 +15,8 @@ from nerg_mi.formats.torch_ngp.nerg import is_nerg, read_nerg
 from nerg_mi.formats.torch_ngp.state_dict import open_checkpoint
 
 from .backend import select_backend
+from .options.checkpoints import ImportOptions
 from .reporter import SILENT, Reporter
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImportOptions:
-    """What a checkpoint does not say of itself, and how its fields are stored."""
-
-    # Moving averages of the weights, or the weights; None: averages, if there are any.
-    ema: bool | None = None
-    # What --color_space was in training: srgb or linear.
-    color_space: str = "srgb"
-    # What --bg_radius was in training, where there is a background network; 0: leave it out.
-    bg_radius: float | None = None
-    # Finest resolution of the hash grid; None: 2048 x bound.
-    finest: int | None = None
-    # Store the weights in fp16.
-    half: bool = False
-    # Mitsuba variant.
-    mode: str = "llvm_ad_rgb"
 
 
 @dataclass(frozen=True)

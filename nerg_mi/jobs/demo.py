@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from nerg_mi.view import figures
 from nerg_mi.view.overlay import Heat, top_of
 from nerg_mi.view.tonemap import srgb, write_png
 
+from .options.pictures import DemoOptions
 from .reporter import SILENT, Reporter
 from .versions import versions
 
@@ -37,24 +38,6 @@ CHECKPOINTS = {"field": "store.safetensors", "gaze": "shoppers.safetensors"}
 MAKE = "python -m nerg_mi.scenes.store.make"
 
 STAGES = ("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures")
-
-
-@dataclass(frozen=True, kw_only=True)
-class DemoOptions:
-    """Which pictures the demo makes."""
-
-    # Scene file; None: the demo store's.
-    scene: Path | None = None
-    # Values for its `<default>`s, such as eye or falloff.
-    defaults: Mapping[str, str] = field(default_factory=dict)
-    # Of a picture in pixels; pictures are 3:2, the sphere's is 2:1 and as wide.
-    width: int = 600
-    # Samples a pixel.
-    spp: int = 8
-    # Seed of the random numbers.
-    seed: int = 0
-    # Mitsuba variant; None: cuda_ad_rgb if it works, else llvm_ad_rgb.
-    mode: str | None = None
 
 
 @dataclass(frozen=True)
@@ -79,11 +62,12 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     out = Path(out)
     check_folder(out)
     scene = store_scene() if options.scene is None else Path(options.scene)
-    inputs = _inputs(scene, options.defaults)
+    defaults = dict(options.defaults or {})
+    inputs = _inputs(scene, defaults)
     mode = activate(options.mode)
     clock = _Clock(reporter)
     sizes = {"width": width, "height": 2 * width // 3, "sphere_width": width // 2 * 2, "sphere_height": width // 2}
-    values = {k: str(v) for k, v in sizes.items()} | dict(options.defaults)
+    values = {k: str(v) for k, v in sizes.items()} | defaults
     values |= {"aovs": "depth,opacity,gaze,visibility"}
 
     with Interruption() as stop:
@@ -127,7 +111,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         "seed": seed,
         "spp": spp,
         **sizes,
-        "defaults": dict(options.defaults),
+        "defaults": defaults,
         "gaze_scale_top_per_sr": heat.top,
         "gaze_sphere_integral": sphere_integral(sphere),
         "seconds": {k: round(v, 2) for k, v in clock.seconds.items()},

@@ -16,55 +16,8 @@ from nerg_mi.formats.torch_ngp.fields import write_torch_ngp
 from nerg_mi.formats.volumes import density_and_color, write_volume
 
 from .backend import select_backend
+from .options.export import MeshOptions, PointOptions, TorchNgpOptions, VolumeOptions
 from .reporter import SILENT, Reporter
-
-
-@dataclass(frozen=True, kw_only=True)
-class MeshOptions:
-    """Where the surface of a mesh lies, and what is left out of it."""
-
-    # Lattice cells along the longest edge of the field's box.
-    resolution: int = 256
-    # Density, 1/unit, at which the surface lies; None: half of the light absorbed in a cell.
-    density: float | None = None
-    # Close holes of up to twice so many cells; 0: none.
-    fill: int = 1
-    # Drop pieces with less than this share of the largest one's area.
-    keep: float = 0.001
-    # Keep the backs and insides that training never looked at.
-    unseen: bool = False
-    # Up axis of the field, for .glb: z or y.
-    up: str = "z"
-    # Mitsuba variant.
-    mode: str = "llvm_ad_rgb"
-
-
-@dataclass(frozen=True, kw_only=True)
-class PointOptions:
-    """Which points of a surface are written."""
-
-    # Lattice cells along the longest edge of the field's box.
-    resolution: int = 256
-    # Density, 1/unit, at which the surface lies; None: half of the light absorbed in a cell.
-    density: float | None = None
-    # Points at most; None: all.
-    count: int | None = None
-    # Up axis of the field, for .glb: z or y.
-    up: str = "z"
-    # Mitsuba variant.
-    mode: str = "llvm_ad_rgb"
-
-
-@dataclass(frozen=True, kw_only=True)
-class VolumeOptions:
-    """What a grid volume holds."""
-
-    # Voxels along the longest edge of the field's box.
-    resolution: int = 256
-    # Also write the colour, to this .vol file.
-    color: Path | None = None
-    # Mitsuba variant.
-    mode: str = "llvm_ad_rgb"
 
 
 @dataclass(frozen=True)
@@ -151,13 +104,16 @@ def export_volume(
 
 
 def export_torch_ngp(
-    field: str | Path | RadianceField, output: str | Path, mode: str = "llvm_ad_rgb", reporter: Reporter = SILENT
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: TorchNgpOptions | None = None,
+    reporter: Reporter = SILENT,
 ) -> Export:
     """Write a torch-ngp checkpoint (.pth), of a field whose grid and networks have torch-ngp's shapes; raises
     `NergError` for another."""
-    output, start = Path(output), time.perf_counter()
+    options, output, start = options or TorchNgpOptions(), Path(output), time.perf_counter()
     check_writable(output, ".pth")
-    write_torch_ngp(_load(field, mode), output)
+    write_torch_ngp(_load(field, options.mode), output)
     return _written([output], start, reporter)
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError, mitsuba_says
@@ -16,30 +15,11 @@ from nerg_mi.rendering.picture_file import FORMATS, picture_rows
 from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.rendering.scene_file import check_samples
 
+from .options.pictures import PictureOptions
 from .reporter import SILENT, Reporter
 
 RESERVE = 150e6
 """Bytes kept free beside a band, for the strips in it and for the kernel that is compiled first."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PictureOptions:
-    """How a scene file is rendered."""
-
-    # Values for the `<default>` and `$key` of the scene.
-    defaults: Mapping[str, str] = field(default_factory=dict)
-    # Index of the sensor, counted from 0.
-    sensor: int = 0
-    # Samples a pixel; 0: as the scene says.
-    spp: int = 0
-    # Seed of the random numbers.
-    seed: int = 0
-    # Worker threads; 0: one a core.
-    threads: int = 0
-    # GB that the process may take; what needs more is rendered in bands of rows.
-    memory: float = 1.0
-    # Mitsuba variant; None: cuda_ad_rgb if it works, else llvm_ad_rgb.
-    mode: str | None = None
 
 
 @dataclass(frozen=True)

@@ -18,51 +18,8 @@ from nerg_mi.training.radiance import run
 from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 
 from .backend import select_backend
+from .options.radiance import RadianceOptions, RadianceScoreOptions
 from .reporter import SILENT, Reporter
-
-
-@dataclass(frozen=True, kw_only=True)
-class RadianceOptions:
-    """How a radiance field is trained."""
-
-    # Hold out every so many frames, 0: none; None: those of transforms_test.json, else every eighth.
-    holdout: int | None = None
-    # Architecture: small, medium or paper.
-    size: str = "small"
-    # Width of the pictures in pixels; None: as they are.
-    width: int | None = None
-    # Or: divide their size by this.
-    downscale: float | None = None
-    # Train for this long; None: 5, unless steps are given.
-    minutes: float | None = None
-    # Or: train for so many steps.
-    steps: int | None = None
-    # Bounds of what is seen, x0, y0, z0, x1, y1, z1, in the coordinates of the field; None: found.
-    aabb: tuple[float, ...] | None = None
-    # What all lengths are multiplied by: what a unit of the data set measures, in metres.
-    scale: float = 1.0
-    # Of the field: file, original (applied_transform undone), or a dataparser_transforms.json.
-    coordinates: str = "file"
-    # Read files outside of the data set's folder too, where it names them.
-    allow_outside: bool = False
-    # Of the weights, rays and jitter.
-    seed: int = 0
-    # Of the CPU; None: all.
-    threads: int | None = None
-    # Store the weights in fp16.
-    half: bool = False
-    # Supervise with the data set's depth, where it has any.
-    depth: bool = True
-    # Weight of the depth's loss; None: the default of `RadianceSettings`.
-    depth_weight: float | None = None
-    # Weight of mip-NeRF 360's distortion loss, against fog; 0: none.
-    distortion_weight: float = 0.0
-    # Go on with the interrupted run of this output.
-    resume: bool = False
-    # Seconds between two states to resume from; 0: only one, when the run ends early.
-    save_every: float = 60.0
-    # Mitsuba variant.
-    mode: str = "llvm_ad_rgb"
 
 
 @dataclass(frozen=True)
@@ -181,34 +138,6 @@ def _tell_result(result: RadianceResult, reporter: Reporter) -> None:
         reporter.warn(complaint)
     if result.output is not None:
         reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")
-
-
-@dataclass(frozen=True, kw_only=True)
-class RadianceScoreOptions:
-    """On which views a radiance field is scored, and how they are rendered."""
-
-    # As it was trained with; None: transforms_test.json, else every eighth frame.
-    holdout: int | None = None
-    # Score the training views instead.
-    train: bool = False
-    # Width of the pictures in pixels; None: as it was trained.
-    width: int | None = None
-    # As it was trained with.
-    scale: float = 1.0
-    # As it was trained with.
-    coordinates: str = "file"
-    # Read files outside of the data set's folder too, where it names them.
-    allow_outside: bool = False
-    # Rays a pixel; the scatter of few is part of the score.
-    spp: int = 16
-    # Folder for the pictures, each beside its photo; None: none are written.
-    pictures: Path | None = None
-    # File for the scores as JSON; None: none is written.
-    json_file: Path | None = None
-    # Of the CPU; None: all.
-    threads: int | None = None
-    # Mitsuba variant.
-    mode: str = "llvm_ad_rgb"
 
 
 def evaluate_radiance(

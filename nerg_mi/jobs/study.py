@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -16,30 +15,9 @@ from nerg_mi.evaluation.study.subject import ExactSurfaces, Subject, open_subjec
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.rendering.pictures import activate
 
+from .options.study import StudyOptions
 from .reporter import SILENT, Reporter
 from .versions import versions
-
-
-@dataclass(frozen=True, kw_only=True)
-class StudyOptions:
-    """What a study renders, and how often."""
-
-    # What the scene is: analytic, file, or auto to find out.
-    scene_kind: str = "auto"
-    # Of a picture in pixels.
-    width: int = 192
-    # Of a picture in pixels.
-    height: int = 128
-    # Timed renders of each setting; their median counts.
-    repeats: int = 5
-    # A few settings only, each timed once.
-    quick: bool = False
-    # Regular expression that the names of further settings than the default match.
-    only: str = ""
-    # Values for the `<default>`s of a scene file.
-    defaults: Mapping[str, str] = field(default_factory=dict)
-    # Mitsuba variant; None: cuda_ad_rgb if it works, else llvm_ad_rgb.
-    mode: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,38 @@
+"""Options of the rendering of a scene file, and of the demo's pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions:
+    """How a scene file is rendered."""
+
+    defaults: Mapping[str, str] | None = option(None, "Values for $KEYs and <default>s of the scene, by name.")
+    sensor: int = option(0, "Index of the sensor, counted from 0.", "-s", "--sensor")
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+    spp: int = option(0, "Samples a pixel; 0: as the scene says.", min=0)
+    seed: int = option(0, "Seed of the random numbers.", min=0)
+    threads: int = option(0, "Worker threads; 0: one a core.", "-t", "--threads", min=0)
+    memory: float = option(1.0, "GB that rendering may take; larger pictures are made in bands.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions:
+    """Which pictures the demo makes."""
+
+    scene: Path | None = option(None, "Scene file.  [default: the demo store's]")
+    defaults: Mapping[str, str] | None = option(None, "Values for its <default>s, such as eye or falloff, by name.")
+    width: int = option(600, "Width of a picture in pixels; pictures are 3:2.")
+    spp: int = option(8, "Samples a pixel.")
+    seed: int = option(0, "Seed of the random numbers.", min=0)
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )

@@ -1,0 +1,55 @@
+"""Options of the training and of the evaluation of a radiance field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoOptions:
+    """How a posed image set is read."""
+
+    holdout: int | None = option(None, "Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.")
+    width: int | None = option(None, "Width of the pictures in pixels. Default: as they are, or as it was trained.")
+    scale: float = option(1.0, "Multiply all lengths by this: what a unit of the data set measures, in metres.")
+    coordinates: str = option(
+        "file", "Of the field: file, original (applied_transform undone), or a dataparser_transforms.json."
+    )
+    allow_outside: bool = option(False, "Read files outside of the data set's folder too, where it names them.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RadianceOptions(PhotoOptions):
+    """How a radiance field is trained."""
+
+    size: str = option("small", "Size of the field: small, medium or paper.")
+    downscale: float | None = option(None, "In place of a width: divide the pictures' size by this.")
+    minutes: float | None = option(None, "Train for this long. Default: 5.")
+    steps: int | None = option(None, "Or: train for so many steps.")
+    aabb: tuple[float, ...] | None = option(
+        None, "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field."
+    )
+    seed: int = option(0, "Seed of the weights, rays and jitter.")
+    threads: int | None = option(None, "CPU threads. Default: all.")
+    half: bool = option(False, "Store the weights in fp16.")
+    depth: bool = option(True, "Supervise with the data set's depth, where it has any.")
+    depth_weight: float | None = option(None, "Weight of the depth's loss.")
+    distortion_weight: float = option(0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.")
+    resume: bool = option(False, "Go on with the interrupted run of this output.")
+    save_every: float = option(60.0, "Seconds between two states for --resume; 0: only one, when it ends early.")
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RadianceScoreOptions(PhotoOptions):
+    """On which views a radiance field is scored, and how they are rendered. The photos are read as in its training."""
+
+    train: bool = option(False, "Score the training views instead.")
+    spp: int = option(16, "Rays a pixel. The scatter of few is part of the score.", min=1)
+    pictures: Path | None = option(None, "Folder for the pictures, each beside its photo.", "-o", "--output")
+    json_file: Path | None = option(None, "Write the scores to this file.", "--json")
+    threads: int | None = option(None, "CPU threads. Default: all.")
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

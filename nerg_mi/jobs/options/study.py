@@ -1,0 +1,24 @@
+"""Options of the study of error against run time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from . import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions:
+    """What a study renders, and how often."""
+
+    scene_kind: str = option("auto", "What SCENE is: auto, analytic or file.")
+    width: int = option(192, "Width of a picture in pixels.")
+    height: int = option(128, "Height of a picture in pixels.")
+    repeats: int = option(5, "Timed renders of each setting; their median counts.")
+    quick: bool = option(False, "A few settings only, each timed once.")
+    only: str = option("", "Only the default, and settings whose name matches.", metavar="REGEX")
+    defaults: Mapping[str, str] | None = option(None, "Values for <default>s of the scene file, by name.")
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
