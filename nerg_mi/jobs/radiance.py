@@ -170,9 +170,19 @@ def evaluate_radiance(
     if not options.train:
         _refuse_trained(field, about, data)
     views = data.train if options.train else data.held_out
-    row = lambda name, psnr, ssim: reporter.message(f"{name[-32:]:32s} {psnr:8.2f} {ssim:7.4f}")
+    done = 0
+
+    def row(name: str, psnr: float, ssim: float) -> None:
+        reporter.message(f"{name[-32:]:32s} {psnr:8.2f} {ssim:7.4f}")
+
+    def scored(name: str, psnr: float, ssim: float) -> None:
+        nonlocal done
+        done += 1
+        row(name, psnr, ssim)
+        reporter.progress(done / len(views), f"{done} of {len(views)} views")
+
     reporter.message(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")
-    scores = score_views(field, views, options.spp, options.pictures, row)
+    scores = score_views(field, views, options.spp, options.pictures, scored)
     row("mean", scores.psnr_mean, scores.ssim_mean)
     if scores.depth is not None:
         d = scores.depth

@@ -13,8 +13,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -32,6 +33,14 @@ STRIP_SECONDS = 0.5
 BYTES_PER_VALUE = 22
 """Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the
 others in the copies on the way to the file."""
+
+
+@runtime_checkable
+class Observing(Protocol):
+    """An integrator in Python that renders as `mi.SamplingIntegrator` does within a context of its own."""
+
+    def seen_by(self, sensor, scene) -> AbstractContextManager:
+        """The context in which samples of ``sensor``'s picture of ``scene`` are traced."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +64,7 @@ def why_whole(scene, sensor) -> str | None:
         return f"the variant {mi.variant()}"
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         return f"the integrator {integrator.class_name()}"
-    if not hasattr(integrator, "seen_by") and _renders_itself(type(integrator), mi.SamplingIntegrator):
+    if not isinstance(integrator, Observing) and _renders_itself(type(integrator), mi.SamplingIntegrator):
         return f"the integrator {integrator.class_name()}, which renders in a way of its own"
     if film.class_name() != "HDRFilm":
         return f"the film {film.class_name()}"
@@ -106,14 +115,15 @@ def render_bands(
         yield _whole(scene, sensor, spp, seed, on_strip)
         return
     grid = _Grid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
-    seen_by = getattr(scene.integrator(), "seen_by", None)
+    integrator = scene.integrator()
+    observing = lambda: integrator.seen_by(sensor, scene) if isinstance(integrator, Observing) else nullcontext()
     base = pixel_sampler.base_seed(sensor.sampler())
     pace = _Pace(strip)
     done = 0
     for top in range(0, grid.height, grid.rows):
-        block = grid.block(scene.integrator())
+        block = grid.block(integrator)
         start, stop = grid.samples(top)
-        with nullcontext() if seen_by is None else seen_by(sensor, scene), grid.as_whole(block):
+        with observing(), grid.as_whole(block):
             for first, count in pace.strips(start, stop, grid.spp):
                 block.put(*_trace(scene, sensor, grid, base, seed, top, first, count, start))
                 # What was traced while the strip before it was computed is computed now.
@@ -125,7 +135,7 @@ def render_bands(
             pace.wait()
         if on_strip is not None:
             on_strip(min(done, grid.total), grid.total)
-        grid.develop(scene.integrator(), block)
+        grid.develop(integrator, block)
         yield Band(top, min(grid.rows, grid.height - top), sensor.film())
 
 

@@ -160,13 +160,14 @@ def visible_samples(
     pad: int | None = None,
     thinning: Thinning | None = None,
     most: int | None = None,
+    with_features: bool = False,
 ) -> tuple[Samples | None, int]:
     """Samples that may matter, and the number of leading rays that they cover completely.
 
-    ``density``: function of points and a mask giving σ without a gradient, or σ and a list of Floats that the samples
-    are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make exactly so many
-    samples, dropping the last rays that do not fit. ``thinning``: let few samples stand for the many that hardly
-    absorb. ``most``: samples at most at which ``density`` is evaluated, by the same means.
+    ``density``: function of points and a mask giving σ without a gradient, and with ``with_features`` also a list of
+    Floats that the samples are to keep; samples that less than ``stop`` of the light reaches are dropped. ``pad``: make
+    exactly so many samples, dropping the last rays that do not fit. ``thinning``: let few samples stand for the many
+    that hardly absorb. ``most``: samples at most at which ``density`` is evaluated, by the same means.
     Returns (None, rays) when no ray meets anything.
     """
     steps = occupied_steps(rays, table, offset, occupied, most)
@@ -176,8 +177,7 @@ def visible_samples(
     Bool, Float, UInt32 = dr.mask_t(t), type(t), type(ray)
     everywhere = dr.full(Bool, True, dr.width(t))
     segments = Segments(ray, everywhere, rays.count)
-    sigma = density(p, everywhere)
-    sigma, features = sigma if isinstance(sigma, tuple) else (sigma, None)
+    sigma, features = density(p, everywhere) if with_features else (density(p, everywhere), None)
     tau = dr.minimum(sigma * length, 60.0)
     # At once: each on its own would evaluate the field again.
     dr.eval(tau, features)

@@ -158,7 +158,7 @@ class RadianceTrainer:
         offset = ns.Float(aligned(self.rng.random(self.rays, np.float32)))
         thinning = Thinning(s.thin_sure, s.thin_least, int(self.rng.integers(2**63))) if s.thin_least < 1 else None
         samples, covered = visible_samples(
-            rays, table, offset, self.grid.occupied, self._look, s.stop, s.batch, thinning, most
+            rays, table, offset, self.grid.occupied, self._look, s.stop, s.batch, thinning, most, with_features=True
         )
         self.steps += 1
         if samples is None:
