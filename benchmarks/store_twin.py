@@ -68,7 +68,7 @@ def shadowed(eye, p, grow: float, behind: float) -> np.ndarray:
     return entry < distance - behind
 
 
-def look(scene, spp=1, seed=1) -> dict:
+def channels(scene, spp=1, seed=1) -> dict:
     """AOVs of sensor 0 by name (h, w) or (h, w, 3), and "color"."""
     import mitsuba as mi
 
@@ -102,7 +102,7 @@ def measure(folder: Path, pair: str, width: int, files: dict, color_spp: int) ->
     camera, target, eye = PAIRS[pair]
     values = {"camera": camera, "target": target, "eye": eye} | {k: v for k, v in files.items() if k == "gaze"}
     field, shapes = (
-        look(load(folder / name, width, radiance="false", **values | extra))
+        channels(load(folder / name, width, radiance="false", **values | extra))
         for name, extra in (("scene.xml", files), ("shapes.xml", {}))
     )
     both = field["surface"] & shapes["surface"]
@@ -113,7 +113,9 @@ def measure(folder: Path, pair: str, width: int, files: dict, color_spp: int) ->
     d = (shapes["p"] - o) / np.maximum(exact[..., None], 1e-9)
     truth = np.zeros(both.shape, bool)
     truth[both] = twin.visible(e, (shapes["p"] - 1e-3 * d)[both])
-    sharp = look(load(folder / "shapes.xml", width, radiance="false", **values | {"falloff": "0"}))["visibility"] > 0.5
+    sharp = (
+        channels(load(folder / "shapes.xml", width, radiance="false", **values | {"falloff": "0"}))["visibility"] > 0.5
+    )
 
     shown, seen = (v["visibility"] > 0.5 for v in (field, shapes))
     away = both & ~near_edges(np.where(both, exact, 1e3), seen, 2)
@@ -137,8 +139,8 @@ def measure(folder: Path, pair: str, width: int, files: dict, color_spp: int) ->
     if color_spp:
         values["width"] = width // 2
         scene = load(folder / "shapes.xml", **values)
-        a = look(load(folder / "scene.xml", **values | files), 16)["color"]
-        first, second = (look(scene, color_spp, seed)["color"] for seed in (1, 2))
+        a = channels(load(folder / "scene.xml", **values | files), 16)["color"]
+        first, second = (channels(scene, color_spp, seed)["color"] for seed in (1, 2))
         # The paths' noise is not the field's error: that of two renders is independent, and cancels in the product.
         a, first, second = (np.clip(c, 0, 1) for c in (a, first, second))
         row["colour dB"] = decibels(np.mean((a - first) * (a - second)))
@@ -172,11 +174,11 @@ def measure_display(folder: Path, width: int, files: dict, shapes: bool = False)
         files = {k: v for k, v in files.items() if k != "field"} | {"falloff": "0"}
     scene = load(folder / "display.xml", width, radiance="false", place=place, **files)
     camera = np.ravel(np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)[:3, 3])
-    there = look(scene)
+    there = channels(scene)
     if not shapes:
         move_away(scene)
-        bare = look(scene)
-    plain = look(load(folder / place, width, radiance="false", eye=EYE, camera=CAMERA, target=TARGET, **files))
+        bare = channels(scene)
+    plain = channels(load(folder / place, width, radiance="false", eye=EYE, camera=CAMERA, target=TARGET, **files))
     if shapes:
         # A display a kilometre away would make the scene, and with it the tolerance, larger.
         bare = plain
@@ -232,9 +234,9 @@ def picture(folder: Path, path: Path, width: int, spp: int, files: dict) -> None
     from nerg_mi.view.tonemap import srgb, write_png
 
     scene = load(folder / "display.xml", width, **files)
-    there = look(scene, spp)
+    there = channels(scene, spp)
     move_away(scene)
-    bare = look(scene, spp)
+    bare = channels(scene, spp)
     heat = Heat(top_of(bare["gaze"], bare["surface"]))
     panels = [srgb(there["color"]), *(overlay(v["color"], v["gaze"], heat, v["surface"]) for v in (bare, there))]
     gap = np.ones((panels[0].shape[0], 6, 3))

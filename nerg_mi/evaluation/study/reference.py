@@ -62,7 +62,7 @@ def box_distances(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.where(miss, 0, near), np.where(miss, 0, far)
 
 
-def look(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | None = None) -> Seen:
+def trace(scene: AnalyticScene, o: np.ndarray, d: np.ndarray, end: np.ndarray | None = None) -> Seen:
     """What float64 rays ``o + t d`` (N, 3) see of ``scene``, up to the distances ``end`` (N,)."""
     near, far = box_distances(o, d)
     if end is not None:
@@ -185,7 +185,7 @@ def truth(
     ``gaze``: what ``evaluate(p_od, p_o, r_o, True)`` asks (a single-precision network, evaluated at float64 positions),
     or None; a normalised one faces the observer already.
     """
-    seen = look(scene, o, d)
+    seen = trace(scene, o, d)
     t = seen.depth(depth)
     surface = seen.opacity >= surface_opacity
     p_d = o + d * t[:, None]
@@ -198,9 +198,9 @@ def truth(
     start = np.broadcast_to(p_o, o.shape)
     p_od = p_d
     if visibility == "transmittance":
-        share = np.exp(-look(scene, start, r_o, distance).tau)
+        share = np.exp(-trace(scene, start, r_o, distance).tau)
     else:
-        met = look(scene, start, r_o)
+        met = trace(scene, start, r_o)
         d_o = np.where(met.opacity >= surface_opacity, met.depth(depth), np.inf)
         excess = distance - d_o - tolerance
         share = 1 - (np.clip(excess / falloff, 0, 1) if falloff > 0 else (excess > 0))

@@ -18,17 +18,21 @@ PAPER = "paper"
 
 @dataclass(frozen=True)
 class Setting:
-    """One row of a study. ``group``: the factor it belongs to; ``params``: of the integrator, over the scene's own;
-    ``spp``;
-    ``resolution``: of the density as a grid (0: the scene's own); ``paper``: (steps, γ) of the paper's marching;
-    ``first_frame``: what is kept from frame to frame is made anew in each."""
+    """One row of a study."""
 
+    # As the tables have it.
     name: str
+    # The factor that it belongs to.
     group: str
+    # Of the integrator, over the scene's own.
     params: Mapping = field(default_factory=dict)
+    # Samples a pixel.
     spp: int = 1
+    # Of the density as a grid; 0: the scene's own.
     resolution: int = 0
+    # (steps, γ) of the paper's marching; None: ours.
     paper: tuple[int, float] | None = None
+    # What is kept from frame to frame is made anew in each.
     first_frame: bool = False
 
     def integrator(self, subject, **more):

@@ -26,7 +26,7 @@ def rays(scene, count=24, seed=0):
 def test_slab_is_the_closed_form():
     scene = study_scenes.SCENES["slab"]
     o, d = rays(scene)
-    seen = study_reference.look(scene, o, d)
+    seen = study_reference.trace(scene, o, d)
     for i in range(len(o) - 1):
         near, far = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
         alpha, expected, median = march_numpy.slab(study_scenes.SLAB_DENSITY, near, far)
@@ -38,7 +38,7 @@ def test_slab_is_the_closed_form():
 def test_references_are_the_limit_of_a_float64_march(name):
     scene = study_scenes.SCENES[name]
     o, d = rays(scene, 12)
-    seen = study_reference.look(scene, o, d)
+    seen = study_reference.trace(scene, o, d)
     color = seen.color(o, d)
     for i in range(len(o) - 1):
         near, far = march_numpy.box(o[i], d[i], (0, 0, 0), (1, 1, 1))
@@ -55,11 +55,11 @@ def test_references_are_the_limit_of_a_float64_march(name):
         assert np.allclose(color[i], total, atol=2e-5)
 
 
-def test_a_look_that_ends_is_the_front_of_a_whole_one():
+def test_a_trace_that_ends_is_the_front_of_a_whole_one():
     for scene in study_scenes.SCENES.values():
         o, d = rays(scene, 8)
-        seen = study_reference.look(scene, o, d)
-        half = study_reference.look(scene, o, d, seen.median)
+        seen = study_reference.trace(scene, o, d)
+        half = study_reference.trace(scene, o, d, seen.median)
         assert np.allclose(half.opacity, seen.opacity / 2, rtol=1e-9)
 
 
@@ -68,7 +68,7 @@ def test_the_point_looked_for_lies_on_the_face_of_a_solid_for_each_kind_of_depth
     subject = open_subject("sphere", "auto", 96, 64)
     t, visible = subject.exact(1)
     o, d = subject.rays(1)
-    seen = study_reference.look(subject.analytic, o, d)
+    seen = study_reference.trace(subject.analytic, o, d)
     thick = np.isfinite(t) & (seen.tau > 12)
     for kind in ("expected", "median"):
         known = study_reference.truth(
