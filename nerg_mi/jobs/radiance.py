@@ -149,8 +149,9 @@ def evaluate_radiance(
     Raises `NergError` for what the user can mend, among it views that the field was trained on.
     """
     options = options or RadianceScoreOptions()
-    if options.pictures is not None:
-        check_folder(options.pictures)
+    pictures = None if options.pictures is None else Path(options.pictures)
+    if pictures is not None:
+        check_folder(pictures)
     if options.json_file is not None:
         check_writable(options.json_file)
     select_backend(options.mode, options.threads)
@@ -182,7 +183,7 @@ def evaluate_radiance(
         reporter.progress(done / len(views), f"{done} of {len(views)} views")
 
     reporter.message(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")
-    scores = score_views(field, views, options.spp, options.pictures, scored)
+    scores = score_views(field, views, options.spp, pictures, scored)
     row("mean", scores.psnr_mean, scores.ssim_mean)
     if scores.depth is not None:
         d = scores.depth
@@ -190,8 +191,8 @@ def evaluate_radiance(
             f"depth: median error {d.median:.4f} units, {d.off:.1%} of the pixels off by more than 10 %; "
             f"opacity {d.opacity:.3f}, {d.translucent:.1%} of the pixels below 0.9"
         )
-    if options.pictures is not None:
-        reporter.message(f"wrote {len(views)} pictures to {options.pictures}")
+    if pictures is not None:
+        reporter.message(f"wrote {len(views)} pictures to {pictures}")
     if options.json_file is not None:
         about = {"field": Path(field).name, "dataset": data.source["dataset"]}
         write_json(options.json_file, about | scores.to_dict())
