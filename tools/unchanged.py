@@ -203,10 +203,14 @@ def digest(path: Path) -> str:
 
 
 def errors_of_study(folder: Path) -> str:
-    """Digest of a study's rows without their times and memory."""
+    """Digest of a study's rows without their times and memory, and without the fronts that follow from times."""
     rows = list(csv.DictReader((folder / "study.csv").open()))
     kept = [
-        {k: v for k, v in row.items() if not any(w in k for w in ("ms", "second", "time", "memory", "bytes"))}
+        {
+            k: v
+            for k, v in row.items()
+            if not any(w in k for w in ("ms", "second", "time", "memory", "bytes", "peak", "pareto"))
+        }
         for row in rows
     ]
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
