@@ -14,7 +14,7 @@ from nerg_mi.training.gaze.log_density_model import log_gaze
 from nerg_mi.training.gaze.product_model import gaze_density
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.field.encoding.dense import DenseConfig, DenseGrid
-from tests.training.radiance.test_trainer import BOX, ball, looking_at_origin, settings
+from tests.training.radiance.ball import BOX, ball, looking_at_origin, settings
 
 register(DenseConfig, DenseGrid)
 CONFIG = RadianceConfig(DenseConfig(), width=16, color_hidden=1, density_scale=0.5)
