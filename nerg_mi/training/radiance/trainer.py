@@ -239,8 +239,11 @@ class RadianceTrainer:
             loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
         loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
-        decay = sum(feature_decay(v.array) for k, v in parameters.items() if k.startswith("grid."))
-        dr.backward(loss + self._clear(parameters) + s.grid_decay * decay)
+        total = loss + self._clear(parameters)
+        for name, value in parameters.items():
+            if name.startswith("grid."):
+                total = total + s.grid_decay * feature_decay(value.array if dr.is_tensor_v(value) else value)
+        dr.backward(total)
         self.optimiser.set_learning_rate(s.rate(self.progress))
         self.optimiser.step()
         self.loss, self.samples = loss, samples.count
