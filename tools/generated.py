@@ -17,6 +17,7 @@ from pathlib import Path
 
 from tools import manual
 from tools.imports import ROOT
+from tools.page import table
 
 PLUGINS = ("nerg", "nerf", "gazefield", "gazekde", "panorama")
 
@@ -42,7 +43,30 @@ def presets() -> str:
     return preset_table()
 
 
-PARTS: dict[str, Callable[[], str]] = {"plugins": plugins, "presets": presets}
+def recipes() -> str:
+    """What each gaze recipe sets: its length, losses and probes."""
+    from nerg_mi.training.gaze.recipes import RECIPES
+
+    found = list(RECIPES.values())
+    rows = [("what it is", *(recipe.summary for recipe in found))]
+    parts = (("", "settings", "gaze_settings"), ("probes: ", "probes", "probe_settings"))
+    for prefix, given, made in parts:
+        values = [getattr(recipe, made)() for recipe in found]
+        names = dict.fromkeys(name for recipe in found for name in getattr(recipe, given))
+        rows += [(f"{prefix}`{name}`", *(_shown(getattr(v, name)) for v in values)) for name in names]
+    return table(("", *(f"`{recipe.name}`" for recipe in found)), rows)
+
+
+def _shown(value: object) -> str:
+    """A setting in a cell of a table."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+PARTS: dict[str, Callable[[], str]] = {"plugins": plugins, "presets": presets, "recipes": recipes}
 """Name of a part -> what makes its text."""
 
 _PART = re.compile(r"(<!-- made by make docs: (\w+) -->\n)(.*?)(<!-- end -->)", re.S)

@@ -37,3 +37,10 @@ def test_check_writes_nothing(monkeypatch, tmp_path, capsys):
     assert "new" not in page.read_text()
     assert generated.main([]) == 0 and "new" in page.read_text()
     assert generated.main(["--check"]) == 0
+
+
+def test_settings_are_shown_as_they_are():
+    recipes = {row.split("|")[1].strip(): row.split("|")[2:-1] for row in generated.recipes().splitlines()[2:]}
+    default = {name: cells[0].strip() for name, cells in recipes.items()}
+    assert default["`zones`"] == "0" and default["`steps`"] == "160" and default["`weight_decay`"] == "4"
+    assert default["probes: `count`"] == "1,024" and default["probes: `weights`"] == "person"
