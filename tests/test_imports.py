@@ -41,7 +41,6 @@ LATE_HERE: dict[tuple[str, str], str] = {
     ("nerg_mi.training.geometry.places", "nerg_mi.formats.fields"): TO_REMOVE,
     ("nerg_mi.training.geometry.places", "nerg_mi.rendering.pictures"): TO_REMOVE,
     ("nerg_mi.training.radiance.preview", "nerg_mi.field.backend"): TO_REMOVE,
-    ("nerg_mi.transport.march.primal", "nerg_mi.transport.march.adjoint"): TO_REMOVE,
     ("nerg_mi.transport.observer.gaze_medium", "nerg_mi.transport.observer.integral"): TO_REMOVE,
     ("nerg_mi.transport.observer.integral", "nerg_mi.maths.ray_box"): TO_REMOVE,
     ("nerg_mi.view.demo", "nerg_mi.scenes"): TO_REMOVE,
@@ -53,9 +52,7 @@ LATE_HERE: dict[tuple[str, str], str] = {
 
 TO_CUT = [
     ["nerg_mi.density.kde", "nerg_mi.density.probes"],
-    ["nerg_mi.transport.march", "nerg_mi.transport.media", "nerg_mi.transport.place"],
     ["nerg_mi.scenes.store.furniture", "nerg_mi.scenes.store.layout"],
-    ["nerg_mi.transport.march.adjoint", "nerg_mi.transport.march.primal"],
 ]
 """Circles that are known and to be cut."""
 
