@@ -17,8 +17,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 from output import write_rows
@@ -26,12 +24,6 @@ from output import write_rows
 ROOT = Path(__file__).resolve().parents[1]
 SCORES = ("KLD", "CC", "SIM", "MAE", "NSS", "AUC", "sAUC", "bits", "loglik")
 OURS, BAR = "gaze field", "4,096 nearest rays"
-
-
-def nerg(*arguments) -> None:
-    """Run the command `nerg`, as a user would."""
-    code = "import sys; from nerg_mi.cli import main; sys.exit(main())"
-    subprocess.run([sys.executable, "-c", code, *map(str, arguments)], check=True, cwd=ROOT)
 
 
 def run_fold(rays: Path, seed: int, args: argparse.Namespace) -> list[dict]:
@@ -81,6 +73,8 @@ def means(rows: list[dict], split: str) -> list[dict]:
 
 
 def main(argv=None) -> None:
+    from nerg_mi.jobs.tracking import ImportOptions, import_rays
+
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "vr_supermarket"
     parser.add_argument("--data", type=Path, default=data)
@@ -99,7 +93,7 @@ def main(argv=None) -> None:
     if not files:
         raise SystemExit(f'no recordings in "{args.data}"; set NERG_DATA to the folder that holds vr_supermarket')
     rays = args.out / "rays.npz"
-    nerg("rays", "import", *files, "--preset", "vr_supermarket", "-o", rays)
+    import_rays(files, ImportOptions(reader="vr_supermarket", output=rays))
     seeds = range(args.first, args.first + args.folds)
     rows = [row for seed in seeds for row in run_fold(rays, seed, args)]
     table = []

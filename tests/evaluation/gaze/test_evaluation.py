@@ -1,9 +1,8 @@
-"""Evaluation of gaze: truth from persons, scores against closed forms, what is held out, the command."""
+"""Evaluation of gaze: truth from persons, scores against closed forms, what is held out."""
 
 from __future__ import annotations
 
 import itertools
-import json
 
 import numpy as np
 import pytest
@@ -175,67 +174,6 @@ def test_markdown_has_intervals_and_gaps():
     )
     assert text.splitlines()[0] == "| method | KLD | MAE |"
     assert text.splitlines()[2:] == ["| a | 0.500 [0.400, 0.600] | 0.0123 |", "| b |  |  |"]
-
-
-def test_the_command(rgb, rays, tmp_path, capsys):
-    from nerg_mi.cli import main
-
-    rays.save(tmp_path / "rays.npz")
-    gaze = tmp_path / "gaze.safetensors"
-
-    def nerg(*arguments):
-        with pytest.raises(SystemExit) as end:
-            main([str(a) for a in arguments])
-        return end.value.code, " ".join(capsys.readouterr().err.split())
-
-    train = [
-        "train",
-        "gaze",
-        tmp_path / "rays.npz",
-        "-o",
-        gaze,
-        "--geometry",
-        "hits",
-        "--voxel",
-        "0.2",
-        "--radius",
-        "0.6",
-        "--steps",
-        "5",
-        "--directions",
-        "64",
-        "--probes",
-        "20",
-        "--zones",
-        "0",
-    ]
-    assert nerg(*train)[0] in (0, None)
-    code, said = nerg("eval", "gaze", gaze, tmp_path / "rays.npz")
-    assert code == 1 and "--test-zones 3" in said
-    assert nerg(*train, "--test-zones", "2", "--test-positions", "6", "--test-people", "0.5")[0] in (0, None)
-    assert nerg(
-        "eval",
-        "gaze",
-        gaze,
-        tmp_path / "rays.npz",
-        "--min-rays",
-        "16",
-        "--resamples",
-        "4",
-        "--directions",
-        "256",
-        "--pictures",
-        "1",
-    )[0] in (0, None)
-    found = json.loads((tmp_path / "gaze.eval" / "gaze.json").read_text())
-    names = [r["method"] for r in found["methods"]]
-    assert names[:2] == ["gaze field", "uniform"] and "4,096 nearest rays" in names and found["split"] == "both"
-    assert found["methods"][0]["integral"] == pytest.approx(1, abs=0.02)
-    for name in ("gaze.md", "gaze.csv", "persons.csv", "positions.png"):
-        assert (tmp_path / "gaze.eval" / name).stat().st_size > 100
-    crowd(seed=1).save(tmp_path / "others.npz")
-    code, said = nerg("eval", "gaze", gaze, tmp_path / "others.npz")
-    assert code == 1 and "trained on other rays" in said
 
 
 def test_halves_of_the_people_are_compared_where_both_were(rays, test_set):

@@ -12,7 +12,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeField
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
+from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.maths.box import Box
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.product import ProductTrainer
@@ -139,54 +139,6 @@ def test04_frozen_trunks_stay_and_others_move(rgb, radiance, rays, frozen):
     for name, value in start.items():
         assert np.array_equal(np.array(field[name]), np.array(value)) == frozen, name
     assert trainer.measure(data).loss < 0.9 * before
-
-
-def test05_the_command(rgb, radiance, rays, tmp_path, capsys):
-    from nerg_mi.cli import main
-
-    save_radiance(radiance, tmp_path / "field.safetensors", {"test": 0})
-    rays.save(tmp_path / "rays.npz")
-    arguments = [
-        "train",
-        "gaze",
-        str(tmp_path / "rays.npz"),
-        "-o",
-        str(tmp_path / "gaze.safetensors"),
-        "--field",
-        str(tmp_path / "field.safetensors"),
-        "--semantic",
-        "snapshot",
-        "--begin",
-        "field",
-        "--freeze",
-        "--steps",
-        "4",
-        "--probes",
-        "6",
-        "--radius",
-        "0.5",
-        "--min-rays",
-        "8",
-        "--directions",
-        "32",
-        "--zones",
-        "0",
-        "--recipe",
-        "small",
-    ]
-    with pytest.raises(SystemExit) as end:
-        main(arguments)
-    assert not end.value.code, capsys.readouterr().err
-    gaze, about = load_gaze(tmp_path / "gaze.safetensors", namespace("llvm"))
-    assert gaze.config.semantic == "snapshot" and about["provenance"]["begins_as"] == "field.safetensors"
-    assert np.array_equal(np.array(gaze.grid.table), np.array(radiance.grid.table))
-    for wrong, said in (
-        (["--freeze"], "add it, or leave --freeze out"),
-        (["--begin", "nerf"], 'must be "random" or "field"'),
-    ):
-        with pytest.raises(SystemExit) as end:
-            main([a for a in arguments if a not in ("--freeze", "--begin", "field")] + wrong)
-        assert end.value.code == 1 and said in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("cutoff", [None, 0.0, 0.05])

@@ -1,4 +1,4 @@
-"""Places of hit points whose files are damaged: Mitsuba's reader believes their headers."""
+"""Places: frames and boxes, and damaged files of hit points (Mitsuba believes their headers)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.volumes import write_volume
-from nerg_mi.training.geometry.places import place_of_volume
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.training.geometry.places import GazePlace, place_of_nothing, place_of_scene, place_of_volume
 
 
 @pytest.fixture
@@ -50,3 +52,24 @@ def test_one_that_is_cut_off(rgb, volume, size):
     volume.write_bytes(volume.read_bytes()[:size])
     with pytest.raises(NergError, match="place.vol"):
         place_of_volume(volume)
+
+
+def test_frames_of_rays_and_place():
+    """Twice the size, a quarter turn about z, and moved."""
+    align = Similarity([[0, -2, 0, 1], [2, 0, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+    place = GazePlace(None, Box((0, 0, 0), (1, 1, 1)), "none", align=align)
+    np.testing.assert_allclose(place.points_from_rays(np.array([[1.0, 0, 0], [0, 1, 1]])), [[1, 4, 3], [-1, 2, 5]])
+    d = np.array([[[0.6, 0.8, 0], [0, 0, 1.0]]])
+    turned = place.directions_from_rays(d)
+    np.testing.assert_allclose(turned, [[[-0.8, 0.6, 0], [0, 0, 1]]], atol=1e-12)
+    np.testing.assert_allclose(place.directions_to_rays(turned), d, atol=1e-12)
+
+
+def test_without_geometry_the_box_is_around_whoever_looked():
+    assert place_of_nothing(np.array([[0.0, 1, 2], [1, 0, 2]])).box == Box((-2, -2, 0), (3, 3, 4))
+
+
+def test_a_scene_without_anything_is_no_place(rgb, tmp_path):
+    (tmp_path / "empty.xml").write_text('<scene version="3.0.0"/>')
+    with pytest.raises(NergError, match="neither shapes nor a field"):
+        place_of_scene(tmp_path / "empty.xml")

@@ -1,0 +1,49 @@
+"""`nerg ablate`: what it hands on."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from nerg_mi.cli import main
+from nerg_mi.jobs import ablation
+from nerg_mi.jobs.options.ablation import AblationOptions
+
+ASKED = {
+    "field": "place.safetensors",
+    "scene": "room.xml",
+    "geometry": "none",
+    "recipes": "small,paper",
+    "seeds": 2,
+    "steps": 5,
+    "default_steps": 6,
+    "probes": 7,
+    "zones": 4,
+    "positions": 8,
+    "people": 0.25,
+    "radius": 0.5,
+    "kappa": 9.0,
+    "min_rays": 3,
+    "law": "a:B",
+    "cameras": 1,
+    "size": "16x9",
+    "threads": 2,
+    "mode": "llvm_ad_mono",
+}
+
+
+def test_the_job_is_given_what_was_asked_for(monkeypatch):
+    given = []
+    monkeypatch.setattr(ablation, "ablate", lambda *a: given.append(a[:-1]))
+    line = [str(word) for name, value in ASKED.items() for word in ("--" + name.replace("_", "-"), value)]
+    for more in ([*line, "--variant", "emit", "--variant", "begins as the field", "--no-refit"], []):
+        with pytest.raises(SystemExit) as end:
+            main(["ablate", "rays.npz", "-o", "out", *more])
+        assert not end.value.code
+    asked = {k: Path(v) if k in ("field", "scene") else v for k, v in ASKED.items()}
+    options = AblationOptions(**asked, variant=("emit", "begins as the field"), refit=False)
+    files = Path("rays.npz"), Path("out")
+    assert given == [(*files, options), (*files, AblationOptions())]
+    assert {*ASKED, "variant", "refit"} == {f.name for f in fields(AblationOptions)}
