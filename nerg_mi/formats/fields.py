@@ -1,24 +1,21 @@
 """Radiance and gaze fields in and out of checkpoint files.
 
-A new kind of gaze field is one entry of ``GAZE_KINDS``.
+Which kinds of gaze fields there are is known to ``field.gaze.registry``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from nerg_mi.field.background import Background, BackgroundConfig
 from nerg_mi.field.cascades import CascadeGrid
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.field.gaze.registry import build
 from nerg_mi.field.gaze.support import RaySupport
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.files.bounded import plain
 from nerg_mi.maths.box import Box
 
 from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
@@ -86,82 +83,12 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
     return field, meta
 
 
-class GazeKind(NamedTuple):
-    """How one kind of gaze field is stored."""
-
-    # The class of its fields.
-    field: type
-    # The JSON object of a field's sizes, with its kind (a product has none).
-    architecture: Callable[[Any], dict[str, Any]]
-    # From the arrays of a file, that JSON object and the box to the field.
-    read: Callable[[StoredArrays, dict[str, Any], Box], Any]
-
-
-def _read_product(arrays: StoredArrays, about: dict[str, Any], box: Box) -> GazeField:
-    config = GazeConfig.from_dict(about)
-    layernorm = config.trunk == "layernorm"
-    return GazeField(
-        config,
-        box,
-        arrays.grid(config.grid),
-        arrays.net("position_net", config.position_sizes, layernorm),
-        arrays.net("direction_net", config.direction_sizes, layernorm),
-        arrays.net("emit_head", [config.width, 1]),
-        arrays.net("capture_head", [config.width, 1]),
-    )
-
-
-def _read_log_density(arrays: StoredArrays, about: dict[str, Any], box: Box) -> LogGazeField:
-    config = LogGazeConfig.from_dict(about)
-    return LogGazeField(
-        config,
-        box,
-        arrays.grid(config.grid),
-        arrays.net("emit_net", config.emit_sizes),
-        arrays.net("capture_net", config.capture_sizes),
-        arrays.ns.Float(arrays.array("escaped", 1)),
-        arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior)),
-    )
-
-
-def _read_ensemble(arrays: StoredArrays, about: dict[str, Any], box: Box) -> GazeEnsemble:
-    members = about["members"]
-    if len(members) > MEMBERS:
-        raise ValueError(f"it has {len(members)} members, and at most {MEMBERS} are read")
-    parts = [arrays.member(i, member) for i, member in enumerate(members)]
-    if any(about.get("kind") == "ensemble" for about, _ in parts):
-        raise ValueError("a member of its ensemble is an ensemble")
-    return GazeEnsemble([_read_gaze(own, about, box) for about, own in parts])
-
-
-GAZE_KINDS = {
-    "product": GazeKind(GazeField, lambda field: field.config.to_dict(), _read_product),
-    "log_density": GazeKind(LogGazeField, lambda field: field.config.to_dict(), _read_log_density),
-    "ensemble": GazeKind(
-        GazeEnsemble,
-        lambda field: {"kind": "ensemble", "members": [m.config.to_dict() for m in field.members]},
-        _read_ensemble,
-    ),
-}
-"""Kinds of gaze fields by the ``kind`` of a checkpoint's architecture; one without is a product."""
-
-
-def _read_gaze(arrays: StoredArrays, about: dict[str, Any], box: Box) -> GazeField | LogGazeField | GazeEnsemble:
-    kind = check_sizes(about).get("kind", "product")
-    if not isinstance(kind, str) or kind not in GAZE_KINDS:
-        raise ValueError(f'it is a gaze field of the kind "{plain(kind, 40)}", which this version does not know')
-    return GAZE_KINDS[kind].read(arrays, about, box)
-
-
-def save_gaze(
-    field: GazeField | LogGazeField | GazeEnsemble, path: str | Path, provenance: dict, half: bool = False
-) -> None:
+def save_gaze(field: AnyGazeField, path: str | Path, provenance: dict, half: bool = False) -> None:
     """Write ``field``, with its support where it has one; ``provenance`` (JSON) says what it was trained on and
     with."""
-    kind = next(kind for kind in GAZE_KINDS.values() if kind.field is type(field))
     c, tensors = field.config, stored(field.parameters(), half)
     metadata = {
-        "architecture": kind.architecture(field),
+        "architecture": field.architecture(),
         "output": {"activation": c.activation, "normalized": c.normalized},
         "box": field.box.to_dict(),
         "units": {"length": "scene unit", "gaze": "1 / steradian"},
@@ -173,15 +100,17 @@ def save_gaze(
     write_checkpoint(path, "gaze", tensors, metadata)
 
 
-def load_gaze(path: str | Path, ns: ModuleType) -> tuple[GazeField | LogGazeField | GazeEnsemble, dict[str, Any]]:
+def load_gaze(path: str | Path, ns: ModuleType) -> tuple[AnyGazeField, dict[str, Any]]:
     """The gaze field in ``path`` on backend ``ns``, with its support, and its metadata.
 
     Raises `NergError` for a file that holds none.
     """
     tensors, meta = read_checkpoint(path, "gaze")
     with building(path):
-        arrays = StoredArrays(tensors, ns)
-        field = _read_gaze(arrays, meta["architecture"], Box(**meta["box"]))
+        arrays, about = StoredArrays(tensors, ns), check_sizes(meta["architecture"])
+        if len(about.get("members", ())) > MEMBERS:
+            raise ValueError(f"it has {len(about['members'])} members, and at most {MEMBERS} are read")
+        field = build(about, Box(**meta["box"]), arrays)
         if "support" in meta:
             field.support = RaySupport(arrays.array("support.cells", None, 5), meta["support"]["radius"])
     return field, meta

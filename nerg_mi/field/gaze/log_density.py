@@ -11,8 +11,9 @@ where the surfaces are, the other where people's heads were.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from types import ModuleType
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
@@ -27,6 +28,9 @@ from nerg_mi.field.radiance import assign, sigmoid
 from nerg_mi.maths.box import Box
 
 from .product import VARIANTS
+from .protocol import Arrays
+from .registry import register
+from .support import RaySupport
 
 GEOMETRIES = ("surface", "none")
 ESCAPES = ("constant", "nearest")
@@ -40,35 +44,38 @@ _FLOOR = 1e-3
 
 @dataclass(frozen=True)
 class LogGazeConfig:
-    """Sizes and conventions.
+    """Sizes and conventions."""
 
-    ``grid``: of emit, over the field's box; coarse levels generalise to positions where nobody stood. ``variant``: as
-    in ``GazeConfig``. ``width``, ``layers``: of both networks' hidden layers. ``heads``: corners of the box of
-    observers that capture's encoding spans; positions beyond count as its nearest point. ``mix``: the share m of the
-    blind density.
-    ``prior``: rows of the blind density's latitude-longitude table.
-    ``geometry``: ``surface``, or ``none`` where no geometry was known: p_od then is ``reach`` from p_o whatever is
-    there.
-    ``escaped``: what emit is where the observer meets no surface: a learnt ``constant``, or (where the geometry has
-    holes, as one made of hit points has) emit at the depth of the ``nearest`` directions that do.
-    """
-
-    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
-    variant: str = "emit_capture"
-    width: int = 64
-    layers: int = 2
-    sh_degree: int = 4
-    heads: tuple = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    mix: float = 0.0
-    prior: int = 64
-    geometry: str = "surface"
-    escaped: str = "constant"
-    reach: float = 2.0
-
-    # What a checkpoint's reader is told; not to be chosen.
+    kind: ClassVar[str] = "log_density"
+    # Not to be chosen: what every gaze field answers (``protocol.GazeFieldConfig``).
     activation = "log"
     normalized = True
     semantic = ""
+    features = 0
+
+    # Of emit, over the field's box; coarse levels generalise to positions where nobody stood.
+    grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(levels=3, log2_rows=14, base=2, finest=8))
+    # As in ``GazeConfig``.
+    variant: str = "emit_capture"
+    # Of both networks' hidden layers.
+    width: int = 64
+    # Hidden layers of both networks.
+    layers: int = 2
+    # Degrees of spherical harmonics of directions.
+    sh_degree: int = 4
+    # Corners of the box of observers that capture's encoding spans; positions beyond count as its nearest point.
+    heads: tuple = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    # The share m of the blind density.
+    mix: float = 0.0
+    # Rows of the blind density's latitude-longitude table.
+    prior: int = 64
+    # surface, or none where no geometry was known: p_od then is ``reach`` from p_o whatever is there.
+    geometry: str = "surface"
+    # What emit is where the observer meets no surface: a learnt constant, or (where the geometry has holes, as one made
+    # of hit points has) emit at the depth of the nearest directions that do.
+    escaped: str = "constant"
+    # Distance of p_od where no geometry was known, in the field's units.
+    reach: float = 2.0
 
     def __post_init__(self):
         object.__setattr__(self, "heads", tuple(tuple(float(x) for x in corner) for corner in self.heads))
@@ -87,6 +94,24 @@ class LogGazeConfig:
             raise ValueError(f"the box of heads needs two finite corners, got {self.heads}")
 
     @property
+    def needs_surfaces(self) -> bool:
+        """Whether it matters where the observer's rays meet a surface."""
+        return self.geometry != "none"
+
+    @property
+    def fills_escaped(self) -> bool:
+        """Whether what escapes takes the depth of the nearest directions that do not."""
+        return self.escaped == "nearest"
+
+    def conventions(self) -> tuple:
+        """What fields must have in common for their densities to be averaged."""
+        return self.kind, self.variant, self.geometry, self.escaped, self.reach
+
+    def for_place(self, surfaces: bool, holes: bool) -> LogGazeConfig:
+        """This configuration for a place whose ``surfaces`` are known or not, and have ``holes`` or not."""
+        return replace(self, escaped="nearest" if holes else "constant", geometry="surface" if surfaces else "none")
+
+    @property
     def emit_sizes(self) -> list[int]:
         return [self.grid.size + self.sh_degree**2 + 2, *[self.width] * self.layers, 1]
 
@@ -95,19 +120,21 @@ class LogGazeConfig:
         return [9 + self.sh_degree**2 + 1, *[self.width] * self.layers, 1]
 
     def to_dict(self) -> dict:
-        return {"kind": "log_density", **asdict(self), "grid": self.grid.to_dict()}
+        return {"kind": self.kind, **asdict(self), "grid": self.grid.to_dict()}
 
     @staticmethod
     def from_dict(d: dict) -> LogGazeConfig:
         return LogGazeConfig(**{**{k: v for k, v in d.items() if k != "kind"}, "grid": encoding_config(d["grid"])})
 
 
+@register
 class LogGazeField:
     """A normalised gaze density. Positions are in the field's units inside ``box``; ``prior``: table (rows, 2 rows) of
     the log of the blind density, rows from +z to -z, columns by azimuth, at texel centres."""
 
-    DRJIT_STRUCT = {"grid": None, "emit_net": None, "capture_net": None, "escaped": None, "prior": None}
+    DRJIT_STRUCT: ClassVar[dict] = {"grid": None, "emit_net": None, "capture_net": None, "escaped": None, "prior": None}
     _NETS = ("emit_net", "capture_net")
+    kind: ClassVar[str] = LogGazeConfig.kind
 
     def __init__(
         self, config: LogGazeConfig, box: Box, grid: Encoding, emit_net: MLP, capture_net: MLP, escaped, prior
@@ -122,8 +149,8 @@ class LogGazeField:
             )
         self.config, self.box, self.grid = config, box, grid
         self.emit_net, self.capture_net, self.escaped, self.prior = emit_net, capture_net, escaped, prior
-        # How many rays it learnt from around a position (``support.RaySupport``), where that is known.
-        self.support = None
+        # How many rays it learnt from around a position, where that is known.
+        self.support: RaySupport | None = None
         self.pack()
 
     @staticmethod
@@ -144,6 +171,34 @@ class LogGazeField:
             ns.Float(0.0),
             ns.TensorXf(np.asarray(prior, np.float32)),
         )
+
+    @classmethod
+    def from_arrays(cls, about: dict, box: Box, arrays: Arrays) -> LogGazeField:
+        """The field of a checkpoint."""
+        config = LogGazeConfig.from_dict(about)
+        return cls(
+            config,
+            box,
+            arrays.grid(config.grid),
+            arrays.net("emit_net", config.emit_sizes),
+            arrays.net("capture_net", config.capture_sizes),
+            arrays.ns.Float(arrays.array("escaped", 1)),
+            arrays.ns.TensorXf(arrays.array("prior", config.prior, 2 * config.prior)),
+        )
+
+    def architecture(self) -> dict:
+        """What ``from_arrays`` needs besides the arrays."""
+        return self.config.to_dict()
+
+    @property
+    def members(self) -> list[LogGazeField]:
+        """The field alone."""
+        return [self]
+
+    @property
+    def networks(self) -> int:
+        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
+        return 2 if self.config.variant == "emit_capture" else 1
 
     def parameters(self) -> dict:
         """Arrays by name, as checkpoints and ``mi.traverse`` spell them."""
@@ -212,14 +267,14 @@ class LogGazeField:
         logit = self.log_blind(r_o)
         if c.variant != "capture":
             emit = self.emit_net(self.emit_inputs(p_od, p_o, r_o, active))[0]
-            logit += emit if c.escaped == "nearest" else dr.select(escaped, self.escaped, emit)
+            logit += emit if c.fills_escaped else dr.select(escaped, self.escaped, emit)
         return dr.exp(dr.minimum(logit, _HIGHEST)), one if c.variant == "emit" else self.capture(p_o, r_o, active)
 
     def evaluate(self, p_od, p_o, r_o, active=True, semantic=None, integral=None, escaped=False):
         """``(gaze, emit, capture)`` of the observer at ``p_o`` attending ``p_od`` along unit ``r_o``, 1/sr; ``escaped``
         as for ``unnormalized``.
 
-        ``integral``: Z(p_o) (``transport.observer.integral``); ``emit`` is divided by it and includes the blind
+        ``integral``: Z(p_o) (``transport.observer.gaze``); ``emit`` is divided by it and includes the blind
         density, so that gaze = (1 - m) emit * capture + m blind. Raises ``ValueError`` without it.
         """
         if integral is None:

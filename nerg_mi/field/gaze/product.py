@@ -12,10 +12,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from types import ModuleType
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
 
+from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
@@ -25,6 +27,10 @@ from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.elementary import log1p
+
+from .protocol import Arrays
+from .registry import register
+from .support import RaySupport
 
 VARIANTS = ("emit", "capture", "emit_capture")
 ACTIVATIONS = ("softplus", "exp", "linear")
@@ -51,40 +57,46 @@ def activate(x, activation: str):
 class GazeConfig:
     """Variant, output activation and sizes. The defaults are the paper's (its NeRF's configuration).
 
-    ``variant``: ``emit`` (a property of the surface alone), ``capture`` (the observer alone,
-    sigmoid output) or ``emit_capture`` (their product). ``activation`` of the emit head:
-    ``softplus`` and ``exp`` give densities, ``linear`` is the paper's and may be negative. ``emit_scale`` multiplies
-    its output: what the untrained field comes to, and what weight decay draws a field towards.
-
-    ``trunk``: ``relu`` hands what the direction net returns to the heads through a ReLU; ``layernorm`` normalises the
-    inputs of every layer, adds biases, and puts a ReLU behind the position net too (what the paper's authors train by
-    default); ``linear`` has no ReLU behind either net (their other choice).
-
-    ``normalized``: the density is divided by its integral over the observer's sphere wherever it is evaluated, so that
-    it integrates to one whatever the weights are.
-
-    ``semantic``: what emit knows of the surface besides, or (without ``semantic_own``) instead of, the field's own
-    grid: the ``geometry`` features of a radiance field, ``accumulated`` along the observer's ray by volume rendering
-    or as a ``snapshot`` at p_od (the paper's semantic variants; ``semantic_own``, a sum of both, is their fine-tuned
-    one). Capture has none.
+    With ``semantic`` emit is given the ``geometry`` features of a radiance field, ``accumulated`` along the observer's
+    ray by volume rendering or as a ``snapshot`` at p_od, in place of those of the field's own grid (the semantic
+    variants of the paper); with ``semantic_own`` too, the sum of both (its fine-tuned one). Capture has none.
     """
 
+    kind: ClassVar[str] = "product"
+    # Not to be chosen: what every gaze field answers (``protocol.GazeFieldConfig``).
+    prior = 0
+    needs_surfaces = True
+    fills_escaped = False
+
+    # The encoding of positions, over the field's box.
     grid: EncodingConfig = field(default_factory=lambda: HashGridConfig(finest=512))
+    # emit: of the surface alone; capture: of the observer alone, through a sigmoid; emit_capture: their product.
     variant: str = "emit_capture"
+    # Of the emit head: softplus and exp give densities, linear is the paper's and may be negative.
     activation: str = "softplus"
+    # Of the hidden layers.
     width: int = 64
+    # Features that the position net hands to the direction net.
     geometry: int = 15
+    # Degrees of spherical harmonics of directions.
     sh_degree: int = 4
+    # Multiplies what emit returns: what the untrained field comes to, and what weight decay draws a field towards.
     emit_scale: float = 1.0
+    # relu: a ReLU behind the direction net; layernorm: every layer's inputs normalised, biases, and a ReLU behind the
+    # position net too (what the paper's authors train by default); linear: a ReLU behind neither (their other choice).
     trunk: str = "relu"
+    # Features of a radiance field that emit is given: accumulated, snapshot or none.
     semantic: str = ""
+    # Added to the field's own features, in place of taking their place.
     semantic_own: bool = False
+    # Divide by the integral over the observer's sphere, so that the density integrates to one whatever the weights are.
     normalized: bool = False
 
     def __post_init__(self):
         if self.semantic not in SEMANTICS:
             raise ValueError(
-                f'the semantics of a gaze field must be one of {", ".join(SEMANTICS[1:])} or none, got "{self.semantic}"'
+                f"the semantics of a gaze field must be one of {', '.join(SEMANTICS[1:])} or none, "
+                f'got "{self.semantic}"'
             )
         if self.semantic and self.variant == "capture":
             raise ValueError("a gaze field of the variant capture has no emit that semantic features could go to")
@@ -106,6 +118,23 @@ class GazeConfig:
             raise ValueError(f"every size of a gaze field must be at least 1, got {self}")
 
     @property
+    def features(self) -> int:
+        """Features of a radiance field that emit is given; 0 without."""
+        return self.geometry if self.semantic else 0
+
+    def conventions(self) -> tuple:
+        """What fields must have in common for their densities to be averaged."""
+        return self.kind, self.variant, self.activation, self.normalized, self.semantic, self.geometry
+
+    def for_place(self, surfaces: bool, holes: bool) -> GazeConfig:
+        """This configuration. Raises ``NergError`` where there are no surfaces, on which emit is a density."""
+        if not surfaces:
+            raise NergError(
+                "a gaze field of this recipe needs surfaces; without any geometry only the default recipe trains"
+            )
+        return self
+
+    @property
     def position_sizes(self) -> list[int]:
         return [self.grid.size, self.width, self.geometry]
 
@@ -118,17 +147,20 @@ class GazeConfig:
 
     @staticmethod
     def from_dict(d: dict) -> GazeConfig:
-        return GazeConfig(**{**d, "grid": encoding_config(d["grid"])})
+        named = {k: v for k, v in d.items() if k != "kind"}
+        return GazeConfig(**{**named, "grid": encoding_config(d["grid"])})
 
 
+@register
 class GazeField:
     """Gaze density (1/sr) of an observer attending a surface.
 
     Positions are in the field's units inside ``box`` (outside of it the grid's features are 0).
     """
 
-    DRJIT_STRUCT = {"grid": None, "position_net": None, "direction_net": None, "emit_head": None, "capture_head": None}
     _NETS = ("position_net", "direction_net", "emit_head", "capture_head")
+    DRJIT_STRUCT: ClassVar[dict] = {"grid": None, **dict.fromkeys(_NETS)}
+    kind: ClassVar[str] = GazeConfig.kind
 
     def __init__(
         self,
@@ -141,19 +173,21 @@ class GazeField:
         capture_head: MLP,
     ):
         grid.require(config.grid)
-        for name, net, sizes in (
-            ("position_net", position_net, config.position_sizes),
-            ("direction_net", direction_net, config.direction_sizes),
-            ("emit_head", emit_head, [config.width, 1]),
-            ("capture_head", capture_head, [config.width, 1]),
-        ):
+        nets = (position_net, direction_net, emit_head, capture_head)
+        for net, (name, sizes) in zip(nets, self._sizes(config).items()):
             net.require(sizes, name, self._is_normalized(config, name))
         self.config, self.box, self.grid = config, box, grid
         self.position_net, self.direction_net = position_net, direction_net
         self.emit_head, self.capture_head = emit_head, capture_head
-        # How many rays it learnt from around a position (``support.RaySupport``), where that is known.
-        self.support = None
+        # How many rays it learnt from around a position, where that is known.
+        self.support: RaySupport | None = None
         self.pack()
+
+    @staticmethod
+    def _sizes(config: GazeConfig) -> dict[str, list[int]]:
+        """Sizes of the layers of each network."""
+        head = [config.width, 1]
+        return dict(zip(GazeField._NETS, (config.position_sizes, config.direction_sizes, head, head)))
 
     @staticmethod
     def _is_normalized(config: GazeConfig, name: str) -> bool:
@@ -162,16 +196,38 @@ class GazeField:
     @staticmethod
     def random(config: GazeConfig, box: Box, ns: ModuleType, seed: int = 0) -> GazeField:
         """An untrained field of backend ``ns``; equal seeds give equal weights."""
-        rng, normalized = np.random.default_rng(seed), config.trunk == "layernorm"
-        return GazeField(
-            config,
-            box,
-            random_encoding(config.grid, ns, rng),
-            MLP.random(config.position_sizes, ns, rng, normalized),
-            MLP.random(config.direction_sizes, ns, rng, normalized),
-            MLP.random([config.width, 1], ns, rng),
-            MLP.random([config.width, 1], ns, rng),
-        )
+        rng = np.random.default_rng(seed)
+        grid = random_encoding(config.grid, ns, rng)
+        is_normalized = GazeField._is_normalized
+        nets = {
+            name: MLP.random(sizes, ns, rng, is_normalized(config, name))
+            for name, sizes in GazeField._sizes(config).items()
+        }
+        return GazeField(config, box, grid, **nets)
+
+    @classmethod
+    def from_arrays(cls, about: dict, box: Box, arrays: Arrays) -> GazeField:
+        """The field of a checkpoint."""
+        config = GazeConfig.from_dict(about)
+        nets = {
+            name: arrays.net(name, sizes, cls._is_normalized(config, name))
+            for name, sizes in cls._sizes(config).items()
+        }
+        return cls(config, box, arrays.grid(config.grid), **nets)
+
+    def architecture(self) -> dict:
+        """What ``from_arrays`` needs besides the arrays."""
+        return self.config.to_dict()
+
+    @property
+    def members(self) -> list[GazeField]:
+        """The field alone."""
+        return [self]
+
+    @property
+    def networks(self) -> int:
+        """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
+        return 2 if self.config.variant == "emit_capture" else 1
 
     def parameters(self) -> dict:
         """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
@@ -197,13 +253,14 @@ class GazeField:
             getattr(self, name).pack()
 
     def _trunk(self, p, d, active, semantic=None):
-        geometry = semantic
-        if semantic is None or self.config.semantic_own:
+        if semantic is not None and not self.config.semantic_own:
+            geometry = semantic
+        else:
             geometry = self.position_net(self.grid(self.box.to_unit(p), active))
             if self.config.trunk == "layernorm":
                 geometry = [dr.maximum(g, 0) for g in geometry]
-        if semantic is not None and self.config.semantic_own:
-            geometry = [g + s for g, s in zip(geometry, semantic)]
+            if semantic is not None:
+                geometry = [g + s for g, s in zip(geometry, semantic)]
         hidden = self.direction_net(encode_direction(d, self.config.sh_degree) + geometry)
         return hidden if self.config.trunk == "linear" else [dr.maximum(h, 0) for h in hidden]
 
@@ -211,9 +268,9 @@ class GazeField:
         """F_e(p_od, -r_o) after its activation, in 1/sr. ``r_o``: unit, from observer to surface. ``semantic``: list of
         ``geometry`` features, for a field whose configuration asks for them."""
         c = self.config
-        if (semantic is None) == bool(c.semantic) or (semantic is not None and len(semantic) != c.geometry):
+        if (0 if semantic is None else len(semantic)) != c.features:
             raise ValueError(
-                f"this gaze field takes {c.geometry if c.semantic else 'no'} semantic features, got "
+                f"this gaze field takes {c.features or 'no'} semantic features, got "
                 f"{'none' if semantic is None else len(semantic)}"
             )
         return activate(self.emit_head(self._trunk(p_od, -r_o, active, semantic))[0], c.activation) * c.emit_scale
@@ -237,7 +294,7 @@ class GazeField:
         no difference.
 
         ``semantic``: see ``emit``. ``integral``: of a normalised field over the sphere at ``p_o``
-        (``transport.observer.integral``), by which ``emit`` is divided; ``ValueError`` without it.
+        (``transport.observer.gaze``), by which ``emit`` is divided; ``ValueError`` without it.
         """
         emit, capture = self.unnormalized(p_od, p_o, r_o, active, semantic)
         if self.config.normalized:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.backend import namespace
+from nerg_mi.field.gaze import registry
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeField
 from nerg_mi.field.gaze.support import RaySupport
@@ -62,3 +63,22 @@ def test_a_single_field_keeps_its_support_too(tmp_path):
     save_gaze(field, tmp_path / "g.safetensors", {})
     assert load_gaze(tmp_path / "plain.safetensors", namespace("llvm"))[0].support is None
     assert load_gaze(tmp_path / "g.safetensors", namespace("llvm"))[0].support.cells.shape == (1, 5)
+
+
+def test_ensembles_of_ensembles_are_refused(tmp_path):
+    """When they are made, and in a file, however deep they lie in one another."""
+    pair = GazeEnsemble([made(seed=1), made(seed=2)])
+    with pytest.raises(ValueError, match="give its members instead"):
+        GazeEnsemble([pair, pair])
+    about = pair.architecture()
+    for _ in range(500):
+        about = {"kind": "ensemble", "members": [about, about]}
+    with pytest.raises(ValueError, match="is an ensemble itself, which this version does not read"):
+        registry.build(about, pair.box, NoArrays())
+
+
+class NoArrays:
+    """Arrays of a file that has none."""
+
+    def member(self, index, about):
+        return about, self

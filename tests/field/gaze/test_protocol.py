@@ -1,0 +1,55 @@
+"""What every gaze field answers: each kind that the library has answers all of it."""
+
+import inspect
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.gaze import protocol, registry
+from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.gaze.log_density import LogGazeField
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+
+from .test_log_density import BOX, GRID, SMALL
+
+
+def asked(of) -> set:
+    """Names of what a protocol asks for."""
+    inherited = set().union(*(vars(c) for c in of.__mro__ if c.__module__ == of.__module__))
+    annotated = set().union(*(inspect.get_annotations(c) for c in of.__mro__ if c.__module__ == of.__module__))
+    return {n for n in inherited | annotated if not n.startswith("_")}
+
+
+def fields():
+    ns = namespace("llvm")
+    log = [LogGazeField.random(SMALL, BOX, ns, seed) for seed in (1, 2)]
+    return {
+        "product": GazeField.random(GazeConfig(GRID, width=16), BOX, ns),
+        "log_density": log[0],
+        "ensemble": GazeEnsemble(log),
+    }
+
+
+@pytest.mark.parametrize("kind", ["product", "log_density", "ensemble"])
+def test_every_kind_answers_what_the_protocol_asks(kind):
+    field = fields()[kind]
+    assert field.kind == kind in registry.kinds()
+    one = len(field.members) == 1
+    assert all(hasattr(field, n) for n in asked(protocol.GazeDensity if one else protocol.AnyGazeField))
+    assert all(hasattr(field.config, n) for n in asked(protocol.GazeFieldConfig))
+    assert one == (field.members[0] is field)
+    assert field.networks == (4 if kind == "ensemble" else 2)
+    # What it says of itself is what it is built of.
+    assert field.architecture().get("kind", "product") == kind
+
+
+def test_a_place_is_answered_by_the_configuration():
+    assert not SMALL.for_place(surfaces=False, holes=False).needs_surfaces
+    assert SMALL.for_place(surfaces=True, holes=True).fills_escaped
+    plain = SMALL.for_place(surfaces=True, holes=False)
+    assert plain.needs_surfaces and not plain.fills_escaped
+    product = GazeConfig()
+    assert product.for_place(surfaces=True, holes=True) is product
+    with pytest.raises(NergError, match="needs surfaces"):
+        product.for_place(surfaces=False, holes=False)
