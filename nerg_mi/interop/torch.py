@@ -30,8 +30,7 @@ except ImportError:
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import is_cuda
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.log_density import LogGazeField
-from nerg_mi.field.gaze.product import GazeField
+from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.field.radiance import RadianceField
 
 _FIXED = ("prior",)
@@ -129,14 +128,16 @@ class GazeModule(_FieldModule):
 
     A normalised field's integral is found once an observer, over directions of equal area::
 
+        around = trace_surroundings(field, Similarity(), place, eye, settings)  # directions, their depths, what escapes
+
         Z = module.integral(p_od, p_o, r_o, escaped)  # everywhere around the observer
         gaze = module(p_od, p_o, r_o, Z)  # anywhere
 
     Raises `NergError` for an ensemble, which is a `GazeEnsembleModule`.
     """
 
-    def __init__(self, field: GazeField | LogGazeField):
-        if isinstance(field, GazeEnsemble):
+    def __init__(self, field: AnyGazeField):
+        if len(field.members) > 1:
             raise NergError(
                 f"an ensemble of {len(field.members)} gaze fields is no GazeModule; make a GazeEnsembleModule of it"
             )
@@ -183,7 +184,7 @@ class GazeModule(_FieldModule):
     ) -> torch.Tensor:
         """The integral over the sphere (one number) of one observer, who is ``p_o`` in every row, from N directions
         ``r_o`` of equal area that lead to ``p_od``. Of the integrator's many directions it is the integrator's
-        (``transport.observer.integral``)."""
+        (``transport.observer.surroundings``)."""
         return 4 * torch.pi * self.unnormalized(p_od, p_o, r_o, escaped).mean()
 
     def _extra(self, count: int, integral, escaped) -> torch.Tensor:
