@@ -29,8 +29,9 @@ def main(argv=None) -> None:
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.training.geometry.places import place_of_field, place_of_volume
-    from nerg_mi.transport.observer.gaze_medium import GazeMedium
-    from nerg_mi.transport.observer.integral import COUNT, GazeIntegral
+    from nerg_mi.transport.observer.gaze import PlacedGaze
+    from nerg_mi.transport.observer.settings import ObserverSettings
+    from nerg_mi.transport.observer.surroundings import COUNT
     from nerg_mi.transport.place import Place
     from nerg_mi.transport.trace import default_settings
 
@@ -43,16 +44,19 @@ def main(argv=None) -> None:
     ns = namespace("llvm_ad_rgb")
     field, _ = load_gaze(args.gaze, ns)
     medium = (place_of_volume(args.place) if args.place.suffix == ".vol" else place_of_field(args.place, ns)).medium
-    gaze, place, settings = GazeMedium(field), Place(medium), default_settings(medium)
+    gaze, place, settings = PlacedGaze(field), Place(medium), ObserverSettings(march=default_settings(medium))
+
+    def integral(p: list[float], count: int) -> float:
+        p_o = mi.Point3f(*p)
+        return float(gaze.at([p_o], place, settings, count=count).integrals(p_o)[0][0])
+
     low, high = np.array(field.config.heads)
     rng, rows = np.random.default_rng(0), []
     for p in rng.uniform(low, high, (args.positions, 3)).tolist():
         started = time.perf_counter()
-        ours = float(GazeIntegral(gaze, place, mi.Point3f(*p), settings, "median", 0.5).value()[0])
+        ours = integral(p, COUNT)
         seconds = time.perf_counter() - started
-        fine = float(
-            GazeIntegral(gaze, place, mi.Point3f(*p), settings, "median", 0.5, count=2 * COUNT + 13).value()[0]
-        )
+        fine = integral(p, 2 * COUNT + 13)
         rows.append({"x": p[0], "y": p[1], "z": p[2], "integral": fine / ours, "seconds": seconds})
     off = np.abs([r["integral"] - 1 for r in rows])
     print(

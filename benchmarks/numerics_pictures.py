@@ -14,7 +14,7 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.color import composite_to_linear
-from nerg_mi.transport.observer.sight import towards
+from nerg_mi.transport.observer.viewpoint import distance_and_direction
 from nerg_mi.transport.observer.visibility import visibility
 from numerics import HEAD, Row
 from numerics_media import all_finite, gradient, share, values, worst
@@ -130,7 +130,7 @@ def observers(mi):
         yield Row("observer not finite", str(bad), "", outcome, "an error that names the observer")
     v = mi.Point3f([0, 1e-18, 0], [0, 0, 1e-9], 0)
     dr.enable_grad(v)
-    distance, r_o = towards(mi.Point3f(0), v)
+    distance, r_o = distance_and_direction(mi.Point3f(0), v)
     dr.backward(distance + dr.sum(r_o))
     yield Row(
         "norm at zero",

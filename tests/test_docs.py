@@ -14,7 +14,7 @@ from nerg_mi.evaluation.study import subject as study_subject
 from nerg_mi.formats.torch_ngp import unpickling
 from nerg_mi.training.gaze.recipes import FieldChoices, gaze_recipe
 from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.observer.integral import COUNT
+from nerg_mi.transport.observer.surroundings import COUNT
 from tests.conftest import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -19,7 +19,9 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.transport.observer.sight import ObserverPass, towards
+from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.observer.sight import trace_sight
+from nerg_mi.transport.observer.viewpoint import distance_and_direction
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
 
@@ -73,29 +75,36 @@ def _centroids(n: int) -> np.ndarray:
 
 
 def arriving(
-    place: Place | None, density, p_o, p, n, falloff=0.0, sight: ObserverPass | None = None, two_sided: bool = False
+    place: Place | None,
+    density,
+    p_o,
+    p,
+    n,
+    falloff=0.0,
+    settings: ObserverSettings | None = None,
+    two_sided: bool = False,
 ):
     """Attention per area, in 1 / square scene unit, that arrives at ``p`` with normal ``n`` from the observer ``p_o``.
 
     ``density(p_od, p_o, r_o, active)``: gaze in 1/sr of an observer at ``p_o`` along the unit direction ``r_o``, who
-    sees the surface ``p_od`` there (``GazeMedium.evaluate(...)[0]``, or anything else). ``place``: what may stand in
-    between (shapes, a field, both; None: nothing). ``falloff`` d_f in scene units, ``sight``: as of the integrator. A
-    closed surface hides its own back, which therefore receives nothing; ``two_sided`` counts both sides of an open one.
-    Lanes are pairs; differentiable in all of them, in the density's parameters and in ``falloff``, but not over the
-    edges of ``place``.
+    sees the surface ``p_od`` there (``ObservedGaze.evaluate(...)[0]``, or anything else). ``place``: what may stand in
+    between (shapes, a field, both; None: nothing). ``falloff`` d_f in scene units, ``settings``: as of the
+    integrator. A closed surface hides its own back, which therefore receives nothing; ``two_sided`` counts both sides
+    of an open one. Lanes are pairs; differentiable in all of them, in the density's parameters and in ``falloff``, but
+    not over the edges of ``place``.
     """
     import mitsuba as mi
 
-    distance, r_o = towards(p_o, p)
+    distance, r_o = distance_and_direction(p_o, p)
     cosine = -dr.dot(n, r_o)
     n = dr.select(two_sided & (cosine < 0), -n, n)
     cosine = dr.abs(cosine) if two_sided else cosine
     active = (cosine > 0) & (distance > 0)
     p_od, seen = p, mi.Float(1)
     if place is not None:
-        sight = sight or ObserverPass(default_settings(place), "depth", "median", 0.5, 0, 512)
+        settings = settings or ObserverSettings(march=default_settings(place))
         # Looked for a tolerance above the surface, as if a camera stood there.
-        found = sight.look(place, mi.Ray3f(p + n, -n), p, p_o, 0, active, mi.Float(falloff), False)
+        found = trace_sight(place, mi.Ray3f(p + n, -n), p, p_o, 0, active, mi.Float(falloff), settings)
         p_od, seen = found.p_od, found.visibility
         active &= seen > 0
     g = dr.select(active, density(p_od, p_o, r_o, active), 0)
@@ -109,7 +118,7 @@ def contributions(
     observers,
     surface: Patches,
     falloff=0.0,
-    sight: ObserverPass | None = None,
+    settings: ObserverSettings | None = None,
     two_sided: bool = False,
 ):
     """Share of each observer's look that each patch receives: Float, all patches of the first observer first.
@@ -125,7 +134,7 @@ def contributions(
     p = dr.gather(mi.Point3f, mi.Point3f(surface.p), where)
     n = dr.gather(mi.Vector3f, mi.Vector3f(surface.n), where)
     area = dr.gather(mi.Float, mi.Float(surface.area), where)
-    return area * arriving(place, density, p_o, p, n, falloff, sight, two_sided)
+    return area * arriving(place, density, p_o, p, n, falloff, settings, two_sided)
 
 
 def received(
@@ -134,7 +143,7 @@ def received(
     observers,
     surface: Patches,
     falloff=0.0,
-    sight: ObserverPass | None = None,
+    settings: ObserverSettings | None = None,
     two_sided: bool = False,
 ):
     """Probability (Float, a lane an observer) that the look of each of ``observers`` (Point3f) lands on ``surface``.
@@ -142,5 +151,5 @@ def received(
     Arguments as of ``arriving``. Makes observers x patches lanes at once. Exact as patches shrink against their
     distance from the observer: at a distance of k patch diameters the error is of the order 1 / k².
     """
-    each = contributions(place, density, observers, surface, falloff, sight, two_sided)
+    each = contributions(place, density, observers, surface, falloff, settings, two_sided)
     return dr.block_sum(each, dr.width(each) // dr.width(observers))

@@ -223,11 +223,12 @@ def test12_the_integrator_sees_the_same_attention(rgb, tmp_path):
     gaze, p = picture[..., -4], picture[..., -3:]
     inside = np.all(np.abs(p - (0.3, 0.1, -0.2)) < np.array([0.3, 0.2, 0.25]) + 1e-3, axis=-1)
     expected = np.sum(gaze * inside * pixel_solid_angles(2 * h, h))
-    medium = scene.integrator().gaze
+    made, place = scene.integrator(), Place(None, scene)
+    observed = made.gaze.at([rgb.Point3f(*eye)], place, made.observer_settings)
 
     def density(*args):
-        return medium.evaluate(*args)[0]
+        return observed.evaluate(*args)[0]
 
     box = next(s for s in scene.shapes() if s.is_mesh())
-    got = received(Place(None, scene), density, rgb.Point3f(*eye), patches(box, 24))[0]
+    got = received(place, density, rgb.Point3f(*eye), patches(box, 24))[0]
     assert expected > 0 and got == pytest.approx(expected, rel=0.03)

@@ -18,8 +18,9 @@ from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.box import Box
 from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.observer.gaze_medium import GazeMedium
-from nerg_mi.transport.observer.integral import GazeIntegral
+from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.observer.surroundings import trace_surroundings
 from nerg_mi.transport.place import Place
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
@@ -220,9 +221,9 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
     field = normalised(kind)
     shape = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.6]).scale(5)}
     place, eye = Place(None, rgb.load_dict({"type": "scene", "s": shape})), rgb.Point3f(0.1, -0.2, 0.3)
-    medium = GazeMedium(field)
-    settings = MarchSettings(step=1)
-    around = GazeIntegral(medium, place, eye, settings, "median", 0.5, count=1 << 12)
+    placed, settings, count = PlacedGaze(field), ObserverSettings(march=MarchSettings(step=1)), 1 << 12
+    around = trace_surroundings(field, placed.to_world, place, eye, settings, count)
+    observed = placed.at([eye], place, settings, count=count)
     tensor = lambda v: torch.tensor(np.ascontiguousarray(np.array(v).T, np.float32))
     r_o, escaped = tensor(around.directions), torch.tensor(np.array(around.escaped))
     assert 0.3 < escaped.float().mean() < 0.7
@@ -230,11 +231,10 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
     p_od = p_o + r_o * torch.tensor(np.array(around.distance))[:, None]
     module = interop.GazeModule(field)
     Z = module.integral(p_od, p_o, r_o, escaped)
-    assert float(Z) == pytest.approx(float(around.value()[0]), rel=1e-5)
+    assert float(Z) == pytest.approx(float(observed.integrals(eye)[0][0]), rel=1e-5)
     gaze = module(p_od, p_o, r_o, Z, escaped)
-    medium.recall([around])
     points = [rgb.Point3f(p_od.numpy().T), rgb.Point3f(p_o.numpy().T.copy()), rgb.Vector3f(r_o.numpy().T)]
-    expected = np.array(medium.evaluate(*points, True, None, around.escaped)[0])
+    expected = np.array(observed.evaluate(*points, True, escaped=around.escaped)[0])
     np.testing.assert_allclose(gaze.detach().numpy(), expected, rtol=2e-5)
     if kind != "mixed":
         assert 4 * np.pi * float(gaze.mean()) == pytest.approx(1, rel=1e-5)

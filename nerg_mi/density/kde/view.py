@@ -1,5 +1,5 @@
 """The kernel density of tracked rays as an observer's view: the ground truth beside a gaze field, inside the
-integrator.
+integrator (``transport.observer.views``).
 
 An observer's density is that of the rays that started nearest (NeRG, Section 5.3, and the baseline of
 ``nerg eval gaze``). It is gathered once an observer, and summed at every pixel or tabulated
@@ -14,8 +14,6 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.transport.observer.ensemble import keep_or_make
-from nerg_mi.transport.observer.gaze_medium import at_nearest
 
 from .estimate import SphericalKde
 from .frame import WORTH
@@ -41,7 +39,7 @@ class KdeView:
         if len(rays) == 0:
             raise NergError("there are no rays to show the density of")
         self.to_world, self.backend = to_world or Similarity(), backend
-        self.count, self.kappa, self._known = min(count, len(rays)), kappa, []
+        self.count, self.kappa = min(count, len(rays)), kappa
         self._origin, self._direction = rays.origin, rays.direction
 
     def nearest(self, p: np.ndarray) -> np.ndarray:
@@ -51,37 +49,34 @@ class KdeView:
             return self._direction
         return self._direction[np.argpartition(square, self.count - 1)[: self.count]]
 
-    def face(self, observers: list) -> None:
-        """Gather the rays around each of ``observers`` (Point3f of one lane); kept until the observer changes."""
-        self._known = keep_or_make(self._known, observers, lambda p_o: _Density(self, p_o))
+    def at(self, p_o) -> ObservedKde:
+        """The density of the observer at ``p_o`` (Point3f in the scene, one lane)."""
+        p = np.array(self.to_world.point_to_local(p_o), np.float64).ravel()
+        rays = self.nearest(p)
+        kde = SphericalKde(rays, np.array([0, len(rays)]), self.kappa, backend=self.backend)
+        return ObservedKde(kde, self.to_world)
 
-    def value(self, p_o, r_o):
-        """Density (1/sr) in direction ``r_o``, unit, of the observer that is faced nearest to ``p_o``, lane by lane;
-        without derivatives.
 
-        ``kde_frame.WORTH`` directions or more are looked up in a table, where that costs less; fewer are summed
-        exactly.
-        """
+class ObservedKde:
+    """The density of one observer: that of ``kde``, whose frame ``to_world`` places in the scene.
+
+    ``frame.WORTH`` directions or more are looked up in a table, where that costs less; fewer are summed exactly.
+    """
+
+    def __init__(self, kde: SphericalKde, to_world: Similarity):
+        self.kde, self.to_world = kde, to_world
+        # Made when it first pays.
+        self.table: SphericalKdeTable | None = None
+
+    def value(self, r_o):
+        """Density (Float, 1/sr) in unit scene directions ``r_o``, without derivatives."""
         d = self.to_world.direction_to_local(dr.detach(r_o))
-        return at_nearest(self._known, p_o, lambda known: known.density(d))
-
-
-class _Density:
-    """That of one observer."""
-
-    def __init__(self, view: KdeView, p_o):
-        self.center, self._table = type(p_o)(dr.detach(p_o)), None
-        p = np.array(view.to_world.point_to_local(self.center), np.float64).ravel()
-        rays = view.nearest(p)
-        self.kde = SphericalKde(rays, np.array([0, len(rays)]), view.kappa, backend=view.backend)
-
-    def density(self, d):
         ns, lanes = self.kde.ns, dr.width(d)
         d = ns.Array3f(d.x, d.y, d.z)
         with dr.suspend_grad():
             # All of a table is made, whatever is seen of it; a texel costs a fifth of a lane.
             if lanes < WORTH or not SphericalKdeTable.fits(self.kde, lanes // 4):
                 return self.kde.density(dr.zeros(ns.UInt32, lanes), d)
-            if self._table is None:
-                self._table = SphericalKdeTable(self.kde)
-            return self._table.density(d)
+            if self.table is None:
+                self.table = SphericalKdeTable(self.kde)
+            return self.table.density(d)

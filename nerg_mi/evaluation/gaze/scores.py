@@ -8,14 +8,11 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import saliency as metrics
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.log_density import LogGazeField
-from nerg_mi.field.gaze.product import GazeField
+from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
-from nerg_mi.transport.observer.ensemble import EnsembleMedium
-from nerg_mi.transport.observer.gaze_medium import GazeMedium
-from nerg_mi.transport.observer.integral import gaze_around
+from nerg_mi.transport.observer.gaze import ObservedGaze, PlacedGaze
+from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
 
@@ -26,9 +23,7 @@ from .baselines import Baseline
 EPS = 1e-6
 
 
-def gaze_field(
-    field: GazeField | LogGazeField | GazeEnsemble, medium, align: Similarity | None = None, kind: str = "median"
-) -> Baseline:
+def gaze_field(field: AnyGazeField, medium, align: Similarity | None = None, kind: str = "median") -> Baseline:
     """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the
     positions' units.
 
@@ -41,29 +36,26 @@ def gaze_field(
     all positions or (P, D, 3), unit. The integrals of positions are kept: neither the field nor its place may change.
     Raises `NergError` for a field that needs surfaces where there is no place.
     """
-    if medium is None and getattr(field.config, "geometry", "surface") != "none":
+    if medium is None and field.config.needs_surfaces:
         raise NergError(
-            "this gaze field was trained among surfaces, and there is no place that has any: "
-            "give it the field, the scene or the geometry"
+            "this gaze field was trained among surfaces, and there is no place that has any: give it the field, the "
+            "scene or the geometry"
         )
     align = align or Similarity()
-    gaze = (EnsembleMedium if isinstance(field, GazeEnsemble) else GazeMedium)(field)
+    gaze = PlacedGaze(field)
     place = medium if isinstance(medium, Place) else Place(medium)
-    how = (place, default_settings(place), kind, SURFACE_OPACITY)
-    known: dict[bytes, list] = {}
+    settings = ObserverSettings(march=default_settings(place), depth=kind, surface_opacity=SURFACE_OPACITY)
+    observed: dict[bytes, ObservedGaze] = {}
 
     def of(position: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Densities (D,) of one observer (3,), both in the field's frame."""
         import mitsuba as mi
 
         p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
-        if key in known:
-            gaze.recall(known[key])
-        else:
-            gaze.face([p_o], *how)
-            known[key] = gaze.known()
+        if key not in observed:
+            observed[key] = gaze.at([p_o], place, settings)
         r_o = mi.Vector3f(np.ascontiguousarray(directions.T, np.float32))
-        return np.array(gaze_around(gaze, place, p_o, r_o, *how[1:]))
+        return np.array(observed[key].along(p_o, r_o))
 
     def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]

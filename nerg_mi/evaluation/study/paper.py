@@ -18,7 +18,6 @@ import functools
 import drjit as dr
 
 from nerg_mi.maths.color import composite_to_linear
-from nerg_mi.transport.features import observed_features
 from nerg_mi.transport.observer import viewpoint
 from nerg_mi.transport.observer.visibility import visibility
 from nerg_mi.transport.place import Place
@@ -72,7 +71,7 @@ def _integrator_class(variant: str):
             local = like.medium.local(ray.o, ray.d)
             t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, ray.maxt)
             alpha, depth, total, n = self._march(local, t0, t1, mi.Bool(active), color)
-            surface = alpha >= like.surface_opacity
+            surface = alpha >= like.observer_settings.surface_opacity
             out = {
                 "depth": depth,
                 "opacity": alpha,
@@ -96,18 +95,15 @@ def _integrator_class(variant: str):
             r_o = (p_d - p_o) / (distance + 1e-6)
             local = like.medium.local(p_o, r_o)
             alpha, depth, _, n = self._march(local, dr.maximum(local.t_near, 0), local.t_far, surface, None)
-            d_o = dr.select(alpha >= like.surface_opacity, depth, distance)
+            d_o = dr.select(alpha >= like.observer_settings.surface_opacity, depth, distance)
             seen = dr.select(surface, visibility(distance, d_o, like.falloff, self._tolerance), 0)
             out["visibility"] = seen
             if gaze:
                 place, attended = Place(like.medium), surface & (seen > 0)
-                like.gaze.face([p_o], place, like.settings, like.depth_kind, like.surface_opacity)
-                p_od = p_o + r_o * d_o
-                semantic = observed_features(
-                    like.gaze.field.config.semantic, place, p_od, p_o, r_o, attended, like.settings
-                )
-                out["gaze"] = dr.select(attended, like.gaze.evaluate(p_od, p_o, r_o, attended, semantic)[0] * seen, 0)
-                out["gaze_evals"] = dr.select(surface, mi.Float(like.gaze.networks), 0.0)
+                observed = like.gaze.at([p_o], place, like.observer_settings, like.cache)
+                density = observed.evaluate(p_o + r_o * d_o, p_o, r_o, attended)[0]
+                out["gaze"] = dr.select(attended, density * seen, 0)
+                out["gaze_evals"] = dr.select(surface, mi.Float(like.gaze.field.networks), 0.0)
             return n
 
     return PaperIntegrator

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.transport.observer.gaze import ObservedGaze
 
 from .scenes import COLOR_BASE, COLOR_SLOPE, NUMPY, AnalyticScene
 
@@ -170,7 +171,7 @@ class Truth:
 
 def truth(
     scene: AnalyticScene,
-    gaze,
+    gaze: ObservedGaze | None,
     o,
     d,
     *,
@@ -182,8 +183,7 @@ def truth(
 ) -> Truth:
     """The reference of ``nerg``'s channels for rays (N, 3), as its manual page defines them.
 
-    ``gaze``: what ``evaluate(p_od, p_o, r_o, True)`` asks (a single-precision network, evaluated at float64 positions),
-    or None; a normalised one faces the observer already.
+    ``gaze``: for the scene's observer (a single-precision network, evaluated at float64 positions), or None.
     """
     seen = trace(scene, o, d)
     t = seen.depth(depth)
@@ -218,9 +218,9 @@ def towards(p_o, p):
     return distance, v / np.where(distance > 0, distance, 1)[:, None]
 
 
-def evaluate_gaze(gaze, p_od, p_o, r_o) -> np.ndarray:
-    """Gaze density (N,) in 1/sr of the medium ``gaze`` at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``,
-    which a normalised one faces already."""
+def evaluate_gaze(gaze: ObservedGaze, p_od, p_o, r_o) -> np.ndarray:
+    """Gaze density (N,) in 1/sr at points (N, 3) seen along unit ``r_o`` (N, 3) from ``p_o``, one of the observers of
+    ``gaze``."""
     import mitsuba as mi
 
     def points(kind, v):

@@ -192,7 +192,7 @@ def _volumes(variant: str):
             from nerg_mi.field.encoding.hashgrid import HashGridConfig
             from nerg_mi.field.gaze.product import GazeConfig, GazeField
             from nerg_mi.maths.box import Box
-            from nerg_mi.transport.observer.gaze_medium import GazeMedium
+            from nerg_mi.transport.observer.gaze import PlacedGaze
 
             super().__init__(props)
             ns = namespace(variant)
@@ -202,10 +202,10 @@ def _volumes(variant: str):
             field = GazeField.random(config, Box((0, 0, 0), (1, 1, 1)), ns, seed=1)
             table = 2 * np.random.default_rng(1).normal(size=len(field.grid.table)).astype(np.float32)
             field.set_parameters({"grid.table": ns.Float(table)})
-            self._medium = GazeMedium(field)
+            self._gaze = PlacedGaze(field)
 
-        def gaze_medium(self):
-            return self._medium
+        def placed_gaze(self):
+            return self._gaze
 
         def bbox(self):
             return mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])

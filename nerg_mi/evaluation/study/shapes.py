@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.transport.observer.gaze import ObservedGaze
 from nerg_mi.transport.place import Place
 
 from .reference import Truth, evaluate_gaze, towards
@@ -53,21 +54,15 @@ def first_hit(corners: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     return out
 
 
-def facing(subject, p_o: np.ndarray):
-    """The gaze medium of ``subject``, normalised over the sphere around ``p_o`` (3,) where it is a normalised one."""
+def observed_gaze(subject, p_o: np.ndarray) -> ObservedGaze:
+    """The gaze field of ``subject`` for the observer at ``p_o`` (3,)."""
     import mitsuba as mi
 
     integrator = subject.integrator()
     # The integral is the integrator's own: over ray casts, which are exact to single precision, and tested against
     # ``first_hit``.
-    integrator.gaze.face(
-        [mi.Point3f(*p_o.tolist())],
-        Place(None, subject.scene),
-        integrator.settings,
-        integrator.depth_kind,
-        integrator.surface_opacity,
-    )
-    return integrator.gaze
+    place = Place(None, subject.scene)
+    return integrator.gaze.at([mi.Point3f(*p_o.tolist())], place, integrator.observer_settings)
 
 
 def truth(subject, seed: int, visibility: str, color: np.ndarray) -> Truth:
@@ -94,6 +89,6 @@ def truth(subject, seed: int, visibility: str, color: np.ndarray) -> Truth:
     share = np.where(hit, share, 0)
     gaze = np.zeros(len(o))
     if subject.has_gaze:
-        gaze = evaluate_gaze(facing(subject, p_o), p_od, p_o, towards(p_o, p_d)[1]) * share
+        gaze = evaluate_gaze(observed_gaze(subject, p_o), p_od, p_o, towards(p_o, p_d)[1]) * share
     source = f"float64 ray casts; colour the mean of {COLOR_SPP} samples a pixel"
     return Truth(color, hit.astype(float), depth, share, gaze, source, {})

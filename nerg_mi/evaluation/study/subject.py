@@ -197,10 +197,13 @@ class AnalyticSubject(Subject):
         return mi.load_dict({"type": "nerg", **self.base, **grid, **params})
 
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+        import mitsuba as mi
+
         o, d = self.rays(seed)
+        made, p_o = self.integrator(), mi.Point3f(*self.analytic.observer)
         return study_reference.truth(
             self.analytic,
-            self._volumes["gaze"].gaze_medium(),
+            made.gaze.at([p_o], Place(made.medium), made.observer_settings),
             o,
             d,
             depth=depth,
@@ -335,14 +338,15 @@ def load_subject(
 
 def parameters(integrator) -> dict:
     """The parameters of an integrator of type ``nerg``, read back by the names of its manual page."""
-    names = ("occlusion", "surface_opacity", "radiance", "jitter")
+    names = ("occlusion", "radiance", "jitter")
     march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse")
     out = {n: getattr(integrator, n) for n in names} | {n: getattr(integrator.settings, n) for n in march}
-    observer = integrator.observer_pass
+    observer = integrator.observer_settings
     return out | {
         "falloff": float(integrator.falloff[0]),
-        "depth": integrator.depth_kind,
-        "visibility": observer.kind,
+        "depth": observer.depth,
+        "surface_opacity": observer.surface_opacity,
+        "visibility": observer.visibility,
         "map_height": observer.map_height,
         "background": np.array(integrator.background, float).ravel().tolist(),
     }

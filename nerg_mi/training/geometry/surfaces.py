@@ -6,7 +6,7 @@ import numpy as np
 
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.ray_box import box_interval
-from nerg_mi.transport.observer.integral import nearest_depth
+from nerg_mi.transport.observer.surroundings import nearest_depth
 from nerg_mi.transport.trace import trace_depth
 
 from .places import NOWHERE, GazePlace

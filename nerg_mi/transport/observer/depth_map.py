@@ -1,64 +1,58 @@
 """What an observer meets in every direction, marched once and looked up ever after.
 
-A latitude-longitude map of depth, and of gaze, around the observer. A point is compared with the
-four nearest entries and the results are interpolated (percentage-closer filtering,
-Reeves et al. 1987), not the depths themselves, which would float between surfaces.
+A latitude-longitude map of depth, and of gaze, around the observer. A point is compared with the four nearest entries
+and the results are interpolated (percentage-closer filtering, Reeves et al. 1987), not the depths themselves, which
+would float between surfaces.
 """
 
 from __future__ import annotations
 
 import drjit as dr
 
-from nerg_mi.transport.fingerprint import Fingerprint, of_shapes
+from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.transport.place import Place
 
+from .gaze import ObservedGaze
+from .settings import ObserverSettings
 from .visibility import visibility
 
 
 class ObserverMap:
-    """Depths (scene units, infinite where nothing is met) around ``p_o``, ``2 height`` x ``height`` entries.
+    """Depths (scene units, infinite where nothing is met) around ``center`` (one lane), ``2 height`` x
+    ``height`` entries.
 
-    Detached: no derivative passes through the map. Rows run from +z to -z, columns from azimuth 0 on,
-    entries at pixel centres. ``gaze``: densities of a gaze field, once ``keep`` was called.
+    Detached: no derivative passes through the map. Rows run from +z to -z, columns from azimuth 0 on, entries at pixel
+    centres.
     """
 
-    def __init__(self, place: Place, p_o, height: int, settings, kind: str, surface_opacity: float):
+    def __init__(self, place: Place, center: Point3f, settings: ObserverSettings):
         import mitsuba as mi
 
-        self.height, self.width = height, 2 * height
+        self.height, self.width, self.center = settings.map_height, 2 * settings.map_height, center
         self._uint, self._vector = mi.UInt32, mi.Vector3f
-        self._shapes = of_shapes(place)
-        self.gaze, self._gaze_of = None, None
         with dr.suspend_grad():
-            self.center = type(p_o)(dr.detach(p_o))
-            everywhere = dr.full(mi.Bool, True, self.width * height)
-            view = place.trace(mi.Ray3f(self.center, self._directions()), everywhere, settings)
-            met = view.meets(surface_opacity)
-            self.depth = dr.select(met, view.depth(kind, met), dr.inf)
+            everywhere = dr.full(mi.Bool, True, self.width * self.height)
+            view = place.trace(mi.Ray3f(self.center, self._directions()), everywhere, settings.march)
+            met = view.meets(settings.surface_opacity)
+            self.depth = dr.select(met, view.depth(settings.depth, met), dr.inf)
             dr.eval(self.depth)
 
-    def serves(self, place: Place) -> bool:
-        """Whether the shapes are still those that were cast at."""
-        return self._shapes == of_shapes(place)
-
-    def keep(self, gaze) -> None:
-        """Have ``look_up`` know the density of ``gaze`` (``gaze_medium.GazeMedium``) where the observer meets a surface."""
-        if self._gaze_of is not None and self._gaze_of == Fingerprint(gaze.parameters()):
-            return
+    def gaze_table(self, gaze: ObservedGaze) -> Float:
+        """The density of ``gaze`` (an entry each) where a surface is met, 0 elsewhere."""
         with dr.suspend_grad():
             r_o = self._directions()
             met = dr.isfinite(self.depth)
             p_od = self.center + r_o * dr.select(met, self.depth, 0)
-            self.gaze = dr.select(met, gaze.evaluate(p_od, self.center, r_o, met)[0], 0)
-            dr.eval(self.gaze)
-        self._gaze_of = Fingerprint(gaze.parameters())
+            table = dr.select(met, gaze.evaluate(p_od, self.center, r_o, met)[0], 0)
+            dr.eval(table)
+        return table
 
     @property
     def spacing(self) -> float:
         """Angle between neighbouring entries, in radian."""
         return dr.pi / self.height
 
-    def _directions(self):
+    def _directions(self) -> Vector3f:
         index = dr.arange(self._uint, self.width * self.height)
         Float = dr.float32_array_t(type(index))
         phi = (Float(index % self.width) + 0.5) * self.spacing
@@ -67,7 +61,9 @@ class ObserverMap:
         sin_phi, cos_phi = dr.sincos(phi)
         return self._vector(sin_theta * cos_phi, sin_theta * sin_phi, cos_theta)
 
-    def look_up(self, r_o, distance, falloff, tolerance, active):
+    def look_up(
+        self, r_o: Vector3f, distance: Float, falloff: Float, tolerance: Float, active: Bool
+    ) -> tuple[Float, Float]:
         """``(nearest depth, visibility)`` of points at ``distance`` along unit ``r_o`` from the centre."""
         Float = type(distance)
         seen, nearest, best = Float(0), Float(dr.inf), Float(-1)
@@ -78,16 +74,20 @@ class ObserverMap:
             nearest, best = dr.select(closer, depth, nearest), dr.select(closer, weight, best)
         return nearest, seen
 
-    def gaze_along(self, r_o, distance, falloff, slack, active):
-        """Density at the surface that is met along unit ``r_o`` for points at ``distance``, negative where the map does
-        not know it: an entry that looks past the point, by more than ``slack``, sees another surface."""
+    def gaze_along(
+        self, table: Float, r_o: Vector3f, distance: Float, falloff: Float, slack: Float, active: Bool
+    ) -> Float:
+        """Density of a ``gaze_table`` at the surface that is met along unit ``r_o`` for points at ``distance``.
+
+        Negative where the map does not know it: an entry that looks past the point, by more than ``slack``, sees
+        another surface."""
         Float = type(distance)
         total, share = Float(0), Float(0)
         for entry, weight in self._entries(r_o, distance):
             depth = dr.gather(Float, self.depth, entry, active)
             weight *= visibility(distance, depth, falloff, slack)
             weight = dr.select(depth < distance + slack, weight, 0)
-            total += weight * dr.gather(Float, self.gaze, entry, active)
+            total += weight * dr.gather(Float, table, entry, active)
             share += weight
         return dr.select(share > 0, total / dr.select(share > 0, share, 1), -1)
 

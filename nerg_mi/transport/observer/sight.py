@@ -1,7 +1,7 @@
 """What an observer, who may stand elsewhere than the camera, sees of a point.
 
-The paper's second depth pass: the observer's ray towards the camera's surface p_d is
-marched for its own depth d_o, and compared with the distance d_o* (see ``visibility``).
+The paper's second depth pass: the observer's ray towards the camera's surface p_d is marched for its own depth d_o, and
+compared with the distance d_o* (see ``visibility``).
 """
 
 from __future__ import annotations
@@ -10,14 +10,16 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from nerg_mi.transport.freezing import recording
-from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.place import Place
+from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f
+from nerg_mi.transport.fingerprint import Fingerprint
+from nerg_mi.transport.place import Place, View
 
+from .cache import ObserverCache, fingerprint_of
 from .depth_map import ObserverMap
+from .gaze import ObservedGaze
+from .settings import ObserverSettings
+from .viewpoint import distance_and_direction
 from .visibility import visibility
-
-KINDS = ("depth", "transmittance", "map")
 
 # An entry of a map sees the same surface as a point if it lies at most this many times the point's lift behind it.
 _PAST = 4
@@ -31,113 +33,104 @@ LARGEST = 1e18
 
 @dataclass
 class Sight:
-    """``p_od``: the surface that the observer meets; ``depth``: d_o, the distance to the point where nothing is
-    met; ``visibility``: 1 visible .. 0 hidden; ``density_evals``: evaluations that it took (None unless counted);
-    ``gaze``: the density, from a map that keeps it, negative where it does not know it; else None."""
+    """What an observer sees of a point; distances in scene units."""
 
-    p_od: object
-    depth: object
-    visibility: object
-    density_evals: object
-    gaze: object = None
-
-
-def towards(p_o, p):
-    """Distance and unit direction from ``p_o`` to ``p``, finite with their derivatives where both coincide."""
-    v = p - p_o
-    square = dr.squared_norm(v)
-    # Nearer than 1e-15 units the derivative of the direction leaves single precision.
-    apart = square > 1e-30
-    distance = dr.select(apart, dr.sqrt(dr.select(apart, square, 1)), 0)
-    # Any direction will do for an observer exactly on the surface.
-    return distance, dr.select(apart, v / dr.select(apart, distance, 1), type(v)(0, 0, 1))
+    # The surface that the observer meets.
+    p_od: Point3f
+    # d_o; the distance to the point where nothing is met.
+    depth: Float
+    # 1 visible .. 0 hidden.
+    visibility: Float
+    # Evaluations of density that it took; None unless counted.
+    density_evals: Float | None
+    # The density of a gaze field, from a map that keeps it, negative where it does not know it; else None.
+    gaze: Float | None = None
 
 
-class ObserverPass:
-    """Looks from an observer at points of a place.
+def trace_sight(
+    place: Place,
+    ray: Ray3f,
+    p_d: Point3f,
+    p_o: Point3f,
+    penetration: Float,
+    active: Bool,
+    falloff: Float,
+    settings: ObserverSettings,
+    *,
+    count: bool = False,
+    gaze: ObservedGaze | None = None,
+    cache: ObserverCache | None = None,
+) -> Sight:
+    """What the observer at ``p_o`` meets towards the surface ``p_d`` that the camera sees on ``ray``.
 
-    ``kind``: one of ``KINDS``; ``depth``: kind of d_o; ``surface_opacity``: opacity from which a ray meets a
-    surface; ``tolerance``: in scene units, 0 for two steps (without a medium, see ``EXACT``);
-    ``map_height``: rows of the map.
+    The point that is looked for lies a little in front of the surface, towards the camera: by the tolerance, and by the
+    ``penetration`` of light into the surface. A surface then never hides itself, however obliquely the observer looks
+    along it, because the ray stays above it. A tolerance along the observer's ray alone would have to grow without
+    bound.
+
+    ``falloff``: d_f. ``count``: count evaluations. ``gaze``: what a map keeps the density of as well, where no
+    derivative needs the field itself. ``cache``: keeps the map.
     """
+    import mitsuba as mi
 
-    def __init__(
-        self, settings: MarchSettings, kind: str, depth: str, surface_opacity: float, tolerance: float, map_height: int
-    ):
-        self.settings, self.kind, self.depth = settings, kind, depth
-        self.surface_opacity, self.tolerance, self.map_height = surface_opacity, tolerance, map_height
-        self._map = None
+    tolerance = _tolerance(place, ray, p_d, p_o, settings)
+    in_front = tolerance + penetration
+    if settings.visibility == "map":
+        # Entries of a map are this far apart where the ray ends, and depths on slopes as much.
+        apart = dr.norm(p_d - p_o) * (dr.pi / settings.map_height)
+        in_front += apart
+        tolerance = tolerance + apart
+    distance, r_o = distance_and_direction(p_o, p_d - ray.d * in_front)
+    attended = None
 
-    def forget(self) -> None:
-        """Drop the cached map: the field has changed."""
-        self._map = None
-
-    def look(self, place: Place, ray, p_d, p_o, fuzz, active, falloff, count: bool, gaze=None) -> Sight:
-        """What the observer at ``p_o`` meets towards the camera's surface ``p_d`` on ``ray``.
-
-        The point that is looked for lies a little in front of the surface, towards the camera: by the
-        tolerance, and by ``fuzz``, how far light goes into the surface. A surface then never hides itself,
-        however obliquely the observer looks along it, because the ray stays above it. A tolerance along the
-        observer's ray alone would have to grow without bound. ``gaze`` (``gaze_medium.GazeMedium``): have a map keep
-        the gaze as well, where no derivative needs the field itself.
-        """
-        import mitsuba as mi
-
-        tolerance = self._tolerance(place, ray, p_d, p_o)
-        in_front = tolerance + fuzz
-        if self.kind == "map":
-            # Entries of a map are this far apart where the ray ends, and depths on slopes as much.
-            apart = dr.norm(p_d - p_o) * (dr.pi / self.map_height)
-            in_front += apart
-            tolerance = tolerance + apart
-        distance, r_o = towards(p_o, p_d - ray.d * in_front)
-        attended = None
-
-        if self.kind == "map":
-            known = self._map_from(place, p_o)
-            if gaze is not None and not dr.grad_enabled(p_o, *gaze.parameters()):
-                known.keep(gaze)
-            else:
-                gaze = None
-            met, seen = known.look_up(r_o, distance, falloff, tolerance, active)
-            if gaze is not None:
-                # Of the surface itself: the point in front of it lies in another direction.
-                whole, r_d = towards(p_o, p_d)
-                attended = known.gaze_along(r_d, whole, falloff, _PAST * in_front, active)
-            evals = type(distance)(0)
-        else:
-            towards_point = mi.Ray3f(p_o, r_o)
-            if self.kind == "transmittance":
-                towards_point.maxt = distance
-                between = place.trace(towards_point, active, self.settings, count=count)
-                seen = dr.select(between.hit, 0, 1 if between.march is None else dr.exp(-between.march.tau))
-                return Sight(p_d, distance, seen, _evals(between))
-            view = place.trace(towards_point, active, self.settings, count=count)
-            met = dr.select(active & view.meets(self.surface_opacity), view.depth(self.depth, active), dr.inf)
-            seen, evals = visibility(distance, met, falloff, tolerance), _evals(view)
-        # An observer who meets nothing before the point sees the point itself.
-        blocked = met < distance - tolerance
-        d_o = dr.select(dr.isfinite(met), met, distance)
-        return Sight(dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals, attended)
-
-    def _tolerance(self, place, ray, p_d, p_o):
-        if self.tolerance:
-            return min(self.tolerance, LARGEST)
-        if place.medium is None:
-            near = 2 * dr.maximum(dr.norm(dr.detach(p_d)), dr.norm(dr.detach(p_o)))
-            return EXACT * dr.minimum(place.diagonal, near) + _FAR * place.diagonal
-        return dr.minimum(2 * dr.maximum(self.settings.step, self.settings.dt_gamma * dr.norm(p_d - ray.o)), LARGEST)
-
-    def _map_from(self, place, p_o) -> ObserverMap:
-        """The observer's map, marched anew only when the observer, the field or a shape has changed."""
-        known = self._map
-        if recording():
-            # A recorded function decides nothing by what it reads: it marches its map whenever it is replayed.
-            return ObserverMap(place, p_o, self.map_height, self.settings, self.depth, self.surface_opacity)
-        if known is None or not known.serves(place) or not dr.all(known.center == dr.detach(p_o), axis=None):
-            self._map = ObserverMap(place, p_o, self.map_height, self.settings, self.depth, self.surface_opacity)
-        return self._map
+    if settings.visibility == "map":
+        around, table = _map_of(place, p_o, settings, gaze, cache or ObserverCache())
+        met, seen = around.look_up(r_o, distance, falloff, tolerance, active)
+        if table is not None:
+            # Of the surface itself: the point in front of it lies in another direction.
+            whole, r_d = distance_and_direction(p_o, p_d)
+            attended = around.gaze_along(table, r_d, whole, falloff, _PAST * in_front, active)
+        evals = type(distance)(0)
+    else:
+        to_point = mi.Ray3f(p_o, r_o)
+        if settings.visibility == "transmittance":
+            to_point.maxt = distance
+            between = place.trace(to_point, active, settings.march, count=count)
+            seen = dr.select(between.hit, 0, 1 if between.march is None else dr.exp(-between.march.tau))
+            return Sight(p_d, distance, seen, _evaluations(between))
+        view = place.trace(to_point, active, settings.march, count=count)
+        met = dr.select(active & view.meets(settings.surface_opacity), view.depth(settings.depth, active), dr.inf)
+        seen, evals = visibility(distance, met, falloff, tolerance), _evaluations(view)
+    # An observer who meets nothing before the point sees the point itself.
+    blocked = met < distance - tolerance
+    d_o = dr.select(dr.isfinite(met), met, distance)
+    return Sight(dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals, attended)
 
 
-def _evals(view):
+def _tolerance(place: Place, ray: Ray3f, p_d: Point3f, p_o: Point3f, settings: ObserverSettings) -> Float:
+    if settings.tolerance:
+        return min(settings.tolerance, LARGEST)
+    if place.medium is None:
+        near = 2 * dr.maximum(dr.norm(dr.detach(p_d)), dr.norm(dr.detach(p_o)))
+        return EXACT * dr.minimum(place.diagonal, near) + _FAR * place.diagonal
+    march = settings.march
+    return dr.minimum(2 * dr.maximum(march.step, march.dt_gamma * dr.norm(p_d - ray.o)), LARGEST)
+
+
+def _map_of(
+    place: Place, p_o: Point3f, settings: ObserverSettings, gaze: ObservedGaze | None, cache: ObserverCache
+) -> tuple[ObserverMap, Float | None]:
+    """The observer's map, and the table of ``gaze`` on it (None without one, or where it has derivatives)."""
+    made_of = (fingerprint_of(place), settings.surfaces, settings.map_height)
+    make = lambda center: ObserverMap(place, center, settings)
+    known = cache.of_each("map", [p_o], made_of, make)
+    around = known[0].value
+    if gaze is None or dr.grad_enabled(p_o, *gaze.parameters()):
+        return around, None
+    of_map = (around, Fingerprint(gaze.parameters()))
+    table = cache.of_known("gaze of map", known, of_map, lambda k: k.value.gaze_table(gaze))[0].value
+    return around, table
+
+
+def _evaluations(view: View) -> Float | None:
     return None if view.march is None else view.march.density_evals

@@ -1,31 +1,40 @@
-"""Where a camera's, or an observer's, eye is.
+"""Where a camera's, or an observer's, eye is, and where a point lies from there.
 
 The eye is the centre of the sensor, not the origin of its rays: Mitsuba starts those at the near plane.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
 import drjit as dr
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.types import Float, Point3f, Ray3f, Vector3f
 from nerg_mi.transport.freezing import recording
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from .cache import Known
 
 _CENTERED = {"PerspectiveCamera", "ThinLensCamera", "Panorama", "RadianceMeter"}
 
 
-def center(sensor):
-    """Centre of ``sensor`` in the scene (Point3f); attached to its ``to_world``."""
+def center(sensor: mi.Sensor) -> Point3f:
+    """Centre of ``sensor`` in the scene (one lane); attached to its ``to_world``."""
     import mitsuba as mi
 
     return sensor.world_transform() @ mi.Point3f(0)
 
 
-def is_batch(sensor) -> bool:
+def is_batch(sensor: mi.Sensor) -> bool:
     """Whether ``sensor`` consists of several."""
     return _kind(sensor) == "BatchSensor"
 
 
-def _members(sensor) -> list:
+def _members(sensor: mi.Sensor) -> list[mi.Sensor]:
     """The sensors that ``sensor`` consists of: itself, or those of a batch."""
     if not is_batch(sensor):
         return [sensor]
@@ -42,13 +51,13 @@ def _members(sensor) -> list:
     return found
 
 
-def _kind(sensor) -> str:
+def _kind(sensor: mi.Sensor) -> str:
     # Sensors written in Python carry their own class name.
     name = type(sensor).__name__
     return sensor.class_name() if name in ("Sensor", "ProjectiveCamera") else name
 
 
-def require_center(sensor, role: str) -> None:
+def require_center(sensor: mi.Sensor, role: str) -> None:
     """Raise ``ValueError`` when ``sensor`` (called ``role`` in the message) has no single centre."""
     if _kind(sensor) not in _CENTERED:
         raise NergError(
@@ -57,7 +66,7 @@ def require_center(sensor, role: str) -> None:
         )
 
 
-def same_center(sensors, p_o) -> bool:
+def same_center(sensors: Sequence[mi.Sensor], p_o: Point3f) -> bool:
     """Whether every sensor's centre is exactly ``p_o`` (which costs a look at both values).
 
     False while a function is recorded by ``dr.freeze``: it will be replayed wherever they stand then.
@@ -69,13 +78,13 @@ def same_center(sensors, p_o) -> bool:
     return len(centers) == count > 0 and all(bool(dr.all(dr.detach(c) == dr.detach(p_o))) for c in centers)
 
 
-def centers(sensors) -> list:
-    """Centre (Point3f) of each of ``sensors`` and of the members of batches."""
+def centers(sensors: Sequence[mi.Sensor]) -> list[Point3f]:
+    """Centre of each of ``sensors`` and of the members of batches."""
     return [center(m) for s in sensors for m in _members(s)]
 
 
-def center_of_ray(sensors, ray):
-    """Centre (Point3f) of the one of ``sensors`` that ``ray`` comes from.
+def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:
+    """Centre of the one of ``sensors`` that ``ray`` comes from.
 
     A ray belongs to the camera on whose axis-aligned near plane it starts and through whose centre
     its line passes, which tells the members of a batch apart.
@@ -104,4 +113,26 @@ def center_of_ray(sensors, ray):
         closer = error < miss
         best = dr.select(closer, c, best)
         miss = dr.select(closer, error, miss)
+    return best
+
+
+def distance_and_direction(p_o: Point3f, p: Point3f) -> tuple[Float, Vector3f]:
+    """Distance and unit direction from ``p_o`` to ``p``, finite with their derivatives where both coincide."""
+    v = p - p_o
+    square = dr.squared_norm(v)
+    # Nearer than 1e-15 units the derivative of the direction leaves single precision.
+    apart = square > 1e-30
+    distance = dr.select(apart, dr.sqrt(dr.select(apart, square, 1)), 0)
+    # Any direction will do for an observer exactly on the surface.
+    return distance, dr.select(apart, v / dr.select(apart, distance, 1), type(v)(0, 0, 1))
+
+
+def select_nearest(known: list[Known], p_o: Point3f, of: Callable[[Any], Float]) -> Float:
+    """``of(k.value)`` of that one ``k`` of ``known`` (``cache.Known``) whose ``center`` is nearest to ``p_o``, lane by
+    lane."""
+    best, apart = of(known[0].value), None
+    for k in known if len(known) > 1 else ():
+        here = dr.detach(dr.squared_norm(p_o - k.center))
+        best = best if apart is None else dr.select(here < apart, of(k.value), best)
+        apart = here if apart is None else dr.minimum(here, apart)
     return best

@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import drjit as dr
 
+from nerg_mi.maths.types import Float
 
-def visibility(d_expected, d_met, falloff, tolerance):
+
+def visibility(d_expected: Float, d_met: Float, falloff: Float, tolerance: Float) -> Float:
     """1 visible .. 0 hidden. ``d_expected``: d_o*, ``d_met``: d_o, ``falloff``: d_f >= 0 (0: a step
     function), ``tolerance``: how much nearer than the point a surface may lie and still be it. All in
     scene units."""

@@ -11,6 +11,8 @@ from nerg_mi.density.kde.view import KdeView
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions, uniform_directions
 from nerg_mi.rays.rays import Rays
+from nerg_mi.transport.observer.cache import ObserverCache
+from nerg_mi.transport.observer.views import view_along
 from tests.reference.kde import kde as reference
 
 COUNT, KAPPA = 40, 15.0
@@ -55,19 +57,20 @@ def test_each_lane_has_the_density_of_its_observer(rgb, rays):
     view = KdeView(rays, COUNT, KAPPA, Similarity(turn), ns)
     eyes, d = np.array([[0.1, 2.0, 0], [0.2, -1.5, 0.1]]), fibonacci_directions(50)
     there = eyes @ turn[:3, :3].T + turn[:3, 3]
-    view.face([points(there[k : k + 1]) for k in (0, 1)])
+    observers = [points(there[k : k + 1]) for k in (0, 1)]
     for k in (0, 1):
-        value = view.value(points(np.repeat(there[k : k + 1], 50, axis=0)), points(d @ turn[:3, :3].T / 2))
+        p_o = points(np.repeat(there[k : k + 1], 50, axis=0))
+        value = view_along(view, observers, p_o, points(d @ turn[:3, :3].T / 2), ObserverCache())
         assert np.allclose(value.numpy(), expected(rays, eyes[k], d), rtol=1e-4, atol=1e-6)
 
 
 def test_many_directions_are_looked_up_and_equal(rays):
     view, p = KdeView(rays, COUNT, KAPPA, backend=ns), np.array([0.1, 0.2, 0.0])
     d = fibonacci_directions(max(WORTH, 20_000))
-    view.face([points(p[None])])
-    found = view.value(points(np.broadcast_to(p, d.shape)), points(d)).numpy()
+    observed = view.at(points(p[None]))
+    found = observed.value(points(d)).numpy()
     want = expected(rays, p, d)
     assert np.abs(found - want).max() < 2e-3 * want.max()
-    few = view.value(points(np.broadcast_to(p, (30, 3))), points(d[:30])).numpy()
+    few = observed.value(points(d[:30])).numpy()
     assert np.allclose(few, want[:30], rtol=1e-4, atol=1e-6)
-    assert not dr.grad_enabled(view.value(points(p[None]), points(d[:1])))
+    assert not dr.grad_enabled(observed.value(points(d[:1])))

@@ -58,22 +58,23 @@ def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
     triangles."""
     subject = open_subject(str(scene(tmp_path, kind, True)), "auto", 8, 8)
     eye = subject.eye()
-    medium = study_shapes.facing(subject, eye)
+    observed = study_shapes.observed_gaze(subject, eye)
+    field = subject.integrator().gaze.field
     d = fibonacci_directions(4096)
     t = study_shapes.first_hit(subject.corners, np.broadcast_to(eye, d.shape), d)
     escaped = np.isinf(t)
     t[escaped] = box_exit(BOX, np.broadcast_to(eye, d.shape)[escaped], d[escaped])
     assert 0.1 < escaped.mean() < 0.9
     points = lambda kind, v: kind(np.ascontiguousarray(np.broadcast_to(v, d.shape).T, np.float32))
-    emit, capture = medium.unnormalized(
+    emit, capture = field.unnormalized(
         points(rgb.Point3f, eye + d * t[:, None]),
         points(rgb.Point3f, eye),
         points(rgb.Vector3f, d),
         True,
-        rgb.Bool(escaped),
+        escaped=rgb.Bool(escaped),
     )
     expected = 4 * np.pi * np.array(emit * capture, float).mean()
-    assert float(medium._integral(rgb.Point3f(*eye.tolist()))[0]) == pytest.approx(expected, rel=3e-3)
+    assert float(observed.integrals(rgb.Point3f(*eye.tolist()))[0][0]) == pytest.approx(expected, rel=3e-3)
 
 
 @pytest.mark.parametrize("shapes", [True, False], ids=["shapes", "medium"])

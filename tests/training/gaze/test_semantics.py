@@ -167,9 +167,10 @@ def test_features_of_training_are_those_of_rendering(rgb, radiance, tmp_path, mo
     made = scene.integrator()
     if cutoff is None:
         assert made.settings == default_settings(made.medium)
-    evaluate = made.gaze.evaluate
+    field = made.gaze.field
+    evaluate = field.evaluate
     # Kept as the render hands them over, and evaluated with the picture.
-    monkeypatch.setattr(made.gaze, "evaluate", lambda *a: (given.append([rgb.Float(f) for f in a[4]]), evaluate(*a))[1])
+    monkeypatch.setattr(field, "evaluate", lambda *a: (given.append([rgb.Float(f) for f in a[4]]), evaluate(*a))[1])
     picture = np.array(rgb.render(scene, spp=1)).reshape(64, -1)[:, -5:]
     rendered = np.stack([np.array(f) for f in given[0]], axis=-1)
     met = picture[:, 0] >= 0.5

@@ -6,16 +6,18 @@ import pytest
 
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.depth_map import ObserverMap
+from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place
 
 HEIGHT = 32
+SETTINGS = ObserverSettings(march=MarchSettings(0.1), depth="expected", map_height=HEIGHT)
 
 
 @pytest.fixture
 def around(rgb):
     """The map of an observer in the middle of a ball of radius 2."""
     ball = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
-    return ObserverMap(Place(None, ball), rgb.Point3f(0.0), HEIGHT, MarchSettings(0.1), "expected", 0.5)
+    return ObserverMap(Place(None, ball), rgb.Point3f(0.0), SETTINGS)
 
 
 def unit(phi, theta):
@@ -83,9 +85,10 @@ def test_gaze_is_that_of_the_entries_that_see_the_point(rgb, around):
     gaze = rng.uniform(0, 1, (HEIGHT, 2 * HEIGHT)).astype(np.float32)
     # At 2 is the surface that is asked for; at 1 stands something in front of it, and at 3 lies what is behind an edge.
     depth = rng.choice(np.float32([1, 2, 2, 3]), (HEIGHT, 2 * HEIGHT))
-    around.depth, around.gaze = rgb.Float(depth.ravel()), rgb.Float(gaze.ravel())
+    around.depth, table = rgb.Float(depth.ravel()), rgb.Float(gaze.ravel())
     phi, theta = directions()
-    found = around.gaze_along(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.1, True).numpy()
+    d, distance = rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi))
+    found = around.gaze_along(table, d, distance, 0.0, 0.1, True).numpy()
     known = (depth == 2).astype(float)
     share = interpolated(known, phi, theta)
     sure = share > 0.02
@@ -93,18 +96,22 @@ def test_gaze_is_that_of_the_entries_that_see_the_point(rgb, around):
         found[sure], (interpolated(known * gaze, phi, theta) / np.where(sure, share, 1))[sure], rtol=2e-2, atol=2e-3
     )
     around.depth = dr.full(rgb.Float, 3.0, 2 * HEIGHT**2)
-    assert (
-        around.gaze_along(rgb.Vector3f(unit(phi, theta)), dr.full(rgb.Float, 2.0, len(phi)), 0.0, 0.1, True).numpy()
-        == -1
-    ).all()
+    assert (around.gaze_along(table, d, distance, 0.0, 0.1, True).numpy() == -1).all()
 
 
-def test_a_map_serves_until_a_shape_moves(rgb):
-    scene = rgb.load_dict({"type": "scene", "ball": {"type": "sphere", "radius": 2.0}})
-    place, params = Place(None, scene), rgb.traverse(scene)
-    known = ObserverMap(place, rgb.Point3f(0.0), HEIGHT, MarchSettings(0.1), "expected", 0.5)
-    assert known.serves(place) and known.serves(Place(None, scene))
-    params[next(k for k in params.keys() if k.endswith("to_world"))] = rgb.Transform4f().translate([0, 0, 0.5])
-    params.update()
-    assert not known.serves(place) and not known.serves(Place(None))
-    assert ObserverMap(place, rgb.Point3f(0.0), HEIGHT, MarchSettings(0.1), "expected", 0.5).serves(place)
+def test_the_gaze_of_a_map_is_that_of_its_directions(rgb):
+    """0 where no surface is met, whatever the field says there."""
+
+    class Gaze:
+        def evaluate(self, p_od, p_o, r_o, active):
+            return (p_od.x + 10 * r_o.z + 100 * p_o.y,)
+
+    half = {"type": "disk", "to_world": rgb.ScalarTransform4f().translate([0, 0, 2]).scale(1e3)}
+    around = ObserverMap(Place(None, rgb.load_dict({"type": "scene", "half": half})), rgb.Point3f(0, 1, 0), SETTINGS)
+    width = np.pi / HEIGHT
+    theta, phi = np.meshgrid((np.arange(HEIGHT) + 0.5) * width, (np.arange(2 * HEIGHT) + 0.5) * width, indexing="ij")
+    x, _, z = unit(phi.ravel(), theta.ravel()).astype(float)
+    met = np.isfinite(around.depth.numpy())
+    assert np.array_equal(met[z > 0.01], np.ones((z > 0.01).sum(), bool)) and not met[z < 0].any()
+    want = np.where(met, x * 2 / np.where(z > 0, z, 1) + 10 * z + 100, 0)
+    assert np.allclose(around.gaze_table(Gaze()).numpy(), want, rtol=1e-3, atol=1e-3)

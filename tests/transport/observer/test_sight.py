@@ -7,7 +7,9 @@ import pytest
 
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.observer.sight import ObserverPass
+from nerg_mi.transport.observer.cache import ObserverCache
+from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.observer.sight import trace_sight
 from nerg_mi.transport.place import Place
 
 STEP = 0.01
@@ -19,22 +21,26 @@ def slab(mi, sigma):
 
 
 def look(
-    mi, place, kind, p_d, p_o, *, camera=(0.5, 0.5, -1), fuzz=0.0, tolerance=0.0, falloff=0.0, dt_gamma=0.0, count=False
+    mi,
+    place,
+    kind,
+    p_d,
+    p_o,
+    *,
+    camera=(0.5, 0.5, -1),
+    penetration=0.0,
+    tolerance=0.0,
+    falloff=0.0,
+    dt_gamma=0.0,
+    **more,
 ):
     """Sight of the point ``p_d`` that a camera sees along its ray, from ``p_o``."""
     o, p_d, p_o = (np.asarray(v, np.float64) for v in (camera, p_d, p_o))
     ray = mi.Ray3f(mi.Point3f(*map(float, o)), mi.Vector3f(*map(float, (p_d - o) / np.linalg.norm(p_d - o))))
-    observer = ObserverPass(MarchSettings(STEP, dt_gamma=dt_gamma), kind, "median", 0.5, tolerance, 64)
-    return observer.look(
-        place,
-        ray,
-        mi.Point3f(*map(float, p_d)),
-        mi.Point3f(*map(float, p_o)),
-        fuzz,
-        mi.Bool(True),
-        mi.Float(falloff),
-        count,
-    )
+    march = MarchSettings(STEP, dt_gamma=dt_gamma)
+    settings = ObserverSettings(march=march, visibility=kind, tolerance=tolerance, map_height=64)
+    points = (mi.Point3f(*map(float, p)) for p in (p_d, p_o))
+    return trace_sight(place, ray, *points, penetration, mi.Bool(True), mi.Float(falloff), settings, **more)
 
 
 @pytest.mark.parametrize(
@@ -44,18 +50,18 @@ def look(
 def test_a_point_is_looked_for_two_steps_in_front_of_its_surface(rgb, dt_gamma, tolerance, want):
     # Steps grow with the distance from the camera, 1.5, and so does what two of them are; a tolerance that is given
     # stays.
-    for fuzz in (0.0, 0.05):
+    for penetration in (0.0, 0.05):
         sight = look(
             rgb,
             slab(rgb, 0),
             "transmittance",
             (0.5, 0.5, 0.5),
             (0.5, 0.5, -3),
-            fuzz=fuzz,
+            penetration=penetration,
             dt_gamma=dt_gamma,
             tolerance=tolerance,
         )
-        assert sight.depth[0] == pytest.approx(3.5 - want - fuzz, rel=1e-5)
+        assert sight.depth[0] == pytest.approx(3.5 - want - penetration, rel=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["depth", "map", "transmittance"])
@@ -88,3 +94,18 @@ def test_evaluations_are_counted_where_that_is_asked_for(rgb, kind, evals):
     given = {"p_d": (0.5, 0.5, 2.0), "p_o": (0.5, 0.5, -2), "camera": (0.5, 0.5, 5)}
     counted = look(rgb, slab(rgb, 0.0), kind, count=True, **given)
     assert abs(counted.density_evals[0] - evals) <= 2 and look(rgb, slab(rgb, 0.0), kind, **given).density_evals is None
+
+
+def test_a_map_is_kept_for_as_long_as_it_holds(rgb):
+    place, cache = slab(rgb, 50), ObserverCache()
+    see = lambda p_o=(0.5, 0.5, -2), place=place: look(rgb, place, "map", (0.5, 0.5, 0.01), p_o, cache=cache)
+    kept = lambda: cache.peek("map")[0].value
+    see()
+    first = kept()
+    see()
+    assert kept() is first
+    see((0.5, 0.5, -1.9))
+    other = kept()
+    assert other is not first
+    see((0.5, 0.5, -1.9), slab(rgb, 50))
+    assert kept() is not other

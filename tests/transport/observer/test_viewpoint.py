@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.transport.observer import viewpoint
+from nerg_mi.transport.observer.cache import Known
 
 
 def camera(mi, origin, target=(0, 0, 0), kind="perspective", **kwargs):
@@ -103,3 +104,13 @@ def test_cameras_on_one_line_are_told_apart_by_where_their_rays_start(rgb, near)
     for z in (3, 1):
         ray = rgb.Ray3f(rgb.Point3f(0, 0, z - near), rgb.Vector3f(0, 0, -1))
         assert np.allclose(np.array(viewpoint.center_of_ray([sensor], ray)).ravel(), [0, 0, z], atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_each_lane_has_what_belongs_to_the_nearest(rgb, count):
+    rng = np.random.default_rng(count)
+    centers, p = rng.normal(size=(count, 3)), rng.normal(size=(60, 3))
+    known = [Known(rgb.Point3f(*map(float, c)), rgb.Float(k)) for k, c in enumerate(centers)]
+    lanes = rgb.Point3f(np.ascontiguousarray(p.T, np.float32))
+    found = viewpoint.select_nearest(known, lanes, lambda value: value).numpy()
+    assert np.array_equal(np.broadcast_to(found, 60), np.linalg.norm(p[:, None] - centers, axis=2).argmin(axis=1))

@@ -1,0 +1,183 @@
+"""A placed gaze field, which only what it says of observers can be evaluated of; its integral over an observer's
+sphere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.log_density import LogGazeField
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.formats.volumes import write_volume
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.training.geometry.places import place_of_volume
+from nerg_mi.transport.march.settings import MarchSettings
+from nerg_mi.transport.observer.cache import ObserverCache
+from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.place import Place
+from nerg_mi.transport.trace import default_settings
+from tests.field.gaze.test_log_density import BOX, SMALL
+
+SETTINGS = ObserverSettings(march=MarchSettings(0.1))
+
+
+def integral_at(mi, gaze, place, p, settings=SETTINGS, count=1 << 12, **more):
+    p_o = mi.Point3f(*map(float, p))
+    return float(gaze.at([p_o], place, settings, count=count, **more).integrals(p_o)[0][0])
+
+
+@pytest.fixture(scope="module")
+def speckled(tmp_path_factory):
+    """A room whose walls are known in places only, as hit points know them."""
+    mi.set_variant("llvm_ad_rgb")
+    rng = np.random.default_rng(3)
+    density = 1e4 * (rng.random((24, 32, 32)) < 0.003)
+    density[8:16, 12:20, 12:20] = 0
+    path = tmp_path_factory.mktemp("place") / "hits.vol"
+    write_volume(path, density, BOX.lower, BOX.upper)
+    return place_of_volume(path).medium
+
+
+@pytest.mark.parametrize("escaped", ["constant", "nearest"])
+def test_does_not_depend_on_the_number_of_directions(speckled, escaped):
+    config, ns = replace(SMALL, escaped=escaped), namespace("llvm_ad_rgb")
+    field = LogGazeField.random(config, BOX, ns, 1)
+    rng = np.random.default_rng(1)
+    # Steep, so that it matters where what escapes is taken to end.
+    field.set_parameters({"grid.table": ns.Float(10 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    place, settings = Place(speckled), ObserverSettings(march=default_settings(speckled))
+    integral = lambda count, p: integral_at(mi, PlacedGaze(field), place, p, settings, count)
+    for p in ((0, 0, 1.5), (0.3, -0.2, 1.6)):
+        assert integral(1 << 17, p) == pytest.approx(integral(1 << 19, p), rel=3e-4), p
+
+
+@pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
+def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
+    """In a room of shapes, whose walls are where a formula says."""
+    ns, rng = namespace("llvm_ad_rgb"), np.random.default_rng(1)
+    field = LogGazeField.random(
+        replace(SMALL, variant=variant, mix=0.0), BOX, ns, 1, rng.normal(size=(SMALL.prior, 2 * SMALL.prior))
+    )
+    field.set_parameters({"grid.table": ns.Float(3 * rng.normal(size=len(field.grid.table)).astype(np.float32))})
+    room = rgb.load_dict(
+        {
+            "type": "scene",
+            "walls": {
+                "type": "cube",
+                "to_world": rgb.ScalarTransform4f().translate([0, 0, 1.5]).scale([1.9, 1.9, 1.4]),
+            },
+        }
+    )
+    o = np.array([0.4, -0.7, 1.7])
+    found = integral_at(rgb, PlacedGaze(field), Place(None, room), o, SETTINGS, 1 << 16)
+    d = fibonacci_directions(20_000)
+    walls = np.where(d > 0, [1.9, 1.9, 2.9], [-1.9, -1.9, 0.1])
+    distance = ((walls - o) / d).min(axis=1)
+    array = lambda v: ns.Array3f(np.ascontiguousarray(v.T, np.float32))
+    emit, capture = field.unnormalized(array(o + d * distance[:, None]), array(np.broadcast_to(o, d.shape)), array(d))
+    assert found == pytest.approx(4 * np.pi * np.mean(np.array(emit * capture, np.float64)), rel=3e-3)
+
+
+def room(mi):
+    return Place(None, mi.load_dict({"type": "scene", "walls": {"type": "cube"}}))
+
+
+def normalized():
+    field = LogGazeField.random(SMALL, BOX, namespace("llvm_ad_rgb"), 1)
+    rng = np.random.default_rng(1)
+    table = namespace("llvm_ad_rgb").Float(3 * rng.normal(size=len(field.grid.table)).astype(np.float32))
+    field.set_parameters({"grid.table": table})
+    return field
+
+
+def test_a_placed_field_has_no_densities(rgb):
+    """Neither the field's own are offered, nor those of observers whom nobody named."""
+    gaze = PlacedGaze(normalized())
+    assert not any(hasattr(gaze, name) for name in ("evaluate", "spread", "along"))
+    with pytest.raises(ValueError, match="needs to know the observers"):
+        gaze.at([], room(rgb), SETTINGS)
+
+
+def test_what_is_observed_stays_as_it_was(rgb):
+    """Other observers, who are asked for with the same cache, change nothing of it."""
+    gaze, place, cache = PlacedGaze(normalized()), room(rgb), ObserverCache()
+    eyes = [rgb.Point3f(0.1, 0.2, 0.3), rgb.Point3f(-0.4, 0.1, 0)]
+    point, d = rgb.Point3f(0.2, 0.9, 0.4), rgb.Vector3f(0, 1, 0)
+    first = gaze.at(eyes[:1], place, SETTINGS, cache, count=1 << 10)
+    before = first.evaluate(point, eyes[0], d, True)[0].numpy()
+    second = gaze.at(eyes[1:], place, SETTINGS, cache, count=1 << 10)
+    assert first.evaluate(point, eyes[0], d, True)[0].numpy() == before
+    assert first.integrals(eyes[0])[0].numpy() != second.integrals(eyes[1])[0].numpy()
+    # Of both together each lane has that of its own observer.
+    both = gaze.at(eyes, place, SETTINGS, cache, count=1 << 10)
+    lanes = rgb.Point3f([0.1, -0.4], [0.2, 0.1], [0.3, 0.0])
+    each = np.concatenate([o.integrals(eye)[0].numpy() for o, eye in zip((first, second), eyes)])
+    assert np.array_equal(both.integrals(lanes)[0].numpy(), each)
+
+
+def test_surroundings_are_traced_once_an_observer(rgb, monkeypatch):
+    """Whatever becomes of the weights; anew for another observer, another place or other settings."""
+    traced, trace = [], Place.trace
+    monkeypatch.setattr(Place, "trace", lambda *a, **k: (traced.append(a), trace(*a, **k))[1])
+    field = normalized()
+    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    counts = []
+
+    def ask(p=(0.1, 0.2, 0.3), place=place, **more):
+        value = integral_at(rgb, gaze, place, p, replace(SETTINGS, **more), cache=cache)
+        counts.append(len(traced))
+        return value
+
+    first = ask()
+    assert ask() == first and counts == [1, 1]
+    field.set_parameters({"prior": field.prior + 1})
+    assert ask() == pytest.approx(np.e * first, rel=1e-4) and counts[-1] == 1
+    # What decides of a surface counts, what decides of a point's visibility does not.
+    ask(visibility="map", tolerance=0.1, map_height=8)
+    assert counts[-1] == 1
+    ask(surface_opacity=0.7)
+    ask()
+    ask((0.1, 0.2, 0.2))
+    ask((0.1, 0.2, 0.2), room(rgb))
+    assert counts[-4:] == [2, 3, 4, 5]
+
+
+def test_derivatives_pass_the_integral_and_are_not_kept(rgb):
+    field, eye = normalized(), rgb.Point3f(0.1, 0.2, 0.3)
+    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    prior = field.prior
+    for _ in range(2):
+        shift = rgb.Float(0)
+        dr.enable_grad(shift)
+        field.set_parameters({"prior": prior + shift})
+        value = gaze.at([eye], place, SETTINGS, cache, count=1 << 10).integrals(eye)[0]
+        dr.forward_from(shift)
+        assert dr.grad(value)[0] == pytest.approx(float(value[0]), rel=1e-4)
+    assert cache.peek((gaze, "integral", field)) == []
+
+
+def test_gaze_turns_and_does_not_scale(rgb):
+    ns, grid = namespace("llvm_ad_rgb"), HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
+    g = GazeField.random(GazeConfig(grid, width=16), Box((0, 0, 0), (1, 1, 2)), ns)
+    table = np.random.default_rng(0).normal(size=len(g.grid.table)).astype(np.float32)
+    g.set_parameters({"grid.table": ns.Float(table)})
+    p_o, p_od = np.array([0.2, 0.3, 0.1]), np.array([0.7, 0.6, 1.5])
+    r = (p_od - p_o) / np.linalg.norm(p_od - p_o)
+
+    def evaluate(gaze, p_od, p_o, r):
+        p_od, p_o, r = (kind(v.tolist()) for kind, v in zip((rgb.Point3f, rgb.Point3f, rgb.Vector3f), (p_od, p_o, r)))
+        return [v.numpy()[0] for v in gaze.at([p_o], Place(None), SETTINGS).evaluate(p_od, p_o, r, True)]
+
+    plain = evaluate(PlacedGaze(g), p_od, p_o, r)
+    m = np.array([[0, -50.0, 0, 3], [50, 0, 0, -7], [0, 0, 50, 11], [0, 0, 0, 1]])
+    moved = evaluate(PlacedGaze(g, Similarity(m)), (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r / 50)
+    assert np.allclose(plain, moved, rtol=1e-4)
