@@ -67,8 +67,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.properties import text
 from nerg_mi.registration import register
-from nerg_mi.transport.observer.ensemble import EnsembleMedium
-from nerg_mi.transport.observer.gaze_medium import GazeMedium
+from nerg_mi.transport.observer.gaze import PlacedGaze
 
 
 class GazeFieldVolume(mi.Volume):
@@ -81,10 +80,9 @@ class GazeFieldVolume(mi.Volume):
         self.field, self.metadata = load_gaze(self.filename, namespace(mi.variant()))
         self._similarity = Similarity(to_world.matrix)
 
-    def gaze_medium(self) -> GazeMedium | EnsembleMedium:
+    def placed_gaze(self) -> PlacedGaze:
         """The gaze field as the integrator sees it."""
-        kind = EnsembleMedium if hasattr(self.field, "members") else GazeMedium
-        return kind(self.field, self._similarity)
+        return PlacedGaze(self.field, self._similarity)
 
     def bbox(self):
         lower, upper = self._similarity.bounds(self.field.box.lower, self.field.box.upper)
@@ -102,10 +100,10 @@ class GazeFieldVolume(mi.Volume):
 
     def to_string(self):
         c = self.field.config
+        about = "".join(f"  {k} = {v},\n" for k, v in c.to_dict().items() if k not in ("variant", "normalized"))
         return (
-            f"GazeFieldVolume[\n  filename = {self.filename},\n  members = {len(getattr(self.field, 'members', [0]))},\n  variant = {c.variant},\n"
-            f"  activation = {c.activation},\n  normalized = {c.normalized},\n"
-            f"  grid = {c.grid.describe()}\n]"
+            f"GazeFieldVolume[\n  filename = {self.filename},\n  members = {len(self.field.members)},\n"
+            f"  variant = {c.variant},\n  normalized = {c.normalized},\n{about}]"
         )
 
 

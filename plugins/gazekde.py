@@ -87,7 +87,10 @@ class GazeKdeVolume(mi.Volume):
 
     def to_string(self):
         v = self._view
-        return f"GazeKdeVolume[\n  filename = {self.filename},\n  rays = {self.rays},\n  count = {v.count},\n  kappa = {v.kappa}\n]"
+        return (
+            f"GazeKdeVolume[\n  filename = {self.filename},\n  rays = {self.rays},\n"
+            f"  count = {v.count},\n  kappa = {v.kappa}\n]"
+        )
 
 
 register("volume", "gazekde", GazeKdeVolume)

@@ -2,6 +2,10 @@
 
 import numpy as np
 
+from nerg_mi.transport.march.settings import MarchSettings
+from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.place import Place
+
 SIZE = 12
 
 
@@ -107,3 +111,10 @@ def hidden_scene(mi, **kwargs):
 
 
 GAZE = "depth,opacity,position,gaze,emit,capture,visibility,observer_depth"
+
+
+def observed(mi, gaze, p_o, place=None):
+    """The gaze field that the dict ``gaze`` describes, for the observer at ``p_o``."""
+    return (
+        mi.load_dict(gaze).placed_gaze().at([p_o], place or Place(None), ObserverSettings(march=MarchSettings(step=1)))
+    )

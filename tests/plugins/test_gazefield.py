@@ -4,17 +4,20 @@ import numpy as np
 import pytest
 
 from . import fields
+from .scenes import observed
 
 
-def load(mi, path, **kwargs):
-    return mi.load_dict({"type": "gazefield", "filename": str(path), **kwargs})
+def volume(path, **kwargs):
+    return {"type": "gazefield", "filename": str(path), **kwargs}
 
 
-def ask(mi, medium, p_od, p_o, r_o):
-    return [
-        v.numpy()[0]
-        for v in medium.evaluate(*(mi.Vector3f(np.asarray(x, float).tolist()) for x in (p_od, p_o, r_o)), True)
-    ]
+def load(mi, path):
+    return mi.load_dict(volume(path))
+
+
+def ask(mi, gaze, p_od, p_o, r_o):
+    points = (mi.Vector3f(np.asarray(x, float).tolist()) for x in (p_od, p_o, r_o))
+    return [v.numpy()[0] for v in observed(mi, gaze, mi.Point3f(*map(float, p_o))).evaluate(*points, True)]
 
 
 @pytest.mark.parametrize("variant", ["emit", "capture", "emit_capture"])
@@ -22,10 +25,10 @@ def test01_placed_in_the_scene(rgb, tmp_path, variant):
     fields.gaze(tmp_path / "g.safetensors", variant)
     p_o, p_od = np.array([-0.5, 0.1, -0.7]), np.array([0.4, 0.3, 0.6])
     r_o = (p_od - p_o) / np.linalg.norm(p_od - p_o)
-    plain = ask(rgb, load(rgb, tmp_path / "g.safetensors").gaze_medium(), p_od, p_o, r_o)
+    plain = ask(rgb, volume(tmp_path / "g.safetensors"), p_od, p_o, r_o)
     to_world = rgb.ScalarTransform4f().translate([1, 2, 3]).rotate([0, 1, 0], 30).scale(4)
     m = np.array(to_world.matrix)
-    moved = load(rgb, tmp_path / "g.safetensors", to_world=to_world).gaze_medium()
+    moved = volume(tmp_path / "g.safetensors", to_world=to_world)
     assert np.allclose(
         ask(rgb, moved, (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r_o / 4), plain, rtol=1e-4
     )

@@ -89,16 +89,17 @@ def test03_rays_are_gathered_once_an_observer(rgb, rays):
             **room(rgb),
         }
     )
-    view = scene.integrator()._views["kde"]
+    view = scene.integrator().views["kde"]
+    kept = lambda: scene.integrator().cache.peek(view)[0].value
     first = np.array(rgb.render(scene, spp=1))
-    made, table = view._known[0], view._known[0]._table
+    made, table = kept(), kept().table
     np.testing.assert_array_equal(np.array(rgb.render(scene, spp=1)), first)
-    assert view._known[0] is made and made._table is table is not None
+    assert kept() is made and made.table is table is not None
     params = rgb.traverse(scene)
     params["integrator.observer.to_world"] = rgb.Transform4f().translate([-0.3, 0.1, 0.1])
     params.update()
     moved = named(rgb, np.array(rgb.render(scene, spp=1)), integrator)
-    assert view._known[0] is not made
+    assert kept() is not made
     seen = moved["kde.Y"] > 0
     assert np.abs(moved["kde.Y"] - expected((-0.3, 0.1, 0.1), moved))[seen].max() < TABLE + 1e-5
 
@@ -138,7 +139,7 @@ def test06_what_is_not_asked_for_is_not_traced(rgb, rays):
     assert operations(rgb, {**without, "density": {"type": "constvolume"}}, sensor) == operations(
         rgb, shown(rays, "depth", density={"type": "constvolume"}), sensor
     )
-    assert rgb.load_dict(shown(rays, "depth"))._views == {}
+    assert rgb.load_dict(shown(rays, "depth")).views == {}
 
 
 def test07_what_is_needed_is_said(rgb, rays, tmp_path):

@@ -22,7 +22,7 @@ def test01_seen_behind_the_field(rgb, tmp_path, scale, density):
     behind = Background.random(BackgroundConfig(3.0, grid, 16, sh_degree=2), ns)
     table = np.random.default_rng(0).normal(size=len(behind.grid.table)).astype(np.float32)
     behind.grid.table = ns.Float(table)
-    plain = fields.radiance(tmp_path / "field.safetensors", density_scale=density)
+    fields.radiance(tmp_path / "field.safetensors", density_scale=density)
     field = fields.radiance(tmp_path / "behind.safetensors", density_scale=density, background=behind)
     again, meta = load_radiance(tmp_path / "behind.safetensors", ns)
     assert again.background.config == behind.config and np.array_equal(again.background.grid.table.numpy(), table)

@@ -1,202 +1,11 @@
-"""The integrator through Mitsuba: its parameters, its channels, and what Python sees of it."""
+"""The integrator through Mitsuba: its channels, and what Python sees of it."""
 
 import math
 
 import numpy as np
 import pytest
 
-from .scenes import (
-    GAZE,
-    SIZE,
-    camera,
-    channels,
-    constant,
-    look_at,
-    named,
-    observer_at,
-    render,
-    straight,
-    with_field,
-    with_gaze,
-)
-
-XML = """<scene version="3.0.0">
-  <integrator type="nerg" id="integrator">
-    <volume name="field" type="nerf"><string name="filename" value="field.safetensors"/></volume>
-    <volume name="gaze" type="gazefield"><string name="filename" value="gaze.safetensors"/></volume>
-    <sensor name="observer" type="perspective">
-      <transform name="to_world"><lookat origin="-2, 0.3, -2" target="0, 0, 0" up="0, 1, 0"/></transform>
-    </sensor>
-    <float name="falloff" value="0.3"/>
-    <boolean name="occlusion" value="true"/>
-    <boolean name="radiance" value="true"/>
-    <string name="depth" value="median"/>
-    <rgb name="background" value="0.1, 0.2, 0.3"/>
-    <integer name="step" value="0"/>
-    <string name="aovs" value="depth, opacity,gaze,visibility,position"/>
-  </integrator>
-  <sensor type="perspective">
-    <float name="fov" value="35"/>
-    <transform name="to_world"><lookat origin="0.5, 0.4, -3" target="0, 0, 0" up="0, 1, 0"/></transform>
-    <sampler type="independent"/>
-    <film type="hdrfilm">
-      <integer name="width" value="12"/><integer name="height" value="12"/>
-      <string name="component_format" value="float32"/><string name="pixel_format" value="rgb"/>
-      <rfilter type="box"/>
-    </film>
-  </sensor>
-</scene>"""
-
-
-def test01_xml_equals_dict_and_files_lie_beside_the_scene(rgb, files):
-    path = files / "scene.xml"
-    path.write_text(XML)
-    scene = rgb.load_file(str(path))
-    observer = {"type": "perspective", "to_world": look_at(rgb, (-2, 0.3, -2))}
-    integrator = with_gaze(
-        files,
-        "depth,opacity,gaze,visibility,position",
-        observer=observer,
-        falloff=0.3,
-        depth="median",
-        background={"type": "rgb", "value": [0.1, 0.2, 0.3]},
-    )
-    a, b = np.array(rgb.render(scene, spp=2, seed=3)), render(rgb, integrator, spp=2, seed=3)
-    # The XML parser rounds placements in another way.
-    assert a.shape == (SIZE, SIZE, 3 + 7) and np.allclose(a, b, atol=3e-6)
-    assert a[..., 3].max() > 0 and a[..., 5].max() > 0
-    plain = render(rgb, {**integrator, "background": [0.1, 0.2, 0.3]}, spp=2, seed=3)
-    assert np.allclose(plain, b, atol=1e-6)
-
-
-def test02_unknown_parameters_are_errors(rgb):
-    with pytest.raises(RuntimeError, match="fallof"):
-        rgb.load_dict(constant(fallof=0.3))
-    xml = '<scene version="3.0.0"><integrator type="nerg"><volume name="density" type="constvolume"/>{}</integrator></scene>'
-    rgb.load_string(xml.format(""))
-    with pytest.raises(RuntimeError, match="fallof"):
-        rgb.load_string(xml.format('<float name="fallof" value="1"/>'))
-
-
-ALL = dict(
-    occlusion=False,
-    falloff=0.5,
-    tolerance=0.1,
-    depth="median",
-    surface_opacity=0.4,
-    radiance=False,
-    background=0.5,
-    aovs="depth",
-    step=0.1,
-    dt_gamma=0.01,
-    stop=1e-3,
-    color_cutoff=0.01,
-    jitter=True,
-)
-
-
-@pytest.mark.parametrize("name", list(ALL))
-def test03_every_documented_parameter_is_read_and_documented(rgb, name):
-    integrator = rgb.load_dict(constant(**{name: ALL[name]}))
-    assert f"* - {name}" in type(integrator).__doc__ or name in ("density",)
-    if name != "background":
-        assert f"{name} = " in str(integrator)
-
-
-@pytest.mark.parametrize(
-    "name, value",
-    [
-        ("falloff", -0.1),
-        ("falloff", "far"),
-        ("falloff", float("nan")),
-        ("falloff", float("inf")),
-        ("falloff", True),
-        ("tolerance", -1.0),
-        ("depth", "mean"),
-        ("depth", 3),
-        ("surface_opacity", 1.5),
-        ("surface_opacity", -0.1),
-        ("radiance", "no"),
-        ("radiance", 2.0),
-        ("occlusion", "false"),
-        ("jitter", "yes"),
-        ("background", -1.0),
-        ("background", "red"),
-        ("aovs", "depth,colour"),
-        ("aovs", "depth,depth"),
-        ("aovs", 3),
-        ("aovs", "gaze"),
-        ("step", -1.0),
-        ("step", float("inf")),
-        ("dt_gamma", -1.0),
-        ("stop", 2.0),
-        ("stop", -1.0),
-        ("color_cutoff", -1.0),
-    ],
-)
-def test04_wrong_values_are_named(rgb, name, value):
-    with pytest.raises((RuntimeError, ValueError), match=f'"{name}"'):
-        rgb.load_dict(constant(**{name: value}))
-
-
-def test05_wrong_children_are_named(rgb, files):
-    with pytest.raises(RuntimeError, match='either "field".*or "density".*not both'):
-        rgb.load_dict(with_field(files, density={"type": "constvolume", "value": 1.0}))
-    with pytest.raises(RuntimeError, match='"color" goes with "density"'):
-        rgb.load_dict(with_field(files, color={"type": "constvolume", "value": 1.0}))
-    with pytest.raises(RuntimeError, match='"field" must be a volume of type "nerf"'):
-        rgb.load_dict({"type": "nerg", "field": {"type": "constvolume", "value": 1.0}})
-    with pytest.raises(RuntimeError, match='"gaze" must be a volume of type "gazefield"'):
-        rgb.load_dict(constant(gaze={"type": "constvolume", "value": 1.0}))
-    with pytest.raises(RuntimeError, match='"density" must be a volume'):
-        rgb.load_dict({"type": "nerg", "density": 3.0})
-    with pytest.raises(RuntimeError, match='"observer" must be a sensor'):
-        rgb.load_dict(constant(observer={"type": "constvolume", "value": 1.0}))
-    with pytest.raises(RuntimeError, match='"observer" is a .*no centre'):
-        rgb.load_dict(constant(observer={"type": "orthographic"}))
-
-
-def test05b_an_empty_place_is_refused(rgb):
-    scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}, "sensor": camera(rgb)})
-    with pytest.raises(ValueError, match="nothing to render.*or the scene shapes"):
-        scene.integrator().render(scene, scene.sensors()[0])
-    with pytest.raises(RuntimeError, match='"color" goes with "density", which is missing'):
-        rgb.load_dict({"type": "nerg", "color": {"type": "constvolume", "value": 1.0}})
-    with pytest.raises(RuntimeError, match="PRBIntegrator.*one ray"):
-        rgb.load_dict({"type": "nerg", "i": {"type": "prb"}})
-
-
-def test06_an_observer_who_is_a_batch_is_refused(rgb):
-    # It would stand at the origin of the scene.
-    batch = {
-        "type": "batch",
-        "film": {"type": "hdrfilm", "width": 4, "height": 2},
-        "a": {
-            "type": "perspective",
-            "to_world": look_at(rgb, (1, 2, 3)),
-            "film": {"type": "hdrfilm", "width": 2, "height": 2},
-        },
-        "b": {
-            "type": "perspective",
-            "to_world": look_at(rgb, (3, 2, 1)),
-            "film": {"type": "hdrfilm", "width": 2, "height": 2},
-        },
-    }
-    with pytest.raises(RuntimeError, match='"observer"'):
-        rgb.load_dict(constant(observer=batch))
-
-
-def test07_missing_files_are_named(rgb, tmp_path):
-    for kind, name in (("nerf", "field"), ("gazefield", "gaze")):
-        with pytest.raises(RuntimeError, match="nowhere.safetensors.*does not exist"):
-            rgb.load_dict(
-                constant(**{name: {"type": kind, "filename": "nowhere.safetensors"}})
-                if name == "gaze"
-                else {"type": "nerg", name: {"type": kind, "filename": "nowhere.safetensors"}}
-            )
-        with pytest.raises(RuntimeError, match='"filename"'):
-            rgb.load_dict({"type": kind})
-
+from .scenes import GAZE, SIZE, camera, channels, constant, look_at, named, observer_at, render, straight, with_gaze
 
 CHANNELS = {
     "depth": ["depth.T"],
@@ -213,7 +22,7 @@ CHANNELS = {
 }
 
 
-def test08_names_and_order(rgb, files):
+def test01_names_and_order(rgb, files):
     assert rgb.load_dict(constant()).aov_names() == ["depth.T", "opacity.Y"]
     assert rgb.load_dict(constant(aovs="")).aov_names() == []
     order = list(CHANNELS)[::-1]
@@ -223,7 +32,7 @@ def test08_names_and_order(rgb, files):
     assert render(rgb, constant(aovs="")).shape == (SIZE, SIZE, 3)
 
 
-def test09_each_channel_alone_equals_all_together(rgb, files):
+def test02_each_channel_alone_equals_all_together(rgb, files):
     observer = {"type": "perspective", "to_world": look_at(rgb, (-2, 0.3, -2))}
     everything = channels(rgb, with_gaze(files, ",".join(CHANNELS), observer=observer))
     for name, parts in CHANNELS.items():
@@ -239,7 +48,7 @@ def test09_each_channel_alone_equals_all_together(rgb, files):
     )
 
 
-def test10_without_radiance(rgb, files):
+def test03_without_radiance(rgb, files):
     names = ",".join(n for n in CHANNELS if n != "color_evals")
     a, b = (render(rgb, with_gaze(files, names, radiance=r)) for r in (True, False))
     assert a[..., :3].max() > 0.05 and not b[..., :3].any() and np.array_equal(a[..., 3:], b[..., 3:])
@@ -249,7 +58,7 @@ def test10_without_radiance(rgb, files):
     assert not black[..., :3].any()
 
 
-def test11_below_the_surface_opacity(rgb, files):
+def test04_below_the_surface_opacity(rgb, files):
     low, high = (
         channels(rgb, with_gaze(files, "opacity,depth,position,gaze,visibility", surface_opacity=s))
         for s in (0.05, 0.97)
@@ -262,7 +71,7 @@ def test11_below_the_surface_opacity(rgb, files):
     assert (low["depth.T"][low["opacity.Y"] > 0] > 0).all() and not low["depth.T"][low["opacity.Y"] == 0].any()
 
 
-def test12_to_string(rgb, files):
+def test05_to_string(rgb, files):
     text = str(rgb.load_dict(with_gaze(files, GAZE, observer=observer_at(rgb, 1, 2, 3), falloff=0.25)))
     for part in (
         "NergIntegrator[",
@@ -276,7 +85,7 @@ def test12_to_string(rgb, files):
         assert part in text, part
 
 
-def test13_traverse_and_update(rgb, files):
+def test06_traverse_and_update(rgb, files):
     scene = rgb.load_dict(
         {
             "type": "scene",
@@ -325,7 +134,7 @@ def test13_traverse_and_update(rgb, files):
     assert not np.allclose(picture()[0]["observer_depth.T"], before["observer_depth.T"], rtol=1e-3)
 
 
-def test14_a_negative_falloff_is_refused_later_too(rgb):
+def test07_a_negative_falloff_is_refused_later_too(rgb):
     integrator = rgb.load_dict(constant())
     params = rgb.traverse(integrator)
     params["falloff"] = rgb.Float(-1)
@@ -333,7 +142,7 @@ def test14_a_negative_falloff_is_refused_later_too(rgb):
         params.update()
 
 
-def test15_a_voxel_grid_that_changes_is_seen(rgb):
+def test08_a_voxel_grid_that_changes_is_seen(rgb):
     # Empty voxels that are filled later must not be skipped.
     data = np.zeros((8, 8, 8), np.float32)
     data[0] = 2
@@ -348,7 +157,7 @@ def test15_a_voxel_grid_that_changes_is_seen(rgb):
     assert before < 0.5 and np.isclose(after, 1 - math.exp(-2), rtol=1e-4)
 
 
-def test16_another_integrator_may_ask_for_some_rays_only(rgb):
+def test09_another_integrator_may_ask_for_some_rays_only(rgb):
     """All of them, unless it says which; the others are black, not valid, and have no depth."""
     scene = rgb.load_dict(
         {"type": "scene", "integrator": constant(aovs="depth,opacity", background=0.5), "sensor": camera(rgb)}

@@ -46,11 +46,9 @@ def told(integrator):
     s = integrator.settings
     return {
         **vars(s),
-        "map_height": integrator.observer_pass.map_height,
-        "kind": integrator.observer_pass.kind,
+        **vars(integrator.observer_settings),
         "text": str(integrator),
         "background": np.array(integrator.background).tolist(),
-        "tolerance": integrator.observer_pass.tolerance,
     }
 
 

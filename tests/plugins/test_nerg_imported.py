@@ -33,7 +33,7 @@ def expected(state, nerf, bound, origins, directions, eye):
         sigma[seen], color[seen], _ = reference.nerf(
             nerf, bound, middles[seen], np.tile(d.astype(np.float32), (seen.sum(), 1))
         )
-        tau, depth, _, total, _ = march_numpy.march(lambda p: sigma, o, d, borders, lambda p: color)
+        tau, depth, _, total, _ = march_numpy.march(lambda p, s=sigma: s, o, d, borders, lambda p, c=color: c)
         alpha = -np.expm1(-tau)
         p_d = o + d * depth
         r_o = (p_d - eye) / np.linalg.norm(p_d - eye)

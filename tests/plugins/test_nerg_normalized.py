@@ -8,9 +8,10 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.box import Box
+from nerg_mi.transport.place import Place
 
 from . import fields
-from .scenes import camera, channels, observer_at
+from .scenes import camera, channels, observed, observer_at
 
 GRID = HashGridConfig(levels=2, log2_rows=10, base=2, finest=4)
 
@@ -93,13 +94,9 @@ def test02_what_escapes_counts(rgb, tmp_path):
     seen = density > 0
     share = (angle * ~seen).sum() / (4 * np.pi)
     assert share == pytest.approx(1 / 6, abs=0.02)
-    medium = rgb.load_dict(gaze).gaze_medium()
-    from nerg_mi.transport.march.settings import MarchSettings
-    from nerg_mi.transport.place import Place
-
     scene = rgb.load_dict({"type": "scene", **room(rgb, True)})
-    medium.face([rgb.Point3f(0)], Place(None, scene), MarchSettings(step=1), "median", 0.5)
-    lost = np.exp(0.4) / 6 / float(medium._integral(rgb.Point3f(0))[0])
+    eye = rgb.Point3f(0)
+    lost = np.exp(0.4) / 6 / float(observed(rgb, gaze, eye, Place(None, scene)).integrals(eye)[0][0])
     assert (density * angle).sum() == pytest.approx(1 - lost, abs=0.01)
 
 
@@ -116,22 +113,28 @@ def test03_one_integral_an_observer(rgb, tmp_path):
     scene = rgb.load_dict(
         {"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.1, -0.2, 0.3), (0.5, 0, 0)), **room(rgb)}
     )
-    medium = scene.integrator().gaze
+    placed = scene.integrator().gaze
+
+    def kept():
+        """What is kept of the observer's surroundings, and of the integral."""
+        things = ((placed, "surroundings"), (placed, "integral", placed.field))
+        return [scene.integrator().cache.peek(thing)[0].value for thing in things]
+
     first = np.array(rgb.render(scene, spp=1))
-    traced, value = medium._integrals[0], medium._integrals[0].value()
+    traced, value = kept()
     np.testing.assert_array_equal(np.array(rgb.render(scene, spp=1)), first)
-    assert medium._integrals[0] is traced and traced.value() is value
+    assert kept()[0] is traced and kept()[1] is value
     params = rgb.traverse(scene)
     params["integrator.gaze.prior"] = params["integrator.gaze.prior"] + 1
     params.update()
     # Weights that scale everything change nothing but the integral (and the blind part, which is not divided).
     rgb.render(scene, spp=1)
-    assert medium._integrals[0] is traced
-    assert float(traced.value()[0]) == pytest.approx(np.e * float(value[0]), rel=1e-5)
+    assert kept()[0] is traced
+    assert float(kept()[1][0]) == pytest.approx(np.e * float(value[0]), rel=1e-5)
     params["integrator.observer.to_world"] = rgb.Transform4f().translate([0.1, 0.1, 0.1])
     params.update()
     rgb.render(scene, spp=1)
-    assert medium._integrals[0] is not traced
+    assert kept()[0] is not traced
 
 
 def test04_a_batch_has_an_integral_a_camera(rgb, tmp_path):

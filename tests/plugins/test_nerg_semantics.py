@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from . import fields
-from .scenes import camera, channels, observer_at, with_field, with_gaze
+from .scenes import camera, channels, observed, observer_at, with_field, with_gaze
 
 
 def points(mi, out, name, mask):
@@ -41,9 +41,8 @@ def test01_emit_takes_the_fields_features(rgb, files, tmp_path, semantic, own, a
     name = "features" if semantic == "accumulated" else "features_at"
     blocks = channels(rgb, with_field(files, aovs=f"{name},opacity", depth="median", color_cutoff=0.0), sensor)
     features = [rgb.Float(np.ascontiguousarray(blocks[f"{name}.{k}"][seen])) for k in range(7)]
-    gaze = rgb.load_dict(integrator["gaze"]).gaze_medium()
-    p = points(rgb, out, "position", seen)
-    p_o = rgb.Point3f(*eye)
+    p, p_o = points(rgb, out, "position", seen), rgb.Point3f(*eye)
+    gaze = observed(rgb, integrator["gaze"], p_o)
     expected = gaze.evaluate(p, p_o, dr.normalize(p - p_o), True, features)
     assert seen.sum() > 10
     for channel, value in zip(("gaze.Y", "emit.Y", "capture.Y"), expected):
@@ -64,8 +63,8 @@ def test02_a_field_with_other_features_is_refused(rgb, files, tmp_path):
 
 
 def test03_features_where_none_are_wanted_are_refused(rgb, files):
-    gaze = rgb.load_dict(with_gaze(files)["gaze"]).gaze_medium()
     p = rgb.Point3f(0.1, 0.2, 0.3)
+    gaze = observed(rgb, with_gaze(files)["gaze"], p + 1)
     with pytest.raises(ValueError, match="takes no semantic features, got 7"):
         gaze.evaluate(p, p + 1, rgb.Vector3f(0, 0, 1), True, [rgb.Float(0)] * 7)
 

@@ -5,7 +5,7 @@ import pytest
 
 from nerg_mi.evaluation.study.operations import traced_operations
 
-from .scenes import camera, channels, constant, named, observer_at, render, with_gaze
+from .scenes import camera, channels, constant, named, observed, observer_at, render, with_gaze
 
 EVERYTHING = "depth,opacity,position,visibility,observer_depth"
 
@@ -181,11 +181,11 @@ def test08_gaze_on_a_shape_is_equation_1(rgb, files):
     integrator = gaze_only(files, aovs, observer=observer_at(rgb, -2, 0.3, -2), falloff=0.0)
     out = channels(rgb, integrator, sensor, s=sphere(rgb, 0, 0, 0))
     seen = out["visibility.Y"] == 1
-    gaze = rgb.load_dict(integrator["gaze"]).gaze_medium()
     p = rgb.Point3f(*[np.ascontiguousarray(out[f"position.{c}"][seen]) for c in "XYZ"])
     p_o = rgb.Point3f(-2, 0.3, -2)
     import drjit as dr
 
+    gaze = observed(rgb, integrator["gaze"], p_o)
     expected = gaze.evaluate(p, p_o, dr.normalize(p - p_o), True)
     assert seen.sum() > 10
     for name, value in zip(("gaze.Y", "emit.Y", "capture.Y"), expected):
@@ -228,8 +228,8 @@ def test10_a_map_follows_shapes_that_move(rgb):
     )
     look = lambda: np.array(rgb.render(scene, spp=1))[..., -1]
     first, again = look(), traced_operations(lambda: rgb.render(scene, spp=1))
-    kept = scene.integrator().observer_pass._map
-    assert np.array_equal(look(), first) and scene.integrator().observer_pass._map is kept
+    kept = scene.integrator().cache.peek("map")[0]
+    assert np.array_equal(look(), first) and scene.integrator().cache.peek("map")[0] is kept
     params = rgb.traverse(scene)
     key = next(k for k in params.keys() if k.endswith("lid.to_world"))
     params[key] = rgb.Transform4f().translate([100, 0, 0])
@@ -291,7 +291,7 @@ def test12_depth_follows_a_moving_shape(rgb, depth):
         key = "cube.vertex_positions"
         start = rgb.Point3f(dr.unravel(rgb.Point3f, rgb.Float(params[key])))
 
-        def image(z):
+        def image(z, scene=scene, params=params, key=key, start=start):
             params[key] = dr.ravel(start + rgb.Vector3f(0, 0, z))
             params.update()
             return rgb.render(scene, params, spp=1)[..., 3]

@@ -92,7 +92,7 @@ def test02_the_spread_is_hidden_like_the_gaze(rgb, files, ensemble):
 def test03_members_are_normalised_each_by_itself(rgb, tmp_path):
     """The mean of densities that integrate to one, and depths traced once for all of them."""
     singles = [volume(tmp_path / f"{i}.safetensors") for i in range(2)]
-    for i, single in enumerate(singles):
+    for i in range(len(singles)):
         log_gaze(tmp_path / f"{i}.safetensors", mix=0.2)
     members = [load_gaze(s["filename"], ns)[0] for s in singles]
     members[1].set_parameters({k: v * 1.3 for k, v in members[1].parameters().items() if k != "prior"})
@@ -107,9 +107,10 @@ def test03_members_are_normalised_each_by_itself(rgb, tmp_path):
     assert np.abs(a - b).max() > 1e-3
     np.testing.assert_allclose(out["gaze.Y"], (a + b) / 2, rtol=1e-4)
     np.testing.assert_allclose(out["gaze_std.Y"], np.abs(a - b) / np.sqrt(2), rtol=2e-3, atol=1e-6)
-    first, second = scene.integrator().gaze.members
-    assert first._integrals[0].distance is second._integrals[0].distance
-    assert float(first._integrals[0].value()[0]) != float(second._integrals[0].value()[0])
+    placed, cache = scene.integrator().gaze, scene.integrator().cache
+    assert len(cache.peek((placed, "surroundings"))) == 1
+    first, second = (float(cache.peek((placed, "integral", m))[0].value[0]) for m in placed.field.members)
+    assert first != second
 
 
 def test04_support_is_that_of_the_observer(rgb, files, ensemble):

@@ -111,33 +111,33 @@ def test03_a_map_follows_the_field(rgb, files, change):
     after = seen(rgb, scene)
     assert np.abs(after - before).max() > 0.1
     # What a map that was made for it says.
-    scene.integrator().observer_pass.forget()
+    scene.integrator().cache.forget()
     np.testing.assert_array_equal(seen(rgb, scene), after)
 
 
 def test04_a_map_outlasts_what_it_does_not_depend_on(rgb):
     scene = behind_a_wall(rgb, visibility="map", map_height=64)
     seen(rgb, scene)
-    kept = scene.integrator().observer_pass._map
+    kept = scene.integrator().cache.peek("map")[0]
     params = rgb.traverse(scene)
     params["integrator.falloff"] = rgb.Float(0.7)
     params.update()
     softer = seen(rgb, scene)
-    assert scene.integrator().observer_pass._map is kept and ((softer > 0.05) & (softer < 0.95)).any()
+    assert scene.integrator().cache.peek("map")[0] is kept and ((softer > 0.05) & (softer < 0.95)).any()
     params["integrator.observer.to_world"] = rgb.ScalarTransform4f().translate([0.3, 0, -0.9])
     params.update()
     seen(rgb, scene)
-    assert scene.integrator().observer_pass._map is not kept
+    assert scene.integrator().cache.peek("map")[0] is not kept
 
 
 def test05_all_is_looked_at_where_nobody_says_what_changed(rgb):
     scene = behind_a_wall(rgb, visibility="map", map_height=64)
     seen(rgb, scene)
     integrator = scene.integrator()
-    kept = integrator.observer_pass._map
+    kept = integrator.cache.peek("map")[0]
     integrator.parameters_changed()
     seen(rgb, scene)
-    assert integrator.observer_pass._map is not kept
+    assert integrator.cache.peek("map")[0] is not kept
 
 
 def test06_gaze_and_its_spread_fade_with_visibility(rgb, files, tmp_path):

@@ -1,0 +1,161 @@
+"""Reading the parameters of :ref:`nerg <integrator-nerg>`."""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from nerg_mi.errors import NergError
+from nerg_mi.properties import choice, color, integer, number
+from nerg_mi.transport.march.depth import DEPTHS
+from nerg_mi.transport.march.rules import RULES, boundaries
+from nerg_mi.transport.march.settings import MarchSettings, default_step
+from nerg_mi.transport.media.protocol import Medium
+from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.observer import viewpoint
+from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer.settings import VISIBILITIES, ObserverSettings
+from nerg_mi.transport.observer.views import ObserverView, SupportView
+
+
+def complete(manual: str) -> str:
+    """The ``manual`` with the kinds of depth and of quadrature that are registered."""
+    return manual.replace("{quadratures}", RULES.manual()).replace("{depths}", DEPTHS.manual())
+
+
+def read_children(props) -> dict:
+    """The objects that ``props`` names, or None, and the nested ``integrator``. Raises ``NergError`` for one that is
+    not what its name asks for."""
+    found = {name: props.get(name, None) for name in ("field", "density", "color", "gaze", "kde", "observer")}
+    if found["gaze"] is not None and not hasattr(found["gaze"], "placed_gaze"):
+        raise NergError('"gaze" must be a volume of type "gazefield"')
+    if found["kde"] is not None and not hasattr(found["kde"], "kde_view"):
+        raise NergError('"kde" must be a volume of type "gazekde"')
+    if found["observer"] is not None and not isinstance(found["observer"], mi.Sensor):
+        raise NergError('"observer" must be a sensor; its to_world places the observer')
+    return found | {"integrator": _nested(props)}
+
+
+def _nested(props):
+    found = [(name, child) for name, child in props.objects() if isinstance(child, mi.Integrator)]
+    for name, _ in found:
+        props.mark_queried(name)
+    if len(found) > 1:
+        raise NergError(f'"nerg" takes one nested integrator, got {len(found)}')
+    return found[0][1] if found else None
+
+
+def check_observer(observer) -> None:
+    """Raise ``NergError`` for an observer (a sensor, or None) who stands nowhere."""
+    if observer is not None:
+        viewpoint.require_center(observer, '"observer"')
+        if not dr.all(dr.isfinite(dr.detach(viewpoint.center(observer))), axis=None):
+            raise NergError('"observer" stands at a position that is not finite; correct its to_world')
+
+
+def medium_of(children: dict) -> Medium | None:
+    """What is marched: the ``field``, or ``density`` and ``color``, or nothing."""
+    field, density, paint = (children[name] for name in ("field", "density", "color"))
+    if field is not None and density is not None:
+        raise NergError('"nerg" takes either "field" (a volume of type "nerf") or "density" (any volume), and not both')
+    if field is not None:
+        if paint is not None:
+            raise NergError('"color" goes with "density"; a "field" brings its own colour')
+        if not hasattr(field, "medium"):
+            raise NergError('"field" must be a volume of type "nerf"; give other volumes as "density" and "color"')
+        return field.medium()
+    if density is None:
+        if paint is not None:
+            raise NergError('"color" goes with "density", which is missing')
+        return None
+    for name, volume in (("density", density), ("color", paint)):
+        if volume is not None and not isinstance(volume, mi.Volume):
+            raise NergError(f'"{name}" must be a volume')
+    return VolumeMedium(density, paint)
+
+
+def gaze_of(children: dict, medium: Medium | None) -> PlacedGaze | None:
+    """The gaze field, whose features the medium must have."""
+    if children["gaze"] is None:
+        return None
+    gaze = children["gaze"].placed_gaze()
+    wanted, given = gaze.field.config.features, None if children["field"] is None else medium
+    if wanted and (given is None or given.feature_count != wanted):
+        has = "there is none" if given is None else f"that has {given.feature_count}"
+        raise NergError(f'the "gaze" field asks for {wanted} semantic features of a "field", but {has}')
+    return gaze
+
+
+def views_of(aovs: list[str], children: dict, gaze: PlacedGaze | None) -> dict[str, ObserverView]:
+    """The views of the observer that ``aovs`` ask for, by these names."""
+    views: dict[str, ObserverView] = {}
+    if "kde" in aovs:
+        views["kde"] = children["kde"].kde_view()
+    if "support" in aovs and gaze is not None and gaze.field.support is not None:
+        views["support"] = SupportView(gaze.field.support, gaze.to_world)
+    return views
+
+
+def march_settings(props, medium: Medium | None) -> MarchSettings:
+    """Of the camera's and the observer's rays."""
+    step = number(props, "step", 0, low=0)
+    settings = MarchSettings(
+        step=step or default_step(medium),
+        dt_gamma=number(props, "dt_gamma", MarchSettings.dt_gamma, low=0, high=1),
+        stop=number(props, "stop", MarchSettings.stop, low=0, high=1),
+        color_cutoff=number(props, "color_cutoff", MarchSettings.color_cutoff, low=0, high=1),
+        quadrature=choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),
+        coarse=number(props, "coarse", MarchSettings.coarse, low=1),
+        cell_step=step or math.inf,
+    )
+    if medium is not None:
+        boundaries(RULES.find(settings.quadrature), medium)
+    return settings
+
+
+def observer_settings(props, march: MarchSettings) -> ObserverSettings:
+    """Of the surfaces, and of what the observer sees of them."""
+    defaults = ObserverSettings(march=march)
+    return ObserverSettings(
+        march=march,
+        depth=choice(props, "depth", defaults.depth, DEPTHS.names()),
+        surface_opacity=number(props, "surface_opacity", defaults.surface_opacity, low=0, high=1),
+        visibility=choice(props, "visibility", defaults.visibility, VISIBILITIES),
+        tolerance=number(props, "tolerance", defaults.tolerance, low=0),
+        map_height=integer(props, "map_height", defaults.map_height, low=2, high=16384),
+    )
+
+
+def background_of(props):
+    """Radiance (Spectrum) behind everything."""
+    background = mi.Color3f(color(props, "background", 0.0))
+    return mi.Spectrum(mi.luminance(background) if mi.is_monochromatic else background)
+
+
+def describe(nerg) -> str:
+    """The integrator ``nerg`` with all its parameters, for people."""
+    body = {k: str(v).replace("\n", "\n  ") for k, v in nerg.children.items() if k not in ("observer", "integrator")}
+    if nerg.observer is not None:
+        body["observer"] = viewpoint.center(nerg.observer)
+    march, seen = nerg.settings, nerg.observer_settings
+    body |= {
+        "occlusion": nerg.occlusion,
+        "visibility": seen.visibility,
+        "falloff": nerg.falloff,
+        "tolerance": seen.tolerance or "2 steps",
+        "map_height": seen.map_height,
+        "depth": seen.depth,
+        "surface_opacity": seen.surface_opacity,
+        "radiance": nerg.radiance,
+        "aovs": ",".join(nerg.aovs),
+        "quadrature": march.quadrature,
+        "step": march.step,
+        "coarse": march.coarse,
+        "dt_gamma": march.dt_gamma,
+        "stop": march.stop,
+        "color_cutoff": march.color_cutoff,
+        "jitter": nerg.jitter,
+    }
+    return "NergIntegrator[\n" + "".join(f"  {k} = {v},\n" for k, v in body.items()) + "]"

@@ -1,0 +1,79 @@
+"""The table of AOVs: one entry is all that an AOV is."""
+
+import sys
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from .scenes import camera, channels, constant, named, with_field, with_gaze
+from .test_nerg_leaves_out import operations
+
+
+@pytest.fixture
+def table(rgb, monkeypatch):
+    """The table, for a test to add to."""
+    module = sys.modules["nerg_mi.plugins.nerg_aovs"]
+    monkeypatch.setattr(module, "AOVS", dict(module.AOVS))
+    return module
+
+
+def test01_an_entry_is_all_that_an_aov_is(rgb, files, table):
+    entry = table.Aov(
+        name="height",
+        channels="ZT",
+        summary="of the surface above the plane z = -1, and the distance to it",
+        compute=lambda p: [dr.select(p.surface, p.p_d.z + 1, 0), p.depth],
+        needs=(table.FIELD,),
+    )
+    table.AOVS["height"] = entry
+    integrator = with_field(files, aovs="position,height,depth")
+    out = channels(rgb, integrator)
+    assert list(out)[3:5] == ["height.Z", "height.T"]
+    met = out["position.Z"] != 0
+    assert met.sum() > 20
+    np.testing.assert_allclose(out["height.Z"][met], out["position.Z"][met] + 1, rtol=1e-5)
+    assert not out["height.Z"][~met].any() and np.array_equal(out["height.T"], out["depth.T"])
+    with pytest.raises(RuntimeError, match='"aovs" asks for "height", which needs a "field"'):
+        rgb.load_dict(constant(aovs="height"))
+    assert "- ``height`` (``.Z .T``): of the surface above the plane" in table.manual()
+
+
+def test02_the_manual_lists_the_table(rgb, table):
+    rgb.load_dict(constant())
+    manual = sys.modules["nerg_mi.plugins.nerg"].NergIntegrator.__doc__
+    assert table.manual() in manual and not any(w in manual for w in ("{aovs}", "{depths}", "{quadratures}"))
+    for name, aov in table.AOVS.items():
+        assert f"- ``{name}`` (" in manual and name == aov.name
+    assert max(len(line) for line in table.manual().splitlines()) <= 120
+
+
+def test03_every_aov_renders(rgb, files, table, tmp_path):
+    """All that need nothing but a field and a gaze field, at once, with as many channels as they are said to have."""
+    given = rgb.load_dict(with_gaze(files))
+    names = [n for n, aov in table.AOVS.items() if all(need.is_met(given) for need in aov.needs)]
+    assert {"features", "gaze", "density_evals"} < set(names) and "gaze_std" not in names
+    integrator = with_gaze(files, ",".join(names))
+    scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb)})
+    out = named(rgb, np.array(rgb.render(scene, spp=1)), integrator)
+    assert all(np.isfinite(v).all() and v.any() for v in out.values()), [k for k, v in out.items() if not v.any()]
+    # Each alone is what it is beside the others.
+    for name in names:
+        alone = channels(rgb, {**integrator, "aovs": name})
+        for channel, value in alone.items():
+            if not name.endswith("density_evals"):
+                np.testing.assert_allclose(value, out[channel], rtol=1e-5, atol=1e-6, err_msg=channel)
+
+
+def test04_what_is_not_asked_for_is_not_computed(rgb, files, table):
+    """An entry costs nothing until its name is asked for."""
+    plain = operations(rgb, with_gaze(files, "depth"))
+    calls = []
+    table.AOVS["costly"] = table.Aov(
+        name="costly",
+        summary="many operations",
+        compute=lambda p: (calls.append(p), [sum(dr.sin(p.depth * k) for k in range(400))])[1],
+        demands=frozenset({"counts", "features"}),
+    )
+    assert operations(rgb, with_gaze(files, "depth")) == plain and not calls
+    assert operations(rgb, with_gaze(files, "depth,costly")) > plain + 400 and calls

@@ -1,0 +1,84 @@
+"""What is found along one camera ray, and when."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.transport.place import Place
+
+from .scenes import camera, observer_at, with_gaze
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """One entry for each ray that is traced: the origin of its first lane."""
+    found, trace = [], Place.trace
+    monkeypatch.setattr(Place, "trace", lambda *a, **k: (found.append(np.array(a[1].o)[:, 0]), trace(*a, **k))[1])
+    return found
+
+
+def pixel(mi, integrator, eye=(0.5, 0.4, -3), **more):
+    """Of rays from a camera at ``eye`` to and past the field."""
+    from nerg_mi.plugins.nerg_pixel import Pixel
+
+    scene = mi.load_dict({"type": "scene", "integrator": {**integrator, **more}, "sensor": camera(mi, eye)})
+    o = mi.Point3f(*map(float, eye))
+    target = mi.Point3f([0, 0.1, 9], [0, 0.1, 9], 0)
+    ray = mi.Ray3f(o + dr.zeros(mi.Point3f, 3), dr.normalize(target - o))
+    return Pixel(scene.integrator(), scene, scene.sensors(), ray, mi.Bool(True), None)
+
+
+def test01_nothing_is_traced_before_it_is_asked_for(rgb, files, traced):
+    found = pixel(rgb, with_gaze(files, "gaze,visibility", observer=observer_at(rgb, -2, 0.3, -2)))
+    assert len(traced) == 1
+    found.depth, found.surface, found.p_d, found.r_o, found.distance_and_direction  # noqa: B018
+    assert len(traced) == 1
+    found.sight, found.attention, found.sight  # noqa: B018
+    assert len(traced) == 2 and np.allclose(traced[1], (-2, 0.3, -2))
+
+
+@pytest.mark.parametrize("observer", [None, (0.5, 0.4, -3)])
+def test02_who_stands_at_the_camera_sees_what_it_sees(rgb, files, traced, observer):
+    more = {} if observer is None else {"observer": observer_at(rgb, *observer)}
+    found = pixel(rgb, with_gaze(files, "gaze,visibility", **more))
+    assert found.aligned and np.allclose(np.array(found.p_o).T, (0.5, 0.4, -3))
+    assert (found.sight.visibility.numpy() == 1).all() and len(traced) == 1
+    assert np.allclose(found.sight.depth.numpy()[:2], found.depth.numpy()[:2], rtol=1e-5)
+
+
+def test03_gaze_is_zero_without_a_surface(rgb, files):
+    found = pixel(rgb, with_gaze(files, "gaze,emit"))
+    surface = found.surface.numpy()
+    assert surface.tolist() == [True, True, False]
+    for value in (found.attention.gaze, found.attention.emit, found.attention.capture):
+        assert ((value.numpy() > 0) == surface).all()
+    assert found.attention.evaluations.numpy().tolist() == [2, 2, 0] and found.attention.spread is None
+
+
+def test04_evaluations_are_those_of_all_that_was_traced(rgb, files):
+    integrator = with_gaze(files, "visibility,density_evals", observer=observer_at(rgb, -2, 0.3, -2))
+    found = pixel(rgb, integrator)
+    alone = found.density_evaluations().numpy()
+    found.sight  # noqa: B018
+    assert (found.density_evaluations().numpy()[:2] > alone[:2]).all() and (alone[:2] > 5).all()
+
+
+@pytest.mark.parametrize(
+    "aovs, looked_up", [("gaze", True), ("gaze,gaze_evals,depth", True), ("gaze,emit", False), ("visibility", False)]
+)
+def test05_a_map_stands_in_for_gaze_alone(rgb, files, aovs, looked_up):
+    """It keeps neither factors nor what nobody asks for."""
+    observer = observer_at(rgb, -2, 0.3, -2)
+    found = pixel(rgb, with_gaze(files, aovs, observer=observer, visibility="map", map_height=32))
+    assert (found.sight.gaze is not None) == looked_up
+    assert bool(found.nerg.cache.peek("gaze of map")) == looked_up
+    assert len(found.nerg.cache.peek("map")) == 1
+
+
+def test06_colour_is_found_where_it_is_wanted(rgb, files):
+    integrator = with_gaze(files, "features")
+    lit, dark = (pixel(rgb, {**integrator, "radiance": r}) for r in (True, False))
+    assert lit.lit and not dark.lit and dark.color is None
+    assert np.array(lit.color).shape[0] == 3
+    for a, b in zip(lit.accumulated_features, dark.accumulated_features):
+        np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-5, atol=1e-6)
