@@ -1,8 +1,8 @@
 """What the commands make, compared bit for bit with what they made before: for changes that are to change nothing.
 
-    python tools/unchanged.py record FOLDER [--only NAME]     run every command below, keep what it writes and its
-    digest python tools/unchanged.py compare FOLDER [--only NAME]    run them again, and name what differs; exit code 1
-    where anything does
+    python tools/unchanged.py record FOLDER [--only NAME ...]   run every command below, keep what it writes and digests
+    python tools/unchanged.py compare FOLDER [--only NAME ...]  run them again, and name what differs; exit code 1 where
+                                                                anything does
 
 Pictures of the demo store with every kind of depth, visibility, quadrature, gaze field and AOV, of shapes and through a
 panorama; trainings of radiance and gaze at one thread; a study's errors; tables and exports. Everything is made of the
@@ -216,12 +216,22 @@ def errors_of_study(folder: Path) -> str:
     return hashlib.sha256(json.dumps(kept, sort_keys=True).encode()).hexdigest()
 
 
-def run(folder: Path, only: str | None) -> dict[str, str]:
-    """Run every command that ``only`` names; file -> digest, or what went wrong."""
+def wanted(folder: Path, only: list[str]) -> list[tuple[str, list[str]]]:
+    """Of ``commands`` those whose outputs' names contain one of ``only`` (all where there is none), and those that make
+    what these read."""
+    kept = []
+    for name, line in reversed(list(commands(folder))):
+        out = folder / name
+        reads = lambda given, out=out: str(out) in given or (out.parent != folder and given == str(out.parent))
+        if not only or any(o in name for o in only) or any(reads(g) for _, other in kept for g in other):
+            kept.append((name, line))
+    return kept[::-1]
+
+
+def run(folder: Path, only: list[str]) -> dict[str, str]:
+    """Run every command that is ``wanted``; file -> digest, or what went wrong."""
     found = {}
-    for name, line in commands(folder):
-        if only is not None and only not in name:
-            continue
+    for name, line in wanted(folder, only):
         out = folder / name
         answer = subprocess.run([*NERG, *line, "-o", str(out)], capture_output=True, text=True)
         if answer.returncode != 0:
@@ -241,7 +251,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["record", "compare"])
     parser.add_argument("folder", type=Path, help="of the recorded digests and of what the commands made")
-    parser.add_argument("--only", help="only outputs whose names contain this, and nothing that they are made of")
+    more = "only outputs whose names contain this, and what they are made of; may be given several times"
+    parser.add_argument("--only", action="append", default=[], help=more)
     args = parser.parse_args(argv)
     record = args.folder / "digests.json"
     if args.what == "record":
