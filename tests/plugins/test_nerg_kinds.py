@@ -39,9 +39,6 @@ class LobeConfig:
     def conventions(self):
         return self.kind, self.normalized
 
-    def for_place(self, surfaces, holes):
-        return self
-
     def to_dict(self):
         return {"kind": self.kind, **asdict(self)}
 

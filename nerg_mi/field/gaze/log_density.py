@@ -11,7 +11,7 @@ where the surfaces are, the other where people's heads were.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from types import ModuleType
 from typing import ClassVar
 
@@ -106,10 +106,6 @@ class LogGazeConfig:
     def conventions(self) -> tuple:
         """What fields must have in common for their densities to be averaged."""
         return self.kind, self.variant, self.geometry, self.escaped, self.reach
-
-    def for_place(self, surfaces: bool, holes: bool) -> LogGazeConfig:
-        """This configuration for a place whose ``surfaces`` are known or not, and have ``holes`` or not."""
-        return replace(self, escaped="nearest" if holes else "constant", geometry="surface" if surfaces else "none")
 
     @property
     def emit_sizes(self) -> list[int]:

@@ -17,7 +17,6 @@ from typing import ClassVar
 import drjit as dr
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
@@ -125,14 +124,6 @@ class GazeConfig:
     def conventions(self) -> tuple:
         """What fields must have in common for their densities to be averaged."""
         return self.kind, self.variant, self.activation, self.normalized, self.semantic, self.geometry
-
-    def for_place(self, surfaces: bool, holes: bool) -> GazeConfig:
-        """This configuration. Raises ``NergError`` where there are no surfaces, on which emit is a density."""
-        if not surfaces:
-            raise NergError(
-                "a gaze field of this recipe needs surfaces; without any geometry only the default recipe trains"
-            )
-        return self
 
     @property
     def position_sizes(self) -> list[int]:

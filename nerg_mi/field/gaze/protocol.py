@@ -75,11 +75,6 @@ class GazeFieldConfig(Protocol):
         """What fields must have in common for their densities to be averaged."""
         ...
 
-    def for_place(self, surfaces: bool, holes: bool) -> GazeFieldConfig:
-        """This configuration for a place: whether its ``surfaces`` are known, and whether they have ``holes`` that
-        nobody saw through. Raises ``NergError`` for a place that the field cannot be trained in."""
-        ...
-
     def to_dict(self) -> dict:
         """As JSON; with ``kind`` unless that is ``product``, which older checkpoints do not name."""
         ...

@@ -4,7 +4,6 @@ import inspect
 
 import pytest
 
-from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.gaze import protocol, registry
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
@@ -42,14 +41,3 @@ def test_every_kind_answers_what_the_protocol_asks(kind):
     assert field.networks == (4 if kind == "ensemble" else 2)
     # What it says of itself is what it is built of.
     assert field.architecture().get("kind", "product") == kind
-
-
-def test_a_place_is_answered_by_the_configuration():
-    assert not SMALL.for_place(surfaces=False, holes=False).needs_surfaces
-    assert SMALL.for_place(surfaces=True, holes=True).fills_escaped
-    plain = SMALL.for_place(surfaces=True, holes=False)
-    assert plain.needs_surfaces and not plain.fills_escaped
-    product = GazeConfig()
-    assert product.for_place(surfaces=True, holes=True) is product
-    with pytest.raises(NergError, match="needs surfaces"):
-        product.for_place(surfaces=False, holes=False)
