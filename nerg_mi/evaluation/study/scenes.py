@@ -13,6 +13,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.maths.box import Box
+from nerg_mi.transport.observer.gaze import PlacedGaze
+
 NUMPY = SimpleNamespace(select=np.where, exp=np.exp)
 """The functions that densities use, as Dr.Jit names them."""
 
@@ -188,12 +194,6 @@ def _volumes(variant: str):
         """A smooth, untrained gaze field over the unit cube, equal in every run."""
 
         def __init__(self, props):
-            from nerg_mi.field.backend import namespace
-            from nerg_mi.field.encoding.hashgrid import HashGridConfig
-            from nerg_mi.field.gaze.product import GazeConfig, GazeField
-            from nerg_mi.maths.box import Box
-            from nerg_mi.transport.observer.gaze import PlacedGaze
-
             super().__init__(props)
             ns = namespace(variant)
             config = GazeConfig(
