@@ -8,6 +8,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.ray_box import box_interval
 
+from . import lens
 from .cameras import Camera, project
 
 # Cameras whose axes miss their common point by less than this look at one thing.
@@ -91,8 +92,6 @@ def unmatched(cameras: list[Camera], box: Box, grid: int = 4, depths: int = 12) 
 
 def _samples(camera: Camera, box: Box, grid: int, depths: int) -> np.ndarray:
     """Points (N, 3) within the box on rays of the picture."""
-    from . import lens
-
     i = camera.intrinsics
     u, v = np.meshgrid((np.arange(grid) + 0.5) / grid * i.width, (np.arange(grid) + 0.5) / grid * i.height)
     d = lens.rays(np.stack([(u.ravel() - i.cx) / i.fx, (v.ravel() - i.cy) / i.fy], axis=-1), i) * [1, -1, -1]

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from nerg_mi import llvm
 from nerg_mi.errors import NergError, UnusableLLVM, mitsuba_says, sentence
 from nerg_mi.files.exr import threads_for_mitsuba
 
@@ -21,8 +22,6 @@ def activate(variant: str | None = None) -> str:
     that Mitsuba does not know and for a variant that does not work here.
     """
     import mitsuba as mi
-
-    from nerg_mi import llvm
 
     if variant is not None and variant not in mi.variants():
         raise NergError(f'there is no variant "{variant}"; this Mitsuba has {", ".join(mi.variants())}.')

@@ -7,7 +7,7 @@ boards are solid and closed, so that nobody sees through a shelf and a field has
 from __future__ import annotations
 
 import numpy as np
-from nerg_mi.scenes.store.layout import EAST, NORTH, SOUTH, WEST, Place, Region, srgb
+from nerg_mi.scenes.store.blocks import EAST, NORTH, SOUTH, WEST, Place, Region, srgb
 
 # What a category's goods look like (sRGB), and the colour of its special offer.
 GOODS = {
