@@ -18,7 +18,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.files.tables import markdown_table
-from numerics import replaced
+from output import replace_table
 
 import numpy as np
 
@@ -167,7 +167,9 @@ def main(argv=None) -> None:
         text = markdown_table(head, rows)
         print(f"### {title}\n\n{text}\n", flush=True)
         if args.update:
-            args.update.write_text(replaced(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")
+            args.update.write_text(
+                replace_table(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8"
+            )
 
 
 if __name__ == "__main__":

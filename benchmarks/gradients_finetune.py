@@ -19,7 +19,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
 from nerg_mi.files.tables import markdown_table
-from numerics import replaced
+from output import replace_table
 
 import drjit as dr
 import mitsuba as mi
@@ -173,7 +173,7 @@ def main(argv=None) -> None:
     title, text = "Errors of gaze", markdown_table(["", *store.views], rows)
     print(f"### {title}\n\n{text}\n")
     if args.update:
-        args.update.write_text(replaced(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")
+        args.update.write_text(replace_table(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.files.tables import markdown_table
+from output import replace_table
 
 HEAD = ["case", "range", "quantity", "largest error", "reference"]
 """Of tables whose lines are `Row`s."""
@@ -39,20 +40,6 @@ class Row:
         return [self.case, self.range, self.quantity, "0" if shown == "0.0e+00" else shown, self.reference]
 
 
-def replaced(document: str, title: str, text: str) -> str:
-    """``document`` with the first table below the heading ``title`` exchanged for ``text``."""
-    lines = document.split("\n")
-    if f"### {title}" not in lines:
-        raise ValueError(f'the document has no heading "### {title}" to put a table under; add it')
-    start = lines.index(f"### {title}") + 1
-    while start < len(lines) and not lines[start].startswith(("|", "#")):
-        start += 1
-    end = start
-    while end < len(lines) and lines[end].startswith("|"):
-        end += 1
-    return "\n".join(lines[:start] + text.split("\n") + ([""] if end == start else []) + lines[end:])
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default=",".join(GROUPS), help="comma-separated groups")
@@ -72,7 +59,7 @@ def main() -> None:
             text = markdown_table(head, rows)
             print(f"### {title}\n\n{text}\n", flush=True)
             if document is not None:
-                document = replaced(document, title, text)
+                document = replace_table(document, title, text)
     if args.update:
         args.update.write_text(document, encoding="utf-8")
         print(f"updated {args.update}")

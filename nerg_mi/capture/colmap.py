@@ -18,7 +18,7 @@ import numpy as np
 from nerg_mi.errors import MissingFile, NergError, sentence
 from nerg_mi.files.bounded import plain, read_bytes
 
-from .posed import FARTHEST, Frame, MaskFile, PosedImages, Unused, drop_repeated, inside, none_usable
+from .posed import FARTHEST, Frame, MaskFile, PosedImages, Unused, inside, settled
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
 _MODELS = {
@@ -121,11 +121,7 @@ def read_colmap(
         except (ValueError, OverflowError, OSError) as e:
             # A name may be longer than the system allows, or hold what no name can.
             unused.append(Unused(name, sentence(e)))
-    frames.sort(key=lambda f: f.name)
-    frames, repeated = drop_repeated(frames)
-    unused = sorted(unused + repeated, key=lambda u: u.name)
-    if not frames:
-        raise none_usable(files["images"], unused)
+    frames, unused = settled(files["images"], frames, unused)
     digest = hashlib.sha256(b"".join(hashlib.sha256(raw[name]).digest() for name in ("cameras", "images")))
     points = None
     if "points3D" in files:
@@ -152,20 +148,14 @@ def _frame(name: str, camera: _Camera | None, number: int, q, t, images: Path, m
 
 
 def _to_world(q, t) -> np.ndarray:
-    w, x, y, z = q
+    from scipy.spatial.transform import Rotation
+
     norm = float(np.linalg.norm(q))
     if not (1e-6 < norm <= FARTHEST and np.abs(t).max() <= FARTHEST):
         raise NergError("its pose is not finite, or its quaternion is zero")
-    w, x, y, z = (v / norm for v in (w, x, y, z))
-    m = np.eye(4)
-    m[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    back = Rotation.from_quat(np.roll(np.asarray(q, np.float64), -1)).as_matrix().T
     out = np.eye(4)
-    out[:3, :3] = m[:3, :3].T
-    out[:3, 3] = -m[:3, :3].T @ np.asarray(t, np.float64)
+    out[:3, :3], out[:3, 3] = back, -back @ np.asarray(t, np.float64)
     return out @ _FLIP
 
 

@@ -235,6 +235,15 @@ def rigid_pose(matrix: object) -> np.ndarray:
     return pose
 
 
+def settled(path: Path, frames: list[Frame], unused: list[Unused]) -> tuple[list[Frame], list[Unused]]:
+    """Both in order of their names, each image file counting once. Raises `NergError` where no frame is left."""
+    frames, repeated = drop_repeated(sorted(frames, key=lambda f: f.name))
+    unused = sorted(unused + repeated, key=lambda u: u.name)
+    if not frames:
+        raise _none_usable(path, unused)
+    return frames, unused
+
+
 def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
     """``frames`` with each image file once, and what was said about it again."""
     first: dict[Path, Frame] = {}
@@ -251,7 +260,7 @@ def drop_repeated(frames: list[Frame]) -> tuple[list[Frame], list[Unused]]:
     return kept, unused
 
 
-def none_usable(path: Path, unused: list[Unused]) -> NergError:
+def _none_usable(path: Path, unused: list[Unused]) -> NergError:
     """The error of a set without a single usable frame."""
     if not unused:
         return NergError(f'"{path}" lists no frames; name the file of a posed image set')

@@ -21,19 +21,7 @@ import numpy as np
 from nerg_mi.errors import NergError, sentence
 from nerg_mi.files.bounded import JSON_BYTES, parse_json, plain, read_bytes
 
-from .posed import (
-    FARTHEST,
-    LENS_KEYS,
-    DepthFile,
-    Frame,
-    MaskFile,
-    PosedImages,
-    Unused,
-    drop_repeated,
-    inside,
-    none_usable,
-    rigid_pose,
-)
+from .posed import FARTHEST, LENS_KEYS, DepthFile, Frame, MaskFile, PosedImages, Unused, inside, rigid_pose, settled
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".exr", ".PNG", ".JPG", ".JPEG", ".EXR")
 _PINHOLE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV")
@@ -81,11 +69,7 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
         except (ValueError, OverflowError, OSError) as e:
             # A name may be longer than the system allows, or hold what no name can.
             unused.append(Unused(name, sentence(e)))
-    frames.sort(key=lambda f: f.name)
-    frames, repeated = drop_repeated(frames)
-    unused = sorted(unused + repeated, key=lambda u: u.name)
-    if not frames:
-        raise none_usable(path, unused)
+    frames, unused = settled(path, frames, unused)
     held_out, spare = _splits(data, frames)
     return PosedImages(
         path,

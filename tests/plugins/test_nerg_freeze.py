@@ -11,15 +11,10 @@ from .scenes import camera, observer_at, with_gaze
 
 
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    folder = tmp_path_factory.mktemp("fields")
-    fields.radiance(folder / "field.safetensors")
-    fields.gaze(folder / "gaze.safetensors")
-    fields.gaze(folder / "normalized.safetensors", normalized=True)
-    return folder
+def files(files):
+    """Those of all tests, and `normalized.safetensors`."""
+    fields.gaze(files / "normalized.safetensors", normalized=True)
+    return files
 
 
 def moved(mi, value, i):

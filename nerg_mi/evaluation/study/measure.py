@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from . import paper as study_paper
-from .errors import errors
+from .errors import NAMES, errors
 from .reference import Truth
 from .settings import Setting
 from .subject import parameters
@@ -28,17 +28,7 @@ COLUMNS = (
     "density_evals",
     "color_evals",
     "gaze_evals",
-    "color_rmse",
-    "color_psnr",
-    "opacity_mae",
-    "depth_mae",
-    "depth_p99",
-    "visibility_mae",
-    "visibility_wrong",
-    "gaze_mae",
-    "gaze_kld",
-    "surface_mae",
-    "surface_p99",
+    *NAMES,
     "peak_mb",
     "pareto",
     "reference",

@@ -117,6 +117,28 @@ def color_share(first: Float, last: Float, share: Float) -> Float:
     return dr.lerp(share, dr.select(r > 0, 1.0, 0.0), r * r)
 
 
+def _step_along_line(
+    medium: Medium,
+    ray: LocalRay,
+    t: Float,
+    delta: Float,
+    dtau: Float,
+    first: Float,
+    last: Float,
+    carry: tuple | None,
+    evaluations: Float,
+) -> Step:
+    """The step from ``t`` on, ``delta`` long and of optical depth ``dtau``, whose density runs in a line from ``first``
+    to ``last``."""
+    share = linear_share(first * delta, last * delta)
+
+    def paint(painter, lit):
+        p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
+        return painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
+
+    return Step(dtau, share, lambda missing: linear_crossing(first, last, delta, missing), paint, carry, evaluations)
+
+
 class Constant:
     """Density constant over a step: its value at the middle (Mildenhall et al. 2020, eq. 3)."""
 
@@ -173,20 +195,8 @@ class Linear:
             first = dr.select(fresh, first, carry[0])
         last = medium.density(ray.o + ray.d * (t + delta), active)
         dtau = dr.select(active, 0.5 * (first + last) * delta, 0)
-        share = linear_share(first * delta, last * delta)
-
-        def paint(painter, lit):
-            p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
-            return painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
-
-        return Step(
-            dtau,
-            share,
-            lambda missing: linear_crossing(first, last, delta, missing),
-            paint,
-            (last, t_next),
-            dr.select(active, 1.0, 0.0) + dr.select(fresh, 1.0, 0.0),
-        )
+        evaluations = dr.select(active, 1.0, 0.0) + dr.select(fresh, 1.0, 0.0)
+        return _step_along_line(medium, ray, t, delta, dtau, first, last, (last, t_next), evaluations)
 
 
 class Cells:
@@ -213,20 +223,7 @@ class Cells:
         # The ends of the line through both samples, kept from leaving the density's range.
         tilt = dr.clip((b - a) * (0.5 / (2 * _GAUSS)), -mean, mean)
         first, last = mean - tilt, mean + tilt
-        share = linear_share(first * delta, last * delta)
-
-        def paint(painter, lit):
-            p = ray.o + ray.d * dr.fma(delta, color_share(first, last, share), t)
-            return painter.paint(medium, medium.density_features(p, lit)[1], p, ray.w, lit)
-
-        return Step(
-            dtau,
-            share,
-            lambda missing: linear_crossing(first, last, delta, missing),
-            paint,
-            None,
-            dr.select(active, 2.0, 0.0),
-        )
+        return _step_along_line(medium, ray, t, delta, dtau, first, last, None, dr.select(active, 2.0, 0.0))
 
 
 for _rule in (Constant(), Linear(), Cells()):

@@ -14,7 +14,8 @@ from nerg_mi.training.gaze.log_density_model import log_gaze
 from nerg_mi.training.gaze.product_model import gaze_density
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from tests.field.encoding.dense import DenseConfig, DenseGrid
-from tests.training.radiance.ball import BOX, ball, looking_at_origin, settings
+from tests.training.radiance.ball import BOX, ball, settings
+from tools.tiny import ball_pose
 
 register(DenseConfig, DenseGrid)
 CONFIG = RadianceConfig(DenseConfig(), width=16, color_hidden=1, density_scale=0.5)
@@ -25,7 +26,7 @@ DIRECTIONS = np.tile(np.float32([[0.6], [0], [0.8]]), 20)
 @pytest.fixture(scope="module")
 def trained():
     """A radiance field of a dense grid after 40 steps, the first and the last loss."""
-    views = [ball(looking_at_origin(np.array(c))) for c in ([2.0, 0, 0.4], [-1.2, 1.6, 0], [-1.2, -1.6, 0.4])]
+    views = [ball(ball_pose(np.array(c))) for c in ([2.0, 0, 0.4], [-1.2, 1.6, 0], [-1.2, -1.6, 0.4])]
     trainer, losses = RadianceTrainer(views, BOX, CONFIG, settings(steps=40, batch=2**10), ns), []
     for _ in range(40):
         trainer.step()

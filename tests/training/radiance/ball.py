@@ -14,6 +14,7 @@ from nerg_mi.field.radiance import RadianceConfig
 from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.settings import RadianceSettings
 from nerg_mi.training.radiance.trainer import RadianceTrainer
+from tools.tiny import ball_pose
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
 RADIUS = 0.6
@@ -21,15 +22,6 @@ TINY = RadianceConfig(
     grid=HashGridConfig(levels=4, log2_rows=12, base=8, finest=64), width=16, color_hidden=1, density_scale=0.5
 )
 LENS = Intrinsics(24, 24, 30.0, 30.0, 12.0, 12.0)
-
-
-def looking_at_origin(center):
-    z = center / np.linalg.norm(center)
-    x = np.cross([0, 0, 1.0], z)
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), center
-    return pose
 
 
 def ball(pose, depth=True):
@@ -53,7 +45,7 @@ def ball_dataset():
     """Twenty views of the ball to train on, and four that are held out."""
     rng = np.random.default_rng(0)
     centers = rng.normal(size=(24, 3)) * [1, 1, 0.5]
-    views = [ball(looking_at_origin(2 * c / np.linalg.norm(c))) for c in centers]
+    views = [ball(ball_pose(2 * c / np.linalg.norm(c))) for c in centers]
     return Dataset(views[4:], views[:4], BOX, "as given", [], {"dataset": "ball"})
 
 
