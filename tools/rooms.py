@@ -15,6 +15,8 @@ else:
 
 BESIDE = {"scenes": "jobs", "plugins": "rendering"}
 """Rooms that the layers of pyproject.toml leave out, since rules of their own hold for them -> the room above them."""
+SCRIPTS = (f"{PACKAGE}.scenes.store.make",)
+"""Modules that are run and not imported: like benchmarks, they stand above all rooms."""
 MODULES = "errors ..."
 """What the picture calls the modules that lie in no room."""
 
@@ -26,7 +28,7 @@ UPWARD = "#c81e1e"
 def layers() -> list[str]:
     """The rooms from top to bottom, as the import rules of pyproject.toml have them."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    (levels,) = [c["layers"] for c in contracts if c["type"] == "layers"]
+    (levels,) = [c["layers"] for c in contracts if c["type"] == "layers" and c["containers"] == [PACKAGE]]
     names = [name.strip(" ()") for level in levels for name in level.replace(":", "|").split("|")]
     rooms = [name for name in names if (ROOT / PACKAGE / name / "__init__.py").is_file()]
     for name, above in BESIDE.items():
@@ -54,7 +56,11 @@ def arrows() -> dict[tuple[str, str], str]:
     functions."""
     known, found = set(layers()), {}
     for i in all_imports():
-        if i.when == "types" or i.source == PACKAGE or (i.names and all(n.startswith("__") for n in i.names)):
+        if (
+            i.when == "types"
+            or i.source in (PACKAGE, *SCRIPTS)
+            or (i.names and all(n.startswith("__") for n in i.names))
+        ):
             continue
         source, target = (r if r in known else MODULES for r in (room(i.source), room(i.target)))
         if source != target and found.get((source, target)) != "load":
