@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.files.tables import markdown_table
-from output import replace_table
+from output import print_table
 
 import numpy as np
 
@@ -164,12 +163,7 @@ def main(argv=None) -> None:
     # A sensor's pose counts as not differentiable in Mitsuba, which says so on each of its updates.
     mi.set_log_level(mi.LogLevel.Error)
     for title, head, rows in errors(mi, args.case, args.depth):
-        text = markdown_table(head, rows)
-        print(f"### {title}\n\n{text}\n", flush=True)
-        if args.update:
-            args.update.write_text(
-                replace_table(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8"
-            )
+        print_table(title, head, rows, args.update)
 
 
 if __name__ == "__main__":

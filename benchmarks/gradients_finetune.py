@@ -18,8 +18,7 @@ from itertools import product
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
-from nerg_mi.files.tables import markdown_table
-from output import replace_table
+from output import print_table
 
 import drjit as dr
 import mitsuba as mi
@@ -170,10 +169,7 @@ def main(argv=None) -> None:
             store.train(batches, args.steps, args.lr)
         rows.append([name, *(f"{e:.1%}" for e in store.errors())])
         print(rows[-1], file=sys.stderr, flush=True)
-    title, text = "Errors of gaze", markdown_table(["", *store.views], rows)
-    print(f"### {title}\n\n{text}\n")
-    if args.update:
-        args.update.write_text(replace_table(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")
+    print_table("Errors of gaze", ["", *store.views], rows, args.update)
 
 
 if __name__ == "__main__":

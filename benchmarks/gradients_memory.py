@@ -21,8 +21,7 @@ import tempfile
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit)
-from nerg_mi.files.tables import markdown_table
-from output import replace_table
+from output import print_table
 
 import drjit as dr
 import mitsuba as mi
@@ -118,10 +117,7 @@ def main(argv=None) -> None:
     if args.one:
         print("\n".join(f"{peak(args.one, n):,.1f}" for n in counts))
         return
-    title, text = "Peak memory", markdown_table(["samples a ray", *COLUMNS.values()], [measured(n) for n in counts])
-    print(f"### {title}\n\n{text}\n")
-    if args.update:
-        args.update.write_text(replace_table(args.update.read_text(encoding="utf-8"), title, text), encoding="utf-8")
+    print_table("Peak memory", ["samples a ray", *COLUMNS.values()], [measured(n) for n in counts], args.update)
 
 
 if __name__ == "__main__":

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.files.tables import markdown_table
-from output import replace_table
+from output import print_table
 
 HEAD = ["case", "range", "quantity", "largest error", "reference"]
 """Of tables whose lines are `Row`s."""
@@ -53,16 +52,9 @@ def main() -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    document = args.update.read_text(encoding="utf-8") if args.update else None
     for name in names:
         for title, head, rows in importlib.import_module(f"numerics_{name}").tables(mi):
-            text = markdown_table(head, rows)
-            print(f"### {title}\n\n{text}\n", flush=True)
-            if document is not None:
-                document = replace_table(document, title, text)
-    if args.update:
-        args.update.write_text(document, encoding="utf-8")
-        print(f"updated {args.update}")
+            print_table(title, head, rows, args.update)
 
 
 if __name__ == "__main__":

@@ -1,21 +1,26 @@
-"""What every benchmark writes beside the table that it prints: CSV, and the table in a page."""
+"""What every benchmark writes beside the table that it prints."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-from nerg_mi.files.tables import write_csv
+from nerg_mi.files.tables import markdown_table, write_csv
 
-# The checkout, of which this folder is no package.
-sys.path.append(str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from tools.page import replace_table
-
-__all__ = ["replace_table", "write_rows"]
+from tools.page import update
 
 
 def write_rows(path: Path, rows: list[dict]) -> None:
     """Write ``rows`` as CSV, and say where."""
     write_csv(path, rows)
     print(f"wrote {path}")
+
+
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence], page: Path | None = None) -> None:
+    """Print a table below its heading, and put it into the ``page`` of the documentation that has this heading."""
+    print(f"### {title}\n")
+    update(page, title, markdown_table(head, rows))
+    print(flush=True)

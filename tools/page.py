@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from nerg_mi.files.atomic import write_text
 from nerg_mi.files.tables import markdown_table as table
 
 __all__ = ["replace_table", "table", "update"]
@@ -37,4 +38,4 @@ def update(path: str | Path | None, title: str, text: str) -> None:
     print(text)
     if path is not None:
         path = Path(path)
-        path.write_text(replace_table(path.read_text(encoding="utf-8"), title, text), encoding="utf-8")
+        write_text(path, replace_table(path.read_text(encoding="utf-8"), title, text))
