@@ -54,7 +54,7 @@ GAZE = "--geometry none --radius 0.6 --probes 8 --directions 64 --zones 0 --min-
 
 
 # Steps that a radiance training takes, and forgets, before its first.
-WARM_UP = 4
+WARM_UP = 5
 
 
 def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
@@ -102,7 +102,7 @@ ENDS = {
         "--min-rays 8 --radius 0.5 --cameras 0 --probes 8",
     ),
     "rays import": (
-        "rays.readers.tables.rays_from_table",
+        "rays.readers.table.add_tables",
         1,
         "rays import {i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'",
     ),
