@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -66,3 +69,19 @@ def color(props, name: str, default: float) -> list[float]:
     if len(rgb) != 3 or not all(math.isfinite(c) and c >= 0 for c in rgb):
         raise NergError(f'"{name}" must be one number or three, finite and not negative, got {value}')
     return rgb
+
+
+def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, str]:
+    """The field of a volume, its metadata and the name of its file ("" without one).
+
+    It is ``network``, a field in memory, whose arrays must belong to the backend ``ns``; where that is None, it is read
+    from the property ``filename`` by ``load(path, ns)``.
+    """
+    import mitsuba as mi
+
+    if network is None:
+        filename = str(mi.file_resolver().resolve(text(props, "filename")))
+        return *load(filename, ns), filename
+    if any(not type(value).__module__.startswith(ns.__name__) for value in network.parameters().values()):
+        raise NergError(f'the field in memory was made for another variant than "{mi.variant()}"; load it again')
+    return network, {}, ""

@@ -12,6 +12,7 @@ import importlib
 import importlib.machinery
 import importlib.util
 import sys
+from typing import Any
 
 from . import llvm
 from .errors import NergError
@@ -30,6 +31,14 @@ uses."""
 _REGISTRY = {"volume": "texture"}
 
 
+_classes: dict[str, type] = {}
+
+
+def plugin_class(name: str) -> Any:
+    """The class of the plugin ``name`` for the active variant, which must not be a scalar one."""
+    return _classes[name]
+
+
 def register(kind: str, name: str, cls: type) -> None:
     """Register the plugin class `cls` under `name` for the active variant; the last line of every plugin module.
 
@@ -44,6 +53,7 @@ def register(kind: str, name: str, cls: type) -> None:
         if kind not in _REGISTRY:
             put(name, _refusal(name, mi.variant()))
     else:
+        _classes[name] = cls
         put(name, cls)
 
 

@@ -62,10 +62,13 @@ from __future__ import annotations
 
 import mitsuba as mi
 
+from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
+from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.field.gaze.registry import kinds
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.properties import text
+from nerg_mi.properties import trained
 from nerg_mi.registration import register
 from nerg_mi.transport.observer.gaze import PlacedGaze
 
@@ -73,12 +76,25 @@ from nerg_mi.transport.observer.gaze import PlacedGaze
 class GazeFieldVolume(mi.Volume):
     __doc__ = __doc__
 
-    def __init__(self, props):
+    def __init__(self, props, network=None):
+        # ``network``: a field in memory in place of a file; see ``of``.
         super().__init__(props)
-        self.filename = str(mi.file_resolver().resolve(text(props, "filename")))
         to_world = props.get("to_world", mi.ScalarTransform4f())
-        self.field, self.metadata = load_gaze(self.filename, namespace(mi.variant()))
+        self.field, self.metadata, self.filename = trained(props, network, load_gaze, namespace(mi.variant()))
         self._similarity = Similarity(to_world.matrix)
+
+    @classmethod
+    def of(cls, network: AnyGazeField, to_world=None, name: str = "in memory") -> GazeFieldVolume:
+        """The volume of a field in memory, for a scene that is made from Python; ``to_world``: a Mitsuba transform,
+        ``name``: what it is called where others have a file's name."""
+        if getattr(network, "kind", None) not in kinds():
+            raise NergError(f"a gaze field in memory is needed, got {type(network).__name__}; load one from its file")
+        props = mi.Properties("gazefield")
+        if to_world is not None:
+            props["to_world"] = to_world
+        volume = cls(props, network)
+        volume.filename = name
+        return volume
 
     def placed_gaze(self) -> PlacedGaze:
         """The gaze field as the integrator sees it."""

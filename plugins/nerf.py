@@ -57,9 +57,10 @@ import mitsuba as mi
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
+from nerg_mi.field.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.properties import number, text
+from nerg_mi.properties import number, trained
 from nerg_mi.registration import register
 from nerg_mi.transport.media.field import FieldMedium
 
@@ -67,16 +68,31 @@ from nerg_mi.transport.media.field import FieldMedium
 class NerfVolume(mi.Volume):
     __doc__ = __doc__
 
-    def __init__(self, props):
-        filename = str(mi.file_resolver().resolve(text(props, "filename")))
+    def __init__(self, props, network=None):
+        # ``network``: a field in memory in place of a file; see ``of``.
         similarity = Similarity(props.get("to_world", mi.ScalarTransform4f()).matrix)
-        field, metadata = load_radiance(filename, namespace(mi.variant()))
+        field, metadata, filename = trained(props, network, load_radiance, namespace(mi.variant()))
         # Mitsuba's own media ask the base class, not bbox(): it makes its box from the unit cube.
         lower, upper = similarity.bounds(field.box.lower, field.box.upper)
         props["to_world"] = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         super().__init__(props)
         self.filename, self.field, self.metadata, self._similarity = filename, field, metadata, similarity
         self.max_density = number(props, "max_density", 0, low=0)
+
+    @classmethod
+    def of(cls, network: RadianceField, to_world=None, name: str = "in memory") -> NerfVolume:
+        """The volume of a field in memory, for a scene that is made from Python; ``to_world``: a Mitsuba transform,
+        ``name``: what it is called where others have a file's name."""
+        if not isinstance(network, RadianceField):
+            raise NergError(
+                f"a radiance field in memory is needed, got {type(network).__name__}; load one from its file"
+            )
+        props = mi.Properties("nerf")
+        if to_world is not None:
+            props["to_world"] = to_world
+        volume = cls(props, network)
+        volume.filename = name
+        return volume
 
     def medium(self) -> FieldMedium:
         """The field as the marcher sees it."""
