@@ -15,11 +15,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from . import pixel_sampler
+from .layers import Layers, OwnLayer
 
 PACKET = 64
 """Samples that Dr.Jit may add up as one (16 on a CPU, 32 on a GPU): a strip begins at a multiple of this many."""
@@ -46,11 +47,13 @@ class Observing(Protocol):
 @dataclass(frozen=True)
 class Band:
     """Rows ``top``, ..., ``top + rows - 1`` of the film's crop window. ``film`` holds them (``bitmap()``,
-    ``develop()``) until the next band is asked for, perhaps followed by empty rows."""
+    ``develop()``) until the next band is asked for, perhaps followed by empty rows. ``layer``: number of the picture,
+    where several are made of the same rays (`layers.Layers`)."""
 
     top: int
     rows: int
-    film: object
+    film: Any
+    layer: int = 0
 
 
 def why_whole(scene, sensor) -> str | None:
@@ -103,40 +106,50 @@ def render_bands(
     rows: int = 0,
     strip: int = 0,
     on_strip: Callable[[int, int], None] | None = None,
+    layers: Layers | None = None,
 ) -> Iterator[Band]:
     """Render the picture of ``sensor`` band by band, from the top; in one piece where `why_whole` has a reason.
 
     ``spp``: samples a pixel, 0 for those of the sampler. ``rows`` of a band; 0: all. ``strip``: samples of a strip, 0:
     as many as take about `STRIP_SECONDS`. ``on_strip`` is told the number of samples done and that of all after every
-    strip, and may raise. Raises ``KeyboardInterrupt`` after a picture in one piece that was to be stopped: there
-    Mitsuba itself takes the signal.
+    strip, and may raise. ``layers``: in place of the scene's integrator, of a picture that can be divided; the
+    bands of all of them follow each other. Raises ``KeyboardInterrupt`` after a picture in one piece that was to be
+    stopped: there Mitsuba itself takes the signal.
     """
     if why_whole(scene, sensor):
         yield _whole(scene, sensor, spp, seed, on_strip)
         return
     grid = _Grid(sensor.film(), spp or sensor.sampler().sample_count(), rows)
     integrator = scene.integrator()
+    layers = OwnLayer(integrator) if layers is None else layers
     observing = lambda: integrator.seen_by(sensor, scene) if isinstance(integrator, Observing) else nullcontext()
     base = pixel_sampler.base_seed(sensor.sampler())
     pace = _Pace(strip)
     done = 0
     for top in range(0, grid.height, grid.rows):
-        block = grid.block(integrator)
+        blocks = [grid.block(names) for names in layers.names]
         start, stop = grid.samples(top)
-        with observing(), grid.as_whole(block):
+        with observing(), grid.as_whole(blocks[0], layers):
             for first, count in pace.strips(start, stop, grid.spp):
-                block.put(*_trace(scene, sensor, grid, base, seed, top, first, count, start))
+                where, active, found = _trace(scene, sensor, layers, grid, base, seed, top, first, count, start)
+                for block, values in zip(blocks, found):
+                    block.put(where, values, active)
+                    if len(blocks) > 1:
+                        # Each in a kernel of its own, which layers of one kind then have in common.
+                        _evaluate(block)
                 # What was traced while the strip before it was computed is computed now.
                 pace.wait()
                 if on_strip is not None and done:
                     on_strip(min(done, grid.total), grid.total)
-                _evaluate(block)
+                for block in blocks:
+                    _evaluate(block)
                 done += count
             pace.wait()
         if on_strip is not None:
             on_strip(min(done, grid.total), grid.total)
-        grid.develop(integrator, block)
-        yield Band(top, min(grid.rows, grid.height - top), sensor.film())
+        for layer, (names, block) in enumerate(zip(layers.names, blocks)):
+            grid.develop(names, block)
+            yield Band(top, min(grid.rows, grid.height - top), sensor.film(), layer)
 
 
 def _whole(scene, sensor, spp, seed, on_strip) -> Band:
@@ -159,10 +172,10 @@ def _evaluate(block):
     dr.eval(block.tensor())
 
 
-def _trace(scene, sensor, grid: _Grid, base, seed, top, first, count, start):
+def _trace(scene, sensor, layers: Layers, grid: _Grid, base, seed, top, first, count, start):
     """Trace samples ``first``, ..., of which those before ``start`` are of no account: where they lie in the block of
-    the band at ``top``, their values and who counts. Follows ``SamplingIntegrator::render_sample`` of Mitsuba 3.9,
-    operation by operation."""
+    the band at ``top``, who counts, and an iterator over their values in each layer. Follows
+    ``SamplingIntegrator::render_sample`` of Mitsuba 3.9, operation by operation."""
     import drjit as dr
     import mitsuba as mi
 
@@ -188,15 +201,23 @@ def _trace(scene, sensor, grid: _Grid, base, seed, top, first, count, start):
     ray, weight = sensor.sample_ray_differential(moment, 0, relative, aperture, active)
     if ray.has_differentials:
         ray.scale_differential(mi.Float(np.float32(1) / np.sqrt(np.float32(spp))))
-    radiance, valid, aovs = scene.integrator().sample(scene, sampler, ray, sensor.get_medium(), active)
-    radiance = mi.Spectrum(radiance) * weight
-    color = [radiance.x] * 3 if mi.is_monochromatic else [radiance.x, radiance.y, radiance.z]
-    alpha = [dr.select(valid, mi.Float(1), 0)] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+    found = layers.sample(scene, sampler, ray, sensor.get_medium(), active)
     # With a box filter the pixel itself, as its samples may be rounded up into the next.
     where = mi.Point2f(pixel) if film.rfilter().is_box_filter() else mi.Point2f(position)
     if grid.divided:
         where -= mi.Vector2f(mi.Vector2i(film.crop_offset()) + mi.Vector2i(0, dr.opaque(mi.Int32, top)))
-    return where, [*color, *alpha, mi.Float(1), *aovs], active
+    return where, active, (_values(film, weight, *of_layer) for of_layer in found)
+
+
+def _values(film, weight, radiance, valid, aovs) -> list:
+    """What is added to a film's block for each sample."""
+    import drjit as dr
+    import mitsuba as mi
+
+    radiance = mi.Spectrum(radiance) * weight
+    color = [radiance.x] * 3 if mi.is_monochromatic else [radiance.x, radiance.y, radiance.z]
+    alpha = [dr.select(valid, mi.Float(1), 0)] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+    return [*color, *alpha, mi.Float(1), *aovs]
 
 
 class _Grid:
@@ -223,33 +244,35 @@ class _Grid:
             first, last = 0, self.height + 2 * self.border
         return first * self.width * self.spp, last * self.width * self.spp
 
-    def block(self, integrator):
+    def block(self, aov_names: list[str]):
         """What the samples of a band are added to."""
         with self._cropped():
-            self.film.prepare(integrator.aov_names())
+            self.film.prepare(aov_names)
             block = self.film.create_block()
             block.set_offset(self.film.crop_offset())
         block.set_coalesce(block.coalesce() and self.spp >= 4)
         return block
 
     @contextmanager
-    def as_whole(self, block):
-        """Add samples to ``block`` in the way in which Dr.Jit would add them to the whole picture, which is another for
-        more than a million values (`dr.set_expand_threshold`) and rounds differently."""
+    def as_whole(self, block, layers: Layers):
+        """Add samples to ``block``, that of the first of ``layers``, and to the others, in the way in which Dr.Jit
+        would add them to the whole picture, which is another for more than a million values
+        (`dr.set_expand_threshold`) and rounds differently."""
         import drjit as dr
 
         threshold = dr.expand_threshold()
-        if self.size[0] * self.size[1] * block.channel_count() > threshold:
+        channels = block.channel_count() - len(layers.names[0]) + layers.count
+        if self.size[0] * self.size[1] * channels > threshold:
             dr.set_expand_threshold(0)
         try:
             yield
         finally:
             dr.set_expand_threshold(threshold)
 
-    def develop(self, integrator, block) -> None:
+    def develop(self, aov_names: list[str], block) -> None:
         """Let the film hold what is in ``block``."""
         with self._cropped():
-            self.film.prepare(integrator.aov_names())
+            self.film.prepare(aov_names)
             self.film.put_block(block)
 
     @contextmanager
