@@ -207,6 +207,7 @@ from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.shading import Shading
 
 from . import nerg_aovs, nerg_properties
+from .nerg_asked import Asked
 from .nerg_pixel import Pixel
 
 __doc__ = nerg_properties.complete(__doc__ or "").replace("{aovs}", nerg_aovs.manual())
@@ -245,8 +246,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self._sensors = None
 
     def aov_names(self):
-        own = [f"{name}.{c}" for name in self.aovs for c in nerg_aovs.AOVS[name].channels_of(self.medium)]
-        return own + self.shading.aov_names()
+        return nerg_aovs.channel_names(self.aovs, self.medium) + self.shading.aov_names()
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
@@ -262,7 +262,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     @contextmanager
     def seen_by(self, sensor, scene):
         """While this is open the rays that ``sample`` is given come from ``sensor``."""
-        self._check_place(scene)
+        self.check_place(scene)
         if 0 in sensor.film().crop_size():
             raise NergError("the film's crop window is empty; give it a crop_width and a crop_height of at least 1")
         self._sensors = [sensor]
@@ -284,13 +284,17 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         if self._sensors is None:
-            self._check_place(scene)
+            self.check_place(scene)
         active = mi.Bool(active)
         offset = sampler.next_1d(active) if self.jitter else None
         pixel = Pixel(self, scene, self._sensors or scene.sensors(), ray, active, offset)
         aovs = nerg_aovs.compute(self.aovs, pixel)
         L, shown, nested = pixel.radiance(scene, sampler, medium)
         return dr.select(active, L, 0), shown, aovs + nested
+
+    def asked(self, aovs, radiance: bool) -> Asked:
+        """This integrator asked for other AOVs, and for colour or not."""
+        return Asked(self, aovs, radiance)
 
     @property
     def children(self):
@@ -321,7 +325,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         if not dr.all(self.falloff >= 0):
             raise NergError(f'"falloff" must not be negative, got {self.falloff}')
 
-    def _check_place(self, scene):
+    def check_place(self, scene):
         if self.medium is None and len(scene.shapes()) == 0:
             raise NergError('there is nothing to render: give "nerg" a "field" or a "density", or the scene shapes')
 

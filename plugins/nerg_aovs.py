@@ -47,6 +47,8 @@ class Aov:
     summary: str
     # A Float for each channel.
     compute: Callable[[Pixel], list]
+    # Whether it depends on where the observer is: what does not is computed once for several of them.
+    of_observer: bool = False
     # In the order in which they are checked.
     needs: tuple[Need, ...] = ()
     # What has to be prepared for it, see ``Pixel``.
@@ -88,6 +90,7 @@ AOVS: dict[str, Aov] = {
             name="gaze",
             summary="density in 1/sr of the observer attending this surface, after occlusion",
             compute=lambda p: [p.attention.gaze],
+            of_observer=True,
             needs=(GAZE,),
             demands=_GAZE,
         ),
@@ -95,6 +98,7 @@ AOVS: dict[str, Aov] = {
             name="emit",
             summary="what the surface attracts, after its activation; 1 for a variant that lacks it",
             compute=lambda p: [p.attention.emit],
+            of_observer=True,
             needs=(GAZE,),
             demands=_FACTORS,
         ),
@@ -102,6 +106,7 @@ AOVS: dict[str, Aov] = {
             name="capture",
             summary="what the observer gives, after its activation; 1 for a variant that lacks it",
             compute=lambda p: [p.attention.capture],
+            of_observer=True,
             needs=(GAZE,),
             demands=_FACTORS,
         ),
@@ -109,6 +114,7 @@ AOVS: dict[str, Aov] = {
             name="gaze_std",
             summary="standard deviation of ``gaze`` over the members of an ensemble, in 1/sr, after occlusion",
             compute=lambda p: [p.attention.spread],
+            of_observer=True,
             needs=(GAZE, MEMBERS),
             demands=frozenset({"gaze", "spread"}),
         ),
@@ -117,6 +123,7 @@ AOVS: dict[str, Aov] = {
             summary="how many training rays started around the observer, one at distance d counting 1 - d²/R² (R of "
             "the training); one number an observer, shown where there is a surface",
             compute=lambda p: [p.view_of_observer("support")],
+            of_observer=True,
             needs=(GAZE, SUPPORT),
         ),
         Aov(
@@ -124,18 +131,21 @@ AOVS: dict[str, Aov] = {
             summary="density in 1/sr of the tracked rays nearest to the observer, towards this surface, after "
             "occlusion",
             compute=lambda p: [p.view_of_observer("kde")],
+            of_observer=True,
             needs=(KDE,),
         ),
         Aov(
             name="visibility",
             summary="1 visible to the observer .. 0 hidden",
             compute=lambda p: [dr.select(p.surface, p.sight.visibility, 0)],
+            of_observer=True,
         ),
         Aov(
             name="observer_depth",
             channels="T",
             summary=":math:`d_o`; the distance to the surface where no occlusion is computed",
             compute=lambda p: [dr.select(p.surface, p.sight.depth, 0)],
+            of_observer=True,
         ),
         Aov(
             name="features",
@@ -156,6 +166,7 @@ AOVS: dict[str, Aov] = {
             name="density_evals",
             summary="evaluations of density made for the pixel",
             compute=lambda p: [p.density_evaluations()],
+            of_observer=True,
             demands=_COUNTS,
         ),
         Aov(
@@ -168,6 +179,7 @@ AOVS: dict[str, Aov] = {
             name="gaze_evals",
             summary="evaluations of gaze networks made for the pixel",
             compute=lambda p: [p.attention.evaluations],
+            of_observer=True,
             needs=(GAZE,),
             demands=_GAZE,
         ),
@@ -193,6 +205,11 @@ def read_aovs(value: str, nerg) -> list[str]:
 def demands_of(names: Iterable[str]) -> frozenset[str]:
     """What has to be prepared for these AOVs."""
     return frozenset().union(*(AOVS[name].demands for name in names))
+
+
+def channel_names(names: Iterable[str], medium) -> list[str]:
+    """The names of all channels of these AOVs, in their order."""
+    return [f"{name}.{channel}" for name in names for channel in AOVS[name].channels_of(medium)]
 
 
 def compute(names: list[str], pixel: Pixel) -> list:

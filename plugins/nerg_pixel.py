@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -17,6 +18,9 @@ from nerg_mi.transport.observer.gaze import ObservedGaze
 from nerg_mi.transport.observer.sight import Sight, trace_sight
 from nerg_mi.transport.observer.views import view_along
 from nerg_mi.transport.place import Place
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,20 @@ class Pixel:
             self.color = mi.Color3f(painted[:3]) if self.lit else None
             self.accumulated_features = [dr.select(active, f, 0) for f in painted[3 * self.lit :]]
         self.some = active & (self.view.opacity > 0)
-        self._evaluations = []
+        self._evaluations: list = []
+        self.cache = nerg.cache
+
+    def for_observer(self, p_o, observers: list, aligned: bool, cache) -> Self:
+        """The same ray for another observer at ``p_o`` (Point3f), one of ``observers``, of whom ``cache`` knows; what
+        does not depend on the observer is found once. ``aligned``: they stand where the camera does."""
+        # What observers have in common is found before it is copied.
+        _ = self.depth, self.surface, self.p_d, self.penetration
+        other = copy(self)
+        for name in ("distance_and_direction", "sight", "gaze", "attention"):
+            other.__dict__.pop(name, None)
+        other.p_o, other.observers, other.aligned, other.cache = p_o, observers, aligned, cache
+        other._evaluations = []
+        return other
 
     @cached_property
     def depth(self):
@@ -77,6 +94,11 @@ class Pixel:
     def p_d(self):
         """The surface, wherever there is one."""
         return self.ray.o + self.ray.d * self.depth
+
+    @cached_property
+    def penetration(self):
+        """How far light goes into the matter before the surface."""
+        return self.view.penetration(self.nerg.observer_settings.depth, self.depth)
 
     @cached_property
     def observers(self) -> list:
@@ -113,19 +135,18 @@ class Pixel:
         nerg = self.nerg
         if not nerg.occlusion or self.aligned:
             return Sight(self.p_d, self.distance_and_direction[0], mi.Float(1), mi.Float(0))
-        penetration = self.view.penetration(nerg.observer_settings.depth, self.depth)
         sight = trace_sight(
             self.place,
             self.ray,
             self.p_d,
             self.p_o,
-            penetration,
+            self.penetration,
             self.surface,
             nerg.falloff,
             nerg.observer_settings,
             count=self.counting,
             gaze=self.gaze if self._may_look_gaze_up else None,
-            cache=nerg.cache,
+            cache=self.cache,
         )
         if sight.density_evals is not None:
             self._evaluations.append(sight.density_evals)
@@ -134,7 +155,7 @@ class Pixel:
     @cached_property
     def gaze(self) -> ObservedGaze:
         """The gaze field for the observers."""
-        return self.nerg.gaze.at(self.observers, self.place, self.nerg.observer_settings, self.nerg.cache)
+        return self.nerg.gaze.at(self.observers, self.place, self.nerg.observer_settings, self.cache)
 
     @property
     def _may_look_gaze_up(self) -> bool:
@@ -176,7 +197,7 @@ class Pixel:
     def view_of_observer(self, name: str):
         """The observer's view of this name on the surface, 0 elsewhere."""
         view = self.nerg.views[name]
-        value = view_along(view, self.observers, self.p_o, self.r_o, self.nerg.cache)
+        value = view_along(view, self.observers, self.p_o, self.r_o, self.cache)
         return dr.select(self.surface, value * self.sight.visibility if view.occluded else value, 0)
 
     def radiance(self, scene, sampler, medium) -> tuple:

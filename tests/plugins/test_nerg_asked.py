@@ -1,0 +1,111 @@
+"""The integrator asked for other AOVs, along any rays, and for several observers of the same rays."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.transport.place import Place
+
+EYES = [(0.3, -3, 0.4), (2.5, -1, 0.5), (-1.5, -2.0, 1.0)]
+
+
+@pytest.fixture
+def scene(rgb, files):
+    field = {"type": "nerf", "filename": str(files / "field.safetensors")}
+    gaze = {"type": "gazefield", "filename": str(files / "gaze.safetensors")}
+    return rgb.load_dict({"type": "scene", "integrator": {"type": "nerg", "field": field, "gaze": gaze}})
+
+
+@pytest.fixture
+def ray(rgb):
+    o, d = np.float32([(0, -3, 0), (0.2, -3, 0.3)]), np.float32([(0, 1, 0), (0, 1, -0.1)])
+    return rgb.RayDifferential3f(rgb.Point3f(o.T.copy()), dr.normalize(rgb.Vector3f(d.T.copy())))
+
+
+def sampler(mi):
+    made = mi.load_dict({"type": "independent"})
+    made.seed(0, 2)
+    return made
+
+
+def test01_what_depends_on_the_observer(scene):
+    asked = scene.integrator().asked(["depth", "gaze", "position", "visibility"], True)
+    assert asked.shared == ["depth", "position"] and asked.own == ["gaze", "visibility"]
+    assert asked.channels(asked.shared) == ["depth.T", "position.X", "position.Y", "position.Z"]
+    # All else is the integrator's, which is left as it was.
+    assert asked.settings is scene.integrator().settings
+    assert scene.integrator().aov_names() == ["depth.T", "opacity.Y"]
+
+
+@pytest.mark.parametrize(
+    "aovs, said",
+    [(["gazes"], 'does not know "gazes"'), (["kde"], 'needs a "kde" volume'), (["gaze_std"], "several members")],
+)
+def test02_what_cannot_be_computed(scene, aovs, said):
+    with pytest.raises(NergError, match=said):
+        scene.integrator().asked(aovs, False)
+
+
+def test03_the_values_of_a_render(rgb, scene, ray):
+    integrator = scene.integrator()
+    asked = integrator.asked(["depth", "gaze", "visibility", "gaze_evals"], False)
+    pixel = asked.pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
+    pixel.settle()
+    for eye in EYES:
+        found = asked.watcher(eye).pixel(pixel).channels(["gaze", "visibility", "gaze_evals"])
+        field, gaze = integrator.children["field"], integrator.children["gaze"]
+        observer = {"type": "perspective", "to_world": rgb.ScalarTransform4f().translate(list(eye))}
+        alone = rgb.load_dict(
+            {"type": "nerg", "field": field, "gaze": gaze, "observer": observer, "aovs": "gaze,visibility,gaze_evals"}
+        )
+        expected = alone.sample(scene, sampler(rgb), ray)[2]
+        for mine, theirs in zip(found, expected):
+            assert np.array_equal(np.array(mine), np.array(theirs))
+
+
+def test04_the_cameras_ray_is_traced_once(rgb, scene, ray, monkeypatch):
+    traced, trace = [], Place.trace
+    monkeypatch.setattr(Place, "trace", lambda *a, **k: traced.append(1) or trace(*a, **k))
+    asked = scene.integrator().asked(["depth", "gaze", "visibility"], False)
+    pixel = asked.pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
+    for eye in EYES:
+        asked.watcher(eye).pixel(pixel).channels(["gaze", "visibility"])
+    assert len(traced) == 1 + len(EYES)
+
+
+def test05_kernels_are_those_of_one_observer(rgb, scene, ray):
+    asked = scene.integrator().asked(["depth", "gaze", "visibility"], False)
+    pixel = asked.pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
+    pixel.settle()
+    kernels = []
+    for eye in EYES:
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+            dr.kernel_history_clear()
+            dr.eval(asked.watcher(eye).pixel(pixel).channels(["gaze", "visibility"]))
+            kernels.append({k["hash"] for k in dr.kernel_history() if "hash" in k})
+    assert kernels[0] and kernels[0] == kernels[1] == kernels[2]
+
+
+def test06_an_observer_where_the_camera_stands(rgb, scene):
+    camera = rgb.load_dict(
+        {"type": "perspective", "to_world": rgb.ScalarTransform4f().look_at([0, -3, 0], [0, 0, 0], [0, 0, 1])}
+    )
+    ray, _ = camera.sample_ray_differential(0, 0, rgb.Point2f([0.4, 0.5], [0.5, 0.6]), rgb.Point2f(0.5))
+    asked = scene.integrator().asked(["gaze", "visibility", "density_evals"], False)
+    pixel = asked.pixel(scene, [camera], sampler(rgb), ray, rgb.Bool(True))
+    there, elsewhere = (asked.watcher(eye).pixel(pixel) for eye in ((0, -3, 0), EYES[1]))
+    assert there.aligned and not elsewhere.aligned
+    # For the others a second march decides what they see.
+    evaluations = lambda pixel: np.array(pixel.channels(["visibility", "density_evals"])[1])
+    assert np.all(evaluations(there) < evaluations(elsewhere))
+    own = pixel.for_origins()
+    assert own.aligned and np.allclose(
+        np.array(own.channels(["gaze"])[0]), np.array(there.channels(["gaze"])[0]), rtol=1e-3
+    )
+
+
+def test07_nothing_to_see(rgb, ray):
+    scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}})
+    with pytest.raises(NergError, match="nothing to render"):
+        scene.integrator().asked(["depth"], False).pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
