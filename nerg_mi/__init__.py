@@ -1,7 +1,17 @@
 """Neural radiance and gaze fields for Mitsuba 3.
 
+    import nerg_mi as nerg
+
+    scene = nerg.make_scene("store.safetensors", "shoppers.safetensors", camera=nerg.Camera((7, 3, 2), (5, 4, 1)))
+    pictures = nerg.render(scene, observers=[(4.4, 2.8, 1.6)])
+
+`docs/python.md` leads through what can be done; every name of `__all__` has an example in its docstring. A Mitsuba
+variant that is set stays set; where none is, the first call that needs one sets ``cuda_ad_rgb`` if it works and
+``llvm_ad_rgb`` otherwise.
+
 Importing this package makes its plugins available to Mitsuba: before or after `import mitsuba`, before or after
-`mi.set_variant`, and again after every change of variant. Mitsuba itself is not imported, so that this stays cheap.
+`mi.set_variant`, and again after every change of variant. Neither Mitsuba nor NumPy is imported, and a name of the API
+only once it is used, so that this stays cheap.
 
 Where the libLLVM that Dr.Jit would load is one on which it aborts the process, importing Dr.Jit or Mitsuba after this
 package raises `nerg_mi.errors.UnusableLLVM`, an `ImportError`; where Dr.Jit is loaded already, importing this package
@@ -9,12 +19,89 @@ does. Everything else works there, the command `nerg doctor` first of all.
 """
 
 from pathlib import Path as _Path
+from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from . import checkout as _checkout
 from . import llvm as _llvm
 from . import registration as _registration
 
+if _TYPE_CHECKING:
+    from .api.attention import attention
+    from .api.camera import Camera
+    from .api.evaluation import ablate, evaluate_gaze, evaluate_radiance, study
+    from .api.fields import load_field, load_gaze, load_rays
+    from .api.pictures import render
+    from .api.queries import observe, trace
+    from .api.scene import Scene, make_scene
+    from .api.tracking import import_rays
+    from .api.training import train_gaze, train_radiance
+    from .errors import NergError
+    from .rays.rays import Rays
+
 __version__ = "0.1.0"
+
+_WHERE = {
+    "Camera": "api.camera",
+    "NergError": "errors",
+    "Rays": "rays.rays",
+    "Scene": "api.scene",
+    "ablate": "api.evaluation",
+    "attention": "api.attention",
+    "evaluate_gaze": "api.evaluation",
+    "evaluate_radiance": "api.evaluation",
+    "import_rays": "api.tracking",
+    "load_field": "api.fields",
+    "load_gaze": "api.fields",
+    "load_rays": "api.fields",
+    "make_scene": "api.scene",
+    "observe": "api.queries",
+    "render": "api.pictures",
+    "study": "api.evaluation",
+    "trace": "api.queries",
+    "train_gaze": "api.training",
+    "train_radiance": "api.training",
+}
+"""The public names, and the module of each."""
+
+__all__ = [
+    "Camera",
+    "NergError",
+    "Rays",
+    "Scene",
+    "ablate",
+    "attention",
+    "evaluate_gaze",
+    "evaluate_radiance",
+    "import_rays",
+    "load_field",
+    "load_gaze",
+    "load_rays",
+    "make_scene",
+    "observe",
+    "render",
+    "study",
+    "trace",
+    "train_gaze",
+    "train_radiance",
+]
+
+
+def __getattr__(name: str) -> object:
+    """A public name, whose module is imported when it is first asked for."""
+    if name not in _WHERE:
+        import sys
+
+        raise AttributeError(f'module "{__name__}" has no attribute "{name}"', name=name, obj=sys.modules[__name__])
+    from importlib import import_module
+
+    value = getattr(import_module(f".{_WHERE[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*__all__, "__version__", *(name for name in globals() if name.startswith("__"))})
+
 
 _checkout.find_folders(__name__, _Path(__file__).resolve().parent)
 _llvm.prepare()

@@ -12,6 +12,13 @@ class NergError(ValueError):
     """Something the user can put right. The message is one sentence: the thing that is wrong, and the remedy.
 
     The command `nerg` prints it without a traceback and ends with exit code 1.
+
+    >>> import nerg_mi as nerg
+    >>> try:
+    ...     nerg.load_field("nowhere.safetensors")
+    ... except nerg.NergError as error:
+    ...     print(error)
+    the checkpoint "nowhere.safetensors" does not exist: correct its name, or make one with "nerg train"
     """
 
 

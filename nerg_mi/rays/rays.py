@@ -28,6 +28,12 @@ class Rays:
 
     Raises `NergError` naming the first offending ray for NaN, zero or non-unit directions, non-finite origins or times,
     and persons out of range; ``ValueError`` for arrays of different lengths.
+
+    >>> import nerg_mi as nerg
+    >>> eye, ahead = [[1.0, 1.0, 1.6], [1.0, 1.0, 1.6]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    >>> rays = nerg.Rays([0.0, 0.1], [0, 0], ("Ada",), origin=eye, direction=ahead, confidence=[1.0, 1.0])
+    >>> len(rays.select(rays.t > 0))
+    1
     """
 
     t: np.ndarray  # (N,) seconds, on any clock

@@ -1,0 +1,160 @@
+"""Attention on things: the share of observers' gaze that lands on a box, a mesh or a shape of the scene."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.jobs.reporter import SILENT, Reporter
+
+from . import arrays
+from .arrays import Floats
+from .observed import ObserverOf
+from .queries import given_observers
+from .scene import Scene
+from .shapes import MESHES, box_dict, mesh_dict
+from .variant import active_mitsuba
+
+PIECE = 4
+"""A piece of a surface is so many times shorter than its distance from the nearest observer."""
+
+MOST = 32
+"""A triangle is cut into so many parts a side at most, unless more are asked for."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Attention:
+    """Attention that a surface, cut into K flat pieces, receives from M observers.
+
+    ``share`` (M,): of each observer's gaze, the integral of the density over the directions in which the surface is
+    seen: a probability where the gaze field integrates to one, as normalised fields do. ``density`` (M, K): the same in
+    area form, in 1 / square scene unit; times ``area`` (K,) it adds up to ``share``. ``points``, ``normals`` (K, 3):
+    centres of the pieces and their outward unit normals. ``observers`` (M, 3).
+    """
+
+    share: Floats
+    density: Floats
+    points: Floats
+    normals: Floats
+    area: Floats
+    observers: Floats
+
+    @property
+    def mean(self) -> float:
+        """Mean share over the observers."""
+        return float(np.mean(self.share, dtype=np.float64))
+
+    def __repr__(self) -> str:
+        return (
+            f"<Attention: mean share {self.mean:.4g} of {len(self.observers)} observers "
+            f"on {float(self.area.sum()):.4g} square units in {len(self.area):,} pieces>"
+        )
+
+
+def attention(
+    scene: Scene,
+    surface: ArrayLike | os.PathLike[str] | str | Mapping[str, Any] | object,
+    observers: ArrayLike | None = None,
+    *,
+    divisions: int | None = None,
+    two_sided: bool = False,
+    reporter: Reporter = SILENT,
+) -> Attention:
+    """How much of their gaze observers give a thing, and where on it.
+
+    ``surface``: a box, as its lower and upper corner (2, 3); the id of a mesh of the scene; a mesh file (.ply, .obj);
+    a dict for ``mi.load_dict``, or a Mitsuba mesh. One that is not of the scene is looked at as if it stood there: the
+    scene hides it, and it hides nothing but its own back. ``observers`` (M, 3), or None for the scene's own.
+    ``divisions``: each triangle is cut into so many parts a side, whose centres stand for them; None: so many that
+    pieces are no longer than a quarter of the distance to the nearest observer, which is right to some thousandths, and
+    32 at most. ``two_sided``: count both sides of an open surface; otherwise the one
+    whose vertices run counter-clockwise. Raises `NergError`.
+
+    >>> import nerg_mi as nerg
+    >>> from importlib.resources import files
+    >>> store = files("nerg_mi.scenes.store")
+    >>> scene = nerg.make_scene(store / "store.safetensors", store / "shoppers.safetensors", falloff=0.05)
+    >>> box = [(4.4, 4.65, 0), (4.9, 5.0, 1.45)]
+    >>> seen = nerg.attention(scene, box, observers=[(4.4, 2.8, 1.6), (6.3, 3.0, 1.6)], divisions=2)
+    >>> seen.share.shape, seen.density.shape, bool((seen.share >= 0).all() and (seen.share < 1).all())
+    ((2,), (2, 48), True)
+    """
+    import drjit as dr
+
+    from nerg_mi.density.received import arriving, patches
+
+    active_mitsuba()
+    if not scene.has_gaze:
+        raise NergError("attention needs a gaze field; give make_scene gaze=")
+    whole = isinstance(divisions, (int, np.integer)) and not isinstance(divisions, bool)
+    if not (divisions is None or (whole and 1 <= divisions <= 4096)):
+        raise NergError(f"divisions must be a whole number from 1 to 4,096, got {divisions!r}")
+    eyes = given_observers(scene, observers)
+    each = []
+    with mitsuba_says(), dr.suspend_grad():
+        mesh = _mesh(scene, surface)
+        pieces = patches(mesh, _enough_divisions(mesh, eyes) if divisions is None else int(divisions))
+        area = np.array(pieces.area, np.float32)
+        i = scene.integrator
+        for number, eye in enumerate(eyes):
+            observer = ObserverOf(scene, eye)
+            found = arriving(
+                observer.place,
+                observer.density,
+                observer.center,
+                pieces.p,
+                pieces.n,
+                i.falloff,
+                i.observer_settings,
+                two_sided,
+            )
+            each.append(np.array(found, np.float32))
+            reporter.progress((number + 1) / len(eyes), f"observer {number + 1} of {len(eyes)}")
+        where, normals = (np.ascontiguousarray(np.array(v, np.float32).T) for v in (pieces.p, pieces.n))
+    density = np.stack(each)
+    share = (density.astype(np.float64) @ area.astype(np.float64)).astype(np.float32)
+    return Attention(share, density, where, normals, area, eyes)
+
+
+def _enough_divisions(mesh: Any, eyes: Floats) -> int:
+    """A power of two, so that meshes of different sizes have kernels in common."""
+    import mitsuba as mi
+
+    params: Any = mi.traverse(mesh)
+    if "vertex_positions" not in params or "faces" not in params:
+        return 1  # no mesh, as will be said
+    corners = np.reshape(params["vertex_positions"], (-1, 3))[np.reshape(params["faces"], (-1, 3))]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+    beside = np.maximum(np.maximum(corners.min((0, 1)) - eyes, eyes - corners.max((0, 1))), 0)
+    nearest = np.linalg.norm(beside, axis=1).min()
+    wanted = PIECE * longest / nearest if nearest > 0 else np.inf
+    return int(2 ** np.ceil(np.log2(np.clip(wanted, 1, MOST))))
+
+
+def _mesh(scene: Scene, surface: object) -> Any:
+    """``surface`` as a Mitsuba mesh."""
+    import mitsuba as mi
+
+    if isinstance(surface, str) and Path(surface).suffix.lower() not in MESHES:
+        by_id = {shape.id(): shape for shape in scene.mitsuba.shapes()}
+        if surface not in by_id:
+            known = f"it has {', '.join(by_id)}" if by_id else "it has none"
+            raise NergError(f'the scene has no shape "{surface}"; {known}')
+        return by_id[surface]
+    if isinstance(surface, (str, os.PathLike)):
+        surface = mesh_dict(surface)
+    if isinstance(surface, mi.Object):
+        return surface
+    if isinstance(surface, Mapping):
+        return mi.load_dict(dict(surface))
+    corners = arrays.points(surface, "the corners of a box")  # type: ignore[arg-type]
+    if len(corners) != 2 or not np.all(corners[0] < corners[1]):
+        raise NergError(f"a box is a lower corner and an upper one, got {corners.tolist()}")
+    return mi.load_dict(box_dict(*corners.astype(np.float64)))

@@ -1,0 +1,86 @@
+"""Shapes as a user has them (files, dicts, scenes, objects), as children of a Mitsuba scene."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError, mitsuba_says
+
+MESHES = {".ply": "ply", ".obj": "obj"}
+"""Suffixes of mesh files, and Mitsuba's plugins that read them."""
+
+
+def mesh_dict(path: str | os.PathLike[str]) -> dict:
+    """The mesh file ``path`` as Mitsuba takes it, in grey and seen from both sides. Raises `NergError` for a file that
+    is missing or damaged."""
+    from nerg_mi.rendering.mesh_file import check_obj, check_ply
+
+    path = Path(path)
+    kind = MESHES.get(path.suffix.lower())
+    if kind is None:
+        raise NergError(f'"{path}" is no mesh file; give one that ends in {" or ".join(MESHES)}')
+    if not path.is_file():
+        raise NergError(f'there is no mesh file "{path}"; correct its name')
+    (check_ply if kind == "ply" else check_obj)(path)
+    grey = {"type": "twosided", "bsdf": {"type": "diffuse"}}
+    return {"type": kind, "filename": str(path), "bsdf": grey}
+
+
+def box_dict(lower: np.ndarray, upper: np.ndarray) -> dict:
+    """The box between two corners as a mesh that Mitsuba takes; a variant must be set."""
+    import mitsuba as mi
+
+    center, half = (lower + upper) / 2, (upper - lower) / 2
+    return {"type": "cube", "to_world": mi.ScalarTransform4d().translate(center.tolist()).scale(half.tolist())}
+
+
+def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
+    """``shapes`` by their names, as a scene's dict takes them; the variant must be active.
+
+    ``shapes``: a mesh file, a scene file, what `mi.load_dict` takes for a shape or a scene, a Mitsuba shape or scene,
+    or several of these in a list or in a dict by name. ``name``: of those that bring none. Raises `NergError` for
+    anything else.
+    """
+    import mitsuba as mi
+
+    if shapes is None:
+        return {}
+    if isinstance(shapes, (str, os.PathLike)):
+        if Path(shapes).suffix.lower() != ".xml":
+            return {name: mesh_dict(shapes)}
+        from nerg_mi.rendering.pictures import load_scene
+
+        return _of_scene(load_scene(Path(shapes)), name)
+    if isinstance(shapes, mi.Scene):
+        return _of_scene(shapes, name)
+    if isinstance(shapes, mi.Object):
+        return {name: shapes}
+    if isinstance(shapes, Mapping):
+        if shapes.get("type") == "scene":
+            with mitsuba_says():
+                return _of_scene(mi.load_dict(dict(shapes), optimize=False), name)
+        if "type" in shapes:
+            return {name: dict(shapes)}
+        named = [scene_children(child, str(key)) for key, child in shapes.items()]
+    elif isinstance(shapes, (list, tuple)):
+        named = [scene_children(child, f"{name}_{i}") for i, child in enumerate(shapes)]
+    else:
+        raise NergError(
+            f"shapes are mesh or scene files, dicts for mi.load_dict or Mitsuba objects, got {type(shapes).__name__}"
+        )
+    return {key: child for children in named for key, child in children.items()}
+
+
+def _of_scene(scene, name: str) -> dict[str, Any]:
+    """Shapes of a scene, and those of its lights that are no shapes."""
+    shapes = list(scene.shapes())
+    found = {shape.id() or f"{name}_{i}": shape for i, shape in enumerate(shapes)}
+    if len(found) < len(shapes):
+        found = {f"{name}_{i}": shape for i, shape in enumerate(shapes)}
+    lights = [light for light in scene.emitters() if not any(s.is_emitter() and s.emitter() is light for s in shapes)]
+    return found | {f"{name}_light_{i}": light for i, light in enumerate(lights)}

@@ -1,0 +1,51 @@
+"""Tracking files in, rays out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+from nerg_mi.jobs.reporter import SILENT, Reporter
+
+if TYPE_CHECKING:
+    from nerg_mi.rays.rays import Rays
+
+    from .fields import FilePath
+
+
+def import_rays(
+    files: FilePath | Sequence[FilePath],
+    reader: str = "table",
+    *,
+    output: FilePath | None = None,
+    reporter: Reporter = SILENT,
+    **options: Any,
+) -> Rays:
+    """Read tracking files as rays of attention: right-handed, z up, metres, seconds.
+
+    ``files``: one or several. ``reader``: the format's name, as for ``nerg rays import --preset``; ``table`` reads any
+    CSV or Parquet table through the option ``columns``. ``output``: rays file to write besides (.npz or .parquet).
+    ``options``: those of the reader, and ``skip_bad_lines``, ``pseudonyms`` and ``salt``
+    (`nerg_mi.jobs.tracking.ImportOptions`). What was dropped, and why, is in the rays'
+    ``metadata``. Raises `NergError`.
+
+    >>> import nerg_mi as nerg
+    >>> _ = (folder / "day.csv").write_text("t,who,x,y,z,dx,dy,dz\\n0.0,Ada,1,1,1.6,1,0,0\\n0.1,Ada,1,1,1.6,0,1,0\\n")
+    >>> columns = "origin=x,y,z direction=dx,dy,dz t=t person=who"
+    >>> rays = nerg.import_rays(folder / "day.csv", columns=columns)
+    >>> len(rays), rays.persons
+    (2, ('Ada',))
+    """
+    from nerg_mi.jobs import tracking
+    from nerg_mi.rays.readers.options import options_of
+    from nerg_mi.rays.readers.registry import make_options, reader_named
+
+    ours = {f.name for f in fields(tracking.ImportOptions)} - {"reader", "settings", "output"}
+    of_job = {name: value for name, value in options.items() if name in ours}
+    parse = {option.name: option.parse for option in options_of(reader_named(reader).Options)}
+    # Values may be written as for the command.
+    read = lambda name, value: parse[name](value) if isinstance(value, str) and parse.get(name) else value
+    of_reader = {name: read(name, value) for name, value in options.items() if name not in ours}
+    job = tracking.ImportOptions(reader=reader, settings=make_options(reader, of_reader), output=output, **of_job)
+    return tracking.import_rays(files, job, reporter).rays

@@ -1,0 +1,81 @@
+"""Trainings: from recordings to fields in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from nerg_mi.jobs.reporter import SILENT, Reporter
+
+from .fields import FilePath, TrainedField
+from .options import options_of
+
+if TYPE_CHECKING:
+    from nerg_mi.field.gaze.protocol import AnyGazeField
+    from nerg_mi.field.radiance import RadianceField
+    from nerg_mi.jobs.options.gaze import GazeOptions
+    from nerg_mi.jobs.radiance import RadianceOptions
+    from nerg_mi.rays.rays import Rays
+
+
+def train_radiance(
+    photos: FilePath,
+    output: FilePath | None = None,
+    *,
+    options: RadianceOptions | None = None,
+    reporter: Reporter = SILENT,
+    **changes: Any,
+) -> TrainedField[RadianceField]:
+    """Train a radiance field on posed photos.
+
+    ``photos``: a folder, its transforms.json, or a COLMAP model. ``output``: checkpoint to write besides
+    (.safetensors), with a preview and, while the training is not done, a state to resume from. ``changes``: options one
+    by one (``minutes=5``, ``size="medium"``, ...) on top of ``options``; `nerg_mi.jobs.radiance.RadianceOptions` says
+    what there is. ``reporter`` is told how it goes (`nerg_mi.jobs.reporter`). What comes back has the error on held-out
+    photos in its ``provenance``. After Ctrl-C it is the result so far, or ``KeyboardInterrupt`` where there is an
+    ``output``, which is written. Raises `NergError`.
+
+    >>> import nerg_mi as nerg
+    >>> field = nerg.train_radiance(photos, steps=2, holdout=0)  # a folder of posed photos
+    >>> field.kind, field.provenance["steps"]
+    ('radiance', 2)
+    """
+    from nerg_mi.jobs import radiance
+
+    job = options_of(radiance.RadianceOptions, "train_radiance", options, changes)
+    result = radiance.train_radiance(photos, output, job, reporter)
+    return TrainedField(result.field, result.provenance, _name(output))
+
+
+def train_gaze(
+    rays: Rays | FilePath | None,
+    output: FilePath | None = None,
+    *,
+    options: GazeOptions | None = None,
+    reporter: Reporter = SILENT,
+    **changes: Any,
+) -> TrainedField[AnyGazeField]:
+    """Train a gaze field on rays of attention, on salience images of posed photos, or on both.
+
+    ``rays``: what `load_rays` or `import_rays` gave, or a file of them; None: salience images alone (``views=``,
+    ``salience=``). Where people looked around is said by one of the options ``field="field.safetensors"``,
+    ``scene="scene.xml"`` and ``geometry="hits"`` or ``"none"``. ``changes``: these and other options one by one
+    (``minutes=5``, ``recipe="small"``, ``test_zones=3``, ...) on top of ``options``;
+    `nerg_mi.jobs.options.gaze.GazeOptions` says what there is. ``output`` and ``reporter``: as for `train_radiance`.
+    What comes back has its scores on held-out positions in its ``provenance``. Raises `NergError`.
+
+    >>> import nerg_mi as nerg
+    >>> gaze = nerg.train_gaze(rays, geometry="none", steps=2, zones=0, probes=8, directions=64)
+    >>> gaze.kind, gaze.provenance["steps"]
+    ('gaze', 2)
+    """
+    from nerg_mi.jobs import gaze
+    from nerg_mi.jobs.options.gaze import GazeOptions
+
+    job = options_of(GazeOptions, "train_gaze", options, changes)
+    result = gaze.train_gaze(rays, output, job, reporter)
+    return TrainedField(result.field, result.provenance, _name(output))
+
+
+def _name(output: FilePath | None) -> str:
+    return "in memory" if output is None else Path(output).name

@@ -1,0 +1,64 @@
+"""Scores from a call: options are passed on to the jobs. That these work is shown by the examples (test_names)."""
+
+from pathlib import Path
+
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.jobs import ablation, evaluation, radiance, study
+from nerg_mi.jobs.options.ablation import AblationOptions
+from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
+
+
+class Asked(Exception):
+    """Ends a job before it begins, with what it was asked."""
+
+
+def raise_it(*arguments):
+    raise Asked(*arguments)
+
+
+@pytest.mark.parametrize(
+    "module, job, call, expected",
+    [
+        (
+            radiance,
+            "evaluate_radiance",
+            lambda: nerg.evaluate_radiance("f.safetensors", "photos", spp=3, pictures="out"),
+            (
+                Path("f.safetensors"),
+                "photos",
+                radiance.RadianceScoreOptions(spp=3, pictures=Path("out"), mode="llvm_ad_rgb"),
+            ),
+        ),
+        (
+            evaluation,
+            "evaluate_gaze",
+            lambda: nerg.evaluate_gaze("g.safetensors", "r.npz", "out", split="pos"),
+            (Path("g.safetensors"), "r.npz", "out", GazeEvaluationOptions(split="pos", mode="llvm_ad_rgb")),
+        ),
+        (
+            ablation,
+            "ablate",
+            lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small"),
+            ("r.npz", "out", AblationOptions(seeds=2, recipes="small", mode="llvm_ad_rgb")),
+        ),
+        (
+            study,
+            "run_study",
+            lambda: nerg.study("slab", "out", quick=True),
+            ("slab", "out", study.StudyOptions(quick=True, mode="llvm_ad_rgb")),
+        ),
+    ],
+)
+def test01_options_reach_the_jobs(monkeypatch, module, job, call, expected):
+    monkeypatch.setattr(module, job, raise_it)
+    with pytest.raises(Asked) as found:
+        call()
+    assert found.value.args[:-1] == expected
+
+
+@pytest.mark.parametrize("name", ["evaluate_radiance", "evaluate_gaze", "ablate", "study"])
+def test02_wrong_options_are_told(name):
+    with pytest.raises(nerg.NergError, match=f'{name} has no option "nothing"'):
+        getattr(nerg, name)("a", "b", nothing=3)
