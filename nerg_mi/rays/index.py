@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +27,9 @@ class RayIndex:
 
         origin = rays.origin if isinstance(rays, Rays) else np.asarray(rays, dtype=np.float64)
         self.count = len(origin)
-        # Without balancing: half the time to build, and as fast to ask.
-        self._tree = KDTree(origin, balanced_tree=False)
+        # Without balancing: half the time to build, and as fast to ask. The order of rays that are equally far depends
+        # on the size of the leaves, and with it the bits of what is made of them.
+        self._tree = KDTree(origin, leafsize=16, balanced_tree=False)
 
     def nearest(self, places: np.ndarray, most: int, radius: float = np.inf) -> Neighbours:
         """The ``most`` nearest rays of each of ``places`` (Q, 3), within ``radius`` metres (those at exactly R
@@ -41,9 +42,10 @@ class RayIndex:
         bound = np.nextafter(radius, np.inf) if np.isfinite(radius) else np.inf
         step = max(1, _BLOCK // most)
         indices, distances, counts = [], [], []
-        query: Any = self._tree.query  # in scipy's stubs it knows of one neighbour only
         for start in range(0, len(places), step):
-            d, i = query(places[start : start + step], k=np.arange(1, most + 1), distance_upper_bound=bound, workers=-1)
+            part = places[start : start + step]
+            answer = self._tree.query(part, k=most, distance_upper_bound=bound, workers=-1)
+            d, i = (np.asarray(v).reshape(len(part), most) for v in answer)
             found = np.isfinite(d)
             indices.append(i[found])
             distances.append(d[found])

@@ -188,12 +188,12 @@ def walking_agreement(rays: Rays, order: np.ndarray | None = None) -> np.ndarray
     """
     order = time_order(rays) if order is None else order
     n, (most, run) = len(rays), _WALKED
-    if n > most:
+    if n <= most:
+        rows = np.arange(n)
+    else:
         first = np.linspace(0, n - run, most // run).astype(np.int64)
         rows = (first[:, None] + np.arange(run)).ravel()
-        order = rows if order is None else order[rows]
-    elif order is None:
-        order = np.arange(n)
+    order = rows if order is None else order[rows]
     t, person = rays.t[order], rays.person[order]
     starts = np.r_[np.flatnonzero(np.r_[True, np.diff(person) != 0]), len(t)]
     later = np.minimum(np.arange(len(t)) + _lag(t, starts), len(t) - 1)

@@ -84,7 +84,8 @@ class Rays:
         _refuse(~np.isfinite(length), "a direction that is not finite", "drop it before building Rays")
         _refuse(length == 0, "a zero direction", "drop it before building Rays")
         _refuse(np.abs(length - 1) > 1e-4, "a direction that is not of unit length", "divide it by its length")
-        _refuse(~np.isfinite(self.origin).all(axis=1), "an origin that is not finite", "drop it before building Rays")
+        nowhere = np.asarray(~np.isfinite(self.origin).all(axis=1))
+        _refuse(nowhere, "an origin that is not finite", "drop it before building Rays")
         _refuse(~np.isfinite(self.t), "a time that is not finite", "drop it before building Rays")
         # Before they become 32 bits wide, in which numbers that are too large would be those of somebody else.
         _refuse(~((self.person >= 0) & (self.person < len(self.persons))), "an unknown person", "extend persons")

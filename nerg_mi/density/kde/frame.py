@@ -65,12 +65,12 @@ def kde_frame(
     """
     if method not in METHODS:
         raise NergError(f'method is "{method}"; it is one of {", ".join(METHODS)}')
-    if (directions is None) == (points is None) or (points is not None and observer is None):
-        raise ValueError("say where the pixels look: either directions, or an observer and points")
     there = None
-    if points is not None:
+    if directions is None and points is not None and observer is not None:
         shape = np.shape(points)[:-1]
         directions, there = directions_to(observer, points)
+    elif directions is None or points is not None:
+        raise ValueError("say where the pixels look: either directions, or an observer and points")
     else:
         directions = np.asarray(directions, np.float32)
         shape = directions.shape[:-1]

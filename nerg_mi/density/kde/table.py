@@ -8,6 +8,7 @@ the probe holds.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -88,7 +89,7 @@ class SphericalKdeTable:
         """Density in ``direction`` (Array3f, unit), in 1/sr: a Float, traced, not evaluated, differentiable."""
         first, (s, t) = self._cell(direction)
         ws, wt = _cubic(s), _cubic(t)
-        total = 0
+        total: Any = 0
         for j in range(4):
             row = 0
             for i in range(4):

@@ -187,19 +187,17 @@ class RaysBuilder:
             "dropped": self._dropped,
             **self._notes,
         }
-        columns: dict[str, Any] = {name: self._column(name) for name in COLUMNS}
+        columns = {name: self._column(name) for name in COLUMNS if any(name in part for part in self._parts)}
         columns["person"], persons = self._persons.sorted(columns["person"])
         cohorts: tuple[str, ...] = ()
-        if columns["cohort"] is not None:
+        if "cohort" in columns:
             columns["cohort"], cohorts = self._cohorts.sorted(columns["cohort"])
             cohorts = tuple(c or "unknown" for c in cohorts)
         return Rays(**columns, persons=persons, cohorts=cohorts, metadata=metadata)
 
-    def _column(self, name: str) -> np.ndarray | None:
-        """A column of all parts; parts without hits or cohorts get NaN or the cohort ""; ``None`` where all are
-        without. The parts' own are let go, so that no more than one column is there twice."""
-        if not any(name in part for part in self._parts):
-            return None
+    def _column(self, name: str) -> np.ndarray:
+        """A column of all parts; those without hits or cohorts get NaN or the cohort "". The parts' own are let go, so
+        that no more than one column is there twice."""
         lacking = {"hit": lambda n: np.full((n, 3), np.nan), "cohort": lambda n: self._cohorts.codes("", n)}
         return np.concatenate(
             [part.pop(name) if name in part else lacking[name](n) for part, n in zip(self._parts, self._kept)]

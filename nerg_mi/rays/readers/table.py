@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -119,12 +119,12 @@ class _Rows:
 
     def __init__(self, columns: ColumnMap, options: TableOptions, valid: Mapping[str, Sequence[str]]) -> None:
         self.columns, self.options, self.valid = columns, options, valid
-        self.by_file = options.person_from == "filename" or columns.person is None
+        self.person = None if options.person_from == "filename" else columns.person
         self.pose_columns = getattr(columns, columns.pose) if columns.pose else ()
         vectors = [c for c in (columns.origin, columns.direction, columns.eye, columns.hit) if c]
         self.numbers = [name for v in vectors for name in v]
         self.numbers += [*self.pose_columns, *(c for c in (columns.t, columns.confidence) if c)]
-        self.texts = [c for c in (None if self.by_file else columns.person, columns.cohort, *valid) if c]
+        self.texts = [c for c in (self.person, columns.cohort, *valid) if c]
 
     def add(self, path: Path, builder: RaysBuilder) -> None:
         """Add the rows of ``path``."""
@@ -143,31 +143,35 @@ class _Rows:
         n = len(block.lines)
         t = value[columns.t] if columns.t else np.arange(before, before + n, dtype=np.float64)
         confidence = value[columns.confidence] if columns.confidence else np.ones(n)
-        origin = vector(columns.origin) if columns.origin else None
-        direction = vector(columns.direction) if columns.direction else None
-        if columns.pose:
-            turn, place = _pose(columns.pose, vector(self.pose_columns), options)
-            origin = place if origin is None else origin
-            if columns.eye:
-                origin = origin + poses.rotate(turn, vector(columns.eye))
-            ahead = poses.axis(options.looks_along, "forward")
-            direction = turn @ ahead if direction is None else poses.rotate(turn, direction)
+        origin, direction = self._geometry(vector)
         drop = {f"confidence below {options.min_confidence:g}": confidence < options.min_confidence}
         for name, words in self.valid.items():
             known = np.isin(np.char.lower(word[name]), [w.lower() for w in words])
             drop[f"{name} is not {' or '.join(words)}"] = ~known
         builder.add(
             t * options.tick,
-            # The column map was found to name these.
-            person_from_filename(path) if self.by_file else word[columns.person],  # pyright: ignore[reportArgumentType]
-            origin,  # pyright: ignore[reportArgumentType]
-            direction,  # pyright: ignore[reportArgumentType]
+            word[self.person] if self.person else person_from_filename(path),
+            origin,
+            direction,
             rows=block.lines,
             confidence=confidence,
             hit=vector(columns.hit) if columns.hit else None,
             cohort=word[columns.cohort] if columns.cohort else None,
             drop=drop,
         )
+
+    def _geometry(self, vector: Callable[[Sequence[str]], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and directions (n, 3) of a block, whose columns ``vector`` stacks."""
+        columns = self.columns
+        if not columns.pose:
+            return vector(columns.origin or ()), vector(columns.direction or ())
+        turn, place = _pose(columns.pose, vector(self.pose_columns), self.options)
+        origin = vector(columns.origin or ()) if place is None else place
+        if columns.eye:
+            origin = origin + poses.rotate(turn, vector(columns.eye))
+        if columns.direction:
+            return origin, poses.rotate(turn, vector(columns.direction))
+        return origin, turn @ poses.axis(self.options.looks_along, "forward")
 
 
 def _pose(kind: str, values: np.ndarray, options: TableOptions) -> tuple[np.ndarray, np.ndarray | None]:

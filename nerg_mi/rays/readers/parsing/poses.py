@@ -54,9 +54,8 @@ def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bo
         raise NergError(f"the up axis and the forward axis are both {up}; say where heads look with forward")
     (side,) = set("xyz") - {up, forward}
     sequence = (up + side + forward).upper()[: angles.shape[1]]
-    return _where(
-        np.isfinite(angles).all(axis=1), angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees)
-    )
+    known = np.asarray(np.isfinite(angles).all(axis=1))
+    return _where(known, angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees))
 
 
 def rotations_from_matrices(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,6 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain, reading, size_of
 from nerg_mi.files.inflating import inflated_limit
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
-from nerg_mi.rays.io import pyarrow_modules
 
 BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
 
@@ -63,33 +62,43 @@ def iterate_table(
     if str(path).lower().endswith(".parquet"):
         yield from _iterate_parquet(path, numbers, texts)
         return
-    columns, separator, count, convert = list(header or ()), ",", 0, None
-    number_at: list[int] = []
-    text_at: list[int] = []
+    count, layout, convert = 0, None, None
     for raw in line_blocks(path, "table", BLOCK):
-        if convert is None:
+        if layout is None:
+            columns, separator = (list(header), ",") if header is not None else _header(path, raw[0])
             if header is None:
-                columns, separator = _header(path, raw[0])
                 raw, count = raw[1:], 1
-            where = {c: i for i, c in reversed(list(enumerate(columns)))}
-            _require(path, [*numbers, *texts], columns)
-            number_at, text_at = [where[c] for c in numbers], [where[c] for c in texts]
-            convert = _fast_reader(separator, columns, number_at, text_at) or (lambda rows: None)
+            layout = _layout(path, separator, columns, numbers, texts)
+            convert = _fast_reader(layout)
         blank = [line.isspace() for line in raw]
         lines = count + 1 + np.flatnonzero(~np.array(blank, dtype=bool))
         kept = raw if len(lines) == len(raw) else [line for line, gone in zip(raw, blank) if not gone]
         count += len(raw)
         if kept:
-            found = convert(kept)
-            block = (
-                TableBlock(*found, lines)
-                if found
-                else _convert(path, kept, lines, separator, columns, number_at, text_at, on_bad)
-            )
+            found = convert(kept) if convert else None
+            block = TableBlock(*found, lines) if found else _convert(path, kept, lines, layout, on_bad)
             if len(block.lines):
                 yield block
-    if convert is None and header is None:
+    if layout is None and header is None:
         _require(path, [*numbers, *texts], [])
+
+
+class _Layout(NamedTuple):
+    """Where in the lines of a CSV the wanted cells stand."""
+
+    separator: str
+    columns: list[str]  # of the file
+    number_at: list[int]  # places among them of the columns of numbers
+    text_at: list[int]  # and of texts
+
+
+def _layout(
+    path: str | os.PathLike, separator: str, columns: list[str], numbers: Sequence[str], texts: Sequence[str]
+) -> _Layout:
+    """Of columns with the same name the first is meant. Raises `NergError` where one is missing."""
+    _require(path, [*numbers, *texts], columns)
+    where = {c: i for i, c in reversed(list(enumerate(columns)))}
+    return _Layout(separator, columns, [where[c] for c in numbers], [where[c] for c in texts])
 
 
 def _header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
@@ -104,9 +113,7 @@ def _header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
         raise NergError(f'the first line of the table "{path}" is no header ({error}); is it a table?') from error
 
 
-def _fast_reader(
-    separator: str, columns: list[str], number_at: list[int], text_at: list[int]
-) -> Callable[[list[str]], tuple[np.ndarray, np.ndarray] | None] | None:
+def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.ndarray] | None] | None:
     """A function of lines that converts them with pyarrow, on all cores; ``None`` without pyarrow.
 
     It gives ``None`` for lines that are in any way unusual (missing cells, words among numbers), which the slower
@@ -117,6 +124,7 @@ def _fast_reader(
         from pyarrow import csv as pc
     except ImportError:
         return None
+    separator, columns, number_at, text_at = layout
     if set(number_at) & set(text_at):  # one column, wanted as both
         return None
     # By place, not by name: names may be given twice.
@@ -151,52 +159,35 @@ def _fast_reader(
 
 
 def _convert(
-    path: str | os.PathLike,
-    rows: list[str],
-    lines: np.ndarray,
-    separator: str,
-    columns: list[str],
-    number_at: list[int],
-    text_at: list[int],
-    on_bad: OnBadLine | None,
+    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: OnBadLine | None
 ) -> TableBlock:
-    # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast
-    # reader refuses them, so they are spelt out first.
-    gap = separator * 2
+    # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast reader refuses them, so they are spelt out
+    # first.
+    gap = layout.separator * 2
     filled = rows
     if any(gap in row for row in rows):
-        filled = [
-            r.replace(gap, f"{separator}nan{separator}").replace(gap, f"{separator}nan{separator}") if gap in r else r
-            for r in rows
-        ]
-    options: dict[str, Any] = dict(delimiter=separator, comments=None, quotechar='"', ndmin=2)
+        spelt = f"{layout.separator}nan{layout.separator}"
+        filled = [r.replace(gap, spelt).replace(gap, spelt) if gap in r else r for r in rows]
+    load = lambda lines, places, kind: np.loadtxt(
+        lines, usecols=places, dtype=kind, delimiter=layout.separator, comments=None, quotechar='"', ndmin=2
+    )
     try:
-        values = np.loadtxt(filled, usecols=number_at, dtype=np.float64, **options)
-        words = (
-            np.loadtxt(rows, usecols=text_at, dtype=str, **options) if text_at else np.empty((len(rows), 0), dtype=str)
-        )
+        values = load(filled, layout.number_at, np.float64)
+        words = load(rows, layout.text_at, str) if layout.text_at else np.empty((len(rows), 0), dtype=str)
     except (ValueError, OverflowError):
-        return _convert_slowly(path, rows, lines, separator, columns, number_at, text_at, on_bad)
+        return _convert_slowly(path, rows, lines, layout, on_bad)
     if len(values) != len(rows) or len(words) != len(rows):  # a quote that is never closed joins lines
-        return _convert_slowly(path, rows, lines, separator, columns, number_at, text_at, on_bad)
+        return _convert_slowly(path, rows, lines, layout, on_bad)
     return TableBlock(values, words, lines)
 
 
 def _convert_slowly(
-    path: str | os.PathLike,
-    rows: list[str],
-    lines: np.ndarray,
-    separator: str,
-    columns: list[str],
-    number_at: list[int],
-    text_at: list[int],
-    on_bad: OnBadLine | None,
+    path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: OnBadLine | None
 ) -> TableBlock:
     """Line by line, cell by cell: knows more spellings of "missing", and names the bad cell."""
     values, words, kept = [], [], []
-    least = max([*number_at, *text_at], default=0)
     for row, line in zip(rows, lines.tolist()):
-        found = _cells(row, separator, columns, number_at, least)
+        found = _cells(row, layout)
         if isinstance(found, str):
             if on_bad is None:
                 raise NergError(f"{path}, line {line}{found}, or leave such lines out with --skip-bad-lines")
@@ -204,38 +195,38 @@ def _convert_slowly(
             continue
         cells, numbers = found
         values.append(numbers)
-        words.append([cells[k].strip() for k in text_at])
+        words.append([cells[k].strip() for k in layout.text_at])
         kept.append(line)
     return TableBlock(
-        np.array(values, np.float64).reshape(len(kept), len(number_at)),
-        np.array(words, dtype=str).reshape(len(kept), len(text_at)),
+        np.array(values, np.float64).reshape(len(kept), len(layout.number_at)),
+        np.array(words, dtype=str).reshape(len(kept), len(layout.text_at)),
         np.array(kept, np.int64),
     )
 
 
-def _cells(
-    row: str, separator: str, columns: list[str], number_at: list[int], least: int
-) -> tuple[list[str], list[float]] | str:
+def _cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | str:
     """The cells of a line and the numbers among them; or what is wrong with it, and the remedy."""
     try:
-        cells = next(csv.reader([row], delimiter=separator), [])
+        cells = next(csv.reader([row], delimiter=layout.separator), [])
     except csv.Error as error:
         return f": it cannot be split into cells ({error}); mend or remove the line"
-    if len(cells) <= least:
-        return f": {len(cells)} cells, the header has {len(columns)}; mend or remove the line"
+    if len(cells) <= max([*layout.number_at, *layout.text_at], default=0):
+        return f": {len(cells)} cells, the header has {len(layout.columns)}; mend or remove the line"
     numbers = []
-    for k in number_at:
+    for k in layout.number_at:
         word = cells[k].strip()
         try:
             numbers.append(np.nan if word.lower() in _MISSING else float(word))
         except ValueError:
-            cell = f"column {plain(columns[k], 40)!r}: {plain(word, 60)!r}"
+            cell = f"column {plain(layout.columns[k], 40)!r}: {plain(word, 60)!r}"
             return f", {cell} is not a number; mend the cell or the column map"
     return cells, numbers
 
 
 def _parquet(path: str | os.PathLike) -> Any:
     """The open Parquet file ``path``; `NergError` for one that is damaged or claims more than its bytes warrant."""
+    from nerg_mi.rays.io import pyarrow_modules
+
     pa, pq = pyarrow_modules()
     size = size_of(path, "table")
     with reading(path, "table", also=(pa.ArrowException,)):
