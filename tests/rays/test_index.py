@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from nerg_mi.rays import index as module
 from nerg_mi.rays.index import RayIndex
@@ -25,3 +26,12 @@ def test_the_rim_counts_and_nonsense_is_refused():
     assert index.nearest([[0, 0, 0]], 5, 0.25).indices.tolist() == [0]
     with pytest.raises(ValueError, match="at least one ray"):
         index.nearest([[0, 0, 0]], 0)
+
+
+def test_rays_that_are_equally_far_keep_their_order():
+    """It decides bits of every training: that of scipy's cKDTree as it is by default."""
+    rng = np.random.default_rng(3)
+    origin = rng.integers(0, 6, (4000, 3)).astype(float)  # on a lattice, many at each place
+    near = RayIndex(origin).nearest(origin[:50], 300)
+    _, indices = cKDTree(origin, balanced_tree=False).query(origin[:50], k=300)
+    assert np.array_equal(near.indices, indices.ravel())
