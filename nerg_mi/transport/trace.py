@@ -91,7 +91,7 @@ def _types(place: Place) -> tuple[ModuleType, type]:
                 return ns, ns.Array3f
     import mitsuba as mi
 
-    return namespace(mi.variant()), mi.Point3f
+    return namespace(mi.Float), mi.Point3f
 
 
 def _trace(place: Place, o: Point3f, d: Vector3f, settings: MarchSettings, kind: str) -> tuple[Float, Float]:

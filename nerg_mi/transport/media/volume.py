@@ -39,7 +39,8 @@ class VolumeMedium:
     def __init__(self, density: mi.Volume, color: mi.Volume | None = None):
         import mitsuba as mi
 
-        self._interaction, self._variant = mi.Interaction3f, mi.variant()
+        # Those of the variant in use: another one may be chosen later on.
+        self._interaction, self._ns = mi.Interaction3f, namespace(mi.Float)
         self._density, self._color = density, color
         self.has_color = color is not None
         box = density.bbox()
@@ -72,7 +73,7 @@ class VolumeMedium:
             self.cells, data = described
             # A step that is longer than a voxel can pass over a sheet.
             self.step = min(self.length_scale / 1024, 0.5 * self.cells.edge)
-            self.bound = bound(data, namespace(self._variant))
+            self.bound = bound(data, self._ns)
         # At the end: what was refused is looked at again.
         self._read = arrays
 
