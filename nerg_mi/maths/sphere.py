@@ -10,6 +10,8 @@ import math
 
 import numpy as np
 
+from .types import Vector3f
+
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
@@ -28,7 +30,7 @@ def fibonacci_directions(count: int) -> np.ndarray:
     return _from_height(z, i * _GOLDEN_ANGLE)
 
 
-def fibonacci_vectors(count: int):
+def fibonacci_vectors(count: int) -> Vector3f:
     """`fibonacci_directions` as a Vector3f of the Mitsuba variant in use, in its precision.
 
     Made by its kernels, since frozen functions take no arrays from NumPy.

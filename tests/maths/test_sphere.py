@@ -19,6 +19,14 @@ def test_fibonacci_is_equal_area():
         sphere.fibonacci_directions(0)
 
 
+@pytest.mark.parametrize("count", [1, 7, 1 << 17])
+def test_the_spiral_of_kernels_is_the_same(rgb, count):
+    ours = np.array(sphere.fibonacci_vectors(count)).reshape(3, count).T
+    # Next to the poles float32 knows the height only so well.
+    assert np.abs(ours - sphere.fibonacci_directions(count)).max() < 5e-5
+    assert np.abs(np.linalg.norm(ours, axis=1) - 1).max() < 1e-6
+
+
 def test_uniform_directions_have_no_preference():
     x = sphere.uniform_directions(100_000, np.random.default_rng(1))
     assert np.abs(x.mean(axis=0)).max() < 0.01

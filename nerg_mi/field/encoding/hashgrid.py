@@ -18,6 +18,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.backend import namespace
+from nerg_mi.maths.types import Array3f, Bool, Float
 
 from .protocol import Encoding, EncodingConfig
 from .registry import DEFAULT_KIND, register
@@ -129,7 +130,7 @@ class HashGrid(Encoding):
         stride = int(np.ceil(self._scales[level])) + 2
         return stride**self.config.dimensions > self._rows[level]
 
-    def __call__(self, p: Any, active: Any = True) -> list:
+    def __call__(self, p: Array3f, active: Bool = True) -> list[Float]:
         """Features at ``p`` (Array3f in the unit cube, or Array2f): ``levels * features`` Floats, zero outside."""
         p, inside = self._clamped(p, active)
         out = []
@@ -137,7 +138,7 @@ class HashGrid(Encoding):
             out += self._level(level, p, inside)
         return out
 
-    def evaluated(self, p: Any, active: Any = True) -> list:
+    def evaluated(self, p: Array3f, active: Bool = True) -> list[Float]:
         """The same features, evaluated one level after another: the rows of one level stay in the caches.
 
         Worth it for many scattered points whose features are to be kept in memory anyhow.

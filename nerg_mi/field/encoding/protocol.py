@@ -18,6 +18,8 @@ from typing import Any, ClassVar, Protocol
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.types import Array3f, Bool, Float
+
 
 class EncodingConfig(Protocol):
     """Sizes of an encoding: a frozen dataclass of JSON values, whose constructor raises ``ValueError`` for wrong ones.
@@ -76,14 +78,14 @@ class Encoding(Protocol):
         """An untrained encoding of backend ``ns``; equal states of ``rng`` give equal parameters."""
         ...
 
-    def __call__(self, p: Any, active: Any = True) -> list:
+    def __call__(self, p: Array3f, active: Bool = True) -> list[Float]:
         """``config.size`` Floats at ``p`` (Array3f, or Array2f, of the unit cube).
 
         Zeros where ``p`` lies outside of the cube or is not ``active``. Derivatives reach the parameters and ``p``.
         """
         ...
 
-    def evaluated(self, p: Any, active: Any = True) -> list:
+    def evaluated(self, p: Array3f, active: Bool = True) -> list[Float]:
         """The same numbers in memory, for many points at once; an encoding may have a faster way to them."""
         out = self(p, active)
         dr.eval(out)

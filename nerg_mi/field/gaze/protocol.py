@@ -13,10 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import ModuleType
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
+from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.mlp import MLP
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
@@ -90,7 +91,7 @@ class Arrays(Protocol):
         """The float32 array ``name`` of that ``shape`` (None: of any length)."""
         ...
 
-    def grid(self, config: Any, name: str = "grid") -> Any:
+    def grid(self, config: EncodingConfig, name: str = "grid") -> Encoding:
         """The encoding of ``config``."""
         ...
 

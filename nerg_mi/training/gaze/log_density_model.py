@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 
+from nerg_mi.field.encoding.protocol import Encoding
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.field.gaze.product import softplus
@@ -54,7 +55,7 @@ def log_gaze(
 class _Inputs(LogGazeField):
     """The part of a field that has no networks."""
 
-    def __init__(self, config: LogGazeConfig, box: Box, grid: HashGrid, prior: Any):
+    def __init__(self, config: LogGazeConfig, box: Box, grid: Encoding, prior: Any):
         self.config, self.box, self.grid, self.prior = config, box, grid, prior
 
 

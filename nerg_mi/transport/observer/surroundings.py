@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,6 +11,7 @@ import numpy as np
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.maths.ray_box import intersect_box
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.sphere import fibonacci_vectors
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.transport.place import Place
 
@@ -45,7 +45,7 @@ def trace_surroundings(
 ) -> Surroundings:
     """Those of the observer at ``center`` (one lane) in ``count`` directions, for ``field`` in ``place``."""
     with dr.suspend_grad():
-        directions = _spiral(count)
+        directions = fibonacci_vectors(count)
         distance, escaped = distance_along(field, to_world, place, center, directions, settings)
         dr.eval(directions, distance, escaped)
     return Surroundings(directions, distance, escaped)
@@ -72,7 +72,7 @@ def distance_along(
     if field.config.fills_escaped:
         escaped = ~np.array(met)
         if escaped.any():
-            few = _spiral(_FILL)
+            few = fibonacci_vectors(_FILL)
             known, distance = (np.array(v) for v in _trace(place, center, few, settings, beyond))
             if known.any():
                 depth = np.array(depth)
@@ -111,17 +111,3 @@ def _beyond(field: AnyGazeField, to_world: Similarity, center: Point3f, directio
         to_world.point_to_local(center), to_world.vector_to_local(directions), box.lower, box.upper
     )
     return dr.select((near < far) & (far > 0) & dr.isfinite(far), far, box.diagonal * to_world.scale)
-
-
-def _spiral(count: int) -> Vector3f:
-    """``count`` directions of equal area on a golden-angle spiral: ``maths.sphere``'s, made on the
-    device."""
-    import mitsuba as mi
-
-    i = dr.arange(mi.Float, count)
-    z = 1 - (2 * i + 1) / count
-    # Turns of the golden angle, of which whole ones are dropped in double precision.
-    turns = dr.arange(mi.Float64, count) * (1.5 - 0.5 * math.sqrt(5))
-    sin, cos = dr.sincos(mi.Float(dr.two_pi * (turns - dr.floor(turns))))
-    r = dr.sqrt((1 - z) * (1 + z))
-    return mi.Vector3f(r * cos, r * sin, z)
