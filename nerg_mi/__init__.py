@@ -19,13 +19,13 @@ does. Everything else works there, the command `nerg doctor` first of all.
 """
 
 from pathlib import Path as _Path
-from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from . import checkout as _checkout
 from . import llvm as _llvm
 from . import registration as _registration
 
-if _TYPE_CHECKING:
+if TYPE_CHECKING:
     from .api.attention import attention
     from .api.camera import Camera
     from .api.evaluation import ablate, evaluate_gaze, evaluate_radiance, study

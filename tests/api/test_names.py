@@ -59,7 +59,7 @@ def test05_types_are_known(name):
 @pytest.mark.parametrize("name", nerg.__all__)
 def test06_names_for_type_checkers_are_those(name):
     source = inspect.getsource(nerg)
-    head = source[source.index("if _TYPE_CHECKING:") : source.index("__version__")]
+    head = source[source.index("if TYPE_CHECKING:") : source.index("__version__")]
     assert f" {name}" in head.replace(",", "").replace("(", "")
 
 
