@@ -48,10 +48,11 @@ def register(kind: str, name: str, cls: type) -> None:
     """
     import mitsuba as mi
 
+    variant = str(mi.variant())
     put = getattr(mi, f"register_{_REGISTRY.get(kind, kind)}")
-    if mi.variant().startswith("scalar"):
+    if variant.startswith("scalar"):
         if kind not in _REGISTRY:
-            put(name, _refusal(name, mi.variant()))
+            put(name, _refusal(name, variant))
     else:
         _classes[name] = cls
         put(name, cls)

@@ -15,16 +15,15 @@ import numpy as np
 from nerg_mi.errors import NergError
 
 
-def namespace(source: str | dr.ArrayBase | type[dr.ArrayBase]) -> ModuleType:
+def namespace(source: str | dr.ArrayBase | type[dr.ArrayBase] | None) -> ModuleType:
     """Module holding the differentiable array types of a backend.
 
-    ``source``: a Mitsuba variant name (``"llvm_ad_rgb"``), ``"llvm"``,
-    ``"cuda"``, or any JIT array or array type. Returns ``drjit.llvm.ad`` or
-    ``drjit.cuda.ad``. Raises ``NergError`` for scalar variants, which have no
-    JIT arrays.
+    ``source``: the name of a Mitsuba variant (``"llvm_ad_rgb"``; None, where none is active, is one that cannot be
+    used), ``"llvm"``, ``"cuda"``, or any JIT array or array type. Returns ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+    Raises ``NergError`` for scalar variants, which have no JIT arrays.
     """
-    if isinstance(source, str):
-        name = source
+    if source is None or isinstance(source, str):
+        name = source or "none"
     else:
         backend = dr.backend_v(source)
         name = {dr.JitBackend.LLVM: "llvm", dr.JitBackend.CUDA: "cuda"}.get(backend, str(backend))

@@ -127,7 +127,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
 
 def store_scene() -> Path:
     """The demo store's scene.xml, as installed."""
-    from nerg_mi import scenes
+    import nerg_mi.scenes as scenes
 
     return Path(scenes.__file__).resolve().parent / "store" / "scene.xml"
 

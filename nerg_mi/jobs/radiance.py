@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from nerg_mi.capture.dataset import Dataset, open_dataset
@@ -89,10 +89,10 @@ def train_radiance(
 
 def _settings(options: RadianceOptions) -> RadianceSettings:
     minutes = 5.0 if options.minutes is None and options.steps is None else options.minutes
-    weights = {"distortion_weight": options.distortion_weight}
-    if options.depth_weight is not None:
-        weights["depth_weight"] = options.depth_weight
-    return RadianceSettings(steps=options.steps, minutes=minutes, seed=options.seed, **weights)
+    given = RadianceSettings(
+        steps=options.steps, minutes=minutes, seed=options.seed, distortion_weight=options.distortion_weight
+    )
+    return given if options.depth_weight is None else replace(given, depth_weight=options.depth_weight)
 
 
 def _open(photos: str | Path, options: RadianceOptions) -> Dataset:

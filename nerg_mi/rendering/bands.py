@@ -63,7 +63,7 @@ def why_whole(scene, sensor) -> str | None:
     from nerg_mi.transport.observer.viewpoint import is_batch
 
     integrator, film = scene.integrator(), sensor.film()
-    if mi.variant().startswith("scalar") or mi.is_spectral or mi.is_polarized:
+    if str(mi.variant()).startswith("scalar") or mi.is_spectral or mi.is_polarized:
         return f"the variant {mi.variant()}"
     if not isinstance(integrator, mi.SamplingIntegrator) or isinstance(integrator, mi.CppADIntegrator):
         return f"the integrator {integrator.class_name()}"
@@ -304,8 +304,8 @@ class _Pace:
         import mitsuba as mi
 
         self._fixed = fixed
-        self._count = fixed or (1 << 20 if mi.variant().startswith("cuda") else 1 << 15)
-        self._most = 1 << 24 if mi.variant().startswith("cuda") else 1 << 18
+        self._count = fixed or (1 << 20 if str(mi.variant()).startswith("cuda") else 1 << 15)
+        self._most = 1 << 24 if str(mi.variant()).startswith("cuda") else 1 << 18
         self._since, self._strips = None, 0
 
     def strips(self, start: int, stop: int, spp: int) -> Iterator[tuple[int, int]]:

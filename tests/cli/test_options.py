@@ -80,4 +80,3 @@ def test_a_command_shows_its_options_to_whoever_asks_for_its_types():
         pass
 
     assert set(get_type_hints(tea)) == {f.name for f in fields(Brew)}
-

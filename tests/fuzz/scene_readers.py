@@ -27,7 +27,17 @@ _SCENE = """<scene version="3.0.0">
     <shape type="obj"><string name="filename" value="a.obj"/></shape>
 </scene>
 """
-_PLY = "ply\nformat {} 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+_PLY = """\
+ply
+format {} 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_indices
+end_header
+"""
 _CORNERS = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
 
 

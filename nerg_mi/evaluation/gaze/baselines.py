@@ -52,9 +52,9 @@ def position_blind(rays: Rays, *, kappa: float = 50.0, backend: object = None) -
 def nearest_probes(probes: Probes, k: int = 16, *, backend: object = None) -> Baseline:
     """Mean density of the ``k`` training probes nearest to a position; k = 1 is
     the nearest probe. Fewer where there are fewer probes."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    tree = cKDTree(probes.positions)
+    tree = KDTree(probes.positions)
     k = min(k, len(probes))
     rays = [np.arange(a, b) for a, b in zip(probes.offsets[:-1], probes.offsets[1:])]
 
@@ -77,9 +77,9 @@ def nearest_probes(probes: Probes, k: int = 16, *, backend: object = None) -> Ba
 def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: object = None) -> Baseline:
     """KDE of the ``k`` training rays whose origins are nearest to a position: a
     probe without a radius, hard to beat where rays are many."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    tree = cKDTree(rays.origin)
+    tree = KDTree(rays.origin)
     k = min(k, len(rays))
 
     def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -135,9 +135,9 @@ def make_test(
 
 def _enough(rays: Rays, centres: np.ndarray, radius: float, min_rays: int) -> np.ndarray:
     """Which of ``centres`` (P,) have ``min_rays`` rays within ``radius`` metres."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    return cKDTree(rays.origin).query_ball_point(centres, radius, return_length=True) >= min_rays
+    return KDTree(rays.origin).query_ball_point(centres, radius, return_length=True) >= min_rays
 
 
 def evaluate_gaze(

@@ -181,7 +181,7 @@ def precision() -> str:
 def _on_cuda() -> bool:
     import mitsuba as mi
 
-    return mi.variant().startswith("cuda")
+    return str(mi.variant()).startswith("cuda")
 
 
 # ----------------------------------------------------------------------------

@@ -15,6 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.transport.observer.sight import EXACT
+from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.place import Place
 
 from . import reference as study_reference
@@ -159,11 +160,9 @@ class Subject:
     def truth(self, seed: int, depth: str, visibility: str) -> Truth:
         """The reference for the rays of ``seed``, for kinds of depth and visibility as the integrator names them."""
         # Refined depths and maps are ways to find the same answers.
-        key = (
-            seed,
-            "expected" if depth == "expected" else "median",
-            "transmittance" if visibility == "transmittance" else "depth",
-        )
+        depth = "expected" if depth == "expected" else "median"
+        visibility = "transmittance" if visibility == "transmittance" else "depth"
+        key = seed, depth, visibility
         if key not in self._truths:
             self._truths[key] = self._find_truth(*key)
         return self._truths[key]
@@ -244,8 +243,6 @@ class FileSubject(Subject):
 
     def eye(self) -> np.ndarray:
         """Where the observer stands (3,)."""
-        from nerg_mi.transport.observer.viewpoint import center
-
         observer = self.base.get("observer")
         return np.array(center(observer if observer is not None else self.sensor), float).reshape(3)
 

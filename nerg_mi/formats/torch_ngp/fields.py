@@ -23,6 +23,7 @@ from nerg_mi.formats.architecture import building, check_sizes
 from nerg_mi.maths.box import Box
 
 from .occupancy import bitfield, read_occupancy
+from .pickling import write_torch
 from .state_dict import (
     StateDict,
     averaged_weights,
@@ -190,8 +191,6 @@ def _put_layers(state: dict, name: str, net: MLP) -> None:
 
 def write_torch_ngp(field: RadianceField, path: str | Path) -> None:
     """Write ``field`` as a torch-ngp checkpoint, of the form of its ``ngp.pth``: no density grid, no optimiser."""
-    from .pickling import write_torch
-
     stats = {"loss": [], "valid_loss": [], "results": [], "checkpoints": [], "best_result": None}
     threshold = 0.0 if field.occupancy is None else field.occupancy.threshold
     write_torch(

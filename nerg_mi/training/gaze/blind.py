@@ -47,7 +47,7 @@ def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
     choices among a few: b = Σ_v p_v / Σ_v 1_v / b(v). One more view, of the whole sphere, is uniform: it links those
     that share nothing. What no view shows is looked at as what lies next to it is.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     directions = table_directions(rows)
     # Of the rows' bands, not of the texels' centres: they sum to 4π.
@@ -68,6 +68,6 @@ def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
         blind /= blind @ area
     shown = known.any(axis=0)
     if shown.any():
-        blind = blind[np.flatnonzero(shown)[cKDTree(directions[shown]).query(directions)[1]]]
+        blind = blind[np.flatnonzero(shown)[KDTree(directions[shown]).query(directions)[1]]]
     kde = SphericalKde(directions, np.array([0, len(area)]), _VIEWS_KAPPA, blind * area)
     return blind_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(_SCALED_OVER))

@@ -138,7 +138,7 @@ def _log_density(choices: FieldChoices) -> LogGazeConfig:
     )
 
 
-def surroundings(place: str) -> dict[str, str]:
+def surroundings(place: str) -> dict[str, Any]:
     """What a log density is told of a kind of ``place``: one of hit points has holes, through which nobody saw whom it
     was made from; no place has no surfaces."""
     return {

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
+from nerg_mi.maths.types import Float
 from nerg_mi.transport.march.quadrature import absorbed_share
 
 # A denser step changes nothing (exp(-60) is 0 in fp32), but would drown the running sum of the other rays.
@@ -78,9 +79,9 @@ class Thinned:
     ray, of all samples.
     """
 
-    copies: object
-    before: object
-    opacity: object
+    copies: Float
+    before: Float
+    opacity: Float
 
 
 class _Weights(dr.CustomOp):

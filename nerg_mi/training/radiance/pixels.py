@@ -9,6 +9,7 @@ import numpy as np
 
 from nerg_mi.capture.images import View
 from nerg_mi.errors import NergError
+from nerg_mi.maths.types import Array3f, Float
 
 from .unproject import LensTable
 
@@ -22,11 +23,11 @@ class PixelBatch:
     """Rays of chosen pixels: ``o``, ``d`` (Array3f, world, d of unit length), ``rgb`` (Array3f, sRGB, straight),
     ``alpha`` (Float or None), ``depth`` (Float, scene units, 0 where unknown; None without any)."""
 
-    o: object
-    d: object
-    rgb: object
-    alpha: object
-    depth: object
+    o: Array3f
+    d: Array3f
+    rgb: Array3f
+    alpha: Float | None
+    depth: Float | None
 
 
 class PixelBank:

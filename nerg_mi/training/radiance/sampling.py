@@ -15,6 +15,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned, namespace
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.transport.march.quadrature import absorbed_share
 
 from .compositing import Segments, Thinned
@@ -60,10 +61,10 @@ class Rays:
     """``o``, ``d``: Array3f origins and unit directions, world frame; ``t0``, ``t1``: where each crosses
     the box (empty where t1 <= t0); ``count``: how many."""
 
-    o: object
-    d: object
-    t0: object
-    t1: object
+    o: Array3f
+    d: Array3f
+    t0: Float
+    t1: Float
     count: int
 
 
@@ -88,10 +89,10 @@ class Samples:
     density pass knew of them, or None; ``thinned``: of samples that stand for others; ``looked``: samples a ray of the
     density pass."""
 
-    ray: object
-    t: object
-    length: object
-    p: object
+    ray: UInt32
+    t: Float
+    length: Float
+    p: Array3f
     segments: Segments
     count: int
     features: list | None = None

@@ -103,7 +103,7 @@ class RadianceSettings:
     def __post_init__(self):
         if (self.steps is None) == (self.minutes is None):
             raise NergError("give the length of the training either in steps or in minutes")
-        if (self.steps if self.steps is not None else self.minutes) <= 0:
+        if (self.steps or self.minutes or 0) <= 0:
             raise NergError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
         given = self.depth_weight, self.distortion_weight, self.grid_decay
         if min(given) < 0:

@@ -84,9 +84,9 @@ def distance_along(
 def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Depth in directions ``wanted`` (M, 3) from that of the up to eight nearest of ``known`` (N, 3): the mean of its
     logarithm, weighted by the inverse square of the distance."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    apart, which = cKDTree(known).query(wanted, k=np.arange(1, min(8, len(known)) + 1))
+    apart, which = KDTree(known).query(wanted, k=np.arange(1, min(8, len(known)) + 1))
     weight = 1 / (apart**2 + 1e-3)
     log = np.log(np.maximum(depth, 1e-6))[which]
     return np.exp((weight * log).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)

@@ -49,7 +49,7 @@ def test_nothing_is_compiled_in_a_run(dataset, depth):
     assert t.stride == 1 and t.settling.done
 
 
-def test_nothing_is_compiled_once_fog_has_cleared(dataset):  # noqa: F811
+def test_nothing_is_compiled_once_fog_has_cleared(dataset):
     """Where all is fog at first nothing is known to be empty, and the bound of rendering holds nothing."""
     t = trainer(dataset, steps=60, depth=False, settle=0.4)
     value = type(t.grid.value)(t.grid.value)
