@@ -1,0 +1,69 @@
+"""Another kind of depth is one object: registered, it is traced and rendered, with and without shapes, and stands in
+the manual."""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from nerg_mi.transport.march.depth import DEPTHS, Expected
+from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.trace import trace_depth
+from tests.plugins.scenes import channels, constant, straight
+
+
+class Entered:
+    """Where the march begins, and the shape itself where there is one."""
+
+    name = "entered"
+    summary = "where the march begins"
+    mean_free_paths = 0.0
+
+    def inside(self, marched):
+        return dr.select(marched.result.tau > 0, marched.t0, 0)
+
+    def with_shape(self, result, front, inside, hit, distance):
+        return distance
+
+
+@pytest.fixture
+def entered():
+    kind = DEPTHS.register(Entered())
+    yield kind
+    DEPTHS.unregister("entered")
+
+
+def test01_it_is_traced(rgb, entered):
+    fog = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": 3.0}))
+    depth, opacity = trace_depth(fog, [[0.5, 0.5, -1.5], [3, 0.5, -1]], [[0, 0, 1], [0, 0, 1]], kind="entered")
+    assert depth.tolist() == [1.5, 0] and opacity[0] > 0.9
+
+
+def test02_it_is_rendered_with_and_without_shapes(rgb, entered):
+    plate = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.5]).scale(2)}
+    asked = constant(3.0, depth="entered", aovs="depth,position")
+    sensor = straight(rgb, "perspective")
+    # The camera stands at z = -2, and its rays start a hundredth in front of it.
+    for more, want in (({}, 1.99), ({"plate": plate}, 2.49)):
+        found = channels(rgb, asked, sensor, **more)
+        assert np.allclose(found["depth.T"], want, rtol=1e-5) and np.allclose(
+            found["position.Z"], want - 1.99, atol=1e-4
+        )
+
+
+def test03_it_is_offered_where_depths_are_and_only_while_it_is_registered(rgb, entered):
+    assert DEPTHS.names() == ("expected", "median", "refined", "entered")
+    assert DEPTHS.manual().endswith("``entered``: where the march begins.")
+    DEPTHS.unregister("entered")
+    with pytest.raises(RuntimeError, match='"depth" must be one of expected, median, refined, got .entered.'):
+        rgb.load_dict(constant(depth="entered"))
+    DEPTHS.register(entered)
+
+
+def test04_the_surface_lies_as_deep_as_light_goes(rgb):
+    """The kinds' mean free paths are those of a thick slab of constant density."""
+    sigma = 500.0
+    slab = VolumeMedium(rgb.load_dict({"type": "constvolume", "value": sigma}))
+    for kind in DEPTHS:
+        depth, _ = trace_depth(slab, [[0.5, 0.5, 0.0]], [[0, 0, 1]], kind=kind.name)
+        assert np.isclose(depth[0] * sigma, kind.mean_free_paths, rtol=1e-3), kind.name
+    assert Expected().mean_free_paths == 1
