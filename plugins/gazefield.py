@@ -80,7 +80,7 @@ class GazeFieldVolume(mi.Volume):
         # ``network``: a field in memory in place of a file; see ``of``.
         super().__init__(props)
         to_world = props.get("to_world", mi.ScalarTransform4f())
-        self.field, self.metadata, self.filename = trained(props, network, load_gaze, namespace(mi.variant()))
+        self.field, self.metadata, self.filename = trained(props, network, load_gaze, namespace(mi.Float))
         self._similarity = Similarity(to_world.matrix)
 
     @classmethod

@@ -71,7 +71,7 @@ class NerfVolume(mi.Volume):
     def __init__(self, props, network=None):
         # ``network``: a field in memory in place of a file; see ``of``.
         similarity = Similarity(props.get("to_world", mi.ScalarTransform4f()).matrix)
-        field, metadata, filename = trained(props, network, load_radiance, namespace(mi.variant()))
+        field, metadata, filename = trained(props, network, load_radiance, namespace(mi.Float))
         # Mitsuba's own media ask the base class, not bbox(): it makes its box from the unit cube.
         lower, upper = similarity.bounds(field.box.lower, field.box.upper)
         props["to_world"] = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())

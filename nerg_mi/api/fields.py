@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ from .variant import array_module
 if TYPE_CHECKING:
     from nerg_mi.rays.rays import Rays
 
-FilePath: TypeAlias = "str | os.PathLike[str]"
+FilePath: TypeAlias = str | Path
 Network = TypeVar("Network", RadianceField, AnyGazeField)
 
 

@@ -44,8 +44,10 @@ def import_rays(
     ours = {f.name for f in fields(tracking.ImportOptions)} - {"reader", "settings", "output"}
     of_job = {name: value for name, value in options.items() if name in ours}
     parse = {option.name: option.parse for option in options_of(reader_named(reader).Options)}
-    # Values may be written as for the command.
-    read = lambda name, value: parse[name](value) if isinstance(value, str) and parse.get(name) else value
-    of_reader = {name: read(name, value) for name, value in options.items() if name not in ours}
+    of_reader = {name: value for name, value in options.items() if name not in ours}
+    for name, value in of_reader.items():
+        # Values may be written as for the command.
+        if isinstance(value, str) and (read := parse.get(name)) is not None:
+            of_reader[name] = read(value)
     job = tracking.ImportOptions(reader=reader, settings=make_options(reader, of_reader), output=output, **of_job)
     return tracking.import_rays(files, job, reporter).rays
