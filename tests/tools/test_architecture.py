@@ -12,7 +12,6 @@ from tools import architecture
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="rooms are being built", strict=False)
 def test_the_pictures_are_up_to_date():
     # In a process of its own, in which nothing has been traced before.
     command = [sys.executable, "-m", "tools.architecture", "--check"]

@@ -14,6 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain, reading, size_of
 from nerg_mi.files.inflating import inflated_limit
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
+from nerg_mi.rays.io import pyarrow_modules
 
 BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
 
@@ -225,8 +226,6 @@ def _cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | str:
 
 def _parquet(path: str | os.PathLike) -> Any:
     """The open Parquet file ``path``; `NergError` for one that is damaged or claims more than its bytes warrant."""
-    from nerg_mi.rays.io import pyarrow_modules
-
     pa, pq = pyarrow_modules()
     size = size_of(path, "table")
     with reading(path, "table", also=(pa.ArrowException,)):
