@@ -53,3 +53,25 @@ def test_a_wrong_value_is_named(read, value, words):
     with pytest.raises(NergError) as said:
         read({"x": value})
     assert '"x"' in str(said.value) and words in str(said.value)
+
+
+def test_a_field_of_a_file_or_in_memory(rgb):
+    import drjit.llvm.ad as ns
+
+    class Field:
+        def __init__(self, array):
+            self.array = array
+
+        def parameters(self):
+            return {"table": self.array}
+
+    load = lambda path, ns: (path, {"about": ns})
+    field, metadata, filename = properties.trained({"filename": "here.safetensors"}, None, load, ns)
+    assert field == filename and filename.endswith("here.safetensors") and metadata == {"about": ns}
+    mine = Field(ns.TensorXf([1.0]))
+    assert properties.trained({}, mine, load, ns) == (mine, {}, "")
+    with pytest.raises(NergError, match='"filename" must be a string, got nothing'):
+        properties.trained({}, None, load, ns)
+    # Arrays that are not of the backend in use.
+    with pytest.raises(NergError, match='made for another variant than "llvm_ad_rgb"; load it again'):
+        properties.trained({}, Field([1.0]), load, ns)

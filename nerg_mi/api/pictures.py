@@ -42,10 +42,10 @@ def render(
     """Render a scene for one or many observers.
 
     ``observers``: positions (M, 3) in scene units of those whose gaze is shown, or one (3,); None: the scene's own,
-    which is the camera where it has none. ``quantities``: ``"color"`` (linear rgb) and any AOV of the integrator
-    ``nerg``: ``depth`` and ``observer_depth`` (scene units), ``opacity``, ``position``, ``gaze`` (1/sr),
-    ``visibility``, ``support``, ...; without any ``color``, ``depth``, ``opacity`` and, where there is a gaze field,
-    ``gaze`` and ``visibility``. ``camera``: a `Camera`, or the number of one of the scene's own (the first).
+    which is the camera where it has none. ``quantities``: ``"color"`` (linear rgb; the luminance in mono variants) and
+    any AOV of the integrator ``nerg``: ``depth`` and ``observer_depth`` (scene units), ``opacity``, ``position``,
+    ``gaze`` (1/sr), ``visibility``, ``support``, ...; without any ``color``, ``depth``, ``opacity`` and, where there is
+    a gaze field, ``gaze`` and ``visibility``. ``camera``: a `Camera`, or the number of one of the scene's own (the first).
     ``spp``: samples a pixel, 0 for as many as the scene says. Equal seeds give equal pictures, and those of
     ``nerg render`` to the bit where the camera has a box filter, as every `Camera` has.
 

@@ -145,8 +145,8 @@ def make_scene(
     a Mitsuba scene or shape, or several of these in a list or a dict by name. ``camera``: a `Camera`, or a sensor as
     Mitsuba takes it. ``observer``: position (3,) of the one whose gaze it is; without it the camera is the observer.
     ``to_world``: (4, 4) rotation, uniform scale and translation that place both fields in the scene. ``settings``:
-    parameters of the integrator ``nerg`` (``falloff=0.3``, ``visibility="map"``, ``density={"type": ...}``, ...); its
-    docstring is their manual. Raises `NergError`.
+    parameters of the integrator ``nerg`` (``falloff=0.3``, ``visibility="map"``, ``density={"type": ...}``,
+    ``kde={"type": "gazekde", "filename": "day.npz"}``, ...); its docstring is their manual. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files

@@ -139,3 +139,5 @@ def test10_without_gaze_points_are_still_seen(files):
 def test11_mono(mono, files):
     scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors")
     assert nerg.trace(scene, (0, -3, 0), (0, 1, 0), "color").color.shape == (1, 1)
+    camera = nerg.Camera((0, -3, 0), (0, 0, 0), width=4, height=3)
+    assert nerg.render(scene, quantities="color", camera=camera, spp=1).color.shape == (1, 3, 4, 1)
