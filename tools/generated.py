@@ -15,6 +15,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before Dr.Jit and Mitsuba)
 from tools import manual
 from tools.imports import ROOT
 from tools.page import table

@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass
 from types import CodeType, FrameType
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before Dr.Jit and Mitsuba)
 from tools.imports import PACKAGE, modules
 from tools.svg import FAINT, INK, PALE, Drawing
 
