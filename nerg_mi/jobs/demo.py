@@ -23,6 +23,8 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import activate, load_scene
+from nerg_mi.transport.observer.viewpoint import center
+from nerg_mi.transport.panorama import pixel_solid_angles
 from nerg_mi.view import figures
 from nerg_mi.view.overlay import Heat, top_of
 from nerg_mi.view.tonemap import srgb, write_png
@@ -159,8 +161,6 @@ def observer_pixel(scene) -> tuple[float, float] | None:
     centre; None outside of it."""
     import mitsuba as mi
 
-    from nerg_mi.transport.observer.viewpoint import center
-
     camera = scene.sensors()[CAMERA]
     film = camera.film()
     fov = mi.traverse(camera)["x_fov"]
@@ -177,8 +177,6 @@ def observer_pixel(scene) -> tuple[float, float] | None:
 
 def sphere_integral(sphere: Channels) -> float:
     """What the gaze density adds up to over the observer's sphere: 1 for a density that is one."""
-    from nerg_mi.transport.panorama import pixel_solid_angles
-
     height, width = sphere.aovs["gaze"].shape
     return float((sphere.aovs["gaze"].astype(np.float64) * pixel_solid_angles(width, height)).sum())
 
