@@ -31,7 +31,7 @@ def test_the_rim_counts_and_nonsense_is_refused():
 def test_rays_that_are_equally_far_keep_their_order():
     """It decides bits of every training: that of scipy's cKDTree as it is by default."""
     rng = np.random.default_rng(3)
-    origin = rng.integers(0, 6, (4000, 3)).astype(float)  # on a lattice, many at each place
+    origin = rng.integers(0, 30, (20_000, 3)).astype(float)  # on a lattice: many are equally far
     near = RayIndex(origin).nearest(origin[:50], 300)
     _, indices = cKDTree(origin, balanced_tree=False).query(origin[:50], k=300)
     assert np.array_equal(near.indices, indices.ravel())
