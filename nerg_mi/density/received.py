@@ -13,38 +13,48 @@ what *else* hides it are not seen by derivatives; the fall-off behind them is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.observer.sight import trace_sight
 from nerg_mi.transport.observer.viewpoint import distance_and_direction
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
 
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+Density = Callable[[Point3f, Point3f, Vector3f, Bool], Float]
+"""Of ``p_od``, ``p_o``, ``r_o`` and the active lanes: gaze in 1/sr of an observer at ``p_o`` along the unit direction
+``r_o``, who sees the surface ``p_od`` there (``ObservedGaze.evaluate(...)[0]``, or anything else)."""
+
 
 @dataclass
 class Patches:
-    """Small flat pieces of a surface: centroids ``p`` (Point3f), unit normals ``n`` (Vector3f), ``area`` (Float, square
-    scene units)."""
+    """Small flat pieces of a surface, one a lane, in the scene."""
 
-    p: object
-    n: object
-    area: object
+    p: Point3f  # centroids
+    n: Vector3f  # unit normals
+    area: Float  # square scene units
 
-    def moved(self, offset) -> Patches:
-        """The same pieces, shifted by ``offset`` (Vector3f)."""
+    def moved(self, offset: Vector3f) -> Patches:
+        """The same pieces, shifted by ``offset``."""
         return Patches(self.p + offset, self.n, self.area)
 
 
-def patches(mesh, divisions: int = 4) -> Patches:
+def patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
     """A Mitsuba mesh, each triangle cut into ``divisions``² congruent ones: the centroid rule, of second order.
 
     Normals are the faces' own, to the side that sees the vertices counter-clockwise. Attached to the
-    ``vertex_positions`` of the mesh. ``ValueError`` for what is not a mesh.
+    ``vertex_positions`` of the mesh. Raises
+    `NergError` for what is not a mesh, ``ValueError`` for no divisions.
     """
     import mitsuba as mi
 
@@ -58,7 +68,10 @@ def patches(mesh, divisions: int = 4) -> Patches:
     count = len(faces) // 3
     index = dr.arange(mi.UInt32, count * len(centre))
     face, piece = index // len(centre), index % len(centre)
-    a, b, c = (dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3))
+    corners: list[Point3f] = [
+        dr.gather(mi.Point3f, positions, dr.gather(mi.UInt32, faces, 3 * face + k)) for k in range(3)
+    ]
+    a, b, c = corners
     u, v = (dr.gather(mi.Float, mi.Float(np.ascontiguousarray(centre[:, k])), piece) for k in range(2))
     across = dr.cross(b - a, c - a)
     twice = dr.norm(across)
@@ -76,22 +89,20 @@ def _centroids(n: int) -> np.ndarray:
 
 def arriving(
     place: Place | None,
-    density,
-    p_o,
-    p,
-    n,
-    falloff=0.0,
+    density: Density,
+    p_o: Point3f,
+    p: Point3f,
+    n: Vector3f,
+    falloff: Float = 0.0,
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
-):
+) -> Float:
     """Attention per area, in 1 / square scene unit, that arrives at ``p`` with normal ``n`` from the observer ``p_o``.
 
-    ``density(p_od, p_o, r_o, active)``: gaze in 1/sr of an observer at ``p_o`` along the unit direction ``r_o``, who
-    sees the surface ``p_od`` there (``ObservedGaze.evaluate(...)[0]``, or anything else). ``place``: what may stand in
-    between (shapes, a field, both; None: nothing). ``falloff`` d_f in scene units, ``settings``: as of the
-    integrator. A closed surface hides its own back, which therefore receives nothing; ``two_sided`` counts both sides
-    of an open one. Lanes are pairs; differentiable in all of them, in the density's parameters and in ``falloff``, but
-    not over the edges of ``place``.
+    ``place``: what may stand in between (shapes, a field, both; None: nothing). ``falloff`` d_f in scene units,
+    ``settings``: as of the integrator. A closed surface hides its own back, which therefore receives nothing;
+    ``two_sided`` counts both sides of an open one. Lanes are pairs; differentiable in all of them, in the density's
+    parameters and in ``falloff``, but not over the edges of ``place``.
     """
     import mitsuba as mi
 
@@ -114,16 +125,16 @@ def arriving(
 
 def contributions(
     place: Place | None,
-    density,
-    observers,
+    density: Density,
+    observers: Point3f,
     surface: Patches,
-    falloff=0.0,
+    falloff: Float = 0.0,
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
-):
-    """Share of each observer's look that each patch receives: Float, all patches of the first observer first.
+) -> Float:
+    """Share of each observer's look that each patch receives, all patches of the first observer first.
 
-    Arguments as of ``arriving``; ``observers``: Point3f, a lane an observer.
+    Arguments as of ``arriving``; ``observers``: a lane an observer.
     """
     import mitsuba as mi
 
@@ -139,14 +150,14 @@ def contributions(
 
 def received(
     place: Place | None,
-    density,
-    observers,
+    density: Density,
+    observers: Point3f,
     surface: Patches,
-    falloff=0.0,
+    falloff: Float = 0.0,
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
-):
-    """Probability (Float, a lane an observer) that the look of each of ``observers`` (Point3f) lands on ``surface``.
+) -> Float:
+    """Probability (a lane an observer) that the look of each of ``observers`` lands on ``surface``.
 
     Arguments as of ``arriving``. Makes observers x patches lanes at once. Exact as patches shrink against their
     distance from the observer: at a distance of k patch diameters the error is of the order 1 / k².

@@ -16,6 +16,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
+from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.maths.vmf import log_normaliser
 
 Backend = str | ModuleType | dr.ArrayBase | None
@@ -99,9 +100,9 @@ class SphericalKde:
         packed = np.array(self._rays).reshape(-1, 4)[offsets[0] : offsets[-1]]
         return SphericalKde(packed[:, :3], offsets - offsets[0], self.kappa[first:last], packed[:, 3], self.ns)
 
-    def density(self, probe, direction):
-        """Density of probe ``probe`` (UInt32, M lanes) in ``direction`` (Array3f, unit, M lanes), in 1/sr; a Float of M
-        lanes, traced, not evaluated. Lanes of one probe should be neighbours: they then share their loop."""
+    def density(self, probe: UInt32, direction: Array3f) -> Float:
+        """Density of probe ``probe`` (M lanes) in ``direction`` (unit, M lanes), in 1/sr, M lanes: traced, not
+        evaluated. Lanes of one probe should be neighbours: they then share their loop."""
         ns = self.ns
         first = dr.gather(ns.UInt32, self._offsets, probe)
         last = dr.gather(ns.UInt32, self._offsets, probe + 1)

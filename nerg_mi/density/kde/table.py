@@ -8,10 +8,11 @@ the probe holds.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import drjit as dr
 import numpy as np
+
+from nerg_mi.maths.types import Array3f, Float, UInt32
 
 from .estimate import SphericalKde
 
@@ -70,7 +71,7 @@ class SphericalKdeTable:
                 out[:, dj:, di:] |= corner[:, : self.width - dj, : self.width - di]
         return out
 
-    def _cell(self, d):
+    def _cell(self, d: Array3f) -> tuple[UInt32, list[Float]]:
         """Index of the first of a lookup's 4 x 4 texels, and where between the middle ones it lies, in [0, 1)."""
         ns = self.ns
         a = dr.abs(d)
@@ -85,11 +86,11 @@ class SphericalKdeTable:
         i, j = (ns.UInt32(w) - 1 for w in whole)
         return (face * self.width + j) * self.width + i, [p - w for p, w in zip(place, whole)]
 
-    def density(self, direction):
-        """Density in ``direction`` (Array3f, unit), in 1/sr: a Float, traced, not evaluated, differentiable."""
+    def density(self, direction: Array3f) -> Float:
+        """Density in ``direction`` (unit), in 1/sr: traced, not evaluated, differentiable."""
         first, (s, t) = self._cell(direction)
         ws, wt = _cubic(s), _cubic(t)
-        total: Any = 0
+        total: Float = 0
         for j in range(4):
             row = 0
             for i in range(4):
@@ -109,7 +110,7 @@ def _texels(kappa: float, spacing: float) -> int:
     return max(8, math.ceil(0.5 * math.pi / spacing * math.sqrt(kappa)))
 
 
-def _cubic(t):
+def _cubic(t: Float) -> tuple[Float, Float, Float, Float]:
     """Weights of four equidistant values at -1, 0, 1, 2 (Lagrange) for a place t between the middle two."""
     a, b, c = t + 1, t - 1, t - 2
     return -t * b * c / 6, a * b * c / 2, -a * t * c / 2, a * t * b / 6

@@ -13,17 +13,20 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.rays.rays import Rays
 
-from .estimate import SphericalKde
+from .estimate import Backend, SphericalKde
 from .frame import WORTH
 from .table import SphericalKdeTable
 
 
 class KdeView:
-    """``rays`` around observers in the scene. ``count``: how many of the nearest; ``kappa``: of their kernels;
-    ``to_world``: from the rays' frame to the scene's; ``backend``: as of ``SphericalKde``. What is hidden from the
-    observer fades, as gaze does.
+    """``rays`` around observers in the scene.
+
+    ``count``: how many of the nearest; ``kappa``: of their kernels; ``to_world``: from the rays' frame to the scene's;
+    ``backend``: as of ``SphericalKde``. What is hidden from the observer fades, as gaze does. Raises `NergError` where
+    there are no rays.
     """
 
     occluded = True
@@ -34,8 +37,8 @@ class KdeView:
         count: int = 4096,
         kappa: float = 20.0,
         to_world: Similarity | None = None,
-        backend: object = None,
-    ):
+        backend: Backend = None,
+    ) -> None:
         if len(rays) == 0:
             raise NergError("there are no rays to show the density of")
         self.to_world, self.backend = to_world or Similarity(), backend
@@ -49,8 +52,8 @@ class KdeView:
             return self._direction
         return self._direction[np.argpartition(square, self.count - 1)[: self.count]]
 
-    def at(self, p_o) -> ObservedKde:
-        """The density of the observer at ``p_o`` (Point3f in the scene, one lane)."""
+    def at(self, p_o: Point3f) -> ObservedKde:
+        """The density of the observer at ``p_o`` (in the scene, one lane)."""
         p = np.array(self.to_world.point_to_local(p_o), np.float64).ravel()
         rays = self.nearest(p)
         kde = SphericalKde(rays, np.array([0, len(rays)]), self.kappa, backend=self.backend)
@@ -63,13 +66,13 @@ class ObservedKde:
     ``frame.WORTH`` directions or more are looked up in a table, where that costs less; fewer are summed exactly.
     """
 
-    def __init__(self, kde: SphericalKde, to_world: Similarity):
+    def __init__(self, kde: SphericalKde, to_world: Similarity) -> None:
         self.kde, self.to_world = kde, to_world
         # Made when it first pays.
         self.table: SphericalKdeTable | None = None
 
-    def value(self, r_o):
-        """Density (Float, 1/sr) in unit scene directions ``r_o``, without derivatives."""
+    def value(self, r_o: Vector3f) -> Float:
+        """Density (1/sr) in unit scene directions ``r_o``, without derivatives."""
         d = self.to_world.direction_to_local(dr.detach(r_o))
         ns, lanes = self.kde.ns, dr.width(d)
         d = ns.Array3f(d.x, d.y, d.z)
