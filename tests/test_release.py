@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 import nerg_mi
 from tests.conftest import ROOT
 
@@ -30,6 +32,12 @@ def test_links_of_the_pages_at_the_root_lead_somewhere():
     for page in ("CONTRIBUTING.md", "CHANGELOG.md"):
         for target in re.findall(r"\]\((?!http)([^)#]+)", (ROOT / page).read_text(encoding="utf-8")):
             assert (ROOT / target).exists(), f"{page}: {target}"
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_files_that_newcomers_are_sent_to_are_there(page):
+    named = set(re.findall(r"`((?:nerg_mi|plugins|tests|tools|docs|benchmarks)/[\w/.-]+)`", (ROOT / page).read_text()))
+    assert len(named) > 8 and [name for name in sorted(named) if not (ROOT / name).exists()] == []
 
 
 def test_hooks_run_what_lint_runs():

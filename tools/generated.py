@@ -25,11 +25,7 @@ PLUGINS = ("nerg", "nerf", "gazefield", "gazekde", "panorama")
 
 def plugins() -> str:
     """A section for each plugin: its parameters and its manual."""
-    import mitsuba as mi
-
-    # A plugin's module belongs to a variant. Its manual does not, but lists what is registered when it is loaded.
-    if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
+    _choose_variant()
     sections = []
     for name in PLUGINS:
         page = manual.read(import_module(f"nerg_mi.plugins.{name}").__doc__ or "")
@@ -67,7 +63,45 @@ def _shown(value: object) -> str:
     return f"{value:,}" if isinstance(value, int) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-PARTS: dict[str, Callable[[], str]] = {"plugins": plugins, "presets": presets, "recipes": recipes}
+def registered() -> str:
+    """What there is of each kind of which there are several, and where."""
+    _choose_variant()
+    from nerg_mi.field.encoding import registry as encodings
+    from nerg_mi.field.gaze import registry as gaze_fields
+    from nerg_mi.rays.readers.registry import reader_names
+    from nerg_mi.training.gaze.recipes import RECIPES
+    from nerg_mi.transport.march.depth import DEPTHS
+    from nerg_mi.transport.march.rules import RULES
+
+    aovs = import_module("nerg_mi.plugins.nerg_aovs").AOVS
+    rows = (
+        ("encoding of positions", "nerg_mi/field/encoding/protocol.py", encodings.kinds()),
+        ("gaze field", "nerg_mi/field/gaze/protocol.py", gaze_fields.kinds()),
+        ("quadrature rule", "nerg_mi/transport/march/rules.py", RULES.names()),
+        ("depth", "nerg_mi/transport/march/depth.py", DEPTHS.names()),
+        ("AOV", "plugins/nerg_aovs.py", aovs),
+        ("tracking reader", "nerg_mi/rays/readers/protocol.py", reader_names()),
+        ("gaze recipe", "nerg_mi/training/gaze/recipes.py", RECIPES),
+    )
+    cells = [(what, f"`{file}`", ", ".join(f"`{name}`" for name in names)) for what, file, names in rows]
+    return table(("what", "protocol, or table", "there are"), cells)
+
+
+def _choose_variant() -> None:
+    """A plugin's modules belong to a variant. Their manual and tables do not, but list what is registered when they are
+    loaded."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
+
+
+PARTS: dict[str, Callable[[], str]] = {
+    "plugins": plugins,
+    "presets": presets,
+    "recipes": recipes,
+    "registered": registered,
+}
 """Name of a part -> what makes its text."""
 
 _PART = re.compile(r"(<!-- made by make docs: (\w+) -->\n)(.*?)(<!-- end -->)", re.S)

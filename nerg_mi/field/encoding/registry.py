@@ -28,6 +28,11 @@ def register(config: type[EncodingConfig], encoding: type[Encoding]) -> None:
     _CONFIGS[config.kind], _ENCODINGS[config] = config, encoding
 
 
+def kinds() -> tuple[str, ...]:
+    """The kinds that are registered."""
+    return tuple(_CONFIGS)
+
+
 def config_type(about: Mapping[str, Any]) -> type[EncodingConfig]:
     """The type of configuration that the JSON object ``about`` is of. Raises ``ValueError`` for an unknown kind."""
     kind = about.get("kind", DEFAULT_KIND)
