@@ -10,6 +10,7 @@ import numpy as np
 
 from nerg_mi.training.geometry.hit_geometry import volume_dict
 from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.transport.place import Place
 
 
 def frame_timer(
@@ -29,7 +30,7 @@ def frame_timer(
     """
     import mitsuba as mi
 
-    if place.kind == "none" or (place.kind == "scene" and place.medium.medium is not None):
+    if place.kind == "none" or (isinstance(place.medium, Place) and place.medium.medium is not None):
         return None
     rng = np.random.default_rng(seed)
     eyes, angles = centres[rng.integers(0, len(centres), cameras)], rng.uniform(0, 2 * np.pi, cameras)
@@ -68,4 +69,6 @@ def _medium(place: GazePlace, folder: Path) -> dict:
 
 
 def _shapes(place: GazePlace) -> dict:
-    return {f"shape{i}": s for i, s in enumerate(place.medium.scene.shapes())} if place.kind == "scene" else {}
+    """The shapes of ``place``, as children of a scene."""
+    scene = place.medium.scene if isinstance(place.medium, Place) else None
+    return {} if scene is None else {f"shape{i}": s for i, s in enumerate(scene.shapes())}

@@ -135,15 +135,15 @@ def log_score(at_gaze: np.ndarray, *, eps: float = np.finfo(np.float64).eps) -> 
 
 def _shares(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
     """Weights that sum to one along the last axis."""
-    a, b = np.shape(a), np.shape(b)
-    if not a or not b or a[-1] != b[-1]:
-        raise ValueError(f"maps of shape {a} and {b} do not have the same directions along the last axis")
+    shape, other = np.shape(a), np.shape(b)
+    if not shape or not other or shape[-1] != other[-1]:
+        raise ValueError(f"maps of shape {shape} and {other} do not have the same directions along the last axis")
     if weights is None:
-        return np.full(a[-1], 1.0 / a[-1])
+        return np.full(shape[-1], 1.0 / shape[-1])
     w = np.asarray(weights, dtype=np.float64)
-    if w.shape[-1:] != a[-1:] or not (w >= 0).all() or not (w.sum(axis=-1) > 0).all():
+    if w.shape[-1:] != shape[-1:] or not (w >= 0).all() or not (w.sum(axis=-1) > 0).all():
         raise ValueError(
-            f"weights of shape {w.shape} must be non-negative solid angles of the {a[-1]} directions, not all zero"
+            f"weights of shape {w.shape} must be non-negative solid angles of the {shape[-1]} directions, not all zero"
         )
     return w / w.sum(axis=-1, keepdims=True)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from nerg_mi.capture.salience.views import SalienceSet, open_salience
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
@@ -21,7 +21,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze import run
 from nerg_mi.training.gaze.ensemble import train_ensemble
 from nerg_mi.training.gaze.fit import GazeProgress
-from nerg_mi.training.gaze.plan import GazePlan, TrainedField
+from nerg_mi.training.gaze.plan import GazePlan
 from nerg_mi.training.gaze.settings import ProbeSettings
 from nerg_mi.training.gaze.splits import far_views, hold_out
 from nerg_mi.training.gaze.state import StateSettings
@@ -40,7 +40,7 @@ class GazeResult:
     """A gaze field that was trained."""
 
     # The field, or the ensemble.
-    field: TrainedField | GazeEnsemble
+    field: AnyGazeField
     # What its checkpoint says about the training (JSON).
     provenance: dict
     # The checkpoint; None where none was asked for.
@@ -68,7 +68,10 @@ def train_gaze(
     output = None if output is None else Path(output)
     probes = check_plan(options, views_alone=rays is None)
     state = None if output is None else output.with_suffix(".run")
-    _check_outputs(options, output, state)
+    if output is not None and state is not None:
+        _check_outputs(options, output, state)
+    elif options.resume or options.geometry == "hits":
+        raise NergError("a run that is resumed, and a place of hit points, need a file for the gaze field: give one")
     ns = select_backend(options.mode, options.threads)
     if options.resume and not options.ensemble and (state is None or not state.is_file()):
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
@@ -79,7 +82,7 @@ def train_gaze(
     place = replace(place, align=align)
     about |= place.about
     plan = plan_gaze(options, place, views_alone=supervision.rays is None)
-    if plan.initial:
+    if plan.initial and options.field is not None:
         about["begins_as"] = Path(options.field).name
     result = train_planned(
         supervision,
@@ -124,13 +127,8 @@ def train_planned(
     return GazeResult(field, {**state.about, **provenance}, output, provenance["interrupted"])
 
 
-def _check_outputs(options: GazeOptions, output: Path | None, state: Path | None) -> None:
-    if output is None:
-        if options.resume or options.geometry == "hits":
-            raise NergError(
-                "a run that is resumed, and a place of hit points, need a file for the gaze field: give one"
-            )
-        return
+def _check_outputs(options: GazeOptions, output: Path, state: Path) -> None:
+    """Raise `NergError` where one of the files cannot be written."""
     check_writable(output, ".safetensors")
     check_writable(state)
     if options.geometry == "hits":
@@ -142,17 +140,19 @@ def _supervision(
 ) -> tuple[Supervision, dict]:
     """What is learnt from, without what a test holds out; and what the provenance says of it (JSON)."""
     about: dict = {"recipe": options.recipe}
-    data = rays if rays is None or isinstance(rays, Rays) else Rays.load(rays)
-    if data is not rays:
-        path = Path(rays)
+    data = None
+    if isinstance(rays, Rays):
+        data = rays
+    elif rays is not None:
+        path, data = Path(rays), Rays.load(rays)
         about["rays_file"] = {"file": path.name, "sha256": file_sha256(path), "persons": len(data.persons)}
     views = []
-    if options.views is not None:
-        found, similarity = _open_views(options)
+    if options.views is not None and options.salience is not None:
+        found, similarity = _open_views(options, options.views, options.salience)
         views = found.views
         about |= {"salience": found.about, **similarity}
         _tell_views(found, reporter)
-    if options.test_zones:
+    if options.test_zones and data is not None:
         data, test = hold_out(
             data,
             probes.radius,
@@ -171,7 +171,7 @@ def _supervision(
     return Supervision(data, tuple(views)), about
 
 
-def _open_views(options: GazeOptions) -> tuple[SalienceSet, dict]:
+def _open_views(options: GazeOptions, photos: Path, salience: str) -> tuple[SalienceSet, dict]:
     """Salience images in the frame of the place, and what the provenance says of their alignment (JSON)."""
     matrix = None
     if options.align_views is not None:
@@ -179,7 +179,7 @@ def _open_views(options: GazeOptions) -> tuple[SalienceSet, dict]:
     trained = None
     if options.field is not None:
         trained = read_checkpoint(options.field, "radiance")[1].get("provenance")
-    found = open_salience(options.views, options.salience, options.salience_per, matrix, trained, options.allow_outside)
+    found = open_salience(photos, salience, options.salience_per, matrix, trained, options.allow_outside)
     return found, {} if matrix is None else {"align_views": matrix.tolist()}
 
 

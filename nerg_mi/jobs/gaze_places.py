@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -50,9 +51,9 @@ def make_place(
     Raises `NergError` for a file that cannot be used, and for rays without hits.
     """
     kind = place_kind(options)
-    if kind == "field":
+    if options.field is not None:
         return places.place_of_field(Path(options.field), ns)
-    if kind == "scene":
+    if options.scene is not None:
         return places.place_of_scene(Path(options.scene))
     if kind == "none":
         origins = [v.camera.center[None] for v in views] + ([] if rays is None else [rays.origin])
@@ -106,9 +107,9 @@ def place_of_training(
 def read_similarity(path: Path, option: str, frames: str) -> Similarity:
     """The similarity in a JSON file of four rows, which was given by ``option`` and leads from and to what ``frames``
     says ("rays to field"). Raises `NergError` for a file that holds none."""
-    matrix = read_json(path, f"similarity of {option}")
+    matrix: Any = read_json(path, f"similarity of {option}")
     try:
-        return Similarity([[float(x) for x in row] for row in matrix])
+        return Similarity(np.array([[float(x) for x in row] for row in matrix]))
     except (TypeError, ValueError, IndexError, OverflowError) as error:
         raise NergError(
             f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": {plain(error)}'

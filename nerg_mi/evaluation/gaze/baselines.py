@@ -8,10 +8,11 @@ positions or (P, D, 3). All share the kernels of :mod:`nerg_mi.density.kde.estim
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from nerg_mi.density.kde.estimate import SphericalKde
+from nerg_mi.density.kde.estimate import Backend, SphericalKde
 from nerg_mi.density.probes import Probes, place_probes
 from nerg_mi.rays.rays import Rays
 
@@ -30,7 +31,7 @@ def uniform() -> Baseline:
     return evaluate
 
 
-def position_blind(rays: Rays, *, kappa: float = 50.0, backend: object = None) -> Baseline:
+def position_blind(rays: Rays, *, kappa: float = 50.0, backend: Backend = None) -> Baseline:
     """One density for all positions: the KDE of all training rays, with ``kappa``
     (what people look at wherever they stand)."""
     # Runs of rays are separate mixtures averaged in float64: one sum of 10^5
@@ -49,7 +50,7 @@ def position_blind(rays: Rays, *, kappa: float = 50.0, backend: object = None) -
     return evaluate
 
 
-def nearest_probes(probes: Probes, k: int = 16, *, backend: object = None) -> Baseline:
+def nearest_probes(probes: Probes, k: int = 16, *, backend: Backend = None) -> Baseline:
     """Mean density of the ``k`` training probes nearest to a position; k = 1 is
     the nearest probe. Fewer where there are fewer probes."""
     from scipy.spatial import KDTree
@@ -59,7 +60,7 @@ def nearest_probes(probes: Probes, k: int = 16, *, backend: object = None) -> Ba
     rays = [np.arange(a, b) for a, b in zip(probes.offsets[:-1], probes.offsets[1:])]
 
     def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        found = tree.query(np.atleast_2d(positions), k=np.arange(1, k + 1))[1]
+        found = _nearest(tree, np.atleast_2d(positions), k)
         # The probes used, once each when the directions are common to all.
         if np.ndim(directions) == 2:
             used, back = np.unique(found, return_inverse=True)
@@ -74,7 +75,7 @@ def nearest_probes(probes: Probes, k: int = 16, *, backend: object = None) -> Ba
     return evaluate
 
 
-def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: object = None) -> Baseline:
+def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: Backend = None) -> Baseline:
     """KDE of the ``k`` training rays whose origins are nearest to a position: a
     probe without a radius, hard to beat where rays are many."""
     from scipy.spatial import KDTree
@@ -86,7 +87,7 @@ def nearest_rays(rays: Rays, k: int = 4096, *, kappa: float = 20.0, backend: obj
         positions, directions = np.atleast_2d(positions), np.asarray(directions)
         out = []
         for start in range(0, len(positions), 64):  # 64 x 4,096 rays at a time
-            found = tree.query(positions[start : start + 64], k=np.arange(1, k + 1))[1]
+            found = _nearest(tree, positions[start : start + 64], k)
             kde = SphericalKde(rays.direction[found.ravel()], np.arange(len(found) + 1) * k, kappa, backend=backend)
             out.append(kde.evaluate(directions if directions.ndim == 2 else directions[start : start + 64]))
         return np.concatenate(out)
@@ -114,7 +115,12 @@ def standard_baselines(
     }
 
 
-def _some(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: object) -> SphericalKde:
+def _nearest(tree: Any, positions: np.ndarray, k: int) -> np.ndarray:
+    """Indices (P, k) of the ``k`` points of a KD-tree that are nearest to each of ``positions`` (P, 3)."""
+    return tree.query(positions, k=np.arange(1, k + 1))[1]
+
+
+def _some(probes: Probes, rays: list[np.ndarray], which: np.ndarray, backend: Backend) -> SphericalKde:
     """The densities of the probes ``which`` of ``probes``, whose rays are at ``rays``."""
     runs = [rays[p] for p in which]
     offsets = np.concatenate([[0], np.cumsum([len(r) for r in runs])])

@@ -77,13 +77,13 @@ def side_by_side(test: GazeTest, methods: dict[str, Baseline], path: Path, count
         len(which), len(pictures), figsize=(3.4 * len(pictures), 1.9 * len(which)), squeeze=False, layout="constrained"
     )
     for i, row in enumerate(axes):
-        top = np.quantile(pictures[0][1][i], 0.995)
+        top, images = np.quantile(pictures[0][1][i], 0.995), []
         for (name, maps), axis in zip(pictures, row):
-            image = axis.imshow(maps[i].reshape(height, 2 * height), vmin=0, vmax=top, cmap="inferno")
+            images.append(axis.imshow(maps[i].reshape(height, 2 * height), vmin=0, vmax=top, cmap="inferno"))
             axis.set(xticks=[], yticks=[])
             if i == 0:
                 axis.set_title(name, fontsize=10)
         row[0].set_ylabel(", ".join(f"{x:.1f}" for x in test.centres[which[i]]) + " m", fontsize=8)
-        figure.colorbar(image, ax=row.tolist(), shrink=0.9).set_label("1/sr", fontsize=8)
+        figure.colorbar(images[-1], ax=row.tolist(), shrink=0.9).set_label("1/sr", fontsize=8)
     write_figure(path, figure, dpi=110)
     plt.close(figure)

@@ -19,6 +19,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
+from nerg_mi.field.gaze.protocol import AnyGazeField, GazeDensity
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from nerg_mi.rays.rays import Rays
@@ -26,7 +27,7 @@ from nerg_mi.training.common.run_state import kept_unless, require_same
 from nerg_mi.training.geometry.places import GazePlace
 
 from .fit import GazeProgress, Listener
-from .plan import GazePlan, TrainedField
+from .plan import GazePlan
 from .run import train_gaze
 from .settings import GazeSettings
 from .state import KIND as RUN
@@ -102,13 +103,13 @@ def train_ensemble(
     interrupted.
     """
     state = state or StateSettings()
-    _check(members, supervision, plan)
+    rays, path = _resampled(members, supervision, plan), state.path
     if plan.settings.minutes is not None:
         plan = plan.with_settings(minutes=plan.settings.minutes / members)
-    rays, path = supervision.rays, state.path
     _, kind = blocks_of(rays)
     parts = [path and path.with_name(f"{path.stem}.member{k}.safetensors") for k in range(members)]
-    if state.resume and not any(p is not None and p.is_file() for p in (path, *parts)):
+    is_file = lambda file: file is not None and file.is_file()
+    if state.resume and not any(map(is_file, (path, *parts))):
         raise NergError(f'there is nothing to resume: "{path}" does not exist; leave out --resume to start')
     fields, each = [], []
     for k, part in enumerate(parts):
@@ -116,7 +117,7 @@ def train_ensemble(
         member_plan = plan.with_settings(seed=plan.settings.seed + 100 * k)
         # All that a state of the run compares, of the rays that the resamples are drawn from.
         identity = member_plan.identity(supervision, place, own)
-        if state.resume and part.is_file():
+        if state.resume and part is not None and part.is_file():
             field, provenance = _finished(part, identity, own, ns)
         else:
             field, provenance = train_gaze(
@@ -124,7 +125,7 @@ def train_ensemble(
                 place,
                 member_plan,
                 ns,
-                state=replace(own, resume=state.resume and path.is_file()),
+                state=replace(own, resume=state.resume and is_file(path)),
                 tell=tell and _of_member(tell, k, members),
                 write=None if part is None else _writer(part, identity),
             )
@@ -145,7 +146,8 @@ def train_ensemble(
     return TrainedEnsemble(ensemble, provenance)
 
 
-def _check(members: int, supervision: Supervision, plan: GazePlan) -> None:
+def _resampled(members: int, supervision: Supervision, plan: GazePlan) -> Rays:
+    """The rays that the members' are drawn from. Raises `NergError` for what cannot be resampled."""
     if members < 2:
         raise NergError(f"an ensemble needs at least two members, got {members}")
     if supervision.rays is None or supervision.views:
@@ -154,6 +156,7 @@ def _check(members: int, supervision: Supervision, plan: GazePlan) -> None:
         raise NergError(
             'an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"'
         )
+    return supervision.rays
 
 
 def _of_member(tell: Listener, k: int, members: int) -> Listener:
@@ -166,21 +169,26 @@ def _of_member(tell: Listener, k: int, members: int) -> Listener:
     return told
 
 
-def _finished(part: Path, identity: dict, state: StateSettings, ns: ModuleType) -> tuple[TrainedField, dict]:
+def _finished(part: Path, identity: dict, state: StateSettings, ns: ModuleType) -> tuple[AnyGazeField, dict]:
     """A member that an earlier process has finished, and its provenance. Raises `NergError` for one of another run."""
     field, meta = load_gaze(part, ns)
     kept = meta["provenance"]
     require_same(part, kept["about"], identity)
-    if state.path.is_file() and read_checkpoint(state.path, RUN)[1]["about"].get("member") == state.about["member"]:
+    run = state.path
+    if (
+        run is not None
+        and run.is_file()
+        and read_checkpoint(run, RUN)[1]["about"].get("member") == state.about["member"]
+    ):
         # Killed between the writing of the member and the removal of its state.
-        state.path.unlink()
+        run.unlink()
     return field, kept["trained"]
 
 
-def _writer(part: Path, identity: dict) -> Callable[[TrainedField, dict], None]:
+def _writer(part: Path, identity: dict) -> Callable[[GazeDensity, dict], None]:
     """Writes a member into ``part``; one that was interrupted has its state, and is none yet."""
 
-    def write(field: TrainedField, provenance: dict) -> None:
+    def write(field: GazeDensity, provenance: dict) -> None:
         if not provenance["interrupted"]:
             save_gaze(field, part, {"trained": provenance, "about": identity})
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -41,8 +42,8 @@ Listener = Callable[[GazeProgress], object]
 class Fit:
     """What a fit has come to."""
 
-    # None: of an earlier process, which kept no more than what was found.
-    trainer: GazeTrainer | None
+    # The `GazeTrainer`; None: of an earlier process, which kept no more than what was found.
+    trainer: Any = None
     # The best weights.
     weights: dict = field(default_factory=dict)
     # After how many steps they were.
@@ -88,8 +89,7 @@ def fit_watched(
     """Train until the schedule ends, or validation on ``watched`` has not improved for ``patience`` looks. ``share``:
     of the minutes."""
     settings = plan.settings
-    timed = settings.minutes is not None
-    if timed:
+    if settings.minutes is not None:
         settings = replace(settings, minutes=settings.minutes * share)
     trainer = plan.trainer(targets, box, plan.config, settings, ns, initial=plan.initial)
     out = Fit.of(file.found, trainer, file.restore("fit", trainer))
@@ -117,7 +117,7 @@ def fit_watched(
         out.scores, out.best_step, out.weights = trainer.measure(watched), trainer.steps, trainer.weights()
     if not out.weights:
         out.weights, out.best_step = trainer.weights(), trainer.steps
-    if timed:
+    if settings.minutes is not None:
         # What the clock's schedule came to in steps, so that a second fit can follow the same one.
         out.schedule = max(trainer.steps, round(trainer.steps / max(trainer.progress, 1e-6)))
     return out

@@ -20,7 +20,7 @@ from nerg_mi.maths.box import Box
 from .batches import Batch
 from .log_density_model import log_gaze, used_parameters
 from .settings import GazeSettings
-from .targets import TargetNeeds, Targets
+from .targets import Targets
 from .trainer import GazeTrainer
 
 
@@ -44,10 +44,6 @@ class LikelihoodTrainer(GazeTrainer):
         super().__init__(targets, box, config, settings, ns, schedule, initial)
         trained = set(self.optimiser.keys())
         self.constant = {k: v for k, v in self.initial.parameters().items() if k not in trained}
-
-    @staticmethod
-    def needs(config: LogGazeConfig) -> TargetNeeds:
-        return TargetNeeds(fill=config.escaped == "nearest", blind_rows=config.prior)
 
     def learn_from(self, targets: Targets, epoch: int) -> None:
         super().learn_from(targets, epoch)

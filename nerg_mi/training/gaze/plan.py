@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
-from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.gaze.protocol import GazeFieldConfig
 from nerg_mi.training.geometry.places import GazePlace
 
 from .settings import GazeSettings, ProbeSettings
 from .state import StateSettings
 from .supervision import Supervision
 from .trainer import GazeTrainer
-
-GazeFieldConfig: TypeAlias = GazeConfig | LogGazeConfig
-"""Architecture of a gaze field of any kind."""
-TrainedField: TypeAlias = GazeField | LogGazeField
-"""A gaze field of any kind."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +27,7 @@ class GazePlan:
     # Moves the weights of a field of this kind.
     trainer: type[GazeTrainer]
     # Arrays to begin with in place of random ones, by name (`semantics.initial_weights`); None: random ones.
-    initial: Mapping[str, Any] | None = None
+    initial: dict[str, Any] | None = None
 
     def with_settings(self, **changes: Any) -> GazePlan:
         """The same with other ``settings``."""

@@ -7,22 +7,17 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.field.gaze.product import GazeField
 
 from .batches import Batch
 from .losses import gaze_loss
 from .product_model import gaze_density, used_parameters
 from .settings import LOSSES
-from .targets import TargetNeeds
 from .trainer import GazeTrainer
 
 
 class ProductTrainer(GazeTrainer):
     """A run of a ``GazeField``; see ``GazeTrainer``."""
-
-    @staticmethod
-    def needs(config: GazeConfig) -> TargetNeeds:
-        return TargetNeeds(semantic=config.semantic)
 
     def untrained(self) -> GazeField:
         return GazeField.random(self.config, self.box, self.ns, self.settings.seed)

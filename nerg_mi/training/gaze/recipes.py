@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypedDict
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig
 from nerg_mi.field.gaze.product import GazeConfig
+from nerg_mi.field.gaze.protocol import GazeFieldConfig
 from nerg_mi.training.geometry.places import GazePlace
 
 from .likelihood import LikelihoodTrainer
-from .plan import GazeFieldConfig, GazePlan
+from .plan import GazePlan
 from .product import ProductTrainer
 from .semantics import initial_weights, trunk_config
 from .settings import GazeSettings, ProbeSettings
@@ -87,16 +88,18 @@ class Recipe:
         field, and such a one is needed.
         """
         choices = replace(choices or FieldChoices(), place=place.kind)
-        if place.radiance is None and (begin or choices.semantic):
-            raise NergError(
-                f"{'--begin field' if begin else '--semantic'} needs a radiance field: give it with --field"
-            )
         config, initial = self.config(choices), None
-        if begin:
-            config = trunk_config(config, place.radiance.config)
-            initial = initial_weights(place.radiance, config)
-        elif choices.semantic:
-            config = replace(config, geometry=place.radiance.config.geometry)
+        if begin or choices.semantic:
+            option = "--begin field" if begin else "--semantic"
+            if place.radiance is None:
+                raise NergError(f"{option} needs a radiance field: give it with --field")
+            if not isinstance(config, GazeConfig):
+                raise NergError(f"a field of the recipe {self.name} does not take {option}; leave it out")
+            if begin:
+                config = trunk_config(config, place.radiance.config)
+                initial = initial_weights(place.radiance, config)
+            else:
+                config = replace(config, geometry=place.radiance.config.geometry)
         return GazePlan(
             config=config,
             settings=self.gaze_settings(settings, views_alone),
@@ -138,7 +141,16 @@ def _log_density(choices: FieldChoices) -> LogGazeConfig:
     )
 
 
-def surroundings(place: str) -> dict[str, Any]:
+class Surroundings(TypedDict):
+    """What a log density is told of where it is."""
+
+    # What its directions without a surface are (`LogGazeConfig.escaped`).
+    escaped: str
+    # Whether there are surfaces (`LogGazeConfig.geometry`).
+    geometry: str
+
+
+def surroundings(place: str) -> Surroundings:
     """What a log density is told of a kind of ``place``: one of hit points has holes, through which nobody saw whom it
     was made from; no place has no surfaces."""
     return {

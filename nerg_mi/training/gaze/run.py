@@ -13,13 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerg_mi.field.gaze.protocol import GazeDensity
 from nerg_mi.training.common.run_state import kept_unless
 from nerg_mi.training.geometry.places import GazePlace
 
 from .fit import Fit, GazeProgress, Listener, fit_again, fit_watched, rounded
-from .plan import GazePlan, TrainedField, alignment
+from .plan import GazePlan, alignment
 from .ray_targets import targets_of_rays
-from .splits import ValidationSplit, split_validation
+from .splits import split_validation
 from .state import GazeRunFile, StateSettings
 from .supervision import Supervision
 from .targets import TargetNeeds, Targets, concatenate
@@ -29,7 +30,7 @@ from .view_targets import targets_of_views
 class TrainedGaze(NamedTuple):
     """What a training came to: the field, and its provenance (JSON)."""
 
-    field: TrainedField
+    field: GazeDensity
     provenance: dict
 
 
@@ -41,7 +42,7 @@ def train_gaze(
     *,
     state: StateSettings | None = None,
     tell: Listener | None = None,
-    write: Callable[[TrainedField, dict], None] | None = None,
+    write: Callable[[GazeDensity, dict], None] | None = None,
 ) -> TrainedGaze:
     """Train a gaze field on ``supervision`` in ``place``, with arrays of the backend ``ns``.
 
@@ -55,36 +56,50 @@ def train_gaze(
     removed; if it raises, the state is that of the end. Without it the state stays.
     """
     tell, state, started = tell or (lambda progress: None), state or StateSettings(), time.perf_counter()
-    settings, needs = plan.settings, plan.trainer.needs(plan.config)
+    settings, needs = plan.settings, TargetNeeds.of(plan.config)
     file = GazeRunFile(state.path, plan.identity(supervision, place, state), state.every, state.resume)
     tell(GazeProgress("probes", 0.0, 0, 0.0, None))
     split, watched = split_validation(supervision, place, settings, plan.probes), None
     if split.watched is not None:
         watched = make_targets(split.watched, place, plan, needs, settings.seed + 2, split.centres)
     refits = settings.refit and watched is not None
-    prepared, targets = 0.0, None
-    if file.stage == "refit":
-        first = last = Fit.of(file.found)
+    prepared, again = 0.0, file.stage == "refit"
+    used = supervision if again else split.learn
+    targets = make_targets(used, place, plan, needs, settings.seed)
+    if again:
+        first = Fit.of(file.found)
     else:
-        targets = make_targets(split.learn, place, plan, needs, settings.seed)
         prepared = time.perf_counter() - started
-        first = last = fit_watched(targets, watched, place.box, plan, ns, 0.5 if refits else 1.0, file, tell)
-    if refits and not first.interrupted:
-        if file.stage != "refit":
+        first = fit_watched(targets, watched, place.box, plan, ns, 0.5 if refits else 1.0, file, tell)
+        again = refits and not first.interrupted
+        if again:
+            # Making the targets of everything may take long: what was found is kept before.
             file.keep("refit", None, first.found(), {}, now=True)
-        targets = make_targets(supervision, place, plan, needs, settings.seed)
-        last = fit_again(targets, first, place.box, plan, ns, file, tell)
-    field = last.trainer.field(last.weights)
-    field.support = (split.learn if last is first else supervision).support(plan.probes.radius, place)
-    provenance = _provenance(supervision, place, plan, targets, first, last) | {
+            used, targets = supervision, make_targets(supervision, place, plan, needs, settings.seed)
+    last = fit_again(targets, first, place.box, plan, ns, file, tell) if again else first
+    trainer = last.trainer
+    field = trainer.field(last.weights)
+    field.support = used.support(plan.probes.radius, place)
+    provenance = _provenance(supervision, place, plan, targets) | {
+        "steps": trainer.steps,
         "seconds": round(file.spent, 1),
         "seconds_preparing": round(prepared, 1),
+        "refitted": again,
+        "interrupted": first.interrupted or last.interrupted,
     }
-    if watched is not None:
-        provenance["validation"] = _account(split, watched, first, settings.zones)
+    if watched is not None and first.scores is not None:
+        provenance["validation"] = {
+            "zones": settings.zones,
+            "probes": len(watched.truth),
+            "rays_held_out": split.rays_held_out,
+            "views_held_out": split.views_held_out,
+            "best_step": first.best_step,
+            **rounded(first.scores),
+            "history": first.history,
+        }
     if write is not None:
-        stage, weights = ("fit", last.weights) if last is first else ("refit", {})
-        keep = lambda: file.keep(stage, last.trainer, first.found(), weights, now=True)
+        stage, weights = ("refit", {}) if again else ("fit", last.weights)
+        keep = lambda: file.keep(stage, trainer, first.found(), weights, now=True)
         with kept_unless(state.path, keep, done=not provenance["interrupted"]):
             write(field, provenance)
     return TrainedGaze(field, provenance)
@@ -111,9 +126,7 @@ def make_targets(
     return concatenate(targets, targets_of_views(views, place, probes, needs, seed))
 
 
-def _provenance(
-    supervision: Supervision, place: GazePlace, plan: GazePlan, targets: Targets, first: Fit, last: Fit
-) -> dict:
+def _provenance(supervision: Supervision, place: GazePlace, plan: GazePlan, targets: Targets) -> dict:
     """What the field was trained with and on (JSON)."""
     return {
         "settings": plan.settings.to_dict(),
@@ -124,21 +137,5 @@ def _provenance(
         "probes_made": len(targets.truth),
         "escaped_directions": round(targets.escape_share, 6),
         "escaped_gaze": round(targets.escaped_gaze, 6),
-        "steps": last.trainer.steps,
-        "refitted": last is not first,
-        "interrupted": first.interrupted or last.interrupted,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-    }
-
-
-def _account(split: ValidationSplit, watched: Targets, first: Fit, zones: int) -> dict:
-    """What the validation came to (JSON)."""
-    return {
-        "zones": zones,
-        "probes": len(watched.truth),
-        "rays_held_out": split.rays_held_out,
-        "views_held_out": split.views_held_out,
-        "best_step": first.best_step,
-        **rounded(first.scores),
-        "history": first.history,
     }

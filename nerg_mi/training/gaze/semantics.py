@@ -8,6 +8,7 @@ fine-tuned.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -17,6 +18,7 @@ from nerg_mi.field.gaze.product import GazeConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.features import accumulated, snapshot
+from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
 
@@ -34,17 +36,16 @@ def semantic_features(
     """
     import mitsuba as mi
 
-    if place.radiance is None:
-        raise NergError("semantic features are those of a radiance field; give one with --field")
     medium = place.medium
+    if not isinstance(medium, FieldMedium):
+        raise NergError("semantic features are those of a radiance field; give one with --field")
     out = np.empty((len(origins), medium.feature_count), np.float16)
     with dr.suspend_grad():
         for a in range(0, len(out), BATCH):
             part = slice(a, a + BATCH)
-            o, d = (
-                array(np.ascontiguousarray(np.asarray(v[part], np.float32).T))
-                for array, v in ((mi.Point3f, origins), (mi.Vector3f, directions))
-            )
+            columns = lambda v, part=part: np.ascontiguousarray(np.asarray(v[part], np.float32).T)
+            o: Any = mi.Point3f(columns(origins))
+            d: Any = mi.Vector3f(columns(directions))
             if kind == "snapshot":
                 t = mi.Float(np.ascontiguousarray(distance[part], np.float32))
                 found = snapshot(medium, o + d * t, mi.Bool(True))

@@ -49,7 +49,7 @@ def split_validation(
     if rays is None:
         learn, watched = split_views(views, settings.zones, 2 * probes.radius, settings.seed + 1)
         return ValidationSplit(
-            Supervision(None, learn), Supervision(None, watched), views_held_out=len(views) - len(learn)
+            Supervision(None, tuple(learn)), Supervision(None, tuple(watched)), views_held_out=len(views) - len(learn)
         )
     split = split_by_position(
         rays,
@@ -61,7 +61,7 @@ def split_validation(
     )
     kept = far_views(views, place.points_from_rays(split.test_centres), 2 * probes.radius * place.align.scale)
     return ValidationSplit(
-        Supervision(rays.select(split.train), kept),
+        Supervision(rays.select(split.train), tuple(kept)),
         # All rays around the centres: what is scored is what people there really looked at.
         Supervision(rays),
         split.test_centres,

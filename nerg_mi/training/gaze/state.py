@@ -69,12 +69,12 @@ class GazeRunFile:
     def restore(self, stage: str, trainer: GazeTrainer) -> dict:
         """Set ``trainer`` to the state of ``stage``, where that is what was read; returns the weights that ``keep`` was
         given."""
-        if stage != self.stage or "random" not in self._meta:
+        if self.path is None or stage != self.stage or "random" not in self._meta:
             return {}
         with restoring(self.path):
             restore_optimiser(trainer, self._tensors, self._meta["taken"])
-            counts = [count_of(self._meta, name) for name in ("steps", "seconds")]
-            trainer.restore(*counts, self._meta["random"])
+            steps, seconds = (count_of(self._meta, name) for name in ("steps", "seconds"))
+            trainer.restore(int(steps), seconds, self._meta["random"])
             best = {k: v for k, v in trainer.averaged.items() if f"best.{k}" in self._tensors}
             for k, v in best.items():
                 require_shape(self._tensors, f"best.{k}", v)

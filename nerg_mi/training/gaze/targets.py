@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerg_mi.field.gaze.protocol import GazeFieldConfig
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.training.geometry.surfaces import surface_distances
 
@@ -27,6 +28,11 @@ class TargetNeeds:
     fill: bool = False
     # Rows of the table of the blind density that the field begins with; 0: it needs none.
     blind_rows: int = 0
+
+    @staticmethod
+    def of(config: GazeFieldConfig) -> TargetNeeds:
+        """What a field of the configuration ``config`` needs."""
+        return TargetNeeds(config.semantic, config.fills_escaped, config.prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +90,8 @@ def observe(
         origins = np.repeat(positions, directions.shape[1], axis=0)
         features = semantic_features(place, origins, directions.reshape(-1, 3), distance.ravel(), needs.semantic)
         features = features.reshape(*directions.shape[:2], -1)
-    narrow = (v.astype(np.float32, copy=False) for v in (positions, directions, truth))
-    return Targets(*narrow, distance, escaped, features)
+    narrow = lambda v: v.astype(np.float32, copy=False)
+    return Targets(narrow(positions), narrow(directions), narrow(truth), distance, escaped, features)
 
 
 def concatenate(a: Targets, b: Targets) -> Targets:
@@ -94,5 +100,7 @@ def concatenate(a: Targets, b: Targets) -> Targets:
     out = {k: rows(k) for k in ("positions", "directions", "truth", "distance", "escaped")}
     extent = [np.full(len(t.truth), 4 * np.pi, np.float32) if t.extent is None else t.extent for t in (a, b)]
     semantic = None if a.semantic is None else rows("semantic")
-    renew = None if a.renew is None else lambda epoch: concatenate(a.renew(epoch), b.renew(epoch))
+    renew, of_a, of_b = None, a.renew, b.renew
+    if of_a is not None and of_b is not None:
+        renew = lambda epoch: concatenate(of_a(epoch), of_b(epoch))
     return Targets(**out, semantic=semantic, blind=a.blind, renew=renew, extent=np.concatenate(extent))

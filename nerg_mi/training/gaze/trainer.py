@@ -11,12 +11,13 @@ import drjit as dr
 import numpy as np
 from drjit.opt import AdamW
 
+from nerg_mi.field.gaze.protocol import GazeDensity
 from nerg_mi.maths.box import Box
 
 from .batches import Batch, TargetArrays
 from .losses import gaze_loss
 from .settings import GazeSettings
-from .targets import TargetNeeds, Targets
+from .targets import Targets
 
 # Samples of one launch of a validation.
 _CHUNK = 1 << 16
@@ -41,7 +42,7 @@ class GazeTrainer(ABC):
     seeds draw equal batches; sums over threads are not ordered, so that weights agree between runs to rounding (and bit
     for bit only with one thread).
 
-    A kind of field has a class of its own, which says what targets it needs, what its weights are, and what moves them.
+    A kind of field has a class of its own, which says what its weights are and what moves them.
     """
 
     def __init__(
@@ -54,11 +55,13 @@ class GazeTrainer(ABC):
         schedule: int | None = None,
         initial: dict | None = None,
     ):
-        self.config, self.settings, self.box, self.ns = config, settings, box, ns
+        # A field's class knows its configuration's, and so does its trainer.
+        self.config: Any = config
+        self.settings, self.box, self.ns = settings, box, ns
         self.rng = np.random.default_rng(settings.seed)
         self._schedule, self._targets = schedule, targets
         self.learn_from(targets, 0)
-        self.initial = self.untrained()
+        self.initial: Any = self.untrained()
         if initial:
             self.initial.set_parameters(initial)
         self.constant = dict(initial or {}) if settings.frozen else {}
@@ -70,13 +73,8 @@ class GazeTrainer(ABC):
         self.steps, self.loss = 0, None
         self._started = time.perf_counter()
 
-    @staticmethod
     @abstractmethod
-    def needs(config: Any) -> TargetNeeds:
-        """What a field of the configuration ``config`` is shown besides directions and densities."""
-
-    @abstractmethod
-    def untrained(self) -> Any:
+    def untrained(self) -> GazeDensity:
         """The field with its random weights."""
 
     @abstractmethod
@@ -103,8 +101,10 @@ class GazeTrainer(ABC):
     @property
     def progress(self) -> float:
         """Share of the schedule that is done, 0..1."""
-        s, steps = self.settings, self._schedule or self.settings.steps
-        return min(1.0, self.steps / steps if steps else self.seconds / (60 * s.minutes))
+        steps, minutes = self._schedule or self.settings.steps, self.settings.minutes
+        if not steps and minutes is not None:
+            return min(1.0, self.seconds / (60 * minutes))
+        return min(1.0, self.steps / (steps or 1))
 
     def restore(self, steps: int, seconds: float, random: dict) -> None:
         """Go on from stored numbers; see ``state``."""
@@ -160,7 +160,7 @@ class GazeTrainer(ABC):
         """A copy of the averaged weights."""
         return {k: type(v)(v) for k, v in self.averaged.items()}
 
-    def field(self, weights: dict | None = None) -> Any:
+    def field(self, weights: dict | None = None) -> GazeDensity:
         """The field with the averaged weights (or ``weights``)."""
         out = self.untrained()
         out.set_parameters({**self.constant, **(weights or self.weights())})

@@ -68,7 +68,7 @@ class HitExtent:
             return np.zeros(len(hits), bool)
         # A wall along which the box was cut is no more than half a voxel beyond it.
         low, high = self.shell[0] - 0.5 * self.voxel, self.shell[1] + 0.5 * self.voxel
-        return ~((hits >= low) & (hits <= high)).all(axis=1)
+        return np.logical_not(((hits >= low) & (hits <= high)).all(axis=1))
 
 
 def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitExtent:
@@ -81,8 +81,7 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
 
     Raises `NergError` for rays without hit points and for a ``voxel`` that is too small or not positive.
     """
-    known = None if rays.hit is None else np.isfinite(rays.hit).all(axis=1)
-    if known is None or not known.any():
+    if rays.hit is None or not (known := np.isfinite(rays.hit).all(axis=1)).any():
         raise NergError("these rays have no hit points to make a place from; give a radiance field instead (--field)")
     if voxel is not None and not (voxel > 0 and np.isfinite(voxel)):
         raise NergError(f"a voxel's edge must be positive, got {voxel} m; leave out --voxel")
@@ -133,7 +132,7 @@ def _cut(
     step = max(1, len(points) // _STEPS)
     while True:
         points = points[((points >= box[0]) & (points <= box[1])).all(axis=1)]
-        count = np.prod(_count(*box, voxel))
+        count = np.prod(_count(box[0], box[1], voxel))
         best, cut = 0.0, None
         for axis in range(3):
             along = np.sort(points[:, axis])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.ray_box import box_interval
 from nerg_mi.rays.rays import Rays
@@ -37,6 +38,8 @@ def voxelise_hits(rays: Rays, voxel: float | None = None, extent: HitExtent | No
     from scipy.ndimage import binary_closing, binary_dilation
 
     extent = extent or hit_extent(rays, voxel)
+    if rays.hit is None:
+        raise NergError("these rays have no hit points to make a place from; give a radiance field instead (--field)")
     known = np.isfinite(rays.hit).all(axis=1)
     hits, origins = rays.hit[known], rays.origin[known]
     if extent.cut:
@@ -45,9 +48,9 @@ def voxelise_hits(rays: Rays, voxel: float | None = None, extent: HitExtent | No
         there = np.isfinite(hits).all(axis=1)
         hits, origins = hits[there], origins[there]
     hit, cube = _marked(extent, hits), np.ones((3, 3, 3), bool)
-    solid = binary_closing(hit, cube, iterations=_CLOSING)
+    solid = np.asarray(binary_closing(hit, cube, iterations=_CLOSING), bool)
     solid &= hit | ~_passed(origins, hits, extent)
-    solid &= ~binary_dilation(_marked(extent, rays.origin), cube)
+    solid &= ~np.asarray(binary_dilation(_marked(extent, rays.origin), cube), bool)
     density = np.where(solid, np.float32(_TAU / extent.voxel), np.float32(0))
     return density, Box(tuple(extent.lower.tolist()), tuple(extent.upper.tolist()))
 

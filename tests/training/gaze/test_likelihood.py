@@ -14,7 +14,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer, log_mean_exp
 from nerg_mi.training.gaze.losses import KLD_EPS
 from nerg_mi.training.gaze.settings import GazeSettings
-from nerg_mi.training.gaze.targets import TargetNeeds, Targets
+from nerg_mi.training.gaze.targets import Targets
 from tests.field.gaze.test_log_density import BOX, SMALL, jit
 
 FAST = GazeSettings(
@@ -118,9 +118,3 @@ def test_equal_seeds_train_equal_fields(variant):
         np.testing.assert_allclose(first[name].numpy(), second[name].numpy(), atol=1e-6)
     name = "capture_net.0" if variant == "capture" else "emit_net.0"
     assert np.abs(first[name].numpy() - other[name].numpy()).max() > 1e-3
-
-
-def test_it_needs_the_blind_density_and_depths_in_holes():
-    assert LikelihoodTrainer.needs(SMALL) == TargetNeeds(blind_rows=SMALL.prior)
-    holes = replace(SMALL, escaped="nearest")
-    assert LikelihoodTrainer.needs(holes) == TargetNeeds(fill=True, blind_rows=SMALL.prior)

@@ -1,8 +1,6 @@
-"""Trainings of products: one probe is learnt, and a whole run with validation is, beside what its targets need."""
+"""Trainings of products: one probe is learnt, and a whole run with validation is."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import drjit.llvm.ad as ns
 import numpy as np
@@ -12,7 +10,6 @@ from nerg_mi.density.probes import place_probes
 from nerg_mi.training.gaze.product import ProductTrainer
 from nerg_mi.training.gaze.ray_targets import targets_of_probes
 from nerg_mi.training.gaze.settings import GazeSettings
-from nerg_mi.training.gaze.targets import TargetNeeds
 
 from .looks import BOX, SMALL
 
@@ -29,11 +26,6 @@ def test_one_probe_is_learnt(rays, wall):
     after = trainer.measure(targets)
     assert before.kld > 0.5
     assert after.kld < 0.05 and after.cc > 0.97 and abs(after.integral - 1) < 0.15
-
-
-def test_a_semantic_field_needs_features_and_nothing_else():
-    assert ProductTrainer.needs(SMALL) == TargetNeeds()
-    assert ProductTrainer.needs(replace(SMALL, semantic="snapshot")) == TargetNeeds(semantic="snapshot")
 
 
 @pytest.mark.parametrize("loss, judged", [("paper", 0.5 + 0.25 + 0.01), ("code", 0.1 * 0.25 + 0.01)])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.training.gaze.targets import TargetNeeds, Targets, concatenate, observe
 
-from .looks import NOWHERE
+from .looks import LOG, NOWHERE, SMALL
 
 
 def made(count, seed=0, **more):
@@ -25,6 +27,19 @@ def made(count, seed=0, **more):
         rng.random((count, 5)) < 0.4,
         **more,
     )
+
+
+@pytest.mark.parametrize(
+    "config, needs",
+    [
+        (SMALL, TargetNeeds()),
+        (replace(SMALL, semantic="snapshot"), TargetNeeds(semantic="snapshot")),
+        (LOG, TargetNeeds(blind_rows=16)),
+        (replace(LOG, escaped="nearest"), TargetNeeds(fill=True, blind_rows=16)),
+    ],
+)
+def test_a_field_says_what_it_needs(config, needs):
+    assert TargetNeeds.of(config) == needs
 
 
 def test_what_escapes_is_counted_by_directions_and_by_gaze():

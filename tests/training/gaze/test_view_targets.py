@@ -14,7 +14,7 @@ from nerg_mi.training.gaze.likelihood import LikelihoodTrainer
 from nerg_mi.training.gaze.product import ProductTrainer
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
 from nerg_mi.training.gaze.supervision import Supervision
-from nerg_mi.training.gaze.targets import Targets, concatenate
+from nerg_mi.training.gaze.targets import TargetNeeds, Targets, concatenate
 from nerg_mi.training.gaze.view_targets import targets_of_views
 from nerg_mi.training.geometry.places import GazePlace
 from tests.field.gaze.test_log_density import BOX, SMALL
@@ -44,7 +44,7 @@ def test_directions_and_densities_of_a_view():
 
 def test_the_likelihood_is_given_the_view():
     """Drawn loss and validation against the field's own densities, divided by their sum over the view in NumPy."""
-    data = targets_of_views(around(4), PLACE, PROBES, LikelihoodTrainer.needs(SMALL))
+    data = targets_of_views(around(4), PLACE, PROBES, TargetNeeds.of(SMALL))
     settings = GazeSettings(steps=1, loss="likelihood", integral=0.0, probes=4, directions=512, rays=2048, zones=0)
     trainer = LikelihoodTrainer(data, BOX, replace(SMALL, mix=0.0, geometry="none"), settings, ns)
     field = trainer.initial
