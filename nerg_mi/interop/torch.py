@@ -15,7 +15,7 @@ a field of the LLVM backend and on the GPU for one of the CUDA backend.
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import numpy as np
@@ -221,7 +221,10 @@ class GazeEnsembleModule(torch.nn.Module):
 
     def field(self) -> GazeEnsemble:
         """An ensemble of its own with the weights as they are now."""
-        return GazeEnsemble([member.field() for member in self.members], self._field.support)
+        return GazeEnsemble([member.field() for member in self._densities()], self._field.support)
+
+    def _densities(self) -> list[GazeModule]:
+        return cast("list[GazeModule]", list(self.members))
 
     def each(
         self,
@@ -236,7 +239,7 @@ class GazeEnsembleModule(torch.nn.Module):
         if integral is not None and len(integral) != len(self.members):
             raise ValueError(f"give the integral of each of the {len(self.members)} members, got {len(integral)}")
         integrals = [None] * len(self.members) if integral is None else integral
-        return torch.stack([member(p_od, p_o, r_o, z, escaped) for member, z in zip(self.members, integrals)])
+        return torch.stack([member(p_od, p_o, r_o, z, escaped) for member, z in zip(self._densities(), integrals)])
 
     def forward(
         self,
@@ -253,7 +256,7 @@ class GazeEnsembleModule(torch.nn.Module):
         self, p_od: torch.Tensor, p_o: torch.Tensor, r_o: torch.Tensor, escaped: torch.Tensor | None = None
     ) -> torch.Tensor:
         """The integrals of the members (members,) over the sphere of one observer; see ``GazeModule.integral``."""
-        return torch.stack([member.integral(p_od, p_o, r_o, escaped) for member in self.members])
+        return torch.stack([member.integral(p_od, p_o, r_o, escaped) for member in self._densities()])
 
 
 def _columns(ns, p):

@@ -9,6 +9,8 @@ uniformly.
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import numpy as np
 
@@ -42,7 +44,8 @@ class RaySupport:
     def at(self, p):
         """Support at ``p`` (Array3f or Point3f of one lane), a Float of one lane: rays that count, without
         derivatives."""
-        Float, p = dr.float32_array_t(type(p.x)), dr.detach(p)
+        Float: Any = dr.float32_array_t(type(p.x))
+        p = dr.detach(p)
         x, y, z, count, apart = (Float(np.ascontiguousarray(column)) for column in self.cells.T)
         square = dr.square(x - p.x) + dr.square(y - p.y) + dr.square(z - p.z)
         scale = 1 / self.radius**2
