@@ -6,7 +6,8 @@
 # While working, and before a release:
 #
 #   make check     the quick tests of every part (a minute or so on two cores); ARGS as above
-#   make lint      format, style, import rules and types, all of which have to be right; nothing is changed
+#   make lint      format, style and import rules, all of which have to be right; nothing is changed
+#   make types     what a type checker finds
 #   make format    put right what of it can be put right by itself
 #   make docs      write what the pages say about the code: tables, pictures
 #   make onecore   the tests that render, write pictures and train, on one core, where Dr.Jit has one thread
@@ -29,7 +30,7 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
-.PHONY: demo test check lint format docs onecore coverage fuzz mutants faults soak packages setup
+.PHONY: demo test check lint types format docs onecore coverage fuzz mutants faults soak packages setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
@@ -39,12 +40,14 @@ test check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
 test: setup
 	$(PYTEST) $(ARGS)
 
-lint format: EXTRAS = lint
+lint types format docs: EXTRAS = lint
 
 lint: setup
 	$(RUN) -m ruff check
 	$(RUN) -m ruff format --check
 	$(RUN) -m tools.import_rules
+
+types: setup
 	$(RUN) -m basedpyright
 
 format: setup

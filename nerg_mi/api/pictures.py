@@ -45,8 +45,8 @@ def render(
     which is the camera where it has none. ``quantities``: ``"color"`` (linear rgb; the luminance in mono variants) and
     any AOV of the integrator ``nerg``: ``depth`` and ``observer_depth`` (scene units), ``opacity``, ``position``,
     ``gaze`` (1/sr), ``visibility``, ``support``, ...; without any ``color``, ``depth``, ``opacity`` and, where there is
-    a gaze field, ``gaze`` and ``visibility``. ``camera``: a `Camera`, or the number of one of the scene's own (the first).
-    ``spp``: samples a pixel, 0 for as many as the scene says. Equal seeds give equal pictures, and those of
+    a gaze field, ``gaze`` and ``visibility``. ``camera``: a `Camera`, or the number of one of the scene's own (the
+    first). ``spp``: samples a pixel, 0 for as many as the scene says. Equal seeds give equal pictures, and those of
     ``nerg render`` to the bit where the camera has a box filter, as every `Camera` has.
 
     The camera's rays are traced once for all observers, and kernels are compiled for one of them. Raises `NergError`,
