@@ -81,7 +81,8 @@ def test_is_the_sum_over_what_is_seen_all_around(rgb, variant):
     found = integral_at(rgb, PlacedGaze(field), Place(None, room), o, SETTINGS, 1 << 16)
     d = fibonacci_directions(20_000)
     walls = np.where(d > 0, [1.9, 1.9, 2.9], [-1.9, -1.9, 0.1])
-    distance = ((walls - o) / d).min(axis=1)
+    # Parallel to a wall, a direction never meets it.
+    distance = np.divide(walls - o, d, out=np.full(d.shape, np.inf), where=d != 0).min(axis=1)
     array = lambda v: ns.Array3f(np.ascontiguousarray(v.T, np.float32))
     emit, capture = field.unnormalized(array(o + d * distance[:, None]), array(np.broadcast_to(o, d.shape)), array(d))
     assert found == pytest.approx(4 * np.pi * np.mean(np.array(emit * capture, np.float64)), rel=3e-3)
