@@ -85,3 +85,13 @@ def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, 
     if any(not type(value).__module__.startswith(ns.__name__) for value in network.parameters().values()):
         raise NergError(f'the field in memory was made for another variant than "{mi.variant()}"; load it again')
     return network, {}, ""
+
+
+def transform(props, name: str) -> np.ndarray:
+    """The matrix (4, 4) of a transform; the identity where there is none."""
+    value = props.get(name, None)
+    if value is None:
+        return np.eye(4)
+    if not hasattr(value, "matrix"):
+        raise NergError(f'"{name}" must be a transform, got {value!r}')
+    return np.array(value.matrix, float)

@@ -68,7 +68,7 @@ from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.field.gaze.registry import kinds
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.properties import trained
+from nerg_mi.properties import trained, transform
 from nerg_mi.registration import register
 from nerg_mi.transport.observer.gaze import PlacedGaze
 
@@ -79,9 +79,8 @@ class GazeFieldVolume(mi.Volume):
     def __init__(self, props, network=None):
         # ``network``: a field in memory in place of a file; see ``of``.
         super().__init__(props)
-        to_world = props.get("to_world", mi.ScalarTransform4f())
         self.field, self.metadata, self.filename = trained(props, network, load_gaze, namespace(mi.Float))
-        self._similarity = Similarity(to_world.matrix)
+        self._similarity = Similarity(transform(props, "to_world"))
 
     @classmethod
     def of(cls, network: AnyGazeField, to_world=None, name: str = "in memory") -> GazeFieldVolume:

@@ -60,7 +60,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.properties import number, trained
+from nerg_mi.properties import number, trained, transform
 from nerg_mi.registration import register
 from nerg_mi.transport.media.field import FieldMedium
 
@@ -70,7 +70,7 @@ class NerfVolume(mi.Volume):
 
     def __init__(self, props, network=None):
         # ``network``: a field in memory in place of a file; see ``of``.
-        similarity = Similarity(props.get("to_world", mi.ScalarTransform4f()).matrix)
+        similarity = Similarity(transform(props, "to_world"))
         field, metadata, filename = trained(props, network, load_radiance, namespace(mi.Float))
         # Mitsuba's own media ask the base class, not bbox(): it makes its box from the unit cube.
         lower, upper = similarity.bounds(field.box.lower, field.box.upper)

@@ -67,7 +67,8 @@ def _features_at(p: Pixel) -> list:
 
 
 def _color_evaluations(p: Pixel) -> list:
-    return [p.view.march.color_evals if p.lit else mi.Float(0)]
+    march = p.view.march
+    return [march.color_evals if p.lit and march is not None else mi.Float(0)]
 
 
 AOVS: dict[str, Aov] = {

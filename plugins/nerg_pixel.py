@@ -53,15 +53,15 @@ class Pixel:
         medium = nerg.medium
         self.place = Place(medium, scene)
         self.lit = nerg.radiance and medium is not None and medium.has_color
-        with_features = "features" in nerg.demands
         painter = ColorPainter(_color_type(medium)) if self.lit else None
-        if with_features:
+        if "features" in nerg.demands and medium is not None:
             painter = FeaturePainter(medium, self.lit)
         self.counting = "counts" in nerg.demands
         self.view = self.place.trace(ray, active, nerg.settings, offset=offset, count=self.counting, color=painter)
-        self.color = self.view.march.color if self.lit else None
-        if with_features:
-            painted = list(self.view.march.color)
+        gathered = None if self.view.march is None else self.view.march.color
+        self.color, self.accumulated_features = gathered, []
+        if isinstance(painter, FeaturePainter) and gathered is not None:
+            painted = list(gathered)
             self.color = mi.Color3f(painted[:3]) if self.lit else None
             self.accumulated_features = [dr.select(active, f, 0) for f in painted[3 * self.lit :]]
         self.some = active & (self.view.opacity > 0)
@@ -226,7 +226,8 @@ class Pixel:
         for counted in self._evaluations:
             total = total + counted
         # Finding the depth may have added to what the march counted.
-        return total if self.view.march is None else total + self.view.march.density_evals
+        march = self.view.march
+        return total if march is None or march.density_evals is None else total + march.density_evals
 
 
 def _color_type(medium):

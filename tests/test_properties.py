@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from nerg_mi import properties
@@ -75,3 +76,11 @@ def test_a_field_of_a_file_or_in_memory(rgb):
     # Arrays that are not of the backend in use.
     with pytest.raises(NergError, match='made for another variant than "llvm_ad_rgb"; load it again'):
         properties.trained({}, Field([1.0]), load, ns)
+
+
+def test_a_transform_is_a_matrix_or_the_identity(rgb):
+    place = rgb.ScalarTransform4f().translate([1, 2, 3]).scale(2)
+    assert np.allclose(properties.transform({"to_world": place}, "to_world"), np.array(place.matrix))
+    assert np.array_equal(properties.transform({}, "to_world"), np.eye(4))
+    with pytest.raises(NergError, match='"to_world" must be a transform, got 3'):
+        properties.transform({"to_world": 3}, "to_world")

@@ -29,7 +29,7 @@ class ObserverMap:
         import mitsuba as mi
 
         self.height, self.width, self.center = settings.map_height, 2 * settings.map_height, center
-        self._uint, self._vector = mi.UInt32, mi.Vector3f
+        self._float, self._uint, self._vector = mi.Float, mi.UInt32, mi.Vector3f
         with dr.suspend_grad():
             everywhere = dr.full(mi.Bool, True, self.width * self.height)
             view = place.trace(mi.Ray3f(self.center, self._directions()), everywhere, settings.march)
@@ -54,7 +54,7 @@ class ObserverMap:
 
     def _directions(self) -> Vector3f:
         index = dr.arange(self._uint, self.width * self.height)
-        Float = dr.float32_array_t(type(index))
+        Float = self._float
         phi = (Float(index % self.width) + 0.5) * self.spacing
         theta = (Float(index // self.width) + 0.5) * self.spacing
         sin_theta, cos_theta = dr.sincos(theta)

@@ -107,7 +107,7 @@ def center_of_ray(sensors: Sequence[mi.Sensor], ray: Ray3f) -> Point3f:
         off_line = dr.norm(v - ray.d * along)
         axis = dr.normalize(member.world_transform() @ mi.Vector3f(0, 0, 1))
         # Only projective cameras have a near plane; others start at their centre.
-        near = member.near_clip() if hasattr(member, "near_clip") else 0
+        near = member.near_clip() if isinstance(member, mi.ProjectiveCamera) else 0
         off_plane = dr.abs(dr.dot(v, axis) - near)
         error = dr.detach(off_line + off_plane)
         closer = error < miss
