@@ -1,7 +1,6 @@
 """The code of docs/python.md runs as it stands there, only smaller."""
 
 import re
-from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -74,17 +73,9 @@ def test04_points_and_rays(run, monkeypatch):
     assert 1.5 < names["down"].depth[0] < 1.7
 
 
-def test07_every_name_is_listed():
+def test06_every_name_is_listed():
     table = PAGE.read_text(encoding="utf-8").partition("## All names")[2]
     assert set(re.findall(r"`(\w+)`", table)) - {"save"} == set(nerg.__all__)
-
-
-def test06_the_readmes_example_runs(rgb, monkeypatch):
-    (text,) = re.findall(r"^```py\n(.*?)^```", (ROOT / "README.md").read_text(encoding="utf-8"), re.M | re.S)
-    monkeypatch.chdir(files("nerg_mi.scenes.store"))
-    names = {"nerg": nerg}
-    exec(compile(text.replace("(4.8, 4.2, 1.0)", "(4.8, 4.2, 1.0), width=12, height=8"), "README.md", "exec"), names)
-    assert names["pictures"].gaze.shape == (2, 8, 12) and 0.1 < names["share"][0] < 0.5
 
 
 def test05_every_name_that_is_called_exists():
