@@ -30,14 +30,14 @@ def spectral_residual(photo: np.ndarray, width: int = WIDTH) -> np.ndarray:
 
     H, W = photo.shape[:2]
     w = min(width, W)
-    grey = np.asarray(photo, np.float32) @ np.float32([0.299, 0.587, 0.114])
+    grey = np.asarray(photo, np.float32) @ np.array([0.299, 0.587, 0.114], np.float32)
     grey = area_average(grey[..., None], w, max(1, round(H * w / W)))[..., 0].astype(np.float64)
     if not np.ptp(grey) > 1e-6:
         raise NergError("it has one colour everywhere, and no spectrum to find salience in")
-    spectrum = fft2(grey)
+    spectrum = np.asarray(fft2(grey))
     # The logarithm of an amplitude of zero is none; rounding decides about smaller ones anyway.
     amplitude = np.log(np.maximum(np.abs(spectrum), 1e-9 * np.abs(spectrum).max()))
     residual = amplitude - uniform_filter(amplitude, 3, mode="nearest")
-    salience = np.abs(ifft2(np.exp(residual + 1j * np.angle(spectrum)))) ** 2
+    salience = np.abs(np.asarray(ifft2(np.exp(residual + 1j * np.angle(spectrum))))) ** 2
     salience = gaussian_filter(salience, _SIGMA, mode="constant", truncate=2.0)
     return salience / salience.max()

@@ -14,6 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.types import UInt32
 
 _DECAY = 0.6
 # A share of the cells is refreshed at a time; the strides walk over all of them.
@@ -208,9 +209,9 @@ class DensityGrid:
     def probe(self, found, index, density, rng: np.random.Generator, stratum: tuple, parts: int) -> None:
         """Set ``found`` (UInt8 a cell) for those of the cells ``index`` that are denser than ``limit`` at a random
         point of their ``stratum`` (three numbers) of ``parts`` an axis."""
-        stratum = self.ns.Array3f(*stratum)
-        dr.make_opaque(stratum)
-        hit = dr.compress(density(self._point(index, rng, stratum, parts), True) > self.limit)
+        corner = self.ns.Array3f(*stratum)
+        dr.make_opaque(corner)
+        hit: UInt32 = dr.compress(density(self._point(index, rng, corner, parts), True) > self.limit)
         if dr.width(hit) > 0:
             dr.scatter(found, self.ns.UInt8(1), dr.gather(self.ns.UInt32, index, hit))
             dr.eval(found)
@@ -228,7 +229,8 @@ class DensityGrid:
     def part(self, turn: int, parts: int = _PARTS):
         """Every ``parts``-th cell (UInt32) that may be sampled, from cell ``turn`` modulo ``parts`` on."""
         index = dr.arange(self.ns.UInt32, self.resolution**3 // parts) * parts + dr.opaque(self.ns.UInt32, turn % parts)
-        return dr.gather(self.ns.UInt32, index, dr.compress(dr.gather(self.ns.Bool, self.seen, index)))
+        seen: UInt32 = dr.compress(dr.gather(self.ns.Bool, self.seen, index))
+        return dr.gather(self.ns.UInt32, index, seen)
 
 
 def _grown(cells: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from nerg_mi.capture.images import View
 from nerg_mi.errors import NergError
-from nerg_mi.maths.types import Array3f, Float
+from nerg_mi.maths.types import Array3f, Float, UInt32
 
 from .unproject import LensTable
 
@@ -139,7 +139,7 @@ class PixelBank:
         for first in range(0, self.size, chunk):
             index = dr.arange(self.ns.UInt32, min(chunk, self.size - first)) + dr.opaque(self.ns.UInt32, first)
             pixels = self.batch(index)
-            known = dr.compress(pixels.depth > 0)
+            known: UInt32 = dr.compress(pixels.depth > 0)
             yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)
 
 

@@ -10,6 +10,8 @@ from __future__ import annotations
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.types import UInt32
+
 from .density_grid import DensityGrid
 
 # Every cell is looked at in alternate corners of its 2 x 2 x 2 parts: each half along each axis has two of them.
@@ -55,7 +57,7 @@ class Settling:
         grid, rng = self.grid, np.random.default_rng((seed, self.at))
         if self.at < self.PROBES:
             part = grid.part(self.at)
-            open_ = dr.compress(dr.gather(grid.ns.UInt8, self.found, part) == 0)
+            open_: UInt32 = dr.compress(dr.gather(grid.ns.UInt8, self.found, part) == 0)
             if dr.width(open_) > 0:
                 index = dr.gather(grid.ns.UInt32, part, open_)
                 grid.probe(self.found, index, density, rng, _STRATA[self.at // _PARTS], 2)

@@ -21,6 +21,7 @@ from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.psnr import psnr
+from nerg_mi.maths.types import UInt32
 from nerg_mi.training.common.step_clock import StepClock
 
 from .compositing import damp_near, weights
@@ -298,7 +299,8 @@ class RadianceTrainer:
         if samples is None:
             return None, None
         weight = weights(density(samples.p, True) * samples.length, samples.segments)
-        return samples, dr.gather(ns.Array3f, samples.p, dr.compress(weight > 1e-3))
+        seen: UInt32 = dr.compress(weight > 1e-3)
+        return samples, dr.gather(ns.Array3f, samples.p, seen)
 
     def pixels_within(self, views: list[View], samples: int) -> int:
         """The ``every`` of `measure` with which ``views`` take about so many ``samples``, by those of the last step's
