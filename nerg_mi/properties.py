@@ -80,7 +80,9 @@ def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, 
     import mitsuba as mi
 
     if network is None:
-        filename = str(mi.file_resolver().resolve(text(props, "filename")))
+        # Mitsuba's stubs know it as an object.
+        file_resolver: Any = mi.file_resolver
+        filename = str(file_resolver().resolve(text(props, "filename")))
         return *load(filename, ns), filename
     if any(not type(value).__module__.startswith(ns.__name__) for value in network.parameters().values()):
         raise NergError(f'the field in memory was made for another variant than "{mi.variant()}"; load it again')
