@@ -31,7 +31,7 @@ TESTS = (
     "renders",
     "test_registration.py",
     "training/gaze/test_losses.py",
-    "transport/observer/test_integral.py",
+    "transport/observer/test_surroundings.py",
     "transport/march/test_quadrature.py",
     "view",
     "cli/test_demo.py",
