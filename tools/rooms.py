@@ -41,7 +41,7 @@ def purpose(name: str) -> str:
     if name == MODULES:
         return "What every room may use: errors told in one sentence, Ctrl-C, libLLVM, registration with Mitsuba."
     text = ast.get_docstring(ast.parse(modules()[f"{PACKAGE}.{name}"].read_text(encoding="utf-8"))) or ""
-    return " ".join(text.split("\n\n")[0].split()).split(". ")[0].split("; ")[0].rstrip(".") + "."
+    return " ".join(text.split("\n\n")[0].split()).split(". ")[0].split("; ")[0].rstrip(".").replace("`", "") + "."
 
 
 def inner(name: str) -> list[str]:
