@@ -20,6 +20,8 @@ _RAYS_KAPPA = 10.0
 _MOST_RAYS = 1 << 16
 # Concentration of the kernels that smooth the density of views.
 _VIEWS_KAPPA = 50.0
+# Points in a leaf of a KD-tree, which decides between directions that are equally far.
+_LEAF = 16
 # Rounds of the iteration that puts it together from them.
 _ROUNDS = 100
 # Directions over which the table is scaled to integrate to one.
@@ -68,6 +70,6 @@ def blind_of_views(views: Sequence[SalienceView], rows: int) -> np.ndarray:
         blind /= blind @ area
     shown = known.any(axis=0)
     if shown.any():
-        blind = blind[np.flatnonzero(shown)[KDTree(directions[shown]).query(directions)[1]]]
+        blind = blind[np.flatnonzero(shown)[KDTree(directions[shown], leafsize=_LEAF).query(directions)[1]]]
     kde = SphericalKde(directions, np.array([0, len(area)]), _VIEWS_KAPPA, blind * area)
     return blind_table(kde.evaluate(directions)[0], rows, kde.ns, fibonacci_directions(_SCALED_OVER))
