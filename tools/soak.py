@@ -259,7 +259,9 @@ def run_apart(name: str, share: float) -> Course | str:
     done = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)
     if done.returncode != 0:
         return f"ended with {done.returncode}: {(done.stderr.strip().splitlines() or ['nothing said'])[-1]}"
-    return Course(**json.loads(done.stdout.splitlines()[-1]))
+    # Mitsuba's log may stand before it on the same line.
+    last = done.stdout.splitlines()[-1]
+    return Course(**json.loads(last[last.index("{") :]))
 
 
 def main(arguments: list[str] | None = None) -> int:
