@@ -23,7 +23,9 @@ def machine(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "nothing"))
     monkeypatch.setattr(llvm, "_loaded", lambda: None)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
-    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    # Set first, so that what a test makes of it is undone also where it was not set.
+    monkeypatch.setenv(llvm.VARIABLE, "")
+    monkeypatch.delenv(llvm.VARIABLE)
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
     return tmp_path
 
