@@ -105,7 +105,9 @@ class Attention:
 
         self.shelf, self.falloff = shelf, falloff
         self.scene = mi.load_file(str(HERE / "shapes.xml"))
-        self.place, self.gaze = Place(None, self.scene), self.scene.integrator().gaze
+        integrator, self.place = self.scene.integrator(), Place(None, self.scene)
+        each = [mi.Point3f(*head) for head in heads.tolist()]
+        self.gaze = integrator.gaze.at(each, self.place, integrator.observer_settings)
         self.observers = mi.Point3f(np.ascontiguousarray(heads.T, np.float32))
         self.surface = patches(mi.load_dict(shelf.box()), settings.divisions)
 
