@@ -107,8 +107,8 @@ def try_tests(there: Environment, unpacked: Path, out: Path) -> str:
     """The quick tests of the source archive against what is installed; how many passed."""
     there.install(f"{there.package}[test,{','.join(EXTRAS)}]")
     (out / "outside").mkdir()
-    # Only the tests: next to the sources these would be imported in place of what is installed.
-    for read in ("tests", "docs"):
+    # Only the tests and what they use: next to the sources these would be imported in place of what is installed.
+    for read in ("tests", "docs", "tools"):
         shutil.copytree(unpacked / read, out / "outside" / read)
     (out / "outside" / "pytest.ini").write_text(
         "[pytest]\naddopts = --import-mode=importlib\nmarkers = slow: takes seconds\n"
@@ -126,6 +126,12 @@ def try_tests(there: Environment, unpacked: Path, out: Path) -> str:
         "faulthandler_timeout=600",
         "-p",
         "no:cacheprovider",
+        "-n",
+        "auto",
+        "--maxprocesses",
+        "4",
+        "--dist",
+        "loadfile",
         f"--junitxml={report}",
         *paths,
         cwd=out / "outside",
