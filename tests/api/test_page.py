@@ -33,10 +33,8 @@ def run(tmp_path_factory):
     folder, done = tmp_path_factory.mktemp("page"), {}
 
     def up_to(number: int, monkeypatch) -> dict:
-        import mitsuba as mi
-
         monkeypatch.chdir(folder)
-        done.setdefault("names", {"mi": mi})
+        done.setdefault("names", {})
         for i in range(done.get("ran", 0), number + 1):
             exec(compile(smaller(blocks()[i]), f"docs/python.md, block {i}", "exec"), done["names"])
             done["ran"] = i + 1

@@ -22,7 +22,9 @@ class GazeOptions(PlaceOptions):
     allow_outside: bool = option(
         False, "Read files outside of --views' folder and that of --salience too, where they name them."
     )
-    recipe: str = option("default", "default (generalises best), small, or paper. Sets what is not set below.")
+    recipe: str = option(
+        "default", "Word of docs/gaze-training.md; default generalises best. Sets what is not set below."
+    )
     voxel: float | None = option(
         None, "Edge of the voxels of --geometry hits in metres.  [default: 0.08, more in very large places]"
     )

@@ -12,7 +12,7 @@ from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 
 @dataclass(frozen=True)
 class DenseConfig(EncodingConfig):
-    kind, limits, dimensions = "dense", {"finest": 64, "size": 16}, 3
+    kind, limits, dimensions = "dense_of_the_tests", {"finest": 64, "size": 16}, 3
     finest: int = 8
     size: int = 4
 

