@@ -6,6 +6,7 @@ import math
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from nerg_mi.field.radiance import density_from_log
+from nerg_mi.transport.march.rules import RULES
 from nerg_mi.transport.march.settings import MarchSettings
 from numerics import Row
 from numerics_media import (
@@ -42,7 +43,7 @@ def sheets_in_a_grid(mi):
     a = -np.expm1(-1e3 * THIN / d[:, 2].astype(float))
     front = to(0.3) + THIN / d[:, 2] * share(1e3 * THIN / d[:, 2].astype(float))
     expected = a * front + (1 - a) * to(0.7)
-    for kind in ("constant", "linear", "cells"):
+    for kind in RULES.names():
         settings = MarchSettings(medium.step, quadrature=kind)
         r, *_ = through(mi, medium, o, d, settings)
         error = worst(r.expected_depth, expected, False)

@@ -12,7 +12,6 @@ import typer
 import nerg_mi.cli
 from nerg_mi.evaluation.study import subject as study_subject
 from nerg_mi.formats.torch_ngp import unpickling
-from nerg_mi.training.gaze.recipes import FieldChoices, gaze_recipe
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.surroundings import COUNT
 from tests.conftest import ROOT
@@ -51,18 +50,6 @@ def test03_defaults_of_the_march_are_the_integrators(rgb):
     for f in fields(MarchSettings):
         if f.name != "step":
             assert getattr(made, f.name) == f.default, f.name
-
-
-def test04_the_default_recipe_is_as_described():
-    row = next(
-        line for line in (ROOT / "docs" / "gaze-training.md").read_text().splitlines() if line.startswith("| `default`")
-    )
-    plan = gaze_recipe()
-    c, s, p = plan.config(FieldChoices()), plan.settings, plan.probes
-    assert f"{NUMBERS[c.grid.levels].capitalize()} levels of a grid ({c.grid.base} to {c.grid.finest})" in row
-    assert f"up to degree {c.sh_degree - 1}, two networks {c.width} wide" in row and c.layers == 2
-    assert f"weight decay {s['weight_decay']:g}, {s['steps']} steps, kernels of kappa {p['kappa']:g}" in row
-    assert f"a share of {c.mix:g} of the blind" in row
 
 
 def test05_numbers_that_are_constants():

@@ -12,6 +12,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
 
@@ -41,8 +42,8 @@ def presets() -> str:
 
 
 def recipes() -> str:
-    """What each gaze recipe sets: its length, losses and probes."""
-    from nerg_mi.training.gaze.recipes import RECIPES
+    """What each gaze recipe sets: its field, length, losses and probes."""
+    from nerg_mi.training.gaze.recipes import RECIPES, FieldChoices
 
     found = list(RECIPES.values())
     rows = [("what it is", *(recipe.summary for recipe in found))]
@@ -51,7 +52,22 @@ def recipes() -> str:
         values = [getattr(recipe, made)() for recipe in found]
         names = dict.fromkeys(name for recipe in found for name in getattr(recipe, given))
         rows += [(f"{prefix}`{name}`", *(_shown(getattr(v, name)) for v in values)) for name in names]
+    configs = [_flat(recipe.config(FieldChoices())) for recipe in found]
+    names = dict.fromkeys(name for config in configs for name in config)
+    rows += [(f"field: `{name}`", *(_shown(c.get(name)) for c in configs)) for name in names]
     return table(("", *(f"`{recipe.name}`" for recipe in found)), rows)
+
+
+def _flat(config: object, prefix: str = "") -> dict[str, object]:
+    """The settings of a field, those of its parts by "part.setting"."""
+    found: dict[str, object] = {}
+    for f in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, f.name)
+        if is_dataclass(value):
+            found |= _flat(value, f"{prefix}{f.name}.")
+        elif not isinstance(value, tuple):  # a box, which is the place's
+            found[prefix + f.name] = value
+    return found
 
 
 def _shown(value: object) -> str:

@@ -26,6 +26,7 @@ def takes(kind: type, *leave_out: str) -> Callable[[Callable[..., None]], Callab
         own = inspect.signature(command, eval_str=True).parameters
         given_as = next(name for name, p in own.items() if p.annotation is kind)
         generated = {f.name: _parameter(f, kind) for f in fields(kind) if f.name not in leave_out}
+        parsers = {f.name: f.metadata["parse"] for f in fields(kind) if f.name not in leave_out}
         parameters: list[inspect.Parameter] = []
         for name, parameter in own.items():
             shown = generated.values() if name == given_as else [parameter]
@@ -33,10 +34,8 @@ def takes(kind: type, *leave_out: str) -> Callable[[Callable[..., None]], Callab
 
         def call(**given: Any) -> None:
             chosen = {name: given.pop(name) for name in generated}
-            several = {k for k, p in generated.items() if _listed(p.annotation)}
-            command(
-                **given, **{given_as: kind(**{k: tuple(v or ()) if k in several else v for k, v in chosen.items()})}
-            )
+            values = {name: _value(generated[name], parsers[name], value) for name, value in chosen.items()}
+            command(**given, **{given_as: kind(**values)})
 
         call.__name__, call.__qualname__, call.__module__ = command.__name__, command.__qualname__, command.__module__
         call.__doc__ = command.__doc__
@@ -51,7 +50,9 @@ def _parameter(field: Field, kind: type) -> inspect.Parameter:
     """The parameter that typer makes the option of ``field`` of."""
     hint, about, default = get_type_hints(kind)[field.name], field.metadata, field.default
     names = about["names"]
-    if get_origin(hint) is tuple:
+    if about["parse"] is not None:
+        hint = str | None  # type: ignore[assignment]
+    elif get_origin(hint) is tuple:
         hint, default = list[get_args(hint)[0]] | None, None  # type: ignore[misc]
     if hint is bool and default is False and not names:
         names = ("--" + field.name.replace("_", "-"),)
@@ -59,6 +60,13 @@ def _parameter(field: Field, kind: type) -> inspect.Parameter:
     return inspect.Parameter(
         field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, info]
     )
+
+
+def _value(parameter: inspect.Parameter, parse: Callable[[str, str], Any] | None, given: Any) -> Any:
+    """What the command line ``given`` to a ``parameter`` means for its field."""
+    if parse is not None:
+        return None if given is None else parse(given, "--" + parameter.name.replace("_", "-"))
+    return tuple(given or ()) if _listed(parameter.annotation) else given
 
 
 def _listed(annotation: Any) -> bool:

@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from nerg_mi.errors import NergError
 from nerg_mi.jobs.options.radiance import RadianceOptions
 
 from .mode import OldMode, mode_of
@@ -21,26 +20,16 @@ app.command("gaze")(train_gaze)
 
 
 @app.command("radiance")
-@takes(RadianceOptions, "aabb")
+@takes(RadianceOptions)
 def train_radiance(
     dataset: Annotated[Path, typer.Argument(help="Folder of posed photos, its transforms.json, or a COLMAP model.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Checkpoint to write (.safetensors).")],
     options: RadianceOptions,
-    aabb: Annotated[str | None, typer.Option(help="Bounds of what is seen: x0,y0,z0,x1,y1,z1.")] = None,
     variant: OldMode = None,
 ) -> None:
     """Train a radiance field on posed pictures, and report the error on those held out."""
     from nerg_mi.jobs import radiance
 
-    options = replace(options, aabb=_numbers(aabb), mode=mode_of(options.mode, variant))
+    options = replace(options, mode=mode_of(options.mode, variant))
     with TerminalReporter() as reporter:
         radiance.train_radiance(dataset, output, options, reporter)
-
-
-def _numbers(text: str | None) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    try:
-        return tuple(float(x) for x in text.replace(",", " ").split())
-    except ValueError as e:
-        raise NergError(f'--aabb needs numbers x0,y0,z0,x1,y1,z1, got "{text}"') from e

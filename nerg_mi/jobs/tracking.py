@@ -20,13 +20,13 @@ from nerg_mi.rays.readers.registry import TABLE, read_rays
 from nerg_mi.rays.summary import RaysSummary, summarise
 from nerg_mi.view import figures, ray_figures
 
+from .options.rays import FilterOptions, SplitOptions
 from .reporter import SILENT, Reporter
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FileName = str | os.PathLike
-DETECTORS = ("ivt", "idt")
 KINDS = ("density", "layout")
 
 
@@ -75,56 +75,6 @@ def import_rays(
         rays = pseudonymise(rays, salt)
     _save(rays, options.output)
     return ImportResult(rays, summarise(rays))
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterOptions:
-    """Which rays to keep: conditions first, then fixations, then fewer of those who stand still.
-
-    Raises `NergError` for an unknown word, or where nothing is said.
-    """
-
-    start: float | None = None  # rays from this time on, seconds
-    end: float | None = None  # rays before this time, seconds
-    persons: Sequence[str] = ()  # only these
-    without_persons: Sequence[str] = ()  # not these
-    cohorts: Sequence[str] = ()  # only these groups of people
-    box: Sequence[float] | None = None  # origins in x0, x1, y0, y1, z0, z1, metres
-    min_confidence: float | None = None  # at least this
-    with_hit: bool = False  # only rays whose hit point is known
-    fixations: str | None = None  # only rays of fixations: "ivt" (by velocity) or "idt" (by dispersion)
-    velocity: float = 100.0  # ivt: degrees a second that end a fixation
-    dispersion: float = 3.0  # idt: degrees within which a fixation stays
-    least: float | None = None  # shortest fixation, seconds; None: ivt 0.06, idt 0.1
-    one_ray: bool = False  # one ray a fixation, its mean
-    thin: float | None = None  # a stop counts as at most this many seconds of rays
-    thin_distance: float = 0.1  # a stop is a stay within this many metres
-    output: FileName | None = None  # rays file to write, .npz or .parquet; None: none
-
-    def __post_init__(self) -> None:
-        if self.fixations not in (None, *DETECTORS):
-            raise NergError(f'--fixations is "{self.fixations}"; it is ivt or idt')
-        if self.one_ray and self.fixations is None:
-            raise NergError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
-        if not self.conditions and self.fixations is None and self.thin is None:
-            raise NergError(
-                "say which rays to keep, for instance with --from, --person, --box, --fixations or --thin "
-                "(--help lists all)"
-            )
-
-    @property
-    def conditions(self) -> dict[str, Any]:
-        """What was asked for, as `nerg_mi.rays.filters.select_mask` takes it."""
-        what = {
-            "time": None if self.start is None and self.end is None else (self.start, self.end),
-            "persons": list(self.persons) or None,
-            "without_persons": list(self.without_persons) or None,
-            "cohorts": list(self.cohorts) or None,
-            "box": None if self.box is None else list(self.box),
-            "min_confidence": self.min_confidence,
-            "with_hit": self.with_hit or None,
-        }
-        return {name: value for name, value in what.items() if value is not None}
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,32 +136,6 @@ class _Steps:
         before = len(self.rays)
         self.reporter.message(f"{step}: one ray each, {len(rays):,} of {before:,} rays")
         self.rays, self.own = rays.with_step(step=step, kept=len(rays), of=before, **what), True
-
-
-@dataclass(frozen=True, kw_only=True)
-class SplitOptions:
-    """How training and test rays are parted: by position, person or time, or several of them at once.
-
-    Raises `NergError` where nothing is said.
-    """
-
-    zones: int = 0  # by position: zones held out; 0: not by position
-    radius: float = 0.25  # by position: R of probes, metres; rays within 2R of a test position are purged
-    zone_radius: float = 0.2  # by position: radius of a zone, metres
-    positions: int = 150  # by position: test positions in the zones
-    min_rays: int = 64  # by position: rays that a test position has within R
-    people: float = 0.0  # by person: share held out, at random; 0: not by share
-    persons: Sequence[str] = ()  # by person: these are held out
-    time: float = 0.0  # by time: share at the end that is held out; 0: not by time
-    gap: float = 5.0  # by time: seconds purged before the end part
-    clock: str = "all"  # by time: "all" (one clock) or "person" (each their own)
-    seed: int = 0  # of zones, positions and people
-    train_output: FileName | None = None  # rays file to write, .npz or .parquet; None: none
-    test_output: FileName | None = None  # the same of the test rays
-
-    def __post_init__(self) -> None:
-        if not (self.zones or self.people or self.persons or self.time):
-            raise NergError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
 
 
 @dataclass(frozen=True, eq=False)

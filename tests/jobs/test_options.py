@@ -11,9 +11,12 @@ from typing import get_type_hints
 
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.jobs import options
 
 MODULES = [importlib.import_module(f"{options.__name__}.{m.name}") for m in pkgutil.iter_modules(options.__path__)]
+# What has to be said where the defaults alone mean nothing.
+SAID = {"FilterOptions": {"thin": 1.0}, "SplitOptions": {"zones": 3}}
 KINDS = [k for m in MODULES for k in vars(m).values() if is_dataclass(k) and k.__module__ == m.__name__]
 
 
@@ -23,7 +26,7 @@ def test_there_are_options():
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.__name__)
 def test_options_are_frozen_and_told(kind):
-    made = kind()
+    made = kind(**SAID.get(kind.__name__, {}))
     with pytest.raises(TypeError):
         kind(1)
     for f in fields(kind):
@@ -38,3 +41,11 @@ def test_they_import_nothing_heavy(module):
     """A command shows its help by them."""
     code = f"import sys, {module.__name__}; print(*{{'numpy', 'drjit', 'mitsuba'}} & set(sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == ""
+
+
+def test_numbers():
+    for text in ("1,-2.5,3e2", "1 -2.5 3e2"):
+        assert options.parse_numbers(text, "--box") == (1.0, -2.5, 300.0)
+    for text in ("", "1,,2", "a"):
+        with pytest.raises(NergError, match="--box is numbers with commas between them"):
+            options.parse_numbers(text, "--box")

@@ -7,6 +7,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.transport.march.rules import RULES
 from tests.reference import march_numpy as reference
 
 from .scenes import GAZE, camera, channels, constant, look_at, observer_at, render, with_gaze
@@ -82,7 +83,7 @@ def test02_their_derivatives(rgb, kind):
         assert np.isfinite(got["depth"])
 
 
-@pytest.mark.parametrize("quadrature", ["constant", "linear", "cells"])
+@pytest.mark.parametrize("quadrature", RULES.names())
 def test03_thin_sheets_in_a_near_vacuum_are_met_with_nothing_else_set(rgb, quadrature):
     data = np.full((10000, 1, 1), 1e-8, np.float32)
     data[7000] = 1e9

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from nerg_mi.transport.march.rules import RULES
+
 from .scenes import camera, channels, constant, render, straight
 
 
@@ -88,7 +90,7 @@ def test07_a_grid_that_repeats_is_bounded_as_it_repeats(rgb):
     assert np.isclose(opacity["repeat"], 1 - math.exp(-40 * (0.5 - 0.01 * 8)), rtol=1e-4)
 
 
-@pytest.mark.parametrize("quadrature", ["constant", "linear", "cells"])
+@pytest.mark.parametrize("quadrature", RULES.names())
 def test08_quadratures_converge_to_one_picture(rgb, quadrature):
     data = np.random.default_rng(0).exponential(2, (4, 5, 6)).astype(np.float32)
     density = {

@@ -51,3 +51,9 @@ def test_settings_are_shown_as_they_are():
     default = {name: cells[0].strip() for name, cells in recipes.items()}
     assert default["`zones`"] == "0" and default["`steps`"] == "160" and default["`weight_decay`"] == "4"
     assert default["probes: `count`"] == "1,024" and default["probes: `weights`"] == "person"
+
+
+def test_recipes_show_their_fields():
+    rows = [line.split(" | ") for line in generated.recipes().splitlines()]
+    assert ["| field: `grid.finest`", "32", "128", "512 |"] in rows
+    assert not [row for row in rows if "heads" in row[0]]

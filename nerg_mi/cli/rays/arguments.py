@@ -7,22 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from nerg_mi.errors import NergError
-
 if TYPE_CHECKING:
     from nerg_mi.rays.rays import Rays
     from nerg_mi.rays.summary import RaysSummary
 
 RaysFile = Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet).")]
 Output = Annotated[Path, typer.Option("-o", "--output", help="Rays file to write (.npz or .parquet).")]
-
-
-def parse_numbers(text: str, flag: str) -> list[float]:
-    """Numbers with commas between them. Raises `NergError` naming ``flag`` for other texts."""
-    try:
-        return [float(v) for v in text.split(",")]
-    except ValueError:
-        raise NergError(f"{flag} is numbers with commas between them, got {text!r}") from None
 
 
 def print_card(rays: Rays, summary: RaysSummary, path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import option
+from . import option, parse_numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class RadianceOptions(PhotoOptions):
     minutes: float | None = option(None, "Train for this long. Default: 5.")
     steps: int | None = option(None, "Or: train for so many steps.")
     aabb: tuple[float, ...] | None = option(
-        None, "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field."
+        None, "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field.", parse=parse_numbers
     )
     seed: int = option(0, "Seed of the weights, rays and jitter.")
     threads: int | None = option(None, "CPU threads. Default: all.")

@@ -1,13 +1,18 @@
-"""What the sub-commands have in common; the card is tried in test_show.py."""
+"""What the sub-commands print alike."""
 
-import pytest
+from pathlib import Path
 
-from nerg_mi.cli.rays.arguments import parse_numbers
-from nerg_mi.errors import NergError
+import numpy as np
+
+from nerg_mi.cli.rays.arguments import print_card
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.summary import summarise
 
 
-def test_numbers():
-    assert parse_numbers("1,-2.5,3e2", "--box") == [1.0, -2.5, 300.0]
-    for text in ("", "1,,2", "a"):
-        with pytest.raises(NergError, match="--box is numbers with commas between them"):
-            parse_numbers(text, "--box")
+def test_names_are_shown_as_they_are(capsys):
+    """A person or a file may be called what the terminal's library takes for a colour."""
+    eyes, ahead = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0], (3, 1))
+    rays = Rays(np.arange(3.0), [0, 0, 1], ("[red]", "[/b]"), eyes, ahead, np.ones(3))
+    print_card(rays, summarise(rays), Path("[bold].npz"))
+    shown = capsys.readouterr().out
+    assert "[bold].npz" in shown and "[red]" in shown and "[/b]" in shown

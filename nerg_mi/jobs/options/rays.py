@@ -1,0 +1,89 @@
+"""Options of what is done to rays of attention: filtering and splitting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerg_mi.errors import NergError
+
+from . import option, parse_numbers
+
+DETECTORS = ("ivt", "idt")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterOptions:
+    """Which rays to keep: conditions first, then fixations, then fewer of those who stand still.
+
+    Raises `NergError` for an unknown word, or where nothing is said.
+    """
+
+    start: float | None = option(None, "Rays from this time on, seconds.", "--from")
+    end: float | None = option(None, "Rays before this time, seconds.", "--to")
+    persons: tuple[str, ...] = option((), "Only this person; repeatable.", "--person")
+    without_persons: tuple[str, ...] = option((), "Not this person; repeatable.", "--without-person")
+    cohorts: tuple[str, ...] = option((), "Only this cohort; repeatable.", "--cohort")
+    box: tuple[float, ...] | None = option(None, "Origins in this box: x0,x1,y0,y1,z0,z1, metres.", parse=parse_numbers)
+    min_confidence: float | None = option(None, "Only rays of at least this confidence.")
+    with_hit: bool = option(False, "Only rays whose hit point is known.")
+    fixations: str | None = option(None, "Only rays of fixations: ivt (by velocity) or idt (by dispersion).")
+    velocity: float = option(100.0, "ivt: degrees a second that end a fixation.")
+    dispersion: float = option(3.0, "idt: degrees within which a fixation stays.")
+    least: float | None = option(None, "Shortest fixation, seconds.  [default: ivt 0.06, idt 0.1]")
+    one_ray: bool = option(False, "One ray a fixation, its mean.")
+    thin: float | None = option(None, "A stop counts as at most this many seconds of rays.")
+    thin_distance: float = option(0.1, "With --thin, a stop is a stay within this many metres.")
+    output: Path | str | None = option(None, "Rays file to write (.npz or .parquet).", "-o", "--output")
+
+    def __post_init__(self) -> None:
+        if self.fixations not in (None, *DETECTORS):
+            raise NergError(f'--fixations is "{self.fixations}"; it is ivt or idt')
+        if self.one_ray and self.fixations is None:
+            raise NergError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
+        if not self.conditions and self.fixations is None and self.thin is None:
+            raise NergError(
+                "say which rays to keep, for instance with --from, --person, --box, --fixations or --thin "
+                "(--help lists all)"
+            )
+
+    @property
+    def conditions(self) -> dict[str, Any]:
+        """What was asked for, as `nerg_mi.rays.filters.select_mask` takes it."""
+        what = {
+            "time": None if self.start is None and self.end is None else (self.start, self.end),
+            "persons": list(self.persons) or None,
+            "without_persons": list(self.without_persons) or None,
+            "cohorts": list(self.cohorts) or None,
+            "box": None if self.box is None else list(self.box),
+            "min_confidence": self.min_confidence,
+            "with_hit": self.with_hit or None,
+        }
+        return {name: value for name, value in what.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitOptions:
+    """How training and test rays are parted: by position, person or time, or several of them at once.
+
+    Raises `NergError` where nothing is said.
+    """
+
+    zones: int = option(0, "By position: zones held out; 0: not by position.")
+    radius: float = option(0.25, "By position: R of probes, metres; rays within 2R of a test position are purged.")
+    zone_radius: float = option(0.2, "By position: radius of a zone, metres.")
+    positions: int = option(150, "By position: test positions in the zones.")
+    min_rays: int = option(64, "By position: rays that a test position has within R.")
+    people: float = option(0.0, "By person: share held out, at random; 0: not by person.")
+    persons: tuple[str, ...] = option((), "By person: this one is held out; repeatable.", "--person")
+    time: float = option(0.0, "By time: share at the end that is held out; 0: not by time.")
+    gap: float = option(5.0, "By time: seconds purged before the end part.")
+    clock: str = option("all", "By time: all (one clock), or person (each their own).")
+    seed: int = option(0, "Seed of zones, positions and people.")
+    train_output: Path | str | None = option(None, "Rays file to write of the training rays (.npz or .parquet).")
+    test_output: Path | str | None = option(None, "The same of the test rays.")
+
+    def __post_init__(self) -> None:
+        if not (self.zones or self.people or self.persons or self.time):
+            raise NergError("say how to split: --zones 3, --people 0.5, --person NAME, --time 0.2, or several of them")
