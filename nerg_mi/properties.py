@@ -89,6 +89,29 @@ def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, 
     return network, {}, ""
 
 
+def volume_of(plugin: Callable, name: str, network, to_world, called: str):
+    """The volume that the class ``plugin``, registered as ``name``, makes of the field ``network`` in memory.
+
+    ``to_world``: a Mitsuba transform, or None; ``called``: what stands where other volumes have the name of a file.
+    """
+    import mitsuba as mi
+
+    props = mi.Properties(name)
+    if to_world is not None:
+        props["to_world"] = to_world
+    volume = plugin(props, network)
+    volume.filename = called
+    return volume
+
+
+def expose_parameters(field, callback) -> None:
+    """Tell a scene's traversal the arrays of ``field``, each of which can be trained."""
+    import mitsuba as mi
+
+    for name, value in field.parameters().items():
+        callback.put(name, value, mi.ParamFlags.Differentiable)
+
+
 def transform(props, name: str) -> np.ndarray:
     """The matrix (4, 4) of a transform; the identity where there is none."""
     value = props.get(name, None)

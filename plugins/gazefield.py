@@ -68,7 +68,7 @@ from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.field.gaze.registry import kinds
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.properties import trained, transform
+from nerg_mi.properties import expose_parameters, trained, transform, volume_of
 from nerg_mi.registration import register
 from nerg_mi.transport.observer.gaze import PlacedGaze
 
@@ -88,12 +88,7 @@ class GazeFieldVolume(mi.Volume):
         ``name``: what it is called where others have a file's name."""
         if getattr(network, "kind", None) not in kinds():
             raise NergError(f"a gaze field in memory is needed, got {type(network).__name__}; load one from its file")
-        props = mi.Properties("gazefield")
-        if to_world is not None:
-            props["to_world"] = to_world
-        volume = cls(props, network)
-        volume.filename = name
-        return volume
+        return volume_of(cls, "gazefield", network, to_world, name)
 
     def placed_gaze(self) -> PlacedGaze:
         """The gaze field as the integrator sees it."""
@@ -107,8 +102,7 @@ class GazeFieldVolume(mi.Volume):
         return 1
 
     def traverse(self, cb):
-        for name, value in self.field.parameters().items():
-            cb.put(name, value, mi.ParamFlags.Differentiable)
+        expose_parameters(self.field, cb)
 
     def parameters_changed(self, keys=()):
         self.field.pack()

@@ -60,7 +60,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.properties import number, trained, transform
+from nerg_mi.properties import expose_parameters, number, trained, transform, volume_of
 from nerg_mi.registration import register
 from nerg_mi.transport.media.field import FieldMedium
 
@@ -87,12 +87,7 @@ class NerfVolume(mi.Volume):
             raise NergError(
                 f"a radiance field in memory is needed, got {type(network).__name__}; load one from its file"
             )
-        props = mi.Properties("nerf")
-        if to_world is not None:
-            props["to_world"] = to_world
-        volume = cls(props, network)
-        volume.filename = name
-        return volume
+        return volume_of(cls, "nerf", network, to_world, name)
 
     def medium(self) -> FieldMedium:
         """The field as the marcher sees it."""
@@ -125,8 +120,7 @@ class NerfVolume(mi.Volume):
         return mi.ScalarVector3i(cells, cells, cells)
 
     def traverse(self, cb):
-        for name, value in self.field.parameters().items():
-            cb.put(name, value, mi.ParamFlags.Differentiable)
+        expose_parameters(self.field, cb)
 
     def parameters_changed(self, keys=()):
         self.field.pack()
