@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.threads import set_thread_count
 
 from .atomic import replacing
 from .bounded import reading
@@ -182,11 +183,11 @@ def threads_for_mitsuba() -> Iterator[None]:
     if threads > 1:
         yield
         return
-    dr.set_thread_count(2)
+    set_thread_count(2)
     try:
         yield
     finally:
-        dr.set_thread_count(threads)
+        set_thread_count(threads)
 
 
 def bitmap_channels(bitmap) -> dict[str, np.ndarray]:

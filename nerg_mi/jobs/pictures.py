@@ -14,6 +14,7 @@ from nerg_mi.rendering import bands
 from nerg_mi.rendering.picture_file import FORMATS, picture_rows
 from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.rendering.scene_file import check_samples
+from nerg_mi.threads import set_thread_count
 
 from .options.pictures import PictureOptions
 from .reporter import SILENT, Reporter
@@ -63,10 +64,8 @@ def render_file(
         raise NergError(f'there is no scene file "{scene}".')
     mode = activate(options.mode)
 
-    import drjit as dr
-
     if options.threads:
-        dr.set_thread_count(options.threads)
+        set_thread_count(options.threads)
     start = time.perf_counter()
     with Interruption() as stop:
 

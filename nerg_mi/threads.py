@@ -1,0 +1,15 @@
+"""How many threads Dr.Jit computes with on the CPU."""
+
+from __future__ import annotations
+
+
+def set_thread_count(count: int) -> None:
+    """Compute with ``count`` threads from now on.
+
+    Waits for what is being computed: Dr.Jit queues its kernels, and a pool of threads that changes its size while some
+    are in it can leave them undone, so that arrays hold what memory happened to hold.
+    """
+    import drjit as dr
+
+    dr.sync_thread()
+    dr.set_thread_count(count)
