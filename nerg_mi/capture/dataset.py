@@ -119,12 +119,13 @@ def _box(posed: PosedImages, views: list[View], aabb) -> tuple[Box, str]:
 
 def _depth_points(views: list[View]) -> np.ndarray | None:
     """World points that views with depth see, evenly over their pixels; None where a view has no depth."""
-    if not all(v.depth is not None for v in views):
+    depths = [v.depth for v in views if v.depth is not None]
+    if len(depths) < len(views):
         return None
     points = []
-    for view in views:
-        step = max(1, int(np.sqrt(view.depth.size / _DEPTH_POINTS)))
-        t = view.depth[::step, ::step]
+    for view, depth in zip(views, depths):
+        step = max(1, int(np.sqrt(depth.size / _DEPTH_POINTS)))
+        t = depth[::step, ::step]
         d = pixel_directions(view.camera.intrinsics)[::step, ::step][t > 0] @ view.camera.to_world[:3, :3].T
         points.append(view.camera.center + d * t[t > 0][:, None])
     return np.concatenate(points)

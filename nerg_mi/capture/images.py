@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 
 from . import lens
 from .cameras import Camera, pixel_directions, pixel_grid, view_tangents
-from .posed import Frame, Unused
+from .posed import DepthFile, Frame, Unused
 from .reading import read_depth, read_image, read_mask
 from .resize import all_used, area_average, nearest
 
@@ -38,9 +38,7 @@ class View:
     @property
     def color(self) -> np.ndarray:
         """The pixels as float32 in 0..1; made anew at every call."""
-        if self.pixels.dtype in (np.uint8, np.uint16):
-            return self.pixels.astype(np.float32) / np.iinfo(self.pixels.dtype).max
-        return self.pixels.astype(np.float32, copy=False)
+        return _as_floats(self.pixels)
 
     @property
     def has_alpha(self) -> bool:
@@ -117,25 +115,32 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
         mask = mask if shown.all() else shown if mask is None else mask & shown
     if mask is not None and not mask.any():
         raise NergError("its mask leaves out every pixel")
-    distance = _distances(frame, (h, w), intrinsics) if depth and frame.depth is not None else None
+    distance = _distances(frame.depth, (h, w), intrinsics) if depth and frame.depth is not None else None
     if size != (w, h):
-        pixels = area_average(View(frame.name, None, pixels).color, *size)
+        pixels = area_average(_as_floats(pixels), *size)
     if pixels.dtype == np.float32:
         # 16 bits tell more than the photo and take half the room.
         pixels = np.round(pixels * 65535).astype(np.uint16)
     return View(frame.name, Camera(intrinsics, frame.to_world), pixels, distance, mask)
 
 
-def _distances(frame: Frame, shape: tuple[int, int], intrinsics) -> np.ndarray:
+def _as_floats(pixels: np.ndarray) -> np.ndarray:
+    """``pixels`` of any of the types of `View.pixels` as float32 in 0..1."""
+    if pixels.dtype in (np.uint8, np.uint16):
+        return pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
+    return pixels.astype(np.float32, copy=False)
+
+
+def _distances(file: DepthFile, shape: tuple[int, int], intrinsics) -> np.ndarray:
     """Distances along the rays of the resized picture; depth cameras may have fewer pixels than the photo."""
-    out, (h, w) = read_depth(frame.depth), shape
+    out, (h, w) = read_depth(file), shape
     if abs(out.shape[1] * h - out.shape[0] * w) > 0.01 * w * out.shape[0]:
         raise NergError(
-            f'the depth file "{frame.depth.path}" has {out.shape[1]} x {out.shape[0]} pixels, which is not the '
+            f'the depth file "{file.path}" has {out.shape[1]} x {out.shape[0]} pixels, which is not the '
             f"shape of its image, {w} x {h}"
         )
     out = nearest(out, intrinsics.width, intrinsics.height)
-    if frame.depth.along_axis:
+    if file.along_axis:
         ahead = -pixel_directions(intrinsics)[..., 2]
         out = np.where(ahead > 1e-3, out / np.maximum(ahead, 1e-3), 0).astype(np.float32)
     return np.ascontiguousarray(out)

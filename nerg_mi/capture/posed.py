@@ -110,7 +110,7 @@ class Frame:
             fy = h / (2 * np.tan(lens["camera_angle_y"] / 2))
         # One focal length means square pixels.
         fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-        if fx is None or not all(_FOCAL[0] * w <= f <= _FOCAL[1] * w for f in (fx, fy)):
+        if fx is None or fy is None or not all(_FOCAL[0] * w <= f <= _FOCAL[1] * w for f in (fx, fy)):
             raise NergError(
                 f'frame "{plain(self.name)}" has no usable focal length; give "fl_x" in pixels or "camera_angle_x" in '
                 "radians"
@@ -119,16 +119,15 @@ class Frame:
             raise NergError(
                 f'the principal point ("cx", "cy") of frame "{plain(self.name)}" is not near its picture; correct it'
             )
-        bent = [lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
-        if not all(abs(k) <= _BENT for k in bent):
+        bent = {k: lens.get(k, 0.0) for k in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")}
+        if not all(abs(x) <= _BENT for x in bent.values()):
             raise NergError(
                 f'the distortion of frame "{plain(self.name)}" has coefficients beyond {_BENT:g}; correct them'
             )
         # One that bends nothing would still be divided by where a lens is asked for its fold.
-        bent = [k if abs(k) >= _UNBENT else 0.0 for k in bent]
-        stated = Intrinsics(
-            w, h, float(fx), float(fy), lens.get("cx", w / 2), lens.get("cy", h / 2), *bent, bool(lens.get("fisheye"))
-        )
+        bent = {k: x if abs(x) >= _UNBENT else 0.0 for k, x in bent.items()}
+        center = lens.get("cx", w / 2), lens.get("cy", h / 2)
+        stated = Intrinsics(w, h, float(fx), float(fy), *center, **bent, fisheye=bool(lens.get("fisheye")))
         return stated.resized(width, height)
 
 

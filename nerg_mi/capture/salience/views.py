@@ -15,7 +15,7 @@ import numpy as np
 from nerg_mi.capture import lens
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.intrinsics import Intrinsics
-from nerg_mi.capture.posed import Frame, inside
+from nerg_mi.capture.posed import Frame, MaskFile, inside
 from nerg_mi.capture.reading import open_bitmap, read_image, read_mask
 from nerg_mi.capture.resize import all_used, nearest, overlap
 from nerg_mi.capture.sources import find_source, read_posed
@@ -253,7 +253,7 @@ def _view(frame: Frame, path: Path | None, model, per: str) -> SalienceView:
     intrinsics = frame.intrinsics(*size).resized(w, h)
     solid = pixel_solid_angles(intrinsics)
     if frame.mask is not None:
-        solid = np.where(_unmasked(frame, size, intrinsics), solid, 0)
+        solid = np.where(_unmasked(frame.mask, frame.image, intrinsics), solid, 0)
     share = np.where(solid > 0, values, 0) if per == "pixel" else values * solid
     if not share.sum() > 0:
         raise NergError(
@@ -277,9 +277,9 @@ def _photo_size(frame: Frame) -> tuple[int, int]:
     return read_image(frame.image).shape[1::-1]
 
 
-def _unmasked(frame: Frame, size: tuple[int, int], intrinsics: Intrinsics) -> np.ndarray:
-    """Which pixels of a map are known altogether."""
-    mask = read_mask(frame.mask, read_image(frame.image).shape[:2])
+def _unmasked(file: MaskFile, photo: Path, intrinsics: Intrinsics) -> np.ndarray:
+    """Which pixels of a map are known altogether, by the mask of its ``photo``."""
+    mask = read_mask(file, read_image(photo).shape[:2])
     width, height = min(intrinsics.width, mask.shape[1]), min(intrinsics.height, mask.shape[0])
     used = all_used(mask, width, height)
     # A map that is finer than its mask takes the nearest.
