@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 
 class TerminalReporter:
@@ -13,7 +17,7 @@ class TerminalReporter:
     """
 
     def __enter__(self) -> TerminalReporter:
-        self._bar = self._task = None
+        self._bar: Progress | None = None
         return self
 
     def message(self, text: str) -> None:
@@ -23,24 +27,27 @@ class TerminalReporter:
         self._print(f"warning: {text}", sys.stderr)
 
     def progress(self, share: float, text: str = "") -> None:
-        if self._bar is None and not self._start():
-            return
-        self._bar.update(self._task, completed=share, description=text)
+        if self._bar is None:
+            self._bar = self._start()
+        if self._bar is not None:
+            (task,) = self._bar.task_ids
+            self._bar.update(task, completed=share, description=text)
 
-    def _start(self) -> bool:
+    def _start(self) -> Progress | None:
+        """The bar, with its one task; None where it would not be seen."""
         if not sys.stderr.isatty():
-            return False
+            return None
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
         columns = BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False)
         # The bar would else take what is printed to the standard output with it, which may be a file.
-        self._bar = Progress(
+        bar = Progress(
             *columns, console=Console(stderr=True), transient=True, redirect_stdout=False, redirect_stderr=False
         )
-        self._task = self._bar.add_task("", total=1.0)
-        self._bar.start()
-        return True
+        bar.add_task("", total=1.0)
+        bar.start()
+        return bar
 
     def _print(self, text: str, stream) -> None:
         if self._bar is not None and stream.isatty():
