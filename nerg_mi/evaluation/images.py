@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ def ssim(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None)
     var_a, var_b, covariance = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
     score = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
     score /= (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
-    whole = np.ones((height, width), bool) if mask is None else minimum_filter(mask, 2 * _RADIUS + 1)
+    whole = np.ones((height, width), bool) if mask is None else np.asarray(minimum_filter(mask, 2 * _RADIUS + 1), bool)
     inner = (slice(_RADIUS, -_RADIUS),) * 2
     kept = score[inner][whole[inner]]
     return float(kept.mean()) if kept.size else float("nan")
@@ -121,8 +122,9 @@ class Renderer:
         about["sampler"] = {"type": "multijitter", "sample_count": self.spp}
         sensor = mi.load_dict(about)
         params = mi.traverse(sensor)
+        to_world: Any = params["to_world"]
         # As a literal every pose would compile kernels of its own.
-        pose = mi.Transform4f(params["to_world"])
+        pose = mi.Transform4f(to_world)
         dr.make_opaque(pose)
         params["to_world"] = pose
         params.update()

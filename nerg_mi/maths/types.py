@@ -16,7 +16,7 @@ Bool: TypeAlias = Any
 """Mask. A Python bool may stand for one."""
 
 UInt32: TypeAlias = Any
-"""Unsigned 32-bit integer a lane."""
+"""Unsigned 32-bit integer a lane. A Python int may stand for one."""
 
 Array3f: TypeAlias = Any
 """Three single-precision numbers a lane, ``x``, ``y`` and ``z``: Dr.Jit's ``Array3f`` or one of Mitsuba's."""

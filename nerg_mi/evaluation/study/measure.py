@@ -136,10 +136,10 @@ def _pixel_truth(subject, spp: int) -> Truth:
     seen = subject.channels(subject.integrator(), spp, SEED + 1)
     none = np.zeros(len(seen["depth"]))
     return Truth(
-        *(seen[n] for n in ("color", "opacity", "depth", "visibility")),
-        seen.get("gaze", none),
-        f"mean of {spp} samples a pixel",
-        {},
+        **{n: seen[n] for n in ("color", "opacity", "depth", "visibility")},
+        gaze=seen.get("gaze", none),
+        source=f"mean of {spp} samples a pixel",
+        convergence={},
     )
 
 

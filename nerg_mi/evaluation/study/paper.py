@@ -139,7 +139,7 @@ def march(medium, ray, t0, t1, active, color, *, steps, shortest, longest, dt_ga
         dt = length(t)
         p = ray.o + ray.d * t
         if color is None:
-            sigma = medium.density(p, full)
+            sigma, features = medium.density(p, full), None
         else:
             sigma, features = medium.density_features(p, full)
         weight = dr.select(full, (1 - dr.exp(-sigma * dt)) * transmittance, 0)

@@ -165,7 +165,7 @@ def _volumes(variant: str):
             self._function = function
 
         def bbox(self):
-            return mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0), mi.ScalarPoint3f(1))
 
         def eval_1(self, it, active=True):
             return dr.select(active, self._function(it.p.x, it.p.y, it.p.z, dr), 0)
@@ -177,7 +177,7 @@ def _volumes(variant: str):
         """Colour that is affine in position."""
 
         def bbox(self):
-            return mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0), mi.ScalarPoint3f(1))
 
         def eval(self, it, active=True):
             rows = [
@@ -200,7 +200,8 @@ def _volumes(variant: str):
                 HashGridConfig(levels=2, log2_rows=10, base=3, finest=6), width=16, geometry=7, sh_degree=2
             )
             field = GazeField.random(config, Box((0, 0, 0), (1, 1, 1)), ns, seed=1)
-            table = 2 * np.random.default_rng(1).normal(size=len(field.grid.table)).astype(np.float32)
+            rows = dr.width(field.parameters()["grid.table"])
+            table = 2 * np.random.default_rng(1).normal(size=rows).astype(np.float32)
             field.set_parameters({"grid.table": ns.Float(table)})
             self._gaze = PlacedGaze(field)
 
@@ -208,7 +209,7 @@ def _volumes(variant: str):
             return self._gaze
 
         def bbox(self):
-            return mi.ScalarBoundingBox3f([0, 0, 0], [1, 1, 1])
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0), mi.ScalarPoint3f(1))
 
         def to_string(self):
             return "Gaze[]"

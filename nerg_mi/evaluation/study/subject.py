@@ -7,12 +7,13 @@ reference is a render with much smaller steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.types import UInt32
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.transport.observer.sight import EXACT
 from nerg_mi.transport.observer.viewpoint import center
@@ -137,7 +138,7 @@ class Subject:
         picture = self.render(Recorder(mi.Properties()), 1, seed)[..., -6:].reshape(-1, 6).astype(float)
         return picture[:, :3], picture[:, 3:]
 
-    def render(self, integrator, spp: int, seed: int) -> np.ndarray:
+    def render(self, integrator, spp: int, seed: UInt32) -> np.ndarray:
         """The picture (h, w, channels)."""
         import mitsuba as mi
 
@@ -161,6 +162,10 @@ class Subject:
         if key not in self._truths:
             self._truths[key] = self._find_truth(*key)
         return self._truths[key]
+
+    def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
+        """What `truth` keeps."""
+        raise NotImplementedError
 
     def exact(self, seed: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Where surfaces are exactly, and whether the observer sees them exactly: (N,) distances, inf on a miss, and
@@ -247,12 +252,13 @@ class FileSubject(Subject):
         fine, half = (
             self.channels(self.integrator({**kinds, "step": self.step / n}), 1, seed) for n in (FINER, FINER // 2)
         )
-        none = np.zeros(len(fine["depth"]))
-        names = ("color", "opacity", "depth", "visibility")
         known = Truth(
-            *(fine[n] for n in names), fine.get("gaze", none), f"render with steps of {self.step / FINER:.3g} units", {}
+            **{n: fine[n] for n in ("color", "opacity", "depth", "visibility")},
+            gaze=fine.get("gaze", np.zeros(len(fine["depth"]))),
+            source=f"render with steps of {self.step / FINER:.3g} units",
+            convergence={},
         )
-        return Truth(*(fine[n] for n in names), known.gaze, known.source, errors(half, known))
+        return replace(known, convergence=errors(half, known))
 
     def exact(self, seed: int):
         if self.surfaces is None:
