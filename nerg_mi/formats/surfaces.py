@@ -29,6 +29,11 @@ class Surface:
     colors: np.ndarray
     report: dict
 
+    @property
+    def face_count(self) -> int:
+        """F, which is 0 of points."""
+        return 0 if self.faces is None else len(self.faces)
+
 
 def mesh(
     field: RadianceField,

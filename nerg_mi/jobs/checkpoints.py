@@ -51,17 +51,17 @@ def import_checkpoint(
     ns = select_backend(options.mode)
     if is_nerg(open_checkpoint(file)[1]):
         field, attention, origin = read_nerg(file, ns, options.ema, given)
-        if output is not None and field is None:
-            raise NergError(f'"{file}" holds a gaze field without its NeRF: import that from its own file.')
     else:
         if gaze is not None:
             raise NergError(f'"{file}" holds no gaze field: leave out --gaze.')
         (field, origin), attention = read_torch_ngp(file, ns, options.ema, given), None
     if output is not None:
+        if field is None:
+            raise NergError(f'"{file}" holds a gaze field without its NeRF: import that from its own file.')
         save_radiance(field, output, origin, options.half)
         reporter.message(_about(field, origin))
         _tell(output, reporter)
-    if gaze is not None:
+    if attention is not None and gaze is not None:
         save_gaze(attention, gaze, origin, options.half)
         config = attention.config
         reporter.message(f"gaze: {config.variant}, trunk {config.trunk}, bound {attention.box.side / 2:g}")

@@ -53,7 +53,7 @@ def export_mesh(
         f"at, and {r['floater_faces']:,} of {r['pieces'] - r['pieces_kept']:,} floaters; {r['pieces_kept']} pieces kept"
     )
     reporter.message(
-        f"{len(found.vertices):,} vertices, {len(found.faces):,} faces; open edges: {r['edges_at_the_box']:,} where "
+        f"{len(found.vertices):,} vertices, {found.face_count:,} faces; open edges: {r['edges_at_the_box']:,} where "
         f"the box cuts, {r['edges_of_holes']:,} around holes"
     )
     return _written([output], start, reporter, found)
@@ -93,8 +93,8 @@ def export_volume(
         f"{_by(density.shape[::-1])} voxels from {_corner(lower)} to {_corner(upper)}; "
         f"density up to {density.max():.4g} / unit"
     )
-    if options.color is not None:
-        write_volume(options.color, color, lower, upper)
+    if color is not None:
+        write_volume(files[0], color, lower, upper)
     done = _written(files, start, reporter)
     reporter.message(
         'use: <volume type="gridvolume"> with <boolean name="use_grid_bbox" value="true"/>, '

@@ -80,6 +80,7 @@ def render_file(
         width, height = map(int, camera.film().crop_size())
         rows = bands.rows_for(loaded, camera, 1e9 * options.memory - resident_bytes() - RESERVE)
         whole = bands.why_whole(loaded, camera) if rows < height else None
+        channels = 0
         with mitsuba_says(), picture_rows(output, width, height) as write:
             pieces = bands.render_bands(
                 loaded, camera, spp=options.spp, seed=options.seed, rows=rows, on_strip=on_strip

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .bands import render_bands
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 SURFACE = 0.5
 """Opacity from which on a pixel shows a surface, as the integrator has it by default."""
@@ -20,7 +24,7 @@ class Channels:
 
     color: np.ndarray
     aovs: dict[str, np.ndarray]
-    bitmap: object
+    bitmap: mi.Bitmap
 
     @property
     def mask(self) -> np.ndarray:

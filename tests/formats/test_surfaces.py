@@ -45,6 +45,7 @@ def test02_floaters_and_holes():
     both, alone = mesh(Ball(speck=True), 48, keep=0), mesh(Ball(speck=True), 48, keep=0.05)
     assert both.report["pieces"] == both.report["pieces_kept"] == 2 and alone.report["pieces_kept"] == 1
     assert np.linalg.norm(alone.vertices - CENTER, axis=1).min() > 0.5
+    assert alone.face_count == len(alone.faces)
     assert alone.report["floater_faces"] == len(both.faces) - len(alone.faces) > 0
     pierced, whole = mesh(Ball(hole=True), 48, fill=0), mesh(Ball(hole=True), 48, fill=1)
     euler = lambda m: trimesh.Trimesh(m.vertices, m.faces, process=False).euler_number
@@ -71,6 +72,7 @@ def test04_points_and_the_box():
     cloud = points(ball, 48, threshold=100.0)
     r = np.linalg.norm(cloud.vertices - CENTER, axis=1)
     assert np.abs(r - expected_radius(ball, 100.0)).max() < 2.4 / 48 / 300 and cloud.faces is None
+    assert cloud.face_count == 0
     assert ((cloud.vertices - CENTER) / r[:, None] * cloud.normals).sum(1).min() > 0.97
     assert len(points(ball, 48, count=100).vertices) == 100
     with pytest.raises(ValueError, match="nowhere"):
