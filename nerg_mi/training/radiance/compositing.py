@@ -11,6 +11,7 @@ would add every sample of a ray to one address.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 
@@ -68,7 +69,8 @@ class Segments:
         return upper - dr.gather(type(inclusive), inclusive, self.start - 1, some & (self.start > 0))
 
     def _masked(self, x):
-        return dr.select(self.active, dr.float64_array_t(type(x))(x), 0)
+        Float64: Any = dr.float64_array_t(type(x))
+        return dr.select(self.active, Float64(x), 0)
 
 
 @dataclass
@@ -100,11 +102,11 @@ class _Weights(dr.CustomOp):
         return Float(self.weight)
 
     def forward(self):
-        g = self.grad_in("tau")
+        g: Float = self.grad_in("tau")
         self.set_grad_out(self.passed * g - self.weight * type(g)(self.segments.before(self.copies * g)))
 
     def backward(self):
-        g = self.grad_out()
+        g: Float = self.grad_out()
         self.set_grad_in("tau", self.passed * g - self.copies * type(g)(self.segments.after(g * self.weight)))
 
     def name(self):
@@ -119,11 +121,11 @@ class _RaySum(dr.CustomOp):
         return type(x)(segments.total(x))
 
     def forward(self):
-        g = self.grad_in("x")
+        g: Float = self.grad_in("x")
         self.set_grad_out(type(g)(self.segments.total(g)))
 
     def backward(self):
-        g = self.grad_out()
+        g: Float = self.grad_out()
         s = self.segments
         self.set_grad_in("x", dr.gather(type(g), g, s.ray, s.active))
 
@@ -131,7 +133,7 @@ class _RaySum(dr.CustomOp):
         return "sum along rays"
 
 
-def weights(tau, segments: Segments, thinned: Thinned | None = None):
+def weights(tau: Float, segments: Segments, thinned: Thinned | None = None) -> Float:
     """Weights of samples of optical depth ``tau`` >= 0 (Float); 0 for padding.
 
     Of ``thinned`` samples each weight is that of all the samples it stands for: sums of them along a ray, and their
@@ -140,7 +142,7 @@ def weights(tau, segments: Segments, thinned: Thinned | None = None):
     return dr.custom(_Weights, tau, segments, thinned)
 
 
-def ray_sum(x, segments: Segments):
+def ray_sum(x: Float, segments: Segments) -> Float:
     """Sum of ``x`` (a Float, one entry a sample) along each ray: a Float, one entry a ray."""
     return dr.custom(_RaySum, x, segments)
 

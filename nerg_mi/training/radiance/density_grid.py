@@ -121,7 +121,8 @@ class DensityGrid:
     def _allow(self, cells) -> None:
         """Restrict samples to ``cells`` (mask), all of which count as occupied until they are looked at."""
         self.seen = cells
-        self.seen_count = int(dr.count(cells)[0])
+        count: UInt32 = dr.count(cells)
+        self.seen_count = int(count[0])
         self.value = dr.zeros(self.ns.Float, self.resolution**3)
         self.bits = dr.select(cells, self.ns.UInt8(1), 0)
         dr.eval(self.seen, self.value, self.bits)

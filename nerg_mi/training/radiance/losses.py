@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import drjit as dr
 
+from nerg_mi.maths.types import Float
 from nerg_mi.transport.march.quadrature import mean_depth_share
 
 from .compositing import ray_sum, weights
@@ -32,8 +33,8 @@ def color_loss(color, opacity, pixels: PixelBatch, background, delta: float):
     return loss / 3
 
 
-def depth_loss(weight, tau, samples: Samples, pixels: PixelBatch, margin: float, scale):
-    """Loss a ray of the absorption's place against the true depth; 0 where that is unknown.
+def depth_loss(weight: Float, tau: Float, samples: Samples, depth: Float, margin: float, scale: Float):
+    """Loss a ray of the absorption's place against the true ``depth`` (as in `PixelBatch`); 0 where that is unknown.
 
     Two terms: the share of the light that is not absorbed within ``margin`` (scene units) of the true
     surface, or within the step that holds it (line-of-sight supervision, Rematas et al. 2022, with a
@@ -41,15 +42,14 @@ def depth_loss(weight, tau, samples: Samples, pixels: PixelBatch, margin: float,
     depth from the true one, in units of ``scale`` (a number or a Float), which places the surface within the step.
     """
     s = samples.segments
-    Float = type(weight)
-    truth = dr.gather(Float, pixels.depth, s.ray, s.active)
+    truth = dr.gather(type(weight), depth, s.ray, s.active)
     near = (samples.t < truth + margin) & (samples.t + samples.length > truth - margin)
     caught = ray_sum(dr.select(near, weight, 0), s)
     # Only absorption near the surface is moved: a floater is to vanish, not to drag the surface along.
     offset = samples.t + samples.length * mean_depth_share(tau) - truth
     shift = ray_sum(dr.select(near, weight * offset, 0), s)
     loss = (1 - caught) + dr.minimum(dr.abs(shift) / scale, 10)
-    return dr.select(pixels.depth > 0, loss, 0)
+    return dr.select(depth > 0, loss, 0)
 
 
 def feature_decay(features):
@@ -88,22 +88,22 @@ class _Spread(dr.CustomOp):
         return self.middle * self.segments.before(x) - self.segments.before(moment)
 
     def forward(self):
-        g, w = self.grad_in("weight"), self.weight
-        Float = type(g)
-        self.set_grad_out(Float(2 * (g * self._before(w) + w * self._before(g))) + 2 * w * g * self.length / 3)
+        g: Float = self.grad_in("weight")
+        w, kind = self.weight, type(g)
+        self.set_grad_out(kind(2 * (g * self._before(w) + w * self._before(g))) + 2 * w * g * self.length / 3)
 
     def backward(self):
-        g, w = self.grad_out(), self.weight
-        Float = type(g)
+        g: Float = self.grad_out()
+        w, kind = self.weight, type(g)
         a = g * w
         later = self.segments.after(a * self.middle) - self.middle * self.segments.after(a)
-        self.set_grad_in("weight", Float(2 * (g * self._before(w) + later)) + 2 * g * w * self.length / 3)
+        self.set_grad_in("weight", kind(2 * (g * self._before(w) + later)) + 2 * g * w * self.length / 3)
 
     def name(self):
         return "distortion of a ray"
 
 
-def composite(sigma, rgb: list, samples: Samples):
+def composite(sigma: Float, rgb: list, samples: Samples) -> tuple[Float, Float, list[Float], Float]:
     """Weights, optical depths, colour (3 Floats) and opacity of every ray.
 
     Of thinned samples the opacity is that of all, and the colour their mean times it: both without the noise of the

@@ -139,8 +139,9 @@ class PixelBank:
         for first in range(0, self.size, chunk):
             index = dr.arange(self.ns.UInt32, min(chunk, self.size - first)) + dr.opaque(self.ns.UInt32, first)
             pixels = self.batch(index)
-            known: UInt32 = dr.compress(pixels.depth > 0)
-            yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)
+            if pixels.depth is not None:
+                known: UInt32 = dr.compress(pixels.depth > 0)
+                yield dr.gather(self.ns.Array3f, pixels.o + pixels.d * pixels.depth, known)
 
 
 def _mask(view: View) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 
 from nerg_mi.capture.dataset import Dataset
 from nerg_mi.capture.images import View
+from nerg_mi.errors import NergError
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.files.png import write_png
 from nerg_mi.interruption import Interruption
@@ -82,11 +83,15 @@ def train_field(
         "box": dataset.box.to_dict(),
         "depth": depth,
     }
-    history = load_run(trainer, state, about) if resume else []
+    history = _resumed(trainer, state, about) if resume else []
     last = history[-1]["psnr"] if history else None
     looks = [x for x in _LOOKS if x > trainer.progress] if watched else []
     looked, saved, interrupted = history[-1]["steps"] if history else 0, trainer.seconds, False
-    keep = lambda: save_run(trainer, state, about, history)
+
+    def keep() -> None:
+        if state is not None:
+            save_run(trainer, state, about, history)
+
     with Interruption() as stop:
         while trainer.progress < 1 and not interrupted:
             trainer.step()
@@ -96,7 +101,7 @@ def train_field(
                 if preview is not None:
                     write_preview(trainer, watched[0], preview)
             if state is not None and trainer.seconds - saved > save_every:
-                save_run(trainer, state, about, history)
+                keep()
                 saved = trainer.seconds
             try:
                 if on_progress is not None:
@@ -113,13 +118,20 @@ def train_field(
         # One that came while the last preview was made.
         interrupted = interrupted or stop.asked
     seconds = trainer.seconds
-    if state is not None and interrupted:
+    if interrupted:
         keep()
     with kept_unless(state, keep, done=write is not None and not interrupted):
         field, provenance = _result(trainer, dataset, watched, history, seconds, interrupted)
         if write is not None:
             write(field, provenance)
     return field, provenance
+
+
+def _resumed(trainer: RadianceTrainer, state: Path | None, about: dict) -> list:
+    """The history of the run in the file ``state``, which ``trainer`` then goes on with."""
+    if state is None:
+        raise NergError("there is nothing to resume: name the file that holds the state of the run")
+    return load_run(trainer, state, about)
 
 
 def _result(

@@ -8,6 +8,7 @@ What is kept lies packed, ray after ray (see ``compositing``).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -43,7 +44,8 @@ class StepTable:
     def split(self, index):
         """Ray and step (UInt32) of candidates ``index`` = ray * steps + step."""
         # Division of integers is slow; in float64 half a step outweighs all rounding.
-        ray = type(index)((dr.float64_array_t(index)(index) + 0.5) * self._share)
+        Float64: Any = dr.float64_array_t(index)
+        ray = type(index)((Float64(index) + 0.5) * self._share)
         return ray, index - ray * self._steps
 
     def interval(self, k, offset):
@@ -188,7 +190,8 @@ def visible_samples(
     if thinning is not None:
         weight = light * absorbed_share(tau)
         share = dr.clip(weight / thinning.sure, thinning.least, 1)
-        random = namespace(t).PCG32(dr.width(t), dr.opaque(dr.uint64_array_t(Float), thinning.seed)).next_float32()
+        ns = namespace(t)
+        random = ns.PCG32(dr.width(t), dr.opaque(ns.UInt64, thinning.seed)).next_float32()
         chosen &= random < share
         thinned = Thinned(dr.rcp(share), before, absorbed_share(Float(segments.total(tau))))
         dr.eval(chosen, thinned.copies, before, thinned.opacity)

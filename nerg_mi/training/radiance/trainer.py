@@ -21,7 +21,7 @@ from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.psnr import psnr
-from nerg_mi.maths.types import UInt32
+from nerg_mi.maths.types import Float, UInt32
 from nerg_mi.training.common.step_clock import StepClock
 
 from .compositing import damp_near, weights
@@ -82,7 +82,7 @@ class RadianceTrainer:
         self.grid.update(self.density, self.rng, everywhere=True)
         self._tables: dict[int, StepTable] = {}
         self.settling = Settling(self.grid)
-        self.hard, self.misplaced = np.zeros(0, np.uint32), None
+        self.hard = np.zeros(0, np.uint32)
         self.steps, self.rays, self.loss, self.samples = 0, 256, 0.0, 0
         # Of the marching: how many times coarser than `march_step`, and samples a ray of the last density-only pass.
         self.stride, self.looked = 1 if self.carved else max(settings.strides, default=1), 0.0
@@ -166,9 +166,9 @@ class RadianceTrainer:
             self.rays = adapted_rays(self.rays, 0, 0, s.batch, most)
             return
         background = ns.Array3f(*[ns.Float(aligned(self.rng.random(self.rays, np.float32))) for _ in range(3)])
-        self._descend(samples, pixels, background, covered, self.stride)
-        if self.use_depth:
-            self._remember(index[:covered])
+        misplaced = self._descend(samples, pixels, background, covered, self.stride)
+        if misplaced is not None:
+            self._remember(index[:covered], misplaced)
         self.looked = samples.looked
         self.rays = adapted_rays(self.rays, samples.count / covered, self.looked, s.batch, most)
 
@@ -210,13 +210,14 @@ class RadianceTrainer:
             self.rng.shuffle(index)
         return index
 
-    def _remember(self, index: np.ndarray) -> None:
+    def _remember(self, index: np.ndarray, misplaced: Float) -> None:
         """Keep the pixels of this batch whose depth was wrong, in place of the oldest kept."""
-        wrong = self.misplaced.numpy()[: len(index)] > _WRONG
+        wrong = misplaced.numpy()[: len(index)] > _WRONG
         self.hard = np.concatenate([self.hard, index[wrong]])[-_HARD:]
 
-    def _descend(self, samples, pixels, background, covered: int, stride: int) -> None:
-        s, ns = self.settings, self.ns
+    def _descend(self, samples, pixels, background, covered: int, stride: int) -> Float | None:
+        """Move the weights once; returns how wrong the depth of each ray was, None where that is not asked for."""
+        s, ns, misplaced = self.settings, self.ns, None
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
         parameters = self._parameters()
         sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns, samples.features)
@@ -232,10 +233,10 @@ class RadianceTrainer:
         if self.use_depth:
             # In units of the step at hand: while marching is coarse, no more can be asked for.
             unit = dr.opaque(ns.Float, stride * self.march_step)
-            placed = depth_loss(weight, tau, samples, pixels, s.depth_margin * self.march_step, unit)
+            placed = depth_loss(weight, tau, samples, pixels.depth, s.depth_margin * self.march_step, unit)
             # Places first, colours later: once surfaces stand, colour has more to say.
             loss += dr.opaque(ns.Float, s.depth_weight * s.final_depth**self.progress) * placed
-            self.misplaced = dr.detach(placed)
+            misplaced = dr.detach(placed)
         if s.distortion_weight > 0:
             loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
@@ -256,6 +257,7 @@ class RadianceTrainer:
             for k, old in self.averaged.items():
                 self.averaged[k] = type(old)(old + (dr.detach(self.optimiser[k]) - old) * part)
             dr.eval(self.averaged)
+        return misplaced
 
     def _clear(self, parameters: dict):
         """Penalty on density in cells that are not sampled.
@@ -323,8 +325,9 @@ class RadianceTrainer:
     def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
         """``view`` by the trainer's own marcher; ``every`` and ``field`` as `measure` has them."""
         field, occupied = field or self.field(bound=False), self.grid.occupied
-        if field.occupancy is not None:
-            occupied = lambda p, active: active & (field.occupancy.empty_cells(self.box.to_unit(p), active) == 0)
+        bound = field.occupancy
+        if bound is not None:
+            occupied = lambda p, active: active & (bound.empty_cells(self.box.to_unit(p), active) == 0)
         return render_view(field, occupied, self.table(), view, self.settings.near * self.box.side, every=every)
 
     def field(self, bound: bool = True) -> RadianceField:

@@ -43,16 +43,14 @@ def test_depth_loss(margin):
     caught = np.bincount(RAY, weight * near)
     shift = np.bincount(RAY, weight * near * offset)
     want = np.where(truth > 0, 1 - caught + np.minimum(np.abs(shift) / scale, 10), 0)
-    got = depth_loss(
-        ns.Float(weight), ns.Float(TAU), samples(), SimpleNamespace(depth=ns.Float(truth)), margin, scale
-    ).numpy()
+    got = depth_loss(ns.Float(weight), ns.Float(TAU), samples(), ns.Float(truth), margin, scale).numpy()
     assert np.allclose(got, want, rtol=1e-5, atol=1e-6)
     assert want[2] == 0 and (want[:2] > 0.01).all()
 
 
 def test_depth_loss_is_bounded_where_all_is_at_the_wrong_place():
-    pixels = SimpleNamespace(depth=ns.Float(100.0, 100.0, 100.0))
-    got = depth_loss(ns.Float(absorbed()), ns.Float(TAU), samples(), pixels, 1e3, 1e-3).numpy()
+    far = ns.Float(100.0, 100.0, 100.0)
+    got = depth_loss(ns.Float(absorbed()), ns.Float(TAU), samples(), far, 1e3, 1e-3).numpy()
     assert np.allclose(got, 1 - np.bincount(RAY, absorbed()) + 10, rtol=1e-5)
 
 

@@ -6,6 +6,7 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_radiance, save_radiance
 from nerg_mi.training.radiance import run as radiance_run
 from nerg_mi.training.radiance.run import train_field, write_preview
@@ -52,3 +53,8 @@ def test_previews_show_the_first_watched_view(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(radiance_run, "LOOK_GAP", 1)
     train_field(dataset, TINY, settings(steps=3), ns, preview=tmp_path / "a.png")
     assert len(shown) > 1 and all(view is dataset.held_out[0] for view in shown)
+
+
+def test_nothing_is_resumed_without_a_state(dataset):
+    with pytest.raises(NergError, match="nothing to resume: name the file that holds the state"):
+        train_field(dataset, TINY, settings(steps=1), ns, resume=True)

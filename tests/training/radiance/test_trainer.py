@@ -90,7 +90,7 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
         sigma, rgb = density_color(TINY, BOX, parameters, samples.p, d, ns)
         weight, tau, color, opacity = composite(sigma, rgb, samples)
         terms = color_loss(color, opacity, pixels, background, 0.1)
-        terms += 0.1 * depth_loss(weight, tau, samples, pixels, 0.1, 0.1)
+        terms += 0.1 * depth_loss(weight, tau, samples, pixels.depth, 0.1, 0.1)
         return dr.sum(ns.Float64(terms))
 
     parameters = {k: type(v)(v) for k, v in start.items()}
