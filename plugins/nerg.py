@@ -198,10 +198,10 @@ import mitsuba as mi
 
 from nerg_mi.errors import NergError
 from nerg_mi.interruption import give_back_ctrl_c
+from nerg_mi.maths.types import Bool, UInt32
 from nerg_mi.properties import boolean, number, text
 from nerg_mi.registration import register
 from nerg_mi.transport.freezing import no_collection, recording
-from nerg_mi.transport.media.volume import KnownEmpty
 from nerg_mi.transport.observer import viewpoint
 from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.shading import Shading
@@ -224,8 +224,7 @@ class NergIntegrator(mi.SamplingIntegrator):
                 'photos; call mi.set_variant("llvm_ad_rgb")'
             )
         self._given = nerg_properties.read_children(props)
-        self.medium = nerg_properties.medium_of(self._given)
-        self._known_empty = None if self._given["density"] is None else KnownEmpty(self.medium)
+        self.medium, self._known_empty = nerg_properties.medium_of(self._given)
         self.gaze = nerg_properties.gaze_of(self._given, self.medium)
         self.observer, self.shading = self._given["observer"], Shading(self._given["integrator"])
         nerg_properties.check_observer(self.observer)
@@ -248,7 +247,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def aov_names(self):
         return nerg_aovs.channel_names(self.aovs, self.medium) + self.shading.aov_names()
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def render(self, scene, sensor=0, seed: UInt32 = 0, spp=0, develop=True, evaluate=True):
         if isinstance(sensor, int):
             sensor = scene.sensors()[sensor]
         give_back_ctrl_c()
@@ -271,7 +270,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         finally:
             self._sensors = None
 
-    def render_forward(self, scene, params, sensor, seed=0, spp=0):
+    def render_forward(self, scene, params, sensor, seed: UInt32 = 0, spp=0):
         # Mitsuba 3.9.1 ends the process instead, also with its own integrators: a batch calls its cameras through a
         # table of all sensors, the observer among them.
         eyes = viewpoint.centers([sensor]) + ([] if self.observer is None else [viewpoint.center(self.observer)])
@@ -282,7 +281,7 @@ class NergIntegrator(mi.SamplingIntegrator):
             )
         return super().render_forward(scene, params, sensor, seed, spp)
 
-    def sample(self, scene, sampler, ray, medium=None, active=True):
+    def sample(self, scene, sampler, ray, medium=None, active: Bool = True):
         if self._sensors is None:
             self.check_place(scene)
         active = mi.Bool(active)

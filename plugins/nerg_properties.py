@@ -13,7 +13,7 @@ from nerg_mi.transport.march.depth import DEPTHS
 from nerg_mi.transport.march.rules import RULES, boundaries
 from nerg_mi.transport.march.settings import MarchSettings, default_step
 from nerg_mi.transport.media.protocol import Medium
-from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.media.volume import KnownEmpty, VolumeMedium
 from nerg_mi.transport.observer import viewpoint
 from nerg_mi.transport.observer.gaze import PlacedGaze
 from nerg_mi.transport.observer.settings import VISIBILITIES, ObserverSettings
@@ -55,8 +55,8 @@ def check_observer(observer) -> None:
             raise NergError('"observer" stands at a position that is not finite; correct its to_world')
 
 
-def medium_of(children: dict) -> Medium | None:
-    """What is marched: the ``field``, or ``density`` and ``color``, or nothing."""
+def medium_of(children: dict) -> tuple[Medium | None, KnownEmpty | None]:
+    """What is marched: the ``field``, or ``density`` and ``color``, or nothing; and what of the latter is skipped."""
     field, density, paint = (children[name] for name in ("field", "density", "color"))
     if field is not None and density is not None:
         raise NergError('"nerg" takes either "field" (a volume of type "nerf") or "density" (any volume), and not both')
@@ -65,15 +65,16 @@ def medium_of(children: dict) -> Medium | None:
             raise NergError('"color" goes with "density"; a "field" brings its own colour')
         if not hasattr(field, "medium"):
             raise NergError('"field" must be a volume of type "nerf"; give other volumes as "density" and "color"')
-        return field.medium()
+        return field.medium(), None
     if density is None:
         if paint is not None:
             raise NergError('"color" goes with "density", which is missing')
-        return None
+        return None, None
     for name, volume in (("density", density), ("color", paint)):
         if volume is not None and not isinstance(volume, mi.Volume):
             raise NergError(f'"{name}" must be a volume')
-    return VolumeMedium(density, paint)
+    medium = VolumeMedium(density, paint)
+    return medium, KnownEmpty(medium)
 
 
 def gaze_of(children: dict, medium: Medium | None) -> PlacedGaze | None:
