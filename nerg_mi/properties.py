@@ -71,6 +71,15 @@ def color(props, name: str, default: float) -> list[float]:
     return rgb
 
 
+def resolved(filename: str) -> str:
+    """The path of the file that a scene calls ``filename``, where it is in one of the folders that Mitsuba looks in."""
+    import mitsuba as mi
+
+    # Mitsuba's stubs know it as an object.
+    file_resolver: Any = mi.file_resolver
+    return str(file_resolver().resolve(filename))
+
+
 def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, str]:
     """The field of a volume, its metadata and the name of its file ("" without one).
 
@@ -80,9 +89,7 @@ def trained(props, network, load: Callable, ns: ModuleType) -> tuple[Any, dict, 
     import mitsuba as mi
 
     if network is None:
-        # Mitsuba's stubs know it as an object.
-        file_resolver: Any = mi.file_resolver
-        filename = str(file_resolver().resolve(text(props, "filename")))
+        filename = resolved(text(props, "filename"))
         return *load(filename, ns), filename
     if any(not type(value).__module__.startswith(ns.__name__) for value in network.parameters().values()):
         raise NergError(f'the field in memory was made for another variant than "{mi.variant()}"; load it again')

@@ -78,6 +78,18 @@ def test_a_field_of_a_file_or_in_memory(rgb):
         properties.trained({}, Field([1.0]), load, ns)
 
 
+def test_a_file_is_looked_for_in_the_folders_of_a_scene(rgb, tmp_path):
+    (tmp_path / "here.ply").touch()
+    known = rgb.file_resolver()
+    rgb.set_file_resolver(type(known)(known))
+    try:
+        rgb.file_resolver().append(rgb.filesystem.path(str(tmp_path)))
+        assert properties.resolved("here.ply") == str(tmp_path / "here.ply")
+        assert properties.resolved("there.ply") == "there.ply"
+    finally:
+        rgb.set_file_resolver(known)
+
+
 def test_a_transform_is_a_matrix_or_the_identity(rgb):
     place = rgb.ScalarTransform4f().translate([1, 2, 3]).scale(2)
     assert np.allclose(properties.transform({"to_world": place}, "to_world"), np.array(place.matrix))

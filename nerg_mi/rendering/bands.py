@@ -19,6 +19,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from nerg_mi.maths.types import Bool
+
 from . import pixel_sampler
 from .layers import Layers, OwnLayer
 
@@ -42,6 +44,7 @@ class Observing(Protocol):
 
     def seen_by(self, sensor, scene) -> AbstractContextManager:
         """The context in which samples of ``sensor``'s picture of ``scene`` are traced."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,7 @@ def _trace(scene, sensor, layers: Layers, grid: _Grid, base, seed, top, first, c
     sampler = pixel_sampler.for_samples(spp, base, seed, first, count)
     # Numbers that differ from strip to strip are kept out of the kernel, which is then the same for all.
     number = dr.arange(mi.UInt32, count)
-    active = number >= dr.opaque(mi.UInt32, max(start - first, 0))
+    active: Bool = number >= dr.opaque(mi.UInt32, max(start - first, 0))
     number += dr.opaque(mi.UInt32, first % spp)
     number = number // dr.opaque(mi.UInt32, spp) + dr.opaque(mi.UInt32, first // spp % grid.width)
     line = number // grid.width

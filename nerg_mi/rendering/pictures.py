@@ -26,6 +26,7 @@ def activate(variant: str | None = None) -> str:
     if variant is not None and variant not in mi.variants():
         raise NergError(f'there is no variant "{variant}"; this Mitsuba has {", ".join(mi.variants())}.')
     wanted = [variant] if variant else [v for v in _PREFERRED if not v.startswith("cuda") or llvm.has_cuda()]
+    reason = ""
     for choice in wanted:
         try:
             mi.set_variant(choice)
@@ -33,8 +34,7 @@ def activate(variant: str | None = None) -> str:
         except UnusableLLVM:
             raise
         except ImportError as error:  # Mitsuba says so where the backend of a variant cannot start
-            failed = error
-    reason = sentence(failed)
+            reason = sentence(error)
     raise NergError(f'the variant "{wanted[-1]}" does not work here ({reason}); "nerg doctor" says how to mend it.')
 
 

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import functools
 import re
+from typing import Any
+
+from nerg_mi.maths.types import UInt32
 
 
 def base_seed(sampler) -> int | None:
@@ -37,9 +40,13 @@ def for_samples(spp: int, base: int, seed: int, first: int, count: int):
     import mitsuba as mi
 
     number = dr.opaque(mi.UInt64, first) + mi.UInt64(dr.arange(mi.UInt32, count))
-    low, high = mi.UInt32(number & 0xFFFFFFFF), mi.UInt32(number >> 32)
-    state, stream = mi.sample_tea_32(dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF) + high * 0x9E3779B9, low)
-    return _class(mi.variant())(spp, mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
+    low: UInt32 = mi.UInt32(number & 0xFFFFFFFF)
+    high: UInt32 = mi.UInt32(number >> 32)
+    key: UInt32 = dr.opaque(mi.UInt32, (base + seed) & 0xFFFFFFFF) + high * 0x9E3779B9
+    state, stream = mi.sample_tea_32(key, low)
+    # Mitsuba's stubs know it as an object.
+    PCG32: Any = mi.PCG32
+    return _class(mi.variant())(spp, PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(stream)))
 
 
 @functools.cache
@@ -61,7 +68,7 @@ def _class(variant: str):
             return mi.Point2f(x, self.next_1d(active))
 
         def clone(self):
-            return Samples(self.sample_count(), mi.PCG32(self.generator))
+            return Samples(self.sample_count(), type(self.generator)(self.generator))
 
         def to_string(self):
             return f"Samples[{self.sample_count()} a pixel, {variant}]"

@@ -13,6 +13,7 @@ from xml.parsers import expat
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.image_header import check_image
+from nerg_mi.properties import resolved
 
 from .mesh_file import check_obj, check_ply, check_vol
 
@@ -162,7 +163,5 @@ class _Scene:
                 check_image(found, "texture")
 
     def _find(self, name: str) -> Path | None:
-        import mitsuba as mi
-
-        places = [folder / name for folder in self._folders] + [Path(str(mi.file_resolver().resolve(name)))]
+        places = [folder / name for folder in self._folders] + [Path(resolved(name))]
         return next((place for place in places if name and place.is_file()), None)

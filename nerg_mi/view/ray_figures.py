@@ -36,7 +36,7 @@ def floor_plan(rays, cell: float | None = None, title: str = "Where people stood
         *edges, density, cmap="viridis", norm=LogNorm(bottom, max(top, bottom * 1.01)), rasterized=True
     )
     _arrows(axes, rays, low, high)
-    bar = figure.colorbar(image, cax=figure.bar_axes)
+    bar = figure.colorbar(image, cax=figure.axes[1])
     bar.set_label(f"rays/m² in cells of {cell:g} m", fontsize=7, color=INK)
     bar.ax.tick_params(labelsize=7, colors=INK, length=2)
     return figure
@@ -158,7 +158,7 @@ def _dimension(axes, low, high) -> None:
 
 def _sheet(low, high, title: str, bar: bool = False, pad: float = 0.0):
     """A figure with axes in metres, of equal scale: so large that the plan's longer side has a fixed number of
-    pixels."""
+    pixels. ``bar``: the figure's second axes are those of a colour bar."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -181,5 +181,5 @@ def _sheet(low, high, title: str, bar: bool = False, pad: float = 0.0):
         spine.set_linewidth(0.5)
     axes.set_title(title, fontsize=9, color=INK, loc="left", pad=19 if not bar else 6)
     if bar:
-        figure.bar_axes = figure.add_axes(((left + size[0] + 12) / width, foot / height, 12 / width, size[1] / height))
+        figure.add_axes(((left + size[0] + 12) / width, foot / height, 12 / width, size[1] / height))
     return figure, axes
