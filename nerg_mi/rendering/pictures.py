@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from nerg_mi import llvm
 from nerg_mi.errors import NergError, UnusableLLVM, mitsuba_says, sentence
@@ -13,6 +14,8 @@ from nerg_mi.files.exr import threads_for_mitsuba
 from .scene_file import check_scene, check_scene_file
 
 _PREFERRED = ("cuda_ad_rgb", "llvm_ad_rgb")
+# What mi.load_file takes besides the values of a scene.
+_OWN = ("path", "parallel", "optimize")
 
 
 def activate(variant: str | None = None) -> str:
@@ -47,10 +50,15 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
 
     if not Path(path).is_file():
         raise NergError(f'there is no scene file "{path}".')
+    # Values of any type, among which Mitsuba looks for its own parameters.
+    given: dict[str, Any] = dict(defaults or {})
+    for name in _OWN:
+        if name in given:
+            raise NergError(f'"{name}" is a name that Mitsuba keeps for itself: give the value in "{path}" another.')
     check_scene_file(path, defaults)
     with mitsuba_says(), threads_for_mitsuba():
         try:
-            loaded = mi.load_file(str(path), **(defaults or {}))
+            loaded = mi.load_file(str(path), **given)
         except RuntimeError as error:
             unused = (
                 re.findall(r"^\s*- \$(\w+)=", str(error), re.MULTILINE) if "unused parameters" in str(error) else []

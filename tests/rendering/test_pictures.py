@@ -48,6 +48,14 @@ def test_values_of_a_scene(rgb, tmp_path):
         load_scene(tmp_path / "s.xml", {"tall": "2"})
 
 
+@pytest.mark.parametrize("name", ["path", "parallel", "optimize"])
+def test_names_that_mitsuba_has_for_itself(rgb, tmp_path, name):
+    file = tmp_path / "scene.xml"
+    file.write_text(f'<scene version="3.0.0"><default name="{name}" value="1"/></scene>')
+    with pytest.raises(NergError, match=f'"{name}" is a name that Mitsuba keeps .*scene.xml"'):
+        load_scene(file, {name: "2"})
+
+
 def test_a_scene_that_is_not_there(tmp_path):
     with pytest.raises(NergError, match="there is no scene file"):
         load_scene(tmp_path / "s.xml")
