@@ -138,7 +138,7 @@ def _enough_divisions(mesh: Any, eyes: Floats) -> int:
     return int(2 ** np.ceil(np.log2(np.clip(wanted, 1, MOST))))
 
 
-def _mesh(scene: Scene, surface: object) -> Any:
+def _mesh(scene: Scene, surface: Any) -> Any:
     """``surface`` as a Mitsuba mesh."""
     import mitsuba as mi
 
@@ -154,7 +154,7 @@ def _mesh(scene: Scene, surface: object) -> Any:
         return surface
     if isinstance(surface, Mapping):
         return mi.load_dict(dict(surface))
-    corners = arrays.points(surface, "the corners of a box")  # type: ignore[arg-type]
+    corners = arrays.points(surface, "the corners of a box")
     if len(corners) != 2 or not np.all(corners[0] < corners[1]):
         raise NergError(f"a box is a lower corner and an upper one, got {corners.tolist()}")
     return mi.load_dict(box_dict(*corners.astype(np.float64)))

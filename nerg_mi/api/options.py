@@ -5,14 +5,17 @@ from __future__ import annotations
 import difflib
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from nerg_mi.errors import NergError
 
 from .arrays import listed
 from .variant import active_mitsuba
 
-Options = TypeVar("Options")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Options = TypeVar("Options", bound="DataclassInstance")
 
 
 def options_of(kind: type[Options], job: str, given: Options | None, changes: dict[str, Any]) -> Options:
@@ -21,7 +24,7 @@ def options_of(kind: type[Options], job: str, given: Options | None, changes: di
 
     Raises `NergError` for an option that the ``job`` has not, naming those that it has.
     """
-    types = {f.name: str(f.type) for f in fields(kind)}  # type: ignore[arg-type]
+    types = {f.name: str(f.type) for f in fields(kind)}
     known = [name for name in types if name != "mode"]
     for name in changes:
         if name == "mode":
@@ -33,4 +36,4 @@ def options_of(kind: type[Options], job: str, given: Options | None, changes: di
     changes = {k: Path(v) if isinstance(v, str) and "Path" in types[k] else v for k, v in changes.items()}
     if "mode" in types:
         changes["mode"] = active_mitsuba().variant()
-    return replace(kind() if given is None else given, **changes)  # type: ignore[type-var]
+    return replace(kind() if given is None else given, **changes)

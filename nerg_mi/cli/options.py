@@ -39,7 +39,7 @@ def takes(kind: type, *leave_out: str) -> Callable[[Callable[..., None]], Callab
 
         call.__name__, call.__qualname__, call.__module__ = command.__name__, command.__qualname__, command.__module__
         call.__doc__ = command.__doc__
-        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call.__signature__ = inspect.Signature(parameters)
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         return call
 
@@ -51,9 +51,9 @@ def _parameter(field: Field, kind: type) -> inspect.Parameter:
     hint, about, default = get_type_hints(kind)[field.name], field.metadata, field.default
     names = about["names"]
     if about["parse"] is not None:
-        hint = str | None  # type: ignore[assignment]
+        hint = str | None
     elif get_origin(hint) is tuple:
-        hint, default = list[get_args(hint)[0]] | None, None  # type: ignore[misc]
+        hint, default = list[get_args(hint)[0]] | None, None
     if hint is bool and default is False and not names:
         names = ("--" + field.name.replace("_", "-"),)
     info = typer.Option(*names, help=about["help"], **about["more"])

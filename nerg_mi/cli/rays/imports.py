@@ -31,9 +31,7 @@ def make_command() -> Callable[..., None]:
     own = inspect.signature(_own_options, eval_str=True).parameters.values()
     before, after = ([p for p in own if (p.name in ("files", "output", "preset")) == first] for first in (True, False))
     parameters = [*before, *map(_parameter, options), *after]
-    command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
-    )
+    command.__signature__ = inspect.Signature([p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters])
     command.__annotations__ = {p.name: p.annotation for p in parameters}
     return command
 

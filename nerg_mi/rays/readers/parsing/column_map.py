@@ -10,6 +10,7 @@ where the eye is in the head's frame.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 from nerg_mi.errors import NergError
 
@@ -87,7 +88,8 @@ class ColumnMap:
             words = shlex.split(text)
         except ValueError as error:
             raise NergError(f"column map: {str(error)[:1].lower()}{str(error)[1:]} in {text!r}; close it") from None
-        found: dict[str, tuple[str, ...] | str] = {}
+        # By a field's name what its type says: `_COUNTS` tells which are of one column.
+        found: dict[str, Any] = {}
         for word in words:
             key, _, value = word.partition("=")
             columns = tuple(c.strip() for c in value.split(",") if c.strip())
@@ -97,7 +99,7 @@ class ColumnMap:
                 needed = " or ".join(map(str, _COUNTS[key]))
                 raise NergError(f"column map: {key} needs {needed} column name(s), got {len(columns)} in {word!r}")
             found[key] = columns[0] if _COUNTS[key] == (1,) else columns
-        return cls(**found)  # type: ignore[arg-type]
+        return cls(**found)
 
     def __str__(self) -> str:
         words = []
