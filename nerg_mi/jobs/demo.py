@@ -21,6 +21,7 @@ from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.files.tables import write_json
 from nerg_mi.interruption import Interruption
+from nerg_mi.maths.types import Float
 from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.transport.observer.viewpoint import center
@@ -129,9 +130,9 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
 
 def store_scene() -> Path:
     """The demo store's scene.xml, as installed."""
-    import nerg_mi.scenes as scenes
+    import nerg_mi.scenes as scenes  # pyright: ignore[reportMissingImports] which lies at the root of a checkout
 
-    return Path(scenes.__file__).resolve().parent / "store" / "scene.xml"
+    return Path(scenes.__path__[0]).resolve() / "store" / "scene.xml"
 
 
 def checksum(path: Path) -> str:
@@ -163,7 +164,7 @@ def observer_pixel(scene) -> tuple[float, float] | None:
 
     camera = scene.sensors()[CAMERA]
     film = camera.film()
-    fov = mi.traverse(camera)["x_fov"]
+    fov: Float = mi.traverse(camera)["x_fov"]
     local = camera.world_transform().inverse() @ center(scene.sensors()[OWN])
     clip = camera.near_clip(), camera.far_clip()
     screen = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, *clip)

@@ -117,7 +117,7 @@ def twin_beside(scene: Path) -> ExactSurfaces | None:
     file = scene.parent / "twin.xml"
     if not file.is_file():
         return None
-    from nerg_mi.scenes.store import twin
+    from nerg_mi.scenes.store import twin  # pyright: ignore[reportMissingImports] at the root of a checkout
 
     shapes = twin.load_twin(file)
     return ExactSurfaces(partial(twin.cast, scene=shapes), partial(twin.visible, scene=shapes))

@@ -16,7 +16,7 @@ def versions(mode: str) -> dict[str, str]:
     out = {
         "nerg_mi": __version__,
         "mitsuba": mitsuba.__version__,
-        "drjit": drjit.__version__,
+        "drjit": drjit.__version__,  # pyright: ignore[reportAttributeAccessIssue] which its stubs leave out
         "numpy": numpy.__version__,
         "python": platform.python_version(),
     }

@@ -57,7 +57,7 @@ class EncodingConfig(Protocol):
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object that stands in a checkpoint; see ``registry.encoding_config`` for the way back."""
-        return {"kind": self.kind, **asdict(self)}  # pyright: ignore[reportArgumentType]
+        return {"kind": self.kind, **asdict(self)}  # pyright: ignore[reportArgumentType] it is a dataclass
 
 
 class Encoding(Protocol):

@@ -59,4 +59,4 @@ def encoding_of(
 ) -> Encoding:
     """The encoding of ``config`` whose parameters stand in ``parameters`` as ``NAME.PARAMETER``; see `Encoding`."""
     arrays = {key: parameters[f"{name}.{key}"] for key in config.shapes()}
-    return _ENCODINGS[type(config)](config, **arrays, mode=mode)  # pyright: ignore[reportCallIssue]
+    return _ENCODINGS[type(config)](config, **arrays, mode=mode)  # pyright: ignore[reportCallIssue] as `Encoding` says

@@ -87,7 +87,7 @@ def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> n
     from scipy.spatial import KDTree
 
     # The leaf decides which of directions that are equally far are among the eight.
-    apart, which = KDTree(known, leafsize=16).query(wanted, k=np.arange(1, min(8, len(known)) + 1))  # pyright: ignore[reportArgumentType]
+    apart, which = KDTree(known, leafsize=16).query(wanted, k=np.arange(1, min(8, len(known)) + 1))  # pyright: ignore[reportArgumentType] SciPy takes several
     weight = 1 / (apart**2 + 1e-3)
     log = np.log(np.maximum(depth, 1e-6))[which]
     return np.exp((weight * log).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
