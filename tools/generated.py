@@ -61,7 +61,7 @@ def recipes() -> str:
 def _flat(config: object, prefix: str = "") -> dict[str, object]:
     """The settings of a field, those of its parts by "part.setting"."""
     found: dict[str, object] = {}
-    for f in fields(config):  # type: ignore[arg-type]
+    for f in fields(config):
         value = getattr(config, f.name)
         if is_dataclass(value):
             found |= _flat(value, f"{prefix}{f.name}.")
