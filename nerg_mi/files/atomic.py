@@ -72,6 +72,40 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         _flush(target.parent)
 
 
+@contextmanager
+def replacing_folder(path: str | os.PathLike) -> Iterator[Path]:
+    """The name of a new, empty folder to be filled, which becomes the folder ``path`` when the block ends.
+
+    ``path`` must be absent or an empty folder, see `check_new_folder`. Parent folders are made. If the block raises,
+    the new folder is removed with all that is in it; an `OSError` of the block comes out as a `NergError` that names
+    ``path`` and the remedy.
+    """
+    check_new_folder(path)
+    with writing(path):
+        target = Path(os.path.realpath(path))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = target.with_name(f".{target.name[:32]}.{os.getpid()}-{secrets.token_hex(4)}.part")
+        temporary.mkdir()
+        try:
+            yield temporary
+            for found in (*temporary.rglob("*"), temporary):
+                _flush(found)
+            os.replace(temporary, target)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+        _flush(target.parent)
+
+
+def check_new_folder(path: str | os.PathLike) -> None:
+    """Raise `NergError` where no folder ``path`` can be made, or where it is there and holds something: to be asked
+    before long work."""
+    check_folder(path)
+    with writing(path):
+        if os.path.isdir(path) and any(os.scandir(path)):
+            raise NergError(f'the folder "{path}" is there and not empty: choose another name, or remove it first.')
+
+
 def write_bytes(path: str | os.PathLike, *parts: bytes | memoryview) -> None:
     """Write ``parts``, one after the other, to ``path``, whole or not at all; see `replacing`."""
     with replacing(path) as temporary, temporary.open("wb") as out:

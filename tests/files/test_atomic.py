@@ -11,7 +11,16 @@ import time
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import check_folder, check_writable, make_folder, replacing, write_bytes, write_text
+from nerg_mi.files.atomic import (
+    check_folder,
+    check_new_folder,
+    check_writable,
+    make_folder,
+    replacing,
+    replacing_folder,
+    write_bytes,
+    write_text,
+)
 
 
 def test_parents_are_made_and_nothing_else_is_left(tmp_path):
@@ -145,3 +154,33 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path):
         child.wait()
         data = path.read_bytes()
         assert len(data) == 100_000 and len(set(data)) == 1
+
+
+def test_a_folder_is_whole_or_absent(tmp_path):
+    out = tmp_path / "new" / "capture"
+    with replacing_folder(out) as folder:
+        assert folder.parent == out.parent and not out.exists()
+        write_text(folder / "a" / "b.txt", "1")
+    assert (out / "a" / "b.txt").read_text() == "1" and os.listdir(out.parent) == ["capture"]
+    for error in (KeyboardInterrupt, ZeroDivisionError):
+        with pytest.raises(error), replacing_folder(tmp_path / "other") as folder:
+            write_text(folder / "a" / "b.txt", "1")
+            raise error
+    with pytest.raises(NergError, match="other.*the disk is full"), replacing_folder(tmp_path / "other"):
+        raise OSError(28, "No space left on device")
+    assert os.listdir(tmp_path) == ["new"]
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
+    (tmp_path / "empty").mkdir()
+    with replacing_folder(tmp_path / "empty") as folder:
+        write_text(folder / "a", "1")
+    for check in (
+        lambda: check_new_folder(tmp_path / "empty"),
+        lambda: replacing_folder(tmp_path / "empty").__enter__(),
+    ):
+        with pytest.raises(NergError, match="there and not empty: choose another name, or remove it"):
+            check()
+    with pytest.raises(NergError, match="one of its parents is a file"):
+        check_new_folder(tmp_path / "empty" / "a")
+    assert os.listdir(tmp_path) == ["empty"] and os.listdir(tmp_path / "empty") == ["a"]
