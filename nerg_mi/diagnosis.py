@@ -19,6 +19,7 @@ EXTRAS = {
     "torch": 'fields as torch modules: pip install "nerg-mi[torch]"',
     "scikit-image": 'meshes of radiance fields: pip install "nerg-mi[mesh]"',
     "pyarrow": 'ray tables in Parquet: pip install "nerg-mi[parquet]"',
+    "pycolmap": 'poses of photos: pip install "nerg-mi[poses]"',
 }
 """Optional distributions, each with what it is for and how to get it."""
 
