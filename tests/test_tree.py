@@ -23,6 +23,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/jobs/options/gaze.py": _OPTIONS,
     "nerg_mi/jobs/options/pictures.py": _OPTIONS,
     "nerg_mi/jobs/options/place.py": _OPTIONS,
+    "nerg_mi/jobs/options/poses.py": _OPTIONS,
     "nerg_mi/jobs/options/radiance.py": _OPTIONS,
     "nerg_mi/jobs/options/study.py": _OPTIONS,
     "nerg_mi/maths/types.py": "names for signatures",

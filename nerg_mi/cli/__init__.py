@@ -25,6 +25,7 @@ COMMANDS = {
     "doctor": "Say what works on this machine, and how to mend what does not.",
     "render": "Render a scene file to an EXR or PNG file.",
     "rays": "Import tracking files as rays of attention, and look at what they hold.",
+    "poses": "Find out from where photos, or frames of a video, were taken.",
     "train": "Train a radiance field on posed photos, or a gaze field on rays.",
     "eval": "Score a trained radiance field on held-out views, or a gaze field on held-out rays.",
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",

@@ -123,6 +123,9 @@ CASES = (
     ),
 )
 
+MAKES_A_FOLDER = {"poses": "tests/cli/test_poses.py"}
+"""Commands that make a folder as a whole, which must not be there before -> where their output is tried."""
+
 READS_ONLY = {"doctor", "rays show"}
 """Commands that write no file."""
 INPUTS = {

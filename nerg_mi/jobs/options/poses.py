@@ -1,0 +1,28 @@
+"""Options of finding the poses of photos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from . import option
+
+
+@dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """How the poses of photos are found."""
+
+    frames: int = option(80, "Of a video: frames to take, each the sharpest of an equally long stretch.", min=3)
+    size: int = option(960, "Longer side, in pixels, of the copies that features are found in.", min=64)
+    matching: str = option(
+        "auto", "Pictures to compare: exhaustive (all), sequential (in order), auto (all up to 100, else in order)."
+    )
+    lens: str = option(
+        "auto",
+        "What is found of a lens: radial (f, k1), opencv (fx, fy, k1, k2, p1, p2), auto (opencv from 10 photos on).",
+    )
+    single_camera: bool = option(
+        True, "Photos of equal size (and maker, model, focal length, where told) share a camera; else each has its own."
+    )
+    orient: bool = option(True, "Turn the place so that up is +z, as far as cameras and a floor tell.")
+    seed: int = option(0, "Seed of what is drawn at random.", min=0)
+    threads: int | None = option(None, "CPU threads. Default: all.", min=1)
