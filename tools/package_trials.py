@@ -93,6 +93,7 @@ def try_missing_extras(there: Environment, out: Path) -> str:
     asked = {
         "nerg-mi[mesh]": ("nerg", "export", "mesh", field, "-o", out / "field.ply", "--resolution", 8),
         "nerg-mi[parquet]": ("nerg", "rays", "show", out / "rays.parquet"),
+        "nerg-mi[poses]": ("nerg", "poses", out, "-o", out / "capture"),
         "nerg-mi[torch]": ("python", "-c", "import nerg_mi.interop.torch"),
     }
     (out / "rays.parquet").write_bytes(b"PAR1")

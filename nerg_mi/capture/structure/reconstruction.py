@@ -160,6 +160,5 @@ def _ended(code: int, words: str, work: Path) -> str:
     # A trace follows the sentence where a library aborts, and precedes it where Python raises.
     said = next((line for line in lines if "Check failed" in line or "] " in line[:80]), lines[-1] if lines else "")
     return (
-        f"COLMAP ended with code {code}, which is a fault of it and not of the photos ({plain(said, 200)}); try again "
-        "with --threads 1"
+        f"COLMAP ended early, with code {code} ({plain(said, 200)}); try again with --threads 1, or with other photos"
     )

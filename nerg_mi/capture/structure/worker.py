@@ -49,7 +49,12 @@ def main(folder: Path, tell: Callable[..., None]) -> None:
     result: dict[str, Any] = {"parts": [[_index(m.image(i)) for i in m.reg_image_ids()] for m in models]}
     if models:
         result |= _finish(pycolmap, models[0], folder, job)
-    np.savez(folder / "result.npz", result=json.dumps(result), **_drawn(models[0] if models else None))
+    to_world, points, colors = (
+        _drawn(models[0]) if models else (np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros((0, 3)))
+    )
+    np.savez(
+        folder / "result.npz", result=np.array(json.dumps(result)), to_world=to_world, points=points, colors=colors
+    )
 
 
 def _write_database(pycolmap: Any, path: Path, job: dict) -> None:
@@ -191,16 +196,14 @@ def _poses(model: Any) -> np.ndarray:
     return np.array(out)
 
 
-def _drawn(model: Any) -> dict[str, np.ndarray]:
+def _drawn(model: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a picture of the model shows: poses, and points seen by three pictures or more with their colours."""
-    if model is None:
-        return {}
     points = [p for p in model.points3D.values() if p.track.length() > 2]
-    return {
-        "to_world": _poses(model),
-        "points": np.array([p.xyz for p in points]).reshape(-1, 3),
-        "colors": np.array([p.color for p in points], np.uint8).reshape(-1, 3),
-    }
+    return (
+        _poses(model),
+        np.array([p.xyz for p in points]).reshape(-1, 3),
+        np.array([p.color for p in points], np.uint8).reshape(-1, 3),
+    )
 
 
 def _alone(arguments: list[str]) -> None:
