@@ -61,6 +61,7 @@ def main(argv=None) -> None:
                     f"{len(result.registered)} of {len(given)}",
                     f"{result.error:.2f}",
                     f"{np.median(errors.rotation):.2f}, {errors.rotation.max():.2f}",
+                    f"{np.median(errors.scatter):.2f}, {errors.scatter.max():.2f}",
                     f"{np.median(errors.position):.2%}, {errors.position.max():.2%}",
                     f"{seconds:.0f}",
                 )
@@ -73,6 +74,7 @@ def main(argv=None) -> None:
         "with a pose",
         "reprojection error, pixels",
         "rotation error, degrees: median, max",
+        "of it not common to all cameras",
         "position error, of the cameras' extent: median, max",
         "seconds",
     )

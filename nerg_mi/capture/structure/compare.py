@@ -9,10 +9,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """``rotation``: (N,) degrees; ``position``: (N,), as shares of the extent of the reference's cameras, which is
-    their largest distance from their mean; ``similarity``: (4, 4), from the poses' coordinates to the reference's."""
+    """``rotation``: (N,) degrees; ``scatter``: (N,) degrees that are left without the turn that all cameras have in
+    common, in their own frames, as where one lens has another principal point; ``position``: (N,), as shares of the
+    extent of the reference's cameras, which is their largest distance from their mean; ``similarity``: (4, 4), from
+    the poses' coordinates to the reference's."""
 
     rotation: np.ndarray
+    scatter: np.ndarray
     position: np.ndarray
     similarity: np.ndarray
 
@@ -43,12 +46,18 @@ def pose_errors(found: np.ndarray, reference: np.ndarray) -> PoseErrors:
     that fits their positions best."""
     similarity = fit_similarity(found[:, :3, 3], reference[:, :3, 3])
     scale = np.cbrt(np.linalg.det(similarity[:3, :3]))
-    turned = similarity[:3, :3] / scale @ found[:, :3, :3]
-    # Of the angle between two rotations the sine of the half is exact where it is small.
-    half = np.linalg.norm(turned - reference[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
+    apart = np.swapaxes(reference[:, :3, :3], 1, 2) @ (similarity[:3, :3] / scale) @ found[:, :3, :3]
+    # The rotation nearest to their mean.
+    u, _, vt = np.linalg.svd(apart.mean(axis=0))
+    common = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     moved = found[:, :3, 3] @ similarity[:3, :3].T + similarity[:3, 3]
     centers = reference[:, :3, 3]
     extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    return PoseErrors(
-        np.degrees(2 * np.arcsin(np.clip(half, 0, 1))), np.linalg.norm(moved - centers, axis=1) / extent, similarity
-    )
+    position = np.linalg.norm(moved - centers, axis=1) / extent
+    return PoseErrors(_degrees(apart), _degrees(apart @ common.T), position, similarity)
+
+
+def _degrees(rotations: np.ndarray) -> np.ndarray:
+    """Angles (N,) of ``rotations`` (N, 3, 3): by the sine of the half, which is exact where they are small."""
+    half = np.linalg.norm(rotations - np.eye(3), axis=(1, 2)) / np.sqrt(8)
+    return np.degrees(2 * np.arcsin(np.clip(half, 0, 1)))

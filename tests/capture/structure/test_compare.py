@@ -61,6 +61,10 @@ def test_errors_are_those_that_were_made():
     wrong[4, :3, :3] = wrong[4, :3, :3] @ Rotation.from_rotvec([0, np.radians(7), 0]).as_matrix()
     errors = pose_errors(wrong, reference)
     assert errors.rotation[4] == pytest.approx(7) and np.delete(errors.rotation, 4).max() < 1e-6
+    wrong = poses()
+    wrong[:, :3, :3] = wrong[:, :3, :3] @ Rotation.from_rotvec([0.02, -0.01, 0]).as_matrix()
+    errors = pose_errors(wrong, reference)
+    assert errors.rotation == pytest.approx(np.degrees(np.hypot(0.02, 0.01))) and errors.scatter.max() < 1e-6
     wrong = moved(poses(), similarity(5))
     wrong[0, :3, 3] += 0.01
     assert 0 < pose_errors(wrong, reference).position.argmax() + 1 == 1
