@@ -1,1 +1,1 @@
-"""Ready scenes, each a folder with its scene file and the script that makes it."""
+"""Ready scenes, each a folder with the script that makes it."""

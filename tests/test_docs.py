@@ -33,7 +33,7 @@ def options() -> set[str]:
 
     for name in nerg_mi.cli.COMMANDS:
         walk(typer.main.get_command(nerg_mi.cli.build_app(name)))
-    for folder in ("benchmarks", "examples", "tools", "scenes/store", "tests/renders"):
+    for folder in ("benchmarks", "examples", "tools", "scenes/store", "scenes/tabletop", "tests/renders"):
         for script in (ROOT / folder).glob("*.py"):
             found.update(re.findall(r'"(--[a-z][a-z0-9-]*)"', script.read_text()))
     return found

@@ -14,7 +14,7 @@ LATE = {
     "nerg_mi.api": "the public API is loaded name by name, so that `import nerg_mi` stays cheap",
     "nerg_mi.cli": "`nerg --help` loads only what describes the options",
     "nerg_mi.jobs": "a job loads Mitsuba's code after the variant is chosen",
-    "nerg_mi.scenes": "the generators of the store load what one of their parts needs when it is made",
+    "nerg_mi.scenes": "the generators of ready scenes load what one of their parts needs when it is made",
 }
 """Where imports within functions are the rule -> the reason."""
 

@@ -1,0 +1,81 @@
+"""The place as an `mi.Scene` of the active variant, lit by its lamps, the sky and the sun."""
+
+from __future__ import annotations
+
+import numpy as np
+from nerg_mi.scenes.tabletop import textures
+from nerg_mi.scenes.tabletop.layout import MATERIALS, Layout, Material, stream
+from nerg_mi.scenes.tabletop.mesh import Mesh
+
+from nerg_mi.maths.color import decode_srgb
+
+# Reflectances stay away from black and white: light stays soft, and no texel is without a gradient.
+_ALBEDO = (0.02, 0.8)
+_SKY = 0.95
+# From the south-west: it shines on the fronts that the windows show, and not into the room.
+_SUN = dict(direction=[0.55, 0.6, -0.75], irradiance=[1.5, 1.4, 1.2])
+DEPTH = 5
+"""Longest path that is followed, in edges."""
+
+
+def load_stage(layout: Layout):
+    """The scene of a layout, with a path tracer."""
+    import mitsuba as mi
+
+    sky = decode_srgb(textures.sky(stream(layout.seed, "sky"))) * _SKY
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": DEPTH},
+            "sky": {
+                "type": "envmap",
+                "bitmap": mi.Bitmap(sky.astype(np.float32)),
+                # Mitsuba's maps have y up.
+                "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
+                "sampling_weight": 1.0,
+            },
+            "sun": {
+                "type": "directional",
+                "direction": _SUN["direction"],
+                "irradiance": {"type": "rgb", "value": _SUN["irradiance"]},
+                "sampling_weight": 0.6,
+            },
+            **{name: _shape(name, mesh, MATERIALS[name], layout.seed) for name, mesh in layout.meshes.items()},
+        }
+    )
+
+
+def _shape(name: str, mesh: Mesh, material: Material, seed: int):
+    import mitsuba as mi
+
+    texture = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.clip(decode_srgb(material.paint(stream(seed, name))), *_ALBEDO).astype(np.float32)),
+        "raw": True,
+    }
+    bsdf = {"type": "diffuse", "reflectance": texture}
+    if material.gloss:
+        bsdf = {"type": "roughplastic", "diffuse_reflectance": texture, "alpha": 0.15, "nonlinear": False}
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+    if material.radiance is not None:
+        props["emitter"] = mi.load_dict(
+            {
+                "type": "area",
+                "radiance": {"type": "rgb", "value": list(material.radiance)},
+                "sampling_weight": material.share,
+            }
+        )
+    shape = mi.Mesh(
+        name, len(mesh.points), len(mesh.faces), props=props, has_vertex_normals=True, has_vertex_texcoords=True
+    )
+    params = mi.traverse(shape)
+    for key, values in (
+        ("vertex_positions", mesh.points),
+        ("vertex_normals", mesh.normals),
+        ("vertex_texcoords", mesh.uv),
+    ):
+        params[key] = np.ascontiguousarray(values, np.float32).ravel()
+    params["faces"] = np.ascontiguousarray(mesh.faces, np.uint32).ravel()
+    params.update()
+    return shape
