@@ -15,7 +15,7 @@ else:
 
 BESIDE = {"scenes": "jobs", "plugins": "rendering"}
 """Rooms that the layers of pyproject.toml leave out, since rules of their own hold for them -> the room above them."""
-SCRIPTS = (f"{PACKAGE}.scenes.store.make",)
+SCRIPTS = (f"{PACKAGE}.scenes.store.make", f"{PACKAGE}.scenes.tabletop.make")
 """Modules that are run and not imported: like benchmarks, they stand above all rooms."""
 MODULES = "errors ..."
 """What the picture calls the modules that lie in no room."""
