@@ -16,6 +16,8 @@ _OFF_PLANE = 0.15
 _SHARPNESS = 32
 # Less reflects nothing that could be smoothed: sky, lamps.
 _DARK = 0.01
+# Mean normals that are shorter are of pixels that show more than one surface.
+_WHOLE = 0.8
 
 
 def denoise(radiance, guides, albedo) -> np.ndarray:
@@ -26,9 +28,11 @@ def denoise(radiance, guides, albedo) -> np.ndarray:
     """
     radiance, guides = np.asarray(radiance, np.float32), np.asarray(guides, np.float32)
     seen, normal, position = (guides[..., k : k + 3] for k in (0, 3, 6))
-    lit = seen.mean(axis=-1) > _DARK
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    # What is partly sky, or an edge, has no one light that its neighbours could share.
+    lit = (seen.mean(axis=-1) > _DARK) & (length[..., 0] > _WHOLE)
     light = np.where(lit[..., None], radiance / np.maximum(seen, _DARK), 0)
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+    normal = normal / np.maximum(length, 1e-6)
     for k, step in enumerate(_STEPS):
         light = _smooth(light, lit, normal, position, step, _EDGE / 2**k)
     return np.where(lit[..., None], light * np.maximum(albedo, _DARK), radiance)

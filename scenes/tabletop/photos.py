@@ -27,6 +27,9 @@ DEPTH_FILE = "transforms_depth.json"
 """The same photos, with their depth."""
 SHARP = 100
 """Samples a pixel of what is painted on surfaces, in a photo."""
+HELD_OUT = 8
+"""Every so many photos one is held out by default: it gets four times the samples, so that its noise does not limit
+what it can measure."""
 
 
 class Photo(NamedTuple):
@@ -46,14 +49,18 @@ class Photographer:
 
         self.scene, self.spp = scene, spp
         self.guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal,position:position"})
-        self.paint = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
+        self.albedo = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
 
-    def radiance(self, camera: Camera, seed: int) -> np.ndarray:
-        """Linear radiance (h, w, 3)."""
-        light = self._render(camera, seed, self.spp)
+    def radiance(self, camera: Camera, seed: int, times: int = 1) -> np.ndarray:
+        """Linear radiance (h, w, 3); ``times`` as many samples."""
+        light = self._render(camera, seed, times * self.spp)
         # Equal seeds and numbers of samples: the same points of the film.
-        guides = self._render(camera, seed, self.spp, self.guides)
-        return denoise(light, guides, self._render(camera, seed + 1, max(self.spp, SHARP), self.paint, "multijitter"))
+        guides = self._render(camera, seed, times * self.spp, self.guides)
+        return denoise(light, guides, self.paint(camera, seed + 1))
+
+    def paint(self, camera: Camera, seed: int, spp: int = SHARP) -> np.ndarray:
+        """Albedo (h, w, 3)."""
+        return self._render(camera, seed, spp, self.albedo, "multijitter")
 
     def depth(self, camera: Camera) -> np.ndarray:
         """Exact distances (h, w) float32 along the rays through the pixels' centres; 0 where nothing is hit."""
@@ -80,8 +87,8 @@ def take_photos(scene, cameras: list[Camera], spp: int = 24, seed: int = 0, say=
     """A photo of ``scene`` by each camera; ``say``: where progress goes."""
     photographer, out, start = Photographer(scene, spp), [], time.perf_counter()
     for k, camera in enumerate(cameras):
-        picture = encode_srgb(np.clip(photographer.radiance(camera, 2 * (10_000 * seed + k)), 0, 1))
-        pixels = np.round(255 * picture).astype(np.uint8)
+        linear = photographer.radiance(camera, 2 * (10_000 * seed + k), 1 if k % HELD_OUT else 4)
+        pixels = np.round(255 * encode_srgb(np.clip(linear, 0, 1))).astype(np.uint8)
         out.append(Photo(f"photo_{k:03d}.png", camera, pixels, photographer.depth(camera)))
         if (k + 1) % 8 == 0 or k + 1 == len(cameras):
             say(f"  {k + 1} of {len(cameras)} photos, {time.perf_counter() - start:.0f} s")

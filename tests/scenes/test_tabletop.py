@@ -174,7 +174,7 @@ def test_points_are_triangulated_where_surfaces_are(scene):
         photos.Photo(
             f"{k}.png",
             camera,
-            (255 * np.sqrt(photographer._render(camera, k, 16, photographer.paint))).astype(np.uint8),
+            (255 * np.sqrt(photographer.paint(camera, k, 16))).astype(np.uint8),
             photographer.depth(camera),
         )
         for k, camera in enumerate(walk)
