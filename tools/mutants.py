@@ -48,7 +48,11 @@ QUOTAS = {
 
 RESULTS = BUILD / "results.json"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.json"
-KILLED = ("failed", "hang", "crash")
+UNRUN = ("error", "none")
+"""What pytest answers where tests cannot be collected, as where a mutant takes away what they are made of."""
+
+_LONGEST = 600  # seconds
+KILLED = ("failed", "hang", "crash", "uncollected")
 
 
 def mutants_of(package: str, tree: Path) -> list[Mutant]:
@@ -115,8 +119,9 @@ def judge(bench: Bench, reach: Reach, mutant: Mutant, bound: float, first: str |
             answer = bench.run(group, 45 + 10 * sum(seconds[t] for t in group))
             entry["seconds"] = round(entry["seconds"] + answer["seconds"], 2)
             entry.update(outcome=answer["outcome"], by=answer["by"])
-            if answer["outcome"] in ("error", "none"):
-                raise SystemExit(f"pytest could not run the tests of {mutant.place}: see {bench.log}")
+            if answer["outcome"] in UNRUN:
+                _blame(bench, mutant, source, group)
+                entry.update(outcome="uncollected", by=None)
             if answer["outcome"] in KILLED:
                 break
     finally:
@@ -125,6 +130,14 @@ def judge(bench: Bench, reach: Reach, mutant: Mutant, bound: float, first: str |
     entry["left"] = len(tests) - len(used)
     entry["files"] = reach.files([entry["by"]] if entry["by"] in reach.tests else tests)
     return entry
+
+
+def _blame(bench: Bench, mutant: Mutant, source: str, tests: list[str]) -> None:
+    """Make sure that it is the mutant for which pytest cannot run ``tests``: without it they run. Raises
+    ``SystemExit`` where they do not."""
+    bench.write(mutant.file, source)
+    if bench.run(tests, _LONGEST)["outcome"] in UNRUN:
+        raise SystemExit(f"pytest could not run the tests of {mutant.place}: see {bench.log}")
 
 
 def is_known(entry: dict | None, mutant: Mutant, reach: Reach, bound: float) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import pytest
+
 from tools import mutants
 from tools.mutation import sites
 
@@ -40,3 +42,36 @@ def test_groups_of_tests_grow_up_to_the_bound():
     seconds = dict.fromkeys("abcdefgh", 2.0)
     assert list(mutants.batches(list("abcdefgh"), seconds, 13.0)) == [["a", "b"], ["c", "d", "e", "f"]]
     assert list(mutants.batches(["a"], {"a": 100.0}, 1.0)) == [["a"]]
+
+
+class Told:
+    """In the place of a bench: its tests end as they are told to, with a mutant and without."""
+
+    def __init__(self, mutated: str, plain: str):
+        self.log, self.source_of, self.now = "log", "x = 1\n", "x = 1\n"
+        self.outcomes = {True: mutated, False: plain}
+
+    def source(self, file):
+        return self.source_of
+
+    def write(self, file, text):
+        self.now = text
+
+    def run(self, tests, limit):
+        return {"outcome": self.outcomes[self.now != self.source_of], "by": None, "seconds": 0.1}
+
+
+def judged(bench):
+    mutant = SimpleNamespace(file="a.py", place="a.py:1", apply=lambda source: "x = 2\n")
+    reach = SimpleNamespace(of=lambda m: ["t.py::a"], tests={"t.py::a": {"seconds": 0.1}}, files=lambda tests: {})
+    return mutants.judge(bench, reach, mutant, 45.0, None)["outcome"]
+
+
+def test_a_mutant_for_which_tests_cannot_be_collected_is_killed():
+    bench = Told("error", "passed")
+    assert judged(bench) == "uncollected" and "uncollected" in mutants.KILLED and bench.now == bench.source_of
+
+
+def test_tests_that_cannot_be_collected_without_a_mutant_judge_none():
+    with pytest.raises(SystemExit, match="a.py:1"):
+        judged(Told("none", "none"))
