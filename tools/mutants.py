@@ -122,7 +122,7 @@ def judge(bench: Bench, reach: Reach, mutant: Mutant, bound: float, first: str |
             if answer["outcome"] in UNRUN:
                 _blame(bench, mutant, source, group)
                 entry.update(outcome="uncollected", by=None)
-            if answer["outcome"] in KILLED:
+            if entry["outcome"] in KILLED:
                 break
     finally:
         bench.write(mutant.file, source)

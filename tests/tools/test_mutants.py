@@ -63,7 +63,8 @@ class Told:
 
 def judged(bench):
     mutant = SimpleNamespace(file="a.py", place="a.py:1", apply=lambda source: "x = 2\n")
-    reach = SimpleNamespace(of=lambda m: ["t.py::a"], tests={"t.py::a": {"seconds": 0.1}}, files=lambda tests: {})
+    seconds = {f"t.py::{name}": {"seconds": 2.0} for name in "abcd"}
+    reach = SimpleNamespace(of=lambda m: list(seconds), tests=seconds, files=lambda tests: {})
     return mutants.judge(bench, reach, mutant, 45.0, None)["outcome"]
 
 
