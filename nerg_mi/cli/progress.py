@@ -1,23 +1,29 @@
-"""What a job tells, on the terminal: its messages, its warnings, and one bar for its progress."""
+"""What a job tells, on the terminal: its messages, its warnings, and one bar for its progress, or lines in a log."""
 
 from __future__ import annotations
 
 import sys
+import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+EVERY = 30.0
+"""Seconds between two lines of progress where no terminal shows a bar."""
 
 
 class TerminalReporter:
     """A `nerg_mi.jobs.reporter.Reporter`, and a context that takes the bar away again.
 
     Messages go to the standard output and warnings to the standard error. The bar is on the standard error, from the
-    first ``progress`` on and only where that is a terminal, so that neither a pipe nor a file ever holds it.
+    first ``progress`` on and only where that is a terminal, so that neither a pipe nor a file ever holds it. Where it
+    is none, as in the log of a job that runs for hours, the standard error gets a line every half minute.
     """
 
     def __enter__(self) -> TerminalReporter:
         self._bar: Progress | None = None
+        self._told = time.monotonic()
         return self
 
     def message(self, text: str) -> None:
@@ -32,6 +38,9 @@ class TerminalReporter:
         if self._bar is not None:
             (task,) = self._bar.task_ids
             self._bar.update(task, completed=share, description=text)
+        elif time.monotonic() - self._told >= EVERY:
+            self._told = time.monotonic()
+            print(f"{share:4.0%} {text}".rstrip(), file=sys.stderr, flush=True)
 
     def _start(self) -> Progress | None:
         """The bar, with its one task; None where it would not be seen."""

@@ -3,6 +3,7 @@
 import io
 import sys
 
+from nerg_mi.cli import progress
 from nerg_mi.cli.progress import TerminalReporter
 
 
@@ -43,3 +44,14 @@ def test_nothing_but_messages_where_there_is_no_terminal(capsys):
         reporter.message("done")
         reporter.warn("thin")
     assert capsys.readouterr() == ("done\n", "warning: thin\n")
+
+
+def test_a_log_gets_a_line_every_half_minute(capsys, monkeypatch):
+    now = 1000.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    with TerminalReporter() as reporter:
+        for second in range(95):
+            now = 1000.0 + second
+            reporter.progress(second / 100, f"{100 - second} s left, held out 21.30 dB")
+    lines = [f"{k:4.0%} {100 - int(100 * k)} s left, held out 21.30 dB" for k in (0.3, 0.6, 0.9)]
+    assert capsys.readouterr() == ("", "\n".join(lines) + "\n")
