@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import drjit as dr
 import numpy as np
@@ -24,6 +25,10 @@ class Box:
     # Half the edge of the unit cube, where that is not the box's longest.
     bound: float | None = None
 
+    # Whether positions are contracted before they are encoded, and how far then (`contraction.ContractedBox`).
+    contracted: ClassVar[bool] = False
+    reach: ClassVar[float | None] = None
+
     def __post_init__(self):
         lower, upper = np.asarray(self.lower, float), np.asarray(self.upper, float)
         if lower.shape != (3,) or upper.shape != (3,) or not np.all(np.isfinite(lower) & np.isfinite(upper)):
@@ -42,6 +47,16 @@ class Box:
         return 2 * self.bound if self.bound is not None else max(u - l for l, u in zip(self.lower, self.upper))
 
     @property
+    def cube_side(self) -> float:
+        """Length, in the field's units, of the cube that `to_cube` makes the unit cube."""
+        return self.side
+
+    @property
+    def core(self) -> Box:
+        """The part that is resolved best: all of it."""
+        return self
+
+    @property
     def center(self) -> tuple[float, ...]:
         """Centre of the unit cube."""
         return (0.0, 0.0, 0.0) if self.bound is not None else tuple((l + u) / 2 for l, u in zip(self.lower, self.upper))
@@ -57,6 +72,22 @@ class Box:
         if dr.is_array_v(p):
             return (p - type(p)(*self.center)) / self.side + 0.5
         return (np.asarray(p) - np.asarray(self.center)) / self.side + 0.5
+
+    def from_unit(self, u):
+        """The points (Array3f) at ``u`` of the unit cube."""
+        return (u - 0.5) * self.side + type(u)(*self.center)
+
+    def to_cube(self, p):
+        """``p`` (Array3f) in a unit cube in which straight lines stay straight: as `to_unit` has it."""
+        return self.to_unit(p)
+
+    def distance_scale(self, p):
+        """How much larger cells of the unit cube are at ``p`` than in the core: they are all alike."""
+        return 1.0
+
+    def density_along(self, sigma, p):
+        """Density per unit of the field at ``p`` where it is ``sigma`` per unit as positions are encoded: the same."""
+        return sigma
 
     @staticmethod
     def _divided(x, divisor: float):
