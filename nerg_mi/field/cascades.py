@@ -144,3 +144,55 @@ def levels_of(bound: float) -> int:
     if not (np.isfinite(bound) and bound >= 1):
         raise ValueError(f"the bound of cascades must be at least 1, got {bound}")
     return 1 + int(np.ceil(np.log2(bound)))
+
+
+def contracted_cascades(bits: np.ndarray, reach: float, ns: ModuleType, threshold: float) -> CascadeGrid:
+    """Cascades that hold all that the cells ``bits`` of a contracted box's unit cube hold.
+
+    ``bits``: bool array (R, R, R), indexed [z, y, x], of the cube that `maths.contraction.ContractedBox` encodes
+    positions in, R even; ``reach``: of the box. The cascades have R cells along each edge, the inner cube's R / 2 cells
+    becoming R; each cell is on that meets one of ``bits``.
+    """
+    r, levels = len(bits), levels_of(reach)
+    out = np.zeros((levels, r, r, r), bool)
+    if bits.any():
+        lower, upper = _preimages(bits, reach)
+        for level in range(levels):
+            # In cells of this level; what only touches a cell does not meet it.
+            scale, shift = r / 2.0 ** (level + 1), r / 2
+            first = np.floor(lower * scale + shift + 1e-4).astype(int)
+            last = np.ceil(upper * scale + shift - 1e-4).astype(int) - 1
+            meets = np.all((last >= 0) & (first < r), axis=1)
+            _mark(out[level], np.clip(first[meets], 0, r - 1), np.clip(last[meets], 0, r - 1))
+    return CascadeGrid(out, reach, ns, threshold)
+
+
+def _preimages(bits: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (N, 3), lower and upper corners in half edges of the inner cube, around what the cells ``bits`` encode."""
+    r = len(bits)
+    index = np.argwhere(bits)[:, ::-1]
+    low, high = 4 * index / r - 2, 4 * (index + 1) / r - 2
+    # Within a cell x = y g(n) for contracted y, n = max |y|, and g grows with n: its extremes bound every coordinate.
+    nearest = np.where((low < 0) & (high > 0), 0, np.minimum(np.abs(low), np.abs(high)))
+    farthest = np.maximum(np.abs(low), np.abs(high))
+
+    def growth(n: np.ndarray) -> np.ndarray:
+        n = np.clip(n, 1, 2 - 1 / reach)
+        return (1 / (n * (2 - n)))[:, None]
+
+    few, many = growth(nearest.max(axis=1)), growth(farthest.max(axis=1))
+    lower, upper = low * np.where(low < 0, many, few), high * np.where(high < 0, few, many)
+    return np.clip(lower, -reach, reach), np.clip(upper, -reach, reach)
+
+
+def _mark(cells: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
+    """Set the ``cells`` [z, y, x] of boxes of cells, from ``first`` (N, 3; x, y, z) to ``last``, both included."""
+    # Eight corners of each box, summed up along the axes: as much work for large boxes as for small ones.
+    count = np.zeros(np.add(cells.shape, 1), np.int32)
+    ends = (first, last + 1)
+    for corner in np.ndindex(2, 2, 2):
+        x, y, z = (ends[c][:, axis] for axis, c in enumerate(corner))
+        np.add.at(count, (z, y, x), 1 - 2 * (sum(corner) % 2))
+    for axis in range(3):
+        np.cumsum(count, axis=axis, out=count)
+    cells |= count[:-1, :-1, :-1] > 0

@@ -4,7 +4,9 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.cascades import CascadeGrid
+from nerg_mi.field.cascades import CascadeGrid, contracted_cascades
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import ContractedBox
 
 R = 4
 
@@ -76,3 +78,18 @@ def test_bytes_and_back(bound):
     assert np.array_equal(again.bits, bits) and again.threshold == 0.25 and again.resolution == R
     with pytest.raises(ValueError, match="bytes"):
         CascadeGrid.from_packed(grid.packed()[:-1], R, bound, ns, 0.25)
+
+
+@pytest.mark.parametrize("reach", [2.0, 8.0, 64.0])
+def test_cascades_of_a_contracted_box_hold_all_that_its_cells_hold(reach):
+    rng, r = np.random.default_rng(int(reach)), 16
+    box, bits = ContractedBox(Box((0, 0, 0), (2, 2, 2)), reach), rng.random((r, r, r)) < 0.02
+    grid = contracted_cascades(bits, reach, ns, 1.0)
+    u = rng.random((3, 200_000)).astype(np.float32)
+    x, y, z = np.minimum((u * r).astype(int), r - 1)
+    p = box.from_unit(ns.Array3f(u))
+    # Those of the corners beyond the outer cube come to stand on its face, in other cells.
+    held = (np.abs((u - 0.5) * 4).max(axis=0) < 2 - 1 / reach) & bits[z, y, x]
+    assert held.sum() > 500 and np.all(grid.empty_cells(box.to_cube(p)).numpy()[held] == 0)
+    # They are not much larger either: by the cells that touch.
+    assert grid.bits[0].mean() < 0.2 and not contracted_cascades(np.zeros((r, r, r), bool), reach, ns, 1.0).bits.any()
