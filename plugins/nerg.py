@@ -106,7 +106,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - dt_gamma
    - |float|
    - Steps are at least this share of the distance travelled: for wide views, whose far parts need no short steps.
-     (Default: 0, i.e. uniform steps)
+     (Default: that which a field without an end was trained with; 0, i.e. uniform steps, for all others)
 
  * - stop
    - |float|

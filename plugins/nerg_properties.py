@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.properties import choice, color, integer, number
 from nerg_mi.transport.march.depth import DEPTHS
 from nerg_mi.transport.march.rules import RULES, boundaries
-from nerg_mi.transport.march.settings import MarchSettings, default_step
+from nerg_mi.transport.march.settings import MarchSettings, default_growth, default_step
 from nerg_mi.transport.media.protocol import Medium
 from nerg_mi.transport.media.volume import KnownEmpty, VolumeMedium
 from nerg_mi.transport.observer import viewpoint
@@ -104,7 +104,7 @@ def march_settings(props, medium: Medium | None) -> MarchSettings:
     step = number(props, "step", 0, low=0)
     settings = MarchSettings(
         step=step or default_step(medium),
-        dt_gamma=number(props, "dt_gamma", MarchSettings.dt_gamma, low=0, high=1),
+        dt_gamma=number(props, "dt_gamma", default_growth(medium), low=0, high=1),
         stop=number(props, "stop", MarchSettings.stop, low=0, high=1),
         color_cutoff=number(props, "color_cutoff", MarchSettings.color_cutoff, low=0, high=1),
         quadrature=choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),

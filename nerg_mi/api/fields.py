@@ -44,7 +44,7 @@ class TrainedField(Generic[Network]):
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Lower and upper corner (2, 3) of the field's box, in its own units."""
+        """Lower and upper corner (2, 3) of where the field may hold density, in its own units."""
         return np.array([self.network.box.lower, self.network.box.upper], np.float64)
 
     @property

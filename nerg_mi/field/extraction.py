@@ -31,14 +31,15 @@ class Lattice:
 
     @staticmethod
     def over(field: RadianceField, resolution: int) -> Lattice:
-        """``resolution`` cells along the longest edge of the field's box."""
+        """``resolution`` cells along the longest edge of the field's box, or of the core of a contracted one."""
         if resolution < 2:
             raise ValueError(f"a lattice needs at least 2 cells along its longest edge, got {resolution}")
-        edges = np.subtract(field.box.upper, field.box.lower)
+        core = field.box.core
+        edges = np.subtract(core.upper, core.lower)
         step = float(edges.max() / resolution)
         shape = np.maximum(np.ceil(edges / step - 1e-6).astype(int), 2)
         # What the last cells overhang is shared by both sides.
-        lower = (np.add(field.box.upper, field.box.lower) - shape * step) / 2
+        lower = (np.add(core.upper, core.lower) - shape * step) / 2
         return Lattice(tuple(lower.tolist()), step, tuple(shape.tolist()))
 
     def points(self, index: np.ndarray) -> np.ndarray:
@@ -58,7 +59,7 @@ class Sampler:
     def _density(self, p, masked: bool = True):
         active = self.ns.Bool(True)
         if masked and self.field.occupancy is not None:
-            active = self.field.occupancy.empty_cells(self.field.box.to_unit(p)) == 0
+            active = self.field.occupancy.empty_cells(self.field.box.to_cube(p)) == 0
         return dr.select(active, self.field.density(p, active), 0)
 
     def density(self, p: np.ndarray, masked: bool = True) -> np.ndarray:

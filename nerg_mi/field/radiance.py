@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import numpy as np
 
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 
 from .backend import namespace
 from .background import Background
@@ -104,7 +104,8 @@ class RadianceField:
 
     ``color_space``: ``"srgb"`` or ``"linear"``, the space in which samples are composited because the field was trained
     in it. ``occupancy``: where density may exceed its threshold; None marches the whole box. ``march_step``: step
-    length, in units, that the field was trained with. ``background``: colour behind the field where it was trained with
+    length, in units, that the field was trained with, and ``march_growth`` the share of their distance that steps were
+    at least, where the box is contracted. ``background``: colour behind the field where it was trained with
     one: what a ray shows in ``color_space`` is then C + (1 - α) background(o, d). Raises ``ValueError`` for parts that
     are not those of ``config``.
     """
@@ -121,7 +122,7 @@ class RadianceField:
     def __init__(
         self,
         config: RadianceConfig,
-        box: Box,
+        box: AnyBox,
         grid: Encoding,
         density_net: MLP,
         color_net: MLP,
@@ -129,6 +130,7 @@ class RadianceField:
         color_space: str = "srgb",
         march_step: float | None = None,
         background: Background | None = None,
+        march_growth: float = 0.0,
     ):
         if color_space not in ("srgb", "linear"):
             raise ValueError(f'color_space must be "srgb" or "linear", got "{color_space}"')
@@ -138,10 +140,11 @@ class RadianceField:
         self.config, self.box, self.color_space = config, box, color_space
         self.grid, self.density_net, self.color_net = grid, density_net, color_net
         self.occupancy, self.march_step, self.background = occupancy, march_step, background
+        self.march_growth = march_growth
         self.pack()
 
     @staticmethod
-    def random(config: RadianceConfig, box: Box, ns: ModuleType, seed: int = 0, **kwargs) -> RadianceField:
+    def random(config: RadianceConfig, box: AnyBox, ns: ModuleType, seed: int = 0, **kwargs) -> RadianceField:
         """An untrained field of backend ``ns``; equal seeds give equal weights."""
         rng = np.random.default_rng(seed)
         return RadianceField(
@@ -200,13 +203,17 @@ class RadianceField:
         """Density in 1/unit at ``p`` (Array3f, the field's units); 0 outside of the box."""
         inside = active & self.box.contains(p)
         h = self._head(self.grid(self.box.to_unit(p), inside))
-        return dr.select(inside, density_from_log(h[0], self.config.density_scale), 0)
+        return dr.select(inside, self._density(h[0], p), 0)
+
+    def _density(self, h, p):
+        """Density (1/unit) at ``p`` where the density net's first output is ``h``."""
+        return self.box.density_along(density_from_log(h, self.config.density_scale), p)
 
     def density_features(self, p, active=True):
         """Density (1/unit) at ``p`` and the ``geometry`` features (list of Floats) that ``color`` needs."""
         inside = active & self.box.contains(p)
         h = self.density_net(self.grid(self.box.to_unit(p), inside))
-        return dr.select(inside, density_from_log(h[0], self.config.density_scale), 0), h[1:]
+        return dr.select(inside, self._density(h[0], p), 0), h[1:]
 
     def color(self, features: list, d):
         """Colour (Array3f in ``color_space``, 0..1) of a point with ``features``, seen along unit ``d``."""

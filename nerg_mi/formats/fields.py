@@ -16,7 +16,7 @@ from nerg_mi.field.gaze.registry import build
 from nerg_mi.field.gaze.support import RaySupport
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import box_of
 
 from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
 from .arrays import StoredArrays, stored
@@ -39,6 +39,7 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
         "box": field.box.to_dict(),
         "color_space": field.color_space,
         "march_step": field.march_step,
+        **({"march_growth": field.march_growth} if field.march_growth else {}),
         "units": {"length": "scene unit", "density": "1 / scene unit"},
         "provenance": provenance,
     }
@@ -63,6 +64,9 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
         step = meta["march_step"]
         if step is not None and not 0 < number(meta, "march_step", "metadata"):
             raise ValueError(f'its "march_step" must be positive, not {step}')
+        growth = number(meta, "march_growth", "metadata") if "march_growth" in meta else 0.0
+        if not 0 <= growth <= 1:
+            raise ValueError(f'its "march_growth" must lie in [0, 1], not {growth}')
         background = None
         if "background" in meta:
             behind = BackgroundConfig.from_dict(check_sizes(meta["background"], "background"))
@@ -71,7 +75,7 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
             )
         field = RadianceField(
             config,
-            Box(**meta["box"]),
+            box_of(meta["box"]),
             arrays.grid(config.grid),
             arrays.net("density_net", config.density_sizes),
             arrays.net("color_net", config.color_sizes),
@@ -79,6 +83,7 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
             meta["color_space"],
             step,
             background,
+            growth,
         )
     return field, meta
 
@@ -110,7 +115,7 @@ def load_gaze(path: str | Path, ns: ModuleType) -> tuple[AnyGazeField, dict[str,
         arrays, about = StoredArrays(tensors, ns), check_sizes(meta["architecture"])
         if len(about.get("members", ())) > MEMBERS:
             raise ValueError(f"it has {len(about['members'])} members, and at most {MEMBERS} are read")
-        field = build(about, Box(**meta["box"]), arrays)
+        field = build(about, box_of(meta["box"]), arrays)
         if "support" in meta:
             field.support = RaySupport(arrays.array("support.cells", None, 5), meta["support"]["radius"])
     return field, meta

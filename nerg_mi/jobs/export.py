@@ -41,7 +41,12 @@ def export_mesh(
     options, output, start = options or MeshOptions(), Path(output), time.perf_counter()
     write = _surface_writer(output, options.up)
     found = mesh(
-        _load(field, options.mode), options.resolution, options.density, options.fill, options.keep, options.unseen
+        _load(field, options.mode, reporter),
+        options.resolution,
+        options.density,
+        options.fill,
+        options.keep,
+        options.unseen,
     )
     write(found, output)
     r = found.report
@@ -69,7 +74,7 @@ def export_points(
     mend."""
     options, output, start = options or PointOptions(), Path(output), time.perf_counter()
     write = _surface_writer(output, options.up)
-    found = points(_load(field, options.mode), options.resolution, options.density, options.count)
+    found = points(_load(field, options.mode, reporter), options.resolution, options.density, options.count)
     write(found, output)
     reporter.message(f"{len(found.vertices):,} points, at a density of {found.report['threshold']:.4g} / unit")
     return _written([output], start, reporter, found)
@@ -86,7 +91,7 @@ def export_volume(
     files = [output] if options.color is None else [Path(options.color), output]
     for path in reversed(files):
         check_writable(path, ".vol")
-    loaded = _load(field, options.mode)
+    loaded = _load(field, options.mode, reporter)
     density, color, lower, upper = density_and_color(loaded, options.resolution, options.color is not None)
     write_volume(output, density, lower, upper)
     reporter.message(
@@ -113,13 +118,16 @@ def export_torch_ngp(
     `NergError` for another."""
     options, output, start = options or TorchNgpOptions(), Path(output), time.perf_counter()
     check_writable(output, ".pth")
-    write_torch_ngp(_load(field, options.mode), output)
+    write_torch_ngp(_load(field, options.mode, reporter), output)
     return _written([output], start, reporter)
 
 
-def _load(field: str | Path | RadianceField, mode: str) -> RadianceField:
+def _load(field: str | Path | RadianceField, mode: str, reporter: Reporter) -> RadianceField:
     ns = select_backend(mode)
-    return field if isinstance(field, RadianceField) else load_radiance(field, ns)[0]
+    loaded = field if isinstance(field, RadianceField) else load_radiance(field, ns)[0]
+    if loaded.box.contracted:
+        reporter.message("the place has no end: written is the box that it resolves best, not what is around it")
+    return loaded
 
 
 def _surface_writer(output: Path, up: str) -> Callable[[Surface, Path], None]:

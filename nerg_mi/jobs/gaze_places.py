@@ -14,7 +14,7 @@ from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain, read_json
 from nerg_mi.files.checksum import file_sha256
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry import places
@@ -77,7 +77,7 @@ def make_place(
 
 
 def place_of_training(
-    gaze: Path, provenance: dict, box: Box, options: GazeEvaluationOptions, ns: ModuleType
+    gaze: Path, provenance: dict, box: AnyBox, options: GazeEvaluationOptions, ns: ModuleType
 ) -> GazePlace:
     """What the field in the checkpoint ``gaze`` was trained in: the file that is named, or the one of the checkpoint's
     beside it, with the alignment of the training.

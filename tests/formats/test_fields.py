@@ -9,12 +9,14 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from nerg_mi.errors import NergError
+from nerg_mi.field.cascades import contracted_cascades
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, load_radiance, save_gaze, save_radiance
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import ContractedBox
 
 GRID = HashGridConfig(levels=2, log2_rows=8, base=4, finest=16)
 BOX = Box((-1, 0, 2), (3, 2, 4))
@@ -198,3 +200,43 @@ def test_cascades_that_float32_cannot_address_are_refused():
 
     with pytest.raises(ValueError, match="cells along an edge"):
         CascadeGrid(np.zeros((25, 2, 2, 2), bool), 2.0**24, ns, 0.0)
+
+
+def test_a_place_without_an_end(tmp_path):
+    box, r = ContractedBox(Box((-1, 0, 2), (3, 2, 4)), 8), 8
+    field = RadianceField.random(
+        RadianceConfig(GRID, width=16, color_hidden=1, geometry=3, sh_degree=2),
+        box,
+        ns,
+        1,
+        occupancy=contracted_cascades(np.random.default_rng(0).random((r, r, r)) < 0.2, 8.0, ns, 0.25),
+        march_step=0.01,
+        march_growth=1 / 128,
+    )
+    path = tmp_path / "f.safetensors"
+    save_radiance(field, path, {})
+    again, meta = load_radiance(path, ns)
+    assert again.box == box and again.march_growth == 1 / 128 and meta["box"]["reach"] == 8
+    assert np.array_equal(again.occupancy.bits, field.occupancy.bits) and again.occupancy.bound == 8
+    p = ns.Array3f(np.random.default_rng(1).uniform(-14, 14, (3, 100)).astype(np.float32))
+    assert np.array_equal(again.density(p).numpy(), field.density(p).numpy())
+    attention = GazeField.random(GazeConfig(GRID, width=16, geometry=3, sh_degree=3), box, ns, 2)
+    save_gaze(attention, path, {})
+    assert load_gaze(path, ns)[0].box == box
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: m["box"].update(reach=3),
+        lambda m: m["box"].update(reach="far"),
+        lambda m: m.update(march_growth=2),
+        lambda m: m.update(march_growth=None),
+    ],
+)
+def test_a_place_without_an_end_that_makes_no_sense(tmp_path, change):
+    path = tmp_path / "f.safetensors"
+    save_radiance(radiance(), path, {})
+    rewrite(path, lambda _, m: change(m))
+    with pytest.raises(NergError, match=path.name):
+        load_radiance(path, ns)

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import drjit as dr
 
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 
 from .protocol import Arrays, GazeDensity
 from .registry import build, register
@@ -42,7 +42,7 @@ class GazeEnsemble:
         self.config, self.box = self.members[0].config, self.members[0].box
 
     @classmethod
-    def from_arrays(cls, about: dict, box: Box, arrays: Arrays) -> GazeEnsemble:
+    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> GazeEnsemble:
         """The ensemble of a checkpoint."""
         members = [arrays.member(i, member) for i, member in enumerate(about["members"])]
         # Before any is built: a file may hold them one inside of another, without end.

@@ -25,7 +25,7 @@ from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 
 from .product import VARIANTS
 from .protocol import Arrays
@@ -133,7 +133,7 @@ class LogGazeField:
     kind: ClassVar[str] = LogGazeConfig.kind
 
     def __init__(
-        self, config: LogGazeConfig, box: Box, grid: Encoding, emit_net: MLP, capture_net: MLP, escaped, prior
+        self, config: LogGazeConfig, box: AnyBox, grid: Encoding, emit_net: MLP, capture_net: MLP, escaped, prior
     ):
         grid.require(config.grid)
         emit_net.require(config.emit_sizes, "emit_net")
@@ -151,7 +151,7 @@ class LogGazeField:
 
     @staticmethod
     def random(
-        config: LogGazeConfig, box: Box, ns: ModuleType, seed: int = 0, prior: np.ndarray | None = None
+        config: LogGazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0, prior: np.ndarray | None = None
     ) -> LogGazeField:
         """An untrained field of backend ``ns``; equal seeds give equal weights. ``prior``: see ``blind_table``;
         uniform."""
@@ -169,7 +169,7 @@ class LogGazeField:
         )
 
     @classmethod
-    def from_arrays(cls, about: dict, box: Box, arrays: Arrays) -> LogGazeField:
+    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> LogGazeField:
         """The field of a checkpoint."""
         config = LogGazeConfig.from_dict(about)
         return cls(

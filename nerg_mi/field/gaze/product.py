@@ -24,7 +24,7 @@ from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.elementary import log1p
 
 from .protocol import Arrays
@@ -156,7 +156,7 @@ class GazeField:
     def __init__(
         self,
         config: GazeConfig,
-        box: Box,
+        box: AnyBox,
         grid: Encoding,
         position_net: MLP,
         direction_net: MLP,
@@ -185,7 +185,7 @@ class GazeField:
         return config.trunk == "layernorm" and not name.endswith("head")
 
     @staticmethod
-    def random(config: GazeConfig, box: Box, ns: ModuleType, seed: int = 0) -> GazeField:
+    def random(config: GazeConfig, box: AnyBox, ns: ModuleType, seed: int = 0) -> GazeField:
         """An untrained field of backend ``ns``; equal seeds give equal weights."""
         rng = np.random.default_rng(seed)
         grid = random_encoding(config.grid, ns, rng)
@@ -197,7 +197,7 @@ class GazeField:
         return GazeField(config, box, grid, **nets)
 
     @classmethod
-    def from_arrays(cls, about: dict, box: Box, arrays: Arrays) -> GazeField:
+    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> GazeField:
         """The field of a checkpoint."""
         config = GazeConfig.from_dict(about)
         nets = {

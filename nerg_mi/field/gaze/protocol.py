@@ -19,7 +19,7 @@ import numpy as np
 
 from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.mlp import MLP
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 
 from .support import RaySupport
@@ -117,7 +117,7 @@ class AnyGazeField(Protocol):
         ...
 
     @property
-    def box(self) -> Box:
+    def box(self) -> AnyBox:
         """Where the field lives; positions outside of it are the encoding's to deal with."""
         ...
 
@@ -141,7 +141,7 @@ class AnyGazeField(Protocol):
         ...
 
     @classmethod
-    def from_arrays(cls, about: dict, box: Box, arrays: Arrays) -> AnyGazeField:
+    def from_arrays(cls, about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
         """The field of ``architecture() == about`` with the ``arrays`` of a checkpoint."""
         ...
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 from nerg_mi.errors import plain
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 
 from .protocol import AnyGazeField, Arrays
 
@@ -25,7 +25,7 @@ def kinds() -> tuple[str, ...]:
     return tuple(_KINDS)
 
 
-def build(about: dict, box: Box, arrays: Arrays) -> AnyGazeField:
+def build(about: dict, box: AnyBox, arrays: Arrays) -> AnyGazeField:
     """The gaze field that a checkpoint describes by ``about``, of its ``arrays``. Raises ``ValueError`` for a kind that
     is not registered."""
     # Checkpoints of the first version name no kind: there was one.

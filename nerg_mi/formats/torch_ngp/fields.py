@@ -142,6 +142,7 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     wrong = [
         words
         for fits, words in (
+            (not box.contracted, "torch-ngp knows no contraction of what is around a box"),
             (
                 box.center == (0, 0, 0) and bound >= 1,
                 f"its unit cube must be [-b, b]^3 with b >= 1, not {box.lower} to {box.upper}",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.interruption import Interruption
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 
 from .plan import GazePlan
 from .state import GazeRunFile
@@ -79,7 +79,7 @@ class Fit:
 def fit_watched(
     targets: Targets,
     watched: Targets | None,
-    box: Box,
+    box: AnyBox,
     plan: GazePlan,
     ns: ModuleType,
     share: float,
@@ -124,7 +124,7 @@ def fit_watched(
 
 
 def fit_again(
-    targets: Targets, first: Fit, box: Box, plan: GazePlan, ns: ModuleType, file: GazeRunFile, tell: Listener
+    targets: Targets, first: Fit, box: AnyBox, plan: GazePlan, ns: ModuleType, file: GazeRunFile, tell: Listener
 ) -> Fit:
     """Train for as many steps as were best in the ``first`` fit, along the same schedule."""
     settings = replace(plan.settings, steps=first.best_step, minutes=None)

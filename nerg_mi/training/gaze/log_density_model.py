@@ -12,12 +12,12 @@ from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.field.gaze.product import softplus
 from nerg_mi.field.mlp import MLP
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.training.radiance.model import stack
 
 
 def log_gaze(
-    config: LogGazeConfig, box: Box, parameters: dict, p_od: Any, p_o: Any, r_o: Any, escaped: Any, ns: ModuleType
+    config: LogGazeConfig, box: AnyBox, parameters: dict, p_od: Any, p_o: Any, r_o: Any, escaped: Any, ns: ModuleType
 ) -> Any:
     """Log of the unnormalised density of B observers ``p_o`` (Array3f, B lanes) along ``r_o`` (Array3f, B * D lanes, D
     for each in turn) at ``p_od``, ``escaped`` (Bool, as many) where there is no surface.
@@ -55,7 +55,7 @@ def log_gaze(
 class _Inputs(LogGazeField):
     """The part of a field that has no networks."""
 
-    def __init__(self, config: LogGazeConfig, box: Box, grid: Encoding, prior: Any):
+    def __init__(self, config: LogGazeConfig, box: AnyBox, grid: Encoding, prior: Any):
         self.config, self.box, self.grid, self.prior = config, box, grid, prior
 
 

@@ -15,13 +15,13 @@ from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.gaze.product import GazeConfig, activate
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import sigmoid
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.training.radiance.model import stack, unstack
 
 
 def gaze_density(
     config: GazeConfig,
-    box: Box,
+    box: AnyBox,
     parameters: dict,
     p_od: Any,
     p_o: Any,

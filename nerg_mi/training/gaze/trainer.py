@@ -12,7 +12,7 @@ import numpy as np
 from drjit.opt import AdamW
 
 from nerg_mi.field.gaze.protocol import GazeDensity
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 
 from .batches import Batch, TargetArrays
 from .losses import gaze_loss
@@ -48,7 +48,7 @@ class GazeTrainer(ABC):
     def __init__(
         self,
         targets: Targets,
-        box: Box,
+        box: AnyBox,
         config: Any,
         settings: GazeSettings,
         ns: ModuleType,

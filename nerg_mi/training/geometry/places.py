@@ -14,6 +14,7 @@ from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.mesh_file import check_vol
@@ -36,7 +37,7 @@ class GazePlace:
     # What depths are traced in, in the field's frame (`transport.trace.trace_depth`); None where nothing is known.
     medium: FieldMedium | VolumeMedium | Place | None
     # Where a gaze field lives, in that frame.
-    box: Box
+    box: AnyBox
     # What it was made of: "field", "scene", "hits" or "none".
     kind: str
     # For the provenance (JSON): the file, and what it is.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.ray_box import box_interval
 from nerg_mi.transport.observer.surroundings import nearest_depth
 from nerg_mi.transport.trace import trace_depth
@@ -43,7 +43,7 @@ def surface_distances(
     return distance, escaped
 
 
-def box_exit(box: Box, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def box_exit(box: AnyBox, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Distance (N,) at which rays leave ``box``; its diagonal for rays that never enter it."""
     near, far = box_interval(origins, directions, box.lower, box.upper)
     return np.where((far > 0) & (near <= far) & np.isfinite(far), far, box.diagonal)

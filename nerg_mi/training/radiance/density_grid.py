@@ -12,9 +12,10 @@ import numpy as np
 from nerg_mi.capture.cameras import Camera, view_tangents
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
+from nerg_mi.field.cascades import CascadeGrid, contracted_cascades
 from nerg_mi.field.occupancy import OccupancyGrid
-from nerg_mi.maths.box import Box
-from nerg_mi.maths.types import UInt32
+from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.types import Array3f, UInt32
 
 _DECAY = 0.6
 # A share of the cells is refreshed at a time; the strides walk over all of them.
@@ -25,21 +26,25 @@ class DensityGrid:
     """Decaying maxima of σ times ``step``, and the cells in which samples are taken.
 
     ``step``: length, in scene units, that turns density into optical depth; ``threshold``: optical
-    depth a step from which on a cell counts, lowered to half of the mean while the field is thin.
+    depth a step from which on a cell counts, lowered to half of the mean while the field is thin. Of a contracted box
+    the cells are equal where positions are encoded, and a step is at least ``growth`` times the distance from its
+    centre: cells and steps grow alike outwards.
     """
 
     def __init__(
         self,
         ns,
-        box: Box,
+        box: AnyBox,
         resolution: int,
         step: float,
         cameras: list[Camera],
         min_views: int,
         threshold: float = 0.01,
         near: float = 0.0,
+        growth: float = 0.0,
     ):
         self.ns, self.box, self.resolution, self.step, self.threshold = ns, box, resolution, step, threshold
+        self.growth = growth if box.contracted else 0.0
         cells = resolution**3
         self.index = dr.arange(ns.UInt32, cells)
         self._allow(self._seen(cameras, min_views, near))
@@ -65,7 +70,18 @@ class DensityGrid:
         return self._to_world(self._corner(index) + (stratum + jitter) / (parts * self.resolution))
 
     def _to_world(self, u):
-        return (u - 0.5) * self.box.side + self.ns.Array3f(*self.box.center)
+        return self.box.from_unit(u)
+
+    def step_at(self, p):
+        """Length of a training step at ``p`` (Array3f, world), about: rays start anywhere near the centre."""
+        if not self.growth:
+            return self.step
+        return dr.maximum(self.growth * dr.norm(p - self.ns.Array3f(*self.box.center)), self.step)
+
+    def cell_at(self, p):
+        """Edge of the cell that holds ``p`` (Array3f, world), in the field's units; across the line to the centre."""
+        inner = 2 if self.box.contracted else 1
+        return self.box.distance_scale(p) * (inner * self.box.side / self.resolution)
 
     def _seen(self, cameras: list[Camera], min_views: int, near: float):
         """Cells whose centre lies within the box and in at least ``min_views`` pictures.
@@ -74,7 +90,7 @@ class DensityGrid:
         """
         Float, UInt32 = self.ns.Float, self.ns.UInt32
         p = self._to_world(self._corner(self.index) + 0.5 / self.resolution)
-        cell = self.box.side / self.resolution
+        cell = 0 if self.box.contracted else self.box.side / self.resolution
         half = ((np.subtract(self.box.upper, self.box.lower) + cell) / 2).tolist()
         inside = dr.all(dr.abs(p - self.ns.Array3f(*self.box.center)) < self.ns.Array3f(*half))
         count = dr.zeros(UInt32, self.resolution**3)
@@ -138,7 +154,7 @@ class DensityGrid:
     def _cell(self, p):
         """Index (UInt32) of the cell that holds ``p`` (Array3f, world)."""
         r = self.resolution
-        u = (p - self.ns.Array3f(*self.box.center)) / self.box.side + 0.5
+        u: Array3f = self.box.to_unit(p)
         c = [self.ns.UInt32(dr.clip(x * r, 0, r - 1)) for x in (u.x, u.y, u.z)]
         return c[0] + r * (c[1] + r * c[2])
 
@@ -151,7 +167,8 @@ class DensityGrid:
         self.turn += not everywhere
         if dr.width(index) > 0:
             # Beyond some optical depth more says nothing, and would drown the mean.
-            value = dr.minimum(density(self._point(index, rng), True) * self.step, 10)
+            p = self._point(index, rng)
+            value = dr.minimum(density(p, True) * self.step_at(p), 10)
             if not everywhere:
                 value = dr.maximum(dr.gather(self.ns.Float, self.value, index) * _DECAY, value)
             dr.scatter(self.value, value, index, mode=dr.ReduceMode.Permute)
@@ -182,7 +199,7 @@ class DensityGrid:
         """Share of all cells that samples are taken in."""
         return float(dr.sum(self.ns.Float(self.bits))[0]) / self.resolution**3
 
-    def bound(self, density, rng: np.random.Generator, lit, probes: int = 3) -> OccupancyGrid:
+    def bound(self, density, rng: np.random.Generator, lit, probes: int = 3) -> OccupancyGrid | CascadeGrid:
         """A grid for rendering, of cells that may hold density and that matter to the training rays.
 
         ``probes``**3 jittered points a cell are looked at; a cell with one above the threshold stays on, and so do all
@@ -200,11 +217,14 @@ class DensityGrid:
         dense = self.grown(found)
         bits = self.ns.UInt8(dense.ravel())
         shown = self._holding(lit(density, lambda p, active: self.within(bits, p, active)))
-        return OccupancyGrid(dense & _grown(shown), self.ns, self.limit)
+        bits = dense & _grown(shown)
+        if self.box.reach is not None:
+            return contracted_cascades(bits, self.box.reach, self.ns, self.limit)
+        return OccupancyGrid(bits, self.ns, self.limit)
 
     @property
     def limit(self) -> float:
-        """Density, in 1/unit, that absorbs ``threshold`` in one training step."""
+        """Density, in 1/unit, that absorbs ``threshold`` in one training step; of a contracted box, near its centre."""
         return self.threshold / self.step
 
     def probe(self, found, index, density, rng: np.random.Generator, stratum: tuple, parts: int) -> None:
@@ -212,7 +232,9 @@ class DensityGrid:
         point of their ``stratum`` (three numbers) of ``parts`` an axis."""
         corner = self.ns.Array3f(*stratum)
         dr.make_opaque(corner)
-        hit: UInt32 = dr.compress(density(self._point(index, rng, corner, parts), True) > self.limit)
+        p = self._point(index, rng, corner, parts)
+        limit = self.threshold / self.step_at(p) if self.growth else self.limit
+        hit: UInt32 = dr.compress(density(p, True) > limit)
         if dr.width(hit) > 0:
             dr.scatter(found, self.ns.UInt8(1), dr.gather(self.ns.UInt32, index, hit))
             dr.eval(found)

@@ -33,16 +33,19 @@ def color_loss(color, opacity, pixels: PixelBatch, background, delta: float):
     return loss / 3
 
 
-def depth_loss(weight: Float, tau: Float, samples: Samples, depth: Float, margin: float, scale: Float):
+def depth_loss(weight: Float, tau: Float, samples: Samples, depth: Float, margin: float | Float, scale: Float):
     """Loss a ray of the absorption's place against the true ``depth`` (as in `PixelBatch`); 0 where that is unknown.
 
-    Two terms: the share of the light that is not absorbed within ``margin`` (scene units) of the true
-    surface, or within the step that holds it (line-of-sight supervision, Rematas et al. 2022, with a
+    Two terms: the share of the light that is not absorbed within ``margin`` (scene units; a number, or a ray each) of
+    the true surface, or within the step that holds it (line-of-sight supervision, Rematas et al. 2022, with a
     box for its Gaussian), which forbids fog, holes and floaters alike; and the distance of the expected
-    depth from the true one, in units of ``scale`` (a number or a Float), which places the surface within the step.
+    depth from the true one, in units of ``scale`` (of all rays, or a ray each), which places the surface within the
+    step.
     """
     s = samples.segments
     truth = dr.gather(type(weight), depth, s.ray, s.active)
+    if not isinstance(margin, float):
+        margin = dr.gather(type(weight), margin, s.ray, s.active)
     near = (samples.t < truth + margin) & (samples.t + samples.length > truth - margin)
     caught = ray_sum(dr.select(near, weight, 0), s)
     # Only absorption near the surface is moved: a floater is to vanish, not to drag the surface along.

@@ -8,7 +8,7 @@ from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import RadianceConfig, density_from_log, sigmoid
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 
 
 def stack(rows: list, ns):
@@ -31,7 +31,7 @@ def unstack(x, ns) -> list:
     ]
 
 
-def density_color(config: RadianceConfig, box: Box, parameters: dict, p, d, ns, features: list | None = None):
+def density_color(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, ns, features: list | None = None):
     """Density (1/unit) and colour (list of 3 Floats in 0..1) at world points ``p`` seen along ``d``.
 
     The same maths as ``RadianceField.density_features`` and ``color`` on ``parameters`` spelt as the field spells them;
@@ -39,21 +39,22 @@ def density_color(config: RadianceConfig, box: Box, parameters: dict, p, d, ns, 
     ``p``, where that has been looked up already.
     """
     h = unstack(_net(parameters, "density_net").tensor(_features(config, box, parameters, p, ns, features)), ns)
-    sigma = density_from_log(h[0], config.density_scale)
+    sigma = box.density_along(density_from_log(h[0], config.density_scale), p)
     c = _net(parameters, "color_net").tensor(stack(encode_direction(d, config.sh_degree) + h[1:], ns))
     return sigma, [sigmoid(x) for x in unstack(c, ns)]
 
 
-def density(config: RadianceConfig, box: Box, parameters: dict, p, ns):
+def density(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns):
     """Density (1/unit) alone, at world points ``p`` in ``box``; see `density_color`."""
     head = _head(parameters)
-    return density_from_log(head.tensor(_features(config, box, parameters, p, ns)).array, config.density_scale)
+    log_density = head.tensor(_features(config, box, parameters, p, ns)).array
+    return box.density_along(density_from_log(log_density, config.density_scale), p)
 
 
-def density_of(config: RadianceConfig, parameters: dict, features: list):
-    """Density (1/unit) where the grid returns ``features`` (list of Floats); without weight gradients, as one
+def density_of(config: RadianceConfig, box: AnyBox, parameters: dict, p, features: list):
+    """Density (1/unit) at ``p`` where the grid returns ``features`` (list of Floats); without weight gradients, as one
     kernel."""
-    return density_from_log(_head(parameters)(features)[0], config.density_scale)
+    return box.density_along(density_from_log(_head(parameters)(features)[0], config.density_scale), p)
 
 
 def _head(parameters: dict) -> MLP:
@@ -61,7 +62,7 @@ def _head(parameters: dict) -> MLP:
     return MLP(net.weights[:-1] + [net.weights[-1][0:1, :]])
 
 
-def _features(config: RadianceConfig, box: Box, parameters: dict, p, ns, known: list | None = None):
+def _features(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns, known: list | None = None):
     rows = encoding_of(config.grid, parameters, mode=dr.ReduceMode.Expand)(box.to_unit(p))
     return stack(rows if known is None else [dr.replace_grad(a, b) for a, b in zip(known, rows)], ns)
 

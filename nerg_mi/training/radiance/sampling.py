@@ -15,7 +15,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned, namespace
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.types import Array3f, Float, UInt32
 from nerg_mi.transport.march.quadrature import absorbed_share
 
@@ -70,7 +70,7 @@ class Rays:
     count: int
 
 
-def rays_in_box(o, d, box: Box, near: float) -> Rays:
+def rays_in_box(o, d, box: AnyBox, near: float) -> Rays:
     """Rays clipped to ``box``, from ``near`` on."""
     # Not maths.ray_box: of rays along a face a training may lose some, and is spared the selects that keep them.
     Float = type(d.x)

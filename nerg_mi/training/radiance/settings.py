@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from nerg_mi.errors import NergError
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 
 # (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's
 # sizes; "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16; "medium" holds the texture of a
@@ -15,11 +15,14 @@ from nerg_mi.maths.box import Box
 _SIZES = {"small": (8, 16, 32, 512, 32, 1), "medium": (8, 18, 32, 512, 32, 1), "paper": (16, 19, 16, 2048, 64, 2)}
 
 
-def sized_config(size: str, box: Box) -> RadianceConfig:
-    """Architecture of a ``size`` for a scene box: an untrained field absorbs about 1 - 1/e across it."""
+def sized_config(size: str, box: AnyBox) -> RadianceConfig:
+    """Architecture of a ``size`` for a scene box: an untrained field absorbs about 1 - 1/e across it. Of a contracted
+    one, whose inner cube takes half of each edge of the grid, it resolves that as it would a box."""
     if size not in _SIZES:
         raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
     levels, rows, base, finest, width, color_hidden = _SIZES[size]
+    if box.contracted:
+        base, finest = 2 * base, 2 * finest
     return RadianceConfig(
         grid=HashGridConfig(levels=levels, log2_rows=rows, base=base, finest=finest),
         width=width,

@@ -19,7 +19,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
-from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.psnr import psnr
 from nerg_mi.maths.types import Float, UInt32
 from nerg_mi.training.common.step_clock import StepClock
@@ -54,7 +54,7 @@ class RadianceTrainer:
     """
 
     def __init__(
-        self, views: list[View], box: Box, config: RadianceConfig, settings: RadianceSettings, ns, depth: bool = True
+        self, views: list[View], box: AnyBox, config: RadianceConfig, settings: RadianceSettings, ns, depth: bool = True
     ):
         if not views:
             raise NergError("there are no pictures to train on")
@@ -74,6 +74,7 @@ class RadianceTrainer:
             [v.camera for v in views],
             settings.min_views,
             near=settings.near * box.side,
+            growth=settings.growth,
         )
         # With exact depth everywhere the free space is known from the start, and there is no fog to clear.
         self.carved = self.use_depth and self.pixels.depth_everywhere
@@ -137,7 +138,7 @@ class RadianceTrainer:
         self.clock.count(dr.width(p))
         now = {k: dr.detach(v) for k, v in self._parameters().items()}
         features = encoding_of(self.config.grid, now).evaluated(self.box.to_unit(p), active)
-        return density_of(self.config, now, features), features
+        return density_of(self.config, self.box, now, p, features), features
 
     def _parameters(self) -> dict:
         return {k: self.optimiser[k] for k in self.averaged}
@@ -232,8 +233,11 @@ class RadianceTrainer:
         loss = color_loss(color, opacity, pixels, background, s.huber)
         if self.use_depth:
             # In units of the step at hand: while marching is coarse, no more can be asked for.
-            unit = dr.opaque(ns.Float, stride * self.march_step)
-            placed = depth_loss(weight, tau, samples, pixels.depth, s.depth_margin * self.march_step, unit)
+            unit, margin = dr.opaque(ns.Float, stride * self.march_step), s.depth_margin * self.march_step
+            if self.box.contracted:
+                step = dr.maximum(s.growth * pixels.depth, self.march_step)
+                unit, margin = step * stride, step * s.depth_margin
+            placed = depth_loss(weight, tau, samples, pixels.depth, margin, unit)
             # Places first, colours later: once surfaces stand, colour has more to say.
             loss += dr.opaque(ns.Float, s.depth_weight * s.final_depth**self.progress) * placed
             misplaced = dr.detach(placed)
@@ -270,8 +274,7 @@ class RadianceTrainer:
         if p is None or s.empty_weight == 0:
             return 0
         self.clock.count(dr.width(p))
-        cell = self.box.side / s.resolution
-        sigma = density(self.config, self.box, parameters, p, self.ns)
+        sigma, cell = density(self.config, self.box, parameters, p, self.ns), self.grid.cell_at(p)
         return s.empty_weight * dr.mean(dr.log(1 + sigma * cell))
 
     def _lit(self, density, occupied):
@@ -327,12 +330,13 @@ class RadianceTrainer:
         field, occupied = field or self.field(bound=False), self.grid.occupied
         bound = field.occupancy
         if bound is not None:
-            occupied = lambda p, active: active & (bound.empty_cells(self.box.to_unit(p), active) == 0)
+            occupied = lambda p, active: active & (bound.empty_cells(self.box.to_cube(p), active) == 0)
         return render_view(field, occupied, self.table(), view, self.settings.near * self.box.side, every=every)
 
     def field(self, bound: bool = True) -> RadianceField:
         """The field with averaged weights. ``bound``: with the occupancy that rendering may rest on."""
-        out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step)
+        growth = self.settings.growth if self.box.contracted else 0.0
+        out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step, march_growth=growth)
         out.set_parameters({k: type(v)(v) for k, v in self.averaged.items()})
         if bound:
             with dr.suspend_grad():

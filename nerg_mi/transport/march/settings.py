@@ -48,6 +48,11 @@ def default_step(medium: Medium | None) -> float:
     return medium.step or medium.length_scale / 1024
 
 
+def default_growth(medium: Medium | None) -> float:
+    """Growth of steps with distance (`MarchSettings.dt_gamma`) where none is asked for: what suits the medium."""
+    return MarchSettings.dt_gamma if medium is None else medium.growth
+
+
 @dataclass
 class MarchResult:
     """What a march gathered along each ray. Distances are in scene units, from the ray's start."""

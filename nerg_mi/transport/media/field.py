@@ -45,6 +45,10 @@ class FieldMedium:
         """The step that the field was trained with, in scene units."""
         return None if self.field.march_step is None else self.field.march_step * self.to_world.scale
 
+    @property
+    def growth(self) -> float:
+        return self.field.march_growth
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         return self.to_world.bounds(self.field.box.lower, self.field.box.upper)
 
@@ -63,10 +67,10 @@ class FieldMedium:
         return self.to_world.point_to_local(p)
 
     def to_unit(self, p: Point3f) -> Array3f:
-        return self.field.box.to_unit(p)
+        return self.field.box.to_cube(p)
 
     def vector_to_unit(self, v: Vector3f) -> Array3f:
-        return v / self.field.box.side
+        return v / self.field.box.cube_side
 
     def density(self, p: Point3f, active: Bool) -> Float:
         return bounded(self.field.density(p, active) * self._per_unit)

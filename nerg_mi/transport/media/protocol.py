@@ -69,6 +69,12 @@ class Medium(Protocol):
         ...
 
     @property
+    def growth(self) -> float:
+        """Share of its distance that a step is at least, which suits a medium that gets coarser with distance; 0 where
+        steps are best of one length."""
+        ...
+
+    @property
     def occupancy(self) -> Occupancy | None:
         """Cells outside of which there certainly is no density; None: nothing may be skipped."""
         ...

@@ -85,6 +85,10 @@ class VolumeMedium:
         return self.bound
 
     @property
+    def growth(self) -> float:
+        return 0.0
+
+    @property
     def length_scale(self) -> float:
         return float(np.linalg.norm(self._upper - self._lower))
 

@@ -41,7 +41,7 @@ def test_density_alone_is_that_of_the_field():
     want = f.density(p).numpy()
     assert np.allclose(density(TINY, BOX, f.parameters(), p, ns).numpy(), want, rtol=1e-4)
     features = [ns.Float(x) for x in f.grid(BOX.to_unit(p))]
-    assert np.allclose(density_of(TINY, f.parameters(), features).numpy(), want, rtol=1e-4)
+    assert np.allclose(density_of(TINY, BOX, f.parameters(), p, features).numpy(), want, rtol=1e-4)
 
 
 def test_rows_are_stacked_and_taken_apart():
