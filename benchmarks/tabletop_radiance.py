@@ -89,7 +89,7 @@ def main(argv=None) -> None:
     path = args.out / "field.safetensors"
     options = RadianceOptions(minutes=args.minutes, threads=args.threads, seed=args.seed)
     result = train_radiance(args.views, path, options)
-    about, box = result.provenance, result.field.box
+    about, box = result.provenance, result.field.box.core
     held_out = open_dataset(args.views / DEPTH_FILE).held_out
     if [v.name.rpartition("/")[2] for v in held_out] != about["held_out"]["frames"]:
         raise SystemExit(f"{args.views / DEPTH_FILE} holds out other photos than the capture beside it")

@@ -1,11 +1,15 @@
-"""The box around a place that cameras looked at: from points on its surfaces, or from the cameras alone."""
+"""What cameras looked at: the box around it, from points on its surfaces or from the cameras alone, and whether the
+place ends there."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox, ContractedBox
 from nerg_mi.maths.ray_box import box_interval
 
 from . import lens
@@ -17,6 +21,54 @@ _CONVERGING = np.radians(30)
 _MIN_POINTS, _OUTLIERS = 100, 0.005
 # Of the points' longest edge, for what lies between them and the wall that they are on.
 _MARGIN = 0.05
+
+# Of the points: so many beyond the box are strays, more are part of the place.
+_BEYOND = 0.02
+# Of the points, how many the core of an unbounded place holds, and how many times larger than the box that the cameras
+# bound, or smaller than the one that holds all but strays, it may then be.
+_CORE, _MOST_LARGER, _LEAST_SMALLER = 0.9, 4.0, 2.0
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Where a place may hold density: ``box``, contracted where the place does not end there; ``how`` the box was
+    found, the end of a sentence; ``kind`` of the place, "object", "room" or "unbounded", and ``why``, a clause."""
+
+    box: AnyBox
+    how: str
+    kind: str
+    why: str
+
+
+def place_extent(cameras: list[Camera], object_only: bool = False, points: np.ndarray | None = None) -> Extent:
+    """The box around what ``cameras`` looked at, as `scene_box` finds it, and whether the place ends there.
+
+    An object before nothing, ``object_only``, ends at its box; a place whose ``points`` (N, 3), on surfaces, lie
+    within the box but for a few strays is a room that ends there; every other is unbounded: its box is the core of a
+    contracted one. So is a place whose box is more than twice as large as what holds nine of ten points: a few of them
+    are far away. Where there are points the core holds nine tenths of them, but is at most four times as large as the
+    box that the cameras bound.
+    """
+    box, how = scene_box(cameras, object_only, points)
+    if object_only:
+        return Extent(box, how, "object", "the photos show nothing behind it")
+    if points is None or len(points) < _MIN_POINTS:
+        return Extent(ContractedBox(box), how, "unbounded", "no points on surfaces tell where it ends")
+    beyond = float(np.mean(np.any((points < box.lower) | (points > box.upper), axis=1)))
+    why = f"{100 * beyond:.1f} % of the points on surfaces lie beyond its box"
+    if beyond > _BEYOND:
+        # What the cameras bound has cut points off.
+        away = float(np.quantile(np.abs(points - box.center).max(axis=1), _CORE))
+        half = float(np.clip(away, 0.5 * box.side, 0.5 * _MOST_LARGER * box.side))
+        core = Box(tuple(np.subtract(box.center, half)), tuple(np.add(box.center, half)))
+        return Extent(ContractedBox(core), f"{how}, nine tenths of them", "unbounded", why)
+    lower, upper = np.quantile(points, [0.5 - 0.5 * _CORE, 0.5 + 0.5 * _CORE], axis=0)
+    if box.side > _LEAST_SMALLER * float(np.max(upper - lower)):
+        margin = _MARGIN * float(np.max(upper - lower))
+        why = f"a box half as large as one around all {len(points)} points holds nine tenths of them"
+        core = Box(tuple(lower - margin), tuple(upper + margin))
+        return Extent(ContractedBox(core), f"around nine tenths of {len(points)} points on surfaces", "unbounded", why)
+    return Extent(box, how, "room", why)
 
 
 def scene_box(cameras: list[Camera], object_only: bool = False, points: np.ndarray | None = None) -> tuple[Box, str]:
@@ -73,7 +125,7 @@ def _half_angle_tangent(camera: Camera) -> float:
     return min(i.width / (2 * i.fx), i.height / (2 * i.fy))
 
 
-def unmatched(cameras: list[Camera], box: Box, grid: int = 4, depths: int = 12) -> list[int]:
+def unmatched(cameras: list[Camera], box: AnyBox, grid: int = 4, depths: int = 12) -> list[int]:
     """Cameras that share nothing within ``box`` with any other: no sample point of their pictures is in another's.
 
     ``grid`` by ``grid`` pixels of each are followed through the box and looked for at ``depths`` places.
@@ -90,7 +142,7 @@ def unmatched(cameras: list[Camera], box: Box, grid: int = 4, depths: int = 12) 
     return out
 
 
-def _samples(camera: Camera, box: Box, grid: int, depths: int) -> np.ndarray:
+def _samples(camera: Camera, box: AnyBox, grid: int, depths: int) -> np.ndarray:
     """Points (N, 3) within the box on rays of the picture."""
     i = camera.intrinsics
     u, v = np.meshgrid((np.arange(grid) + 0.5) / grid * i.width, (np.arange(grid) + 0.5) / grid * i.height)

@@ -9,8 +9,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import AnyBox, ContractedBox
 
-from .bounds import scene_box, unmatched
+from .bounds import Extent, place_extent, unmatched
 from .cameras import pixel_directions
 from .images import View, load_usable
 from .posed import PosedImages, Unused
@@ -21,6 +22,11 @@ from .sources import read_split
 _PAD = 1 / 80
 # Of each view's depth, at most so many points help to find the box.
 _DEPTH_POINTS = 2000
+_KINDS = {
+    "object": "an object before nothing",
+    "room": "a bounded place",
+    "unbounded": "a place without an end, resolved best within its box and contracted around it",
+}
 
 
 @dataclass(frozen=True)
@@ -31,8 +37,8 @@ class Dataset:
     train: list[View]
     # To score on, never to learn from.
     held_out: list[View]
-    # Where density may be.
-    box: Box
+    # Where density may be, contracted where the place does not end at the box that was found.
+    box: AnyBox
     # How the box was found, the end of a sentence.
     box_from: str
     # Frames that were left out, each with its reason.
@@ -43,6 +49,8 @@ class Dataset:
     notes: list[str] | tuple = ()
     # A sentence on the length of a unit.
     unit: str = ""
+    # What kind of place it was taken for, and why, a sentence.
+    kind: str = ""
 
 
 def open_dataset(
@@ -55,13 +63,16 @@ def open_dataset(
     scale: float = 1.0,
     coordinates: str = "file",
     allow_outside: bool = False,
+    unbounded: bool | None = None,
 ) -> Dataset:
     """Read the data set ``path``: a folder with a transforms file or a COLMAP model, or one of these itself.
 
     ``holdout``, ``coordinates``, ``scale``, ``allow_outside``: as `read_split` has them. ``width``, ``downscale``: size
     of the pictures. ``aabb``: six numbers x0, y0, z0, x1, y1, z1 bounding what is seen, in the coordinates asked for;
     else "aabb" of the file, else a guess from points on surfaces (COLMAP's, or from depth) or from the cameras.
-    ``depth``: read the depth files that the frames name.
+    ``unbounded``: whether there is anything to be seen beyond that box; None: what the points tell, and yes where none
+    do, but for a box that is given, by hand or by the file, and for pictures with alpha. ``depth``: read the depth
+    files that the frames name.
 
     Frames that cannot be used are left out and listed; `NergError`, naming file and frame, when none can.
     """
@@ -73,18 +84,18 @@ def open_dataset(
             f'"{bad[0].name}": {bad[0].reason}'
         )
     held_out, bad_held = load_usable(split.held_out, width, downscale, depth)
-    box, box_from = _box(split.posed, train, aabb)
-    alone = unmatched([v.camera for v in train], box) if len(train) > 1 else []
+    extent = _extent(split.posed, train, aabb, unbounded)
+    alone = unmatched([v.camera for v in train], extent.box) if len(train) > 1 else []
     if len(alone) == len(train):
         raise NergError(
             f'no two of the {len(train)} training frames of "{split.posed.path}" (the first: "{train[0].name}") look '
-            f"at the same place within the box {_corners(box)}; check the poses, or give a box that holds what they "
-            "show with --aabb"
+            f"at the same place within the box {_corners(extent.box)}; check the poses, or give a box that holds what "
+            "they show with --aabb"
         )
     if alone:
         bad += [Unused(train[k].name, "no other frame looks at what it shows") for k in alone]
         train = [v for k, v in enumerate(train) if k not in set(alone)]
-        box, box_from = _box(split.posed, train, aabb)
+        extent = _extent(split.posed, train, aabb, unbounded)
     unused = [*split.posed.unused, *bad, *bad_held]
     source = {
         "dataset": split.posed.path.resolve().parent.name,
@@ -97,12 +108,23 @@ def open_dataset(
         "height": train[0].shape[0],
         "to_file": split.posed.to_file.tolist(),
     }
-    return Dataset(
-        train, held_out, box, box_from, unused, source, split.posed.notes, _unit(split.posed, train, box, scale)
-    )
+    kind = f"{_KINDS[extent.kind]}: {extent.why}"
+    unit = _unit(split.posed, train, extent.box.core, scale)
+    return Dataset(train, held_out, extent.box, extent.how, unused, source, split.posed.notes, unit, kind)
 
 
-def _box(posed: PosedImages, views: list[View], aabb) -> tuple[Box, str]:
+def _extent(posed: PosedImages, views: list[View], aabb, unbounded: bool | None) -> Extent:
+    """Where density may be: the box that is given, or the one that is found; contracted as asked for, or as found."""
+    extent = _found(posed, views, aabb)
+    if unbounded is None or unbounded == extent.box.contracted:
+        return extent
+    core = extent.box.core
+    if unbounded:
+        return Extent(ContractedBox(core), extent.how, "unbounded", "as asked for")
+    return Extent(core, extent.how, "room", "it is to end at its box, as asked for")
+
+
+def _found(posed: PosedImages, views: list[View], aabb) -> Extent:
     if aabb is not None:
         if len(aabb) != 6:
             raise NergError(f"aabb needs the six numbers x0,y0,z0,x1,y1,z1, got {len(aabb)}")
@@ -111,10 +133,11 @@ def _box(posed: PosedImages, views: list[View], aabb) -> tuple[Box, str]:
         given, source = posed.aabb, f'"aabb" of {posed.path.name}'
     else:
         points = posed.points if posed.points is not None else _depth_points(views)
-        return scene_box([v.camera for v in views], all(v.has_alpha for v in views), points)
+        return place_extent([v.camera for v in views], all(v.has_alpha for v in views), points)
     tight = Box(tuple(given[0]), tuple(given[1]))
     pad = _PAD * tight.side
-    return Box(tuple(given[0] - pad), tuple(given[1] + pad)), f"{source}, grown by {pad:.3g} on every side"
+    box, how = Box(tuple(given[0] - pad), tuple(given[1] + pad)), f"{source}, grown by {pad:.3g} on every side"
+    return Extent(box, how, "room", "it ends at its box")
 
 
 def _depth_points(views: list[View]) -> np.ndarray | None:
@@ -131,11 +154,11 @@ def _depth_points(views: list[View]) -> np.ndarray | None:
     return np.concatenate(points)
 
 
-def _corners(box: Box) -> str:
+def _corners(box: AnyBox) -> str:
     return " to ".join("(" + ", ".join(f"{x:.3g}" for x in c) + ")" for c in (box.lower, box.upper))
 
 
-def _unit(posed: PosedImages, views: list[View], box: Box, scale: float) -> str:
+def _unit(posed: PosedImages, views: list[View], box: AnyBox, scale: float) -> str:
     """What is known of the length of a unit."""
     centers = np.array([v.camera.center for v in views])
     size = " x ".join(f"{u - l:.3g}" for l, u in zip(box.lower, box.upper))

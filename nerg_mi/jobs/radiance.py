@@ -107,14 +107,16 @@ def _open(photos: str | Path, options: RadianceOptions) -> Dataset:
             options.scale,
             options.coordinates,
             options.allow_outside,
+            options.unbounded,
         )
 
 
 def _tell_about(data: Dataset, reporter: Reporter) -> None:
-    corner = lambda values: ", ".join(f"{x:.3g}" for x in values)
+    corner, core = lambda values: ", ".join(f"{x:.3g}" for x in values), data.box.core
     for line in (*data.unused, *data.notes):
         reporter.message(str(line))
-    reporter.message(f"box: ({corner(data.box.lower)}) to ({corner(data.box.upper)}), {data.box_from}")
+    reporter.message(f"taken for {data.kind}; --unbounded, --bounded or --aabb say otherwise")
+    reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_from}")
     reporter.message(data.unit)
     reporter.message(
         f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
@@ -134,6 +136,8 @@ def _tell_result(result: RadianceResult, reporter: Reporter) -> None:
     reporter.message(f"{about['steps']} steps in {about['seconds']:.0f} s{speed}")
     if result.psnr is not None:
         reporter.message(f"held-out PSNR: {result.psnr:.2f} dB")
+    if "beyond_box" in about:
+        reporter.message(f"{about['beyond_box']:.0%} of the watched pixels show what lies beyond the box")
     for complaint in about["complaints"]:
         reporter.warn(complaint)
     if result.output is not None:

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from nerg_mi.capture.bounds import scene_box, unmatched
+from nerg_mi.capture.bounds import place_extent, scene_box, unmatched
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import ContractedBox
 
 LENS = Intrinsics(10, 10, 10.0, 10.0, 5.0, 5.0)
 
@@ -83,3 +84,46 @@ def test_a_camera_that_sees_what_no_other_does_is_found():
     assert unmatched([*ring[:4], away, *ring[4:]], Box((-3, -3, -3), (5, 7, 40))) == [4]
     outside = looking(np.array([100.0, 0, 0]), [200, 0, 0])
     assert unmatched([*AROUND, outside], box) == [20]
+
+
+def test_an_object_before_nothing_ends_at_its_box():
+    extent = place_extent(AROUND, object_only=True)
+    assert extent.kind == "object" and not extent.box.contracted and extent.box == scene_box(AROUND, True)[0]
+
+
+def test_a_room_ends_at_its_walls_in_spite_of_strays():
+    strays = np.random.default_rng(7).uniform(-60, 60, (12, 3))
+    extent = place_extent(INSIDE, points=np.concatenate([walls(), strays]))
+    assert extent.kind == "room" and not extent.box.contracted and "0.3 % of the points" in extent.why
+
+
+def test_a_place_whose_points_lie_beyond_its_box_has_no_end():
+    near, far = (
+        1 + np.random.default_rng(8).uniform(0, 2, (900, 3)),
+        np.random.default_rng(9).uniform(-90, 90, (100, 3)),
+    )
+    extent = place_extent(AROUND, points=np.concatenate([near, far]))
+    assert extent.kind == "unbounded" and extent.box.contracted and "% of the points on surfaces lie" in extent.why
+    # Nine tenths of the points lie within the box that the cameras bound, whose longest edge is the core's.
+    box = scene_box(AROUND, points=np.concatenate([near, far]))[0]
+    assert extent.box.side == pytest.approx(box.side) and np.allclose(extent.box.center, box.center)
+
+
+def test_the_core_holds_nine_tenths_of_the_points_within_reason():
+    points = np.random.default_rng(9).uniform(-20, 20, (4000, 3)) + [1, 2, 3]
+    extent = place_extent(AROUND, points=points)
+    inside = np.all((points > extent.box.core.lower) & (points < extent.box.core.upper), axis=1)
+    assert extent.kind == "unbounded" and inside.mean() == pytest.approx(0.9, abs=0.01)
+    assert place_extent(AROUND, points=points * 100).box.side == pytest.approx(4 * 10)
+
+
+def test_a_few_points_far_away_do_not_make_a_room_of_a_street():
+    far = np.random.default_rng(10).uniform(-400, 400, (200, 3))
+    extent = place_extent(INSIDE, points=np.concatenate([walls(3800), far]))
+    assert extent.kind == "unbounded" and "nine tenths" in extent.how and extent.box.side < 12
+
+
+def test_where_nothing_tells_a_place_has_no_end():
+    for cameras in (AROUND, INSIDE):
+        extent = place_extent(cameras)
+        assert extent.kind == "unbounded" and extent.box == ContractedBox(scene_box(cameras)[0])

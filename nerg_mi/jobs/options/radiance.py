@@ -32,6 +32,11 @@ class RadianceOptions(PhotoOptions):
     aabb: tuple[float, ...] | None = option(
         None, "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field.", parse=parse_numbers
     )
+    unbounded: bool | None = option(
+        None,
+        "Whether anything is to be seen beyond those bounds. Default: as the points tell, and yes without any.",
+        "--unbounded/--bounded",
+    )
     seed: int = option(0, "Seed of the weights, rays and jitter.")
     threads: int | None = option(None, "CPU threads. Default: all.")
     half: bool = option(False, "Store the weights in fp16.")

@@ -18,6 +18,7 @@ from nerg_mi.files.png import write_png
 from nerg_mi.interruption import Interruption
 from nerg_mi.training.common.run_state import kept_unless, load_run, save_run
 
+from .coverage import share_beyond
 from .settings import RadianceSettings
 from .trainer import RadianceTrainer
 from .verdict import complaints
@@ -158,6 +159,10 @@ def _result(
             "views": {v.name: round(p, 3) for v, p in zip(dataset.held_out, psnr)},
         }
         _look(trainer, watched, history, field)
+        if field.box.contracted:
+            every = trainer.pixels_within(watched, _LOOK_SAMPLES)
+            beyond = share_beyond(watched, lambda view: trainer.render(view, every, field), field.box.core, every)
+            provenance["beyond_box"] = round(beyond, 4)
     provenance["psnr_watched"] = {"views": [v.name for v in watched], "history": history}
     minutes = trainer.settings.minutes
     provenance["complaints"] = complaints(history, trainer.steps, trainer.stride, minutes, seconds)
