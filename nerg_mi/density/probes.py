@@ -155,7 +155,7 @@ def place_probes(
 
 def person_weights(rays: Rays) -> np.ndarray:
     """Weights (N,) under which every person counts as much, whatever the number of their rays; their mean is one."""
-    counts = np.bincount(rays.person, minlength=len(rays.persons))
+    counts = np.bincount(rays.person)
     return len(rays) / np.count_nonzero(counts) / counts[rays.person]
 
 

@@ -27,9 +27,7 @@ def probe_at(
     """The one probe of an observer at ``observer`` (3,), in metres in the rays' frame; ``options`` as for
     :func:`nerg_mi.density.probes.place_probes`. Raises `NergError` where too few rays start near."""
     options = {"min_rays": 1, "centre": "query", **options}
-    return place_probes(
-        rays, radius, queries=np.asarray(observer, dtype=np.float64).reshape(1, 3), index=index, **options
-    )
+    return place_probes(rays, radius, queries=np.asarray(observer).reshape(1, 3), index=index, **options)
 
 
 def directions_to(observer: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -132,7 +132,7 @@ class Refined(Median):
         enter = dr.select(half.rest, again.enter, result.enter)
         missing = dr.select(half.rest, half.goal - again.enter_tau, LOG2 - result.enter_tau)
         met = dr.isfinite(dr.select(half.rest, again.half, result.half))
-        found = marched.active & (half.rest | half.opaque) & (missing > 0) & met
+        found = marched.active & (half.rest | half.opaque) & met
         # Steps of cells are as long as their voxels: they are searched until the crossing is found.
         in_cells = RULES.find(settings.quadrature).in_cells
         end = t1 if in_cells else dr.minimum(enter + step_length(enter, settings), t1)
