@@ -36,6 +36,8 @@ def test_lattice_and_box(origin):
     rng = np.random.default_rng(3)
     grid = place_queries(origin, "grid", 1, None, 0.25, rng)
     assert np.allclose(np.diff(np.unique(grid[:, 0].round(9))), 0.5)
+    # As far from one wall as from the other.
+    assert np.allclose(grid.min(axis=0) + grid.max(axis=0), origin.min(axis=0) + origin.max(axis=0))
     box = place_queries(origin, "random", 300, None, 0.25, rng)
     assert len(box) == 300 and (box >= origin.min(axis=0)).all() and (box <= origin.max(axis=0)).all()
     with pytest.raises(ValueError, match="placement"):

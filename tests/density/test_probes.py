@@ -75,7 +75,7 @@ def test_leave_one_out_sees_through_repetition():
 
 def test_refusals(rays):
     with pytest.raises(ValueError, match="placement"):
-        place_probes(rays, 0.25, placement="hexagons")
+        place_probes(rays, 0.25, placement="hexagons", queries=np.zeros((1, 3)))
     with pytest.raises(ValueError, match="kappa_rule"):
         place_probes(rays, 0.25, kappa_rule="magic")
     with pytest.raises(ValueError, match="enlarge the radius"):

@@ -108,3 +108,10 @@ def test_samples_of_no_concentration_are_uniform():
     assert np.allclose(x.mean(axis=0), 0, atol=0.02) and np.allclose(x.T @ x / len(x), np.eye(3) / 3, atol=0.02)
     with pytest.raises(ValueError, match="negative or NaN"):
         vmf.sample(np.array([[0.0, 0.0, 1.0]]), -1.0, np.random.default_rng(5))
+
+
+def test_single_precision_is_widened():
+    """Concentrations of a file in fp32 give the same digits as in fp64."""
+    kappa = np.geomspace(1e-6, 1e7, 50).astype(np.float32)
+    for of in (vmf.log_normaliser, vmf.mean_resultant_length):
+        assert np.array_equal(of(kappa), of(kappa.astype(np.float64)))

@@ -218,7 +218,7 @@ def test_parquet_of_other_types(tmp_path, column, value):
 def test_what_does_not_shrink_is_stored(tmp_path):
     """Random digits are not worth the time of deflating them, and of inflating them each time."""
     rng = np.random.default_rng(0)
-    n = 20_000
+    n = 50_000  # of a column more than the sample that is looked at
     d = rng.normal(size=(n, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     rays = Rays(np.arange(n) * 0.02, np.zeros(n, int), ("a",), np.zeros((n, 3)), d, np.ones(n))

@@ -50,6 +50,7 @@ def test_what_is_known_and_what_is_not():
         ({"persons": ["ann", 2]}, '"persons" .*list of names'),
         ({"transform": np.zeros((4, 4)).tolist()}, "can be inverted"),
         ({"transform": np.eye(3).tolist()}, "can be inverted"),
+        ({"transform": (np.arange(16).reshape(4, 4) + 1).tolist()}, "can be inverted"),
         ({"rows_read": -1}, "number of rows"),
         ({"rows_read": True}, "number of rows"),
         ({"sources": [{"sha256": "00"}]}, "list of files"),

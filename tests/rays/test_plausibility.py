@@ -112,3 +112,10 @@ def test_a_kilometre_is_the_most_that_origins_in_metres_span(along):
         origin[:, along] *= span / np.ptp(origin[:, along])
         slow = replace(rays, origin=origin, t=rays.t * 40)  # nobody runs
         assert ("--units mm" in warnings_of(slow)) == warned
+
+
+def test_walking_is_seen_through_the_noise_of_tracking():
+    """Between one ray and the next heads seem to move by more than they walk; in half a second they do not."""
+    rays = walk()
+    noisy = rays.origin + np.random.default_rng(1).normal(0, 0.03, rays.origin.shape)
+    assert (walking_agreement(replace(rays, origin=noisy))[:2] > 0.5).all()

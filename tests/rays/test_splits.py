@@ -143,3 +143,9 @@ def test_the_metadata_tell_how_rays_were_split(rays):
     split = rays.with_step(step="filter", kept=9, of=9).with_step(step="split", side="test", kept=9, of=9, by=by)
     assert position_of_split(split) == by["position"]
     assert position_of_split(rays.with_step(step="split", kept=9, of=9, by={"time": {"share": 0.2}})) == {}
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_of_two_people_one_is_on_each_side(rays, share):
+    train, test = split_by_person(rays.select(rays.person < 2), test_share=share)
+    assert train.any() and test.any()

@@ -68,8 +68,9 @@ def test_a_single_field_keeps_its_support_too(tmp_path):
 def test_ensembles_of_ensembles_are_refused(tmp_path):
     """When they are made, and in a file, however deep they lie in one another."""
     pair = GazeEnsemble([made(seed=1), made(seed=2)])
-    with pytest.raises(ValueError, match="give its members instead"):
-        GazeEnsemble([pair, pair])
+    for members in ([pair, pair], [made(), pair]):
+        with pytest.raises(ValueError, match="give its members instead"):
+            GazeEnsemble(members)
     about = pair.architecture()
     for _ in range(500):
         about = {"kind": "ensemble", "members": [about, about]}

@@ -197,3 +197,13 @@ def test_file(tmp_path, half):
 def test_settings_that_make_no_sense_are_refused(wrong):
     with pytest.raises(ValueError):
         replace(SMALL, **wrong)
+
+
+def test_heads_in_a_box_of_any_size_span_the_same_coordinates():
+    found = []
+    for size in (1.0, 1e-5):
+        low, high = np.array([-1, -1, 1.4]) * size, np.array([1, 0.5, 1.8]) * size
+        field = made(replace(SMALL, heads=(tuple(low), tuple(high))))
+        found.append([np.array(v) for v in field.capture_position(jit(np.linspace(low, high, 5)))])
+    assert np.ptp(found[0][0]) == pytest.approx(2, abs=1e-5)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-4)

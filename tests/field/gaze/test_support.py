@@ -54,3 +54,10 @@ def test_what_is_no_support_is_refused():
     for cells, radius in (([[0, 0, 0, 1, np.nan]], 1.0), ([[0, 0, 0, 1, 0]], 0.0)):
         with pytest.raises(ValueError, match="finite cells and a positive radius"):
             RaySupport(np.array(cells), radius)
+
+
+def test_a_cube_of_the_radius_has_eight_cells():
+    """However its lowest rays lie on their borders."""
+    axis = np.arange(4) / 4
+    origins = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    assert RaySupport.of(origins, 1.0).cells[:, 3].tolist() == [8] * 8

@@ -125,8 +125,10 @@ def test07_evaluations_that_a_depth_takes_are_added(rgb, sigma):
     assert counts["median"] < counts["refined"] <= counts["median"] + 17
 
 
-def test08_a_refined_depth_finds_what_a_step_hides(rgb):
-    """A wall that starts within a step: the step's own rule spreads it over all of it, a finer look does not."""
+@pytest.mark.parametrize("stop", [1e-6, 1e-2])
+def test08_a_refined_depth_finds_what_a_step_hides(rgb, stop):
+    """A wall that starts within a step: the step's own rule spreads it over all of it, a finer look does not. On rays
+    that became opaque and on those that did not."""
     back = 40.0
     data = np.zeros((64, 1, 1), np.float32)
     data[27:37] = 3.0
@@ -135,6 +137,17 @@ def test08_a_refined_depth_finds_what_a_step_hides(rgb):
     total = 3 * 10 / 64 + back * 20 / 64
     goal = -math.log1p(0.5 * math.expm1(-total))
     want = 27 / 64 + goal / 3 if goal < 30 / 64 else 44 / 64 + (goal - 30 / 64) / back
-    steps = MarchSettings(1 / 9, stop=1e-6)
+    steps = MarchSettings(1 / 9, stop=stop)
     median, refined = (abs(depth(rgb, medium, kind, steps, (0.5, 0.5, 0))[0] - want) for kind in ("median", "refined"))
     assert refined < 0.25 * median and median > 4e-3
+
+
+@pytest.mark.parametrize("kind", ["median", "refined"])
+def test09_no_depth_where_none_is_asked_for(rgb, kind):
+    """Of rays that have all been marched."""
+    medium, settings = slab(rgb, 60), MarchSettings(0.1)
+    ray = medium.local(rgb.Point3f(0.5, 0.5, 0), rgb.Vector3f(0, 0, 1))
+    result = march(medium, ray, ray.t_near, ray.t_far, True, settings)
+    asked = rgb.Bool([True, False])
+    found = surface_depth(kind, result, medium, ray, ray.t_near, ray.t_far, asked, settings).numpy()
+    assert found[0] > 1 and found[1] == 0

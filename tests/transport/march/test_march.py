@@ -47,6 +47,10 @@ def test02_both_marches_find_the_same(rgb):
     attached = through(rgb, medium, settings, z, count=True)
     for name in ("tau", "moment", "half", "half_slope", "enter", "enter_tau", "density_evals", "origin"):
         assert np.array_equal(getattr(plain, name).numpy(), dr.detach(getattr(attached, name)).numpy()), name
+    tracked = {
+        name for name in ("half", "half_slope", "enter", "enter_tau") if dr.grad_enabled(getattr(attached, name))
+    }
+    assert tracked == {"half"}
 
 
 def test03_a_goal_carries_derivatives_too(rgb):

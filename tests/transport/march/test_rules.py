@@ -270,3 +270,14 @@ def test14_cells_show_the_features_colour(rgb):
     shown = np.array(along_z(medium, 8, quadrature="cells").color)[0, 0]
     # ∫ z σ exp(-σ z) dz over [0, 1]
     assert np.isclose(shown, (1 - np.exp(-3) * (1 + 3)) / 3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", RULES.names())
+def test15_steps_that_are_not_taken_add_nothing(kind):
+    """Whatever the step before them has left: lanes may end between two steps."""
+    rule, z = RULES.find(kind), ns.Array3f(0, 0, 1)
+    medium = Colored(lambda z, x: 3 * x + 0 * z, lambda z: z, ns.Float(1))
+    ray, t, delta = LocalRay(ns.Array3f(0), z, z, ns.Float(0), ns.Float(2)), ns.Float(0), ns.Float(0.5)
+    taken = rule.step(medium, ray, t, delta, t + delta, rule.start(ns.Float), ns.Bool(True), False)
+    left = rule.step(medium, ray, t + delta, delta, t + 2 * delta, taken.carry, ns.Bool(False), False)
+    assert np.isclose(taken.dtau[0], 1.5) and (left.dtau[0], left.evals[0]) == (0, 0)

@@ -59,13 +59,14 @@ def test_a_body_is_the_same_on_both_sides():
     body = bodies.keypoints_from_head(origin, direction)
     left = np.cross([0, 0, 1.0], direction)
     pairs = np.array(
-        [(bodies.LEFT_EAR, bodies.RIGHT_EAR), (4, 15), (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19)]
+        [(bodies.LEFT_EAR, bodies.RIGHT_EAR), (4, 15), (0, 12), (3, 14), (5, 16), (6, 17), (7, 18), (8, 19), (9, 20)]
     )
     # Mirrored in the plane through the middle of the ears in which the head looks.
     aside = np.einsum("nkj,nj->nk", body - origin[:, None], left)[..., None]
     mirrored = body - 2 * aside * left[:, None]
     assert np.allclose(body[:, pairs[:, 0]], mirrored[:, pairs[:, 1]], atol=1e-12)
     assert (aside[:, pairs[:, 0], 0] > 0.01).all()
+    assert np.allclose(aside[:, [10, bodies.NOSE, 21]], 0)
     # The eyes lie between the ears; heels, knees, hips and shoulders one above the other, in proportion to the height.
     eyes, ears = (
         np.linalg.norm(body[:, i] - body[:, j], axis=1) for i, j in ((4, 15), (bodies.LEFT_EAR, bodies.RIGHT_EAR))

@@ -157,3 +157,12 @@ def test_damaged_parquet_tables(tmp_path):
     pq.write_table(pa.table({"a": pa.array(np.zeros(20_000_000, np.int8))}), path)
     with pytest.raises(NergError, match="20,000,000 rows, which its .* bytes do not warrant"):
         read(path, ["a"])
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_texts_alone(tmp_path, monkeypatch, fast):
+    if not fast:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda *a: None)
+    (tmp_path / "t.csv").write_text("who,a\nann,1\nbo,2\n")
+    (block,) = read(tmp_path / "t.csv", [], ["who"])
+    assert block.numbers.shape == (2, 0) and block.texts.tolist() == [["ann"], ["bo"]]
