@@ -43,17 +43,17 @@ class Extent:
 def place_extent(cameras: list[Camera], object_only: bool = False, points: np.ndarray | None = None) -> Extent:
     """The box around what ``cameras`` looked at, as `scene_box` finds it, and whether the place ends there.
 
-    An object before nothing, ``object_only``, ends at its box; a place whose ``points`` (N, 3), on surfaces, lie
-    within the box but for a few strays is a room that ends there; every other is unbounded: its box is the core of a
-    contracted one. So is a place whose box is more than twice as large as what holds nine of ten points: a few of them
-    are far away. Where there are points the core holds nine tenths of them, but is at most four times as large as the
-    box that the cameras bound.
+    An object before nothing, ``object_only``, ends at its box, and so does a place without ``points`` (N, 3), on
+    surfaces, and one whose points lie within its box but for a few strays. Every other is unbounded: its box is the
+    core of a contracted one. So is a place whose box is more than twice as large as what holds nine of ten points: a
+    few of them are far away. The core holds nine tenths of the points, but is at most four times as large as the box
+    that the cameras bound.
     """
     box, how = scene_box(cameras, object_only, points)
     if object_only:
         return Extent(box, how, "object", "the photos show nothing behind it")
     if points is None or len(points) < _MIN_POINTS:
-        return Extent(ContractedBox(box), how, "unbounded", "no points on surfaces tell where it ends")
+        return Extent(box, how, "room", "no points on surfaces tell whether there is more than its box")
     beyond = float(np.mean(np.any((points < box.lower) | (points > box.upper), axis=1)))
     why = f"{100 * beyond:.1f} % of the points on surfaces lie beyond its box"
     if beyond > _BEYOND:

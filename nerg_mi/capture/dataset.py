@@ -70,8 +70,8 @@ def open_dataset(
     ``holdout``, ``coordinates``, ``scale``, ``allow_outside``: as `read_split` has them. ``width``, ``downscale``: size
     of the pictures. ``aabb``: six numbers x0, y0, z0, x1, y1, z1 bounding what is seen, in the coordinates asked for;
     else "aabb" of the file, else a guess from points on surfaces (COLMAP's, or from depth) or from the cameras.
-    ``unbounded``: whether there is anything to be seen beyond that box; None: what the points tell, and yes where none
-    do, but for a box that is given, by hand or by the file, and for pictures with alpha. ``depth``: read the depth
+    ``unbounded``: whether there is anything to be seen beyond that box; None: what the points tell, and no where there
+    are none, for a box that is given, by hand or by the file, and for pictures with alpha. ``depth``: read the depth
     files that the frames name.
 
     Frames that cannot be used are left out and listed; `NergError`, naming file and frame, when none can.

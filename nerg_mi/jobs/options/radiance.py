@@ -34,7 +34,7 @@ class RadianceOptions(PhotoOptions):
     )
     unbounded: bool | None = option(
         None,
-        "Whether anything is to be seen beyond those bounds. Default: as the points tell, and yes without any.",
+        "Whether anything is to be seen beyond those bounds. Default: as the points tell, and no without any.",
         "--unbounded/--bounded",
     )
     seed: int = option(0, "Seed of the weights, rays and jitter.")
