@@ -52,7 +52,7 @@ def frame_timer(
                 }
             )
             started = time.perf_counter()
-            np.array(mi.render(scene, sensor=sensor, spp=1))
+            np.array(mi.render(scene, sensor=sensor))
             times.append(time.perf_counter() - started)
         return float(np.mean(times[1:]))
 

@@ -107,7 +107,7 @@ def sauc(at_gaze: np.ndarray, at_others: np.ndarray) -> np.ndarray:
     shape = np.broadcast_shapes(a.shape[:-1], b.shape[:-1])
     a, b = (np.broadcast_to(v, (*shape, v.shape[-1])).reshape(-1, v.shape[-1]) for v in (a, b))
     out = []
-    for gaze, other in zip(a, np.sort(b, axis=-1)):
+    for gaze, other in zip(a, np.sort(b)):
         lower, upper = (np.searchsorted(other, gaze, side) for side in ("left", "right"))
         out.append(np.mean(0.5 * (lower + upper)) / len(other))
     return np.reshape(out, shape)

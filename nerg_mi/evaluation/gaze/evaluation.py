@@ -235,7 +235,7 @@ def split_half(
         return None
     first = make_test(halves[0], centres[both], radius, kappa, min_rays=min_rays)
     probes = place_probes(
-        halves[1], radius, queries=first.centres, cap=1024, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
+        halves[1], radius, queries=first.centres, min_rays=1, kappa_rule="fixed", kappa=kappa, centre="query"
     )
     predicted = lambda positions, directions: probes.density(directions)
     row = evaluate_gaze(first, {"split half": predicted}, blind, resamples=0)[0]

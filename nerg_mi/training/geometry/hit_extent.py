@@ -126,8 +126,8 @@ def _cut(
     low: np.ndarray, high: np.ndarray, core: np.ndarray, points: np.ndarray, voxel: float, most: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Corners of a box of at most ``most`` voxels, from ``low`` to ``high`` cut face by face down to ``core`` (2, 3) at
-    the least: each time where most voxels are saved for each of ``points`` (N, 3) that is given up. None where ``core``
-    is too large."""
+    the least: each time where giving up a 512th of ``points`` (N, 3) saves most voxels. None where ``core`` is too
+    large."""
     box = np.stack([low, high])
     step = max(1, len(points) // _STEPS)
     while True:
@@ -141,8 +141,7 @@ def _cut(
                 to = core[side, axis]
                 if len(along) > step:
                     to = min(to, along[step]) if side == 0 else max(to, along[-1 - step])
-                lost = np.count_nonzero(along < to if side == 0 else along > to)
-                worth = abs(to - box[side, axis]) / (box[1, axis] - box[0, axis]) * step / max(lost, step)
+                worth = abs(to - box[side, axis]) / (box[1, axis] - box[0, axis])
                 if worth > best:
                     best, cut = worth, (side, axis, to)
         if count <= most and best * count < _WORTH * most:

@@ -42,6 +42,6 @@ def refined(stride: int, strides: tuple[int, ...], scheduled: int, looked: float
     """
     if scheduled >= stride:
         return stride
-    finer = max((s for s in (*strides, 1) if s < stride), default=1)
+    finer = max(s for s in (*strides, 1) if s < stride)
     fits = looked * stride / finer * FEW_RAYS <= most
     return finer if fits or not waits else stride
