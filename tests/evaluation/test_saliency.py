@@ -75,6 +75,8 @@ def test_identity_scale_and_batches():
         batch = score(p, q, w)
         assert batch.shape == (4, 3) and np.isclose(batch[2, 1], score(p[2, 1], q[2, 1], w))
         assert np.allclose(score(p, q, w), score(p, q, 9 * w))  # any unit of solid angle
+        each = rng.random(p.shape)  # weights of each map's own
+        assert np.isclose(score(p, q, each)[2, 1], score(p[2, 1], q[2, 1], each[2, 1]))
     assert (metrics.kld(p, q, w) > 0).all()
     assert np.isclose(metrics.mae(np.array([1.0, 3]), np.array([2.0, 5]), np.array([1.0, 3])), 1.75)
 

@@ -18,6 +18,16 @@ def test01_equal_seeds(rgb, files, rfilter, tolerance):
     assert not np.allclose(a, c, atol=1e-4)
 
 
+def test01b_the_integrators_own_render_has_the_seed_of_mitsubas(rgb, files):
+    scene = rgb.load_dict({"type": "scene", "integrator": with_field(files), "sensor": camera(rgb)})
+    own, same, other = (
+        scene.integrator().render(scene, spp=1),
+        rgb.render(scene, spp=1),
+        rgb.render(scene, spp=1, seed=1),
+    )
+    assert np.array_equal(own, same) and not np.array_equal(own, other)
+
+
 def test02_jitter_alone_makes_seeds_differ(rgb, files):
     # One sample in the middle of each pixel: nothing but the jitter depends on the seed.
     still = {"type": "stratified", "jitter": False, "sample_count": 1}
@@ -94,6 +104,15 @@ def test06_nested(rgb, files):
     names, image = rgb.load_dict(moment).aov_names(), render(rgb, moment)
     for i, name in enumerate(rgb.load_dict(inner).aov_names()):
         assert np.allclose(image[..., 3 + names.index(f"nested.{name}")], plain[..., 3 + i], atol=1e-6), name
+
+
+def test06b_rays_are_active_unless_told(rgb, files):
+    """As for integrators in Python that ask another one for the radiance along a ray."""
+    scene = rgb.load_dict({"type": "scene", "integrator": with_field(files), "sensor": camera(rgb)})
+    sampler, ray = rgb.load_dict({"type": "independent"}), rgb.Ray3f([0.5, 0.4, -3], [0, 0, 1])
+    sampler.seed(0, 1)
+    (plain, *_), (told, *_) = (scene.integrator().sample(scene, sampler, ray, **k) for k in ({}, {"active": True}))
+    assert np.array_equal(plain, told) and np.array(plain).max() > 0
 
 
 def test07_integrator_given_to_render(rgb, files):

@@ -108,12 +108,17 @@ def by_hand(persons: int) -> evaluation.GazeTest:
 def test_intervals_are_a_bootstrap_over_persons():
     """Of three persons all 27 draws can be made: the error of what one of them sees is the share of the others."""
     test = by_hand(3)
-    first = lambda positions, directions: test.parts[:, 0] if directions.ndim == 2 else np.ones(directions.shape[:2])
-    (row,) = evaluation.evaluate_gaze(test, {"first": first}, uniform(), resamples=2000)
-    mae = [2 * (1 - draw.count(0) / 3) / (4 * np.pi) for draw in itertools.product(range(3), repeat=3)]
+    sees = lambda k: lambda p, d: test.parts[:, k] if d.ndim == 2 else np.ones(d.shape[:2])
+    row, _ = evaluation.evaluate_gaze(test, {"first": sees(0), "second": sees(1)}, uniform(), resamples=1000)
+    draws = list(itertools.product(range(3), repeat=3))
+    mae = [2 * (1 - draw.count(0) / 3) / (4 * np.pi) for draw in draws]
     assert row["MAE"] == pytest.approx(np.mean(mae))
     assert row["MAE.high"] - row["MAE"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
     assert row["MAE"] - row["MAE.low"] == pytest.approx(1.96 * np.std(mae), rel=0.1)
+    # Of a difference: over the same draws.
+    less = [2 * (draw.count(1) - draw.count(0)) / 3 / (4 * np.pi) for draw in draws]
+    assert row["MAE.less.high"] - row["MAE.less"] == pytest.approx(1.96 * np.std(less), rel=0.1)
+    assert row["MAE.less"] - row["MAE.less.low"] == pytest.approx(1.96 * np.std(less), rel=0.1)
 
 
 @pytest.mark.parametrize("persons, known", [(2, False), (3, True), (4, True)])
@@ -183,6 +188,8 @@ def test_halves_of_the_people_are_compared_where_both_were(rays, test_set):
     assert row["method"] == "split half" and 0 < row["CC"] < 1 and row["KLD"] > 0
     nobody = np.array([[40.0, 0, 0]])
     assert evaluation.split_half(rays, nobody, 0.6, 20.0, uniform(), min_rays=20) is None
+    two = evaluation.split_half(rays.select(rays.person < 2), test_set.centres, 0.6, 20.0, uniform(), min_rays=20)
+    assert two is not None and two["KLD"] > 0
     alone = rays.select(rays.person == 0)
     assert evaluation.split_half(alone, test_set.centres, 0.6, 20.0, uniform(), min_rays=20) is None
     with pytest.raises(ValueError, match="kappa is negative"):

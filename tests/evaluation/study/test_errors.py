@@ -24,6 +24,10 @@ def test_errors_of_known_pictures():
     assert math.isclose(off["depth_mae"], 0.05) and off["depth_p99"] == 0.5
     assert off["visibility_mae"] == 0 and off["visibility_wrong"] == 0.25
     assert off["gaze_mae"] == 0 and abs(off["gaze_kld"]) < 1e-12
+    # Errors of either sign; and half seen is seen.
+    half = np.where(np.arange(n) % 2, 0.4, 0.6)
+    off = errors({"opacity": 0.5 + half, "visibility": half}, known, (2 * one, one > 0))
+    assert math.isclose(off["opacity_mae"], 0.1) and off["visibility_wrong"] == 0.5
     # A ray that met nothing counts in full; what was not rendered has no error.
     off = errors({"depth": none, "color": none[:, None]}, known)
     assert off["depth_mae"] == 2 and "color_rmse" not in off and "gaze_mae" not in off

@@ -53,7 +53,9 @@ def test_cost_is_taken_along_doublings_from_the_scene_itself(quick):
     assert len(said) == len(rows) and (len(rows) == 6) == quick
     for axis in ("samples", "extent"):
         assert of(axis) == [2**k for k in range(len(of(axis)))]
-    assert np.allclose(np.divide(of("pixels")[1:], of("pixels")[:-1]), 4, rtol=0.07)
+    sizes = [(k, 2 * k // 3) for k in (16 * 2**n for n in range(len(of("pixels"))))]
+    assert of("pixels") == [width * height for width, height in sizes]
+    assert list(dict.fromkeys(size for size, _, _ in subject.renders))[: len(sizes)] == sizes
     # An extent k times as large: steps k times shorter, in the picture that was asked for, with one sample.
     renders = [r for r in subject.renders if r[2] is not None]
     assert renders == [((12, 8), 1, 0.5 / k) for k in of("extent") for _ in range(3)]

@@ -53,6 +53,14 @@ def test_rows_do_what_their_names_say(rows):
             assert row.paper[1] == 0, row.name
 
 
+@pytest.mark.parametrize("has_gaze", [True, False])
+def test_gaze_is_left_out_where_there_is_one(has_gaze):
+    subject = SimpleNamespace(marched=True, extent=2.0, has_gaze=has_gaze, resampled=True)
+    left_out = {r.name: r.params.get("aovs", "") for r in settings(subject) if r.group == "leave out"}
+    assert ("no gaze" in left_out) == has_gaze and all("gaze" not in aovs for aovs in left_out.values())
+    assert not has_gaze or "visibility" in left_out["no gaze"]
+
+
 def test_settings_vary_one_factor_at_a_time():
     subject = open_subject("slab", "auto", 12, 8)
     rows = settings(subject)

@@ -46,6 +46,20 @@ def test01_first_hits_are_those_of_a_ray_caster(rgb, scene):
     assert np.allclose(found[hit], expected[hit], rtol=1e-5)
 
 
+def test01b_visibility_is_told_to_a_share_of_the_scenes_diagonal(rgb, scene):
+    subject = study_subject.open_subject(str(scene), "auto", 24, 16)
+    assert subject.extent > 8 and subject.tolerance == study_subject.EXACT * subject.extent
+    assert subject.integrator().observer_settings.tolerance == pytest.approx(subject.tolerance)
+
+
+def test01c_noise_of_the_true_colour_is_not_that_of_a_picture(rgb, scene, monkeypatch):
+    subject, asked = study_subject.open_subject(str(scene), "auto", 12, 8), []
+    channels = subject.channels
+    monkeypatch.setattr(subject, "channels", lambda made, spp, seed: (asked.append(seed), channels(made, 1, seed))[1])
+    subject.truth(1, "median", "depth")
+    assert len(asked) == 1 and asked != [1]
+
+
 def test02_rays_do_not_slip_between_triangles():
     corners = np.array([[[0, 0, 1], [1, 0, 1], [1, 1, 1]], [[0, 0, 1], [1, 1, 1], [0, 1, 1]]], float)
     s = np.linspace(0.01, 0.99, 99)

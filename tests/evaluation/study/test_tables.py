@@ -17,6 +17,18 @@ def test_pareto():
     assert study_tables.pareto(points) == [not b for b in beaten]
 
 
+def test_a_page_shows_times_in_ms_shares_in_percent_and_errors_as_they_are():
+    units = {"seconds": 1e3, "cpu_seconds": 1e3, "visibility_wrong": 100}
+    names = [*units, "density_evals", "color_evals", "peak_mb", "color_rmse", "depth_mae", "depth_p99", "surface_mae"]
+    names += ["visibility_mae", "gaze_mae", "gaze_kld"]
+    row = {"setting": "a", "group": "leave out", "spp": 1, "resolution": "", "visibility": "depth"}
+    row |= {name: (k + 1) / 128 for k, name in enumerate(names)}
+    about = {"scene": "s", "size": (1, 1), "variant": "v", "reference": "r", "reference_change_when_step_halved": {}}
+    page = study_tables.markdown({"rows": [{**row, "group": "default"}, row], **about})
+    shown = [float(cell) for cell in page.split("| a |")[2].split("\n")[0].strip(" |").split("|")]
+    assert sorted(shown) == sorted(float(f"{row[name] * units.get(name, 1):.3g}") for name in names)
+
+
 def test_against_paper_takes_the_best_of_either_kind():
     def row(setting, group, seconds, depth_mae):
         return {

@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from nerg_mi.training.common import step_clock
 from nerg_mi.training.common.step_clock import StepClock
 
 
@@ -24,6 +25,13 @@ def test_a_state_is_restored_with_and_without_steps(seconds):
     again.add(2.0)
     clock.add(2.0)
     assert again.summary() == clock.summary() and again.summary()["step_ms"]["max"] == 2000
+
+
+def test_durations_are_kept_of_steps_that_are_equally_far_apart(monkeypatch):
+    monkeypatch.setattr(step_clock, "KEPT", 4)
+    for steps, each in ((4, 1), (5, 2), (9, 4), (30, 8)):
+        clock = timed(*range(steps))
+        assert clock.each == each and clock.durations == list(range(0, steps, each))
 
 
 @pytest.mark.parametrize("change", [{"durations": []}, {"steps": 0}, {"steps": -1}, {"each": 0}, {"extremes": [0.5]}])

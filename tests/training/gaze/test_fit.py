@@ -84,6 +84,20 @@ def test_an_interrupted_fit_ends_after_its_step(targets):
     assert fit.interrupted and fit.trainer.steps == fit.best_step == 3 and fit.weights
 
 
+@pytest.mark.parametrize("stopped", [2, 99])
+def test_a_schedule_of_minutes_is_told_in_steps(targets, monkeypatch, stopped):
+    """Half a minute of steps of six seconds: five, also where the fit ends before."""
+    monkeypatch.setattr(GazeTrainer, "seconds", property(lambda trainer: 6.0 * trainer.steps))
+
+    def stop(progress):
+        if progress.steps == stopped:
+            raise KeyboardInterrupt
+
+    plan = planned(SMALL, replace(PRODUCT, steps=None, minutes=1.0, zones=0))
+    fit = fit_watched(targets, None, BOX, plan, ns, 0.5, NO_FILE, stop)
+    assert fit.schedule == 5 and fit.best_step == min(stopped, 5)
+
+
 def test_minutes_are_those_of_both_fits(wall, monkeypatch):
     """The first fit has half of them; the second follows its schedule, in steps."""
     # A clock that goes on by six seconds a step.

@@ -13,7 +13,7 @@ from nerg_mi.field.gaze.log_density import blind_table
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer, log_mean_exp
 from nerg_mi.training.gaze.losses import KLD_EPS
-from nerg_mi.training.gaze.settings import GazeSettings
+from nerg_mi.training.gaze.settings import LOSSES, GazeSettings
 from nerg_mi.training.gaze.targets import Targets
 from tests.field.gaze.test_log_density import BOX, SMALL, jit
 
@@ -89,6 +89,12 @@ def test_a_validation_sees_the_density_that_the_field_has(mix):
         density = (1 - mix) * product / (4 * np.pi * product.mean()) + mix * np.exp(np.array(field.log_blind(args[2])))
         kld.append(metrics.kld(truth[None], density[None], eps=KLD_EPS)[0])
     assert scores.kld == pytest.approx(np.mean(kld), rel=1e-4)
+
+
+def test_a_validation_is_judged_by_the_weights_of_its_loss():
+    trainer, weight = LikelihoodTrainer(targets(2), BOX, SMALL, FAST, namespace("llvm")), LOSSES["likelihood"]
+    weighted = weight["kld"] * 2.0 + weight["cc"] * (1 - 0.25) + weight["mae"] * 0.5
+    assert trainer.judge(2.0, 0.25, 0.5, 9.0) == weighted
 
 
 def test_a_law_is_learnt_and_holds_elsewhere():

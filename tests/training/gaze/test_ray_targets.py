@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from nerg_mi.density.probes import place_probes
 from nerg_mi.maths.similarity import Similarity
@@ -53,6 +54,8 @@ def test_probes_are_placed_as_the_settings_say(rays):
     )
     at = np.array([[-0.6, 0, 1.6]])
     np.testing.assert_array_equal(probes_of_rays(rays, PROBES, at).queries, at)
+    lattice = probes_of_rays(rays, replace(PROBES, placement="grid", spacing=0.3))
+    assert np.diff(np.unique(lattice.queries[:, 1].round(9))) == pytest.approx(0.3)
 
 
 def test_directions_are_turned_anew_where_they_are_to_be(rays, wall):

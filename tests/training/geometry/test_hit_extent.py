@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.training.geometry.hit_extent import PAD, VOXEL, hit_extent
+from nerg_mi.training.geometry.hit_extent import PAD, VOXEL, HitExtent, hit_extent
 from nerg_mi.training.geometry.hit_geometry import voxelise_hits
 from nerg_mi.training.geometry.places import place_of_hits
 from nerg_mi.transport.trace import trace_depth
@@ -63,6 +63,22 @@ def test_a_place_that_is_not_too_large_is_left_as_it_was(rays):
     low = np.minimum(np.quantile(room.hit, 0.005, axis=0), room.origin.min(axis=0)) - PAD * VOXEL
     np.testing.assert_array_equal(extent.lower, low)
     assert not extent.beyond_shell(np.full((1, 3), 1e6)).any()
+
+
+def test_what_stands_on_the_shell_is_more_than_half_a_voxel_beyond_it():
+    extent = HitExtent(np.array([1.0, 2.0, 3.0]), (PAD * 2 + 4,) * 3, 0.5, cut=True)
+    low, high = extent.shell
+    np.testing.assert_allclose([low, high], [[4, 5, 6], [6, 7, 8]])
+    for axis in np.eye(3):
+        hits = [end + side * by * 0.5 * axis for end, side in ((low, -1), (high, 1)) for by in (0.45, 0.55)]
+        assert extent.beyond_shell(np.array(hits)).tolist() == [False, True, False, True]
+
+
+def test_a_place_is_a_file_of_64_mib_at_most():
+    """A cube of 24 m, all of which people looked at, is nearly twice as many voxels."""
+    corners = np.array(list(np.ndindex(2, 2, 2))) * 24.0
+    extent = hit_extent(replace(office(8), origin=corners, hit=corners))
+    assert 4 * np.prod(extent.shape) <= 64 * 2**20 and (extent.cut or extent.voxel > VOXEL)
 
 
 def test_voxels_grow_where_people_were_everywhere():

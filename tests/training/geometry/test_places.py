@@ -69,6 +69,15 @@ def test_without_geometry_the_box_is_around_whoever_looked():
     assert place_of_nothing(np.array([[0.0, 1, 2], [1, 0, 2]])).box == Box((-2, -2, 0), (3, 3, 4))
 
 
+def test_a_scenes_box_holds_its_field_and_its_shapes_and_a_hundredth_more(rgb, tmp_path):
+    (tmp_path / "both.xml").write_text("""<scene version="3.0.0">
+      <integrator type="nerg"><volume name="density" type="constvolume"><float name="value" value="1"/>
+      </volume></integrator>
+      <shape type="cube"><transform name="to_world"><translate x="-2" y="-2" z="-3"/></transform></shape></scene>""")
+    box = place_of_scene(tmp_path / "both.xml").box
+    np.testing.assert_allclose([box.lower, box.upper], [[-3.05, -3.05, -4.05], [1.05, 1.05, 1.05]], atol=1e-6)
+
+
 def test_a_scene_without_anything_is_no_place(rgb, tmp_path):
     (tmp_path / "empty.xml").write_text('<scene version="3.0.0"/>')
     with pytest.raises(NergError, match="neither shapes nor a field"):

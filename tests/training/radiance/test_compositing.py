@@ -36,6 +36,15 @@ def test_weights_and_sums_equal_the_reference(packed):
     assert np.allclose(ray_sum(ns.Float(x), segments).numpy(), reference.ray_sum(tau, ray, RAYS), atol=1e-6)
 
 
+def test_the_ends_of_a_ray_are_written_once(packed, monkeypatch):
+    """Of several samples that write to one address the threads' order would choose."""
+    written, scatter = [], dr.scatter
+    monkeypatch.setattr(dr, "scatter", lambda *a: (written.append(np.array(a[2])[np.array(a[3])]), scatter(*a)))
+    ray, _, _, segments = packed
+    Segments(segments.ray, segments.active, RAYS)
+    assert [w.tolist() for w in written] == [np.unique(ray).tolist()] * 2
+
+
 def test_opacity_is_the_absorbed_share(packed):
     ray, tau, padded_tau, segments = packed
     opacity = ray_sum(weights(ns.Float(padded_tau), segments), segments).numpy()

@@ -142,6 +142,15 @@ def test_known_depth_never_rounds_to_unknown():
     assert len(points) == bank.size
 
 
+def test_surface_points_lie_at_the_depth_of_their_rays():
+    rng = np.random.default_rng(6)
+    views = [view(lens, rng, depth=True, mask=True) for lens in LENSES[:2]]
+    points = np.concatenate([p.numpy().T for p in PixelBank(ns, views).surface_points(100)])
+    o, d, _, _, depth = expected(views)
+    known = depth > 0
+    assert not known.all() and np.allclose(points, (o + d * depth[:, None])[known], atol=2e-4)
+
+
 def test_too_many_pixels_are_refused(monkeypatch):
     monkeypatch.setattr("nerg_mi.training.radiance.pixels._MOST", 100)
     with pytest.raises(ValueError, match="smaller width"):
