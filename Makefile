@@ -48,7 +48,7 @@ lint: setup
 	$(RUN) -m tools.import_rules
 
 types: setup
-	$(RUN) -m basedpyright
+	$(RUN) -m basedpyright --project pyproject.toml
 
 format: setup
 	$(RUN) -m ruff check --fix
