@@ -106,7 +106,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
  * - dt_gamma
    - |float|
    - Steps are at least this share of the distance travelled: for wide views, whose far parts need no short steps.
-     (Default: that which a field without an end was trained with; 0, i.e. uniform steps, for all others)
+     (Default: 0, i.e. uniform steps; for a field without an end that which it was trained with)
 
  * - stop
    - |float|
