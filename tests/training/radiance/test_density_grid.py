@@ -8,6 +8,7 @@ import pytest
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import ContractedBox
 from nerg_mi.training.radiance.density_grid import DensityGrid
 
 BOX = Box((-1, -1, -1), (1, 1, 1))
@@ -230,3 +231,14 @@ def test_what_is_kept_stays():
     held = np.zeros((R, R, R), bool)
     held[3, 4, 2] = True
     assert np.array_equal(cube(grid.bits) > 0, grown(held))
+
+
+def test_cells_and_steps_of_a_contracted_box_grow_outwards():
+    """Its inner cube, 2 units wide, has half of the cells along each edge."""
+    box = ContractedBox(BOX, 16)
+    grid = DensityGrid(ns, box, R, 0.01, above(), 1, growth=1 / 128)
+    p = ns.Array3f([0.5, 0.0, 4.0], [0.0, -0.9, 0.0], [0.0, 0.2, 3.0])
+    assert np.allclose(grid.cell_at(p).numpy(), np.array([1, 1, 4]) * 2 / (R / 2))
+    assert np.allclose(grid.step_at(p).numpy(), [0.01, 0.01, 5 / 128])
+    plain = DensityGrid(ns, BOX, R, 0.01, above(), 1, growth=1 / 128)
+    assert plain.cell_at(p) == 2 / R and plain.step_at(p) == 0.01

@@ -2,6 +2,8 @@
 
 import pytest
 
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.maths.contraction import ContractedBox
 from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
 
 from .ball import BOX
@@ -31,3 +33,12 @@ def test_damping_near_cameras_ends_when_surfaces_stand():
 def test_a_march_takes_1024_steps_through_the_box():
     """From corner to corner of a cube, as the paper's."""
     assert RadianceSettings(steps=1).march_step * BOX.side * 1024 == pytest.approx(BOX.diagonal)
+
+
+def test_a_size_is_a_grid_and_a_contracted_box_has_one_twice_as_fine():
+    """Its inner cube takes half of each edge."""
+    small = sized_config("small", BOX)
+    assert small.grid == HashGridConfig(levels=8, log2_rows=16, base=32, finest=512) and small.density_scale == 0.5
+    around = sized_config("small", ContractedBox(BOX))
+    assert around.grid == HashGridConfig(levels=8, log2_rows=16, base=64, finest=1024)
+    assert around.density_scale == small.density_scale
