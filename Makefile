@@ -5,7 +5,7 @@
 #
 # While working, and before a release:
 #
-#   make check     the quick tests of every part (some four minutes on two cores); ARGS as above
+#   make check     the quick tests of every part (a minute on two cores); ARGS as above
 #   make lint      format, style and import rules, all of which have to be right; nothing is changed
 #   make types     what a type checker finds
 #   make format    put right what of it can be put right by itself

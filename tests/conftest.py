@@ -46,12 +46,26 @@ def rgb_and_mono(request, rgb):
     rgb.set_variant("llvm_ad_rgb")
 
 
+def _resident() -> float:
+    """Memory of this process in GiB; unbounded where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return float("inf")
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**30
+
+
 @pytest.fixture(autouse=True, scope="module")
-def _free_memory():
-    """Kernels and arrays of one file are of no use to the next, and the suite must fit on a small machine."""
+def _free_memory(request):
+    """Kernels and arrays of one file are of no use to the next, and the suite must fit on a small machine.
+
+    It takes nearly half a second a file, which is most of what the quick tests take: these leave a gigabyte be.
+    """
     yield
     import drjit as dr
 
+    if request.config.option.markexpr == "not slow" and _resident() < 1:
+        return
     gc.collect()
     dr.kernel_history_clear()
     dr.flush_malloc_cache()
