@@ -96,8 +96,7 @@ class ObserverMap:
         Float, UInt32 = type(distance), self._uint
         r_o = dr.detach(r_o)
         theta = dr.atan2(dr.sqrt(r_o.x * r_o.x + r_o.y * r_o.y), r_o.z)
-        phi = dr.atan2(r_o.y, r_o.x)
-        x = dr.select(phi < 0, phi + dr.two_pi, phi) / self.spacing - 0.5
+        x = dr.atan2(r_o.y, r_o.x) / self.spacing - 0.5
         y = dr.clip(theta / self.spacing - 0.5, 0, self.height - 1)
         x = dr.select(x < 0, x + self.width, x)
         i, j = UInt32(x), dr.minimum(UInt32(y), self.height - 1)

@@ -249,3 +249,21 @@ def test_weights_move_however_faint_their_gradient(dataset):
         optimiser.step()
         moved.append(np.abs(optimiser[name].numpy() - before))
     assert moved[0].min() > 0 and np.allclose(moved[1], moved[0], rtol=0.05)
+
+
+def test_rays_that_do_not_fit_into_a_batch_do_not_count(dataset, monkeypatch):
+    """With a loss of 1 a ray the mean over those that are complete is 1."""
+    from nerg_mi.training.radiance import trainer as module
+
+    monkeypatch.setattr(module, "color_loss", lambda _, opacity, *rest: dr.ones(ns.Float, dr.width(opacity)))
+    trainer = RadianceTrainer(dataset.train, BOX, TINY, settings(batch=2**10), ns, depth=False)
+    trainer.rays, seen = 2**10, []
+    visible = module.visible_samples
+    monkeypatch.setattr(
+        module,
+        "visible_samples",
+        lambda rays, *a, **k: seen.append((rays.count, visible(rays, *a, **k))) or seen[-1][1],
+    )
+    trainer.step()
+    count, (_, covered) = seen[0]
+    assert 0 < covered < count and trainer.loss.numpy()[0] == pytest.approx(1, rel=1e-5)

@@ -84,3 +84,25 @@ def test04_leaps_pass_the_steps_whose_middle_lies_in_an_empty_cell_and_no_others
         medium, grid, ray, ns.Float(0.8), ns.Float(1), ns.Float(share), MarchSettings(step), ns.Bool(True), None
     )
     assert t[0] >= 1
+
+
+def test05_leaps_of_coarse_steps_end_where_fine_ones_begin(rgb):
+    bits = np.zeros((16, 1, 1), bool)
+    bits[11] = True
+    same = lambda v: v
+    medium, grid = SimpleNamespace(to_unit=same, vector_to_unit=same), OccupancyGrid(bits, ns, 0)
+    ray = SimpleNamespace(o=ns.Array3f(0.5, 0.5, 0), d=ns.Array3f(0, 0, 1))
+    step, fine = 1 / 43, 0.52
+    t, _ = leap(
+        medium,
+        grid,
+        ray,
+        ns.Float(0),
+        ns.Float(1),
+        ns.Float(1),
+        MarchSettings(step, coarse=4),
+        ns.Bool(True),
+        ns.Float(fine),
+    )
+    middles = fine + (np.arange(22) + 0.5) * step
+    assert t.numpy() == pytest.approx(fine + np.argmax(np.floor(16 * middles) == 11) * step, abs=1e-6)

@@ -45,10 +45,10 @@ def look(
 
 @pytest.mark.parametrize(
     "dt_gamma, tolerance, want",
-    [(0.0, 0.0, 2 * STEP), (0.004, 0.0, 2 * STEP), (0.1, 0.0, 2 * 0.1 * 1.5), (0.1, 0.3, 0.3)],
+    [(0.0, 0.0, 2 * STEP), (0.004, 0.0, 2 * STEP), (0.1, 0.0, 2 * 0.1 * 2.5), (0.1, 0.3, 0.3)],
 )
 def test_a_point_is_looked_for_two_steps_in_front_of_its_surface(rgb, dt_gamma, tolerance, want):
-    # Steps grow with the distance from the camera, 1.5, and so does what two of them are; a tolerance that is given
+    # Steps grow with the distance from the camera, 2.5, and so does what two of them are; a tolerance that is given
     # stays.
     for penetration in (0.0, 0.05):
         sight = look(
@@ -57,6 +57,7 @@ def test_a_point_is_looked_for_two_steps_in_front_of_its_surface(rgb, dt_gamma, 
             "transmittance",
             (0.5, 0.5, 0.5),
             (0.5, 0.5, -3),
+            camera=(0.5, 0.5, -2),
             penetration=penetration,
             dt_gamma=dt_gamma,
             tolerance=tolerance,

@@ -55,7 +55,7 @@ def batch(mi, *cameras):
     return mi.load_dict(d | {f"c{i}": c for i, c in enumerate(cameras)})
 
 
-@pytest.mark.parametrize("near", [0.01, 1.0])
+@pytest.mark.parametrize("near", [0.01, 1.0, 8.0])
 def test03_rays_of_a_batch_find_their_camera(rgb, near):
     origins = [[0, 0, 3], [0.5, 0, 3], [-3, 1, 0], [0, 0, -3]]
     sensor = batch(rgb, *(camera(rgb, o, near_clip=near) for o in origins))
