@@ -59,7 +59,6 @@ def main(argv=None) -> None:
 
     import drjit as dr
     import mitsuba as mi
-    import numpy as np
 
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
@@ -67,6 +66,7 @@ def main(argv=None) -> None:
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
     from nerg_mi.formats.fields import save_radiance
+    from nerg_mi.training.radiance.held_out import measure
     from nerg_mi.training.radiance.settings import RadianceSettings, sized_config
     from nerg_mi.training.radiance.trainer import RadianceTrainer
     from nerg_mi.training.radiance.warm_up import warm_up
@@ -93,7 +93,7 @@ def main(argv=None) -> None:
         seconds = trainer.seconds
         path = args.out / f"{args.width}_{stop:g}.safetensors"
         save_radiance(trainer.field(), path, {"minutes": stop, "settings": settings.to_dict()})
-        train = float(np.mean(trainer.measure(data.train[::8], 2)))
+        train = measure(trainer, data.train[::8], 2).mean
         # What was spent on looking is no training.
         trainer.restore(seconds, trainer.hard)
         rows.append(

@@ -18,6 +18,7 @@ from nerg_mi.capture.images import View
 from nerg_mi.capture.undistort import pinhole, through_lens
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import make_folder
+from nerg_mi.maths.color_fit import psnr_of_fitted_half
 from nerg_mi.maths.psnr import psnr
 from nerg_mi.view.tonemap import srgb, write_png
 
@@ -154,6 +155,8 @@ class ViewScores:
     psnr: list[float]
     # Of each view.
     ssim: list[float]
+    # Of the right half of each view in dB, its colours fitted on the left half.
+    psnr_fitted: list[float]
     # Means over the views with true depth; None where there are none.
     depth: DepthScore | None
 
@@ -162,12 +165,17 @@ class ViewScores:
         return float(np.mean(self.psnr))
 
     @property
+    def psnr_fitted_mean(self) -> float:
+        return float(np.nanmean(self.psnr_fitted))
+
+    @property
     def ssim_mean(self) -> float:
         return float(np.mean(self.ssim))
 
     def to_dict(self) -> dict:
         """For JSON: the fields and the means; without ``depth`` where it is None."""
-        names = "views", "width", "height", "spp", "psnr", "psnr_mean", "ssim", "ssim_mean"
+        names = ["views", "width", "height", "spp", "psnr", "psnr_mean", "ssim", "ssim_mean"]
+        names += ["psnr_fitted", "psnr_fitted_mean"]
         out = {name: getattr(self, name) for name in names}
         return out if self.depth is None else out | {"depth": asdict(self.depth)}
 
@@ -189,20 +197,23 @@ def score_views(
     for k, view in enumerate(views):
         seen, truth = render(view.camera, k), view.over(0)
         mask = seen.mask if view.mask is None else seen.mask & view.mask
-        rows.append((psnr(seen.color, truth, mask), ssim(seen.color, truth, mask)))
+        alpha = view.color[..., 3] if view.has_alpha else None
+        fitted = psnr_of_fitted_half(seen.color, truth, alpha, mask)
+        rows.append((psnr(seen.color, truth, mask), ssim(seen.color, truth, mask), fitted))
         if view.depth is not None:
             depths.append(depth_score(seen.depth, seen.opacity, np.where(mask, view.depth, 0)))
         if pictures is not None:
             write_png(pictures / f"{Path(view.name).stem}.png", np.concatenate([seen.color, truth], axis=1))
-        on_view(view.name, *rows[-1])
+        on_view(view.name, *rows[-1][:2])
     known = [d for d in depths if d is not None]
     return ViewScores(
         views=[v.name for v in views],
         width=views[0].shape[1],
         height=views[0].shape[0],
         spp=spp,
-        psnr=[p for p, _ in rows],
-        ssim=[s for _, s in rows],
+        psnr=[r[0] for r in rows],
+        ssim=[r[1] for r in rows],
+        psnr_fitted=[r[2] for r in rows],
         depth=_mean_depth_score(known) if known else None,
     )
 

@@ -21,6 +21,9 @@ from .backend import select_backend
 from .options.radiance import RadianceOptions, RadianceScoreOptions
 from .reporter import SILENT, Reporter
 
+# Photos whose exposures differ by less than this, which nobody sees, are not told of.
+_STOPS = 0.05
+
 
 @dataclass(frozen=True)
 class RadianceResult:
@@ -90,7 +93,11 @@ def train_radiance(
 def _settings(options: RadianceOptions) -> RadianceSettings:
     minutes = 5.0 if options.minutes is None and options.steps is None else options.minutes
     given = RadianceSettings(
-        steps=options.steps, minutes=minutes, seed=options.seed, distortion_weight=options.distortion_weight
+        steps=options.steps,
+        minutes=minutes,
+        seed=options.seed,
+        distortion_weight=options.distortion_weight,
+        photo_colors=options.photo_colors,
     )
     return given if options.depth_weight is None else replace(given, depth_weight=options.depth_weight)
 
@@ -135,7 +142,12 @@ def _tell_result(result: RadianceResult, reporter: Reporter) -> None:
     speed = f"; {about['evaluations_a_second']:.3g} field evaluations a second" if about["steps"] else ""
     reporter.message(f"{about['steps']} steps in {about['seconds']:.0f} s{speed}")
     if result.psnr is not None:
-        reporter.message(f"held-out PSNR: {result.psnr:.2f} dB")
+        fitted = about["psnr_held_out"]["mean_fitted"]
+        reporter.message(
+            f"held-out PSNR: {result.psnr:.2f} dB; of right halves, colours fitted on left ones: {fitted:.2f} dB"
+        )
+    if about.get("photo_stops", 0) >= _STOPS:
+        reporter.message(f"the photos' exposures differ by {about['photo_stops']:.2f} stops (standard deviation)")
     if "beyond_box" in about:
         reporter.message(f"{about['beyond_box']:.0%} of the watched pixels show what lies beyond the box")
     for complaint in about["complaints"]:
@@ -189,6 +201,7 @@ def evaluate_radiance(
     reporter.message(f"{'view':32s} {'PSNR dB':>8s} {'SSIM':>7s}")
     scores = score_views(field, views, options.spp, pictures, scored)
     row("mean", scores.psnr_mean, scores.ssim_mean)
+    reporter.message(f"PSNR of right halves, their colours fitted on left ones: {scores.psnr_fitted_mean:.2f} dB")
     if scores.depth is not None:
         d = scores.depth
         reporter.message(

@@ -55,7 +55,8 @@ def test_scores_without_any_file(place):  # noqa: F811
     scores = evaluate_radiance(place / "cube.safetensors", place, RadianceScoreOptions(holdout=2, spp=4), told)
     assert set(place.iterdir()) == before
     assert scores.psnr_mean == pytest.approx(np.mean(scores.psnr)) and scores.depth is None and scores.spp == 4
-    assert len(told.messages) == len(scores.views) + 2 and told.messages[-1].startswith("mean")
+    assert len(told.messages) == len(scores.views) + 3 and told.messages[-2].startswith("mean")
+    assert told.messages[-1].endswith(f"{np.mean(scores.psnr_fitted):.2f} dB")
 
 
 def test_views_that_were_trained_on_are_no_held_out_views(place):  # noqa: F811

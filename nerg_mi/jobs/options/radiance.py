@@ -43,6 +43,7 @@ class RadianceOptions(PhotoOptions):
     depth: bool = option(True, "Supervise with the data set's depth, where it has any.")
     depth_weight: float | None = option(None, "Weight of the depth's loss.")
     distortion_weight: float = option(0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.")
+    photo_colors: bool = option(True, "Learn the exposure and white balance of each photo.")
     resume: bool = option(False, "Go on with the interrupted run of this output.")
     save_every: float = option(60.0, "Seconds between two states for --resume; 0: only one, when it ends early.")
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

@@ -28,6 +28,7 @@ class PixelBatch:
     rgb: Array3f
     alpha: Float | None
     depth: Float | None
+    frame: UInt32
 
 
 class PixelBank:
@@ -118,8 +119,8 @@ class PixelBank:
         if self._depth is not None:
             low, high = (ns.Float(dr.gather(ns.UInt8, self._depth, index * 2 + k)) for k in range(2))
             depth = (low + 256 * high) * dr.gather(ns.Float, self._depth_unit, frame)
-        dr.eval(o, d, rgb, alpha, depth)
-        return PixelBatch(o, d, rgb, alpha, depth)
+        dr.eval(o, d, rgb, alpha, depth, frame)
+        return PixelBatch(o, d, rgb, alpha, depth, frame)
 
     def _locate(self, index):
         """Frame, column and row (UInt32) of the pixels at ``index``."""

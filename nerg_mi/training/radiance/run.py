@@ -19,6 +19,8 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.training.common.run_state import kept_unless, load_run, save_run
 
 from .coverage import share_beyond
+from .held_out import measure
+from .photo_colors import PHOTOS
 from .settings import RadianceSettings
 from .trainer import RadianceTrainer
 from .verdict import complaints
@@ -150,13 +152,16 @@ def _result(
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         **trainer.clock.summary(),
     }
+    if trainer.photos is not None:
+        provenance["photo_stops"] = round(trainer.photos.stops(trainer.averaged[PHOTOS]), 3)
     if dataset.held_out:
         every = trainer.pixels_within(dataset.held_out, _FINAL_SAMPLES)
-        psnr = trainer.measure(dataset.held_out, every, field)
+        error = measure(trainer, dataset.held_out, every, field)
         provenance["psnr_held_out"] = {
-            "mean": round(float(np.mean(psnr)), 3),
+            "mean": round(error.mean, 3),
+            "mean_fitted": round(error.mean_fitted, 3),
             "every_pixel": every,
-            "views": {v.name: round(p, 3) for v, p in zip(dataset.held_out, psnr)},
+            "views": {v.name: round(p, 3) for v, p in zip(dataset.held_out, error.psnr)},
         }
         _look(trainer, watched, history, field)
         if field.box.contracted:
@@ -172,7 +177,7 @@ def _result(
 def _look(trainer: RadianceTrainer, watched: list[View], history: list, field: RadianceField | None = None) -> float:
     """The error on the ``watched`` views, added to ``history``: every so many pixels, as many as take little time."""
     every, seconds = trainer.pixels_within(watched, _LOOK_SAMPLES), trainer.seconds
-    psnr = float(np.nanmean(trainer.measure(watched, every, field)))
+    psnr = measure(trainer, watched, every, field).mean
     history.append({"steps": trainer.steps, "seconds": round(seconds, 1), "psnr": round(psnr, 2), "every_pixel": every})
     return psnr
 

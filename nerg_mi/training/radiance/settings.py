@@ -92,6 +92,10 @@ class RadianceSettings:
     # Weight of the mean square of the hash grid's features, which lets go of what few rays have shaped (Barron et al.
     # 2023, Zip-NeRF, there level by level).
     grid_decay: float = 0.1
+    # Whether each photo has an exposure and a white balance of its own.
+    photo_colors: bool = True
+    # Weight of the squares of how far they are from the average, the mean over the photos.
+    photo_decay: float = 0.01
     # Weight of the depth terms where depth is known.
     depth_weight: float = 0.02
     # What ``depth_weight`` falls to, times itself.
@@ -108,7 +112,7 @@ class RadianceSettings:
             raise NergError("give the length of the training either in steps or in minutes")
         if (self.steps or self.minutes or 0) <= 0:
             raise NergError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
-        given = self.depth_weight, self.distortion_weight, self.grid_decay
+        given = self.depth_weight, self.distortion_weight, self.grid_decay, self.photo_decay
         if min(given) < 0:
             raise NergError(f"weights of losses must be 0 or more, got {', '.join(map(str, given))}")
         if not (self.thin_sure > 0 and 0 < self.thin_least <= 1):

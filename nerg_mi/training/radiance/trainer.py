@@ -20,7 +20,6 @@ from nerg_mi.field.backend import aligned
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.contraction import AnyBox
-from nerg_mi.maths.psnr import psnr
 from nerg_mi.maths.types import Float, UInt32
 from nerg_mi.training.common.step_clock import StepClock
 
@@ -29,6 +28,7 @@ from .density_grid import DensityGrid
 from .losses import color_loss, composite, depth_loss, distortion_loss, feature_decay
 from .model import density, density_color, density_of
 from .pace import adapted_rays, affordable_rays, refined
+from .photo_colors import PHOTOS, PhotoColors
 from .pixels import PixelBank
 from .preview import Preview, render_view
 from .sampling import StepTable, Thinning, rays_in_box, visible_samples
@@ -63,8 +63,11 @@ class RadianceTrainer:
         self.pixels = PixelBank(ns, views)
         self.use_depth = depth and self.pixels.has_depth
         self.live = RadianceField.random(config, box, ns, settings.seed)
-        self.optimiser = Adam(settings.learning_rate, self.live.parameters(), beta_2=0.99, epsilon=1e-15)
-        self.averaged = {k: type(v)(dr.detach(v)) for k, v in self.live.parameters().items()}
+        # One photo has nothing to differ from.
+        self.photos = PhotoColors(ns, len(views)) if settings.photo_colors and len(views) > 1 else None
+        start = self.live.parameters() | ({} if self.photos is None else {PHOTOS: self.photos.start()})
+        self.optimiser = Adam(settings.learning_rate, start, beta_2=0.99, epsilon=1e-15)
+        self.averaged = {k: type(v)(dr.detach(v)) for k, v in start.items()}
         self.march_step = settings.march_step * box.side
         self.grid = DensityGrid(
             ns,
@@ -141,7 +144,8 @@ class RadianceTrainer:
         return density_of(self.config, self.box, now, p, features), features
 
     def _parameters(self) -> dict:
-        return {k: self.optimiser[k] for k in self.averaged}
+        """The weights of the field, with their derivatives."""
+        return {k: self.optimiser[k] for k in self.live.parameters()}
 
     def step(self) -> None:
         """Draw rays, march, composite, and move the weights once."""
@@ -230,6 +234,11 @@ class RadianceTrainer:
         dr.eval(sigma, rgb)
         self.clock.count(s.batch)
         weight, tau, color, opacity = composite(sigma, rgb, samples)
+        total = 0
+        if self.photos is not None:
+            changes = self.photos.changes(self.optimiser[PHOTOS])
+            color = self.photos.apply(changes, color, opacity, pixels.frame)
+            total = s.photo_decay * self.photos.decay(changes)
         loss = color_loss(color, opacity, pixels, background, s.huber)
         if self.use_depth:
             # In units of the step at hand: while marching is coarse, no more can be asked for.
@@ -245,7 +254,7 @@ class RadianceTrainer:
             loss += s.distortion_weight * distortion_loss(weight, samples, self.box.side)
         complete = dr.arange(ns.UInt32, self.rays) < dr.opaque(ns.UInt32, covered)
         loss = dr.sum(dr.select(complete, loss, 0)) / dr.opaque(ns.Float, covered)
-        total = loss + self._clear(parameters)
+        total += loss + self._clear(parameters)
         for name, value in parameters.items():
             if name.startswith("grid."):
                 total = total + s.grid_decay * feature_decay(value.array if dr.is_tensor_v(value) else value)
@@ -308,25 +317,16 @@ class RadianceTrainer:
         return samples, dr.gather(ns.Array3f, samples.p, seen)
 
     def pixels_within(self, views: list[View], samples: int) -> int:
-        """The ``every`` of `measure` with which ``views`` take about so many ``samples``, by those of the last step's
+        """The ``every`` of `render` with which ``views`` take about so many ``samples``, by those of the last step's
         rays."""
         rays = sum(v.pixels.shape[0] * v.pixels.shape[1] for v in views)
         return max(1, int(np.ceil((rays * max(self.looked * self.stride, 1) / samples) ** 0.5)))
 
-    def measure(self, views: list[View], every: int = 1, field: RadianceField | None = None) -> list[float]:
-        """PSNR in dB on each of ``views``, before black, on every ``every``-th pixel of those that their masks leave
-        in.
+    def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
+        """Every ``every``-th pixel of ``view`` by the trainer's own marcher.
 
         Of ``field``, by its own occupancy; without one, of the averaged weights so far.
         """
-        field, part = field or self.field(bound=False), (slice(every // 2, None, every),) * 2
-        return [
-            psnr(self.render(v, every, field).color, v.over(0)[part], None if v.mask is None else v.mask[part])
-            for v in views
-        ]
-
-    def render(self, view: View, every: int = 1, field: RadianceField | None = None) -> Preview:
-        """``view`` by the trainer's own marcher; ``every`` and ``field`` as `measure` has them."""
         field, occupied = field or self.field(bound=False), self.grid.occupied
         bound = field.occupancy
         if bound is not None:
@@ -337,7 +337,7 @@ class RadianceTrainer:
         """The field with averaged weights. ``bound``: with the occupancy that rendering may rest on."""
         growth = self.settings.growth if self.box.contracted else 0.0
         out = RadianceField.random(self.config, self.box, self.ns, 0, march_step=self.march_step, march_growth=growth)
-        out.set_parameters({k: type(v)(v) for k, v in self.averaged.items()})
+        out.set_parameters({k: type(v)(v) for k, v in self.averaged.items() if k != PHOTOS})
         if bound:
             with dr.suspend_grad():
                 out.occupancy = self.grid.bound(out.density, np.random.default_rng(self.settings.seed), self._lit)

@@ -8,6 +8,7 @@ import pytest
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.images import View
 from nerg_mi.maths.contraction import ContractedBox
+from nerg_mi.training.radiance.held_out import measure
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.trace import trace_depth
@@ -42,11 +43,11 @@ def poses(count):
 @pytest.fixture(scope="module")
 def trained():
     views = [before_a_wall(pose) for pose in poses(44)]
-    trainer = RadianceTrainer(views[4:], ContractedBox(BOX, 32), TINY, settings(steps=300), ns)
+    trainer = RadianceTrainer(views[4:], ContractedBox(BOX, 32), TINY, settings(steps=300, photo_colors=False), ns)
     while trainer.progress < 1:
         trainer.step()
     field = trainer.field()
-    return field, np.mean(trainer.measure(views[:4], 1, field)), trainer
+    return field, measure(trainer, views[:4], 1, field).mean, trainer
 
 
 @pytest.mark.slow
