@@ -14,11 +14,12 @@
 #   make coverage  all tests, and which branches of the package they reach
 #   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
 #   make mutants   judge the tests by 400 small mistakes in the source, resuming where it stopped (about an hour at first)
+#   make mendings  bring faults of the past back, one at a time: the tests that look for each must fail (half an hour)
 #   make faults    kill commands at moments spread over their run, fill disks, forbid folders: nothing may be lost
 #   make soak      thousands of frames and steps: memory may not grow
 #   make packages  build the packages, install and try them with every Python that is here
 #
-# The last six print a table; ARGS="--update docs/trust.md" puts it there. Set-up is done once: the second run of any of
+# The last seven print a table; ARGS="--update docs/trust.md" puts it there. Set-up is done once: the second run of any of
 # these only does its own work.
 
 PYTHON ?= python3
@@ -30,12 +31,12 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
-.PHONY: demo test check lint types format docs onecore coverage fuzz mutants faults soak packages setup
+.PHONY: demo test check lint types format docs onecore coverage fuzz mutants mendings faults soak packages setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
 
-test check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
+test check onecore coverage fuzz mutants mendings faults soak packages: EXTRAS = test
 
 test: setup
 	$(PYTEST) $(ARGS)
@@ -68,7 +69,7 @@ onecore: setup
 coverage: setup
 	$(RUN) -m tools.branches $(ARGS)
 
-fuzz mutants faults soak packages: setup
+fuzz mutants mendings faults soak packages: setup
 	$(RUN) -m tools.$@ $(ARGS)
 
 setup:

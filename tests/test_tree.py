@@ -9,6 +9,7 @@ from tools.mirror import without_tests
 
 LONGEST = 350
 
+_MENDINGS = "a list only: tests/tools/test_mendings.py holds it to the sources, the tests and the page"
 _OPTIONS = "only fields: tests/jobs/test_options.py looks at every one, and each job's tests set them"
 
 TESTED_ELSEWHERE: dict[str, str] = {
@@ -28,6 +29,9 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/jobs/options/study.py": _OPTIONS,
     "nerg_mi/maths/types.py": "names for signatures",
     "nerg_mi/transport/media/local_ray.py": "only fields: tests/transport/media/test_protocol.py makes them",
+    "tools/mending/__init__.py": _MENDINGS,
+    "tools/mending/outputs.py": _MENDINGS,
+    "tools/mending/scenes.py": _MENDINGS,
     "tools/mutation/changes.py": "tables only: tests/tools/mutation/test_sites.py finds a mistake of every kind",
 }
 """Modules without a file of tests of their own -> where and why."""

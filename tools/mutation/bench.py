@@ -43,11 +43,16 @@ class Bench:
         return self
 
     def __exit__(self, *error) -> None:
+        self.stop()
+        shutil.rmtree(self.tree, ignore_errors=True)
+        self.log.unlink(missing_ok=True)
+
+    def stop(self) -> None:
+        """End the worker; the next run starts another, which imports what stands in the copy by then."""
         if self.worker is not None:
             self.worker.kill()
             self.worker.wait()
-        shutil.rmtree(self.tree, ignore_errors=True)
-        self.log.unlink(missing_ok=True)
+            self.worker = None
 
     def _start(self) -> None:
         environment = {

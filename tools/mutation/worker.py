@@ -5,7 +5,8 @@
 runs in TREE, a copy of the repository, and answers each line of JSON on its input with one on its output. A request:
 `tests` (pytest's arguments), `limit` (seconds), `log` (a file for what the tests print), `record` (a file to write
 into which tests execute which lines, or null). An answer: `outcome` ("passed", "failed", "hang", "crash"), `by` (what
-failed first), `seconds`. A child in which a module of the project came from another place than TREE ends the worker.
+failed first), `ran` (how many tests were not skipped), `seconds`. A child in which a module of the project came from
+another place than TREE ends the worker.
 """
 
 from __future__ import annotations
@@ -82,6 +83,11 @@ class Watch:
         if report.failed and self.first is None:
             self.first = report.nodeid
 
+    @property
+    def ran(self) -> int:
+        """How many tests were not skipped."""
+        return sum(entry["outcome"] != "skipped" for entry in self.tests.values())
+
     def lines(self) -> dict[str, dict[str, list[int]]]:
         """Source file -> test (or file of tests) -> lines."""
         data = self.coverage.get_data()
@@ -134,7 +140,7 @@ def run_tests(tree: Path, request: dict, answer: int) -> int:
     if stray:
         print("not from the tree under test:", *stray, sep="\n")
         return STRAY
-    os.write(answer, json.dumps({"status": int(status), "by": watch.first}).encode())
+    os.write(answer, json.dumps({"status": int(status), "by": watch.first, "ran": watch.ran}).encode())
     return 0
 
 
@@ -182,16 +188,16 @@ def serve(tree: Path, requests, answers) -> None:
         if status == STRAY:
             raise SystemExit(f"tests ran on another tree: see {request['log']}")
         if status is None:
-            answer = {"outcome": "hang", "by": None}
+            answer = {"outcome": "hang", "by": None, "ran": 0}
         elif status != 0 or not text:
-            answer = {"outcome": "crash", "by": None}
+            answer = {"outcome": "crash", "by": None, "ran": 0}
         else:
             told = json.loads(text)
             # A file that cannot be imported any more leaves pytest without the test that it was told to run.
             outcome = {0: "passed", 1: "failed", 2: "failed", 5: "none"}.get(
                 told["status"], "failed" if told["by"] else "error"
             )
-            answer = {"outcome": outcome, "by": told["by"]}
+            answer = {"outcome": outcome, "by": told["by"], "ran": told["ran"]}
         print(json.dumps({**answer, "seconds": round(seconds, 2)}), file=answers, flush=True)
 
 
