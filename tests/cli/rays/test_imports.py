@@ -188,6 +188,8 @@ def test_a_wrong_tick_is_told_and_nothing_is_nan(tmp_path, tick, words):
     )
     said = " ".join(done.output.split())
     assert done.exit_code == 0 and "nan" not in said and words in said, said
+    # People have rays at many times, however far apart these are taken to be.
+    assert f"{1 / (20 * tick):.4g} rays a second" in said and "at two times" not in said, said
     assert ("implausible" in said) == bool(words)
 
 
