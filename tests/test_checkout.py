@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -17,6 +18,15 @@ from tests.conftest import ROOT
 # Where the dependencies are: without the site module nothing of that folder's .pth files, and so no editable
 # installation, counts.
 SITE = Path(numpy.__file__).parents[1]
+
+
+@pytest.fixture
+def clone(tmp_path):
+    """The checkout as it is cloned: nothing within the package but what is committed there."""
+    for name in ("nerg_mi", *checkout.FOLDERS):
+        others = checkout.FOLDERS if name == "nerg_mi" else ()
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__", "build", *others))
+    return tmp_path
 
 
 def uninstalled(code: str, folder: Path, **environment):
@@ -47,12 +57,12 @@ USE = """
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
-def test01_plugins_and_scenes_are_found(tmp_path, elsewhere):
-    done = uninstalled(USE, tmp_path, PYTHONPATH=str(ROOT)) if elsewhere else uninstalled(USE, ROOT)
+def test01_plugins_and_scenes_are_found(clone, elsewhere):
+    done = uninstalled(USE, Path("/"), PYTHONPATH=str(clone)) if elsewhere else uninstalled(USE, clone)
     assert done.returncode == 0, done.stderr
     kind, files = done.stdout.strip().splitlines()[-2:]
     assert kind == "NergIntegrator"
-    assert files.split() == [str(ROOT / "plugins" / "nerg.py"), str(ROOT / "scenes" / "store" / "layout.py")]
+    assert files.split() == [str(clone / "plugins" / "nerg.py"), str(clone / "scenes" / "store" / "layout.py")]
 
 
 def test02_nothing_else_becomes_part_of_the_package():
