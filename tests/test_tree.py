@@ -30,8 +30,11 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/maths/types.py": "names for signatures",
     "nerg_mi/transport/media/local_ray.py": "only fields: tests/transport/media/test_protocol.py makes them",
     "tools/mending/__init__.py": _MENDINGS,
+    "tools/mending/house.py": _MENDINGS,
     "tools/mending/outputs.py": _MENDINGS,
+    "tools/mending/readers.py": _MENDINGS,
     "tools/mending/scenes.py": _MENDINGS,
+    "tools/mending/trainings.py": _MENDINGS,
     "tools/mutation/changes.py": "tables only: tests/tools/mutation/test_sites.py finds a mistake of every kind",
 }
 """Modules without a file of tests of their own -> where and why."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import outputs, scenes
+from . import house, outputs, readers, scenes, trainings
 
-MENDINGS = (*outputs.MENDINGS, *scenes.MENDINGS)
+MENDINGS = (*outputs.MENDINGS, *trainings.MENDINGS, *scenes.MENDINGS, *readers.MENDINGS, *house.MENDINGS)
 """All of them, in the order of the table on the page."""
