@@ -14,7 +14,7 @@
 #   make coverage  all tests, and which branches of the package they reach
 #   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
 #   make mutants   judge the tests by 400 small mistakes in the source, resuming where it stopped (about an hour at first)
-#   make mendings  bring faults of the past back, one at a time: the tests that look for each must fail (half an hour)
+#   make mendings  bring faults of the past back, one at a time: the tests that look for each must fail (a quarter of an hour)
 #   make faults    kill commands at moments spread over their run, fill disks, forbid folders: nothing may be lost
 #   make soak      thousands of frames and steps: memory may not grow
 #   make packages  build the packages, install and try them with every Python that is here

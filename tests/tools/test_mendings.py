@@ -14,6 +14,13 @@ from tools.mending.reversal import held, undo
 REVERSALS = [r for m in MENDINGS for r in m.reversals]
 
 
+def rows_of_the_page() -> list[list[str]]:
+    """The cells of each row of the table under the heading of the mendings."""
+    text = (ROOT / "docs" / "trust.md").read_text(encoding="utf-8")
+    part = text.split(f"## {mendings.HEADING}\n")[1].split("\n## ")[0]
+    return [line.strip("| ").split(" | ") for line in part.splitlines() if line.startswith("| ")][2:]
+
+
 @pytest.mark.parametrize("reversal", REVERSALS, ids=lambda r: r.undone)
 def test_what_is_replaced_stands_once_in_the_sources(reversal):
     for file, text in reversal.sources(lambda file: (ROOT / file).read_text(encoding="utf-8")).items():
@@ -31,6 +38,16 @@ def test_tests_that_are_named_exist():
 def test_every_reversal_is_one_of_its_own_and_has_tests():
     assert len({m.held for m in MENDINGS}) == len(MENDINGS) and all(r.tests and r.changes for r in REVERSALS)
     assert len({r.changes for r in REVERSALS}) == len(REVERSALS)
+
+
+def test_the_page_has_the_rows_of_the_list():
+    """Its last column is what a run came to: every test passes with its mending and fails without."""
+    rows = rows_of_the_page()
+    assert [r[0] for r in rows] == [m.held for m in MENDINGS]
+    for cells, mending in zip(rows, MENDINGS):
+        count = sum(len(r.tests) for r in mending.reversals)
+        trials = [mendings.Trial("", True, True)] * count
+        assert cells == mendings.row(mending, trials)
 
 
 class Told:
