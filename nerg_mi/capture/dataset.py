@@ -15,13 +15,16 @@ from .bounds import Extent, place_extent, unmatched
 from .cameras import pixel_directions
 from .images import View, load_usable
 from .posed import PosedImages, Unused
-from .sources import read_split
+from .sources import read_split, up_of
+from .upright import Up
 
 # A surface on a face of the box needs cells behind it: rays end at the box, and a half step before it nothing can
 # absorb.
 _PAD = 1 / 80
 # Of each view's depth, at most so many points help to find the box.
 _DEPTH_POINTS = 2000
+# Up by how cameras are held, where no floor helps, is not better known than to so many degrees.
+_LEVEL = 10.0
 _KINDS = {
     "object": "an object before nothing",
     "room": "a bounded place",
@@ -51,6 +54,8 @@ class Dataset:
     unit: str = ""
     # What kind of place it was taken for, and why, a sentence.
     kind: str = ""
+    # Which way is up, a sentence.
+    up: str = ""
 
 
 def open_dataset(
@@ -108,9 +113,12 @@ def open_dataset(
         "height": train[0].shape[0],
         "to_file": split.posed.to_file.tolist(),
     }
+    up = up_of(split.posed)
+    if up.sure:
+        source["up"] = [round(float(x), 6) for x in up.direction]
     kind = f"{_KINDS[extent.kind]}: {extent.why}"
     unit = _unit(split.posed, train, extent.box.core, scale)
-    return Dataset(train, held_out, extent.box, extent.how, unused, source, split.posed.notes, unit, kind)
+    return Dataset(train, held_out, extent.box, extent.how, unused, source, split.posed.notes, unit, kind, _up(up))
 
 
 def _extent(posed: PosedImages, views: list[View], aabb, unbounded: bool | None) -> Extent:
@@ -156,6 +164,20 @@ def _depth_points(views: list[View]) -> np.ndarray | None:
 
 def _corners(box: AnyBox) -> str:
     return " to ".join("(" + ", ".join(f"{x:.3g}" for x in c) + ")" for c in (box.lower, box.upper))
+
+
+def _up(up: Up) -> str:
+    """What is known of up, and what to do where it is not +z."""
+    if not up.sure:
+        return f"the cameras do not agree on what is up (rolled by {up.roll:.0f} degrees, median)"
+    off = float(np.degrees(np.arccos(np.clip(up.direction[2], -1, 1))))
+    if off <= _LEVEL:
+        return f"up is +z to {off:.1f} degrees ({up})"
+    direction = ", ".join(f"{x:.2f}" for x in up.direction)
+    return (
+        f"up is ({direction}), {off:.0f} degrees from +z, which it is for tracking ({up}); --coordinates upright turns "
+        "the place"
+    )
 
 
 def _unit(posed: PosedImages, views: list[View], box: AnyBox, scale: float) -> str:

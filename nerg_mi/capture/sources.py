@@ -13,9 +13,10 @@ from .colmap import model_files, read_colmap
 from .images import split_holdout
 from .posed import Frame, PosedImages, Unused
 from .transforms import read_dataparser, read_transforms
+from .upright import Up, find_up, turn_to_z
 
 _MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
-COORDINATES = ("file", "original")
+COORDINATES = ("file", "upright", "original")
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,8 @@ def read_split(
 
     ``holdout``: every so many frames, 0 none. None: the frames of a ``transforms_test.json`` or else
     ``transforms_val.json`` beside the file, or those that the file itself lists for testing, or every 8th.
-    ``coordinates``: "file"; "original", before the writer applied its ``applied_transform``; or a
+    ``coordinates``: "file"; "upright", those turned about their origin so that up is +z, as cameras and points tell
+    (`find_up`); "original", before the writer applied its ``applied_transform``; or a
     ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that.
     ``allow_outside``: as `read_posed` has it.
     """
@@ -114,6 +116,12 @@ def read_split(
     return Split(replace(posed, frames=train), held, f"every {every}th frame" if every else "none")
 
 
+def up_of(posed: PosedImages) -> Up:
+    """Up, as the cameras of ``posed`` are held and as its points lie."""
+    points = np.zeros((0, 3)) if posed.points is None else posed.points
+    return find_up(np.stack([f.to_world for f in posed.frames]), points)
+
+
 def _test_file(source: Path) -> Path | None:
     if not source.is_file():
         return None
@@ -131,6 +139,9 @@ def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarra
     original = np.eye(4) if posed.original is None else posed.original
     if coordinates == "file":
         to = np.eye(4)
+    elif coordinates == "upright":
+        to = np.eye(4)
+        to[:3, :3] = turn_to_z(up_of(posed).direction)
     elif coordinates == "original":
         if posed.original is None:
             raise NergError(

@@ -125,6 +125,7 @@ def _tell_about(data: Dataset, reporter: Reporter) -> None:
     reporter.message(f"taken for {data.kind}; --unbounded, --bounded or --aabb say otherwise")
     reporter.message(f"box: ({corner(core.lower)}) to ({corner(core.upper)}), {data.box_from}")
     reporter.message(data.unit)
+    reporter.message(data.up)
     reporter.message(
         f"{len(data.train)} views to train on, {len(data.held_out)} held out, "
         f"{data.source['width']} x {data.source['height']} pixels"

@@ -76,3 +76,53 @@ def test_coordinates_of_a_nerfstudio_training(tmp_path, rgb):
     for view, pose in zip(data.train, cameras()):
         assert np.allclose(view.camera.center, 0.25 * (turn @ pose[:, 3] + [1, 2, 3]))
         assert np.allclose(view.camera.to_world[:3, :3], turn @ opengl(pose)[:3, :3])
+
+
+def tip(content, turn):
+    """Turn all frames of a transforms file by the rotation ``turn``."""
+    for frame in content["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3] = turn @ pose[:3]
+        frame["transform_matrix"] = pose.tolist()
+
+
+def test_upright_coordinates_have_up_along_z(ring):
+    level = open_dataset(ring, holdout=0)
+    assert level.up.startswith("up is +z") and np.allclose(level.source["up"], [0, 0, 1], atol=0.02)
+    turn = Rotation.from_euler("xyz", [100, -30, 70], degrees=True).as_matrix()
+    rewrite(ring, lambda c: tip(c, turn))
+    tipped = open_dataset(ring, holdout=0)
+    assert "--coordinates upright" in tipped.up and "degrees from +z" in tipped.up
+    assert np.allclose(tipped.source["up"], turn[:, 2], atol=0.02)
+    data = open_dataset(ring, holdout=0, coordinates="upright")
+    assert data.up.startswith("up is +z to 0.0") and np.allclose(data.source["up"], [0, 0, 1], atol=1e-5)
+    back = np.array(data.source["to_file"])
+    for a, b, c in zip(data.train, tipped.train, level.train):
+        assert np.allclose(back @ a.camera.to_world, b.camera.to_world, atol=1e-6)
+        assert np.allclose(a.camera.to_world[2], c.camera.to_world[2], atol=0.02)
+
+
+def test_cameras_that_do_not_agree_on_up_say_so(ring):
+    def roll(content):
+        for k, frame in enumerate(content["frames"]):
+            about = np.eye(4)
+            about[:3, :3] = Rotation.from_euler("z", 80 * (-1) ** k * (k % 3), degrees=True).as_matrix()
+            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ about).tolist()
+
+    rewrite(ring, roll)
+    data = open_dataset(ring, holdout=0)
+    assert data.up.startswith("the cameras do not agree") and "up" not in data.source
+
+
+def test_held_out_frames_of_a_file_of_their_own_are_turned_alike(ring):
+    turn = Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    rewrite(ring, lambda c: tip(c, turn))
+    content = json.loads((ring / "transforms.json").read_text())
+    test = {**content, "frames": content["frames"][6:]}
+    (ring / "transforms_test.json").write_text(json.dumps(test))
+    data = open_dataset(ring, coordinates="upright")
+    whole = open_dataset(ring, holdout=0, coordinates="upright")
+    everywhere = {v.name: v.camera.to_world for v in whole.train}
+    assert len(data.held_out) == 3
+    for view in [*data.train, *data.held_out]:
+        assert np.allclose(view.camera.to_world, everywhere[view.name], atol=1e-6)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from nerg_mi.capture.dataset import open_dataset
 from nerg_mi.capture.structure.reconstruction import Reconstruction
-from nerg_mi.capture.structure.upright import Up
+from nerg_mi.capture.upright import Up
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import poses as job
 from nerg_mi.jobs.options.poses import PoseOptions

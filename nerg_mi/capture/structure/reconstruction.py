@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.capture.upright import Up
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.atomic import write_text
 
 from .pairs import chosen_pairs
 from .pictures import Picture, cameras_of
-from .upright import Up
 
 LENSES = {"auto": None, "radial": "SIMPLE_RADIAL", "opencv": "OPENCV"}
 """Names of lenses -> COLMAP's model that is refined; auto: by how many pictures a camera has."""

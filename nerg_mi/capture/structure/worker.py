@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.capture.upright import find_up, turn_to_z
+
 from .pairs import chosen_pairs
 from .pictures import small_name
-from .upright import find_up, turn_to_z
 
 SMALLEST = 3
 """So many pictures a model needs: two of them tell a place from one that is bent."""

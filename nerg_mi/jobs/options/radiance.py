@@ -16,7 +16,8 @@ class PhotoOptions:
     width: int | None = option(None, "Width of the pictures in pixels. Default: as they are, or as it was trained.")
     scale: float = option(1.0, "Multiply all lengths by this: what a unit of the data set measures, in metres.")
     coordinates: str = option(
-        "file", "Of the field: file, original (applied_transform undone), or a dataparser_transforms.json."
+        "file",
+        "Of the field: file, upright (+z up), original (applied_transform undone), a dataparser_transforms.json.",
     )
     allow_outside: bool = option(False, "Read files outside of the data set's folder too, where it names them.")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.capture.structure.upright import find_up, turn_to_z
+from nerg_mi.capture.upright import find_up, turn_to_z
 
 SOME = Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix()
 
