@@ -39,20 +39,22 @@ class ImageHeader:
     bytes: int
 
 
-def check_image(path: str | os.PathLike, what: str = "image") -> ImageHeader:
-    """The header of the picture ``path``; `NergError` where it is damaged, or beyond both `PIXELS` or `DECODED_BYTES`
-    and `WARRANTED` times its file."""
-    length = size_of(path, what)
+def check_image(
+    path: str | os.PathLike, what: str = "image", most: int = PIXELS, most_bytes: int | None = None
+) -> ImageHeader:
+    """The header of the picture ``path``; `NergError` where it is damaged, beyond ``most`` pixels of three bytes and
+    beyond `WARRANTED` times its file, or where the file has more than ``most_bytes``."""
+    length = size_of(path, what, most_bytes)
     with reading(path, what), open(path, "rb") as file:
         header = _header(file, length)
     width, height = header.size
     if not (width > 0 and height > 0):
         raise NergError(f'the {what} "{path}" has {width} x {height} pixels; give one that shows something')
-    pixels, most = (max(limit, WARRANTED * length) for limit in (PIXELS, DECODED_BYTES))
-    if width * height > pixels or header.bytes > most:
+    pixels, decoded = (max(limit, WARRANTED * length) for limit in (most, most * DECODED_BYTES // PIXELS))
+    if width * height > pixels or header.bytes > decoded:
         raise NergError(
             f'the {what} "{path}" has {width:,} x {height:,} pixels, {header.bytes:,} bytes, and at most '
-            f"{pixels:,} pixels and {most:,} bytes are read of a file of {length:,}; make it smaller"
+            f"{pixels:,} pixels and {decoded:,} bytes are read of a file of {length:,}; make it smaller"
         )
     return header
 

@@ -99,7 +99,7 @@ def _copy(
     skipped: list[Unused] = []
     if pictures.is_dir():
         photos, others = list_photos(pictures)
-        copies, unused = copy_photos(photos, folders, options.size, progress)
+        copies, unused = copy_photos(photos, folders, options.size, progress, options.allow_outside)
         skipped = [*others, *unused]
     else:
         copies = copy_frames(pictures, options.frames, folders, options.size, options.threads, progress)

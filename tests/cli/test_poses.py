@@ -71,6 +71,16 @@ def test_errors_take_a_sentence(installed, arguments, words, photos, capsys, mon
     assert code == 1 and words in said and said.count("\n") == 1 and os.listdir(tmp_path) == ["photos"]
 
 
+def test_links_are_followed_only_if_allowed(installed, photos, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(job, "reconstruct", lambda *given: None)
+    (photos / "2.png").rename(tmp_path / "2.png")
+    (photos / "2.png").symlink_to(tmp_path / "2.png")
+    code, _, said = nerg(capsys, photos, "-o", tmp_path / "capture")
+    assert code == 1 and "has 2 pictures" in said and "--allow-outside" in said and said.count("\n") == 1
+    code, _, said = nerg(capsys, photos, "-o", tmp_path / "capture", "--allow-outside")
+    assert code == 1 and "no 3 of the 3 pictures" in said
+
+
 def test_ctrl_c_ends_with_130_and_leaves_nothing(installed, photos, capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(job, "reconstruct", lambda *given: signal.raise_signal(signal.SIGINT))
     code, _, said = nerg(capsys, photos, "-o", tmp_path / "capture")

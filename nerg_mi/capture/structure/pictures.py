@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.files.atomic import write_bytes
+SIDE = 65_500
+"""Longest side of a picture in pixels: that of a JPEG file."""
 
 # As good as telephones write them; colours are not stored more coarsely than brightness.
 _JPEG = dict(format="JPEG", quality=95, subsampling=0)
@@ -51,20 +52,25 @@ def small_size(size: tuple[int, int], longest: int) -> tuple[int, int]:
 def encoded(image: Any, suffix: str) -> bytes:
     """A Pillow image as the bytes of a PNG or JPEG file, by its ``suffix``."""
     out = io.BytesIO()
-    image.convert("RGB").save(out, **(dict(format="PNG") if suffix.lower() == ".png" else _JPEG))
+    _rgb(image).save(out, **(dict(format="PNG") if suffix.lower() == ".png" else _JPEG))
     return out.getvalue()
 
 
-def write_small(path: Path, image: Any, size: tuple[int, int]) -> None:
-    """Write a Pillow image at ``size``, by averaging, as a PNG file."""
+def _rgb(image: Any) -> Any:
+    # Pillow copies a picture that is RGB already.
+    return image if image.mode == "RGB" else image.convert("RGB")
+
+
+def shrunk(image: Any, size: tuple[int, int]) -> bytes:
+    """A Pillow image at ``size``, by averaging, as the bytes of a PNG file."""
     from PIL import Image
 
     out = io.BytesIO()
-    small = image.convert("RGB")
+    small = _rgb(image)
     if small.size != size:
         small = small.resize(size, Image.Resampling.LANCZOS)
     small.save(out, format="PNG", compress_level=1)
-    write_bytes(path, out.getbuffer())
+    return out.getvalue()
 
 
 def cameras_of(pictures: Iterable[Picture], share: bool = True) -> list[int]:

@@ -15,7 +15,7 @@ from nerg_mi.files.bounded import reading, size_of
 from nerg_mi.files.image_header import PIXELS
 
 from .photos import SUFFIXES
-from .pictures import Folders, Picture, encoded, small_name, small_size, write_small
+from .pictures import Folders, Picture, encoded, shrunk, small_name, small_size
 
 # Sharpness is compared at this width: finer, it would be the noise of dark places.
 _WIDTH = 480
@@ -49,7 +49,7 @@ def copy_frames(
         name = f"frame_{len(pictures) + 1:05d}.jpg"
         write_bytes(folders.images / name, encoded(image, ".jpg"))
         small = small_size(image.size, longest)
-        write_small(folders.small / small_name(len(pictures)), image, small)
+        write_bytes(folders.small / small_name(len(pictures)), shrunk(image, small))
         pictures.append(Picture(name, image.size, small, seconds=seconds))
         progress(len(pictures), count)
     return pictures

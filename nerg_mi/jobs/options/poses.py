@@ -23,6 +23,7 @@ class PoseOptions:
     single_camera: bool = option(
         True, "Photos of equal size (and maker, model, focal length, where told) share a camera; else each has its own."
     )
+    allow_outside: bool = option(False, "Follow links that lead out of the folder of photos.")
     orient: bool = option(True, "Turn the place so that up is +z, as far as cameras and a floor tell.")
     seed: int = option(0, "Seed of what is drawn at random.", min=0)
     threads: int | None = option(None, "CPU threads. Default: all.", min=1)

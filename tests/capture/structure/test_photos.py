@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import struct
+import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +121,73 @@ def test_what_cannot_be_used_is_named(folder, folders):
     assert set(unused) == {"b.jpg", "cut.jpg", "empty.png", "text.jpg", "a gif.jpg"}
     assert all("cannot be read" in unused[n] and n in unused[n] for n in set(unused) - {"b.jpg"})
     assert {p.name for p in folders.images.iterdir()} == {"a.jpg", "good.jpg"}
+
+
+def test_pictures_of_other_kinds_are_named_whatever_they_are_called(folder, folders):
+    ramp().save(folder / "a.jpg", "bmp")
+    ramp(seed=1).save(folder / "b.jpg", "png")
+    (folder / "c.jpg").write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["b.jpg"] and 'of the kind "bmp"' in unused["a.jpg"]
+    assert "no picture of a kind that is read" in unused["c.jpg"]
+
+
+def test_links_out_of_the_folder_are_followed_only_if_allowed(folder, folders, tmp_path):
+    ramp().save(tmp_path / "private.jpg")
+    ramp(seed=1).save(folder / "a.jpg")
+    (folder / "b.jpg").symlink_to(tmp_path / "private.jpg")
+    (folder / "c.jpg").symlink_to("a.jpg")
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["a.jpg"] and "same file" in unused["c.jpg"]
+    assert "outside of" in unused["b.jpg"] and "--allow-outside" in unused["b.jpg"]
+    found, _ = copy_photos(list_photos(folder)[0], folders, 24, lambda *now: None, allow_outside=True)
+    assert [p.name for p in found] == ["a.jpg", "b.jpg"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes on Linux alone")
+def test_names_that_cannot_be_stored_are_told(folder, folders):
+    ramp().save(folder / "good.jpg")
+    for k, name in enumerate((b"caf\xe9.jpg", b"two\nlines.jpg", b"\x1b[31m.jpg")):
+        ramp(seed=k + 1).save(folder / os.fsdecode(name))
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["good.jpg"]
+    assert len(unused) == 3 and all("rename it" in reason for reason in unused.values())
+
+
+def test_photos_are_as_large_as_their_bytes_warrant(folder, folders, monkeypatch):
+    ramp().save(folder / "a.png")
+    raw = (folder / "a.png").read_bytes()
+    claim = raw[12:16] + struct.pack(">II", 8193, 8193) + raw[24:29]
+    (folder / "b.png").write_bytes(raw[:12] + claim + zlib.crc32(claim).to_bytes(4, "big") + raw[33:])
+    with (folder / "c.jpg").open("wb") as file:
+        file.truncate((1 << 28) + 1)
+    pictures, unused = copied(folder, folders)
+    assert [p.name for p in pictures] == ["a.png"]
+    assert "8,193 x 8,193 pixels" in unused["b.png"] and "make it smaller" in unused["b.png"]
+    assert "268,435,457 bytes" in unused["c.jpg"]
+    # JPEG, in which it is stored where it is turned, has no longer sides.
+    Image.new("L", (65_501, 1)).save(folder / "d.png")
+    assert "a side of 65,501 pixels" in copied(folder, folders)[1]["d.png"]
+    # Pillow's own limit is lower than what telephones take by now.
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    assert [p.name for p in copied(folder, folders)[0]] == ["a.png"]
+
+
+def test_odd_notes_leave_a_photo_as_it_is(folder, folders):
+    """Of each kind and size: Pillow's own turning writes the notes anew, and fails on some."""
+    entry = lambda *numbers: struct.pack(">HHII", *numbers)
+    notes = [
+        entry(0x0112, 3, 0xFFFFFFFF, 8) + entry(0x8769, 4, 1 << 30, 8),
+        entry(0x0112, 11, 1, 0x7FC00000),
+        entry(0x0112, 2, 4, 0x36363636),
+        entry(0x8769, 4, 1, 8) + entry(0x0112, 5, 1, 8),
+    ]
+    for k, found in enumerate(notes):
+        head = b"Exif\0\0MM\0*\0\0\0\x08" + struct.pack(">H", len(found) // 12)
+        # What follows are the same notes again.
+        ramp(seed=k).save(folder / f"{k}.jpg", exif=head + found + struct.pack(">I", 8))
+    pictures, unused = copied(folder, folders)
+    assert [p.size for p in pictures] == [(48, 32)] * 4 and not unused
 
 
 def test_others_are_named_and_hidden_ones_are_not(folder):

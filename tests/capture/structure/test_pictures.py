@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from nerg_mi.capture.structure.pictures import Picture, cameras_of, encoded, small_name, small_size, write_small
+from nerg_mi.capture.structure.pictures import Picture, cameras_of, encoded, shrunk, small_name, small_size
 
 
 def test_the_longer_side_is_bounded():
@@ -17,14 +17,12 @@ def test_the_longer_side_is_bounded():
     assert small_name(7) == "000007.png"
 
 
-def test_small_copies_are_averages(tmp_path):
+def test_small_copies_are_averages():
     pixels = np.zeros((40, 60, 3), np.uint8)
     pixels[:, ::2] = 200
-    write_small(tmp_path / "a.png", Image.fromarray(pixels), (15, 10))
-    small = np.asarray(Image.open(tmp_path / "a.png"))
+    small = np.asarray(Image.open(io.BytesIO(shrunk(Image.fromarray(pixels), (15, 10)))))
     assert small.shape == (10, 15, 3) and abs(small.astype(int) - 100).max() <= 12
-    write_small(tmp_path / "b.png", Image.fromarray(pixels), (60, 40))
-    assert np.array_equal(np.asarray(Image.open(tmp_path / "b.png")), pixels)
+    assert np.array_equal(np.asarray(Image.open(io.BytesIO(shrunk(Image.fromarray(pixels), (60, 40))))), pixels)
 
 
 @pytest.mark.parametrize("suffix, kind", [(".png", "PNG"), (".JPG", "JPEG"), (".jpeg", "JPEG")])
