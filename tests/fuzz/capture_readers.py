@@ -65,6 +65,20 @@ def _read_dataset(folder: Path) -> object:
     return open_dataset(folder, coordinates=str(coordinates) if coordinates.is_file() else "file")
 
 
+def _make_place(folder: Path) -> None:
+    """With points enough to tell a place from what is around it."""
+    _make_colmap("bin")(folder)
+    p = np.random.default_rng(0).normal(size=(130, 3)) * np.where(np.arange(130) % 5, 1, 50)[:, None]
+    points = [struct.pack("<Q3d3BdQ6i", k, *xyz, 1, 2, 3, 0.5, 3, *range(6)) for k, xyz in enumerate(p)]
+    (folder / "sparse" / "0" / "points3D.bin").write_bytes(struct.pack("<Q", 130) + b"".join(points))
+
+
+def _read_place(folder: Path) -> object:
+    from nerg_mi.capture.dataset import open_dataset
+
+    return [open_dataset(folder, holdout=0, scale=0.5, unbounded=given) for given in (None, True, False)]
+
+
 def _read_salience_set(folder: Path) -> object:
     from nerg_mi.capture.salience.views import open_salience
 
@@ -165,8 +179,15 @@ CAPTURES = [
     Reader("salience of a set", _make_transforms, {"transforms.json": ("json",)}, _read_salience_set),
     Reader("COLMAP binary", _make_colmap("bin"), _BINARIES, _read_dataset),
     Reader("COLMAP text", _make_colmap("txt"), _TEXTS, _read_dataset),
+    Reader("COLMAP place", _make_place, {"sparse/0/points3D.bin": (), "sparse/0/images.bin": ()}, _read_place),
     *(
         Reader(f"picture {name}", _picture(name), {name: kinds}, _read_picture(name))
-        for name, kinds in (("a.png", ()), ("a16.png", ()), ("a.jpg", ()), ("a.exr", ()), ("a.npy", ("npy",)))
+        for name, kinds in (
+            ("a.png", ("png",)),
+            ("a16.png", ("png",)),
+            ("a.jpg", ()),
+            ("a.exr", ()),
+            ("a.npy", ("npy",)),
+        )
     ),
 ]

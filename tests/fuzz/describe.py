@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +13,17 @@ class Reader:
     """``make`` writes a small valid input into an empty folder; ``read`` reads that folder and uses what it gets.
 
     ``targets``: the files in it that are damaged, by name, each with the kinds of structure that damage may keep, of
-    "json", "text", "zip", "gzip", "npy", "safetensors"; bytes are damaged in any case. Both functions import what they
-    need themselves.
+    "json", "text", "zip", "gzip", "npy", "safetensors", "png", "boxes" (of MP4); bytes are damaged in any case. Both
+    functions import what they need themselves. ``needs``: a package that may be missing, without which there is no
+    such reader.
     """
 
     name: str
     make: Callable[[Path], None]
     targets: dict[str, tuple[str, ...]]
     read: Callable[[Path], object]
+    needs: str | None = None
+
+    @property
+    def installed(self) -> bool:
+        return self.needs is None or importlib.util.find_spec(self.needs) is not None

@@ -8,6 +8,7 @@ import json
 import re
 import struct
 import zipfile
+import zlib
 
 from hypothesis import strategies as st
 
@@ -282,4 +283,61 @@ def _safetensors(draw, data: bytes) -> bytes:
     return struct.pack("<Q", len(raw)) + raw + data[8 + size :]
 
 
-_STRUCTURES = {"json": _json, "text": _text, "npy": _npy, "gzip": _gzip, "zip": _zip, "safetensors": _safetensors}
+@st.composite
+def _png(draw, data: bytes) -> bytes:
+    """A chunk is damaged, left out, or stands twice, and its checksum is right."""
+    chunks, at = [], 8
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
+        at += 12 + size
+    k, what = draw(st.integers(0, len(chunks) - 1)), draw(_EIGHTH)
+    kind, content = chunks[k]
+    if kind == b"IDAT" and what > 4:
+        content = zlib.compress(draw(_bytes(zlib.decompress(content))))
+    elif what > 1:
+        content = draw(_bytes(content))
+    chunks[k : k + 1] = [] if what == 0 else [(kind, content)] * (2 if what == 1 else 1)
+    pieces = [(len(c).to_bytes(4, "big"), t + c, zlib.crc32(t + c).to_bytes(4, "big")) for t, c in chunks]
+    return data[:8] + b"".join(b"".join(p) for p in pieces)
+
+
+_NESTED = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts", b"moof", b"traf", b"mvex", b"udta")
+
+
+@st.composite
+def _boxes(draw, data: bytes) -> bytes:
+    """A box of an MP4 file is damaged, left out, renamed, or stands twice, and those around it fit."""
+    return _changed_boxes(draw, data)
+
+
+def _changed_boxes(draw, data: bytes) -> bytes:
+    boxes, at = [], 0
+    while at + 8 <= len(data):
+        size = max(8, int.from_bytes(data[at : at + 4], "big"))
+        boxes.append((data[at + 4 : at + 8], data[at + 8 : at + size]))
+        at += size
+    if not boxes:
+        return draw(_bytes(data))
+    # Most of it is in what describes the rest.
+    likely = [k for k, (kind, _) in enumerate(boxes) if kind in _NESTED for _ in range(4)]
+    k, what = draw(st.sampled_from([*range(len(boxes)), *likely])), draw(st.integers(0, 11))
+    kind, content = boxes[k]
+    if kind in _NESTED and what > 1:
+        content = _changed_boxes(draw, content)
+    elif what == 2:
+        kind = draw(st.sampled_from([b"free", b"stsz", b"trun", b"cmov", b"meta", b"wide", bytes(4), *_NESTED]))
+    elif what > 7 and len(content) >= 8:
+        # Of most, numbers stand at multiples of four.
+        at = 4 * draw(st.integers(0, len(content) // 4 - 1))
+        content = content[:at] + (draw(_EXTREME) % (1 << 32)).to_bytes(4, "big") + content[at + 4 :]
+    elif what > 2:
+        content = draw(_bytes(content))
+    boxes[k : k + 1] = [] if what == 0 else [(kind, content)] * (2 if what == 1 else 1)
+    return b"".join((len(c) + 8).to_bytes(4, "big") + t + c for t, c in boxes)
+
+
+_STRUCTURES = {"json": _json, "text": _text, "npy": _npy, "gzip": _gzip, "zip": _zip, "safetensors": _safetensors} | {
+    "png": _png,
+    "boxes": _boxes,
+}

@@ -3,6 +3,8 @@
 from tests.fuzz.capture_readers import CAPTURES
 from tests.fuzz.checkpoint_readers import CHECKPOINTS
 from tests.fuzz.scene_readers import SCENES
+from tests.fuzz.structure_readers import STRUCTURE
 from tests.fuzz.tracking_readers import TRACKING
 
-READERS = [*CHECKPOINTS, *CAPTURES, *SCENES, *TRACKING]
+ALL = [*CHECKPOINTS, *CAPTURES, *STRUCTURE, *SCENES, *TRACKING]
+READERS = [r for r in ALL if r.installed]
