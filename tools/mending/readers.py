@@ -5,6 +5,8 @@ from __future__ import annotations
 from .reversal import held, undo
 
 _IMPORTS = "tests/cli/rays/test_imports.py::"
+_STRUCTURE = "tests/capture/structure/"
+_VIDEO = "nerg_mi/capture/structure/video.py"
 _BUILDER = "nerg_mi/rays/readers/builder.py"
 _PSEUDONYMS = "nerg_mi/rays/pseudonyms.py"
 
@@ -104,6 +106,55 @@ MENDINGS = (
                 "nerg_mi/capture/posed.py",
                 "not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root)):\n",
                 "not Path(path).is_relative_to(root):\n",
+            ),
+        ),
+    ),
+    held(
+        "Photos are read of their own folder, and as large as their bytes warrant",
+        undo(
+            "links lead anywhere",
+            [_STRUCTURE + "test_photos.py::test_links_out_of_the_folder_are_followed_only_if_allowed"],
+            (
+                "nerg_mi/capture/structure/photos.py",
+                'read_photo(path if allow_outside else inside(path.parent, path, "photo"))',
+                "read_photo(path)",
+            ),
+        ),
+        undo(
+            "what a header claims is read",
+            [_STRUCTURE + "test_photos.py::test_photos_are_as_large_as_their_bytes_warrant"],
+            (
+                "nerg_mi/capture/structure/photos.py",
+                "_PIXELS, _BYTES = 1 << 26, 1 << 28\n",
+                "_PIXELS, _BYTES = 1 << 40, 1 << 40\n",
+            ),
+        ),
+    ),
+    held(
+        "A video makes FFmpeg open nothing but itself, and room for no more than it holds",
+        undo(
+            "FFmpeg opens what a video names",
+            [_STRUCTURE + "test_video.py::test_nothing_but_the_file_is_opened"],
+            (_VIDEO, "                io_open=_nothing_else,\n", ""),
+            (
+                _VIDEO,
+                'container_options={"format_whitelist": ",".join(FORMATS), "protocol_whitelist": "none"},\n',
+                "\n",
+            ),
+            (_VIDEO, "                _Source(file),\n", "                str(video),\n"),
+        ),
+        undo(
+            "FFmpeg is given the name",
+            [_STRUCTURE + "test_video.py::test_a_name_is_no_address"],
+            (_VIDEO, "                _Source(file),\n", "                str(video),\n"),
+        ),
+        undo(
+            "samples take no bytes",
+            ["tests/files/test_movie_tables.py::test_samples_need_bytes"],
+            (
+                "nerg_mi/files/movie_tables.py",
+                "    if claims.samples * max(1, claims.edits - 1) > length:\n",
+                "    if claims.samples < 0:\n",
             ),
         ),
     ),
