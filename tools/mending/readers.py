@@ -173,7 +173,7 @@ MENDINGS = (
             ["tests/fuzz/test_readers.py::test_cases_that_once_failed"],
             (
                 "nerg_mi/files/image_header.py",
-                "    if width * height > pixels or header.bytes > most:\n",
+                "    if width * height > pixels or header.bytes > decoded:\n",
                 "    if width * height < 1:\n",
             ),
         ),
