@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import shlex
 from dataclasses import fields
 
 import pytest
@@ -74,3 +75,50 @@ def test06_tests_that_are_named_exist():
         if f"\ndef {name}(" not in (ROOT / file).read_text(encoding="utf-8")
     ]
     assert not missing
+
+
+def commands(text: str) -> list[list[str]]:
+    """The words of each command of nerg and of Python that stands in a block of a page, or in a line as a whole."""
+    fenced = re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+    blocks = "\n".join([*fenced, *re.findall(r"^ {4}(.*)", prose, re.M)])
+    lines = re.sub(r"\\\n\s*", " ", blocks).splitlines()
+    lines = [re.sub(r"^for \w+ in .*?; do (.*); done$", r"\1", line.strip()) for line in lines]
+    lines += [" ".join(line.split()) for line in re.findall(r"`(?:NERG_DATA=DIR )?(python\s[^`]+)`", prose)]
+    return [shlex.split(line, comments=True) for line in lines if re.match(r"(nerg|python) ", line)]
+
+
+def test07_commands_are_found():
+    text = "```sh\nnerg a b \\\n  --c 'd e'  # f\nfor x in y; do nerg $x; done\n```\n"
+    text += "\n    python g.py\n\nRun `python\nh.py --i`."
+    assert commands(text) == [
+        ["nerg", "a", "b", "--c", "d e"],
+        ["nerg", "$x"],
+        ["python", "g.py"],
+        ["python", "h.py", "--i"],
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test08_commands_are_right_as_they_stand(page):
+    for program, *words in commands(page.read_text(encoding="utf-8")):
+        if program == "nerg":
+            command = typer.main.get_command(nerg_mi.cli.build_app(words[0]))
+            context = command.make_context("nerg", list(words))
+            while hasattr(command, "commands"):
+                name, command, words = command.resolve_command(context, list(words))
+                context = command.make_context(name, list(words), parent=context)
+            continue
+        module = words[0] == "-m"
+        script = words[1].removeprefix("nerg_mi.").replace(".", "/") + ".py" if module else words[0]
+        known = re.findall(r'"(--[a-z][a-z0-9-]*)"', (ROOT / script).read_text(encoding="utf-8"))
+        asked = [word.strip("[") for word in words if word.strip("[").startswith("--")]
+        assert set(asked) <= set(known), (script, asked)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test09_files_that_are_named_exist(page):
+    folders = "benchmarks|docs|examples|nerg_mi|plugins|scenes|tests|tools"
+    named = set(re.findall(rf"`((?:{folders})/[\w./-]*)", page.read_text(encoding="utf-8")))
+    named -= {"scenes/store/example.xml"}  # what a reader is to write
+    assert not [path for path in named if not (ROOT / path).exists()]
