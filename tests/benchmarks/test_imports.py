@@ -1,13 +1,17 @@
 """Every script imports nerg_mi before Dr.Jit and Mitsuba: it chooses the libLLVM, and refuses one that would abort the
-process."""
+process. And what scripts import of this repository is there, also what only a run to the end would come to."""
 
 from __future__ import annotations
 
 import ast
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
 
 import pytest
 
 from tests.conftest import ROOT
+from tools.imports import modules
 
 SCRIPTS = sorted(p for folder in ("benchmarks", "examples", "tools") for p in (ROOT / folder).glob("*.py"))
 
@@ -74,3 +78,58 @@ def test01_libllvm_is_chosen_first(path):
 )
 def test02_what_is_found(source, found):
     assert late(source) == found
+
+
+def known() -> dict[str, Path]:
+    """Name of each module that a script may import from this repository -> its file."""
+    found = modules()
+    for path in [*SCRIPTS, *(ROOT / "tools").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
+        found[".".join(path.relative_to(ROOT).with_suffix("").parts)] = path
+    # Benchmarks find each other beside them.
+    return found | {path.stem: path for path in (ROOT / "benchmarks").glob("*.py")}
+
+
+KNOWN = known()
+OURS = {name.split(".")[0] for name in KNOWN}
+
+
+@cache
+def bound(path: Path) -> set[str]:
+    """Names that the file ``path`` binds at the level of its module."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Import | ast.ImportFrom):
+            found |= {a.asname or a.name for a in node.names}
+    return found
+
+
+def missing(source: str) -> list[str]:
+    """Modules and names of this repository that ``source`` imports, anywhere, and that are not there."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [a.name for a in node.names if a.name.split(".")[0] in OURS and a.name not in KNOWN]
+        elif isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in OURS:
+            there = bound(KNOWN[node.module]) if node.module in KNOWN else set()
+            names = (f"{node.module}.{a.name}" for a in node.names if a.name not in there)
+            found += [name for name in names if name not in KNOWN]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and "import " in node.value:
+            with suppress(SyntaxError):  # prose
+                found += missing(node.value)
+    return found
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: f"{p.parent.name}/{p.name}")
+def test03_what_is_imported_is_there(path):
+    assert missing(path.read_text()) == []
+
+
+def test04_what_is_missing():
+    source = (
+        "def f():\n    from nerg_mi.maths import box, circle\n    import nerg_mi.nowhere\nRUN = 'import nerg_mi.gone'"
+    )
+    assert sorted(missing(source)) == ["nerg_mi.gone", "nerg_mi.maths.circle", "nerg_mi.nowhere"]
