@@ -2,12 +2,13 @@
 PSNR, SSIM, and depth near the object and far behind it.
 
     python -m nerg_mi.scenes.tabletop.make                     # the photos, rendered from a place made of a seed
-    python benchmarks/tabletop_radiance.py [--minutes 4] [--views DIR] [--threads 2] [--seed 0] [--out DIR]
+    python benchmarks/tabletop_radiance.py [--minutes 4] [--bounded] [--views DIR] [--threads 2] [--seed 0] [--out DIR]
 
 The photos are read as a user's are: COLMAP's model, every 8th held out, the box found by its points. Pictures and
 median depth are those of the `nerg` integrator at its defaults; depth is compared with exact ray casts. "near": what
 lies within 1.5 m of the object; "far": what is farther than 4 m from the camera, without the sky; "beyond": what lies
-outside of the field's box, the sky too.
+outside of the field's box, or of the core of one whose surroundings are contracted, the sky too. ``--bounded``: as if
+nothing were to be seen beyond that box.
 """
 
 from __future__ import annotations
@@ -73,6 +74,7 @@ def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--views", type=Path, default=VIEWS)
     parser.add_argument("--minutes", type=float, default=4)
+    parser.add_argument("--bounded", action="store_true", help="as of nerg train radiance")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--spp", type=int, default=16)
     parser.add_argument("--seed", type=int, default=0)
@@ -87,14 +89,16 @@ def main(argv=None) -> None:
     if not (args.views / DEPTH_FILE).is_file():
         raise SystemExit(f"{args.views} holds no photos; make them with: python -m nerg_mi.scenes.tabletop.make")
     path = args.out / "field.safetensors"
-    options = RadianceOptions(minutes=args.minutes, threads=args.threads, seed=args.seed)
+    unbounded = False if args.bounded else None
+    options = RadianceOptions(minutes=args.minutes, unbounded=unbounded, threads=args.threads, seed=args.seed)
     result = train_radiance(args.views, path, options)
     about, box = result.provenance, result.field.box.core
     held_out = open_dataset(args.views / DEPTH_FILE).held_out
     if [v.name.rpartition("/")[2] for v in held_out] != about["held_out"]["frames"]:
         raise SystemExit(f"{args.views / DEPTH_FILE} holds out other photos than the capture beside it")
     scores = score(path, held_out, box, CENTRE, args.spp, args.out / "pictures")
-    size = " x ".join(f"{u - l:.1f}" for l, u in zip(box.lower, box.upper))
+    size = " x ".join(f"{u - l:.1f}" for l, u in zip(box.lower, box.upper)) + " m"
+    size += ", contracted" if result.field.box.contracted else ""
     rows = [{"minutes": args.minutes, "seconds": about["seconds"], "steps": about["steps"], **scores, "box": size}]
     for line in about["complaints"]:
         print(line)
@@ -109,7 +113,7 @@ def main(argv=None) -> None:
         f"{s['beyond']:.1%}",
         f"{100 * s['near_median']:.2f} cm, {s['near_off']:.1%}",
         f"{s['far_median']:.1%}, {s['far_off']:.1%}",
-        f"{size} m",
+        size,
     ]
     head = ["minutes", "seconds", "steps", "PSNR, dB", "SSIM", "within, beyond", "pixels beyond"]
     head += ["near: median, off", "far: median, off", "box"]
