@@ -1,6 +1,6 @@
 """What memory pictures of the demo store take: peak of a process that renders one, from 1080p to 8K.
 
-python -m tools.sizes [--memory GB] [--update docs/trust.md]      (8K takes about ten minutes on two cores)
+python -m tools.sizes [--only 1080p,4K] [--memory GB] [--update docs/trust.md]      (8K: some ten minutes on two cores)
 """
 
 from __future__ import annotations
@@ -64,11 +64,16 @@ def row(name: str, width: int, height: int, memory: float) -> tuple[str, ...]:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--only", default=",".join(SIZES), help="comma-separated sizes")
     parser.add_argument("--memory", type=float, default=1.0, help="GB, as of nerg render")
     parser.add_argument("--update", metavar="PAGE", help="page to put the table into")
     options = parser.parse_args(arguments)
+    names = options.only.split(",")
+    for name in names:
+        if name not in SIZES:
+            parser.error(f'there is no size "{name}"; there are {", ".join(SIZES)}')
     head = ("picture, 1 sample a pixel, 7 channels", "--memory", "bands", "peak of the process", "file")
-    update(options.update, "Large requests", table(head, [row(n, *size, options.memory) for n, size in SIZES.items()]))
+    update(options.update, "Large requests", table(head, [row(n, *SIZES[n], options.memory) for n in names]))
 
 
 if __name__ == "__main__":
