@@ -1,0 +1,64 @@
+"""Tables that benchmarks print have the heads of those on the pages, as far as that is quick to find out."""
+
+import importlib
+
+import pytest
+
+from tests.conftest import ROOT
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    """Imports a benchmark by its name, as it is when it is run: beside the others."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    return importlib.import_module
+
+
+def lines(text: str) -> list[str]:
+    """Lines of the tables in ``text``."""
+    return [line for line in text.splitlines() if line.startswith("|")]
+
+
+def page(name: str) -> list[str]:
+    return lines((ROOT / "docs" / name).read_text(encoding="utf-8"))
+
+
+def test01_slow_and_busy_machines(benchmark):
+    known = dict.fromkeys(
+        ("threads", "steps", "seconds", "psnr", "warnings", "max_by_median", "evaluations_a_second"), 1
+    )
+    rows = [
+        {"length": n, "beside": "nothing", "ms_min": 1, "ms_median": 2, "ms_max": 3} | known for n in ("2 min", "1 min")
+    ]
+    head, _, first, _ = lines(benchmark("radiance_robustness").printed(rows))
+    assert head in page("radiance-training.md") and first.startswith("| 1 min | 1 | nothing |")
+
+
+def test02_places_of_hit_points(benchmark, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("NERG_DATA", str(tmp_path))
+    benchmark("hit_places").main(["--rays", "2000"])
+    head, _, row = lines(capsys.readouterr().out)
+    assert head in page("gaze-training.md") and row.startswith("| room of 8 x 6 x 3 m, window |")
+
+
+def test03_memory_of_derivatives(benchmark, monkeypatch, capsys):
+    memory = benchmark("gradients_memory")
+    monkeypatch.setattr(memory, "measured", lambda samples: [str(samples), "", "", ""])
+    memory.main(["--samples", "16,64"])
+    head, _, *rows = lines(capsys.readouterr().out)
+    assert head in page("gradients.md") and len(rows) == 2
+
+
+def test04_errors_of_derivatives(benchmark, capsys):
+    benchmark("gradients").main(["--case", "silhouette"])
+    head, rule, *rows = lines(capsys.readouterr().out)
+    assert {head, *rows} <= set(page("gradients.md")) and len(rows) == 2
+
+
+def test05_rays_sizes_and_derivatives(benchmark, monkeypatch, capsys):
+    numerics = benchmark("numerics")
+    monkeypatch.setattr("sys.argv", ["numerics.py", "--only", "rays"])
+    numerics.main()
+    printed, there = lines(capsys.readouterr().out), page("numerics.md")
+    cases = {line.rsplit("|", 3)[0] for line in there}
+    assert len(printed) > 10 and all(line.rsplit("|", 3)[0] in cases for line in printed)
