@@ -149,11 +149,12 @@ def summarise(rows: list[dict]) -> list[dict]:
 
 
 def table(summary: list[dict]) -> str:
-    """``summary`` as Markdown: losses relative to emit_capture of the same recipe, scores on held-out positions,
-    seconds."""
+    """``summary`` as Markdown: losses relative to emit_capture of the same recipe and as they are, scores on held-out
+    positions, seconds."""
     shown = (
         "train_relative",
         "test_relative",
+        "train_loss",
         "test_loss",
         "test_KLD",
         "test_CC",

@@ -70,6 +70,11 @@ def test_spreads_are_over_seeds():
     assert len({line.count("|") for line in table([emit, both]).splitlines()}) == 1
 
 
+def test_what_the_page_shows_is_in_the_table():
+    head = [name.strip() for name in table(summarise(rows())).splitlines()[0].split("|")]
+    assert {"train loss", "test loss", "test KLD", "test CC", "test MAE", "frame seconds"} <= set(head)
+
+
 def test_files(tmp_path):
     files = write_ablation(tmp_path, rows(), "notes")
     assert all(f.stat().st_size > 50 for f in files)
