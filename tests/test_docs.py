@@ -6,11 +6,13 @@ import inspect
 import re
 import shlex
 from dataclasses import fields
+from types import SimpleNamespace
 
 import pytest
 import typer
 
 import nerg_mi.cli
+from nerg_mi.evaluation.study import settings as study_settings
 from nerg_mi.evaluation.study import subject as study_subject
 from nerg_mi.formats.torch_ngp import unpickling
 from nerg_mi.transport.march.settings import MarchSettings
@@ -122,3 +124,14 @@ def test09_files_that_are_named_exist(page):
     named = set(re.findall(rf"`((?:{folders})/[\w./-]*)", page.read_text(encoding="utf-8")))
     named -= {"scenes/store/example.xml"}  # what a reader is to write
     assert not [path for path in named if not (ROOT / path).exists()]
+
+
+def test10_settings_of_the_study_are_the_studys():
+    subject = SimpleNamespace(marched=True, extent=1.0, has_gaze=True, resampled=True)
+    names = {setting.name for setting in study_settings.settings(subject)}
+    told = set()
+    for table in re.findall(
+        r"^\| setting .*\n\|.*\n((?:\|.*\n)+)", (ROOT / "docs/error-and-time.md").read_text(), re.M
+    ):
+        told |= {line.split("|")[1].strip() for line in table.splitlines()}
+    assert len(told) > 50 and told <= names
