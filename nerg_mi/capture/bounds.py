@@ -19,6 +19,9 @@ from .cameras import Camera, project
 _CONVERGING = np.radians(30)
 # So few points, or so many beyond either end of an axis, are no evidence of where a place ends.
 _MIN_POINTS, _OUTLIERS = 100, 0.005
+# Of the box between those ends: so far beyond it, of its longest edge, what few points show is still of the place, but
+# for so many of them.
+_NEAR_BY, _FEWEST = 0.5, 0.0005
 # Of the points' longest edge, for what lies between them and the wall that they are on.
 _MARGIN = 0.05
 
@@ -26,7 +29,9 @@ _MARGIN = 0.05
 _BEYOND = 0.02
 # Of the points, how many the core of an unbounded place holds, and how many times larger than the box that the cameras
 # bound, or smaller than the one that holds all but strays, it may then be.
-_CORE, _MOST_LARGER, _LEAST_SMALLER = 0.9, 4.0, 2.0
+_CORE, _MOST_LARGER, _LEAST_SMALLER = 0.9, 4.0, 2.5
+# So many times larger may a box get that is to hold the cameras as well as the points.
+_FAR_OUTSIDE = 2.0
 
 
 @dataclass(frozen=True)
@@ -40,14 +45,19 @@ class Extent:
     why: str
 
 
-def place_extent(cameras: list[Camera], object_only: bool = False, points: np.ndarray | None = None) -> Extent:
+def place_extent(
+    cameras: list[Camera], object_only: bool = False, points: np.ndarray | None = None, complete: bool = False
+) -> Extent:
     """The box around what ``cameras`` looked at, as `scene_box` finds it, and whether the place ends there.
 
     An object before nothing, ``object_only``, ends at its box, and so does a place without ``points`` (N, 3), on
     surfaces, and one whose points lie within its box but for a few strays. Every other is unbounded: its box is the
-    core of a contracted one. So is a place whose box is more than twice as large as what holds nine of ten points: a
+    core of a contracted one. So is a place whose box is over 2.5 times as large as what holds nine of ten points: a
     few of them are far away. The core holds nine tenths of the points, but is at most four times as large as the box
     that the cameras bound.
+
+    A place that ends at its box holds its cameras too, or is contracted around its points where that would more than
+    double the box. Not so where the points are ``complete``, of all that the cameras see: nothing stands before them.
     """
     box, how = scene_box(cameras, object_only, points)
     if object_only:
@@ -65,21 +75,34 @@ def place_extent(cameras: list[Camera], object_only: bool = False, points: np.nd
     lower, upper = np.quantile(points, [0.5 - 0.5 * _CORE, 0.5 + 0.5 * _CORE], axis=0)
     if box.side > _LEAST_SMALLER * float(np.max(upper - lower)):
         margin = _MARGIN * float(np.max(upper - lower))
-        why = f"a box half as large as one around all {len(points)} points holds nine tenths of them"
+        why = f"a box two fifths as large as one around all {len(points)} points holds nine tenths of them"
         core = Box(tuple(lower - margin), tuple(upper + margin))
         return Extent(ContractedBox(core), f"around nine tenths of {len(points)} points on surfaces", "unbounded", why)
-    return Extent(box, how, "room", why)
+    return Extent(box, how, "room", why) if complete else _with_cameras(box, cameras, how, why)
+
+
+def _with_cameras(box: Box, cameras: list[Camera], how: str, why: str) -> Extent:
+    """A place whose points lie within ``box``, and its ``cameras``: what stands between them and the points may have
+    none, and is seen."""
+    centers = np.array([c.center for c in cameras])
+    lower, upper = np.minimum(box.lower, centers.min(axis=0)), np.maximum(box.upper, centers.max(axis=0))
+    whole = Box(tuple(lower), tuple(upper))
+    if whole.side > _FAR_OUTSIDE * box.side:
+        why = f"{why}, but the cameras stand far outside of it"
+        return Extent(ContractedBox(box), how, "unbounded", why)
+    grown = np.any(lower < box.lower) or np.any(upper > box.upper)
+    return Extent(whole, f"{how} and the cameras" if grown else how, "room", why)
 
 
 def scene_box(cameras: list[Camera], object_only: bool = False, points: np.ndarray | None = None) -> tuple[Box, str]:
     """A box in the cameras' coordinates, and a sentence saying how it was found.
 
-    ``points`` (N, 3) on surfaces: the box that holds all of them but half a percent beyond each end, with a
-    margin; cameras that stand around something also bound it, as below, because points may lie far behind it. Without
-    points, cameras that look at a common point: a cube around that point, which holds the cameras and as much
-    again behind the point as they stand away from it, or, with ``object_only`` (pictures with alpha,
-    without background), the region that the frusta share. Other cameras stand inside of what they
-    see: the box of their centres, grown on every side by half of its longest edge.
+    ``points`` (N, 3) on surfaces: the box that holds them but for strays, with a margin; cameras that stand around
+    something also bound it, as below, because points may lie far behind it. Without points, cameras that look at a
+    common point: a cube around that point, which holds the cameras and as much again behind the point as they stand
+    away from it, or, with ``object_only`` (pictures with alpha, without background), the region that the frusta share.
+    Other cameras stand inside of what they see: the box of their centres, grown on every side by half of its longest
+    edge.
     """
     centers = np.array([c.center for c in cameras])
     axes = np.array([c.axis for c in cameras])
@@ -94,7 +117,7 @@ def scene_box(cameras: list[Camera], object_only: bool = False, points: np.ndarr
             half = 1.25 * float(distance.max())
             around = focus - half, focus + half, "around the point that the cameras look at"
     if points is not None and len(points) >= _MIN_POINTS:
-        lower, upper = np.quantile(points, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
+        lower, upper = _without_strays(points)
         margin = _MARGIN * float(np.max(upper - lower))
         lower, upper = lower - margin, upper + margin
         if around is not None:
@@ -108,6 +131,14 @@ def scene_box(cameras: list[Camera], object_only: bool = False, points: np.ndarr
     if margin == 0:
         raise NergError("all cameras stand at one point, so that no scene box can be guessed; give one with --aabb")
     return Box(tuple(lower - margin), tuple(upper + margin)), "around the cameras"
+
+
+def _without_strays(points: np.ndarray) -> np.ndarray:
+    """Lower and upper corner (2, 3) of the box around ``points``, but for those far beyond what nearly all lie in."""
+    lower, upper = np.quantile(points, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
+    around = _NEAR_BY * float(np.max(upper - lower))
+    near = points[np.all((points >= lower - around) & (points <= upper + around), axis=1)]
+    return np.quantile(near, [_FEWEST, 1 - _FEWEST], axis=0)
 
 
 def _focus(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

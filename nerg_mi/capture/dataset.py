@@ -140,8 +140,9 @@ def _found(posed: PosedImages, views: list[View], aabb) -> Extent:
     elif posed.aabb is not None:
         given, source = posed.aabb, f'"aabb" of {posed.path.name}'
     else:
-        points = posed.points if posed.points is not None else _depth_points(views)
-        return place_extent([v.camera for v in views], all(v.has_alpha for v in views), points)
+        seen = None if posed.points is not None else _depth_points(views)
+        points, cutout = posed.points if seen is None else seen, all(v.has_alpha for v in views)
+        return place_extent([v.camera for v in views], cutout, points, complete=seen is not None)
     tight = Box(tuple(given[0]), tuple(given[1]))
     pad = _PAD * tight.side
     box, how = Box(tuple(given[0] - pad), tuple(given[1] + pad)), f"{source}, grown by {pad:.3g} on every side"

@@ -126,3 +126,49 @@ def test_where_nothing_tells_a_place_ends_at_its_box():
     for cameras in (AROUND, INSIDE):
         extent = place_extent(cameras)
         assert extent.kind == "room" and extent.box == scene_box(cameras)[0] and "no points" in extent.why
+
+
+def facing(distance):
+    """Cameras side by side before a wall with points, in the plane y = 0."""
+    cameras = [looking(np.array([x, -distance, 1.0]), np.array([x, 0.0, 1.0])) for x in np.linspace(-1, 1, 9)]
+    points = np.random.default_rng(0).uniform([-2, -0.1, 0], [2, 0.1, 2], (2000, 3))
+    return cameras, points
+
+
+def test_what_stands_between_cameras_and_points_is_within_the_box():
+    """It may have no points: a plain wall, a blurred frame at the border of a photo."""
+    cameras, points = facing(2)
+    centers = np.array([c.center for c in cameras])
+    extent = place_extent(cameras, points=points)
+    assert extent.kind == "room" and extent.how.endswith("and the cameras") and not extent.box.contracted
+    for p in np.concatenate([centers, 0.5 * (centers + [0, 0, 1])]):
+        assert np.all(p >= np.subtract(extent.box.lower, 1e-9)) and np.all(p <= extent.box.upper)
+    # The wall itself ends where its points do.
+    assert extent.box.upper[1] < 0.4
+
+
+def test_cameras_far_outside_of_the_points_make_a_place_without_an_end():
+    cameras, points = facing(30)
+    extent = place_extent(cameras, points=points)
+    assert extent.kind == "unbounded" and extent.box.contracted and "far outside" in extent.why
+    assert extent.box.core.side < 6
+
+
+def test_nothing_stands_before_what_depth_shows():
+    cameras, points = facing(2)
+    box = place_extent(cameras, points=points, complete=True).box
+    assert box == scene_box(cameras, points=points)[0] and box.lower[1] > -1
+
+
+def test_cameras_within_leave_a_box_as_it_is():
+    centers = np.random.default_rng(4).uniform(0, 1.5, (20, 3))
+    cameras = [looking(c, c + d) for c, d in zip(centers, directions(20))]
+    extent = place_extent(cameras, points=walls())
+    assert extent.box == scene_box(cameras, points=walls())[0] and "cameras" not in extent.how
+
+
+def test_points_just_beyond_the_others_are_within_the_box_and_strays_are_not():
+    """Plain parts of a place have few points, which are no strays for that."""
+    few, strays = np.tile([[8.0, 2, 0.5]], (12, 1)), np.full((3, 3), 40.0)
+    box, _ = scene_box(INSIDE, points=np.concatenate([walls(), few, strays]))
+    assert 8 < box.upper[0] < 9 and box.upper[1] < 5 and box.upper[2] < 3

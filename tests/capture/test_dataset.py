@@ -136,7 +136,7 @@ def test_depth_finds_the_box(ring):
     rewrite(ring, lambda c: [f.update(depth_file_path="d.npy") for f in c["frames"]])
     data = open_dataset(ring, holdout=0)
     points = np.concatenate([(o + 2 * d).reshape(-1, 3) for o, d in (expected_rays(OPENCV, p) for p in cameras())])
-    lower, upper = np.quantile(points, [0.005, 0.995], axis=0)
+    lower, upper = np.quantile(points, [0.0005, 0.9995], axis=0)
     assert "points on surfaces" in data.box_from
     assert np.allclose(data.box.lower, lower - 0.05 * np.max(upper - lower), atol=1e-3)
     assert data.train[0].depth.dtype == np.float32 and "box" not in open_dataset(ring, depth=False).box_from
