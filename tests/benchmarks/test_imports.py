@@ -84,7 +84,8 @@ def known() -> dict[str, Path]:
     """Name of each module that a script may import from this repository -> its file."""
     found = modules()
     for path in [*SCRIPTS, *(ROOT / "tools").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
-        found[".".join(path.relative_to(ROOT).with_suffix("").parts)] = path
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     # Benchmarks find each other beside them.
     return found | {path.stem: path for path in (ROOT / "benchmarks").glob("*.py")}
 
