@@ -69,7 +69,12 @@ def _rays_file(name: str, *kinds: str) -> Reader:
 
         _shown(Rays.load(folder / name))
 
-    return Reader(f"rays {name}", lambda folder: _rays().save(folder / name), {name: kinds}, read)
+    return Reader(f"rays {name}", lambda folder: _rays().save(folder / name), {name: kinds}, read, _needed(name))
+
+
+def _needed(name: str) -> str | None:
+    """The package without which files of that name are not read."""
+    return "pyarrow" if name.endswith(".parquet") else None
 
 
 def _make_metadata(folder: Path) -> None:
@@ -113,7 +118,7 @@ def _tables(name: str, make, *kinds: str) -> Reader:
 
         _shown(read_rays("table", folder / name, make_options("table", EXAMPLES["table"].options)))
 
-    return Reader(f"table {name}", lambda folder: make(folder / name), {name: kinds}, read)
+    return Reader(f"table {name}", lambda folder: make(folder / name), {name: kinds}, read, _needed(name))
 
 
 def _make_parquet(path: Path) -> None:

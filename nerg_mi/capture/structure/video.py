@@ -152,8 +152,8 @@ def _opened(video: str | Path) -> Iterator[tuple[Any, Any]]:
 
     FFmpeg is given the open file, since it takes names such as "12:30.mp4" for addresses; it may open nothing else.
     """
-    av = _pyav()
     size_of(video, "video")
+    av = _pyav()
     with _reading(video):
         check_movie(video)
         file = open(video, "rb")

@@ -130,15 +130,16 @@ def test_damaged_tables_are_one_sentence(tmp_path):
     path.write_text("a" * 200_000 + ",b\n1,2\n")
     with pytest.raises(NergError, match="no header"):
         read(path, ["b"])
-    for name in ("absent.csv", "absent.parquet"):
-        with pytest.raises(NergError, match=name):
-            read(tmp_path / name, ["a"])
+    with pytest.raises(NergError, match="absent.csv"):
+        read(tmp_path / "absent.csv", ["a"])
 
 
 def test_damaged_parquet_tables(tmp_path):
     pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed (pip install pyarrow)")
     import pyarrow.parquet as pq
 
+    with pytest.raises(NergError, match="absent.parquet"):
+        read(tmp_path / "absent.parquet", ["a"])
     path = tmp_path / "t.parquet"
     pq.write_table(pa.table({"a": np.arange(500.0), "who": ["x"] * 500}), path)
     data, rng = path.read_bytes(), np.random.default_rng(0)
