@@ -234,5 +234,6 @@ def test_without_pyav(tmp_path, monkeypatch):
         return original(name, *given, **more)
 
     monkeypatch.setattr(builtins, "__import__", no_av)
+    (tmp_path / "a.mp4").write_bytes(b"film")
     with pytest.raises(ImportError, match=r"PyAV, which is not installed: pip install \"nerg-mi\[poses\]\""):
         list(sharpest_frames(tmp_path / "a.mp4", 3))
