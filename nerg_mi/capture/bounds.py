@@ -19,8 +19,8 @@ from .cameras import Camera, project
 _CONVERGING = np.radians(30)
 # So few points, or so many beyond either end of an axis, are no evidence of where a place ends.
 _MIN_POINTS, _OUTLIERS = 100, 0.005
-# Of the box between those ends: so far beyond it, of its longest edge, what few points show is still of the place, but
-# for so many of them.
+# Points within this share of the longest edge beyond the box of nearly all still count, as plain parts of a place have
+# few; all but this share of them at either end, which may be strays as well.
 _NEAR_BY, _FEWEST = 0.5, 0.0005
 # Of the points' longest edge, for what lies between them and the wall that they are on.
 _MARGIN = 0.05

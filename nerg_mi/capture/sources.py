@@ -75,7 +75,7 @@ def read_split(
     ``holdout``: every so many frames, 0 none. None: the frames of a ``transforms_test.json`` or else
     ``transforms_val.json`` beside the file, or those that the file itself lists for testing, or every 8th.
     ``coordinates``: "file"; "upright", those turned about their origin so that up is +z, as cameras and points tell
-    (`find_up`); "original", before the writer applied its ``applied_transform``; or a
+    (`find_up`; `NergError` where the cameras do not agree); "original", before the writer applied its ``applied_transform``; or a
     ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that.
     ``allow_outside``: as `read_posed` has it.
     """
@@ -140,8 +140,13 @@ def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarra
     if coordinates == "file":
         to = np.eye(4)
     elif coordinates == "upright":
-        to = np.eye(4)
-        to[:3, :3] = turn_to_z(up_of(posed).direction)
+        up, to = up_of(posed), np.eye(4)
+        if not up.sure:
+            raise NergError(
+                f'the cameras of "{posed.path}" do not agree on what is up (rolled by {up.roll:.0f} degrees, median), so '
+                'that nothing can be turned upright; use the coordinates "file"'
+            )
+        to[:3, :3] = turn_to_z(up.direction)
     elif coordinates == "original":
         if posed.original is None:
             raise NergError(

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.dataset import open_dataset
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.errors import NergError
 from tests.capture.written_sets import OPENCV, H, W, cameras, expected_rays, nerfstudio, opengl, picture, rewrite
 
 
@@ -112,6 +113,8 @@ def test_cameras_that_do_not_agree_on_up_say_so(ring):
     rewrite(ring, roll)
     data = open_dataset(ring, holdout=0)
     assert data.up.startswith("the cameras do not agree") and "up" not in data.source
+    with pytest.raises(NergError, match='nothing can be turned upright; use the coordinates "file"'):
+        open_dataset(ring, holdout=0, coordinates="upright")
 
 
 def test_held_out_frames_of_a_file_of_their_own_are_turned_alike(ring):
