@@ -75,8 +75,8 @@ def read_split(
     ``holdout``: every so many frames, 0 none. None: the frames of a ``transforms_test.json`` or else
     ``transforms_val.json`` beside the file, or those that the file itself lists for testing, or every 8th.
     ``coordinates``: "file"; "upright", those turned about their origin so that up is +z, as cameras and points tell
-    (`find_up`; `NergError` where the cameras do not agree); "original", before the writer applied its ``applied_transform``; or a
-    ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that.
+    (`find_up`; `NergError` where the cameras do not agree); "original", before the writer applied its
+    ``applied_transform``; or a ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that.
     ``allow_outside``: as `read_posed` has it.
     """
     source = find_source(dataset)
@@ -143,8 +143,8 @@ def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarra
         up, to = up_of(posed), np.eye(4)
         if not up.sure:
             raise NergError(
-                f'the cameras of "{posed.path}" do not agree on what is up (rolled by {up.roll:.0f} degrees, median), so '
-                'that nothing can be turned upright; use the coordinates "file"'
+                f'the cameras of "{posed.path}" do not agree on what is up (rolled by {up.roll:.0f} degrees), so that '
+                'nothing can be turned upright; use the coordinates "file"'
             )
         to[:3, :3] = turn_to_z(up.direction)
     elif coordinates == "original":
