@@ -76,7 +76,8 @@ def read_split(
     ``transforms_val.json`` beside the file, or those that the file itself lists for testing, or every 8th.
     ``coordinates``: "file"; "upright", those turned about their origin so that up is +z, as cameras and points tell
     (`find_up`; `NergError` where the cameras do not agree); "original", before the writer applied its
-    ``applied_transform``; or a ``dataparser_transforms.json``, those that nerfstudio trained in. ``scale``: of all lengths, after that.
+    ``applied_transform``; or a ``dataparser_transforms.json``, those that nerfstudio trained in.
+    ``scale``: of all lengths, after that.
     ``allow_outside``: as `read_posed` has it.
     """
     source = find_source(dataset)
