@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import struct
 from pathlib import Path
@@ -170,6 +171,25 @@ def _read_picture(name: str):
     return read
 
 
+_POINTS = "semidense_points.csv.gz"
+
+
+def _make_points(folder: Path) -> None:
+    head = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std"
+    rows = [f"{k},world{k % 3 == 0},{0.1 * k:.3f},{k % 7},-1.5,0.00{k % 9},0.0{k % 3}" for k in range(60)]
+    (folder / _POINTS).write_bytes(gzip.compress("\n".join([head, *rows, ""]).encode(), mtime=0))
+    (folder / _POINTS.removesuffix(".gz")).write_text("\n".join([head, *rows, ""]))
+
+
+def _read_points(name: str):
+    def read(folder: Path) -> object:
+        from nerg_mi.capture.semidense import read_semidense
+
+        return read_semidense(folder / name)
+
+    return read
+
+
 _TEXTS = {"sparse/0/cameras.txt": ("text",), "sparse/0/images.txt": ("text",), "sparse/0/points3D.txt": ("text",)}
 _BINARIES = {"sparse/0/cameras.bin": (), "sparse/0/images.bin": (), "sparse/0/points3D.bin": ()}
 _SET = {"transforms.json": ("json",), "dataparser_transforms.json": ("json",)}
@@ -180,6 +200,10 @@ CAPTURES = [
     Reader("COLMAP binary", _make_colmap("bin"), _BINARIES, _read_dataset),
     Reader("COLMAP text", _make_colmap("txt"), _TEXTS, _read_dataset),
     Reader("COLMAP place", _make_place, {"sparse/0/points3D.bin": (), "sparse/0/images.bin": ()}, _read_place),
+    *(
+        Reader(f"semi-dense points {name}", _make_points, {name: kinds}, _read_points(name))
+        for name, kinds in ((_POINTS, ("gzip",)), (_POINTS.removesuffix(".gz"), ("text",)))
+    ),
     *(
         Reader(f"picture {name}", _picture(name), {name: kinds}, _read_picture(name))
         for name, kinds in (

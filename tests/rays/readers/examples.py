@@ -63,6 +63,16 @@ _POSES = ["timestamp", *(f"{what}_{axis}" for what in ("rotation", "translation"
 _GAZE = ["gaze_timestamp", "confidence", *(f"gaze_normal{e}_{a}" for e in "01" for a in "xyz")]
 _GAZE += [f"eye_center{e}_3d_{a}" for e in "01" for a in "xyz"]
 
+ARIA_POSES = ["graph_uid", "tracking_timestamp_us", "utc_timestamp_ns", *(f"t{a}_world_device" for a in "xyz")]
+ARIA_POSES += [f"q{a}_world_device" for a in "xyzw"] + [f"gravity_{a}_world" for a in "xyz"] + ["quality_score"]
+_ARIA_GAZE = "tracking_timestamp_us yaw_rads_cpf pitch_rads_cpf depth_m".split()
+
+
+def aria_pose(us: int, world: str = "w", place=(0, 0, 1.6), gravity=(0, 0, -9.81), turn=(0.5, 0.5, -0.5, 0.5)) -> list:
+    """A row of a trajectory of Aria's; by default the wearer stands upright."""
+    return [world, us, -1, *place, *turn, *gravity, 1.0]
+
+
 EXAMPLES = {
     "skeleton22": Example({"day.csv": write_walk}, {"tick": 0.1}),
     "unity": Example({"ann.csv": lines(_UNITY, lambda k: [0.02 * k, "ann", 0, 1.6, k, 0, 0, 1, "VALID"])}),
@@ -84,6 +94,12 @@ EXAMPLES = {
             "gaze_positions.csv": lines(_GAZE, lambda k: [0.02 * k, 0.9, *[0, 0.1, 1] * 4]),
         },
         {"marker": 0.05},
+    ),
+    "aria": Example(
+        {
+            "closed_loop_trajectory.csv": lines(ARIA_POSES, lambda k: aria_pose(10_000 * k, place=(0.01 * k, 0, 1.6))),
+            "general_eye_gaze.csv": lines(_ARIA_GAZE, lambda k: [10_000 * k + 500, 0.1, -0.2, "" if k % 2 else 1.5]),
+        }
     ),
     "vr_supermarket": Example(
         {
