@@ -12,7 +12,7 @@ from typing import Any
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import aria, hololens, pupil, skeleton22, table, unity, varjo, vr_supermarket
+from . import aria, eyenavgs, hololens, pupil, qualisys, skeleton22, table, unity, varjo, vr_supermarket
 from .builder import RaysBuilder
 from .options import Option, options_of, recorded_options
 from .protocol import Reader
@@ -183,6 +183,6 @@ def preset_table() -> str:
     return "\n".join(rows) + "\n"
 
 
-for _module in (skeleton22, unity, varjo, hololens, pupil, aria, vr_supermarket, table):
+for _module in (skeleton22, unity, varjo, hololens, pupil, qualisys, aria, eyenavgs, vr_supermarket, table):
     for _reader in _module.READERS:
         register(_reader)

@@ -66,6 +66,9 @@ _GAZE += [f"eye_center{e}_3d_{a}" for e in "01" for a in "xyz"]
 ARIA_POSES = ["graph_uid", "tracking_timestamp_us", "utc_timestamp_ns", *(f"t{a}_world_device" for a in "xyz")]
 ARIA_POSES += [f"q{a}_world_device" for a in "xyzw"] + [f"gravity_{a}_world" for a in "xyz"] + ["quality_score"]
 _ARIA_GAZE = "tracking_timestamp_us yaw_rads_cpf pitch_rads_cpf depth_m".split()
+_NAVGS = [
+    f"{what}{a}" for what in ("Position", "Quaternion", "GazeQ") for a in ("XYZ" if what == "Position" else "XYZW")
+]
 
 
 def aria_pose(us: int, world: str = "w", place=(0, 0, 1.6), gravity=(0, 0, -9.81), turn=(0.5, 0.5, -0.5, 0.5)) -> list:
@@ -95,10 +98,37 @@ EXAMPLES = {
         },
         {"marker": 0.05},
     ),
+    "qualisys": Example(
+        {
+            "ann_g.tsv": lines(
+                ["X Pos", "Y Pos", "Z Pos", "X Vec", "Y Vec", "Z Vec"],
+                lambda k: [10 * k, "" if k == 3 else 0, 1600, 0.1 * k, 1, -0.2],
+                "\t",
+            ).join(["GAZE_VECTOR_NAME\tann\nNO_OF_SAMPLES\t8\nFREQUENCY\t100\nSTART_OFFSET\t0.5\n", ""])
+        }
+    ),
+    "neon_mocap": Example(
+        {
+            "gaze_in_mocap_space.csv": lines(
+                ["", "timestamp [ns]", *(f"gaze_{what}_{a}" for what in ("origin", "dir") for a in "XYZ")],
+                lambda k: [k, 1_700_000_000_000_000_000 + 10**7 * k, 0, 10 * k, 1600, 0.1, 1, -0.2],
+            )
+        },
+        {"up": "z"},
+    ),
     "aria": Example(
         {
             "closed_loop_trajectory.csv": lines(ARIA_POSES, lambda k: aria_pose(10_000 * k, place=(0.01 * k, 0, 1.6))),
             "general_eye_gaze.csv": lines(_ARIA_GAZE, lambda k: [10_000 * k + 500, 0.1, -0.2, "" if k % 2 else 1.5]),
+        }
+    ),
+    "eyenavgs": Example(
+        {
+            "scene_setting.csv": 'Scene_Name,Quaternion,Scale,Initial_Position\nroom,"0, 0, 0, 1",2,"0, 0.8, 0"\n',
+            "user1_room.csv": lines(
+                ["ViewIndex", *_NAVGS, "Timestamp"],
+                lambda k: [k % 2, 0.1 * k, 0.8, 0, 0, 0.1 * (k // 2), 0, 1, 0.1, 0.02 * k, 0, 1, 14 * (k // 2)],
+            ),
         }
     ),
     "vr_supermarket": Example(
