@@ -21,7 +21,8 @@ from .parsing.tables import TableBlock, iterate_table, table_columns
 from .protocol import RECORDINGS
 
 _TICK = 1e-3  # seconds
-_TURNED = 5.0  # degrees: a head that turned farther has eyes that move
+_TURNED = 5.0, 30.0  # degrees: a head that turned farther has eyes that turn in the world, and in the head
+_STILL = 4.0  # degrees from their mean direction in the head, by the median; people who look about have 7 to 13
 _SAME = 1e-6  # of a quaternion's numbers, which have three decimals or six
 _SETTINGS = "scene_setting.csv"
 _ABOVE = 4  # folders above a recording in which it is looked for
@@ -32,6 +33,7 @@ _COLUMNS = ["ViewIndex", *(f"Position{a}" for a in "XYZ"), *_HEAD, *_GAZE]
 _TIMES = ("Timestamp", "timestep")
 _FORWARD = np.array([0.0, 0.0, -1.0])
 _FROZEN = "the gaze of the recording is frozen: it never changes while the head turns"
+_LOCKED = "the gaze of the recording is locked to the head: it turns as the head does, some time later"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +60,7 @@ class EyeNavGS:
     stands it upright (``Quaternion``; heads are upright after it, and tilted by up to 27 degrees before), and, from one
     of the sites, where the viewer put the play area (``Initial_Position`` p): the play area's point of x is
     R((x - p) / scale + p) + p, with the floor at height 0. The metadata have the way back to the splats' own axes as
-    ``place_from_rays``. A recording whose gaze is frozen (of Rutgers' every fourth) is dropped as a whole.
+    ``place_from_rays``. A recording whose gaze is frozen, or stays where it is in the head, is dropped as a whole.
     """
 
     name = "eyenavgs"
@@ -93,20 +95,17 @@ class EyeNavGS:
             units_per_metre=setting.scale,
             place_from_rays=(setting.splat_from_area() @ np.linalg.inv(OPENGL.to_rays())).tolist(),
         )
-        frozen = [_add(path, setting, options, builder) for path in recordings]
-        if all(frozen):
-            raise NergError(
-                f"the gaze of all {len(frozen)} recordings is frozen, as in {recordings[0]}: it never changes while "
-                "the heads turn; give others"
-            )
+        faults = [_add(path, setting, options, builder) for path in recordings]
+        if all(faults):
+            raise NergError(f"nobody's eyes were tracked; of {recordings[0]}: {faults[0]}; give other recordings")
 
 
 READERS = (EyeNavGS(),)
 
 
-def _add(path: Path, setting: SceneSetting, options: EyeNavGSOptions, builder: RaysBuilder) -> bool:
-    """Add a recording's rows; whether its gaze is frozen, so that all were dropped."""
-    frozen = _is_frozen(path, tolerant=builder.on_bad is not None)
+def _add(path: Path, setting: SceneSetting, options: EyeNavGSOptions, builder: RaysBuilder) -> str | None:
+    """Add a recording's rows; why all were dropped, if they were."""
+    fault = _fault(path, tolerant=builder.on_bad is not None)
     time = _time(path)
     builder.source(path)
     for v, paired, lines in _frames(iterate_table(path, [*_COLUMNS, time], on_bad=builder.on_bad)):
@@ -121,9 +120,9 @@ def _add(path: Path, setting: SceneSetting, options: EyeNavGSOptions, builder: R
             eyes[:, side].mean(axis=1),
             sight[:, side].mean(axis=1),
             rows=lines,
-            drop={_FROZEN: np.full(len(v), frozen), "the other eye's row is missing": ~paired},
+            drop={**({fault: np.full(len(v), True)} if fault else {}), "the other eye's row is missing": ~paired},
         )
-    return frozen
+    return fault
 
 
 def _frames(blocks: Iterator[TableBlock]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -151,24 +150,31 @@ def _paired(v: np.ndarray, lines: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     return np.stack([v[first], v[first + paired]], axis=1), paired, lines[first]
 
 
-def _is_frozen(path: Path, tolerant: bool) -> bool:
-    """Whether the gaze of a recording stays the same while its head turns."""
-    first: dict[int, np.ndarray] = {}
-    turned = False
-    blocks = iterate_table(path, ["ViewIndex", *_HEAD, *_GAZE], on_bad=(lambda line, why: None) if tolerant else None)
-    for block in blocks:
-        for eye in (0, 1):
-            v = block.numbers[block.numbers[:, 0] == eye, 1:]
-            v = v[np.isfinite(v).all(axis=1)]
-            if not len(v):
-                continue
-            head, gaze = np.split(first.setdefault(eye, v[0]), [4])
-            if np.abs(v[:, 4:] - gaze).max() > _SAME:
-                return False
-            # The scalar product of unit quaternions is the cosine of half the angle between them.
-            cosine = np.abs(v[:, :4] @ head) / np.maximum(np.linalg.norm(v[:, :4], axis=1), 1e-12)
-            turned |= bool((cosine < np.cos(np.radians(_TURNED) / 2) * np.linalg.norm(head)).any())
-    return turned
+def _fault(path: Path, tolerant: bool) -> str | None:
+    """Why the gaze of a recording is none, by the rows of its left eye; None where it is one."""
+    first: np.ndarray | None = None
+    changes, turned, in_head = False, 0.0, []
+    columns = ["ViewIndex", *_HEAD, *_GAZE]
+    for v, _, _ in iterate_table(path, columns, on_bad=(lambda line, why: None) if tolerant else None):
+        v = v[(v[:, 0] == 0) & np.isfinite(v).all(axis=1), 1:]
+        v = v[(np.linalg.norm(v[:, :4], axis=1) > 0.5) & (np.linalg.norm(v[:, 4:], axis=1) > 0.5)]
+        if not len(v):
+            continue
+        first = v[0] if first is None else first
+        changes |= bool(np.abs(v[:, 4:] - first[4:]).max() > _SAME)
+        # The scalar product of unit quaternions is the cosine of half the angle between them.
+        length = np.linalg.norm(v[:, :4], axis=1) * np.linalg.norm(first[:4])
+        turned = max(turned, 2 * np.degrees(np.arccos(min(1.0, np.abs(v[:, :4] @ first[:4] / length).min()))))
+        head, gaze = (poses.rotations_from_quaternions(q) for q in (v[:, :4], v[:, 4:]))
+        in_head.append(np.einsum("nji,nj->ni", head, gaze @ _FORWARD).astype(np.float32))
+    if first is None or turned <= _TURNED[0]:
+        return None
+    if not changes:
+        return _FROZEN
+    directions = np.concatenate(in_head)
+    mean = directions.mean(axis=0, dtype=np.float64)
+    off = np.degrees(np.arccos(np.clip(directions @ mean / max(np.linalg.norm(mean), 1e-12), -1, 1)))
+    return _LOCKED if turned > _TURNED[1] and np.median(off) < _STILL else None
 
 
 def _recordings(given: Path) -> list[Path]:

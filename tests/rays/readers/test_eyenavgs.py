@@ -78,10 +78,10 @@ def test_all_recordings(recorded, place):
     """Which are frozen, where eyes are above the floor, how far apart, and that heads are upright."""
     folder = recorded("eyenavgs") / place
     rays = read("eyenavgs", folder)
-    frozen = {"room": 6, "playroom": 8, "truck": 4}[place]
-    assert len(rays.persons) == 22 - frozen
-    reasons = [d for d in rays.metadata["dropped"] if d["reason"].startswith("the gaze of the recording is frozen")]
-    assert len({d["file"] for d in reasons}) == frozen
+    frozen, locked = {"room": (6, 5), "playroom": (8, 5), "truck": (4, 4)}[place]
+    assert len(rays.persons) == 22 - frozen - locked
+    for word, count in (("frozen", frozen), ("locked to the head", locked)):
+        assert sum(f"gaze of the recording is {word}" in d["reason"] for d in rays.metadata["dropped"]) == count
     heights = [np.median(rays.origin[rays.person == p, 2]) for p in range(len(rays.persons))]
     assert 1.3 < min(heights) and max(heights) < 1.9 and 1.5 < np.median(heights) < 1.7
     scale, degrees, _ = PLACES[place]
@@ -150,7 +150,9 @@ def test_rows_without_the_other_eye(tmp_path, monkeypatch, block):
 def test_frozen_gaze(tmp_path):
     (tmp_path / "scene_setting.csv").write_text('Scene_Name,Quaternion,Scale\ntrain,"0, 0, 0, 1",2\n')
     still = write(tmp_path, "user1_train.csv", gaze=lambda k: 5.0)
-    with pytest.raises(ValueError, match="the gaze of all 1 recordings is frozen, as in .*user1_train.csv"):
+    with pytest.raises(
+        ValueError, match="nobody's eyes were tracked; of .*user1_train.csv: the gaze of the recording is frozen"
+    ):
         read("eyenavgs", still)
     # Spelt as one of the sites has it. Who keeps their head still as well may have looked at one thing.
     moving, resting = (
@@ -161,6 +163,24 @@ def test_frozen_gaze(tmp_path):
     assert rays.persons == ("user2", "user3") and rays.metadata["place"] == "train"
     frozen = "the gaze of the recording is frozen: it never changes while the head turns"
     assert dropped(rays) == {frozen: [[k, k] for k in range(2, 13, 2)]}
+
+
+def test_gaze_that_is_locked_to_the_head(tmp_path):
+    """It follows the head five rows later, which no eye does; a head that hardly turns tells nothing."""
+    (tmp_path / "scene_setting.csv").write_text('Scene_Name,Quaternion,Scale\nroom,"0, 0, 0, 1",2\n')
+    turn = lambda k: 40 * math.sin(0.02 * k)
+    looks = lambda k: turn(k) + 12 * math.sin(0.4 * k)
+    behind = write(tmp_path, "user1_room.csv", eyes=(0, 1) * 400, head=turn, gaze=lambda k: 8 + turn(k - 5))
+    living = write(tmp_path, "user2_room.csv", eyes=(0, 1) * 400, head=turn, gaze=looks)
+    resting = write(
+        tmp_path, "user3_room.csv", eyes=(0, 1) * 400, head=lambda k: turn(k) / 4, gaze=lambda k: turn(k) / 4
+    )
+    rays = read("eyenavgs", behind, living, resting)
+    assert rays.persons == ("user2", "user3") and len(rays) == 800
+    (lost,) = rays.metadata["dropped"]
+    assert "locked to the head" in lost["reason"] and lost["file"] == behind.name and lost["count"] == 400
+    with pytest.raises(ValueError, match="nobody's eyes were tracked.*locked to the head"):
+        read("eyenavgs", behind)
 
 
 def test_what_is_refused(tmp_path):
