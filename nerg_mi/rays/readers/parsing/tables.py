@@ -21,6 +21,12 @@ BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
 COLUMNS = 1 << 14
 """A table may have so many columns."""
 
+TEXT_CHARACTERS = 1000
+"""So many characters may a cell have that is read as text."""
+
+# Cells of an array of text all take the space of the longest: rows times its characters, at four bytes each.
+_TEXT_BLOCK = 1 << 26
+
 # Memory of a row that is read, at least.
 _ROW_BYTES = 32
 
@@ -153,7 +159,10 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
             if number_at
             else np.empty((len(rows), 0))
         )
-        words = [np.char.strip(table.column(names[i]).to_numpy().astype(str)) for i in text_at]
+        cells = [table.column(names[i]).to_numpy() for i in text_at]
+        if any(len(rows) * max(map(len, column)) > _TEXT_BLOCK for column in cells):
+            return None
+        words = [np.char.strip(column.astype(str)) for column in cells]
         return values, np.stack(words, axis=1) if words else np.empty((len(rows), 0), dtype=str)
 
     return convert
@@ -162,6 +171,8 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
 def _convert(
     path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: OnBadLine | None
 ) -> TableBlock:
+    if layout.text_at and len(rows) * max(map(len, rows)) > _TEXT_BLOCK:
+        return _convert_slowly(path, rows, lines, layout, on_bad)
     # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast reader refuses them, so they are spelt out
     # first.
     gap = layout.separator * 2
@@ -213,6 +224,12 @@ def _cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | str:
         return f": it cannot be split into cells ({error}); mend or remove the line"
     if len(cells) <= max([*layout.number_at, *layout.text_at], default=0):
         return f": {len(cells)} cells, the header has {len(layout.columns)}; mend or remove the line"
+    for k in layout.text_at:
+        if len(cells[k]) > TEXT_CHARACTERS:
+            what = (
+                f"column {plain(layout.columns[k], 40)!r}: more than the {TEXT_CHARACTERS:,} characters that are read"
+            )
+            return f", {what}; mend or remove the line"
     numbers = []
     for k in layout.number_at:
         word = cells[k].strip()
@@ -262,15 +279,23 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
                 n = batch.num_rows
                 column = {c: batch.column(batch.schema.get_field_index(c)) for c in wanted}
                 values = [_as_numbers(path, c, column[c]) for c in numbers]
-                words = [
-                    np.array(["" if v is None else str(v) for v in column[c].to_pylist()], dtype=str) for c in texts
-                ]
+                words = [_as_texts(path, c, column[c]) for c in texts]
             yield TableBlock(
                 np.stack(values, axis=1) if values else np.empty((n, 0)),
                 np.stack(words, axis=1) if words else np.empty((n, 0), dtype=str),
                 np.arange(first, first + n),
             )
             first += n
+
+
+def _as_texts(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
+    words = ["" if v is None else str(v) for v in column.to_pylist()]
+    if max(map(len, words), default=0) > TEXT_CHARACTERS:
+        raise NergError(
+            f'the column {plain(name, 40)!r} of the table "{path}" has cells of more than the {TEXT_CHARACTERS:,} '
+            "characters that are read; name another one"
+        )
+    return np.array(words, dtype=str)
 
 
 def _as_numbers(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:

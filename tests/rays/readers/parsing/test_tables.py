@@ -167,3 +167,28 @@ def test_texts_alone(tmp_path, monkeypatch, fast):
     (tmp_path / "t.csv").write_text("who,a\nann,1\nbo,2\n")
     (block,) = read(tmp_path / "t.csv", [], ["who"])
     assert block.numbers.shape == (2, 0) and block.texts.tolist() == [["ann"], ["bo"]]
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_one_long_cell_does_not_make_all_of_them_long(tmp_path, monkeypatch, fast):
+    """An array of text gives each cell the space of the longest: 19 GB for these."""
+    if fast:
+        pytest.importorskip("pyarrow")
+    else:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda layout: None)
+    path, long = tmp_path / "t.csv", "w" * 120_000
+    path.write_text("a,who\n" + "1,ann\n" * 40_000 + f"2,{long}\n" + "3,bo\n")
+    with pytest.raises(NergError, match="line 40002, column 'who': more than the 1,000 characters"):
+        read(path, ["a"], ["who"])
+    told = []
+    (block,) = iterate_table(path, ["a"], ["who"], on_bad=lambda line, why: told.append(line))
+    assert told == [40002] and len(block.lines) == 40001 and block.texts[-1, 0] == "bo" and block.texts.nbytes < 1 << 20
+    # Numbers of such lines are read as ever.
+    assert read(path, ["a"])[0].numbers[-2:, 0].tolist() == [2, 3]
+
+
+def test_long_cells_of_parquet(tmp_path):
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    pq.write_table(pa.table({"a": [1.0, 2.0], "who": ["ann", "w" * 1001]}), tmp_path / "t.parquet")
+    with pytest.raises(NergError, match="'who' .* has cells of more than the 1,000 characters"):
+        read(tmp_path / "t.parquet", ["a"], ["who"])
