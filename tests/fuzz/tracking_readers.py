@@ -12,7 +12,7 @@ import numpy as np
 
 from nerg_mi.rays.readers.registry import reader_names
 from tests.fuzz.describe import Reader
-from tests.rays.readers.examples import EXAMPLES, TABLE, write_walk
+from tests.rays.readers.examples import EXAMPLES, TABLE, VARIANTS, Example, write_walk
 
 
 def _rays():
@@ -93,9 +93,9 @@ def _read_metadata(folder: Path) -> None:
     _shown(replace(_rays(), metadata=about, persons=persons, cohorts=cohorts))
 
 
-def _recording(name: str, skip: bool = False) -> Reader:
-    """The reader ``name`` on its example, of which any file may be damaged."""
-    example = EXAMPLES[name]
+def _recording(name: str, example: Example, kind: str = "") -> Reader:
+    """The reader ``name`` on an example, of which any file may be damaged."""
+    skip = kind == " skipping"
 
     def make(folder: Path) -> None:
         example.make(folder)
@@ -107,7 +107,7 @@ def _recording(name: str, skip: bool = False) -> Reader:
         _shown(read_rays(name, given, make_options(name, example.options), skip_bad_lines=skip))
 
     kinds = {file: ("gzip",) if file.endswith(".gz") else ("text",) for file in example.files}
-    return Reader(f"preset {name}{' skipping' if skip else ''}", make, kinds, read)
+    return Reader(f"preset {name}{kind}", make, kinds, read)
 
 
 def _tables(name: str, make, *kinds: str) -> Reader:
@@ -153,7 +153,12 @@ TRACKING = [
     _rays_file("rays.npz", "zip"),
     _rays_file("rays.parquet"),
     Reader("rays metadata", _make_metadata, {"metadata.json": ("json",)}, _read_metadata),
-    *(_recording(name, skip) for name in reader_names() for skip in (False, True)),
+    *(_recording(name, EXAMPLES[name], kind) for name in reader_names() for kind in ("", " skipping")),
+    *(
+        _recording(name, example, f" {k}")
+        for name, examples in VARIANTS.items()
+        for k, example in enumerate(examples, 2)
+    ),
     _tables("gaze.csv.gz", lambda path: path.write_bytes(gzip.compress(TABLE.encode(), mtime=0)), "gzip"),
     _tables("gaze.parquet", _make_parquet),
     _skeletons("day.csv", "text"),

@@ -76,6 +76,28 @@ def aria_pose(us: int, world: str = "w", place=(0, 0, 1.6), gravity=(0, 0, -9.81
     return [world, us, -1, *place, *turn, *gravity, 1.0]
 
 
+_ARIA_EYES = [f"{what}_{side}_eye_cpf" for side in ("left", "right") for what in ("tx", "ty", "tz")]
+_ARIA_POSES = {"aria_trajectory.csv": lines(ARIA_POSES, lambda k: aria_pose(10_000 * k, world=f"w{k > 6}"))}
+_ARIA_GEN2 = "tracking_timestamp_us yaw_rads_cpf pitch_rads_cpf left_pitch_rads_cpf right_pitch_rads_cpf".split()
+_ARIA_VERGENCE = "tracking_timestamp_us left_yaw_rads_cpf right_yaw_rads_cpf pitch_rads_cpf depth_m".split()
+
+VARIANTS = {
+    "aria": [
+        Example(
+            _ARIA_POSES | {"generalized_gaze.csv": lines(_ARIA_VERGENCE, lambda k: [9000 * k, 0.1, 0.12, -0.2, 1.5])}
+        ),
+        Example(
+            _ARIA_POSES
+            | {
+                "eyegaze.csv": lines(
+                    [*_ARIA_GEN2, *_ARIA_EYES], lambda k: [9000 * k, 0.1, -0.2, -0.2, -0.2, 0.03, 0, 0, -0.03, 0, 0]
+                )
+            }
+        ),
+    ]
+}
+"""Recordings of other kinds that readers tell apart by what is in the files: for the fuzzer besides `EXAMPLES`."""
+
 EXAMPLES = {
     "skeleton22": Example({"day.csv": write_walk}, {"tick": 0.1}),
     "unity": Example({"ann.csv": lines(_UNITY, lambda k: [0.02 * k, "ann", 0, 1.6, k, 0, 0, 1, "VALID"])}),
