@@ -160,11 +160,12 @@ def _fault(path: Path, tolerant: bool) -> str | None:
         v = v[(np.linalg.norm(v[:, :4], axis=1) > 0.5) & (np.linalg.norm(v[:, 4:], axis=1) > 0.5)]
         if not len(v):
             continue
-        first = v[0] if first is None else first
-        changes |= bool(np.abs(v[:, 4:] - first[4:]).max() > _SAME)
+        start: np.ndarray = v[0] if first is None else first
+        first = start
+        changes |= bool(np.abs(v[:, 4:] - start[4:]).max() > _SAME)
         # The scalar product of unit quaternions is the cosine of half the angle between them.
-        length = np.linalg.norm(v[:, :4], axis=1) * np.linalg.norm(first[:4])
-        turned = max(turned, 2 * np.degrees(np.arccos(min(1.0, np.abs(v[:, :4] @ first[:4] / length).min()))))
+        length = np.linalg.norm(v[:, :4], axis=1) * np.linalg.norm(start[:4])
+        turned = max(turned, 2 * np.degrees(np.arccos(min(1.0, np.abs(v[:, :4] @ start[:4] / length).min()))))
         head, gaze = (poses.rotations_from_quaternions(q) for q in (v[:, :4], v[:, 4:]))
         in_head.append(np.einsum("nji,nj->ni", head, gaze @ _FORWARD).astype(np.float32))
     if first is None or turned <= _TURNED[0]:
