@@ -105,12 +105,8 @@ def read_colmap(
     record for what cannot be parsed, and when no frame can be used.
     """
     folder, images = Path(folder), Path(images)
-    files = model_files(folder)
-    if files is None:
-        raise MissingFile(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
+    files, raw = _open(folder)
     binary = files["cameras"].suffix == ".bin"
-    # Both are digested as well, and images.bin may have gigabytes of observations.
-    raw = {name: read_bytes(files[name], "COLMAP file") for name in ("cameras", "images")}
     cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"], raw["cameras"])
     poses = (_images_bin if binary else _images_txt)(files["images"], raw["images"])
     frames, unused = [], []
@@ -122,13 +118,41 @@ def read_colmap(
             # A name may be longer than the system allows, or hold what no name can.
             unused.append(Unused(name, sentence(e)))
     frames, unused = settled(files["images"], frames, unused)
-    digest = hashlib.sha256(b"".join(hashlib.sha256(raw[name]).digest() for name in ("cameras", "images")))
     points = None
     if "points3D" in files:
         points = (_points_bin if binary else _points_txt)(
             files["points3D"], read_bytes(files["points3D"], "COLMAP file")
         )
-    return PosedImages(files["images"], frames, unused, None, digest.hexdigest(), points=points)
+    return PosedImages(files["images"], frames, unused, None, _digest(raw), points=points)
+
+
+def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.ndarray]]]:
+    """Of the model in ``folder``, whose images need not be there: its file of images, the model's SHA-256 as
+    `PosedImages` has it, and of each image its name and its OpenGL camera-to-world pose (4, 4).
+
+    `NergError` names file and record for what cannot be parsed.
+    """
+    files, raw = _open(Path(folder))
+    path, found = files["images"], []
+    for name, _, q, t in (_images_bin if path.suffix == ".bin" else _images_txt)(path, raw["images"]):
+        try:
+            found.append((name, _to_world(q, t)))
+        except NergError as error:
+            raise NergError(f'image "{plain(name)}" of "{path}": {error}; copy the model again') from error
+    return path, _digest(raw), found
+
+
+def _open(folder: Path) -> tuple[dict[str, Path], dict[str, bytes]]:
+    """Files of the model in ``folder``, and the bytes of its cameras and images; `MissingFile` where there is none."""
+    files = model_files(folder)
+    if files is None:
+        raise MissingFile(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
+    # Both are digested as well, and images.bin may have gigabytes of observations.
+    return files, {name: read_bytes(files[name], "COLMAP file") for name in ("cameras", "images")}
+
+
+def _digest(raw: dict[str, bytes]) -> str:
+    return hashlib.sha256(b"".join(hashlib.sha256(raw[name]).digest() for name in ("cameras", "images"))).hexdigest()
 
 
 def _frame(name: str, camera: _Camera | None, number: int, q, t, images: Path, masks, root: Path | None) -> Frame:

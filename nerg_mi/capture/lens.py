@@ -38,15 +38,28 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
 
     Raises `NergError` where the model folds over inside the image, so that no inverse exists.
     """
+    u, good = undistort_where(xy, lens)
+    if not good.all():
+        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+        listed = ", ".join(f"{k}={v:g}" for k, v in zip(names, lens.distortion) if v)
+        raise NergError(
+            f"the distortion {listed} cannot be inverted over the whole image; undistort the images beforehand, "
+            "or crop them"
+        )
+    return u
+
+
+def undistort_where(xy: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    """As `undistort`, (..., 2), and a mask (...) of the coordinates that have an inverse; elsewhere it is none."""
     goal = np.asarray(xy, np.float64)
     if not any(lens.distortion):
-        return goal.copy()
+        return goal.copy(), np.isfinite(goal).all(axis=-1)
     u = goal.copy()
     # Beside the fold a step may overflow; what comes of it is found out below.
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(_NEWTON):
             residual = distort(u, lens) - goal
-            if np.abs(residual).max() < 1e-13:
+            if np.abs(residual).max(initial=0.0) < 1e-13:
                 break
             a, b, d = _jacobian(u, lens)
             det = a * d - b * b
@@ -60,15 +73,8 @@ def undistort(xy: np.ndarray, lens: Intrinsics) -> np.ndarray:
             )
         a, b, d = _jacobian(u, lens)
         # Past the fold the picture runs backwards: another point with the same image, that the lens does not show.
-        good = np.all(np.abs(distort(u, lens) - goal) < 1e-6) and np.all(a * d - b * b > 0) and np.all(a + d > 0)
-    if not good:
-        names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-        listed = ", ".join(f"{k}={v:g}" for k, v in zip(names, lens.distortion) if v)
-        raise NergError(
-            f"the distortion {listed} cannot be inverted over the whole image; undistort the images beforehand, "
-            "or crop them"
-        )
-    return u
+        good = np.all(np.abs(distort(u, lens) - goal) < 1e-6, axis=-1) & (a * d - b * b > 0) & (a + d > 0)
+    return u, good
 
 
 def _ratio(r2, lens: Intrinsics):

@@ -51,15 +51,14 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
     path = Path(path)
     raw = read_bytes(path, "transforms file", JSON_BYTES)
     data = _json(path, raw)
-    if not isinstance(data.get("frames"), list):
-        raise NergError(f'"{path}" is not a transforms file: it has no list "frames"; name one that has')
+    listed = _frames(data, path)
     original = _original(data, path)
     # Millimetres are of the original coordinates.
     metre = 1.0 if original is None else 1 / float(np.cbrt(np.linalg.det(original[:3, :3])))
     frames, unused, notes = [], [], []
     shared = {k: v for k, v in data.items() if k in _SHARED or k.startswith("ftheta")}
     root = None if allow_outside else path.parent
-    for index, entry in enumerate(data["frames"]):
+    for index, entry in enumerate(listed):
         name = entry.get("file_path") if isinstance(entry, dict) else None
         if not isinstance(name, str):
             unused.append(Unused(f"frame {index}", 'it has no "file_path"'))
@@ -84,6 +83,28 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
     )
 
 
+def read_frame_poses(path: str | Path) -> tuple[str, list[tuple[str, np.ndarray]]]:
+    """Of a transforms file, whose images need not be there: its SHA-256, and of each frame its name and its OpenGL
+    camera-to-world pose (4, 4).
+
+    `NergError` names file and frame for what is no such file, or no pose.
+    """
+    path = Path(path)
+    raw = read_bytes(path, "transforms file", JSON_BYTES)
+    found = []
+    for index, entry in enumerate(_frames(_json(path, raw), path)):
+        name = entry.get("file_path") if isinstance(entry, dict) else None
+        if not isinstance(name, str) or "transform_matrix" not in entry:
+            raise NergError(
+                f'frame {index} of "{path}" has no "file_path" or no "transform_matrix"; complete or remove it'
+            )
+        try:
+            found.append((name, rigid_pose(entry["transform_matrix"])))
+        except NergError as error:
+            raise NergError(f'frame "{plain(name)}" of "{path}": {error}; correct or remove it') from error
+    return hashlib.sha256(raw).hexdigest(), found
+
+
 def read_dataparser(path: str | Path) -> np.ndarray:
     """The similarity (4, 4) of nerfstudio's ``dataparser_transforms.json``: original coordinates to trained ones."""
     path = Path(path)
@@ -104,6 +125,12 @@ def _json(path: Path, raw: bytes) -> dict:
     if not isinstance(data, dict):
         raise NergError(f'"{path}" is not a transforms file: it holds no JSON object; name one that does')
     return data
+
+
+def _frames(data: dict, path: Path) -> list:
+    if not isinstance(data.get("frames"), list):
+        raise NergError(f'"{path}" is not a transforms file: it has no list "frames"; name one that has')
+    return data["frames"]
 
 
 def _frame(

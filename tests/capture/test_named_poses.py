@@ -1,0 +1,80 @@
+"""Poses by names, without images."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.capture.named_poses import read_named_poses
+from nerg_mi.capture.transforms import read_transforms
+from nerg_mi.errors import NergError
+
+
+def write_transforms(path, poses):
+    frames = [{"file_path": name, "transform_matrix": pose.tolist()} for name, pose in poses.items()]
+    path.write_text(json.dumps({"frames": frames}))
+    return path
+
+
+def write_colmap(folder, poses):
+    """A text model of OpenGL camera-to-world poses: COLMAP's are world-to-camera, y down and z forward."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
+    text = "# images\n"
+    for k, (name, pose) in enumerate(poses.items()):
+        x, y, z, w = Rotation.from_matrix((pose[:3, :3] @ np.diag([1, -1, -1])).T).as_quat()
+        t = -(pose[:3, :3] @ np.diag([1, -1, -1])).T @ pose[:3, 3]
+        text += f"{k + 1} {w} {x} {y} {z} {t[0]} {t[1]} {t[2]} 1 {name}\n\n"
+    (folder / "images.txt").write_text(text)
+    return folder
+
+
+def some_poses(n=4):
+    rng = np.random.default_rng(1)
+    poses = {}
+    for k in range(n):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = Rotation.random(random_state=k).as_matrix(), rng.normal(size=3)
+        poses[f"images/scene_{k:04d}.jpg"] = pose
+    return poses
+
+
+def test_both_kinds_give_the_same_poses(tmp_path):
+    poses = some_poses()
+    a = read_named_poses(write_transforms(tmp_path / "transforms.json", poses))
+    b = read_named_poses(write_colmap(tmp_path / "sparse", poses))
+    for found in (a, b):
+        assert found.names == list(poses) and np.allclose(found.to_world, list(poses.values()), atol=1e-12)
+    assert a.path.name == "transforms.json" and b.path.name == "images.txt" and a.sha256 != b.sha256
+
+
+def test_the_checksum_is_that_of_a_training(tmp_path):
+    poses = some_poses(2)
+    path = write_transforms(tmp_path / "transforms.json", poses)
+    (tmp_path / "images").mkdir()
+    for name in poses:
+        (tmp_path / name).write_bytes(b"")
+    assert read_named_poses(path).sha256 == read_transforms(path).sha256
+
+
+@pytest.mark.parametrize(
+    "frames, message",
+    [
+        ([], "lists no images"),
+        ([{"file_path": "a.jpg"}], 'frame 0 of .* has no "file_path" or no "transform_matrix"'),
+        ([{"file_path": "a.jpg", "transform_matrix": [[1]]}], 'frame "a.jpg" of .*4 x 4'),
+    ],
+)
+def test_what_is_no_pose(tmp_path, frames, message):
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"frames": frames}))
+    with pytest.raises(NergError, match=message):
+        read_named_poses(path)
+
+
+def test_a_model_whose_quaternion_is_zero(tmp_path):
+    folder = write_colmap(tmp_path / "sparse", some_poses(1))
+    (folder / "images.txt").write_text("1 0 0 0 0 0 0 0 1 a.jpg\n\n")
+    with pytest.raises(NergError, match='image "a.jpg" of .*its quaternion is zero'):
+        read_named_poses(folder)
