@@ -1,4 +1,4 @@
-"""Poses of a model by the names of its images, whether or not the images are there."""
+"""Which file describes a posed image set, and its poses by the names of its images, whether or not they are there."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import MissingFile, NergError
 
 from .colmap import model_files, read_image_poses
 from .transforms import read_frame_poses
+
+_MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +25,27 @@ class NamedPoses:
     to_world: np.ndarray  # (N, 4, 4) rigid OpenGL camera-to-world: x right, y up, z back
 
 
+def find_source(dataset: str | Path) -> Path:
+    """The transforms file of ``dataset``, or the folder of its COLMAP model. ``dataset``: a folder, or that file
+    itself."""
+    dataset = Path(dataset)
+    if dataset.is_file():
+        # A file of a COLMAP model stands for the model.
+        return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
+    for name in ("transforms.json", "transforms_train.json"):
+        if (dataset / name).is_file():
+            return dataset / name
+    for name in _MODELS:
+        if model_files(dataset / name) is not None:
+            return dataset / name
+    raise MissingFile(
+        f'"{dataset}" holds neither transforms.json nor transforms_train.json nor a COLMAP model '
+        "(sparse/0/cameras.bin); name the folder of a posed image set"
+    )
+
+
 def read_named_poses(source: str | Path) -> NamedPoses:
-    """Of a transforms file, or of the folder of a COLMAP model; `nerg_mi.capture.sources.find_source` finds either.
+    """Of a transforms file, or of the folder of a COLMAP model; `find_source` finds either.
 
     Raises `NergError` for what cannot be parsed, and for a file that lists nothing.
     """

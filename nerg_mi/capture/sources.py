@@ -9,13 +9,13 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
 
-from .colmap import model_files, read_colmap
+from .colmap import read_colmap
 from .images import split_holdout
+from .named_poses import find_source
 from .posed import Frame, PosedImages, Unused
 from .transforms import read_dataparser, read_transforms
 from .upright import Up, find_up, turn_to_z
 
-_MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 COORDINATES = ("file", "upright", "original")
 
 
@@ -27,25 +27,6 @@ class Split:
     posed: PosedImages
     held_out: list[Frame]
     rule: str
-
-
-def find_source(dataset: str | Path) -> Path:
-    """The transforms file of ``dataset``, or the folder of its COLMAP model. ``dataset``: a folder, or that file
-    itself."""
-    dataset = Path(dataset)
-    if dataset.is_file():
-        # A file of a COLMAP model stands for the model.
-        return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
-    for name in ("transforms.json", "transforms_train.json"):
-        if (dataset / name).is_file():
-            return dataset / name
-    for name in _MODELS:
-        if model_files(dataset / name) is not None:
-            return dataset / name
-    raise MissingFile(
-        f'"{dataset}" holds neither transforms.json nor transforms_train.json nor a COLMAP model '
-        "(sparse/0/cameras.bin); name the folder of a posed image set"
-    )
 
 
 def read_posed(source: Path, allow_outside: bool = False) -> PosedImages:

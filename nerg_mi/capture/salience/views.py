@@ -18,7 +18,8 @@ from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.capture.posed import Frame, MaskFile, inside
 from nerg_mi.capture.reading import open_bitmap, read_image, read_mask
 from nerg_mi.capture.resize import all_used, nearest, overlap
-from nerg_mi.capture.sources import find_source, read_posed
+from nerg_mi.capture.named_poses import find_source
+from nerg_mi.capture.sources import read_posed
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.npy import read_npy
 
@@ -113,7 +114,7 @@ def open_salience(
     trained: dict | None = None,
     allow_outside: bool = False,
 ) -> SalienceSet:
-    """The salience images of a posed image set ``dataset`` (as `sources.find_source` knows them).
+    """The salience images of a posed image set ``dataset`` (as `named_poses.find_source` knows them).
 
     ``source``: a folder with one .png, .exr or .npy a frame, called as the photo is but for the suffix, or the name of
     a model (``MODELS``), which makes them from the photos. ``per``: what the images' values are proportional to: gaze a
