@@ -15,10 +15,10 @@ import numpy as np
 from nerg_mi.capture import lens
 from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.capture.named_poses import find_source
 from nerg_mi.capture.posed import Frame, MaskFile, inside
 from nerg_mi.capture.reading import open_bitmap, read_image, read_mask
 from nerg_mi.capture.resize import all_used, nearest, overlap
-from nerg_mi.capture.named_poses import find_source
 from nerg_mi.capture.sources import read_posed
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.npy import read_npy
