@@ -12,6 +12,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable
+from nerg_mi.files.tables import write_json
 from nerg_mi.rays import filters, fixations, splits
 from nerg_mi.rays.io import SUFFIXES
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
@@ -40,6 +41,7 @@ class ImportOptions:
     pseudonyms: bool = False  # replace the names of persons by salted hashes
     salt: FileName | None = None  # of the hashes: a file of 16 bytes or more; None: random, not kept
     output: FileName | None = None  # rays file to write, .npz or .parquet; None: none
+    align_output: FileName | None = None  # JSON file to write: the similarity from rays to the files' frame; None: none
 
     def __post_init__(self) -> None:
         if self.salt is not None and not self.pseudonyms:
@@ -59,10 +61,13 @@ def import_rays(
 ) -> ImportResult:
     """Tracking files (or folders, by the reader) as rays: right-handed, z up, metres, seconds.
 
-    Raises `NergError` for what the reader refuses, or an output that cannot be written, before anything is read.
+    Raises `NergError` for what the reader refuses, or an output that cannot be written, before anything is read; for an
+    alignment with files whose frame is the other hand's.
     """
     files = [files] if isinstance(files, (str, os.PathLike)) else list(files)
     _check_outputs(options.output)
+    if options.align_output is not None:
+        check_writable(options.align_output, ".json")
     salt = None if options.salt is None else read_salt(options.salt)
     begun: list[str] = []
 
@@ -73,8 +78,22 @@ def import_rays(
     rays = read_rays(options.reader, files, options.settings, skip_bad_lines=options.skip_bad_lines, on_source=progress)
     if options.pseudonyms:
         rays = pseudonymise(rays, salt)
+    align = None if options.align_output is None else _to_files(rays)
     _save(rays, options.output)
+    if options.align_output is not None:
+        write_json(options.align_output, align)
     return ImportResult(rays, summarise(rays))
+
+
+def _to_files(rays: Rays) -> list[list[float]]:
+    """The similarity (4 rows) from rays to the frame of the files that they were made of, for --align."""
+    back = np.linalg.inv(np.array(rays.metadata["transform"], np.float64))
+    if np.linalg.det(back[:3, :3]) < 0:
+        raise NergError(
+            "the files' frame is left-handed and that of rays right-handed, so that no similarity leads from one to the "
+            "other; leave out --write-align, and align the rays with the place"
+        )
+    return (back + 0.0).tolist()
 
 
 @dataclass(frozen=True, eq=False)

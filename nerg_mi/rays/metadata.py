@@ -116,5 +116,6 @@ _KNOWN = {
         lambda v: _objects(v, step=_text, kept=is_count, of=is_count, by_=_by),
         "list of steps with their counts",
     ),
+    "complaints": (_names, "list of sentences"),
     "tick": (lambda v: _number(v) and v > 0, "time in seconds"),
 }

@@ -50,6 +50,11 @@ def _to_source(rays: Rays) -> np.ndarray:
     return np.linalg.inv(matrix / np.cbrt(abs(np.linalg.det(matrix))))
 
 
+def check_files(rays: Rays, figures: Figures) -> list[str]:
+    """What the reader of the files found wrong with them."""
+    return list(rays.metadata.get("complaints", []))
+
+
 def check_lengths(rays: Rays, figures: Figures) -> list[str]:
     """Units of length and the up axis, by the heights and the extent of the origins."""
     extent, median, out = figures.extent, figures.height[1], []
@@ -174,7 +179,7 @@ def _check_walking(rays: Rays, order: np.ndarray | None) -> list[str]:
     return []
 
 
-CHECKS: tuple[Callable[[Rays, Figures], list[str]], ...] = (check_lengths, check_times, check_directions)
+CHECKS: tuple[Callable[[Rays, Figures], list[str]], ...] = (check_files, check_lengths, check_times, check_directions)
 """What is looked for, in the order of the card; each check gives no sentence where nothing is wrong."""
 
 

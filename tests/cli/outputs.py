@@ -64,6 +64,11 @@ CASES = (
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
     Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
+    Case(
+        "rays import",
+        "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p' --write-align {o}/align.json",
+        ("a.npz", "align.json"),
+    ),
     Case("rays filter", "{i}/rays.npz -o {o}/a.npz --person a", ("a.npz",)),
     Case("rays filter", "{i}/rays.npz -o {o}/a.parquet --person a", ("a.parquet",)),
     Case("rays split", "{i}/rays.npz -o {o}/a.npz --people 0.5", ("a-train.npz", "a-test.npz")),
@@ -130,7 +135,7 @@ READS_ONLY = {"doctor", "rays show"}
 """Commands that write no file."""
 INPUTS = {
     "render": {"scene"},
-    "rays import": {"files", "salt"},
+    "rays import": {"files", "salt", "poses", "place"},
     "rays show": {"rays"},
     "rays filter": {"rays"},
     "rays split": {"rays"},

@@ -103,10 +103,11 @@ def _recording(name: str, example: Example, kind: str = "") -> Reader:
     def read(folder: Path) -> None:
         from nerg_mi.rays.readers.registry import make_options, read_rays
 
-        given = folder / list(example.files)[-1]
-        _shown(read_rays(name, given, make_options(name, example.options), skip_bad_lines=skip))
+        options = make_options(name, example.options_in(folder))
+        _shown(read_rays(name, example.given(folder), options, skip_bad_lines=skip))
 
-    kinds = {file: ("gzip",) if file.endswith(".gz") else ("text",) for file in example.files}
+    known = {".gz": "gzip", ".json": "json", ".g3": "json"}
+    kinds = {file: (known.get(Path(file).suffix, "text"),) for file in example.files}
     return Reader(f"preset {name}{kind}", make, kinds, read)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.jobs.gaze_places import read_similarity
 from nerg_mi.jobs.tracking import (
     FilterOptions,
     ImportOptions,
@@ -58,6 +59,22 @@ def test_import(tmp_path):
     kept = Rays.load(tmp_path / "rays.npz")
     assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(columns(kept), columns(result.rays)))
     assert len(import_rays(given, ImportOptions(settings=settings)).rays) == 20
+
+
+def test_the_way_back_to_the_files(tmp_path):
+    """The matrix that training is given takes rays to where they stood in the file."""
+    given, align = EXAMPLES["table"].make(tmp_path), tmp_path / "align.json"
+    table = EXAMPLES["table"].options
+    settings = make_options("table", {**table, "up": "-y", "units": "mm"})
+    rays = import_rays(given, ImportOptions(settings=settings, align_output=align)).rays
+    back = read_similarity(align, "--align", "rays to field")
+    plain = import_rays(given, ImportOptions(settings=make_options("table", table))).rays
+    assert np.isclose(back.scale, 1000.0)
+    assert np.allclose(rays.origin @ back.matrix[:3, :3].T + back.matrix[:3, 3], plain.origin)
+    with pytest.raises(NergError, match="left-handed"):
+        left = make_options("table", {**table, "up": "y", "handedness": "left"})
+        import_rays(given, ImportOptions(settings=left, align_output=align, output=tmp_path / "none.npz"))
+    assert not (tmp_path / "none.npz").exists()
 
 
 def test_import_under_pseudonyms(tmp_path):

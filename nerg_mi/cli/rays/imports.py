@@ -42,6 +42,13 @@ def _own_options(
     ],
     output: Output,
     preset: Annotated[str | None, typer.Option(help=f"Known recording: {', '.join(preset_names())}.")] = None,
+    write_align: Annotated[
+        Path | None,
+        typer.Option(
+            help="JSON file to write: the similarity from the rays to the files' own frame, for --align where a place "
+            "is in that frame."
+        ),
+    ] = None,
     skip_bad_lines: Annotated[
         bool,
         typer.Option(
@@ -81,6 +88,7 @@ def _import_rays(
     files: list[Path],
     output: Path,
     preset: str | None,
+    write_align: Path | None,
     skip_bad_lines: bool,
     pseudonyms: bool,
     salt: Path | None,
@@ -100,8 +108,11 @@ def _import_rays(
         pseudonyms=pseudonyms,
         salt=salt,
         output=output,
+        align_output=write_align,
     )
     with TerminalReporter() as reporter:
         result = import_rays(files, options, reporter)
     print_card(result.rays, result.summary, output)
     typer.echo(f"wrote {output}")
+    if write_align is not None:
+        typer.echo(f"wrote {write_align}")

@@ -61,6 +61,12 @@ class RaysBuilder:
         """Keep something in the metadata of the rays; values as JSON has them."""
         self._notes.update(what)
 
+    def complain(self, sentence: str) -> None:
+        """Say what is likely wrong with the files, and the remedy; it stands on the card of the rays."""
+        found = self._notes.setdefault("complaints", [])
+        if sentence not in found:
+            found.append(sentence)
+
     @property
     def on_bad(self) -> OnBadLine | None:
         """Called with each line that cannot be read: its number, from 1, and why. None where it ends the import."""

@@ -12,7 +12,21 @@ from typing import Any
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import aria, eyenavgs, hololens, pupil, qualisys, skeleton22, table, unity, varjo, vr_supermarket
+from . import (
+    aria,
+    eyenavgs,
+    glassestools,
+    hololens,
+    neon,
+    pupil,
+    qualisys,
+    skeleton22,
+    table,
+    tobii3,
+    unity,
+    varjo,
+    vr_supermarket,
+)
 from .builder import RaysBuilder
 from .options import Option, options_of, recorded_options
 from .protocol import Reader
@@ -183,6 +197,20 @@ def preset_table() -> str:
     return "\n".join(rows) + "\n"
 
 
-for _module in (skeleton22, unity, varjo, hololens, pupil, qualisys, aria, eyenavgs, vr_supermarket, table):
+for _module in (
+    skeleton22,
+    unity,
+    varjo,
+    hololens,
+    pupil,
+    qualisys,
+    aria,
+    eyenavgs,
+    neon,
+    tobii3,
+    glassestools,
+    vr_supermarket,
+    table,
+):
     for _reader in _module.READERS:
         register(_reader)

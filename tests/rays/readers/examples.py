@@ -13,6 +13,7 @@ import numpy as np
 from nerg_mi.rays.readers.parsing.bodies import keypoints_from_head
 from nerg_mi.rays.readers.parsing.column_map import ColumnMap
 from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
+from tests.rays.readers import scene_examples as scenes
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,15 @@ class Example:
                 (folder / name).write_bytes(gzip.compress(content.encode(), mtime=0))
             else:
                 (folder / name).write_text(content)
+        return self.given(folder)
+
+    def given(self, folder: Path) -> Path:
+        """The path to give to the reader, of files that lie in ``folder``."""
         return folder / list(self.files)[-1]
+
+    def options_in(self, folder: Path) -> dict[str, Any]:
+        """The options, files among them as they lie in ``folder``."""
+        return {name: folder / v if isinstance(v, Path) else v for name, v in self.options.items()}
 
 
 def lines(head: list[str] | None, row: Callable[[int], list], separator: str = ",", count: int = 8) -> str:
@@ -98,6 +107,8 @@ VARIANTS = {
 }
 """Recordings of other kinds that readers tell apart by what is in the files: for the fuzzer besides `EXAMPLES`."""
 
+_SCENE = {"poses": Path("transforms.json"), "frames": scenes.FRAMES}
+
 EXAMPLES = {
     "skeleton22": Example({"day.csv": write_walk}, {"tick": 0.1}),
     "unity": Example({"ann.csv": lines(_UNITY, lambda k: [0.02 * k, "ann", 0, 1.6, k, 0, 0, 1, "VALID"])}),
@@ -161,5 +172,8 @@ EXAMPLES = {
             )
         }
     ),
+    "neon": Example(scenes.NEON, _SCENE),
+    "tobii3": Example(scenes.TOBII, _SCENE),
+    "glassestools": Example(scenes.GLASSESTOOLS, _SCENE),
     "table": Example({"gaze.csv": TABLE}, {"columns": ColumnMap.parse(MAP)}),
 }

@@ -10,6 +10,7 @@ from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers import builder as builder_module
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
+from nerg_mi.rays.summary import summarise
 
 
 def add(builder, n, gone=(), first=1):
@@ -105,3 +106,14 @@ def test_rays_are_taken_out_of_the_frame(tmp_path):
     assert np.allclose(rays.hit, [1, 8, 1.6]) and begun == ["ann/a.csv"]
     assert rays.metadata["source_frame"] == {"up": "y", "handedness": "left", "units": "cm"}
     assert np.allclose(rays.metadata["transform"], Frame("y", "left", "cm").to_rays())
+
+
+def test_complaints_are_kept_once_and_stand_on_the_card(tmp_path):
+    builder = RaysBuilder()
+    (tmp_path / "a.csv").write_text("")
+    builder.source(tmp_path / "a.csv")
+    builder.add(np.arange(3.0), "ann", np.eye(3), np.eye(3), rows=np.arange(3))
+    for sentence in ("one", "two", "one"):
+        builder.complain(sentence)
+    rays = builder.build()
+    assert rays.metadata["complaints"] == ["one", "two"] and summarise(rays).warnings[:2] == ("one", "two")

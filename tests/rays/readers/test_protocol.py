@@ -26,7 +26,7 @@ def test_what_they_say_of_themselves(name):
 def test_what_all_readers_keep(tmp_path, name, skip_bad_lines):
     """Of the example of each: rays in the frame that is declared, with an account of all rows."""
     example, reader = EXAMPLES[name], registry.reader_named(name)
-    given, options = example.make(tmp_path), registry.make_options(name, example.options)
+    given, options = example.make(tmp_path), registry.make_options(name, example.options_in(tmp_path))
     begun = []
     rays = registry.read_rays(name, given, options, skip_bad_lines=skip_bad_lines, on_source=begun.append)
     about = rays.metadata
@@ -53,4 +53,4 @@ def test_a_file_that_is_none_of_theirs(tmp_path, name):
     given = example.make(tmp_path)
     given.write_text("this is a letter\nand no table\n")
     with pytest.raises(NergError, match=given.name.split(".")[0]):
-        registry.read_rays(name, given, registry.make_options(name, example.options))
+        registry.read_rays(name, given, registry.make_options(name, example.options_in(tmp_path)))
