@@ -90,8 +90,8 @@ def _to_files(rays: Rays) -> list[list[float]]:
     back = np.linalg.inv(np.array(rays.metadata["transform"], np.float64))
     if np.linalg.det(back[:3, :3]) < 0:
         raise NergError(
-            "the files' frame is left-handed and that of rays right-handed, so that no similarity leads from one to the "
-            "other; leave out --write-align, and align the rays with the place"
+            "the files' frame is left-handed and that of rays right-handed, so that no similarity leads from one to "
+            "the other; leave out --write-align, and align the rays with the place"
         )
     return (back + 0.0).tolist()
 

@@ -27,7 +27,8 @@ class TableOptions:
         None,
         'Column map: "origin=x,y,z direction=dx,dy,dz t=time person=id confidence=c hit=hx,hy,hz cohort=g"; for heads, '
         "in place of direction: xyzw=..., wxyz=..., ypr=yaw,pitch,roll or matrix=... (12 or 16 columns, instead of "
-        "origin too).",
+        "origin too); a direction as angles: azel=azimuth,elevation (right, up) or yawpitch=yaw,pitch, - before a name "
+        "turns its sign.",
         flag="--map",
         parse=ColumnMap.parse,
         recorded=False,
@@ -65,11 +66,12 @@ class TableOptions:
 class Table:
     """CSV or Parquet tables through a column map.
 
-    Directions need not be unit. Where the map has a head's pose (``xyzw``, ``wxyz``, ``ypr``, ``matrix``),
-    ``direction`` and ``eye`` are in the head's frame, and without a ``direction`` the ray is where the head points:
-    along ``forward``, an axis of its frame. How angles turn is told at
-    :func:`nerg_mi.rays.readers.parsing.poses.rotations_from_angles`. Rows with a confidence below ``min_confidence``
-    are dropped. ``tick``: seconds in one unit of the time column; without one, in one row.
+    Directions need not be unit, and may be two angles from ``forward`` on: ``azel`` as told at
+    :func:`nerg_mi.rays.readers.parsing.poses.directions_from_azimuths`, or ``yawpitch``. Where the map has a head's
+    pose (``xyzw``, ``wxyz``, ``ypr``, ``matrix``), ``direction``, angles and ``eye`` are in the head's frame, and
+    without a direction the ray is where the head points: along ``forward``, an axis of its frame. How yaw, pitch and
+    roll turn is told at :func:`nerg_mi.rays.readers.parsing.poses.rotations_from_angles`. Rows with a confidence below
+    ``min_confidence`` are dropped. ``tick``: seconds in one unit of the time column; without one, in one row.
     """
 
     name = "table"
@@ -101,9 +103,9 @@ def add_tables(
         raise NergError("a table needs a column map; say what its columns are (--map)")
     rows = _Rows(options.columns, options, valid or {})
     builder.note(columns=str(rows.columns), min_confidence=options.min_confidence, tick=options.tick)
-    if rows.columns.pose:
+    if rows.columns.pose or rows.columns.angles:
         builder.note(forward=options.looks_along)
-    if rows.columns.ypr:
+    if rows.columns.ypr or rows.columns.angles:
         builder.note(degrees=not options.radians)
     for path in files:
         rows.add(path, builder)
@@ -121,9 +123,12 @@ class _Rows:
         self.columns, self.options, self.valid = columns, options, valid
         self.person = None if options.person_from == "filename" else columns.person
         self.pose_columns = getattr(columns, columns.pose) if columns.pose else ()
+        signed = getattr(columns, columns.angles) if columns.angles else ()
+        self.angle_columns = tuple(name.removeprefix("-") for name in signed)
+        self.angle_signs = np.array([-1.0 if name.startswith("-") else 1.0 for name in signed])
         vectors = [c for c in (columns.origin, columns.direction, columns.eye, columns.hit) if c]
         self.numbers = [name for v in vectors for name in v]
-        self.numbers += [*self.pose_columns, *(c for c in (columns.t, columns.confidence) if c)]
+        self.numbers += [*self.pose_columns, *self.angle_columns, *(c for c in (columns.t, columns.confidence) if c)]
         self.texts = [c for c in (self.person, columns.cohort, *valid) if c]
 
     def add(self, path: Path, builder: RaysBuilder) -> None:
@@ -163,15 +168,29 @@ class _Rows:
     def _geometry(self, vector: Callable[[Sequence[str]], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Origins and directions (n, 3) of a block, whose columns ``vector`` stacks."""
         columns = self.columns
+        direction = self._direction(vector)
         if not columns.pose:
-            return vector(columns.origin or ()), vector(columns.direction or ())
+            return vector(columns.origin or ()), np.asarray(direction)
         turn, place = _pose(columns.pose, vector(self.pose_columns), self.options)
         origin = vector(columns.origin or ()) if place is None else place
         if columns.eye:
             origin = origin + poses.rotate(turn, vector(columns.eye))
-        if columns.direction:
-            return origin, poses.rotate(turn, vector(columns.direction))
+        if direction is not None:
+            return origin, poses.rotate(turn, direction)
         return origin, turn @ poses.axis(self.options.looks_along, "forward")
+
+    def _direction(self, vector: Callable[[Sequence[str]], np.ndarray]) -> np.ndarray | None:
+        """The directions (n, 3) that the table gives beside a pose, or without one; None where the pose is all."""
+        if self.columns.direction:
+            return vector(self.columns.direction)
+        if not self.columns.angles:
+            return None
+        options, angles = self.options, vector(self.angle_columns) * self.angle_signs
+        if self.columns.azel:
+            forward = options.looks_along
+            return poses.directions_from_azimuths(angles, options.up, forward, options.handedness, not options.radians)
+        turn = poses.rotations_from_angles(angles, options.up, options.looks_along, not options.radians)
+        return turn @ poses.axis(options.looks_along, "forward")
 
 
 def _pose(kind: str, values: np.ndarray, options: TableOptions) -> tuple[np.ndarray, np.ndarray | None]:

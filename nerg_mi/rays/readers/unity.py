@@ -37,6 +37,10 @@ _GAZE = ("gaze_dir", "gaze_direction", "gaze_forward")
 _EYES = ("gaze_origin", "gaze_position", "eye_position")
 _HEADS = ("head_pos", "head_position", "hmd_pos")
 _ROTATIONS = ("head_rot", "head_rotation", "hmd_rot")
+# Names that do not say of what: where there are none of those above.
+_BARE_DIRECTIONS = ("dir", "direction", "d")
+_BARE_PLACES = ("origin", "pos", "position", "")
+_BARE_ROTATIONS = ("rot", "rotation", "quaternion", "quat", "q")
 
 
 class UnityReader:
@@ -84,25 +88,25 @@ class UnityReader:
 
 
 def _gaze_in_world(table: ColumnFinder) -> dict:
-    return {"direction": table.vector(*_GAZE), "origin": table.vector(*_EYES)}
+    return {"direction": table.vector(*_GAZE, *_BARE_DIRECTIONS), "origin": table.vector(*_EYES, *_BARE_PLACES)}
 
 
 def _gaze_in_head(table: ColumnFinder) -> dict:
     return {
-        "direction": table.vector(*_GAZE),
+        "direction": table.vector(*_GAZE, *_BARE_DIRECTIONS),
         "eye": table.find_vector(*_EYES),
-        "origin": table.vector(*_HEADS),
-        "xyzw": table.vector(*_ROTATIONS, axes="xyzw"),
+        "origin": table.vector(*_HEADS, *_BARE_PLACES),
+        "xyzw": table.vector(*_ROTATIONS, *_BARE_ROTATIONS, axes="xyzw"),
     }
 
 
 def _heads(table: ColumnFinder) -> dict:
-    rotation = table.find_vector(*_ROTATIONS, axes="xyzw")
+    rotation = table.find_vector(*_ROTATIONS, *_BARE_ROTATIONS, axes="xyzw")
     if rotation is not None:
-        return {"origin": table.vector(*_HEADS), "xyzw": rotation}
+        return {"origin": table.vector(*_HEADS, *_BARE_PLACES), "xyzw": rotation}
     # Unity's Euler angles in degrees are pitch, yaw and roll.
-    x, y, z = table.vector(*_ROTATIONS)
-    return {"origin": table.vector(*_HEADS), "ypr": (y, x, z)}
+    x, y, z = table.vector(*_ROTATIONS, "rot", "rotation")
+    return {"origin": table.vector(*_HEADS, *_BARE_PLACES), "ypr": (y, x, z)}
 
 
 READERS = (

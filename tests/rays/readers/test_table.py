@@ -172,3 +172,50 @@ def test_parquet_is_read_as_csv_is(tmp_path, heads):
     assert two.metadata["dropped"] == [
         {"reason": "person is missing", "file": "t.parquet", "count": 1, "rows": [[20, 20]]}
     ]
+
+
+# What is meant: 30 degrees to the right of forward and 20 up, in the frame of rays (z up, x right, y forward).
+AZIMUTH, ELEVATION = 30.0, 20.0
+MEANT = np.array([0.46984631, 0.81379768, 0.34202014])
+"""cos 20 sin 30, cos 20 cos 30, sin 20."""
+
+
+@pytest.mark.parametrize(
+    "frame, azel, yawpitch",
+    [
+        # Unity: yaw right, pitch down. OpenXR: yaw left, pitch up. ROS with forward y here: yaw left, pitch up.
+        ({"up": "y", "handedness": "left"}, "az,el", "az,-el"),
+        ({"up": "y"}, "az,el", "-az,el"),
+        ({"up": "z", "forward": "y"}, "az,el", "-az,el"),
+    ],
+)
+@pytest.mark.parametrize("radians", [False, True])
+def test_angles_are_directions(tmp_path, frame, azel, yawpitch, radians):
+    unit = np.pi / 180 if radians else 1.0
+    path = tmp_path / "a.csv"
+    path.write_text(f"x,y,z,az,el\n0,0,0,{AZIMUTH * unit},{ELEVATION * unit}\n0,0,0,{AZIMUTH * unit},\n")
+    for columns in (f"azel={azel}", f"yawpitch={yawpitch}"):
+        rays = read("table", path, columns=ColumnMap.parse(f"origin=x,y,z {columns}"), radians=radians, **frame)
+        assert np.allclose(rays.direction, [MEANT]) and rays.metadata["degrees"] is not radians
+
+
+def test_angles_of_ros_turn_left_and_down(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z,yaw,pitch\n0,0,0,90,0\n0,0,0,0,30\n")
+    rays = read("table", path, columns=ColumnMap.parse("origin=x,y,z yawpitch=yaw,pitch"))
+    assert np.allclose(rays.direction, [[0, 1, 0], [np.sqrt(0.75), 0, -0.5]])
+    rays = read("table", path, columns=ColumnMap.parse("origin=x,y,z azel=-yaw,-pitch"))
+    assert np.allclose(rays.direction, [[0, 1, 0], [np.sqrt(0.75), 0, -0.5]])
+
+
+def test_angles_beside_a_pose_are_in_the_head(tmp_path):
+    """The head looks to the right (x); from there 30 degrees further to the right, and 20 up."""
+    head = Rotation.from_euler("Y", 90, degrees=True).as_quat()  # of Unity: to the right
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z,qx,qy,qz,qw,az [deg],el [deg]\n" + ",".join(map(str, [1, 2, 3, *head, 30, 20])) + "\n")
+    columns = ColumnMap.parse('origin=x,y,z xyzw=qx,qy,qz,qw "azel=az [deg],el [deg]"')
+    assert ColumnMap.parse(str(columns)) == columns
+    rays = read("table", path, columns=columns, up="y", handedness="left")
+    assert np.allclose(rays.direction, [[MEANT[1], -MEANT[0], MEANT[2]]]) and np.allclose(rays.origin, [[1, 3, 2]])
+    with pytest.raises(ValueError, match="are both y"):
+        read("table", path, columns=columns, up="y", handedness="left", forward="-y")

@@ -60,3 +60,30 @@ def test_unity_names_what_is_missing(tmp_path):
     (tmp_path / "b.csv").write_text("time," + head + "\n0,0,0,0,0,0,1\n")
     with pytest.raises(ValueError, match="b.csv has other columns"):
         read("unity", path, tmp_path / "b.csv")
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "time,gazeOrigin_x,gazeOrigin_y,gazeOrigin_z,gazeDirection_x,gazeDirection_y,gazeDirection_z",
+        "Time,GazeOriginX,GazeOriginY,GazeOriginZ,GazeDirX,GazeDirY,GazeDirZ",
+        "time,origin_x,origin_y,origin_z,dir_x,dir_y,dir_z",
+        "t,x,y,z,dx,dy,dz",
+        "t,Position (x),Position (y),Position (z),Direction.x,Direction.y,Direction.z",
+        "time [s],gaze origin x [m],gaze origin y [m],gaze origin z [m],gaze dir x,gaze dir y,gaze dir z",
+    ],
+)
+def test_names_that_are_usual_elsewhere(tmp_path, head):
+    path = tmp_path / "ann.csv"
+    path.write_text(head + "\n0.5,1,1.6,3,0,0,2\n")
+    rays = read("unity", path)
+    assert np.allclose(rays.origin, [[1, 3, 1.6]]) and np.allclose(rays.direction, [[0, 1, 0]]) and rays.t[0] == 0.5
+
+
+def test_heads_of_bare_names(tmp_path):
+    path, q = tmp_path / "ann.csv", TURN.as_quat()
+    path.write_text("t,x,y,z,qx,qy,qz,qw\n" + ",".join(map(str, (0, 1, 1.6, 2, *q))) + "\n")
+    rays = read("unity_head", path)
+    assert np.allclose(rays.direction, [3**0.5 / 2, 0, -0.5]) and np.allclose(rays.origin, [[1, 2, 1.6]])
+    path.write_text("t,posX,posY,posZ,rotX,rotY,rotZ\n0,1,1.6,2,30,90,0\n")
+    assert np.allclose(read("unity_head", path).direction, rays.direction)

@@ -4,7 +4,8 @@ Written as ``origin=x,y,z direction=dx,dy,dz t=time person=id confidence=valid h
 a direction, or beside one that is in the head's own frame, the head's pose: ``xyzw=qx,qy,qz,qw`` or
 ``wxyz=qw,qx,qy,qz`` (quaternion, its order in its name), ``ypr=yaw,pitch,roll`` (or yaw and pitch),
 ``matrix=m00,m01,...`` (12 or 16 columns, row by row, head to world; it holds the origin as well). ``eye=ex,ey,ez``:
-where the eye is in the head's frame.
+where the eye is in the head's frame. A direction may also be two angles: ``azel=azimuth,elevation`` (right and up) or
+``yawpitch=yaw,pitch`` (which turn as those of ``ypr`` do); ``-`` before the name of a column turns its sign.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from nerg_mi.errors import NergError
 _COUNTS = {
     "origin": (3,),
     "direction": (3,),
+    "azel": (2,),
+    "yawpitch": (2,),
     "xyzw": (4,),
     "wxyz": (4,),
     "ypr": (2, 3),
@@ -29,19 +32,23 @@ _COUNTS = {
     "cohort": (1,),
 }
 POSES = ("xyzw", "wxyz", "ypr", "matrix")
+ANGLES = ("azel", "yawpitch")
 
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Names of a table's columns. Required: where (``origin``, or in ``matrix``) and whereto (``direction`` or a pose).
+    """Names of a table's columns. Required: where (``origin``, or in ``matrix``) and whereto (``direction``, angles or
+    a pose).
 
-    A ``direction`` beside a pose is in the head's frame, without one in the table's. Without ``t`` rows are numbered,
-    without ``person`` the file is the person, without ``confidence`` it is one. Raises `NergError` for a map that is
-    incomplete or says one thing twice.
+    A ``direction``, or its angles, is in the head's frame beside a pose, and in the table's without one. Without ``t``
+    rows are numbered, without ``person`` the file is the person, without ``confidence`` it is one. Raises `NergError`
+    for a map that is incomplete or says one thing twice.
     """
 
     origin: tuple[str, ...] | None = None
     direction: tuple[str, ...] | None = None
+    azel: tuple[str, ...] | None = None
+    yawpitch: tuple[str, ...] | None = None
     xyzw: tuple[str, ...] | None = None
     wxyz: tuple[str, ...] | None = None
     ypr: tuple[str, ...] | None = None
@@ -61,10 +68,13 @@ class ColumnMap:
             raise NergError("column map: origin is missing; add origin=x,y,z with the names of its columns")
         if self.origin is not None and self.matrix is not None:
             raise NergError("column map: origin is given twice, since matrix holds it; leave out origin")
-        if self.direction is None and not poses:
+        ways = [w for w in ("direction", *ANGLES) if getattr(self, w)]
+        if len(ways) > 1:
+            raise NergError(f"column map: {' and '.join(ways)} are two directions; keep one of them")
+        if not ways and not poses:
             raise NergError(
-                "column map: direction is missing; add direction=x,y,z with the names of its columns, "
-                "or a pose (xyzw, wxyz, ypr or matrix)"
+                "column map: direction is missing; add direction=x,y,z with the names of its columns, angles "
+                "(azel or yawpitch), or a pose (xyzw, wxyz, ypr or matrix)"
             )
         if self.eye is not None and not poses:
             raise NergError(
@@ -75,6 +85,11 @@ class ColumnMap:
     def pose(self) -> str | None:
         """Name of the pose's field, if there is one."""
         return next((p for p in POSES if getattr(self, p)), None)
+
+    @property
+    def angles(self) -> str | None:
+        """Name of the field of a direction's angles, if there is one."""
+        return next((a for a in ANGLES if getattr(self, a)), None)
 
     @classmethod
     def parse(cls, text: str) -> ColumnMap:
@@ -106,6 +121,12 @@ class ColumnMap:
         for field in fields(self):
             value = getattr(self, field.name)
             if value is not None:
-                word = f"{field.name}={value if isinstance(value, str) else ','.join(value)}"
-                words.append(f'"{word}"' if " " in word else word)
+                words.append(_quoted(f"{field.name}={value if isinstance(value, str) else ','.join(value)}"))
         return " ".join(words)
+
+
+def _quoted(word: str) -> str:
+    """A word as `ColumnMap.parse` takes it apart, in double quotes where it has to be."""
+    if not any(c.isspace() or c in "\"'\\" for c in word):
+        return word
+    return '"' + word.replace("\\", "\\\\").replace('"', '\\"') + '"'

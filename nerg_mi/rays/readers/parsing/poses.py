@@ -58,6 +58,25 @@ def rotations_from_angles(angles: np.ndarray, up: str, forward: str, degrees: bo
     return _where(known, angles, lambda rotation, a: rotation.from_euler(sequence, a, degrees=degrees))
 
 
+def directions_from_azimuths(
+    angles: np.ndarray, up: str, forward: str, handedness: str, degrees: bool = True
+) -> np.ndarray:
+    """Unit directions (N, 3) of azimuths, which turn from ``forward`` to the right, and elevations, which turn up from
+    there to the axis ``up``, (N, 2).
+
+    With a = azimuth and e = elevation: cos e cos a forward + cos e sin a right + sin e up. Right is forward x up in a
+    right-handed frame, and up x forward, by coordinates, in a left-handed one. Raises `NergError` where ``up`` and
+    ``forward`` are the same axis.
+    """
+    if up[-1] == forward[-1]:
+        raise NergError(f"the up axis and the forward axis are both {up[-1]}; say where heads look with forward")
+    ahead, top = axis(forward, "forward"), axis(up, "up")
+    right = np.cross(ahead, top) if handedness == "right" else np.cross(top, ahead)
+    a, e = (np.radians(angles) if degrees else np.asarray(angles, np.float64)).T
+    part = lambda weight, vector: weight[:, None] * vector
+    return part(np.cos(e) * np.cos(a), ahead) + part(np.cos(e) * np.sin(a), right) + part(np.sin(e), top)
+
+
 def rotations_from_matrices(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotation matrices (N, 3, 3) and origins (N, 3) of head-to-world matrices, given row by row as (N, 12) or (N, 16).
 

@@ -11,6 +11,9 @@ from nerg_mi.rays.readers.parsing.column_map import ColumnMap
         "origin=x,y,z ypr=yaw,pitch",
         "direction=a,b,c matrix=" + ",".join(f"m{i}" for i in range(12)) + " eye=e,f,g",
         'origin=x,y,z direction=a,b,c "t=timestamp [ns]"',
+        "origin=x,y,z azel=az,-el",
+        'origin=x,y,z "yawpitch=-gaze yaw (rad),pitch" xyzw=a,b,c,d eye=e,f,g',
+        r'origin=x,y,z direction=a,b,c "t=the \"time\" in \\s"',
     ],
 )
 def test_round_trip(text):
@@ -33,6 +36,9 @@ def test_order_of_fields_is_free():
         ("origin=x,y,z direction=a,b,c speed=v", "'speed' is unknown"),
         ("origin=x,y,z origin=x,y,z direction=a,b,c", "given twice"),
         ("origin=x,y,z xyzw=a,b,c,d ypr=e,f,g", "two poses"),
+        ("origin=x,y,z direction=a,b,c azel=d,e", "direction and azel are two directions"),
+        ("origin=x,y,z azel=d,e yawpitch=f,g", "azel and yawpitch are two directions"),
+        ("origin=x,y,z azel=d", "azel needs 2"),
         ("origin=x,y,z matrix=" + ",".join("abcdefghijkl"), "leave out origin"),
         ("origin=x,y,z direction=a,b,c eye=e,f,g", "needs a pose"),
     ],

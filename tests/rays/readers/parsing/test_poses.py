@@ -45,3 +45,19 @@ def test_axes_and_forward():
         poses.axis("w", "up")
     with pytest.raises(NergError, match="both z"):
         poses.rotations_from_angles(np.zeros((1, 3)), "z", "-z")
+
+
+def test_azimuths_turn_right_in_every_frame():
+    """Against a way that knows of no cross product: the frame of rays, in which right is x where forward is y."""
+    from nerg_mi.rays.readers.frames import HANDS, Frame
+
+    a, e = np.radians([35.0, -12.0])
+    for up in poses.AXES:
+        for hand in HANDS:
+            to_rays = Frame(up, hand).to_rays()[:3, :3]
+            for forward in (f for f in poses.AXES if f[-1] != up[-1]):
+                found = poses.directions_from_azimuths(np.array([[35.0, -12.0]]), up, forward, hand)[0] @ to_rays.T
+                ahead = to_rays @ poses.AXES[forward]
+                heading = np.arctan2(ahead[0], ahead[1])  # clockwise from y, seen from above
+                want = [np.cos(e) * np.sin(heading + a), np.cos(e) * np.cos(heading + a), np.sin(e)]
+                assert np.allclose(found, want), (up, hand, forward)
