@@ -67,7 +67,7 @@ class Pupil:
             for v, _, lines in iterate_table(gaze, columns, on_bad=builder.on_bad):
                 turn, place, lost = heads.at(v[:, 0], _GAP)
                 # An eye that was not seen has no columns filled: the other one stands alone.
-                direction, eye = (_mean_of_two(v[:, a : a + 6].reshape(-1, 2, 3)) for a in (2, 8))
+                direction, eye = (poses.mean_of_two(v[:, a : a + 6].reshape(-1, 2, 3)) for a in (2, 8))
                 builder.add(
                     v[:, 0],
                     person,
@@ -103,10 +103,3 @@ def _person(gaze: Path) -> str:
     """The recording's folder: the first above ``gaze`` that is neither a number nor ``exports``."""
     folders = reversed(gaze.resolve().parent.parts)
     return next((p for p in folders if not p.isdigit() and p != "exports"), gaze.stem)
-
-
-def _mean_of_two(v: np.ndarray) -> np.ndarray:
-    """Mean over the eyes of (n, 2, 3), of those that are there; NaN where neither is."""
-    there = np.isfinite(v).all(axis=2, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        return np.where(there, v, 0.0).sum(axis=1) / there.sum(axis=1)

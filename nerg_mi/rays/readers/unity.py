@@ -11,36 +11,11 @@ from nerg_mi.files.bounded import plain
 from .builder import RaysBuilder
 from .frames import UNITY, Frame
 from .options import TickOption
+from .parsing import usual_names as names
 from .parsing.column_finder import ColumnFinder
 from .parsing.column_map import ColumnMap
 from .protocol import DESCRIPTION
 from .table import TableOptions, add_tables
-
-# Names met in logs of Unity projects; upper and lower case are one.
-_TIMES = ("t", "time", "timestamp", "time_s", "unity_time", "utc_timestamp", "raw_timestamp", "sender_time")
-_PERSONS = (
-    "person",
-    "participant",
-    "participant_id",
-    "participantid",
-    "user",
-    "user_id",
-    "userid",
-    "subject",
-    "subject_id",
-    "id",
-)
-_STATUS = ("status", "gaze_status", "gazestatus", "tracking_state", "gaze_valid", "valid")
-_VALID = ("valid", "true", "1", "1.0", "tracked", "tracking", "ok")
-_HITS = ("hit", "gaze_hit", "hit_point", "hit_pos", "hit_position")
-_GAZE = ("gaze_dir", "gaze_direction", "gaze_forward")
-_EYES = ("gaze_origin", "gaze_position", "eye_position")
-_HEADS = ("head_pos", "head_position", "hmd_pos")
-_ROTATIONS = ("head_rot", "head_rotation", "hmd_rot")
-# Names that do not say of what: where there are none of those above.
-_BARE_DIRECTIONS = ("dir", "direction", "d")
-_BARE_PLACES = ("origin", "pos", "position", "")
-_BARE_ROTATIONS = ("rot", "rotation", "quaternion", "quat", "q")
 
 
 class UnityReader:
@@ -71,42 +46,45 @@ class UnityReader:
                     f"{other.path} has other columns ({plain(found)}) than {first.path} ({plain(columns)}); "
                     "import them apart, or with one column map (--map)"
                 )
-        status = first.find(*_STATUS)
+        status = first.find(*names.STATUS)
         settings = TableOptions(
             columns=columns, up=UNITY.up, handedness=UNITY.handedness, units=UNITY.units, forward="z", tick=options.tick
         )
-        add_tables(files, settings, builder, {status: _VALID} if status else {})
+        add_tables(files, settings, builder, {status: names.VALID} if status else {})
 
     def _map(self, table: ColumnFinder) -> ColumnMap:
         return ColumnMap(
             **self._columns_of(table),
-            hit=table.find_vector(*_HITS),
-            t=table.find(*_TIMES),
-            person=table.find(*_PERSONS),
+            hit=table.find_vector(*names.HITS),
+            t=table.find(*names.TIMES),
+            person=table.find(*names.PERSONS),
             confidence=table.find("confidence"),
         )
 
 
 def _gaze_in_world(table: ColumnFinder) -> dict:
-    return {"direction": table.vector(*_GAZE, *_BARE_DIRECTIONS), "origin": table.vector(*_EYES, *_BARE_PLACES)}
+    return {
+        "direction": table.vector(*names.DIRECTIONS, *names.BARE_DIRECTIONS),
+        "origin": table.vector(*names.EYES, *names.BARE_PLACES),
+    }
 
 
 def _gaze_in_head(table: ColumnFinder) -> dict:
     return {
-        "direction": table.vector(*_GAZE, *_BARE_DIRECTIONS),
-        "eye": table.find_vector(*_EYES),
-        "origin": table.vector(*_HEADS, *_BARE_PLACES),
-        "xyzw": table.vector(*_ROTATIONS, *_BARE_ROTATIONS, axes="xyzw"),
+        "direction": table.vector(*names.DIRECTIONS, *names.BARE_DIRECTIONS),
+        "eye": table.find_vector(*names.EYES),
+        "origin": table.vector(*names.HEADS, *names.BARE_PLACES),
+        "xyzw": table.vector(*names.ROTATIONS, *names.BARE_ROTATIONS, axes="xyzw"),
     }
 
 
 def _heads(table: ColumnFinder) -> dict:
-    rotation = table.find_vector(*_ROTATIONS, *_BARE_ROTATIONS, axes="xyzw")
+    rotation = table.find_vector(*names.ROTATIONS, *names.BARE_ROTATIONS, axes="xyzw")
     if rotation is not None:
-        return {"origin": table.vector(*_HEADS, *_BARE_PLACES), "xyzw": rotation}
+        return {"origin": table.vector(*names.HEADS, *names.BARE_PLACES), "xyzw": rotation}
     # Unity's Euler angles in degrees are pitch, yaw and roll.
-    x, y, z = table.vector(*_ROTATIONS, "rot", "rotation")
-    return {"origin": table.vector(*_HEADS, *_BARE_PLACES), "ypr": (y, x, z)}
+    x, y, z = table.vector(*names.ROTATIONS, "rot", "rotation")
+    return {"origin": table.vector(*names.HEADS, *names.BARE_PLACES), "ypr": (y, x, z)}
 
 
 READERS = (

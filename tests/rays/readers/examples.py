@@ -13,6 +13,7 @@ import numpy as np
 from nerg_mi.rays.readers.parsing.bodies import keypoints_from_head
 from nerg_mi.rays.readers.parsing.column_map import ColumnMap
 from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
+from tests.rays.readers import headset_examples as headsets
 from tests.rays.readers import scene_examples as scenes
 
 
@@ -124,6 +125,10 @@ EXAMPLES = {
     "hololens": Example(
         {"a_head_hand_eye.csv": lines(None, lambda k: [k * 10**5, *[0] * 850, 1, 0, 1.6, 0, 1, 0, 0, 1, 0, 2])}
     ),
+    "arett": Example(headsets.ARETT),
+    "sranipal": Example(headsets.SRANIPAL),
+    "openxr": Example(headsets.OPENXR),
+    "quest": Example(headsets.QUEST),
     "pupil": Example(
         {
             "head_pose_tracker_poses.csv": lines(_POSES, lambda k: [0.02 * k, 0, 0, 0.1, k, 1, 1]),

@@ -52,8 +52,8 @@ class ColumnFinder:
 def column_words(column: str) -> str:
     """The words of a column's name in lower case with underscores between them, without a unit in brackets that is none
     of the axes: ``Gaze Origin.X (mm)`` is ``gaze_origin_x``."""
-    name = re.sub(
-        r"[(\[]([^)\]]*)[)\]]", lambda unit: f"_{unit[1]}" if unit[1].lower() in tuple("xyzw") else "", column
-    )
+    axis = lambda unit: f"_{unit[1]}" if unit[1].lower() in tuple("xyzw") else ""
+    # No name that is looked for is longer, and a bracket is looked for the end of.
+    name = re.sub(r"[(\[]([^)\]]*)[)\]]", axis, column[:200])
     name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
     return re.sub(r"[^0-9a-z]+", "_", name.lower()).strip("_")

@@ -97,6 +97,13 @@ def rotate(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     return np.einsum("nij,nj->ni", rotations, vectors)
 
 
+def mean_of_two(v: np.ndarray) -> np.ndarray:
+    """Mean over the eyes of (n, 2, 3), of those that are there; NaN where neither is."""
+    there = np.isfinite(v).all(axis=2, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        return np.where(there, v, 0.0).sum(axis=1) / there.sum(axis=1)
+
+
 def _where(good: np.ndarray | np.bool_, values: np.ndarray, make) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 
