@@ -14,6 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.rays import filters, fixations, splits
+from nerg_mi.rays.guess.proposal import Proposal, propose_import
 from nerg_mi.rays.io import SUFFIXES
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
@@ -94,6 +95,15 @@ def _to_files(rays: Rays) -> list[list[float]]:
             "the other; leave out --write-align, and align the rays with the place"
         )
     return (back + 0.0).tolist()
+
+
+def guess_import(file: FileName, reporter: Reporter = SILENT) -> Proposal:
+    """What an unknown tracking file is likely to be, and the command to import it by; nothing is applied or written.
+
+    Raises `NergError` for a file that is no table, or is damaged.
+    """
+    reporter.message(f"looking at {file}")
+    return propose_import(Path(file))
 
 
 @dataclass(frozen=True, eq=False)

@@ -131,11 +131,12 @@ CASES = (
 MAKES_A_FOLDER = {"poses": "tests/cli/test_poses.py"}
 """Commands that make a folder as a whole, which must not be there before -> where their output is tried."""
 
-READS_ONLY = {"doctor", "rays show"}
+READS_ONLY = {"doctor", "rays guess", "rays show"}
 """Commands that write no file."""
 INPUTS = {
     "render": {"scene"},
     "rays import": {"files", "salt", "poses", "place"},
+    "rays guess": {"file"},
     "rays show": {"rays"},
     "rays filter": {"rays"},
     "rays split": {"rays"},

@@ -122,6 +122,17 @@ def _tables(name: str, make, *kinds: str) -> Reader:
     return Reader(f"table {name}", lambda folder: make(folder / name), {name: kinds}, read, _needed(name))
 
 
+def _guess(name: str, make, *kinds: str) -> Reader:
+    """What is proposed of a damaged table; nothing of it is applied."""
+
+    def read(folder: Path) -> None:
+        from nerg_mi.rays.guess.proposal import propose_import
+
+        propose_import(folder / name).command  # noqa: B018
+
+    return Reader(f"guess {name}", lambda folder: make(folder / name), {name: kinds}, read, _needed(name))
+
+
 def _make_parquet(path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -162,6 +173,8 @@ TRACKING = [
     ),
     _tables("gaze.csv.gz", lambda path: path.write_bytes(gzip.compress(TABLE.encode(), mtime=0)), "gzip"),
     _tables("gaze.parquet", _make_parquet),
+    _guess("gaze.csv", lambda path: path.write_text(TABLE), "text"),
+    _guess("gaze.parquet", _make_parquet),
     _skeletons("day.csv", "text"),
     _skeletons("day.csv.gz", "gzip"),
     Reader("salt", _make_salt, {"salt": ()}, _read_salt),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from . import filter, imports, plot, show, split
+from . import filter, guess, imports, plot, show, split
 
 
 def make_app() -> typer.Typer:
@@ -14,6 +14,7 @@ def make_app() -> typer.Typer:
         help="Import tracking files as rays of attention, look at them, choose among them and split them.",
     )
     app.command("import", help=imports.HELP)(imports.make_command())
+    app.command("guess")(guess.command)
     app.command("show")(show.command)
     app.command("filter")(filter.command)
     app.command("split")(split.command)

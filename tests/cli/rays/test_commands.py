@@ -12,7 +12,7 @@ from nerg_mi.rays.readers.registry import shared_options
 
 def test_sub_commands():
     commands = typer.main.get_command(app).commands
-    assert set(commands) == {"import", "show", "filter", "split", "plot"}
+    assert set(commands) == {"import", "guess", "show", "filter", "split", "plot"}
     assert all(command.help for command in commands.values())
 
 

@@ -1,0 +1,339 @@
+"""A proposal of how to import an unknown table: a preset, or a column map with the frame that it needs.
+
+Nothing is applied: the proposal says what is sure, what is a guess and what no file says, and gives the command to run.
+"""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays.readers.parsing import poses
+from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
+from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.registry import reader_named
+
+from . import row_evidence as rows
+from .column_roles import Roles, find_roles, in_degrees, time_unit
+from .signatures import check_is_table, preset_of_columns, preset_of_files, preset_of_text
+from .table_sample import TableSample
+
+_DIRECTION = {"dir", "direct", "direction", "forward", "vec", "vector", "ray", "normal", "look", "gazedir"}
+_HIT = {"hit", "point", "intersection", "target", "fixation", "poi", "collision"}
+_HEAD = {"head", "hmd", "camera", "cam", "device", "body", "headset"}
+_GAZE = {"gaze", "eye", "eyes"}
+_SIDES = {"left", "right", "l", "r", "0", "1"}
+_SCENE = ("neon", "tobii3", "glassestools")
+
+
+@dataclass
+class Proposal:
+    """How to import ``path``; ``options`` of the command line beside the preset or the map, and sentences on what is
+    ``sure``, what is ``guessed`` and what is ``open``."""
+
+    path: Path
+    preset: str | None = None
+    columns: ColumnMap | None = None
+    options: dict[str, str] = field(default_factory=dict)
+    sure: list[str] = field(default_factory=list)
+    guessed: list[str] = field(default_factory=list)
+    open: list[str] = field(default_factory=list)
+
+    @property
+    def command(self) -> str | None:
+        """The whole import command; None where nothing can be proposed."""
+        if self.preset is None and self.columns is None:
+            return None
+        what = ["--preset", self.preset] if self.preset else ["--map", str(self.columns)]
+        stem = self.path.resolve().name.split(".")[0] or "rays"
+        words = ["nerg", "rays", "import", str(self.path), "-o", f"{stem}.npz", *what]
+        for flag, value in self.options.items():
+            words += [flag, value] if value else [flag]
+        return shlex.join(words)
+
+
+def propose_import(path: str | Path) -> Proposal:
+    """What the tracking file, or folder of a recording, ``path`` is likely to be.
+
+    Raises `NergError` for a file that is no table, or is damaged.
+    """
+    path = Path(path)
+    out = Proposal(path)
+    found = preset_of_files(path)
+    if found is None:
+        check_is_table(path)
+        found = preset_of_text(path) if path.suffix.lower() != ".parquet" else None
+    table = None
+    if found is None:
+        table = ColumnFinder(path)
+        found = preset_of_columns(table)
+    if found is not None:
+        _use_preset(out, *found)
+        return out
+    assert table is not None
+    if not any(_is_name(c) for c in table.columns):
+        raise NergError(f"the first line of {path} holds no names of columns; a table needs a header: add one")
+    _use_columns(out, TableSample(path, table.columns), find_roles(table.columns))
+    return out
+
+
+def _is_name(column: str) -> bool:
+    try:
+        float(column)
+    except ValueError:
+        return bool(column)
+    return False
+
+
+def _use_preset(out: Proposal, name: str, why: str) -> None:
+    out.preset = name
+    surely = out.guessed if "no column says" in why else out.sure
+    surely.append(f"the preset {name} ({reader_named(name).files.split(';')[0].split(':')[0]}): {why}")
+    if name in _SCENE:
+        out.options |= {"--poses": "MODEL", "--frames": "frame_{frame1}"}
+        out.open.append(
+            "where the scene camera was: --poses names the model that holds its frames and the place's photos, "
+            "--frames how they are called; --place the place that was trained on it"
+        )
+    if name == "pupil":
+        out.options["--marker"] = "METRES"
+        out.open.append("the edge of a tracking marker in metres (--marker) and the up axis of the markers (--up)")
+    if name in ("skeleton22", "unity"):
+        out.open.append("the unit of the time (--tick); the card tells which would give a device's rate")
+
+
+def _use_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
+    """Fill ``out`` with a column map, as far as there is one."""
+    numbers = sample.numbers
+    vectors = {s: v for s, v in roles.vectors.items() if all(c in numbers for c in v)}
+    quaternions = {
+        s: q for s, q in roles.quaternions.items() if all(c in numbers for c in q) and rows.is_unit(sample.vector(q))
+    }
+    # A place named like a quaternion (x, y, z beside w) is none.
+    vectors |= {s: q[:3] for s, q in roles.quaternions.items() if s not in quaternions and all(c in numbers for c in q)}
+    parts = {stem: set(stem.replace("*", "").split("_")) for stem in (*vectors, *quaternions)}
+    direction = _best(
+        vectors,
+        lambda s: 4 * bool(parts[s] & _DIRECTION) + 2 * rows.is_unit(sample.vector(vectors[s])) - _aside(parts[s]),
+        least=2,
+        more=lambda s: bool(parts[s] & _GAZE) - 2 * bool(parts[s] & _HEAD),
+    )
+    hit = _best(vectors, lambda s: 3 * bool(parts[s] & _HIT) - _aside(parts[s]), least=3, but=(direction,))
+    place = lambda prefer, but: _best(
+        vectors,
+        lambda s: 2 + 3 * bool(parts[s] & prefer) - 3 * bool(parts[s] & (_HIT | _DIRECTION)) - _aside(parts[s]),
+        least=1,
+        but=but,
+    )
+    turn = _best(quaternions, lambda s: 2 + 2 * bool(parts[s] & _HEAD) - _aside(parts[s]), least=1)
+    matrix = next((m for m in roles.matrices.values() if all(c in numbers for c in m)), None)
+    head = place(_HEAD, (direction, hit))
+    eye = place(_GAZE, (direction, hit, head)) if head is not None and parts[head] & _HEAD else None
+    has_pose = turn is not None or matrix is not None
+
+    origin = head if has_pose or eye is None else eye
+    standing = None
+    where = sample.vector(matrix)[:, 3:12:4] if matrix else sample.vector(vectors[origin]) if origin else None
+    if where is not None:
+        standing = rows.find_standing(where)
+    time = _find_time(out, sample, roles)
+    settings = _frame(out, standing, _gravity_up(sample, roles))
+    turns = None
+    if matrix is not None:
+        turns, _ = poses.rotations_from_matrices(sample.vector(matrix))
+    elif turn is not None:
+        turns = poses.rotations_from_quaternions(sample.vector(quaternions[turn]))
+    gaze = sample.vector(vectors[direction]) if direction else None
+    local = _pose_evidence(out, settings, turns, gaze, where, time[1])
+    if turns is not None and gaze is not None and local is False:
+        turn = matrix = turns = None
+        if origin is None or (eye is not None and parts[eye] & _GAZE):
+            origin = eye or origin
+    chosen: dict = {
+        "t": time[0],
+        "person": roles.person,
+        "confidence": _confidence(roles, sample),
+        "hit": vectors[hit] if hit else None,
+        "direction": vectors[direction] if direction else None,
+        "xyzw": quaternions[turn] if turn else None,
+        "matrix": matrix,
+        "origin": vectors[origin] if origin and matrix is None else None,
+        "eye": vectors[eye] if turns is not None and local and eye and eye != origin else None,
+    }
+    _use_angles(out, sample, roles, chosen)
+    _finish(out, sample, roles, chosen)
+
+
+def _aside(parts: set[str]) -> int:
+    """How much less likely a vector is of one eye only, or none that a head or gaze has."""
+    return 2 * bool(parts & _SIDES)
+
+
+def _best(stems, score, least: int, but: tuple = (), more=lambda stem: 0) -> str | None:
+    """The stem of the highest score, of those that have ``least``; ``more`` decides between equal ones, then the order
+    in the file."""
+    fits = [s for s in stems if s not in but and score(s) >= least]
+    return max(fits, key=lambda s: (score(s), more(s)), default=None)
+
+
+def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | None, np.ndarray | None]:
+    """The column of the time, and its seconds."""
+    name = next((c for c in roles.times if c in sample.numbers), None)
+    if name is None:
+        out.open.append("the time: no column is called so; without t= rows are numbered, and --tick is the time of one")
+        return None, None
+    stated, fits = time_unit(name), rows.find_tick(sample.numbers[name])
+    tick = stated or fits
+    if stated:
+        out.sure.append(f"{name!r} is the time, in units of {stated:g} s by its name")
+    elif fits:
+        out.guessed.append(f"{name!r} is the time, in units of {fits:g} s by the steps between its rows")
+    else:
+        out.open.append(f"the unit of the time {name!r}: its steps fit no device (--tick, seconds in one unit)")
+    if stated and fits and not np.isclose(stated, fits):
+        out.guessed.append(f"the steps of {name!r} would be a device's in units of {fits:g} s: is its name right?")
+    if tick and tick != 1.0:
+        out.options["--tick"] = f"{tick:g}"
+    return name, sample.numbers[name] * (tick or 1.0)
+
+
+def _gravity_up(sample: TableSample, roles: Roles) -> str | None:
+    """The axis against which gravity pulls, where the table has columns of it."""
+    if roles.gravity is None or not sample.rows:
+        return None
+    pull = np.nan_to_num(np.nanmedian(sample.vector(roles.gravity), axis=0))
+    axis = int(np.argmax(np.abs(pull)))
+    if np.abs(pull[axis]) < 0.95 * np.linalg.norm(pull) or not pull.any():
+        return None
+    return ("-" if pull[axis] > 0 else "") + "xyz"[axis]
+
+
+def _frame(out: Proposal, standing: rows.Standing | None, against: str | None) -> dict[str, str]:
+    """Up and units, as far as the rows tell: by where heads are, or by the axis ``against`` which gravity pulls."""
+    if against is not None:
+        out.sure.append(f"{against} is up: the columns of gravity say so")
+    if standing is None or (against is not None and standing.up != against):
+        if against is None:
+            out.open.append(
+                "which axis is up (--up), the hand (--hand) and the unit (--units): along no one axis do the rows stay "
+                "at the height of eyes"
+            )
+            out.options |= {"--up": "UP", "--hand": "HAND", "--units": "UNIT"}
+            return {}
+        out.options["--up"] = against
+        out.guessed.append("the unit is the metre; the rows are at no height that would tell, as where 0 is no floor")
+        return {"up": against, "metre": "m"}
+    out.options["--up"] = standing.up
+    if standing.units != "m":
+        out.options["--units"] = standing.units
+    which = f"the unit is {standing.units}" if against else f"{standing.up} is up and the unit {standing.units}"
+    out.guessed.append(f"{which}: the rows stay at {standing.height:.2f} m along {standing.up}")
+    return {"up": standing.up, "metre": standing.units}
+
+
+def _pose_evidence(
+    out: Proposal,
+    settings: dict[str, str],
+    turns: np.ndarray | None,
+    gaze: np.ndarray | None,
+    where: np.ndarray | None,
+    seconds: np.ndarray | None,
+) -> bool | None:
+    """Hand and forward axis into ``out``, and whether gaze is in the head's frame."""
+    up = settings.get("up")
+    forward = None
+    if turns is not None and up and where is not None and seconds is not None:
+        forward = rows.find_forward(turns, where, seconds, up, rows.UNITS[settings["metre"]])
+        if forward:
+            out.guessed.append(f"heads look along their {forward}: that is where they walk to")
+    usual = up is not None and up.endswith("y")
+    hand = "left" if usual and forward != "-z" else "right"
+    if up:
+        out.options["--hand"] = hand
+        which = "as Unity's worlds with y up are" if hand == "left" else "as most worlds with that axis up are"
+        out.guessed.append(
+            f"the world is {hand}-handed, {which}; no row tells: a mirrored place is the sign of the other"
+        )
+    if turns is None:
+        return None
+    default = poses.default_forward(up, hand) if up else None
+    if forward is not None and forward != default:
+        out.options["--forward"] = forward
+    if forward is None:
+        usual_one = f"{default} is usual in such a world" if default else "it depends on the world"
+        out.open.append(f"the axis along which heads look (--forward): {usual_one}, and nobody walks in the rows")
+    if gaze is None:
+        return None
+    local = rows.find_local(gaze, turns, forward or default or "z")
+    if local is None:
+        out.open.append("whether the gaze is in the head's frame: its rows tell neither; it is taken for the head's")
+        return True
+    where_to = "the head's frame" if local else "the world, so that the head's pose is left out"
+    out.guessed.append(f"the gaze is in {where_to}: so it is nearer to where the head points")
+    return local
+
+
+def _confidence(roles: Roles, sample: TableSample) -> str | None:
+    """The column of confidences, if they are from 0 to 1."""
+    if roles.confidence is None or roles.confidence not in sample.numbers:
+        return None
+    values = sample.numbers[roles.confidence]
+    values = values[np.isfinite(values)]
+    return roles.confidence if values.size and values.min() >= 0 and values.max() <= 1 else None
+
+
+def _use_angles(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) -> None:
+    """Angles, where there is no vector: as a direction, or as the head's pose."""
+    posed = chosen["xyzw"] or chosen["matrix"]
+    names: tuple[str, ...] | None = None
+    if chosen["direction"] is None and roles.azel and all(c in sample.numbers for c in roles.azel):
+        names = chosen["azel"] = roles.azel
+        out.guessed.append("azimuths turn to the right and elevations up; put - before a name where they do not")
+    elif chosen["direction"] is None and roles.yaw_pitch_roll:
+        if all(c in sample.numbers for c in roles.yaw_pitch_roll):
+            names = roles.yaw_pitch_roll
+            gaze = any(set(n.lower().replace("_", " ").split()) & _GAZE for n in names)
+            chosen["yawpitch" if posed or (gaze and len(names) == 2) else "ypr"] = names[: 2 if posed else 3]
+            out.guessed.append(
+                "yaw and pitch turn as docs/rays.md tells of this frame; put - before a name of yawpitch where not"
+            )
+    if names is None:
+        return
+    stated = in_degrees(names)
+    most = float(np.nanmax(np.abs(sample.vector(names)), initial=0.0))
+    degrees = stated if stated is not None else most > 2 * np.pi
+    if not degrees:
+        out.options["--radians"] = ""
+    how = "by their names" if stated is not None else f"the largest is {most:.3g}"
+    which = out.sure if stated is not None else out.guessed
+    which.append(f"the angles are {'degrees' if degrees else 'radians'}: {how}")
+
+
+def _finish(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) -> None:
+    named = {key: value for key, value in chosen.items() if value}
+    try:
+        out.columns = ColumnMap(**named)
+    except NergError as error:
+        out.options = {}
+        out.open.append(
+            f"no map can be proposed ({error}); its columns that hold numbers are "
+            f"{', '.join(list(sample.numbers)[:24]) or 'none'}"
+        )
+        return
+    for key in ("origin", "direction", "hit", "eye", "xyzw", "matrix"):
+        if key in named:
+            out.guessed.append(
+                f"{key}: {', '.join(named[key][:4])}{', ...' if len(named[key]) > 4 else ''} by its names"
+            )
+    if "person" in named:
+        out.guessed.append(f"person: {named['person']!r} by its name")
+    else:
+        out.open.append("the person: no column is called so, and the file is one")
+    used = {name for value in named.values() if not isinstance(value, str) for name in value}
+    left = [v[0] for v in (*roles.vectors.values(), *roles.quaternions.values()) if not used & set(v)]
+    if left:
+        out.open.append(f"what is left out: {', '.join(left[:8])}{', ...' if len(left) > 8 else ''}")

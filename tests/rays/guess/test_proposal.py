@@ -1,0 +1,169 @@
+"""Proposals: the command that is printed imports the rays that were meant."""
+
+import shlex
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays.guess.proposal import propose_import
+from nerg_mi.rays.rays import Rays
+from tests.cli.rays.running import run
+from tests.rays.guess.tables import FORWARD, N, csv, frame, walk, xyz
+from tests.rays.readers.examples import EXAMPLES
+
+WALK = walk()
+
+
+def imported(path, monkeypatch) -> Rays:
+    """The rays by the command that is proposed for ``path``."""
+    monkeypatch.chdir(path.parent)
+    proposal = propose_import(path)
+    assert proposal.command is not None
+    words = shlex.split(proposal.command)
+    assert words[:3] == ["nerg", "rays", "import"]
+    done = run(*words[2:])
+    assert done.exit_code == 0, (proposal.command, done.exception)
+    return Rays.load(path.parent / words[words.index("-o") + 1])
+
+
+def gaze_in_world(to, metre, tick, **names):
+    eye, gaze, _ = frame(WALK, to, metre)
+    stems = {"time": "time", "eye": "gaze_origin_", "gaze": "gaze_direction_", **names}
+    return {stems["time"]: WALK.t / tick, **xyz(stems["eye"], eye), **xyz(stems["gaze"], gaze)}
+
+
+def gaze_in_head(to, local=True, **names):
+    eye, gaze, head = frame(WALK, to)
+    stems = {"head": "head_pos_", "turn": "head_rot_", "gaze": "look_dir_", **names}
+    gaze = head.inv().apply(gaze) if local else gaze
+    return {
+        "t": WALK.t,
+        **xyz(stems["head"], eye),
+        **xyz(stems["turn"], head.as_quat(), "xyzw"),
+        **xyz(stems["gaze"], gaze),
+    }
+
+
+TABLES = {
+    "ros, millimetres, microseconds": gaze_in_world("z right", 1e-3, 1e-6, eye="eyePos", gaze="rayVec"),
+    "unity, named units": gaze_in_world("y left", 1.0, 1e-3, time="timestamp (ms)", eye="Origin.", gaze="Dir."),
+    "centimetres, nanoseconds": gaze_in_world("y left", 1e-2, 1e-9, time="time", eye="o_pos", gaze="d"),
+    "unity, local": gaze_in_head("y left"),
+    "unity, world beside the head": gaze_in_head("y left", local=False),
+    "openxr, local": gaze_in_head("y right", head="pos", turn="q", gaze="gaze_vec_"),
+    "openxr, world beside the head": gaze_in_head("y right", local=False),
+    "ros, local": gaze_in_head("z right", head="camera.position.", turn="camera.orientation."),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_the_command_imports_what_was_meant(tmp_path, monkeypatch, name):
+    path = tmp_path / "log.csv"
+    path.write_text(csv(**TABLES[name]))
+    rays = imported(path, monkeypatch)
+    assert len(rays) == N and np.allclose(rays.t, WALK.t, atol=1e-4)
+    assert np.abs(rays.origin - WALK.eye).max() < 1e-5
+    assert np.abs(rays.direction - WALK.gaze).max() < 1e-5
+
+
+@pytest.mark.parametrize("radians", [False, True])
+def test_angles_are_a_direction(tmp_path, monkeypatch, radians):
+    eye, gaze, head = frame(WALK, "y left")
+    local = head.inv().apply(gaze)
+    unit = 1.0 if radians else 180 / np.pi
+    angles = {"azimuth": unit * np.arctan2(local[:, 0], local[:, 2]), "elevation": unit * np.arcsin(local[:, 1])}
+    path = tmp_path / "log.csv"
+    table = {"t": WALK.t, **xyz("head_pos_", eye), **xyz("head_rot_", head.as_quat(), "xyzw"), **angles}
+    path.write_text(csv(**table))
+    rays = imported(path, monkeypatch)
+    assert np.abs(rays.direction - WALK.gaze).max() < 1e-5 and np.abs(rays.origin - WALK.eye).max() < 1e-5
+    assert ("--radians" in propose_import(path).options) == radians
+
+
+def test_heads_alone_and_matrices(tmp_path, monkeypatch):
+    """Each head looks where it walks; the rows of its matrix in the names of the columns."""
+    eye, _, head = frame(WALK, "y right")
+    ahead = np.c_[np.cos(WALK.heading), np.sin(WALK.heading), np.zeros(N)]
+    path = tmp_path / "log.csv"
+    m = np.concatenate([head.as_matrix(), eye[:, :, None]], axis=2)
+    path.write_text(csv(t=WALK.t, **{f"m_{r}{c}": m[:, r, c] for r in range(3) for c in range(4)}))
+    rays = imported(path, monkeypatch)
+    assert np.abs(rays.direction - ahead).max() < 1e-5 and np.abs(rays.origin - WALK.eye).max() < 1e-5
+
+
+def test_people_confidence_and_hits(tmp_path, monkeypatch):
+    table = gaze_in_world("z right", 1.0, 1.0)
+    table |= {"participant_id": np.repeat(["ann", "bo"], N // 2), "confidence": np.full(N, 0.5)}
+    table |= xyz("hit_point_", WALK.eye + 2 * WALK.gaze)
+    path = tmp_path / "log.tsv"
+    path.write_text(csv(**table).replace(",", "\t"))
+    rays = imported(path, monkeypatch)
+    assert rays.persons == ("ann", "bo") and np.all(rays.confidence == 0.5)
+    assert rays.hit is not None and np.allclose(rays.hit, rays.origin + 2 * rays.direction, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [n for n in EXAMPLES if n not in ("table", "unity_local", "unity_head")])
+def test_examples_of_presets_are_known(tmp_path, name):
+    """By their header, or by the files of their folder."""
+    given = EXAMPLES[name].make(tmp_path)
+    assert propose_import(given).preset == name
+    proposal = propose_import(given)
+    assert proposal.command is not None and f"--preset {name}" in proposal.command
+
+
+@pytest.mark.parametrize("name", ["unity_local", "unity_head"])
+def test_a_map_does_for_presets_that_look_alike(tmp_path, name):
+    """What Unity projects call the gaze does not say of which frame it is."""
+    proposal = propose_import(EXAMPLES[name].make(tmp_path))
+    assert proposal.preset is None and proposal.columns is not None and proposal.columns.xyzw is not None
+
+
+def test_folders(tmp_path):
+    EXAMPLES["neon"].make(tmp_path)
+    proposal = propose_import(tmp_path)
+    assert proposal.preset == "neon" and proposal.open and "--poses MODEL" in (proposal.command or "")
+    (tmp_path / "info.json").unlink()
+    with pytest.raises(NergError, match="of no recording that is known"):
+        propose_import(tmp_path)
+
+
+def test_what_is_not_known_is_to_be_said(tmp_path):
+    """Nobody stands in these rows, and no name says what they are: the command does not run as it is."""
+    path = tmp_path / "log.csv"
+    rising = np.outer(np.arange(9.0), [1, 7, 5])
+    path.write_text(csv(**xyz("a_", rising), **xyz("dir_", np.tile([1.0, 0, 0], (9, 1)))))
+    proposal = propose_import(path)
+    assert proposal.options["--up"] == "UP" and any("which axis is up" in s for s in proposal.open)
+    assert any("the time" in s for s in proposal.open) and not proposal.sure
+    with pytest.raises(NergError, match='"UP up'):
+        raise run(*shlex.split(proposal.command or "")[2:]).exception
+    path.write_text(csv(speed=np.arange(9.0), note=["x"] * 9))
+    proposal = propose_import(path)
+    assert proposal.command is None and "origin is missing" in proposal.open[-1]
+
+
+def test_gravity_says_what_is_up(tmp_path):
+    table = {**gaze_in_world("y right", 1.0, 1.0), **xyz("gravity_", np.tile([0, -9.81, 0], (N, 1)))}
+    table = {name: v + (50 if name == "gaze_origin_y" else 0) for name, v in table.items()}
+    path = tmp_path / "log.csv"
+    path.write_text(csv(**{k.replace("gaze_direction", "d"): v for k, v in table.items()}))
+    proposal = propose_import(path)
+    assert proposal.options["--up"] == "y" and any("gravity" in s for s in proposal.sure)
+
+
+@pytest.mark.parametrize("text, message", [("1,2,3\n4,5,6\n", "holds no names of columns"), ("", "holds no names")])
+def test_what_is_no_table(tmp_path, text, message):
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    with pytest.raises(NergError, match=message):
+        propose_import(path)
+
+
+def test_forward_axes_are_those_of_the_frames():
+    """The tables of this file look along the axes that they are meant to."""
+    for to, forward in FORWARD.items():
+        _, _, head = frame(WALK, to)
+        eye, _, _ = frame(WALK, to)
+        moved = np.diff(eye[::25], axis=0)
+        assert np.mean(np.sum(head.apply(forward)[::25][:-1] * moved, axis=1)) > 0.3

@@ -1,0 +1,46 @@
+"""Presets by names."""
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays.guess.signatures import check_is_table, preset_of_columns, preset_of_files, preset_of_text
+from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
+from nerg_mi.rays.readers.registry import preset_names
+
+
+def table(path, head):
+    path.write_text(head + "\n")
+    return ColumnFinder(path)
+
+
+@pytest.mark.parametrize(
+    "head, preset",
+    [
+        ("tracking_timestamp_us,yaw_rads_cpf,pitch_rads_cpf,depth_m", "aria"),
+        ("graph_uid,tracking_timestamp_us,tx_world_device,ty_world_device,qx_world_device", "aria"),
+        ("ViewIndex,FOV1,PositionX,QuaternionX,GazePosX,GazeQX,Timestamp", "eyenavgs"),
+        ("X Pos,Y Pos,Z Pos,X Vec,Y Vec,Z Vec", "qualisys"),
+    ],
+)
+def test_readers_of_others_are_proposed_where_they_are(tmp_path, head, preset):
+    found = preset_of_columns(table(tmp_path / "a.csv", head))
+    assert (found is not None and found[0] == preset) == (preset in preset_names())
+
+
+def test_a_head_beside_gaze_is_no_sign_of_the_world(tmp_path):
+    gaze = "gaze_dir_x,gaze_dir_y,gaze_dir_z,gaze_origin_x,gaze_origin_y,gaze_origin_z"
+    assert preset_of_columns(table(tmp_path / "a.csv", gaze))[0] == "unity"  # pyright: ignore[reportOptionalSubscript]
+    assert preset_of_columns(table(tmp_path / "b.csv", gaze + ",head_pos_x,head_pos_y,head_pos_z")) is None
+    assert preset_of_columns(table(tmp_path / "c.csv", "x,y,z")) is None
+
+
+def test_files_and_first_lines(tmp_path):
+    (tmp_path / "x_head_hand_eye.csv").write_text("0\n")
+    (tmp_path / "day.csv").write_text("ann|3|[1, 2]\n")
+    found = preset_of_files(tmp_path / "x_head_hand_eye.csv"), preset_of_text(tmp_path / "day.csv")
+    assert found[0] and found[0][0] == "hololens" and found[1] and found[1][0] == "skeleton22"
+    (tmp_path / "a.csv").write_text("a|b|c\n")
+    assert preset_of_text(tmp_path / "a.csv") is None and preset_of_files(tmp_path / "a.csv") is None
+    check_is_table(tmp_path / "a.csv")
+    with pytest.raises(NergError, match="name a file of it"):
+        check_is_table(tmp_path)
