@@ -53,7 +53,7 @@ def undistort_where(xy: np.ndarray, lens: Intrinsics) -> tuple[np.ndarray, np.nd
     """As `undistort`, (..., 2), and a mask (...) of the coordinates that have an inverse; elsewhere it is none."""
     goal = np.asarray(xy, np.float64)
     if not any(lens.distortion):
-        return goal.copy(), np.isfinite(goal).all(axis=-1)
+        return goal.copy(), np.asarray(np.isfinite(goal).all(axis=-1))
     u = goal.copy()
     # Beside the fold a step may overflow; what comes of it is found out below.
     with np.errstate(over="ignore", invalid="ignore"):

@@ -15,7 +15,6 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
 from nerg_mi.rays.readers.parsing.column_map import ColumnMap
-from nerg_mi.rays.readers.registry import reader_named
 
 from . import row_evidence as rows
 from .column_roles import Roles, find_roles, in_degrees, time_unit
@@ -92,7 +91,7 @@ def _is_name(column: str) -> bool:
 def _use_preset(out: Proposal, name: str, why: str) -> None:
     out.preset = name
     surely = out.guessed if "no column says" in why else out.sure
-    surely.append(f"the preset {name} ({reader_named(name).files.split(';')[0].split(':')[0]}): {why}")
+    surely.append(f"the preset {name}: {why}")
     if name in _SCENE:
         out.options |= {"--poses": "MODEL", "--frames": "frame_{frame1}"}
         out.open.append(

@@ -69,8 +69,9 @@ def _of_words(table: ColumnFinder) -> tuple[str, str] | None:
     sdk += ("combined_eye_data_gaze_origin_mm", "left_gaze_origin_mm", "gaze_origin_l", "gaze_origin_c")
     sdk += ("verbose_data_left_gaze_origin_mm",)
     head = find(_HEADS)
-    if find(sdk) and head:
-        return "sranipal", f"it has {find(sdk)[0]} beside {head[0]}"
+    origin = find(sdk)
+    if origin and head:
+        return "sranipal", f"it has {origin[0]} beside {head[0]}"
     left = find([f"left_eye_{w}" for w in ("rotation", "rot", "gaze_rotation", "orientation")], "xyzw")
     if left:
         return "quest", f"it has a pose of each eye ({left[0]})"

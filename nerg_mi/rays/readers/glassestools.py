@@ -57,7 +57,7 @@ class GlassesTools:
             builder.source(gaze, f"{person}/{gaze.name}")
             columns = ["timestamp", "gaze_pos_vid_x", "gaze_pos_vid_y"]
             for v, _, lines in iterate_table(gaze, columns, on_bad=builder.on_bad):
-                none = ~np.isfinite(v[:, 1:]).all(axis=1)
+                none = np.asarray(~np.isfinite(v[:, 1:]).all(axis=1))
                 direction = camera.directions(v[:, 1:])
                 scene.add(v[:, 0] * _MILLISECOND, person, direction, rows=lines, drop={"there is no gaze": none})
             scene.finish("")

@@ -110,14 +110,15 @@ class SceneGaze:
         """Add n rows: seconds ``t``, and gaze ``direction`` (n, 3) in the scene camera's frame (OpenCV), NaN beyond its
         picture. ``other``: the same by another account, which is compared with it."""
         turn, place, lost = self._at(t)
-        drop = {**drop, "gaze lies beyond the scene camera's picture": ~np.isfinite(direction).all(axis=1)}
+        beyond = np.asarray(~np.isfinite(direction).all(axis=1))
+        reasons = {**drop, "gaze lies beyond the scene camera's picture": beyond}
         if other is not None and self._compared < _COMPARED:
             self._compared += len(t)
             with np.errstate(invalid="ignore"):
                 angles = angles_between(direction, other)
-            self._angles.append(angles[np.isfinite(angles) & ~np.any(list(drop.values()), axis=0)])
-        drop["no frame of the scene camera near that time has a pose"] = lost
-        self._builder.add(t, person, place, poses.rotate(turn, direction), rows=rows, drop=drop)
+            self._angles.append(angles[np.isfinite(angles) & ~np.any(list(reasons.values()), axis=0)])
+        reasons["no frame of the scene camera near that time has a pose"] = lost
+        self._builder.add(t, person, place, poses.rotate(turn, direction), rows=rows, drop=reasons)
 
     def finish(self, accounts: str) -> None:
         """Keep in the metadata how many frames were posed and how far the two ``accounts`` of the gaze differ ("pixels

@@ -65,7 +65,7 @@ class Tobii3:
             for rows, lines in _samples(gaze, builder):
                 direction = glasses.camera.directions(rows[:, 1:3] * glasses.size)
                 other = _seen_from_camera(rows[:, 3:], glasses, direction)
-                none = ~np.isfinite(rows[:, 1:3]).all(axis=1)
+                none = np.asarray(~np.isfinite(rows[:, 1:3]).all(axis=1))
                 scene.add(rows[:, 0], person, direction, rows=lines, drop={"there is no gaze": none}, other=other)
             scene.finish("gaze2d and gaze3d")
 

@@ -41,8 +41,9 @@ class SceneCamera:
             raise NergError(
                 f"{where} has a skew, or coefficients beyond OpenCV's rational model of eight, which are not supported"
             )
-        named = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), d.tolist()))
-        return cls(Intrinsics(int(w), int(h), *(float(x) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])), **named))
+        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(d[:_COEFFICIENTS], (0, max(0, _COEFFICIENTS - len(d)))).tolist()
+        fx, fy, cx, cy = (float(x) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
+        return cls(Intrinsics(int(w), int(h), fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6))
 
     def directions(self, pixels: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) of ``pixels`` (n, 2); NaN beyond the picture, and where the lens shows nothing."""
