@@ -90,8 +90,7 @@ def _is_name(column: str) -> bool:
 
 def _use_preset(out: Proposal, name: str, why: str) -> None:
     out.preset = name
-    surely = out.guessed if "no column says" in why else out.sure
-    surely.append(f"the preset {name}: {why}")
+    out.sure.append(f"the preset {name}: {why}")
     if name in _SCENE:
         out.options |= {"--poses": "MODEL", "--frames": "frame_{frame1}"}
         out.open.append(
@@ -101,7 +100,7 @@ def _use_preset(out: Proposal, name: str, why: str) -> None:
     if name == "pupil":
         out.options["--marker"] = "METRES"
         out.open.append("the edge of a tracking marker in metres (--marker) and the up axis of the markers (--up)")
-    if name in ("skeleton22", "unity"):
+    if name == "skeleton22":
         out.open.append("the unit of the time (--tick); the card tells which would give a device's rate")
 
 

@@ -77,11 +77,6 @@ def _of_words(table: ColumnFinder) -> tuple[str, str] | None:
         return "quest", f"it has a pose of each eye ({left[0]})"
     if find(("gaze_orientation", "gaze_pose_orientation"), "xyzw") and table.find("location_flags"):
         return "openxr", "it has gaze_orientation and location_flags"
-    gaze = find(("gaze_dir", "gaze_direction", "gaze_forward"))
-    if gaze is None:
-        return None
-    if find(("gaze_origin", "gaze_position", "eye_position")) and not head:
-        return "unity", f"it has {gaze[0]} and a gaze origin, and no head; whether it is Unity's world no column says"
     return None
 
 

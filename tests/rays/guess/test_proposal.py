@@ -103,7 +103,7 @@ def test_people_confidence_and_hits(tmp_path, monkeypatch):
     assert rays.hit is not None and np.allclose(rays.hit, rays.origin + 2 * rays.direction, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", [n for n in EXAMPLES if n not in ("table", "unity_local", "unity_head")])
+@pytest.mark.parametrize("name", [n for n in EXAMPLES if n not in ("table", "unity", "unity_local", "unity_head")])
 def test_examples_of_presets_are_known(tmp_path, name):
     """By their header, or by the files of their folder."""
     given = EXAMPLES[name].make(tmp_path)
@@ -112,11 +112,12 @@ def test_examples_of_presets_are_known(tmp_path, name):
     assert proposal.command is not None and f"--preset {name}" in proposal.command
 
 
-@pytest.mark.parametrize("name", ["unity_local", "unity_head"])
+@pytest.mark.parametrize("name", ["unity", "unity_local", "unity_head"])
 def test_a_map_does_for_presets_that_look_alike(tmp_path, name):
     """What Unity projects call the gaze does not say of which frame it is."""
     proposal = propose_import(EXAMPLES[name].make(tmp_path))
-    assert proposal.preset is None and proposal.columns is not None and proposal.columns.xyzw is not None
+    assert proposal.preset is None and proposal.columns is not None and proposal.options["--hand"] == "left"
+    assert (proposal.columns.xyzw is not None) == (name != "unity")
 
 
 def test_folders(tmp_path):
