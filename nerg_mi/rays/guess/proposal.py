@@ -100,6 +100,9 @@ def _use_preset(out: Proposal, name: str, why: str) -> None:
     if name == "pupil":
         out.options["--marker"] = "METRES"
         out.open.append("the edge of a tracking marker in metres (--marker) and the up axis of the markers (--up)")
+    if name == "neon_mocap":
+        out.options["--up"] = "UP"
+        out.open.append("the up axis of the motion capture (--up)")
     if name == "skeleton22":
         out.open.append("the unit of the time (--tick); the card tells which would give a device's rate")
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from nerg_mi.errors import NergError
 from nerg_mi.files.line_blocks import line_blocks
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
-from nerg_mi.rays.readers.registry import preset_names
 
 # By the name of a file, in a folder or given itself; what is beside it tells some apart.
 _FILES = (
@@ -16,15 +15,14 @@ _FILES = (
     ("glassestools", "gazeData.tsv", "calibration.xml"),
     ("pupil", "gaze_positions.csv", "head_pose_tracker_poses.csv"),
 )
-# By columns that all have to be there, the more telling first. Those of readers that are not registered are passed by.
+# By columns that all have to be there, the more telling first.
 _COLUMNS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("vr_supermarket", ("ctw_00", "ctw_23", "ray_x", "eye_x", "opennessl", "opennessr", "xc")),
     ("arett", ("eyeDataTimestamp", "gazeHasValue", "isCalibrationValid", "gazeOrigin_x", "gazeDirection_x")),
     ("varjo", ("CaptureTime", "HMDPosition", "HMDRotation", "CombinedGazeForward", "GazeStatus")),
-    ("eyenavgs", ("ViewIndex", "FOV1", "PositionX", "QuaternionX", "GazeQX")),
+    ("eyenavgs", ("ViewIndex", "PositionX", "QuaternionX", "GazeQX")),
     ("aria", ("tracking_timestamp_us", "pitch_rads_cpf")),
-    ("aria", ("tracking_timestamp_us", "tx_world_device", "qx_world_device")),
-    ("qualisys", ("X Pos", "Y Pos", "Z Pos", "X Vec", "Y Vec", "Z Vec")),
+    ("neon_mocap", ("timestamp [ns]", "gaze_origin_X", "gaze_origin_Y", "gaze_origin_Z", "gaze_dir_X")),
     ("neon", ("timestamp [ns]", "gaze x [px]", "gaze y [px]")),
     ("glassestools", ("timestamp", "frame_idx", "gaze_pos_vid_x", "gaze_pos_vid_y")),
     ("pupil", ("gaze_timestamp", "gaze_normal0_x", "eye_center0_3d_x")),
@@ -44,11 +42,13 @@ def preset_of_files(path: Path) -> tuple[str, str] | None:
 
 
 def preset_of_text(path: Path) -> tuple[str, str] | None:
-    """A preset by the first line of a file that has no header, and why."""
+    """A preset by the first line of a file, where that is no header, and why."""
     for block in line_blocks(path, "tracking file", 1):
         words = block[0].split("|")
         if len(words) == 3 and words[2].lstrip().startswith("["):
             return "skeleton22", "its lines are id|time|[keypoints]"
+        if block[0].startswith("GAZE_VECTOR_NAME\t"):
+            return "qualisys", "its first line names a gaze vector"
         break
     return None
 
@@ -57,7 +57,7 @@ def preset_of_columns(table: ColumnFinder) -> tuple[str, str] | None:
     """A preset by the columns of a table, and which of them tell."""
     there = set(table.columns)
     for name, needed in _COLUMNS:
-        if name in preset_names() and set(needed) <= there:
+        if set(needed) <= there:
             return name, f"it has the columns {', '.join(needed)}"
     return _of_words(table)
 
