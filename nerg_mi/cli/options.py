@@ -7,7 +7,7 @@ takes it as one parameter shows an option for each of its fields.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import Field, fields
 from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
@@ -26,7 +26,7 @@ def takes(kind: type, *leave_out: str) -> Callable[[Callable[..., None]], Callab
         own = inspect.signature(command, eval_str=True).parameters
         given_as = next(name for name, p in own.items() if p.annotation is kind)
         generated = {f.name: _parameter(f, kind) for f in fields(kind) if f.name not in leave_out}
-        parsers = {f.name: f.metadata["parse"] for f in fields(kind) if f.name not in leave_out}
+        told = {f.name: f.metadata for f in fields(kind) if f.name not in leave_out}
         parameters: list[inspect.Parameter] = []
         for name, parameter in own.items():
             shown = generated.values() if name == given_as else [parameter]
@@ -34,7 +34,7 @@ def takes(kind: type, *leave_out: str) -> Callable[[Callable[..., None]], Callab
 
         def call(**given: Any) -> None:
             chosen = {name: given.pop(name) for name in generated}
-            values = {name: _value(generated[name], parsers[name], value) for name, value in chosen.items()}
+            values = {name: _value(generated[name], told[name], value) for name, value in chosen.items()}
             command(**given, **{given_as: kind(**values)})
 
         call.__name__, call.__qualname__, call.__module__ = command.__name__, command.__qualname__, command.__module__
@@ -62,10 +62,11 @@ def _parameter(field: Field, kind: type) -> inspect.Parameter:
     )
 
 
-def _value(parameter: inspect.Parameter, parse: Callable[[str, str], Any] | None, given: Any) -> Any:
-    """What the command line ``given`` to a ``parameter`` means for its field."""
-    if parse is not None:
-        return None if given is None else parse(given, "--" + parameter.name.replace("_", "-"))
+def _value(parameter: inspect.Parameter, told: Mapping[str, Any], given: Any) -> Any:
+    """What the command line ``given`` to a ``parameter`` means for its field, of which ``told`` is the metadata."""
+    if told["parse"] is not None:
+        flag = told["names"][-1] if told["names"] else "--" + parameter.name.replace("_", "-")
+        return None if given is None else told["parse"](given, flag)
     return tuple(given or ()) if _listed(parameter.annotation) else given
 
 

@@ -27,7 +27,7 @@ def command(
     """Render a scene file to an EXR or PNG file, with the integrator that the scene names.
 
     An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour, tonemapped to
-    sRGB.
+    sRGB, or an overlay with its scale. Pictures of a sequence have a number added to their names.
     """
     options = replace(options, defaults=parse_defines(define))
     from nerg_mi.jobs import pictures

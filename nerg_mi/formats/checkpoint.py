@@ -7,7 +7,9 @@ architecture, units, bounding box, colour space and provenance.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,6 +22,9 @@ FORMAT = 1
 
 HEADER_BYTES = 16 << 20
 """The header, which names every array and holds the metadata, may have so many bytes."""
+
+
+_Contents = TypeVar("_Contents")
 
 
 def write_checkpoint(path: str | Path, kind: str, tensors: dict[str, np.ndarray], metadata: dict) -> None:
@@ -39,6 +44,15 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray],
 
     Raises `MissingFile` when there is no such file and `NergError` when it is not such a checkpoint.
     """
+    return _read(path, lambda f: _contents(f, Path(path), kind))
+
+
+def read_metadata(path: str | Path) -> dict:
+    """The metadata of a checkpoint of any kind, which they name as ``kind``; raises as `read_checkpoint`."""
+    return _read(path, lambda f: _metadata(f, Path(path)))
+
+
+def _read(path: str | Path, contents: Callable[[Any], _Contents]) -> _Contents:
     from safetensors import SafetensorError, safe_open
 
     path = Path(path)
@@ -49,7 +63,7 @@ def read_checkpoint(path: str | Path, kind: str) -> tuple[dict[str, np.ndarray],
     with reading(path, "checkpoint", also=(TypeError, AttributeError)):
         try:
             with safe_open(path, framework="numpy") as f:
-                return _contents(f, path, kind)
+                return contents(f)
         except SafetensorError as e:
             raise NergError(
                 f'"{path}" is not a readable safetensors file: {plain(e)}; copy it again, or make it anew'
@@ -70,6 +84,12 @@ def _check_header(path: Path) -> None:
 
 
 def _contents(f, path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
+    metadata = _metadata(f, path, kind)
+    return {k: f.get_tensor(k) for k in f.keys()}, metadata
+
+
+def _metadata(f, path: Path, kind: str | None = None) -> dict:
+    """What the header says, of a checkpoint of ``kind``; None: of any."""
     raw = (f.metadata() or {}).get("nerg")
     if raw is None:
         raise NergError(
@@ -78,7 +98,7 @@ def _contents(f, path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
     metadata = parse_json(raw, path, "checkpoint, in its metadata")
     if not isinstance(metadata, dict):
         raise NergError(f'the metadata of "{path}" are damaged: a JSON object is needed; copy it again')
-    if metadata.get("kind") != kind:
+    if kind is not None and metadata.get("kind") != kind:
         raise NergError(
             f'"{path}" holds a {plain(metadata.get("kind"), 40)} field where a {kind} field is needed; '
             "name one of those"
@@ -90,4 +110,4 @@ def _contents(f, path: Path, kind: str) -> tuple[dict[str, np.ndarray], dict]:
         )
     if not isinstance(metadata.get("provenance", {}), dict):
         raise NergError(f'the metadata of "{path}" are damaged: "provenance" must be a JSON object; copy it again')
-    return {k: f.get_tensor(k) for k in f.keys()}, metadata
+    return metadata

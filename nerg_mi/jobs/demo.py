@@ -21,9 +21,9 @@ from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.files.tables import write_json
 from nerg_mi.interruption import Interruption
-from nerg_mi.maths.types import Float
 from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import activate, load_scene
+from nerg_mi.rendering.projection import pixel_of
 from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.panorama import pixel_solid_angles
 from nerg_mi.view import figures
@@ -160,20 +160,7 @@ def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
 def observer_pixel(scene) -> tuple[float, float] | None:
     """Where the observer of ``scene`` stands in the camera's picture: (x, y) in pixels, counted from the first one's
     centre; None outside of it."""
-    import mitsuba as mi
-
-    camera = scene.sensors()[CAMERA]
-    film = camera.film()
-    fov: Float = mi.traverse(camera)["x_fov"]
-    local = camera.world_transform().inverse() @ center(scene.sensors()[OWN])
-    clip = camera.near_clip(), camera.far_clip()
-    screen = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, *clip)
-    x, y, _ = (float(v[0]) for v in np.array(screen @ local).reshape(3, -1))
-    depth = float(np.array(local).reshape(3, -1)[2, 0])
-    if depth <= 0 or not (0 < x < 1 and 0 < y < 1):
-        return None
-    width, height = film.crop_size()
-    return x * width - 0.5, y * height - 0.5
+    return pixel_of(scene.sensors()[CAMERA], center(scene.sensors()[OWN]))
 
 
 def sphere_integral(sphere: Channels) -> float:

@@ -84,7 +84,7 @@ def place_of_training(
 
     ``box``: of the gaze field. Raises `NergError` for a file that is missing or another one.
     """
-    align = Similarity() if provenance.get("align") is None else Similarity(provenance["align"])
+    align = align_of_training(provenance)
     if provenance.get("geometry") == "none":
         return GazePlace(None, box, "none", align=align)
     makers: dict[str, tuple[Path | None, str, Callable[[Path], GazePlace]]] = {
@@ -92,16 +92,38 @@ def place_of_training(
         "scene_file": (options.scene, "--scene", places.place_of_scene),
         "geometry_file": (options.geometry, "--geometry", places.place_of_volume),
     }
-    key = next((k for k in makers if k in provenance), None)
+    key = place_key(gaze, provenance)
+    given, name, make = makers[key]
+    path = file_of_training(gaze, provenance, given, f"say where it is with {name}", f"give that one with {name}")
+    return replace(make(path), align=align)
+
+
+def align_of_training(provenance: dict) -> Similarity:
+    """From the rays that a gaze field was trained on to its place. Raises `NergError` for one that is damaged."""
+    return Similarity() if provenance.get("align") is None else Similarity(provenance["align"])
+
+
+def place_key(gaze: Path, provenance: dict) -> str:
+    """The entry of the ``provenance`` of the checkpoint ``gaze`` that names the file of its place: "field_file",
+    "scene_file" or "geometry_file". Raises `NergError` where there is none."""
+    key = next((k for k in ("field_file", "scene_file", "geometry_file") if k in provenance), None)
     if key is None:
         raise NergError(f'"{gaze}" does not say what it was trained in')
-    given, name, make = makers[key]
-    path = gaze.parent / provenance[key]["file"] if given is None else Path(given)
+    return key
+
+
+def file_of_training(gaze: Path, provenance: dict, given: Path | None, where: str, other: str) -> Path:
+    """The file of the place that ``gaze`` was trained in: ``given``, or the one of its name beside the checkpoint.
+
+    Raises `NergError` for a file that is missing, which ends in ``where``, or is another one, which ends in ``other``.
+    """
+    about = provenance[place_key(gaze, provenance)]
+    path = gaze.parent / about["file"] if given is None else Path(given)
     if not path.is_file():
-        raise NergError(f'"{path}", which the field was trained in, does not exist; say where it is with {name}')
-    if file_sha256(path) != provenance[key]["sha256"]:
-        raise NergError(f'"{path}" is not the file that "{gaze}" was trained in; give that one with {name}')
-    return replace(make(path), align=align)
+        raise NergError(f'"{path}", which the field was trained in, does not exist; {where}')
+    if file_sha256(path) != about["sha256"]:
+        raise NergError(f'"{path}" is not the file that "{gaze}" was trained in; {other}')
+    return path
 
 
 def read_similarity(path: Path, option: str, frames: str) -> Similarity:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -40,13 +40,18 @@ def render_channels(
     ``spp``: samples a pixel, 0 for those of the sensor's sampler. ``on_strip`` is told the samples done and those of
     all, several times a second, and may raise.
     """
-    names = [name.split(".") for name in scene.integrator().aov_names()]
     (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip)
-    pixels = np.array(band.film.develop())
+    return channels_of(band.film, scene.integrator().aov_names())
+
+
+def channels_of(film, aov_names: Sequence[str]) -> Channels:
+    """What a developed ``film`` holds, whose last channels are those of AOVs, with these names."""
+    names = [name.split(".") for name in aov_names]
+    pixels = np.array(film.develop())
     color = pixels[..., : pixels.shape[2] - len(names)]
     first = color.shape[2]
     several = {parts[0] for parts in names if [p[0] for p in names].count(parts[0]) > 1}
     key = lambda parts: ".".join(parts) if parts[0] in several else parts[0]
     aovs = {key(parts): pixels[..., first + k] for k, parts in enumerate(names)}
     # Mono variants render one channel.
-    return Channels(np.broadcast_to(color[..., :3], (*color.shape[:2], 3)), aovs, band.film.bitmap())
+    return Channels(np.broadcast_to(color[..., :3], (*color.shape[:2], 3)), aovs, film.bitmap())

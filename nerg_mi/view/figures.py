@@ -34,14 +34,22 @@ def save(figure, path, text: dict[str, str] | None = None) -> None:
     )
 
 
-def depth_figure(depth, mask, title: str = "Depth", unit: str = "m"):
-    """``depth`` (h, w) in scene units, with a colour bar; white where ``mask`` (h, w) says that nothing is met."""
+def depth_limits(depth, mask) -> tuple[float, float]:
+    """The ends of a scale for ``depth`` (h, w) where ``mask`` (h, w) is true, but for the outermost half percents."""
+    depth = np.asarray(depth, np.float64)
+    some = np.asarray(mask, bool) & np.isfinite(depth)
+    low, high = (float(v) for v in np.percentile(depth[some], (0.5, 99.5))) if some.any() else (0.0, 1.0)
+    return low, max(high, low + 1e-6)
+
+
+def depth_figure(depth, mask, title: str = "Depth", unit: str = "m", limits: tuple[float, float] | None = None):
+    """``depth`` (h, w) in scene units, with a colour bar; white where ``mask`` (h, w) says that nothing is met.
+    ``limits``: ends of the scale, by default those of `depth_limits`."""
     import matplotlib
 
     depth = np.asarray(depth, np.float64)
     some = np.asarray(mask, bool) & np.isfinite(depth)
-    low, high = (float(v) for v in np.percentile(depth[some], (0.5, 99.5))) if some.any() else (0.0, 1.0)
-    high = max(high, low + 1e-6)
+    low, high = limits or depth_limits(depth, mask)
     colors = matplotlib.colormaps["viridis_r"]
     shown = np.where(some[..., None], colors((depth - low) / (high - low))[..., :3], 1.0)
     figure = _Sheet([shown], [title], scale=True)
@@ -49,10 +57,13 @@ def depth_figure(depth, mask, title: str = "Depth", unit: str = "m"):
     return figure.figure
 
 
-def gaze_figure(color, gaze, mask, heat: Heat, title: str = "Gaze"):
-    """``gaze`` (h, w) in 1/sr over the linear picture ``color`` (h, w, 3), with its scale."""
+def gaze_figure(color, gaze, mask, heat: Heat, title: str = "Gaze", label: str = "gaze density [1/sr]", marker=None):
+    """``gaze`` (h, w) in 1/sr over the linear picture ``color`` (h, w, 3), with its scale, which ``label`` explains.
+    ``marker``: pixel (x, y) at which the observer stands."""
     sheet = _Sheet([overlay(color, gaze, heat, mask)], [title], scale=True)
-    sheet.bar(scale_strip(heat), 0.0, heat.top, "gaze density [1/sr]", above=_exceeds(heat, [gaze]))
+    if marker is not None:
+        _mark(sheet.panels[0], marker)
+    sheet.bar(scale_strip(heat), 0.0, heat.top, label, above=_exceeds(heat, [gaze]))
     return sheet.figure
 
 
@@ -103,18 +114,18 @@ def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None):
     sheet = _Sheet(pictures, titles, scale=True)
     if marker is not None:
         for axes in sheet.panels[1:]:
-            axes.plot(
-                *marker,
-                marker="o",
-                markersize=6,
-                markerfacecolor="#35c2ff",
-                markeredgecolor="white",
-                markeredgewidth=1.2,
-            )
-            axes.annotate("observer", marker, xytext=(6, 5), textcoords="offset points", fontsize=7, color="white")
+            _mark(axes, marker)
     above = _exceeds(heat, [gaze for _, gaze, _ in (own, moved_without, moved_with)])
     sheet.bar(scale_strip(heat), 0.0, heat.top, "gaze density [1/sr]", above=above)
     return sheet.figure
+
+
+def _mark(axes, marker) -> None:
+    """Show in a picture where the observer stands."""
+    axes.plot(
+        *marker, marker="o", markersize=6, markerfacecolor="#35c2ff", markeredgecolor="white", markeredgewidth=1.2
+    )
+    axes.annotate("observer", marker, xytext=(6, 5), textcoords="offset points", fontsize=7, color="white")
 
 
 def _exceeds(heat: Heat, values) -> bool:

@@ -19,6 +19,10 @@ CELLS = 2
 tests)."""
 
 
+# Cells that are looked at for the one with the greatest support.
+_DENSE = 64
+
+
 class RaySupport:
     """``cells`` (n, 5): mean origin (3), number of rays, and their mean squared distance from that; ``radius``: R. Both
     in one frame."""
@@ -55,3 +59,11 @@ class RaySupport:
         reach = dr.sqrt(4 * square * apart) * scale + 1e-9
         cut = dr.square(dr.maximum(inside + reach, 0)) / (4 * reach)
         return dr.sum(count * dr.select(inside > reach, inside, cut))
+
+    def densest(self) -> np.ndarray:
+        """Where the support is greatest (3,) float64, of the mean origins of the cells with most rays; of equal ones
+        the first."""
+        cells = self.cells.astype(np.float64)
+        best = cells[np.argsort(-cells[:, 3], kind="stable")[:_DENSE], :3]
+        square = ((best[:, None] - cells[None, :, :3]) ** 2).sum(axis=-1) + cells[:, 4]
+        return best[np.argmax((np.maximum(1 - square / self.radius**2, 0) * cells[:, 3]).sum(axis=1))]

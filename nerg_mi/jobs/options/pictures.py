@@ -22,6 +22,15 @@ class PictureOptions:
     seed: int = option(0, "Seed of the random numbers.", min=0)
     threads: int = option(0, "Worker threads; 0: one a core.", "-t", "--threads", min=0)
     memory: float = option(1.0, "GB that rendering may take; larger pictures are made in bands.")
+    overlay: str | None = option(
+        None, "Lay this over the colour, with its scale (.png): gaze, kde, visibility, depth, support, ..."
+    )
+    top: float | None = option(
+        None, "Upper end of the overlay's scale, for gaze in 1/sr.  [default: the 99.5th percentile]"
+    )
+    frames: Path | None = option(
+        None, "Render a sequence: CSV file whose header names <default>s, a line of values for each picture."
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,144 @@
+"""Pictures with a quantity laid over their colour, alone or as a sequence with one scale."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.files.atomic import write_bytes
+from nerg_mi.interruption import Interruption
+from nerg_mi.rendering.asked import render_asked
+from nerg_mi.rendering.projection import pixel_of
+from nerg_mi.transport.observer.viewpoint import center
+from nerg_mi.view import figures
+from nerg_mi.view.overlays import Layers, Limits, Overlay, find_overlay, shared_limits
+
+from .options.pictures import PictureOptions
+
+BYTES_PER_PIXEL = 400
+"""Memory that drawing an overlay takes for a pixel, at most: matplotlib keeps colours in double precision."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """``size`` (width, height) in pixels, number of ``channels``, and why it was not divided, as `PictureResult` has
+    them."""
+
+    size: tuple[int, int]
+    channels: int
+    whole: str | None = None
+
+
+OnStrip = Callable[[int, int], None]
+"""Is told how many samples are done, and of how many."""
+
+Make = Callable[[Any, Any, OnStrip], Picture]
+"""Makes a picture of a scene, a sensor, and a function that is told of each strip."""
+
+
+def check_overlay(output: Path, options: PictureOptions) -> None:
+    """Raise `NergError` for options of an overlay that contradict each other."""
+    if options.overlay is None:
+        if options.top is not None:
+            raise NergError("--top is the end of an overlay's scale, and there is none; give --overlay, too")
+        return
+    find_overlay(options.overlay)
+    if output.suffix.lower() != ".png":
+        raise NergError(
+            f'an overlay is a picture to look at, and "{output}" is none: let its name end in .png (an .exr holds the '
+            "quantity itself, if the scene's aovs name it)"
+        )
+    if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
+        raise NergError(f"--top must be positive, got {options.top}")
+
+
+def overlay_pictures(
+    path: Path,
+    frames: Sequence[Mapping[str, str]],
+    files: Sequence[Path],
+    options: PictureOptions,
+    render: Callable[[Mapping[str, str], Make], Picture],
+    stop: Interruption,
+) -> tuple[Picture, float | None]:
+    """Write a picture with the overlay of ``options`` for each of ``frames``, values of `<default>`s of the scene file
+    ``path``, to ``files``. Gives the last one, and the upper end of the scale of all, None where there is none.
+
+    ``render``: loads the scene of a frame and lets a picture be made of it. Pictures of a sequence wait on the disk
+    until the scale is known. Raises `NergError` where the quantity is 0 everywhere.
+    """
+    overlay = find_overlay(options.overlay or "")
+    limits: list[Limits] = []
+    last = Picture((0, 0), 0)
+    with tempfile.TemporaryDirectory() as folder:
+        kept: list[tuple[Path, tuple[int, ...], Any]] = []
+
+        def make(loaded: Any, camera: Any, on_strip: OnStrip) -> Picture:
+            _check_memory(path, camera, options)
+            layers = _layers(path, loaded, camera, overlay, options, on_strip)
+            limits.append(overlay.limits(layers))
+            array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
+            # Alone it need not wait.
+            file = Path(folder, str(len(kept)))
+            if len(frames) > 1:
+                write_bytes(file, np.ascontiguousarray(array, np.float32).data)
+            kept.append((file, array.shape, layers.marker if len(frames) > 1 else layers))
+            height, width = layers.mask.shape
+            return Picture((width, height), 3)
+
+        for frame in frames:
+            last = render(frame, make)
+        ends = shared_limits(limits, options.top)
+        if ends is None and overlay.scaled:
+            raise NergError(
+                f'"{overlay.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
+            )
+        for (file, shape, rest), output in zip(kept, files):
+            layers = rest if isinstance(rest, Layers) else _read(file, shape, rest)
+            figures.save(overlay.draw(layers, ends), output)
+            stop.check()
+    return last, None if ends is None else ends[1]
+
+
+def _read(file: Path, shape: tuple[int, ...], marker: Any) -> Layers:
+    array = np.fromfile(file, np.float32).reshape(shape)
+    return Layers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker)
+
+
+def _check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
+    width, height = map(int, camera.film().crop_size())
+    needed = BYTES_PER_PIXEL * width * height / 1e9
+    if needed > options.memory:
+        raise NergError(
+            f"an overlay of {width:,} x {height:,} pixels is drawn in one piece, for which it takes {needed:.2g} GB; "
+            f'give --memory {needed:.1f}, or a smaller picture of "{path}"'
+        )
+
+
+def _layers(
+    path: Path, loaded: Any, camera: Any, overlay: Overlay, options: PictureOptions, on_strip: OnStrip
+) -> Layers:
+    asked = list(dict.fromkeys([overlay.name, "opacity", "depth"]))
+    with mitsuba_says():
+        found = render_asked(path, loaded, camera, asked, options.spp, options.seed, on_strip)
+    return Layers(found.color, found.aovs[overlay.name], found.mask, _marker(loaded, camera, found.aovs["depth"]))
+
+
+def _marker(loaded: Any, camera: Any, depth: np.ndarray) -> tuple[float, float] | None:
+    """The pixel at which the scene's observer stands, if the ``camera`` sees them."""
+    observer = loaded.integrator().observer
+    if observer is None or camera.class_name() != "PerspectiveCamera":
+        return None
+    eye = center(observer)
+    found = pixel_of(camera, eye)
+    if found is None:
+        return None
+    column, row = (int(np.clip(round(v), 0, n - 1)) for v, n in zip(found, depth.shape[::-1]))
+    away = float(np.linalg.norm(np.ravel(np.array(eye - center(camera)))))
+    before = depth[row, column]
+    return found if not 0 < before < away else None

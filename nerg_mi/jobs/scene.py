@@ -1,0 +1,295 @@
+"""From checkpoints, meshes and rays to a scene file that `nerg render` renders."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import check_writable, write_text
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.frames_file import write_frames
+from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene_parts import Attention, Eye, Lens, SceneText, default_name, relative_name
+from nerg_mi.rendering.scene_writer import numbers, value_of
+from nerg_mi.training.geometry.places import place_of_hits
+from nerg_mi.view.overview import Frame, Seen
+
+from .backend import select_backend
+from .gaze_places import read_similarity
+from .options.scene import SceneOptions
+from .reporter import SILENT, Reporter
+from .scenes.cameras import Probe, best_camera, given_point, probe_values, turned_ahead, upright
+from .scenes.files import GivenFiles, recognise
+from .scenes.observers import Walk, eye_of_person, support_of_rays, to_place, walk_of_person
+from .scenes.photos import camera_of_photo
+from .scenes.places import LAMP, WrittenPlace, place_of_files
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """``path``: the scene; ``files``: all that was written; ``camera``, ``observer``: where they are and what they look
+    at, in the place's coordinates (no observer: the camera is it); ``quantity``: the AOV of attention, or None;
+    ``frames``: how many of a walk there are."""
+
+    path: Path
+    files: tuple[Path, ...]
+    camera: Eye
+    observer: Eye | None
+    quantity: str | None
+    frames: int = 0
+
+
+def write_scene(
+    files: Sequence[str | Path], output: str | Path, options: SceneOptions | None = None, reporter: Reporter = SILENT
+) -> SceneResult:
+    """Write the scene file ``output`` (.xml) of a place, a gaze field or rays, of which ``files`` are, in any order.
+
+    A place is a radiance field, a mesh (.ply, .obj), a scene (.xml) or hit points (.vol); of a gaze field without one
+    it is what that was trained in, found beside it. The scene has the sensors and the `<default>`s of the demo store's:
+    sensor 0 is a camera, 1 the observer's own view, 2 all that the observer could turn to. Names of files are relative
+    to the scene's folder where that is possible. Raises `NergError` for what the user can mend.
+    """
+    options, output = options or SceneOptions(), Path(output)
+    check_writable(output, ".xml")
+    _check_options(options)
+    frames_file = output.with_suffix(".frames.csv")
+    if options.times is not None:
+        check_writable(frames_file)
+    given = recognise([Path(file) for file in files], options.geometry, reporter)
+    ns = select_backend(options.mode)
+    align = given.align if options.align is None else read_similarity(options.align, "--align", "rays to place")
+    rays = None if given.rays is None else Rays.load(given.rays)
+    given, made = _with_hits(given, rays, output, reporter)
+    place = place_of_files(given, output)
+    up = _up(given, align, options)
+    observer, walk, about = _observer(given, rays, align, ns, options, reporter)
+    tracked = given.gaze is not None or given.rays is not None
+    scene = _Draft(given, place, align, up, observer, tracked)
+    with tempfile.TemporaryDirectory() as folder:
+        # The same scene, with a camera anywhere, to look around in.
+        probe_file = Path(folder) / "scene.xml"
+        write_text(probe_file, scene.text(probe_file.parent, observer or Eye(np.zeros(3), up), Lens(), 96).write())
+        taken = place.make(probe_file.parent, scene.lamps(1, 1)).taken
+        values = {default_name(name, taken): value for name, value in probe_values().items()}
+        probe = Probe(load_scene(probe_file, values), scene.attention(probe_file.parent).quantity, up)
+        seen = None if observer is None else probe.around(observer)
+        if seen is not None and observer is not None and not seen.met.any() and given.kind != "none":
+            reporter.warn("the observer meets no surface at all; give --observer another place, or check the alignment")
+        if observer is not None and seen is not None and walk is None and options.person is None:
+            observer = turned_ahead(observer, seen)
+            scene = replace(scene, observer=observer)
+        camera, lens, chosen = _camera(scene, probe, seen, options, reporter)
+    camera = upright(camera, up)
+    usual = seen.usual if seen is not None and seen.usual > 0 else 0.0
+    away = float(np.linalg.norm(camera.target - camera.origin))
+    scene = replace(scene, usual=(max(away, usual), usual))
+    text = scene.text(output.parent, camera, lens, options.width)
+    text = replace(text, about=_about(output, text, place, scene), about_camera=chosen, about_observer=about)
+    write_text(output, text.write())
+    written = [output, *made, *place.files]
+    if walk is not None:
+        write_frames(frames_file, _frames(walk, options.own, text.place.taken))
+        written.append(frames_file)
+        missing = f"; {walk.missing} more have no rays within {options.gap:g} s" if walk.missing else ""
+        reporter.message(f"{len(walk.eyes)} frames{missing}: nerg render {output} -o walk.png --frames {frames_file}")
+    for sentence in (about, chosen):
+        if sentence:
+            reporter.message(sentence)
+    for path in written:
+        reporter.message(f"wrote {path}")
+    quantity = text.attention.quantity
+    return SceneResult(output, tuple(written), camera, observer, quantity, 0 if walk is None else len(walk.eyes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Draft:
+    """A scene but for its camera."""
+
+    given: GivenFiles
+    place: WrittenPlace
+    align: Similarity
+    up: np.ndarray
+    observer: Eye | None
+    tracked: bool
+    # How far away things are usually from the camera and from the observer, for lamps.
+    usual: tuple[float, float] = (1.0, 1.0)
+
+    @property
+    def unit(self) -> float:
+        """Scene units of a metre, where tracking tells; else 1."""
+        return self.align.scale if self.tracked else 1.0
+
+    def attention(self, folder: Path) -> Attention:
+        """What is shown of attention, by the names that files have in ``folder``."""
+        name = lambda path: None if path is None else value_of(relative_name(path, folder))
+        align = None if self.align.identity else self.align.matrix
+        return Attention(name(self.given.gaze), name(self.given.rays), align)
+
+    def lamps(self, camera: float, eye: float) -> dict[str, float]:
+        """Intensities of lamps by the `<default>` that says where they are."""
+        if self.observer is None:
+            return {"camera": LAMP * camera**2}
+        return {"eye": LAMP * max(eye, 0.1 * camera) ** 2, "camera": 0.5 * LAMP * camera**2}
+
+    def text(self, folder: Path, camera: Eye, lens: Lens, width: int) -> SceneText:
+        """The scene in ``folder``."""
+        place = self.place.make(folder, self.lamps(*self.usual))
+        return SceneText(place, self.attention(folder), camera, self.observer, self.up, lens, width, self.unit)
+
+
+def _check_options(options: SceneOptions) -> None:
+    """Raise `NergError` for options that contradict each other, or need others."""
+    moment = options.time is not None or options.times is not None
+    if moment != (options.person is not None) or (options.time is not None and options.times is not None):
+        raise NergError("whose eye it is takes --person and one of --time and --times; give both, or neither")
+    if options.person is not None and options.observer is not None:
+        raise NergError("the observer is either at --observer or a --person; leave out one of them")
+    if (options.photo is None) != (options.photos is None):
+        raise NergError(
+            "the camera of a photo takes --photos, the data set, and --photo, its number or name; give both"
+        )
+    ways = [options.camera_from is not None, options.photo is not None, options.own]
+    if sum(ways) > 1 or (options.camera_to is not None and options.camera_from is None):
+        raise NergError("a camera is given by --from and --to, by --photo or by --own; give one of these")
+    if options.times is not None and len(options.times) != 2:
+        raise NergError(f"--times is two times, A,B, got {len(options.times)}")
+    if options.fov is not None and not 0 < options.fov < 180:
+        raise NergError(f"--fov must lie between 0 and 180 degrees, got {options.fov:g}")
+
+
+def _with_hits(
+    given: GivenFiles, rays: Rays | None, output: Path, reporter: Reporter
+) -> tuple[GivenFiles, tuple[Path, ...]]:
+    """``given`` with the place made of hit points where rays alone are shown in these, and the file of it."""
+    if given.kind != "hits" or given.place is not None:
+        return given, ()
+    if rays is None:
+        raise NergError("--geometry hits shows rays in their hit points, and there are no rays; name their file")
+    path = output.with_suffix(".vol")
+    check_writable(path)
+    made = place_of_hits(rays, path).about["geometry_file"]
+    size = " x ".join(map(str, made["shape"]))
+    reporter.message(f"the place is made of the rays' hit points: {size} voxels of {made['voxel']:.3g} m")
+    return replace(given, place=path), (path,)
+
+
+def _up(given: GivenFiles, align: Similarity, options: SceneOptions) -> np.ndarray:
+    """Which way is up in the place: as it is given, that of the rays, that of the radiance field, or +z."""
+    chosen = given_point(options.up, "--up")
+    if chosen is None and (given.rays is not None or "rays_file" in given.about or not align.identity):
+        chosen = align.matrix[:3, 2] / align.scale
+    if chosen is None:
+        known = given.field_about.get("provenance", {}).get("up")
+        chosen = np.array([0.0, 0, 1]) if known is None else np.asarray(known, float)
+    length = float(np.linalg.norm(chosen))
+    if chosen.shape != (3,) or not (np.isfinite(length) and length > 0):
+        raise NergError("up must be a direction, three numbers that are not all 0; give --up x,y,z")
+    return chosen / length
+
+
+def _observer(
+    given: GivenFiles, rays: Rays | None, align: Similarity, ns, options: SceneOptions, reporter: Reporter
+) -> tuple[Eye | None, Walk | None, str]:
+    """The observer, the walk of one, and a sentence on them."""
+    point = given_point(options.observer, "--observer")
+    if point is not None:
+        return (
+            Eye(point, point + np.array([1.0, 0, 0])),
+            None,
+            "The observer's eye, as given, turned to where most gaze goes.",
+        )
+    if options.person is not None:
+        if rays is None:
+            raise NergError("--person is one of the rays, and there are none; name their file, too")
+        if options.times is not None:
+            walk = walk_of_person(rays, options.person, *options.times, options.fps, options.gap, align)
+            middle = len(walk.eyes) // 2
+            about = f"The eye of {options.person} at {walk.times[middle]:.6g} s, in the middle of the walk."
+            return walk.eyes[middle], walk, about
+        assert options.time is not None
+        eye, when = eye_of_person(rays, options.person, options.time, options.gap, align)
+        return eye, None, f"The eye of {options.person} at {when:.6g} s, and a point ahead of it."
+    if rays is not None:
+        at = to_place(support_of_rays(rays).densest(), align)
+        return (
+            Eye(at, at + align.matrix[:3, 0]),
+            None,
+            "The observer: where most rays are, turned to where most gaze goes.",
+        )
+    if given.gaze is not None:
+        support = load_gaze(given.gaze, ns)[0].support
+        if support is not None:
+            at = support.densest()
+            words = "The observer: where the gaze field rests on most rays, turned to where most gaze goes."
+            return Eye(at, at + np.array([1.0, 0, 0])), None, words
+        if given.kind == "none":
+            raise NergError(
+                f'"{given.gaze}" knows no place, and not where people were; say where the observer is with --observer'
+            )
+        reporter.message("nothing says where people were: the camera is the observer; --observer x,y,z places one")
+    return None, None, ""
+
+
+def _camera(
+    scene: _Draft, probe: Probe, seen: Seen | None, options: SceneOptions, reporter: Reporter
+) -> tuple[Eye, Lens, str]:
+    """The camera, its lens, and a sentence on how they were chosen."""
+    lens = Lens() if options.fov is None else Lens(options.fov)
+    if options.photos is not None and options.photo is not None:
+        about = scene.given.field_about.get("provenance", {})
+        found = camera_of_photo(options.photos, options.photo, about, options.allow_outside)
+        if found.bent:
+            reporter.message(f"the lens of {found.name} bends lines, which this camera does not")
+        lens = found.lens if options.fov is None else replace(found.lens, fov=options.fov)
+        return found.eye, lens, f"The camera of sensor 0: that of the photo {found.name}."
+    origin, target = given_point(options.camera_from, "--from"), given_point(options.camera_to, "--to")
+    if origin is not None:
+        if target is None:
+            target = None if seen is None else seen.looked_at()
+        if target is None:
+            target = np.mean(probe.bounds(), axis=0)
+        return Eye(origin, target), lens, "The camera of sensor 0, and the point that it looks at."
+    if options.own or (scene.given.kind == "none" and scene.observer is not None):
+        if scene.observer is None:
+            raise NergError("--own is the observer's view, and there is no observer; give --observer or --person")
+        return scene.observer, lens, "The camera of sensor 0: the observer's own eye."
+    frame = Frame(lens.fov, lens.aspect, scene.up)
+    box = scene.given.field_about.get("box") if scene.given.kind == "field" else None
+    shot = best_camera(probe, seen, frame, box)
+    if shot is None:
+        raise NergError("no camera was found that shows anything of the place; give one with --from and --to")
+    attended = "" if shot.attended is None else f" and {100 * shot.attended:.0f} % of what the observer attends to"
+    words = f"The camera of sensor 0: the best overview that was found; it shows surfaces in {100 * shot.opaque:.0f} %"
+    return Eye(shot.origin, shot.target), lens, f"{words} of the picture{attended}."
+
+
+def _about(output: Path, text: SceneText, place: WrittenPlace, scene: _Draft) -> str:
+    """The first comment of the file."""
+    gaze = {"gaze": "with the gaze of an observer", "kde": "with where people around an observer looked", None: ""}
+    what = f"{place.words} {gaze[text.attention.quantity]}".rstrip() + "."
+    unit = f"A metre is {scene.unit:.4g} units." if scene.tracked and abs(scene.unit - 1) > 1e-4 else ""
+    names = text.place.taken
+    example = f'-D {default_name("spp", names)}=64 -D {default_name("camera", names)}="{numbers(text.camera.origin)}"'
+    sensors = "Sensors: 0 a camera, 1 the observer's own view, 2 all that the observer could turn to."
+    if text.observer is None:
+        sensors = "Sensors: 0 a camera, which is the observer; 1 the same view; 2 all directions around it."
+    return (
+        f"{what} {unit}\n{sensors}\nEvery default can be set from the command line: "
+        f"nerg render {output.name} -o out.png {example}"
+    )
+
+
+def _frames(walk: Walk, own: bool, taken: frozenset[str]) -> list[dict[str, str]]:
+    names = ["eye", "ahead", *(["camera", "target"] if own else [])]
+    rows = []
+    for eye in walk.eyes:
+        values = [numbers(eye.origin), numbers(eye.target)] * 2
+        rows.append({default_name(name, taken): value for name, value in zip(names, values)})
+    return rows

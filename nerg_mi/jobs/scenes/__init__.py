@@ -1,0 +1,1 @@
+"""What a scene file is made of when it is written for checkpoints: its files, its place, its observer, its camera."""

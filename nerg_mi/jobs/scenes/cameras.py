@@ -1,0 +1,118 @@
+"""From where a scene is shown: what an observer meets around, and the best camera for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.maths.contraction import box_of
+from nerg_mi.rendering.channels import render_channels
+from nerg_mi.rendering.scene_parts import Eye, ahead_level
+from nerg_mi.transport.panorama import pixel_directions, pixel_solid_angles
+from nerg_mi.transport.place import Place
+from nerg_mi.transport.trace import trace_depth
+from nerg_mi.view.overview import Frame, Seen, Shot, around_observer, of_place
+
+PANORAMA = (96, 48)
+"""Pixels of the picture of what an observer meets."""
+
+SPHERE = 2
+"""Number of the sensor that takes it."""
+
+# Where nothing is known of attention: how much more level directions count than those beyond 35 degrees.
+_LEVEL, _STEEP = 1.0, 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """A scene as it is before its camera is chosen, loaded to look around in: ``scene``; ``quantity``: the AOV of
+    attention, or None; ``up`` (3,)."""
+
+    scene: Any
+    quantity: str | None
+    up: np.ndarray
+
+    @property
+    def place(self) -> Place:
+        """What its rays meet."""
+        return Place(self.scene.integrator().medium, self.scene)
+
+    def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Depth and opacity along rays (N, 3)."""
+        with mitsuba_says():
+            return trace_depth(self.place, origins, directions)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner (3,) of what there is; of a field without an end those of its inner cube."""
+        place, corners = self.place, []
+        if place.medium is not None:
+            corners.append(place.medium.bounds())
+        if place.scene is not None:
+            corners.append(place.corners())
+        return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
+
+    def around(self, eye: Eye) -> Seen:
+        """What somebody at ``eye`` meets, as the sensor of the sphere shows it."""
+        with mitsuba_says():
+            found = render_channels(self.scene, self.scene.sensors()[SPHERE], spp=1)
+        width, height = PANORAMA
+        front, up = ahead_level(eye, self.up), self.up / np.linalg.norm(self.up)
+        # The panorama's own frame: x to the left, y up, z to the front.
+        directions = pixel_directions(width, height).reshape(-1, 3) @ np.stack([np.cross(up, front), up, front])
+        even = np.where(np.abs(directions @ up) < np.sin(np.radians(35)), _LEVEL, _STEEP)
+        attention = even if self.quantity is None else found.aovs[self.quantity].reshape(-1).astype(float)
+        return Seen(
+            np.asarray(eye.origin, float),
+            directions,
+            found.aovs["depth"].reshape(-1).astype(float),
+            found.mask.reshape(-1),
+            attention if attention.any() else even,
+            pixel_solid_angles(width, height).reshape(-1),
+        )
+
+
+def probe_values() -> dict[str, str]:
+    """Values of `<default>`s for the scene of a `Probe`."""
+    return {"sphere_width": str(PANORAMA[0]), "sphere_height": str(PANORAMA[1]), "radiance": "false", "spp": "1"}
+
+
+def turned_ahead(eye: Eye, seen: Seen) -> Eye:
+    """The observer at ``eye``, turned to where most of the attention goes."""
+    towards = seen.main_direction()
+    at = int(np.argmax(seen.directions @ towards))
+    away = seen.depth[at] if seen.met[at] else max(seen.usual, 1.0)
+    return replace(eye, target=eye.origin + away * towards)
+
+
+def best_camera(probe: Probe, seen: Seen | None, frame: Frame, field_box: dict | None) -> Shot | None:
+    """The best overview: of what the observer of ``seen`` looks at, or of the whole place, whose metadata may say that
+    the field has a box (``field_box``)."""
+    if seen is not None:
+        return around_observer(probe.trace, frame, seen)
+    if field_box is not None:
+        box = box_of(field_box)
+        return of_place(probe.trace, frame, np.array(box.core.lower), np.array(box.core.upper), not box.contracted)
+    return of_place(probe.trace, frame, *probe.bounds())
+
+
+def given_point(values: tuple[float, ...] | None, option: str) -> np.ndarray | None:
+    """Three numbers that were given by ``option``, (3,), or None. Raises `NergError` for other ones."""
+    if values is None:
+        return None
+    if len(values) != 3 or not np.isfinite(values).all():
+        raise NergError(f"{option} is three numbers x,y,z, got {','.join(f'{v:g}' for v in values)}")
+    return np.array(values, float)
+
+
+def upright(eye: Eye, up: np.ndarray) -> Eye:
+    """``eye`` with an up of its own where it looks straight up or down, along ``up``. Raises `NergError` for one that
+    looks at where it is."""
+    ahead = np.subtract(eye.target, eye.origin)
+    if not np.any(np.abs(ahead) > 1e-9 * (1 + np.abs(eye.origin))):
+        raise NergError("a camera cannot look at the point at which it stands; give --to another one")
+    if eye.up is None and np.linalg.norm(np.cross(ahead, up)) < 1e-3 * np.linalg.norm(ahead) * np.linalg.norm(up):
+        return replace(eye, up=ahead_level(eye, up))
+    return eye

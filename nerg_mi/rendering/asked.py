@@ -1,0 +1,71 @@
+"""The integrator `nerg` of a scene asked for AOVs that its own list may lack, for the scene's own observer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.transport.observer import viewpoint
+
+from .bands import render_bands, why_whole
+from .channels import Channels, channels_of
+
+
+class AskedLayer:
+    """What is rendered in place of a scene's own picture (`layers.Layers`): colour, and the AOVs ``names_asked``.
+
+    Raises `NergError` for those that ``integrator``, a `nerg`, cannot compute.
+    """
+
+    def __init__(self, integrator: Any, sensor: Any, names_asked: Sequence[str]):
+        self._sensor, self._asked = sensor, integrator.asked(names_asked, True)
+        observer = integrator.observer
+        self._watcher = None
+        if observer is not None and self._asked.own:
+            eye = np.ravel(np.array(viewpoint.center(observer), np.float32))
+            self._watcher = self._asked.watcher(eye, True)
+        self._order = [*self._asked.shared, *self._asked.own]
+        self.names = [self._asked.channels(self._order)]
+        self.count = len(self.names[0])
+
+    def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> Iterable[tuple]:
+        pixel = self._asked.pixel(scene, [self._sensor], sampler, ray, active)
+        if self._watcher is None:
+            channels = pixel.channels(self._order)
+        else:
+            channels = pixel.channels(self._asked.shared) + self._watcher.pixel(pixel).channels(self._asked.own)
+        radiance, shown, _ = pixel.radiance(scene, sampler, medium)
+        return [(radiance, shown, channels)]
+
+
+def render_asked(
+    path: Path,
+    scene: Any,
+    sensor: Any,
+    names: Sequence[str],
+    spp: int = 0,
+    seed: int = 0,
+    on_strip: Callable[[int, int], None] | None = None,
+) -> Channels:
+    """Colour and the AOVs ``names`` of what ``sensor`` sees of ``scene``, which was read from ``path``.
+
+    Raises `NergError` for a scene whose integrator is not `nerg`, for AOVs that this cannot compute, and for pictures
+    that are made in one piece only (`bands.why_whole`).
+    """
+    integrator = scene.integrator()
+    if type(integrator).__name__ != "NergIntegrator":
+        kind = "none" if integrator is None else f'"{integrator.class_name()}"'
+        raise NergError(
+            f'an overlay needs the integrator "nerg", and "{path}" has {kind}; "nerg scene {path} -o new.xml" writes '
+            "one around it"
+        )
+    reason = why_whole(scene, sensor)
+    if reason is not None:
+        raise NergError(f'"{path}" cannot be rendered with an overlay because of {reason}; choose another sensor')
+    layer = AskedLayer(integrator, sensor, names)
+    (band,) = render_bands(scene, sensor, spp=spp, seed=seed, on_strip=on_strip, layers=layer)
+    return channels_of(band.film, layer.names[0])

@@ -1,0 +1,112 @@
+"""Somebody's scene file as the place of a scene with gaze.
+
+Mitsuba takes one integrator a scene, which has to be `nerg`; the one of the file then lights its shapes from within
+(docs/shapes-and-fields.md). An `<include>` cannot do that, so that the file is copied: what it includes becomes a part
+of the copy, its sensors come after ours, and a `<path>` leads to the files that it names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from copy import deepcopy
+from pathlib import Path
+from xml.etree import ElementTree
+
+from nerg_mi.errors import NergError, plain
+from nerg_mi.files.bounded import reading, size_of
+
+from .scene_file import check_scene_file
+from .scene_parts import Place, relative_name
+from .scene_writer import Blank, Comment, Node, Verbatim, element, value_of
+
+BYTES = 16 << 20
+"""A scene file that is copied may have so many bytes, with each that it includes."""
+
+SPP = 64
+"""Samples a pixel: paths of light have more noise than fields."""
+
+
+def nested_place(path: Path, folder: Path) -> Place:
+    """The scene file ``path`` as the place of one that is written into ``folder``.
+
+    Raises `NergError` for what is no scene file, and for one whose integrator is `nerg` already or one of several.
+    """
+    check_scene_file(path)
+    root = _root(path)
+    children = list(_inlined(root, path, [path.parent]))
+    defaults = [child for child in children if child.tag == "default"]
+    values: dict[str, str] = {}
+    for default in defaults:
+        values.setdefault(default.get("name", ""), _filled(default.get("value", ""), values))
+    integrators = [child for child in children if child.tag == "integrator"]
+    _check_integrators(path, integrators, values)
+    ids = {found.get("id", "") for child in children for found in child.iter()}
+    others = [child for child in children if child.tag not in ("default", "integrator", "path")]
+    light: tuple[Node, ...] = ()
+    if integrators:
+        light = (Comment(f"What lights the shapes: the integrator of {path.name}."), *map(_verbatim, integrators))
+    return Place(
+        inside=light,
+        beside=(Comment(f"What follows is {path.name}; its sensors are counted after ours."), *map(_verbatim, others)),
+        first=(*_paths(path, children, folder), *map(_verbatim, defaults), Blank()),
+        spp=SPP,
+        version=root.get("version", "3.0.0"),
+        taken=frozenset(values) | frozenset(ids),
+    )
+
+
+def _root(path: Path) -> ElementTree.Element:
+    size_of(path, "scene file", BYTES)
+    builder = ElementTree.TreeBuilder(insert_comments=True)
+    with reading(path, "scene file", "correct it", also=(ElementTree.ParseError,)):
+        root = ElementTree.parse(path, ElementTree.XMLParser(target=builder)).getroot()
+    if root.tag != "scene":
+        raise NergError(f'"{path}" is no scene file: it begins with <{plain(root.tag, 40)}> where <scene> is needed')
+    return root
+
+
+def _inlined(root: ElementTree.Element, path: Path, folders: list[Path]) -> Iterator[ElementTree.Element]:
+    """The elements of a scene with those that it includes in their place. `check_scene_file` has bounded the depth."""
+    for child in root:
+        if child.tag == "path":
+            folders.append(folders[0] / child.get("value", ""))
+        if child.tag != "include":
+            yield child
+            continue
+        name = child.get("filename", "")
+        found = next((f / name for f in folders if name and (f / name).is_file()), None)
+        if found is None:
+            raise NergError(f'the scene file "{path}" includes "{plain(name)}", which is not there; correct the name')
+        yield from _inlined(_root(found), found, folders)
+
+
+def _check_integrators(path: Path, integrators: list[ElementTree.Element], values: dict[str, str]) -> None:
+    if len(integrators) > 1:
+        raise NergError(f'the scene file "{path}" has {len(integrators)} integrators; leave one of them')
+    kinds = {_filled(found.get("type", ""), values) for i in integrators for found in i.iter("integrator")}
+    if "nerg" in kinds:
+        raise NergError(
+            f'the integrator of "{path}" is "nerg" already; put the gaze field into it by hand, as a <volume '
+            'name="gaze" type="gazefield"> (docs/plugins.md), and "nerg render" shows it'
+        )
+
+
+def _filled(text: str, values: dict[str, str]) -> str:
+    # The longest name first, as Mitsuba does.
+    for key in sorted(values, key=len, reverse=True):
+        text = text.replace(f"${key}", values[key])
+    return text
+
+
+def _paths(path: Path, children: list[ElementTree.Element], folder: Path) -> list[Node]:
+    """Where the files are that the scene names."""
+    given = [path.parent, *(path.parent / child.get("value", "") for child in children if child.tag == "path")]
+    names = [relative_name(place, folder) for place in given]
+    return [element("path", value=value_of(name)) for name in dict.fromkeys(names) if name != "."]
+
+
+def _verbatim(found: ElementTree.Element) -> Verbatim:
+    found = deepcopy(found)
+    found.tail = None
+    ElementTree.indent(found, " " * 4)
+    return Verbatim(ElementTree.tostring(found, encoding="unicode"))

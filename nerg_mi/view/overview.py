@@ -1,0 +1,269 @@
+"""Where a camera should stand so that a place, or what somebody in it looks at, can be seen well.
+
+Many candidates are looked through at a few hundred pixels each, by depths alone, and the best is taken: it sees
+surfaces and not the void, nothing right before the lens, near things and far ones, and, where there is an observer,
+as much as can be of what gets their attention. All positions are scene units, arrays of float64; depths come from a
+function ``trace(origins (N, 3), directions (N, 3)) -> (depth (N,), opacity (N,))`` such as that of
+`nerg_mi.transport.trace.trace_depth` with a place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+Trace = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+SURFACE = 0.5
+"""Opacity from which on a ray meets a surface."""
+
+_COARSE, _FINE = (18, 12), (48, 32)
+_KEPT = 10
+# Nearer than this share of the usual distance things fill a picture.
+_NEAR = 0.2
+# Attention above this share of its greatest density counts as seen where it is seen.
+_ATTENDED = 0.15
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A camera at ``origin`` (3,) that looks at ``target`` (3,); ``score``: 0 .. 1, of `Judge`; ``opaque``: share of
+    its picture that shows surfaces; ``attended``: share of the observer's attention that it shows, None without one."""
+
+    origin: np.ndarray
+    target: np.ndarray
+    score: float
+    opaque: float
+    attended: float | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Pixels of a pinhole camera: ``fov``, degrees from left to right, ``aspect``: width by height, ``up`` (3,)."""
+
+    fov: float
+    aspect: float
+    up: np.ndarray
+
+    def axes(self, ahead: np.ndarray) -> np.ndarray:
+        """Right, up and ahead (..., 3, 3) of cameras that look along unit ``ahead`` (..., 3)."""
+        right = np.cross(ahead, self.up)
+        right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-9)
+        return np.stack([right, np.cross(right, ahead), ahead], axis=-2)
+
+    def directions(self, ahead: np.ndarray, width: int, height: int) -> np.ndarray:
+        """Unit directions (..., height * width, 3) of the pixels of cameras that look along ``ahead`` (..., 3)."""
+        reach = np.tan(np.radians(self.fov / 2))
+        x = ((np.arange(width) + 0.5) / width * 2 - 1) * reach
+        y = (1 - (np.arange(height) + 0.5) / height * 2) * reach / self.aspect
+        local = np.stack([*(v.ravel() for v in np.meshgrid(x, y)), np.ones(width * height)], axis=-1)
+        local /= np.linalg.norm(local, axis=-1, keepdims=True)
+        return local @ self.axes(np.asarray(ahead, float))
+
+    def pixels(self, origins: np.ndarray, ahead: np.ndarray, points: np.ndarray, width: int, height: int) -> np.ndarray:
+        """The pixel (N, P) in which each of ``points`` (P, 3) lies for cameras at ``origins`` (N, 3); -1 outside."""
+        away = points[None] - origins[:, None]
+        local = np.einsum("npj,nij->npi", away, self.axes(ahead))
+        z = np.maximum(local[..., 2], 1e-9)
+        reach = np.tan(np.radians(self.fov / 2))
+        x = np.floor((local[..., 0] / z / reach + 1) / 2 * width)
+        y = np.floor((1 - local[..., 1] / z / reach * self.aspect) / 2 * height)
+        inside = (local[..., 2] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return np.where(inside, y * width + x, -1).astype(int)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What somebody at ``eye`` (3,) meets: unit ``directions`` (P, 3), ``depth`` (P,), whether it is a surface,
+    ``met`` (P,) bool, and ``attention`` (P,), density in 1/sr; ``weight`` (P,): solid angles."""
+
+    eye: np.ndarray
+    directions: np.ndarray
+    depth: np.ndarray
+    met: np.ndarray
+    attention: np.ndarray
+    weight: np.ndarray
+
+    @property
+    def points(self) -> np.ndarray:
+        """Where the directions end (P, 3)."""
+        return self.eye + self.depth[:, None] * self.directions
+
+    @property
+    def usual(self) -> float:
+        """How far away most of what is met is; 0 where nothing is."""
+        return float(np.median(self.depth[self.met])) if self.met.any() else 0.0
+
+    def main_direction(self, kappa: float = 8.0) -> np.ndarray:
+        """Unit direction (3,) towards which most of the attention goes, within some 20 degrees (a von Mises-Fisher
+        kernel); of even attention some direction."""
+        share = np.where(self.met, self.attention * self.weight, 0)
+        smooth = np.exp(kappa * (self.directions @ self.directions.T - 1)) @ share
+        return self.directions[np.argmax(smooth)]
+
+    def looked_at(self, width: float = 60.0) -> np.ndarray | None:
+        """Mean point (3,) of the attention within ``width`` degrees around the main direction, far ones counted as
+        three times the usual distance; None where there is none."""
+        towards = self.directions @ self.main_direction() > np.cos(np.radians(width))
+        share = np.where(self.met & towards, self.attention * self.weight, 0)
+        if not share.sum() > 0:
+            return None
+        near = np.minimum(self.depth, 3 * self.usual)[:, None] * self.directions
+        return self.eye + share @ near / share.sum()
+
+
+class Judge:
+    """Scores pictures by their depths: the share that shows surfaces, less what is right before the lens, how many
+    sizes of depth there are, and how much of the attention of ``seen`` there is in them."""
+
+    def __init__(self, trace: Trace, frame: Frame, usual: float, seen: Seen | None = None):
+        self.trace, self.frame, self.usual, self.seen = trace, frame, usual, seen
+
+    def shots(self, origins: np.ndarray, targets: np.ndarray, size: tuple[int, int]) -> list[Shot]:
+        """One a camera at ``origins`` (N, 3) that looks at ``targets`` (N, 3), in pictures of ``size``."""
+        width, height = size
+        ahead = targets - origins
+        ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
+        directions = self.frame.directions(ahead, width, height)
+        o = np.repeat(origins, width * height, axis=0)
+        depth, opacity = self.trace(o, directions.reshape(-1, 3))
+        depth, met = depth.reshape(len(origins), -1), opacity.reshape(len(origins), -1) >= SURFACE
+        opaque, near = met.mean(axis=1), (met & (depth < _NEAR * self.usual)).mean(axis=1)
+        spread = np.array([_spread(d[m]) for d, m in zip(depth, met)])
+        score = opaque * (1 - near) ** 3 * (0.35 + 0.65 * np.minimum(spread / 0.6, 1))
+        attended: list[float | None] = [None] * len(origins)
+        if self.seen is not None:
+            shown, covered = self._attention(origins, ahead, directions, depth, met, size)
+            # A third of the picture is enough for what is attended: the rest tells where that is.
+            score = score * (0.05 + 0.95 * shown) * (0.25 + 0.75 * np.minimum(covered / 0.3, 1))
+            attended = [float(x) for x in shown]
+        return [Shot(*row) for row in zip(origins, targets, score.tolist(), opaque.tolist(), attended)]
+
+    def _attention(
+        self,
+        origins: np.ndarray,
+        ahead: np.ndarray,
+        directions: np.ndarray,
+        depth: np.ndarray,
+        met: np.ndarray,
+        size: tuple[int, int],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Of each picture the share of the observer's attention that it shows, and the share of its pixels that show
+        attended surfaces. What the observer meets is known in the directions of ``seen`` alone."""
+        seen = self.seen
+        assert seen is not None
+        share = np.where(seen.met, seen.attention * seen.weight, 0)
+        points = seen.points
+        pixel = self.frame.pixels(origins, ahead, points, *size)
+        away = np.linalg.norm(points[None] - origins[:, None], axis=-1)
+        there = np.take_along_axis(np.where(met, depth, np.inf), np.maximum(pixel, 0), axis=1)
+        visible = (pixel >= 0) & (away < 1.1 * there + 0.02 * self.usual)
+        shown = (visible * share).sum(axis=1) / max(share.sum(), 1e-12)
+        if not share.any():
+            return np.ones(len(origins)), np.ones(len(origins))
+        # The other way round: which pixels lie where the observer looks, and are not hidden from there.
+        from scipy.spatial import KDTree
+
+        surface = origins[:, None] + depth[..., None] * directions
+        way = surface - seen.eye
+        distance = np.linalg.norm(way, axis=-1)
+        _, nearest = KDTree(seen.directions).query((way / np.maximum(distance, 1e-9)[..., None]).reshape(-1, 3))
+        nearest = nearest.reshape(distance.shape)
+        top = _ATTENDED * float(np.quantile(seen.attention[seen.met], 0.99))
+        attended = (seen.attention[nearest] > top) & (distance < 1.1 * seen.depth[nearest] + 0.02 * self.usual)
+        return shown, (met & attended).mean(axis=1)
+
+    def best(self, origins: np.ndarray, targets: np.ndarray) -> Shot | None:
+        """The best of many cameras; None where none of them shows anything."""
+        apart = np.linalg.norm(targets - origins, axis=1) > 1e-6 * max(self.usual, 1e-12)
+        if not apart.any():
+            return None
+        found = sorted(self.shots(origins[apart], targets[apart], _COARSE), key=lambda s: -s.score)[:_KEPT]
+        again = self.shots(np.array([s.origin for s in found]), np.array([s.target for s in found]), _FINE)
+        best = max(again, key=lambda s: s.score)
+        return best if best.score > 0 else None
+
+
+def _spread(depth: np.ndarray) -> float:
+    """How many sizes of depth there are: the standard deviation of its logarithm."""
+    return float(np.std(np.log(np.maximum(depth, 1e-9)))) if depth.size else 0.0
+
+
+def around_observer(trace: Trace, frame: Frame, seen: Seen) -> Shot | None:
+    """The camera that shows best what the observer of ``seen`` looks at: in free sight of the observer, from above or
+    beside. None where nothing is met."""
+    target = seen.looked_at()
+    if target is None:
+        return None
+    up = frame.up / np.linalg.norm(frame.up)
+    across = seen.main_direction() - up * (seen.main_direction() @ up)
+    across = across if np.linalg.norm(across) > 1e-6 else np.roll(up, 1) - up * (np.roll(up, 1) @ up)
+    across /= np.linalg.norm(across)
+    beside = np.cross(up, across)
+    azimuth = np.arange(16) / 16 * 2 * np.pi
+    directions = []
+    for elevation in np.radians([8, 20, 33, 47]):
+        level = np.cos(azimuth)[:, None] * across + np.sin(azimuth)[:, None] * beside
+        directions.append(np.cos(elevation) * level + np.sin(elevation) * up)
+    along = np.concatenate(directions)
+    depth, opacity = trace(np.broadcast_to(seen.eye, along.shape).copy(), along)
+    free = np.where(opacity >= SURFACE, depth, np.inf)
+    origins = []
+    for share in (0.85, 0.5):
+        # Not farther than what the observer looks at needs.
+        away = np.minimum(share * free, 2.5 * share * seen.usual)
+        origins.append(seen.eye + along * away[:, None])
+    places = np.concatenate(origins)
+    far = np.linalg.norm(places - seen.eye, axis=1) > 0.3 * seen.usual
+    places = places[far]
+    if not len(places):
+        return None
+    # At what is looked at, or half way to it, so that the observer's surroundings are in the picture.
+    targets = [target, 0.5 * (target + seen.eye)]
+    every = np.concatenate([np.broadcast_to(t, places.shape) for t in targets])
+    return Judge(trace, frame, seen.usual, seen).best(np.concatenate([places, places]), every)
+
+
+def of_place(trace: Trace, frame: Frame, lower: np.ndarray, upper: np.ndarray, outside: bool = True) -> Shot | None:
+    """The camera that shows best what lies between the corners ``lower`` and ``upper`` (3,): from within, where it can
+    stand free, or, with ``outside``, from around. None where nothing is met."""
+    lower, upper = np.asarray(lower, float), np.asarray(upper, float)
+    up = frame.up / np.linalg.norm(frame.up)
+    center, size = (lower + upper) / 2, upper - lower
+    radius = 0.5 * float(np.linalg.norm(size))
+    side, front = frame.axes(np.roll(up, 1) - up * (up @ np.roll(up, 1)))[..., [0, 2], :]
+    azimuth = np.arange(12) / 12 * 2 * np.pi
+    level = np.cos(azimuth)[:, None] * front + np.sin(azimuth)[:, None] * side
+    origins, targets = [], []
+    vertical = int(np.argmax(np.abs(up)))
+    shares: list[tuple[float, ...]] = [(0.2, 0.5, 0.8)] * 3
+    # People look at places from the middle of their height, or from above it.
+    shares[vertical] = (0.5, 0.7) if up[vertical] > 0 else (0.5, 0.3)
+    grid = np.stack([a.ravel() for a in np.meshgrid(*shares, indexing="ij")], axis=-1)
+    within = lower + grid * size
+    free = _clearance(trace, within, radius)
+    within = within[free > 0.06 * radius]
+    for elevation in np.radians([-5, -20]):
+        along = np.cos(elevation) * level + np.sin(elevation) * up
+        origins.append(np.repeat(within, len(along), axis=0))
+        targets.append(origins[-1] + np.tile(along, (len(within), 1)) * 0.5 * radius)
+    if outside:
+        away = 1.15 * radius / np.tan(np.radians(frame.fov / 2))
+        for elevation in np.radians([12, 25, 40]):
+            origins.append(center + away * (np.cos(elevation) * level + np.sin(elevation) * up))
+            targets.append(np.broadcast_to(center, origins[-1].shape))
+    if not len(o := np.concatenate(origins)):
+        return None
+    return Judge(trace, frame, 0.5 * radius).best(o, np.concatenate(targets))
+
+
+def _clearance(trace: Trace, points: np.ndarray, far: float) -> np.ndarray:
+    """How far matter is from each of ``points`` (N, 3), in the direction in which it is nearest but for a tenth."""
+    from nerg_mi.maths.sphere import fibonacci_directions
+
+    around = fibonacci_directions(64)
+    depth, opacity = trace(np.repeat(points, len(around), axis=0), np.tile(around, (len(points), 1)))
+    depth = np.where(opacity >= SURFACE, depth, far).reshape(len(points), -1)
+    return np.quantile(depth, 0.1, axis=1)
