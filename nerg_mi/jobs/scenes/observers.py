@@ -68,7 +68,8 @@ def walk_of_person(
     before, after = np.maximum(after - 1, 0), np.minimum(after, len(own) - 1)
     between = t[after] - t[before]
     outside = np.maximum(t[before] - times, times - t[after])
-    known = (between <= gap) & (outside <= gap)
+    # A moment of a ray is not between any.
+    known = ((between <= gap) & (outside <= gap)) | (t[after] == times)
     if not known.any():
         raise NergError(_not_then(rays, own, person, f"from {first:g} to {last:g} s", gap))
     share = np.clip(np.divide(times - t[before], between, out=np.zeros(len(times)), where=between > 0), 0, 1)[:, None]
