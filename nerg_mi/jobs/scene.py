@@ -75,7 +75,9 @@ def write_scene(
     with tempfile.TemporaryDirectory() as folder:
         # The same scene, with a camera anywhere, to look around in.
         probe_file = Path(folder) / "scene.xml"
-        write_text(probe_file, scene.text(probe_file.parent, observer or Eye(np.zeros(3), up), Lens(), 96).write())
+        write_text(
+            probe_file, scene.text(probe_file.parent, observer or upright(Eye(np.zeros(3), up), up), Lens(), 96).write()
+        )
         taken = place.make(probe_file.parent, scene.lamps(1, 1)).taken
         values = {default_name(name, taken): value for name, value in probe_values().items()}
         probe = Probe(load_scene(probe_file, values), scene.attention(probe_file.parent).quantity, up)
@@ -265,7 +267,8 @@ def _camera(
     shot = best_camera(probe, seen, frame, box)
     if shot is None:
         raise NergError("no camera was found that shows anything of the place; give one with --from and --to")
-    attended = "" if shot.attended is None else f" and {100 * shot.attended:.0f} % of what the observer attends to"
+    whose = "what the observer attends to" if probe.quantity else "what is around the observer"
+    attended = "" if shot.attended is None else f" and {100 * shot.attended:.0f} % of {whose}"
     words = f"The camera of sensor 0: the best overview that was found; it shows surfaces in {100 * shot.opaque:.0f} %"
     return Eye(shot.origin, shot.target), lens, f"{words} of the picture{attended}."
 

@@ -23,6 +23,8 @@ _COARSE, _FINE = (18, 12), (48, 32)
 _KEPT = 10
 # Nearer than this share of the usual distance things fill a picture.
 _NEAR = 0.2
+# Where the mean and the median depth differ by this share there is more fog than surface.
+_FOG = 0.1
 # Attention above this share of its greatest density counts as seen where it is seen.
 _ATTENDED = 0.15
 
@@ -116,10 +118,14 @@ class Seen:
 
 class Judge:
     """Scores pictures by their depths: the share that shows surfaces, less what is right before the lens, how many
-    sizes of depth there are, and how much of the attention of ``seen`` there is in them."""
+    sizes of depth there are, and how much of the attention of ``seen`` there is in them.
 
-    def __init__(self, trace: Trace, frame: Frame, usual: float, seen: Seen | None = None):
-        self.trace, self.frame, self.usual, self.seen = trace, frame, usual, seen
+    ``usual``: how far away things are. ``mean``: gives the mean depth at which light ends where ``trace`` gives the
+    median; they are the same on a surface and differ by half in fog, as there is in a field where no photo looked.
+    """
+
+    def __init__(self, trace: Trace, frame: Frame, usual: float, seen: Seen | None = None, mean: Trace | None = None):
+        self.trace, self.frame, self.usual, self.seen, self.mean = trace, frame, usual, seen, mean
 
     def shots(self, origins: np.ndarray, targets: np.ndarray, size: tuple[int, int]) -> list[Shot]:
         """One a camera at ``origins`` (N, 3) that looks at ``targets`` (N, 3), in pictures of ``size``."""
@@ -133,6 +139,10 @@ class Judge:
         opaque, near = met.mean(axis=1), (met & (depth < _NEAR * self.usual)).mean(axis=1)
         spread = np.array([_spread(d[m]) for d, m in zip(depth, met)])
         score = opaque * (1 - near) ** 3 * (0.35 + 0.65 * np.minimum(spread / 0.6, 1))
+        if self.mean is not None:
+            other = self.mean(o, directions.reshape(-1, 3))[0].reshape(depth.shape)
+            clear = np.exp(-np.abs(other - depth) / np.maximum(depth, 1e-9) / _FOG)
+            score = score * (0.02 + 0.98 * np.where(met, clear, 0).sum(axis=1) / np.maximum(met.sum(axis=1), 1))
         attended: list[float | None] = [None] * len(origins)
         if self.seen is not None:
             shown, covered = self._attention(origins, ahead, directions, depth, met, size)
@@ -191,9 +201,9 @@ def _spread(depth: np.ndarray) -> float:
     return float(np.std(np.log(np.maximum(depth, 1e-9)))) if depth.size else 0.0
 
 
-def around_observer(trace: Trace, frame: Frame, seen: Seen) -> Shot | None:
+def around_observer(trace: Trace, frame: Frame, seen: Seen, mean: Trace | None = None) -> Shot | None:
     """The camera that shows best what the observer of ``seen`` looks at: in free sight of the observer, from above or
-    beside. None where nothing is met."""
+    beside. ``mean``: as `Judge` has it. None where nothing is met."""
     target = seen.looked_at()
     if target is None:
         return None
@@ -223,19 +233,21 @@ def around_observer(trace: Trace, frame: Frame, seen: Seen) -> Shot | None:
     # At what is looked at, or half way to it, so that the observer's surroundings are in the picture.
     targets = [target, 0.5 * (target + seen.eye)]
     every = np.concatenate([np.broadcast_to(t, places.shape) for t in targets])
-    return Judge(trace, frame, seen.usual, seen).best(np.concatenate([places, places]), every)
+    return Judge(trace, frame, seen.usual, seen, mean).best(np.concatenate([places, places]), every)
 
 
-def of_place(trace: Trace, frame: Frame, lower: np.ndarray, upper: np.ndarray, outside: bool = True) -> Shot | None:
+def of_place(
+    trace: Trace, frame: Frame, lower: np.ndarray, upper: np.ndarray, outside: bool = True, mean: Trace | None = None
+) -> Shot | None:
     """The camera that shows best what lies between the corners ``lower`` and ``upper`` (3,): from within, where it can
-    stand free, or, with ``outside``, from around. None where nothing is met."""
+    stand free, or, with ``outside``, from around. ``mean``: as `Judge` has it. None where nothing is met."""
     lower, upper = np.asarray(lower, float), np.asarray(upper, float)
     up = frame.up / np.linalg.norm(frame.up)
     center, size = (lower + upper) / 2, upper - lower
     radius = 0.5 * float(np.linalg.norm(size))
     side, front = frame.axes(np.roll(up, 1) - up * (up @ np.roll(up, 1)))[..., [0, 2], :]
-    azimuth = np.arange(12) / 12 * 2 * np.pi
-    level = np.cos(azimuth)[:, None] * front + np.sin(azimuth)[:, None] * side
+    ring = lambda count: np.arange(count)[:, None] / count * 2 * np.pi
+    level, finer = (np.cos(a) * front + np.sin(a) * side for a in (ring(8), ring(12)))
     origins, targets = [], []
     vertical = int(np.argmax(np.abs(up)))
     shares: list[tuple[float, ...]] = [(0.2, 0.5, 0.8)] * 3
@@ -249,14 +261,16 @@ def of_place(trace: Trace, frame: Frame, lower: np.ndarray, upper: np.ndarray, o
         along = np.cos(elevation) * level + np.sin(elevation) * up
         origins.append(np.repeat(within, len(along), axis=0))
         targets.append(origins[-1] + np.tile(along, (len(within), 1)) * 0.5 * radius)
-    if outside:
-        away = 1.15 * radius / np.tan(np.radians(frame.fov / 2))
-        for elevation in np.radians([12, 25, 40]):
-            origins.append(center + away * (np.cos(elevation) * level + np.sin(elevation) * up))
+    # What photos were taken around is often in the middle.
+    away = [share * 0.5 * float(size.max()) for share in (0.3, 0.5, 0.7)]
+    away += [1.15 * radius / np.tan(np.radians(frame.fov / 2))] if outside else []
+    for distance in away:
+        for elevation in np.radians([5, 18, 35]):
+            origins.append(center + distance * (np.cos(elevation) * finer + np.sin(elevation) * up))
             targets.append(np.broadcast_to(center, origins[-1].shape))
     if not len(o := np.concatenate(origins)):
         return None
-    return Judge(trace, frame, 0.5 * radius).best(o, np.concatenate(targets))
+    return Judge(trace, frame, 0.5 * radius, mean=mean).best(o, np.concatenate(targets))
 
 
 def _clearance(trace: Trace, points: np.ndarray, far: float) -> np.ndarray:

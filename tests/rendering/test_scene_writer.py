@@ -21,7 +21,7 @@ from nerg_mi.rendering.scene_writer import (
     value_of,
 )
 
-NASTY = 'a<b>&"c"\'d\' \n\té'
+NASTY = "a<b>&\"c\"'d' \n\té"
 
 
 def test_what_is_written_is_read_back():
@@ -43,7 +43,9 @@ def test_comments_hold_nothing_that_ends_them():
 
 
 def test_lines_are_short_and_indented():
-    text = document([element("sensor", Comment("word " * 100), prop("float", "fov", 70), type="perspective")], "w " * 200)
+    text = document(
+        [element("sensor", Comment("word " * 100), prop("float", "fov", 70), type="perspective")], "w " * 200
+    )
     assert max(map(len, text.splitlines())) <= 120
     assert '\n        <float name="fov" value="70"/>\n    </sensor>\n' in text
     assert document([Verbatim("<a>\n  <b/>\n</a>")], "h").endswith("    <a>\n      <b/>\n    </a>\n</scene>\n")

@@ -41,9 +41,14 @@ class Probe:
         return Place(self.scene.integrator().medium, self.scene)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depth and opacity along rays (N, 3)."""
+        """Median depth, and opacity, along rays (N, 3)."""
         with mitsuba_says():
             return trace_depth(self.place, origins, directions)
+
+    def mean(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean depth at which light ends, and opacity, along rays (N, 3)."""
+        with mitsuba_says():
+            return trace_depth(self.place, origins, directions, kind="expected")
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of what there is; of a field without an end those of its inner cube."""
@@ -88,14 +93,16 @@ def turned_ahead(eye: Eye, seen: Seen) -> Eye:
 
 
 def best_camera(probe: Probe, seen: Seen | None, frame: Frame, field_box: dict | None) -> Shot | None:
-    """The best overview: of what the observer of ``seen`` looks at, or of the whole place, whose metadata may say that
-    the field has a box (``field_box``)."""
+    """The best overview: of what the observer of ``seen`` looks at, or of the whole place. ``field_box``: the box of
+    the radiance field, as its checkpoint has it, or None where the place is none."""
+    mean = None if field_box is None else probe.mean
     if seen is not None:
-        return around_observer(probe.trace, frame, seen)
-    if field_box is not None:
-        box = box_of(field_box)
-        return of_place(probe.trace, frame, np.array(box.core.lower), np.array(box.core.upper), not box.contracted)
-    return of_place(probe.trace, frame, *probe.bounds())
+        return around_observer(probe.trace, frame, seen, mean)
+    if field_box is None:
+        return of_place(probe.trace, frame, *probe.bounds())
+    box = box_of(field_box)
+    lower, upper = np.array(box.core.lower), np.array(box.core.upper)
+    return of_place(probe.trace, frame, lower, upper, not box.contracted, mean)
 
 
 def given_point(values: tuple[float, ...] | None, option: str) -> np.ndarray | None:

@@ -97,6 +97,7 @@ def _mesh(path: Path, words: str) -> WrittenPlace:
                 *_lamps(lamps),
             ),
             files={"place": _name(path, folder)},
+            spp=64,
         )
 
     return WrittenPlace(make, words)
