@@ -79,7 +79,8 @@ def render_file(
     if options.frames is not None:
         frames = read_frames(options.frames)
         files = [numbered(output, k + 1, len(frames)) for k in range(len(frames))]
-        check_writable(files[0])
+        for file in files:
+            check_writable(file)
     mode = activate(options.mode)
 
     if options.threads:

@@ -29,7 +29,7 @@ from .scenes.cameras import Probe, best_camera, given_point, probe_values, turne
 from .scenes.files import GivenFiles, recognise
 from .scenes.observers import Walk, eye_of_person, support_of_rays, to_place, walk_of_person
 from .scenes.photos import camera_of_photo
-from .scenes.places import LAMP, WrittenPlace, place_of_files
+from .scenes.places import LAMP, WrittenPlace, colors_of, place_of_files
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,9 @@ def write_scene(
     if options.times is not None:
         check_writable(frames_file)
     given = recognise([Path(file) for file in files], options.geometry, reporter)
+    if given.kind == "hits":
+        check_writable(colors_of(output))
+        check_writable(output.with_suffix(".vol") if given.place is None else output)
     ns = select_backend(options.mode)
     align = given.align if options.align is None else read_similarity(options.align, "--align", "rays to place")
     rays = None if given.rays is None else Rays.load(given.rays)
@@ -175,7 +178,6 @@ def _with_hits(
     if rays is None:
         raise NergError("--geometry hits shows rays in their hit points, and there are no rays; name their file")
     path = output.with_suffix(".vol")
-    check_writable(path)
     made = place_of_hits(rays, path).about["geometry_file"]
     size = " x ".join(map(str, made["shape"]))
     reporter.message(f"the place is made of the rays' hit points: {size} voxels of {made['voxel']:.3g} m")

@@ -63,6 +63,19 @@ CASES = (
     Case("demo", "-o {o}/demo --width 24 --spp 1 -m llvm_ad_rgb", _below("demo", DEMO), ("demo",)),
     Case("render", "{i}/scene.xml -o {o}/a.exr -m llvm_ad_rgb", ("a.exr",)),
     Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb", ("a.png",)),
+    Case("render", "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb --frames {i}/frames.csv", ("a_0001.png", "a_0002.png")),
+    Case(
+        "render",
+        "{i}/ball.xml -o {o}/a.png -m llvm_ad_rgb --frames {i}/frames.csv --overlay depth",
+        ("a_0001.png", "a_0002.png"),
+    ),
+    Case("scene", "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none", ("a.xml",)),
+    Case("scene", "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb", ("a.xml", "a.vol", "a.color.vol")),
+    Case(
+        "scene",
+        "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none --person a --times 0,2 --gap 100",
+        ("a.xml", "a.frames.csv"),
+    ),
     Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
     Case(
         "rays import",
@@ -134,7 +147,8 @@ MAKES_A_FOLDER = {"poses": "tests/cli/test_poses.py"}
 READS_ONLY = {"doctor", "rays guess", "rays show"}
 """Commands that write no file."""
 INPUTS = {
-    "render": {"scene"},
+    "scene": {"files", "photos", "align"},
+    "render": {"scene", "frames"},
     "rays import": {"files", "salt", "poses", "place"},
     "rays guess": {"file"},
     "rays show": {"rays"},
@@ -165,6 +179,8 @@ def make_inputs(folder: Path) -> Path:
     from nerg_mi.formats.torch_ngp.pickling import write_torch
 
     (folder / "scene.xml").write_text(SCENE)
+    (folder / "ball.xml").write_text(SCENE.replace('type="aov"><string name="aovs" value="dd:depth"/>', 'type="nerg">'))
+    (folder / "frames.csv").write_text("level\n0.25\n0.5\n")
     (folder / "demo").mkdir()
     (folder / "demo.json").write_text(json.dumps(write_standins(folder / "demo")))
     rows = [f"{t},a,{0.1 * t},0,1.6,0,1,0" for t in range(2000)]

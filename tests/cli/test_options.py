@@ -11,7 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from nerg_mi.cli.options import takes
-from nerg_mi.jobs.options import option
+from nerg_mi.jobs.options import option, parse_numbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +24,7 @@ class Brew:
     stir: bool = option(True, "Stirred.")
     minutes: float = option(3.0, "How long.", "-t", "--time", min=0.5)
     guests: tuple[str, ...] = option((), "Who drinks it; may be given several times.")
+    origin: tuple[float, ...] | None = option(None, "Where it grew.", "--from", parse=parse_numbers)
     secret: int = option(7, "Nobody's business.")
 
 
@@ -80,3 +81,9 @@ def test_a_command_shows_its_options_to_whoever_asks_for_its_types():
         pass
 
     assert set(get_type_hints(tea)) == {f.name for f in fields(Brew)}
+
+
+def test_a_word_that_is_parsed_is_called_as_it_was_given(serve):
+    assert serve("mug", "--from", "1,2.5")[1][1].origin == (1.0, 2.5)
+    done, _ = serve("mug", "--from", "east")
+    assert "--from is numbers" in str(done.exception)

@@ -11,7 +11,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.checkpoint import FORMAT, read_checkpoint, write_checkpoint
+from nerg_mi.formats.checkpoint import FORMAT, read_checkpoint, read_metadata, write_checkpoint
 
 TENSORS = {
     "a": np.arange(6, dtype=np.float32).reshape(2, 3),
@@ -29,7 +29,7 @@ def test01_round_trip(tmp_path):
     for k, v in TENSORS.items():
         assert tensors[k].dtype == v.dtype and np.array_equal(tensors[k], v)
     assert meta == {"format": FORMAT, "kind": "radiance", "provenance": {"σ": 1.5, "list": [1, None]}}
-    assert os.listdir(path.parent) == ["f.safetensors"]
+    assert read_metadata(path) == meta and os.listdir(path.parent) == ["f.safetensors"]
 
 
 def test02_files_are_as_readable_as_others(tmp_path):

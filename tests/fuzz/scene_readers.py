@@ -63,6 +63,34 @@ def _read(folder: Path) -> object:
     return [shape.bbox() for shape in scene.shapes()]
 
 
+def _nest(folder: Path) -> object:
+    from nerg_mi.rendering.nested_scene import nested_place
+    from nerg_mi.rendering.scene_parts import Attention, Eye, SceneText
+
+    place = nested_place(folder / "theirs.xml", folder / "ours")
+    camera = Eye(np.zeros(3), np.ones(3))
+    return SceneText(place, Attention(), camera, None, np.array([0.0, 0, 1])).write()
+
+
+def _make_nested(folder: Path) -> None:
+    _make(folder)
+    integrator = '<integrator type="$kind" id="light"><integer name="max_depth" value="3"/></integrator>'
+    path = '<default name="kind" value="path"/><path value="."/><include filename="more.xml"/>'
+    theirs = _SCENE.replace(_SCENE[_SCENE.index("    <integrator") : _SCENE.index("    <sensor")], integrator + path)
+    (folder / "theirs.xml").write_text(theirs)
+    (folder / "more.xml").write_text('<scene version="3.0.0"><!-- more --><shape type="cube"/></scene>')
+
+
+def _make_frames(folder: Path) -> None:
+    (folder / "walk.frames.csv").write_text('eye,ahead,falloff\n"1, 2, 3","4, 5, 6",0.1\n"1,2,3","""a"" b",\n')
+
+
+def _read_frames(folder: Path) -> object:
+    from nerg_mi.rendering.frames_file import read_frames
+
+    return read_frames(folder / "walk.frames.csv")
+
+
 def _reader(name: str, *kinds: str) -> Reader:
     return Reader(f"scene's {name}", _make, {name: kinds}, _read)
 
@@ -73,4 +101,6 @@ SCENES = [
     _reader("text.ply", "text"),
     _reader("a.obj", "text"),
     _reader("fog.vol"),
+    Reader("scene to be nested", _make_nested, {"theirs.xml": ("text",), "more.xml": ("text",)}, _nest),
+    Reader("frames of a sequence", _make_frames, {"walk.frames.csv": ("text",)}, _read_frames),
 ]

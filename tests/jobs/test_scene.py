@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.checkpoint import read_checkpoint
-from nerg_mi.formats.fields import load_gaze, save_gaze
+from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
 from nerg_mi.jobs.gaze_places import make_place
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.options.place import PlaceOptions
 from nerg_mi.jobs.options.scene import SceneOptions
 from nerg_mi.jobs.pictures import render_file
 from nerg_mi.jobs.scene import write_scene
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.contraction import ContractedBox
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.channels import render_channels
 from nerg_mi.rendering.frames_file import read_frames
@@ -29,7 +31,8 @@ MODE = "llvm_ad_rgb"
 SMALL = {"width": "18", "height": "12", "sphere_width": "16", "sphere_height": "8", "spp": "2"}
 ROOM = """<scene version="3.0.0">
     <integrator type="path"/>
-    <shape type="cube"><transform name="to_world"><scale value="2"/></transform><boolean name="flip_normals" value="true"/>
+    <shape type="cube">
+        <transform name="to_world"><scale value="2"/></transform><boolean name="flip_normals" value="true"/>
     </shape>
     <emitter type="point"><point name="position" value="0, 0, 1.5"/><rgb name="intensity" value="5"/></emitter>
     <sensor type="perspective"/>
@@ -102,8 +105,8 @@ def test_a_place_with_gaze_and_an_observer(rgb, folder, tmp_path, place, unit):
     _, own = shown(result.path, 1)
     assert own.mask.any() and own.aovs["visibility"][own.mask].min() == 1
     # What is written is relative to the folder of the scene.
-    given = defaults(result.path)
-    assert given["gaze"] == "../places0/gaze.safetensors" or not given["gaze"].startswith("/")
+    named = defaults(result.path)["gaze"]
+    assert not named.startswith("/") and (tmp_path / named).samefile(folder / "gaze.safetensors")
 
 
 def test_a_place_alone_is_shown_from_where_it_can_be_seen(rgb, folder, tmp_path):
@@ -113,6 +116,18 @@ def test_a_place_alone_is_shown_from_where_it_can_be_seen(rgb, folder, tmp_path)
     assert result.observer is None and result.quantity is None and scene.integrator().observer is None
     assert found.mask.mean() > 0.5 and found.color[found.mask].mean() > 0.05
     assert f"wrote {result.path}" in told.messages and any("best overview" in line for line in told.messages)
+
+
+def test_a_field_without_an_end(rgb, tmp_path):
+    config = RadianceConfig(fields.GRID, width=16, geometry=3, sh_degree=2, density_scale=1.0)
+    box = ContractedBox(Box((-2, -2, -2), (2, 2, 2)), 16)
+    field = RadianceField.random(config, box, _ns(), march_step=0.1, march_growth=1 / 64)
+    save_radiance(field, tmp_path / "far.safetensors", {"up": [0, 1, 0]})
+    result = write_scene([tmp_path / "far.safetensors"], tmp_path / "a.xml", SceneOptions(mode=MODE))
+    # The camera stands in the inner cube, and up is what the photos said.
+    assert np.abs(result.camera.origin).max() <= 2 and defaults(result.path)["up"] == "0, 1, 0"
+    _, found = shown(result.path)
+    assert found.mask.mean() > 0.5
 
 
 def test_gaze_alone_finds_its_place_by_its_name_and_sum(rgb, folder, tmp_path):
@@ -250,11 +265,3 @@ def test_a_gaze_field_without_anything_needs_an_observer(rgb, folder, tmp_path):
     result = write_scene([gaze], tmp_path / "a.xml", SceneOptions(observer=(0.1, 0, 0), mode=MODE))
     _, found = shown(result.path)
     assert found.mask.all() and found.aovs["gaze"].max() > 0 and len(np.unique(found.color.round(3))) > 1
-
-
-def test_metadata_of_any_kind(folder):
-    from nerg_mi.formats.checkpoint import read_metadata
-
-    for name, kind in (("field", "radiance"), ("gaze", "gaze")):
-        path = folder / f"{name}.safetensors"
-        assert read_metadata(path) == read_checkpoint(path, kind)[1] and read_metadata(path)["kind"] == kind

@@ -128,9 +128,14 @@ def _lamps(lamps: dict[str, float]) -> list[Node]:
     ]
 
 
+def colors_of(output: Path) -> Path:
+    """The file of the colours of hit points, beside the scene file ``output``."""
+    return output.with_name(f"{output.stem}.color.vol")
+
+
 def _hits(path: Path, output: Path, words: str) -> WrittenPlace:
     check_vol(path)
-    colors = output.with_name(f"{output.stem}.color.vol")
+    colors = colors_of(output)
     with reading(path, "place of hit points"):
         shape = np.fromfile(path, "<i4", 4, offset=8)
         lower, upper = np.fromfile(path, "<f4", 6, offset=24).astype(float).reshape(2, 3)

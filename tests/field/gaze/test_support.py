@@ -22,6 +22,16 @@ def paths(n=20_000, seed=0):
     return np.concatenate([walk, rng.normal(1.6, 0.08, (n, 1))], axis=1)
 
 
+def test_where_it_is_greatest():
+    rng = np.random.default_rng(0)
+    origins = np.concatenate([rng.normal(c, 0.05, (n, 3)) for c, n in (((0, 0, 1), 400), ((3, 1, 2), 900))])
+    support = RaySupport.of(origins, 0.3)
+    densest = support.densest()
+    assert np.linalg.norm(densest - (3, 1, 2)) < 0.1
+    everywhere = [exact(origins, 0.3, p) for p in origins[::7]]
+    assert exact(origins, 0.3, densest) > 0.9 * max(everywhere)
+
+
 @pytest.mark.parametrize("radius", [0.1, 0.25, 0.6])
 def test_cells_stand_for_their_rays(radius):
     origins = paths()
