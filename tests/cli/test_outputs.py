@@ -141,7 +141,9 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb):
     if case.name == "train radiance":  # in the preview's: between two steps, with a result to be gone on from
         assert set(files(out)) == {*case.files, "a.run"} and "go on with --resume" in said
     elif case.name == "render":  # heard between steps, of which writing is the last
-        assert set(files(out)) == set(case.files)
+        kept = set(files(out))
+        # Of a sequence the pictures that were there already; of one that waits for its scale none.
+        assert kept == set(case.files) if len(case.files) == 1 else kept < set(case.files)
     else:  # what a training has come to by then is kept
         assert set(files(out)) <= {"a.run"} and ("--resume" in said or not files(out))
 

@@ -1,0 +1,51 @@
+"""What is looked around with before a camera is chosen: directions, depths and bounds of a known room."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.jobs.scenes.cameras import Probe, given_point, probe_values, turned_ahead, upright
+from nerg_mi.maths.ray_box import box_interval
+from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene_parts import Attention, Eye, Place, SceneText
+from nerg_mi.rendering.scene_writer import element
+
+EYE = Eye(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
+
+
+@pytest.fixture
+def probe(rgb, tmp_path):
+    """A cube of ±1, whose up is +y."""
+    up = np.array([0.0, 1, 0])
+    place = Place(beside=(element("shape", type="cube"),))
+    (tmp_path / "a.xml").write_text(SceneText(place, Attention(), EYE, EYE, up).write())
+    return Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
+
+
+def test_what_is_met_around(probe):
+    seen = probe.around(EYE)
+    _, far = box_interval(np.broadcast_to(EYE.origin, seen.directions.shape), seen.directions, -np.ones(3), np.ones(3))
+    assert seen.met.all() and np.sum(seen.weight) == pytest.approx(4 * np.pi)
+    # Pixels are sampled anywhere in them: a few degrees.
+    assert np.quantile(np.abs(seen.depth - far) / far, 0.95) < 0.08
+    depth, opacity = probe.trace(EYE.origin[None], np.array([[1.0, 0, 0]]))
+    assert depth[0] == pytest.approx(0.7) and opacity[0] == 1
+    np.testing.assert_allclose(np.array(probe.bounds()), [[-1] * 3, [1] * 3], atol=1e-6)
+    turned = turned_ahead(EYE, seen)
+    np.testing.assert_allclose(turned.origin, EYE.origin)
+    assert np.abs(turned.target).max() == pytest.approx(1, abs=0.1)
+
+
+def test_points_and_ups():
+    assert given_point(None, "--to") is None and given_point((1, 2, 3), "--to").tolist() == [1, 2, 3]
+    for wrong in ((1.0, 2.0), (1.0, 2.0, float("nan"))):
+        with pytest.raises(NergError, match="--to is three numbers"):
+            given_point(wrong, "--to")
+    up = np.array([0.0, 0, 1])
+    assert upright(EYE, up) is EYE
+    down = upright(Eye(np.zeros(3), np.array([0, 0, -2.0])), up)
+    assert abs(down.up @ up) < 1e-9
+    with pytest.raises(NergError, match="cannot look at the point"):
+        upright(Eye(np.ones(3), np.ones(3)), up)
