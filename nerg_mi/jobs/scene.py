@@ -213,7 +213,8 @@ def _observer(
         if rays is None:
             raise NergError("--person is one of the rays, and there are none; name their file, too")
         if options.times is not None:
-            walk = walk_of_person(rays, options.person, *options.times, options.fps, options.gap, align)
+            first, last = options.times
+            walk = walk_of_person(rays, options.person, first, last, options.fps, options.gap, align)
             middle = len(walk.eyes) // 2
             about = f"The eye of {options.person} at {walk.times[middle]:.6g} s, in the middle of the walk."
             return walk.eyes[middle], walk, about

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from nerg_mi.maths.types import Float, Point3f
 
-if TYPE_CHECKING:
-    import mitsuba as mi
 
-
-def pixel_of(camera: mi.Sensor, point: Point3f) -> tuple[float, float] | None:
+def pixel_of(camera: Any, point: Point3f) -> tuple[float, float] | None:
     """Where ``point`` (one lane, scene units) lies in the picture of the perspective ``camera``: (x, y) in pixels,
     counted from the first one's centre; None outside of it, and behind the camera."""
     import mitsuba as mi

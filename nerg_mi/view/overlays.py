@@ -57,7 +57,7 @@ OVERLAYS = {
     overlay.name: overlay
     for overlay in (
         _heat("gaze", "how much the observer attends to what is seen", "Gaze", "gaze density [1/sr]"),
-        _heat("kde", "where tracked people looked", "Where people looked", "density of tracked gaze [1/sr]"),
+        _heat("kde", "where tracked people looked", "Where people looked", "tracked gaze [1/sr]"),
         _heat("gaze_std", "how sure that is", "Uncertainty of gaze", "standard deviation of gaze [1/sr]"),
         _heat("emit", "how much surfaces attract", "What surfaces attract", "emitted attention"),
         _heat("capture", "how much the observer gives", "What the observer gives", "captured attention"),

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerg_mi.maths.sphere import fibonacci_directions
+
 Trace = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 SURFACE = 0.5
@@ -275,8 +277,6 @@ def of_place(
 
 def _clearance(trace: Trace, points: np.ndarray, far: float) -> np.ndarray:
     """How far matter is from each of ``points`` (N, 3), in the direction in which it is nearest but for a tenth."""
-    from nerg_mi.maths.sphere import fibonacci_directions
-
     around = fibonacci_directions(64)
     depth, opacity = trace(np.repeat(points, len(around), axis=0), np.tile(around, (len(points), 1)))
     depth = np.where(opacity >= SURFACE, depth, far).reshape(len(points), -1)
