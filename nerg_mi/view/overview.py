@@ -119,8 +119,8 @@ class Seen:
 
 
 class Judge:
-    """Scores pictures by their depths: the share that shows surfaces, less what is right before the lens, how many
-    sizes of depth there are, and how much of the attention of ``seen`` there is in them.
+    """Scores pictures by their depths: the share that shows surfaces, less what is right before the lens, how far away
+    these are, how many sizes of depth there are, and how much of the attention of ``seen`` there is in them.
 
     ``usual``: how far away things are. ``mean``: gives the mean depth at which light ends where ``trace`` gives the
     median; they are the same on a surface and differ by half in fog, as there is in a field where no photo looked.
@@ -140,7 +140,10 @@ class Judge:
         depth, met = depth.reshape(len(origins), -1), opacity.reshape(len(origins), -1) >= SURFACE
         opaque, near = met.mean(axis=1), (met & (depth < _NEAR * self.usual)).mean(axis=1)
         spread = np.array([_spread(d[m]) for d, m in zip(depth, met)])
+        # The farther away things are, the more of the place there is in the picture.
+        reach = np.array([np.median(d[m]) if m.any() else 0.0 for d, m in zip(depth, met)]) / self.usual
         score = opaque * (1 - near) ** 3 * (0.35 + 0.65 * np.minimum(spread / 0.6, 1))
+        score = score * (0.1 + 0.9 * np.minimum(reach, 1))
         if self.mean is not None:
             other = self.mean(o, directions.reshape(-1, 3))[0].reshape(depth.shape)
             clear = np.exp(-np.abs(other - depth) / np.maximum(depth, 1e-9) / _FOG)
