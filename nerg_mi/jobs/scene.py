@@ -25,10 +25,10 @@ from .backend import select_backend
 from .gaze_places import read_similarity
 from .options.scene import SceneOptions
 from .reporter import SILENT, Reporter
-from .scenes.cameras import Probe, best_camera, given_point, probe_values, turned_ahead, upright
+from .scenes.cameras import Probe, best_camera, best_photo, given_point, probe_values, turned_ahead, upright
 from .scenes.files import GivenFiles, recognise
 from .scenes.observers import Walk, eye_of_person, support_of_rays, to_place, walk_of_person
-from .scenes.photos import camera_of_photo
+from .scenes.photos import camera_of_photo, cameras_of_photos
 from .scenes.places import LAMP, WrittenPlace, colors_of, place_of_files
 
 
@@ -156,11 +156,9 @@ def _check_options(options: SceneOptions) -> None:
         raise NergError("whose eye it is takes --person and one of --time and --times; give both, or neither")
     if options.person is not None and options.observer is not None:
         raise NergError("the observer is either at --observer or a --person; leave out one of them")
-    if (options.photo is None) != (options.photos is None):
-        raise NergError(
-            "the camera of a photo takes --photos, the data set, and --photo, its number or name; give both"
-        )
-    ways = [options.camera_from is not None, options.photo is not None, options.own]
+    if options.photo is not None and options.photos is None:
+        raise NergError("--photo is one of the photos that the field was trained on; give these, --photos DATASET")
+    ways = [options.camera_from is not None, options.photos is not None, options.own]
     if sum(ways) > 1 or (options.camera_to is not None and options.camera_from is None):
         raise NergError("a camera is given by --from and --to, by --photo or by --own; give one of these")
     if options.times is not None and len(options.times) != 2:
@@ -247,13 +245,18 @@ def _camera(
 ) -> tuple[Eye, Lens, str]:
     """The camera, its lens, and a sentence on how they were chosen."""
     lens = Lens() if options.fov is None else Lens(options.fov)
-    if options.photos is not None and options.photo is not None:
-        about = scene.given.field_about.get("provenance", {})
-        found = camera_of_photo(options.photos, options.photo, about, options.allow_outside)
+    if options.photos is not None:
+        about, outside = scene.given.field_about.get("provenance", {}), options.allow_outside
+        if options.photo is None:
+            found = best_photo(probe, seen, cameras_of_photos(options.photos, about, outside))
+            words = f"that of the photo {found.name}, which shows most of it"
+        else:
+            found = camera_of_photo(options.photos, options.photo, about, outside)
+            words = f"that of the photo {found.name}"
         if found.bent:
             reporter.message(f"the lens of {found.name} bends lines, which this camera does not")
         lens = found.lens if options.fov is None else replace(found.lens, fov=options.fov)
-        return found.eye, lens, f"The camera of sensor 0: that of the photo {found.name}."
+        return found.eye, lens, f"The camera of sensor 0: {words}."
     origin, target = given_point(options.camera_from, "--from"), given_point(options.camera_to, "--to")
     if origin is not None:
         if target is None:
@@ -273,6 +276,10 @@ def _camera(
     whose = "what the observer attends to" if probe.quantity else "what is around the observer"
     attended = "" if shot.attended is None else f" and {100 * shot.attended:.0f} % of {whose}"
     words = f"The camera of sensor 0: the best overview that was found; it shows surfaces in {100 * shot.opaque:.0f} %"
+    if scene.given.kind == "field" and seen is None:
+        reporter.message(
+            "a field is clearest from where its photos were taken: --photos DATASET takes a camera of theirs"
+        )
     return Eye(shot.origin, shot.target), lens, f"{words} of the picture{attended}."
 
 

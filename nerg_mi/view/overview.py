@@ -190,6 +190,10 @@ class Judge:
         attended = (seen.attention[nearest] > top) & (distance < 1.1 * seen.depth[nearest] + 0.02 * self.usual)
         return shown, (met & attended).mean(axis=1)
 
+    def best_of(self, origins: np.ndarray, targets: np.ndarray) -> int:
+        """Number of the best of a few cameras."""
+        return int(np.argmax([shot.score for shot in self.shots(origins, targets, _COARSE)]))
+
     def best(self, origins: np.ndarray, targets: np.ndarray) -> Shot | None:
         """The best of many cameras; None where none of them shows anything."""
         apart = np.linalg.norm(targets - origins, axis=1) > 1e-6 * max(self.usual, 1e-12)

@@ -244,7 +244,7 @@ def test_a_walk(rgb, folder, tmp_path):
         (["mesh.ply"], {"person": "Ada", "time": 1.0}, "--person is one of the rays"),
         (["rays.npz"], {"person": "Eve", "time": 1.0}, "nobody in the rays"),
         (["mesh.ply"], {"camera_to": (0, 0, 1)}, "a camera is given by --from and --to"),
-        (["mesh.ply"], {"photo": "1"}, "takes --photos"),
+        (["mesh.ply"], {"photo": "1"}, "give these, --photos DATASET"),
         (["mesh.ply"], {"observer": (1, 2)}, "--observer is three numbers"),
         (["mesh.ply"], {"camera_from": (1, 2, 3), "camera_to": (1, 2, 3)}, "cannot look at the point"),
         (["mesh.ply"], {"own": True}, "--own is the observer's view"),

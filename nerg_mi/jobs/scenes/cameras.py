@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +15,9 @@ from nerg_mi.rendering.scene_parts import Eye, ahead_level
 from nerg_mi.transport.panorama import pixel_directions, pixel_solid_angles
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import trace_depth
-from nerg_mi.view.overview import Frame, Seen, Shot, around_observer, of_place
+from nerg_mi.view.overview import Frame, Judge, Seen, Shot, around_observer, of_place
+
+from .photos import PhotoCamera
 
 PANORAMA = (96, 48)
 """Pixels of the picture of what an observer meets."""
@@ -103,6 +106,17 @@ def best_camera(probe: Probe, seen: Seen | None, frame: Frame, field_box: dict |
     box = box_of(field_box)
     lower, upper = np.array(box.core.lower), np.array(box.core.upper)
     return of_place(probe.trace, frame, lower, upper, not box.contracted, mean)
+
+
+def best_photo(probe: Probe, seen: Seen | None, cameras: Sequence[PhotoCamera]) -> PhotoCamera:
+    """That of the ``cameras`` of photos which shows best what the observer of ``seen`` looks at, or the place. They are
+    compared as if all had the lens of the first and were held level."""
+    lens = cameras[0].lens
+    origins, targets = (np.array([getattr(c.eye, name) for c in cameras]) for name in ("origin", "target"))
+    ahead = targets - origins
+    usual = seen.usual if seen is not None else float(np.median(probe.trace(origins, ahead)[0]))
+    judge = Judge(probe.trace, Frame(lens.fov, lens.aspect, probe.up), max(usual, 1e-6), seen, probe.mean)
+    return cameras[judge.best_of(origins, targets)]
 
 
 def given_point(values: tuple[float, ...] | None, option: str) -> np.ndarray | None:

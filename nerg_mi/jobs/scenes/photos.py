@@ -1,4 +1,4 @@
-"""The camera of a photo that a radiance field was trained on, in the field's coordinates."""
+"""The cameras of photos that a radiance field was trained on, in the field's coordinates."""
 
 from __future__ import annotations
 
@@ -30,12 +30,28 @@ def camera_of_photo(photos: Path, photo: str, provenance: dict, allow_outside: b
     ``provenance``: of the radiance field, which says in which coordinates it was trained. Raises `NergError` for
     photos that it was not trained on and for one that is not among them.
     """
+    return _camera(_frame(_posed(photos, provenance, allow_outside), photo))
+
+
+def cameras_of_photos(
+    photos: Path, provenance: dict, allow_outside: bool = False, most: int = 200
+) -> list[PhotoCamera]:
+    """The cameras of the data set ``photos``, of ``most`` of them at most, evenly chosen; otherwise as
+    `camera_of_photo`."""
+    frames = _posed(photos, provenance, allow_outside).frames
+    return [_camera(f) for f in frames[:: -(-len(frames) // most)]]
+
+
+def _posed(photos: Path, provenance: dict, allow_outside: bool) -> PosedImages:
     posed = read_posed(find_source(photos), allow_outside)
     if "sha256" in provenance and provenance["sha256"] != posed.sha256:
         raise NergError(f'"{posed.path}" is not what the field was trained on; give those photos with --photos')
     if "to_file" in provenance:
         posed = posed.moved(np.linalg.inv(np.asarray(provenance["to_file"], np.float64)))
-    frame = _frame(posed, photo)
+    return posed
+
+
+def _camera(frame: Frame) -> PhotoCamera:
     lens = frame.lens
     size = (round(lens["w"]), round(lens["h"])) if "w" in lens and "h" in lens else _size(frame)
     i = frame.intrinsics(*size)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.scenes.cameras import Probe, given_point, probe_values, turned_ahead, upright
+from nerg_mi.jobs.scenes.cameras import Probe, best_photo, given_point, probe_values, turned_ahead, upright
+from nerg_mi.jobs.scenes.photos import PhotoCamera
 from nerg_mi.maths.ray_box import box_interval
 from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.rendering.scene_parts import Attention, Eye, Place, SceneText
+from nerg_mi.rendering.scene_parts import Attention, Eye, Lens, Place, SceneText
 from nerg_mi.rendering.scene_writer import element
 
 EYE = Eye(np.array([0.3, -0.2, 0.1]), np.array([1.0, 0.6, 0.4]))
@@ -49,3 +50,11 @@ def test_points_and_ups():
     assert abs(down.up @ up) < 1e-9
     with pytest.raises(NergError, match="cannot look at the point"):
         upright(Eye(np.ones(3), np.ones(3)), up)
+
+
+def test_the_best_photo(probe):
+    # Of three cameras in the cube one has the whole of it before it, one a wall, and one looks out of it.
+    looks = [((0.9, 0, 0), (1, 0, 0)), ((-0.9, 0.1, 0.1), (0, 0.1, 0.1)), ((3, 0, 0), (4, 0, 0))]
+    eyes = [Eye(np.array(o, float), np.array(t, float)) for o, t in looks]
+    cameras = [PhotoCamera(str(k), eye, Lens(), False) for k, eye in enumerate(eyes)]
+    assert best_photo(probe, None, cameras).name == "1"

@@ -9,7 +9,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.checksum import file_sha256
-from nerg_mi.jobs.scenes.photos import camera_of_photo
+from nerg_mi.jobs.scenes.photos import camera_of_photo, cameras_of_photos
 
 POSE = np.array([[1, 0, 0, 0.5], [0, 0, -1, -3], [0, 1, 0, 1.2], [0, 0, 0, 1]], float)  # looks along +y, up is +z
 
@@ -54,3 +54,10 @@ def test_other_photos(photos):
     for photo in ("3", "p9", "-1"):
         with pytest.raises(NergError, match=r'give --photo a number from 0 to 2, or a name such as "p0.png"'):
             camera_of_photo(photos, photo, {})
+
+
+def test_all_of_them(photos):
+    assert [c.name for c in cameras_of_photos(photos, {})] == ["p0.png", "p1.png", "p2.png"]
+    assert [c.name for c in cameras_of_photos(photos, {}, most=2)] == ["p0.png", "p2.png"]
+    for k, camera in enumerate(cameras_of_photos(photos, {})):
+        np.testing.assert_array_equal(camera.eye.origin, camera_of_photo(photos, str(k), {}).eye.origin)
