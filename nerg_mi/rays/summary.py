@@ -9,8 +9,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
+from .checks.figures import Figures
+from .checks.registry import find_warnings
 from .filters import time_order
-from .plausibility import Figures, find_warnings
 from .rays import Rays
 
 _BLOCK = 1 << 18  # rays looked at at a time: a summary takes little memory besides the rays
@@ -35,7 +36,7 @@ class RaysSummary:
     rows_read: int  # by the import
     dropped: dict[str, int]  # rows by reason
     cohorts: dict[str, int]  # rays by cohort
-    warnings: tuple[str, ...]  # about figures that people cannot produce (`nerg_mi.rays.plausibility`)
+    warnings: tuple[str, ...]  # about figures that people cannot produce (`nerg_mi.rays.checks`)
 
 
 def summarise(rays: Rays) -> RaysSummary:

@@ -51,7 +51,7 @@ MENDINGS = (
             "no unit of time is offered",
             [_IMPORTS + "test_a_wrong_tick_is_told_and_nothing_is_nan"],
             (
-                "nerg_mi/rays/plausibility.py",
+                "nerg_mi/rays/checks/times.py",
                 "        if fits:\n            unit",
                 "        if not fits:\n            unit",
             ),

@@ -1,0 +1,31 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.rays.checks.people import walk, warnings_of
+
+
+@pytest.mark.parametrize("scale, word", [(1000, "--units mm"), (100, "--units cm")])
+def test_units(scale, word):
+    rays = walk(hit=False)
+    assert word in warnings_of(replace(rays, origin=rays.origin * scale))
+
+
+def test_the_axis_that_is_up():
+    # A file with y up that was declared with z up: heights stand in y.
+    rays = walk(hit=False)
+    assert "--up y" in warnings_of(replace(rays, origin=rays.origin[:, [0, 2, 1]]))
+    assert "--up -x" in warnings_of(replace(rays, origin=rays.origin[:, [2, 0, 1]] * (-1, 1, 1)))
+    assert "floor is not at height 0" in warnings_of(replace(rays, origin=rays.origin - (0, 0, 1.6)))
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_a_kilometre_is_the_most_that_origins_in_metres_span(along):
+    """Heads at eye height: nothing but how far they are apart gives the unit away."""
+    rays = walk(hit=False)
+    for span, warned in ((999.5, False), (1000.5, True)):
+        origin = rays.origin.copy()
+        origin[:, along] *= span / np.ptp(origin[:, along])
+        slow = replace(rays, origin=origin, t=rays.t * 40)  # nobody runs
+        assert ("--units mm" in warnings_of(slow)) == warned
