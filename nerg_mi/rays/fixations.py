@@ -71,8 +71,8 @@ def idt(rays: Rays, dispersion: float = 3.0, least: float = 0.1, gap: float = _G
 def fixation_rays(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
     """One ray a fixation, and how long each lasted (F,), seconds.
 
-    Time of the middle, mean origin, mean direction, mean confidence and mean hit point (of those known) of the rays
-    with the same number in ``label`` (N,), -1 left out. Raises `NergError` when there is no fixation.
+    Time of the middle, mean origin, mean direction, mean confidence, mean hit point and mean head (of those known) of
+    the rays with the same number in ``label`` (N,), -1 left out. Raises `NergError` when there is no fixation.
     """
     kept = np.flatnonzero(label >= 0)
     if not kept.size:
@@ -86,24 +86,29 @@ def fixation_rays(rays: Rays, label: np.ndarray) -> tuple[Rays, np.ndarray]:
     first, last = np.full(len(n), np.inf), np.full(len(n), -np.inf)
     np.minimum.at(first, number, rays.t[kept])
     np.maximum.at(last, number, rays.t[kept])
-    hit = None
-    if rays.hit is not None:
-        known = np.isfinite(rays.hit[kept]).all(axis=1)
-        weight = np.bincount(number, weights=known.astype(float))
-        with np.errstate(invalid="ignore"):
-            hit = (
-                np.stack([np.bincount(number, weights=np.where(known, c, 0.0)) for c in rays.hit[kept].T], axis=1)
-                / weight[:, None]
-            )
+    hit = None if rays.hit is None else _mean_of_known(rays.hit[kept], number)
+    head = None if rays.head is None else _mean_of_known(rays.head[kept], number)
+    if head is not None:
+        head /= np.linalg.norm(head, axis=1, keepdims=True)
     one = replace(
         rays.select(kept[index]),
         t=0.5 * (first + last),
         origin=mean(rays.origin),
         hit=hit,
+        head=head,
         direction=direction / np.linalg.norm(direction, axis=1, keepdims=True),
         confidence=np.clip(np.bincount(number, weights=rays.confidence[kept]) / n, 0.0, 1.0),
     )
     return one, last - first
+
+
+def _mean_of_known(values: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Means (F, C) of the rows of ``values`` (N, C) with the same ``number`` (N,); NaN where all hold a NaN."""
+    known = np.isfinite(values).all(axis=1)
+    weight = np.bincount(number, weights=known.astype(float))
+    sums = np.stack([np.bincount(number, weights=np.where(known, c, 0.0)) for c in values.T], axis=1)
+    with np.errstate(invalid="ignore"):
+        return sums / weight[:, None]
 
 
 def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -26,21 +26,21 @@ from .metadata import VERSION, not_rays, read_metadata
 
 SUFFIXES = (".npz", ".parquet")
 _REQUIRED = ("t", "person", "origin", "direction", "confidence")
-_OPTIONAL = ("hit", "cohort")
+_OPTIONAL = ("hit", "cohort", "head")
 COLUMNS = (*_REQUIRED, *_OPTIONAL)
-"""Columns of rays, one row each; hit points and cohorts may be missing."""
-_VECTORS = ("origin", "direction", "hit")
+"""Columns of rays, one row each; hit points, cohorts and heads may be missing."""
+_VECTORS = ("origin", "direction", "hit", "head")
 # Columns of numbers of names; all others are measurements.
 _CODES = ("person", "cohort")
 # Memory of a ray with all columns.
-_BYTES = 96
+_BYTES = 108
 # Numbers on either side of a column's middle by which it is told whether it shrinks.
 _SAMPLE = 1 << 15
 
 
 def write_rays_file(path: str | os.PathLike, columns: dict[str, np.ndarray], metadata: dict[str, Any]) -> None:
     """Write columns of N rows (``t``, ``person``, ``origin``, ``direction``,
-    ``confidence``, optionally ``hit`` and ``cohort``) and JSON-serialisable metadata, whole or not at all.
+    ``confidence``, optionally ``hit``, ``cohort`` and ``head``) and JSON-serialisable metadata, whole or not at all.
 
     Raises `NergError` for another suffix and for metadata that `read_rays_file` would refuse, and ``ImportError`` with
     the remedy where Parquet is asked for without pyarrow.

@@ -117,5 +117,10 @@ _KNOWN = {
         "list of steps with their counts",
     ),
     "complaints": (_names, "list of sentences"),
+    "eye_distance": (
+        lambda v: isinstance(v, dict) and all(_number(d) and d >= 0 for d in v.values()),
+        "list of persons and their distances in metres",
+    ),
+    "floor": (_text, "word"),
     "tick": (lambda v: _number(v) and v > 0, "time in seconds"),
 }

@@ -48,6 +48,7 @@ class Rays:
     metadata: dict[str, Any] = field(default_factory=lambda: {"frame": dict(FRAME)})
     cohort: np.ndarray | None = None  # (N,) int32 index into cohorts
     cohorts: tuple[str, ...] = ()  # names of groups of people
+    head: np.ndarray | None = None  # (N, 3) float32 unit, where the head points, NaN where unknown
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)
@@ -60,6 +61,8 @@ class Rays:
         for name in ("origin", "direction", "confidence", "hit"):
             if getattr(self, name) is not None:
                 put(name, np.ascontiguousarray(getattr(self, name), dtype=np.float64))
+        if self.head is not None:
+            put("head", np.ascontiguousarray(self.head, dtype=np.float32))
 
         n = len(self.t)
         shapes = {
@@ -69,6 +72,7 @@ class Rays:
             "confidence": (n,),
             "hit": (n, 3),
             "cohort": (n,),
+            "head": (n, 3),
         }
         for name, shape in shapes.items():
             value = getattr(self, name)
@@ -93,6 +97,9 @@ class Rays:
         if self.cohort is not None:
             _refuse(~((self.cohort >= 0) & (self.cohort < len(self.cohorts))), "an unknown cohort", "extend cohorts")
             put("cohort", np.ascontiguousarray(self.cohort, dtype=np.int32))
+        if self.head is not None:
+            length = np.sqrt(np.einsum("ij,ij->i", self.head, self.head))
+            _refuse(np.abs(length - 1) > 1e-4, "a head that is not of unit length", "divide it by its length")
         _refuse(~((self.confidence >= 0) & (self.confidence <= 1)), "a confidence outside [0, 1]", "rescale it")
 
     def __len__(self) -> int:

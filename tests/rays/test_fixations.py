@@ -1,4 +1,5 @@
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,3 +139,12 @@ def test_two_people_are_never_one_fixation(find, gap):
     assert find(still).tolist() == [0] * 20 + [1] * 20
     # Each stay is too short by itself; together they would not be.
     assert (find(still, least=0.5) == -1).all()
+
+
+def test_a_fixation_has_the_mean_head():
+    rays = gaze([*[0, 2] * 5, *[40] * 10])
+    head = np.tile([1.0, 0, 0], (20, 1))
+    head[1], head[2], head[10:] = [0, 1, 0], [np.nan] * 3, np.nan
+    one, _ = fixation_rays(replace(rays, head=head), idt(rays))
+    want = np.array([8.0, 1, 0])
+    assert np.allclose(one.head[0], want / np.linalg.norm(want)) and np.isnan(one.head[1]).all()

@@ -25,6 +25,7 @@ def some(hit):
     d = rng.normal(size=(9, 3))
     points = rng.random((9, 3))
     points[4] = np.nan
+    heads = np.where(np.isnan(points), points, np.float32([0.6, 0.0, 0.8]))
     return Rays(
         np.arange(9) / 7,
         np.arange(9) % 2,
@@ -34,6 +35,7 @@ def some(hit):
         rng.random(9),
         points if hit else None,
         {"frame": dict(FRAME), "dropped": [{"reason": "blink", "count": 2, "rows": [[3, 4]]}]},
+        head=heads if hit else None,
     )
 
 
@@ -47,7 +49,8 @@ def test_round_trip(tmp_path, ending, hit):
     for name in ("t", "person", "origin", "direction", "confidence"):
         assert np.array_equal(getattr(back, name), getattr(rays, name))
     if hit:
-        assert np.array_equal(back.hit, rays.hit, equal_nan=True)
+        assert np.array_equal(back.hit, rays.hit, equal_nan=True) and back.head.dtype == np.float32
+        assert np.array_equal(back.head, rays.head, equal_nan=True)
 
 
 def test_refusals(tmp_path):

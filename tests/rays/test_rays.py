@@ -34,6 +34,7 @@ def broken(name, row, value):
         (broken("t", 5, np.nan), r"time that is not finite \(rays 5\)"),
         (broken("person", 0, 7), r"unknown person \(rays 0\)"),
         (broken("confidence", 0, 1.5), r"confidence outside \[0, 1\]"),
+        ({"head": np.tile([[0.0, 0, 2], [np.nan, 0, 0]], (3, 1))}, r"head that is not of unit length \(rays 0, 2, 4\)"),
         ({"origin": np.zeros((5, 3))}, r"origin has shape \(5, 3\)"),
         ({"metadata": {}}, "state units, up axis and handedness"),
     ],

@@ -22,6 +22,8 @@ BAD_LINES = 0.01
 NAMED_RUNS = 500_000
 """So many runs of dropped rows are named; of more, as where every other row is a blink, only the number is kept."""
 
+_EYES = "eye_distance"  # a column while files are read; of the rays, one number a person in the metadata
+
 
 def _ranges(rows: np.ndarray) -> list[list[int]]:
     """Sorted row numbers as inclusive [first, last] runs: blinks come in runs,
@@ -33,6 +35,16 @@ def _ranges(rows: np.ndarray) -> list[list[int]]:
     first = rows[np.r_[0, cuts + 1]]
     last = rows[np.r_[cuts, rows.size - 1]]
     return [[int(a), int(b)] for a, b in zip(first, last)]
+
+
+def _medians(values: np.ndarray, person: np.ndarray, persons: Sequence[str]) -> dict[str, float]:
+    """Median of the ``values`` (n,) of each of the ``persons`` for whom there are some."""
+    known = np.isfinite(values)
+    values, person = values[known], person[known]
+    order = np.argsort(person, kind="stable")
+    ends = np.searchsorted(person[order], np.arange(len(persons) + 1))
+    found = zip(persons, np.split(values[order], ends[1:-1]))
+    return {name: round(float(np.median(mine)), 5) for name, mine in found if mine.size}
 
 
 class RaysBuilder:
@@ -114,6 +126,8 @@ class RaysBuilder:
         confidence: np.ndarray | None = None,
         hit: np.ndarray | None = None,
         cohort: Sequence[str] | np.ndarray | None = None,
+        head: np.ndarray | None = None,
+        eye_distance: np.ndarray | None = None,
         drop: dict[str, np.ndarray] | None = None,
     ) -> None:
         """Add n rows of the present source.
@@ -121,9 +135,12 @@ class RaysBuilder:
         ``t`` (n,) seconds. ``person``: a name for each row, or one for all. ``origin`` (n, 3) and ``hit`` (n, 3), the
         point looked at: in the frame and units given to the builder. ``direction`` (n, 3) in the same frame, of any
         length. ``confidence`` (n,) in [0, 1], by default one. ``cohort``: the name of each row's group of people.
-        ``rows`` (n,): 1-based rows of the source. ``drop``: reasons of the recording's own, each with its mask (n,),
-        before those found here: what is NaN or, of a direction, zero. A row counts under the first reason it meets;
-        one without a person's name is dropped, one without a cohort is of the cohort "unknown".
+        ``head`` (n, 3): where the head points, in the same frame, of any length, NaN or zero where that is unknown;
+        left out where ``direction`` is the head's. ``eye_distance`` (n,): between both eyes, in the same units and
+        recorded as the origins are, NaN where one is not seen. ``rows`` (n,): 1-based rows of the
+        source. ``drop``: reasons of the recording's own, each with its mask (n,), before those found here: what is NaN
+        or, of a direction, zero. A row counts under the first reason it meets; one without a person's name is dropped,
+        one without a cohort is of the cohort "unknown".
         """
         n = len(t)
         person = self._persons.codes(person, n)
@@ -157,6 +174,12 @@ class RaysBuilder:
         }
         if hit is not None:
             part["hit"] = hit[keep] @ R.T + shift
+        if head is not None:
+            with np.errstate(invalid="ignore", divide="ignore"):
+                unit = head[keep] / np.linalg.norm(head[keep], axis=1, keepdims=True)
+            part["head"] = (unit @ (R / scale).T).astype(np.float32)
+        if eye_distance is not None:
+            part[_EYES] = (scale * eye_distance[keep]).astype(np.float32)
         if cohort is not None:
             part["cohort"] = self._cohorts.codes(cohort, n)[keep]
         self._parts.append(part)
@@ -195,6 +218,8 @@ class RaysBuilder:
         }
         columns = {name: self._column(name) for name in COLUMNS if any(name in part for part in self._parts)}
         columns["person"], persons = self._persons.sorted(columns["person"])
+        if any(_EYES in part for part in self._parts):
+            metadata[_EYES] = _medians(self._column(_EYES), columns["person"], persons)
         cohorts: tuple[str, ...] = ()
         if "cohort" in columns:
             columns["cohort"], cohorts = self._cohorts.sorted(columns["cohort"])
@@ -202,9 +227,14 @@ class RaysBuilder:
         return Rays(**columns, persons=persons, cohorts=cohorts, metadata=metadata)
 
     def _column(self, name: str) -> np.ndarray:
-        """A column of all parts; those without hits or cohorts get NaN or the cohort "". The parts' own are let go, so
-        that no more than one column is there twice."""
-        lacking = {"hit": lambda n: np.full((n, 3), np.nan), "cohort": lambda n: self._cohorts.codes("", n)}
+        """A column of all parts; those without one get NaN or the cohort "". The parts' own are let go, so that no more
+        than one column is there twice."""
+        lacking = {
+            "hit": lambda n: np.full((n, 3), np.nan),
+            "head": lambda n: np.full((n, 3), np.nan, np.float32),
+            _EYES: lambda n: np.full(n, np.nan, np.float32),
+            "cohort": lambda n: self._cohorts.codes("", n),
+        }
         return np.concatenate(
             [part.pop(name) if name in part else lacking[name](n) for part, n in zip(self._parts, self._kept)]
         )

@@ -19,16 +19,18 @@ _JOINTS = 26  # of a hand, a 4x4 matrix each
 _HANDS = 2 * (1 + 16 * _JOINTS)
 # The files have no header: time, head, hands, and then the gaze.
 _GAZE = ["seen", *(f"{what}{i}" for what in "od" for i in range(4)), "distance"]
+_BACK = ["head2", "head6", "head10"]  # the third column of the matrix, row by row
 _HEADER = ["t", *(f"head{i}" for i in range(16)), *(f"hand{i}" for i in range(_HANDS)), *_GAZE]
 
 
 class HoloLens:
     """``*_head_hand_eye.csv``, which has no header.
 
-    A line: time in ticks of 100 ns; the head's 4x4 matrix; for each hand whether it is seen and 26 matrices; whether
-    the gaze is, its origin and direction (homogeneous) and the distance to what was met, 0 for nothing. The world is
-    right-handed, y up, metres. Rows in which the eyes were not seen are dropped. The person is the file's name before
-    ``_head_hand_eye``; times count from the recording's first row.
+    A line: time in ticks of 100 ns; the head's 4x4 matrix, row by row, which looks along minus its third column; for
+    each hand whether it is seen and 26 matrices; whether the gaze is, its origin and direction (homogeneous) and the
+    distance to what was met, 0 for nothing. The world is right-handed, y up, metres. Rows in which the eyes were not
+    seen are dropped. The person is the file's name before ``_head_hand_eye``; times count from the recording's first
+    row.
     """
 
     name = "hololens"
@@ -45,9 +47,9 @@ class HoloLens:
         for path in files:
             builder.source(path)
             first = None
-            for v, _, lines in iterate_table(path, ["t", *_GAZE], header=_HEADER, on_bad=builder.on_bad):
+            for v, _, lines in iterate_table(path, ["t", *_GAZE, *_BACK], header=_HEADER, on_bad=builder.on_bad):
                 first = v[0, 0] if first is None else first
-                origin, direction, distance = v[:, 2:5], v[:, 6:9], v[:, 10:]
+                origin, direction, distance = v[:, 2:5], v[:, 6:9], v[:, 10:11]
                 with np.errstate(invalid="ignore", divide="ignore"):
                     unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
                 builder.add(
@@ -57,6 +59,7 @@ class HoloLens:
                     direction,
                     rows=lines,
                     hit=np.where(distance > 0, origin + distance * unit, np.nan),
+                    head=-v[:, 11:],
                     drop={"the eyes were not seen": v[:, 1] != 1},
                 )
 

@@ -53,7 +53,9 @@ class Reader(Protocol[O]):
         Each file is begun with ``builder.source(path)``, and its rows are added block by block with ``builder.add``:
         times in seconds, origins and hit points in the frame and units of `frame`, directions of any length,
         confidences in [0, 1], NaN where something is missing, the 1-based ``rows`` of the file, and reasons of the
-        format's own to ``drop`` some. Lines that cannot be read are told to ``builder.on_bad`` where there is one. What
+        format's own to ``drop`` some. The checks of rays see more where the file has heads (``head``) and both eyes
+        (``eye_distance``); where the height 0 of the files is not the floor, ``builder.note(floor="unknown")`` says so.
+        Lines that cannot be read are told to ``builder.on_bad`` where there is one. What
         else is worth keeping goes into the metadata with ``builder.note``; options are kept there already. Memory stays
         bounded by the blocks. Raises `NergError` for what the user can mend: a missing column or file, a damaged one,
         an option that is needed.

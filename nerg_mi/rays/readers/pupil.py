@@ -58,6 +58,7 @@ class Pupil:
                 "Pupil's head poses count in edges of the tracking markers; give the edge's length in metres "
                 "(--marker 0.05)"
             )
+        builder.note(floor="unknown")  # a marker may lie or hang anywhere
         for given in files:
             gaze = given / "gaze_positions.csv" if given.is_dir() else given
             person = _person(gaze)
@@ -75,6 +76,7 @@ class Pupil:
                     poses.rotate(turn, direction),
                     rows=lines,
                     confidence=v[:, 1],
+                    head=turn[:, :, 2],
                     drop={
                         f"confidence below {options.min_confidence:g}": v[:, 1] < options.min_confidence,
                         "there is no head pose at that time": lost,

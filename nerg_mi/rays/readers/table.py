@@ -28,7 +28,7 @@ class TableOptions:
         'Column map: "origin=x,y,z direction=dx,dy,dz t=time person=id confidence=c hit=hx,hy,hz cohort=g"; for heads, '
         "in place of direction: xyzw=..., wxyz=..., ypr=yaw,pitch,roll or matrix=... (12 or 16 columns, instead of "
         "origin too); a direction as angles: azel=azimuth,elevation (right, up) or yawpitch=yaw,pitch, - before a name "
-        "turns its sign.",
+        "turns its sign; for checks: head=x,y,z (or qx,qy,qz,qw), eyes=lx,ly,lz,rx,ry,rz.",
         flag="--map",
         parse=ColumnMap.parse,
         recorded=False,
@@ -126,7 +126,7 @@ class _Rows:
         signed = getattr(columns, columns.angles) if columns.angles else ()
         self.angle_columns = tuple(name.removeprefix("-") for name in signed)
         self.angle_signs = np.array([-1.0 if name.startswith("-") else 1.0 for name in signed])
-        vectors = [c for c in (columns.origin, columns.direction, columns.eye, columns.hit) if c]
+        vectors = [getattr(columns, name) or () for name in ("origin", "direction", "eye", "hit", "head", "eyes")]
         self.numbers = [name for v in vectors for name in v]
         self.numbers += [*self.pose_columns, *self.angle_columns, *(c for c in (columns.t, columns.confidence) if c)]
         self.texts = [c for c in (self.person, columns.cohort, *valid) if c]
@@ -148,7 +148,7 @@ class _Rows:
         n = len(block.lines)
         t = value[columns.t] if columns.t else np.arange(before, before + n, dtype=np.float64)
         confidence = value[columns.confidence] if columns.confidence else np.ones(n)
-        origin, direction = self._geometry(vector)
+        origin, direction, head = self._geometry(vector)
         drop = {f"confidence below {options.min_confidence:g}": confidence < options.min_confidence}
         for name, words in self.valid.items():
             known = np.isin(np.char.lower(word[name]), [w.lower() for w in words])
@@ -162,22 +162,32 @@ class _Rows:
             confidence=confidence,
             hit=vector(columns.hit) if columns.hit else None,
             cohort=word[columns.cohort] if columns.cohort else None,
+            head=head,
+            eye_distance=np.linalg.norm(np.subtract(*np.split(vector(columns.eyes), 2, axis=1)), axis=1)
+            if columns.eyes
+            else None,
             drop=drop,
         )
 
-    def _geometry(self, vector: Callable[[Sequence[str]], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and directions (n, 3) of a block, whose columns ``vector`` stacks."""
-        columns = self.columns
+    def _geometry(
+        self, vector: Callable[[Sequence[str]], np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Origins and directions (n, 3) of a block, whose columns ``vector`` stacks, and the heads', if they are not
+        the directions."""
+        columns, forward = self.columns, poses.axis(self.options.looks_along, "forward")
         direction = self._direction(vector)
         if not columns.pose:
-            return vector(columns.origin or ()), np.asarray(direction)
+            head = vector(columns.head) if columns.head else None
+            if head is not None and head.shape[1] == 4:
+                head = poses.rotations_from_quaternions(head) @ forward
+            return vector(columns.origin or ()), np.asarray(direction), head
         turn, place = _pose(columns.pose, vector(self.pose_columns), self.options)
         origin = vector(columns.origin or ()) if place is None else place
         if columns.eye:
             origin = origin + poses.rotate(turn, vector(columns.eye))
         if direction is not None:
-            return origin, poses.rotate(turn, direction)
-        return origin, turn @ poses.axis(self.options.looks_along, "forward")
+            return origin, poses.rotate(turn, direction), turn @ forward
+        return origin, turn @ forward, None
 
     def _direction(self, vector: Callable[[Sequence[str]], np.ndarray]) -> np.ndarray | None:
         """The directions (n, 3) that the table gives beside a pose, or without one; None where the pose is all."""

@@ -66,6 +66,7 @@ def _gaze_in_world(table: ColumnFinder) -> dict:
     return {
         "direction": table.vector(*names.DIRECTIONS, *names.BARE_DIRECTIONS),
         "origin": table.vector(*names.EYES, *names.BARE_PLACES),
+        "head": table.find_vector(*names.ROTATIONS, axes="xyzw"),  # for the checks
     }
 
 

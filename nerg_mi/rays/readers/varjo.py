@@ -65,6 +65,7 @@ class Varjo:
                     position + poses.rotate(turn, eye),
                     poses.rotate(turn, forward),
                     rows=lines[~bad],
+                    head=turn[:, :, 2],
                     drop={"GazeStatus is not VALID": np.char.upper(texts[~bad, 4]) != "VALID"},
                 )
 

@@ -73,6 +73,7 @@ class VrSupermarket:
                     rows=lines,
                     confidence=np.clip(openness, 0.0, 1.0),
                     hit=v[:, 18:21],
+                    head=-turn[:, :, 2],
                     drop={f"an eye is closed (openness at most {least:g})": openness <= least},
                 )
 

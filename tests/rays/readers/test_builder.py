@@ -117,3 +117,26 @@ def test_complaints_are_kept_once_and_stand_on_the_card(tmp_path):
         builder.complain(sentence)
     rays = builder.build()
     assert rays.metadata["complaints"] == ["one", "two"] and summarise(rays).warnings[:2] == ("one", "two")
+
+
+def test_heads_and_eyes(tmp_path):
+    """Where heads point in the frame of rays; how far the eyes are apart, in metres, one number a person."""
+    (tmp_path / "a.csv").write_text("x")
+    builder = RaysBuilder(Frame(up="y", handedness="left", units="cm"))
+    builder.source(tmp_path / "a.csv")
+    ones = np.ones((4, 3))
+    heads = np.array([[0, 0, 2.0], [0, 5, 0], [0, 0, 0], [np.nan, 0, 1]])
+    gone = np.array([[1.0, 1, 1], [np.nan] * 3, [1, 1, 1], [1, 1, 1]])
+    builder.add(np.arange(4), ["bo", "bo", "ann", "ann"], gone, ones, rows=np.arange(4), head=heads)
+    eyes = np.array([6.0, 7.0, np.nan, 6.2, 6.4])
+    builder.add(
+        np.arange(5),
+        ["bo", "bo", "bo", "ann", "bo"],
+        np.ones((5, 3)),
+        np.ones((5, 3)),
+        rows=np.arange(4, 9),
+        eye_distance=eyes,
+    )
+    rays = builder.build()
+    assert np.allclose(rays.head[0], [0, 1, 0]) and np.isnan(rays.head[1:]).all() and len(rays.head) == 8
+    assert rays.metadata["eye_distance"] == {"ann": 0.062, "bo": 0.064}

@@ -25,7 +25,8 @@ def test_pupil(tmp_path):
     rays = read("pupil", folder, marker=0.05, up="z")
     assert rays.persons == ("anna",) and np.allclose(rays.t, [10.51, 10.53]) and rays.metadata["marker"] == 0.05
     turn = Rotation.from_rotvec([[0, 0, 0.51 * np.pi / 2], [0, 0, 0.53 * np.pi / 2]])
-    assert np.allclose(rays.direction, [0, 0, 1])
+    assert np.allclose(rays.direction, [0, 0, 1]) and np.allclose(rays.head, [0, 0, 1])
+    assert rays.metadata["floor"] == "unknown"
     want = 0.05 * np.array([[0.51, 20, 30], [0.53, 20, 30]]) + turn.apply(
         1e-3 * np.array([[-10, 10, -20], [-40, 10, -20]])
     )

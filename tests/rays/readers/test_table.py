@@ -219,3 +219,21 @@ def test_angles_beside_a_pose_are_in_the_head(tmp_path):
     assert np.allclose(rays.direction, [[MEANT[1], -MEANT[0], MEANT[2]]]) and np.allclose(rays.origin, [[1, 3, 2]])
     with pytest.raises(ValueError, match="are both y"):
         read("table", path, columns=columns, up="y", handedness="left", forward="-y")
+
+
+@pytest.mark.parametrize("kind", ["vector", "quaternion"])
+def test_heads_beside_gaze_in_the_world_and_both_eyes(tmp_path, heads, kind):
+    """A direction beside ``head`` stays as it is: the head is there for the checks."""
+    origin, turn = heads
+    gaze, aside = np.tile([0.0, 3, 4], (20, 1)), turn.apply([3.1, 0, 0])
+    head = turn.apply([0, 0, 1]) if kind == "vector" else turn.as_quat()
+    names = [f"h{i}" for i in range(head.shape[1])]
+    path = write(
+        tmp_path / "a.csv",
+        "x,y,z,a,b,c,l,m,n,o,p,q," + ",".join(names),
+        np.hstack([origin, gaze, origin - aside, origin + aside, head]),
+    )
+    columns = f"origin=x,y,z direction=a,b,c eyes=l,m,n,o,p,q head={','.join(names)}"
+    rays = read_table(path, columns, up="y", handedness="left", units="cm")
+    assert np.allclose(rays.direction, [0, 0.8, 0.6]) and np.allclose(rays.head, turn.apply([0, 0, 1])[:, [0, 2, 1]])
+    assert rays.metadata["eye_distance"] == {"a": 0.062}

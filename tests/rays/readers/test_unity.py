@@ -46,6 +46,9 @@ def test_unity_local_and_head(tmp_path):
     assert np.allclose(local.origin, head.origin + 0.1 * head.direction)
     d = TURN.apply([0, 0.5, 1]) / 1.25**0.5
     assert np.allclose(local.direction, d[[0, 2, 1]])
+    # The head is kept beside gaze in the head, beside gaze in the world, and not beside itself.
+    world = read("unity", path)
+    assert np.allclose(local.head, head.direction) and np.allclose(world.head, head.direction) and head.head is None
     path.write_text("head_pos_x,head_pos_y,head_pos_z,head_rot_x,head_rot_y,head_rot_z\n1,1.6,2,30,90,0\n")
     assert np.allclose(read("unity_head", path).direction, head.direction)
 

@@ -23,6 +23,7 @@ def test_varjo(tmp_path):
     assert np.allclose(rays.t, [0, 0.01], atol=1e-6) and dropped(rays) == {"GazeStatus is not VALID": [[3, 3]]}
     ahead = np.array([3**0.5 / 2, 0, -0.5])
     assert [s["file"] for s in rays.metadata["sources"]] == ["2026-01-02.csv"]
+    assert np.allclose(rays.head, ahead, atol=1e-6)
     assert np.allclose(rays.direction[1], ahead, atol=1e-6) and np.allclose(
         rays.origin, [[1, 2, 1.6] + 0.1 * ahead, [1, 2, 1.6]], atol=1e-6
     )

@@ -17,6 +17,8 @@ def test_real_supermarket(recorded):
     angle = np.degrees(2 * np.arcsin(0.5 * np.linalg.norm(to_hit - rays.direction[hit], axis=1)))
     assert np.median(angle) < 1e-3 and np.percentile(angle, 99) < 0.05
     assert 0.97 < hit.mean() < 1
+    # Gaze is about where heads point.
+    assert np.median(np.einsum("ij,ij->i", rays.head, rays.direction)) > np.cos(np.radians(20))
     assert 1.2 < np.median(rays.origin[:, 2]) < 1.8  # z is up: eye heights
     probes = place_probes(rays, 0.25, count=64, min_rays=8, cap=100_000)
     assert 200 < np.median(probes.counts) < 2000
@@ -37,6 +39,7 @@ def test_frame_eyes_and_openness(tmp_path):
     rays = read("vr_supermarket", path)
     assert rays.persons == ("user7",) and np.allclose(rays.t, [0, 0.04]) and np.allclose(rays.confidence, [0.8, 1])
     assert np.allclose(rays.direction, (turn @ (0, 0, -1))[[0, 2, 1]]) and np.isnan(rays.hit).all()
+    assert np.allclose(rays.head, (turn @ (0, 0, -1))[[0, 2, 1]])
     assert np.allclose(rays.origin, ((1, 1.6, 2) + turn @ (0.01, 0, -0.1))[[0, 2, 1]])
     assert dropped(rays) == {
         "an eye is closed (openness at most 0.5)": [[3, 3]],

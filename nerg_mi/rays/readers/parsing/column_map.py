@@ -5,7 +5,9 @@ a direction, or beside one that is in the head's own frame, the head's pose: ``x
 ``wxyz=qw,qx,qy,qz`` (quaternion, its order in its name), ``ypr=yaw,pitch,roll`` (or yaw and pitch),
 ``matrix=m00,m01,...`` (12 or 16 columns, row by row, head to world; it holds the origin as well). ``eye=ex,ey,ez``:
 where the eye is in the head's frame. A direction may also be two angles: ``azel=azimuth,elevation`` (right and up) or
-``yawpitch=yaw,pitch`` (which turn as those of ``ypr`` do); ``-`` before the name of a column turns its sign.
+``yawpitch=yaw,pitch`` (which turn as those of ``ypr`` do); ``-`` before the name of a column turns its sign. For
+checks: ``head=fx,fy,fz`` or ``head=qx,qy,qz,qw``, where the head points while the direction is in the table's frame,
+and ``eyes=lx,ly,lz,rx,ry,rz``, where both eyes are.
 """
 
 from __future__ import annotations
@@ -30,6 +32,8 @@ _COUNTS = {
     "person": (1,),
     "confidence": (1,),
     "cohort": (1,),
+    "head": (3, 4),
+    "eyes": (6,),
 }
 POSES = ("xyzw", "wxyz", "ypr", "matrix")
 ANGLES = ("azel", "yawpitch")
@@ -59,6 +63,8 @@ class ColumnMap:
     person: str | None = None
     confidence: str | None = None
     cohort: str | None = None
+    head: tuple[str, ...] | None = None
+    eyes: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         poses = [p for p in POSES if getattr(self, p)]
@@ -79,6 +85,12 @@ class ColumnMap:
         if self.eye is not None and not poses:
             raise NergError(
                 "column map: eye is in the head's frame and needs a pose; add one (xyzw, wxyz, ypr or matrix)"
+            )
+
+        if self.head is not None and (poses or not (self.direction or self.angles)):
+            raise NergError(
+                "column map: head says where the head points while direction is in the table's frame; leave out "
+                + (" or ".join(["head", *poses]) if poses else "head, or add direction")
             )
 
     @property
