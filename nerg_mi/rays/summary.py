@@ -67,7 +67,7 @@ def summarise(rays: Rays) -> RaysSummary:
 
     height = np.percentile(rays.origin[:, 2], [5, 50, 95])
     low, high = rays.origin.min(axis=0), rays.origin.max(axis=0)
-    figures = Figures(height, high - low, speed_p95, median_step if some else None, order)
+    figures = Figures(rays, height, high - low, speed_p95, median_step if some else None, order)
     return RaysSummary(
         rays=len(rays),
         persons=int(np.count_nonzero(np.bincount(rays.person))),
@@ -85,7 +85,7 @@ def summarise(rays: Rays) -> RaysSummary:
         cohorts={}
         if rays.cohort is None
         else dict(zip(rays.cohorts, np.bincount(rays.cohort, minlength=len(rays.cohorts)).tolist())),
-        warnings=tuple(find_warnings(rays, figures)),
+        warnings=tuple(find_warnings(figures)),
     )
 
 

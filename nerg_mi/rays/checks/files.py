@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from nerg_mi.rays.rays import Rays
-
 from .figures import Figures
+from .protocol import Check
 
 
-def check_files(rays: Rays, figures: Figures) -> list[str]:
-    """What the reader of the files found wrong with them."""
-    return list(rays.metadata.get("complaints", []))
+def _complaints(figures: Figures) -> list[str]:
+    return list(figures.rays.metadata.get("complaints", []))
+
+
+CHECK = Check("files", "what the reader of the files found wrong with them, as it read them", _complaints)

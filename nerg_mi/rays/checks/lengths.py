@@ -10,9 +10,12 @@ import numpy as np
 from nerg_mi.rays.rays import Rays
 
 from .figures import MOST, Figures, to_source
+from .protocol import Check
+
+_HEADS = 0.4, 2.3  # metres over the floor between which the median of all heads is
 
 
-def check_lengths(rays: Rays, figures: Figures) -> list[str]:
+def _check_lengths(figures: Figures) -> list[str]:
     """Units of length and the up axis, by the heights and the extent of the origins."""
     extent, median, out = figures.extent, figures.height[1], []
     if 100 <= median <= 230:
@@ -24,13 +27,15 @@ def check_lengths(rays: Rays, figures: Figures) -> list[str]:
         )
     elif extent.max() < 0.05:
         out.append(f"the origins span {extent.max():.3f} m: is the unit larger than declared?")
-    elif (extent[2] > 2.0 and extent[2] > min(extent[0], extent[1])) or not 0.4 <= median <= 2.3:
+    elif (extent[2] > 2.0 and extent[2] > min(extent[0], extent[1])) or (
+        figures.floor_known and not _HEADS[0] <= median <= _HEADS[1]
+    ):
         what = (
             "the origins vary more in height than sideways"
-            if 0.4 <= median <= 2.3
+            if not figures.floor_known or _HEADS[0] <= median <= _HEADS[1]
             else f"the median eye height is {median:.2f} m"
         )
-        axis = _standing_axis(rays)
+        axis = _standing_axis(figures.rays)
         remedy = (
             f"{axis} of the file looks like the height: is it the up axis? (--up {axis})"
             if axis
@@ -48,3 +53,11 @@ def _standing_axis(rays: Rays) -> str | None:
     like_heads[np.argmax(np.abs(to_source(rays)[:, 2]))] = False
     (found,) = np.nonzero(like_heads)
     return None if len(found) != 1 else ("-" if mid[found[0]] < 0 else "") + "xyz"[found[0]]
+
+
+CHECK = Check(
+    "lengths",
+    "heights and extents that heads do not have, and the axis of the file along which they have them (`--units`, "
+    "`--up`)",
+    _check_lengths,
+)

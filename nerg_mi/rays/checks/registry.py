@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from nerg_mi.rays.rays import Rays
-
-from .directions import check_directions
+from . import clocks, directions, eyes, files, frames, frozen, head, holding, lengths, times
 from .figures import Figures
-from .files import check_files
-from .lengths import check_lengths
-from .times import check_times
+from .protocol import Check
 
-CHECKS: tuple[Callable[[Rays, Figures], list[str]], ...] = (check_files, check_lengths, check_times, check_directions)
-"""What is looked for, in the order of the card; each check gives no sentence where nothing is wrong."""
+CHECKS: tuple[Check, ...] = tuple(
+    module.CHECK for module in (files, lengths, eyes, times, clocks, frozen, head, holding, directions, frames)
+)
+"""What is looked for, in the order of the card."""
 
 
-def find_warnings(rays: Rays, figures: Figures) -> list[str]:
+def find_warnings(figures: Figures) -> list[str]:
     """Sentences about what people cannot have produced, each with the likely mistake and its remedy: those of all
     `CHECKS`."""
-    return [warning for check in CHECKS for warning in check(rays, figures)]
+    return [warning for check in CHECKS for warning in check.find(figures)]
+
+
+def check_table() -> str:
+    """The checks as a table in Markdown, for the manual."""
+    rows = ["| check | looks for |", "|---|---|"]
+    return "\n".join([*rows, *(f"| {check.name} | {check.looks_for} |" for check in CHECKS)]) + "\n"

@@ -1,5 +1,7 @@
 """People made up for checks of rays."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from nerg_mi.rays.rays import FRAME, Rays
@@ -24,3 +26,40 @@ def walk(hit=True, frame=None, seed=0):
 
 def warnings_of(rays):
     return " | ".join(summarise(rays).warnings)
+
+
+def watch(people=3, n=3000, seed=0):
+    """A minute each of people who walk about a room of 6 x 4 m, and look at one point of it after the other: their
+    eyes jump every third of a second, and their heads follow."""
+    rng, parts = np.random.default_rng(seed), []
+    t = np.arange(n) * 0.02
+    for _ in range(people):
+        a, b = rng.uniform(0, 2 * np.pi, 2)
+        speed = rng.uniform(0.25, 0.35)
+        floor = np.stack([4 + 2.5 * np.sin(speed * t + a), 3 + 1.5 * np.sin(1.31 * speed * t + b)], axis=1)
+        origin = np.column_stack([floor, np.full(n, rng.uniform(1.5, 1.75)) + 0.01 * np.sin(9 * t)])
+        ahead = np.arctan2(*np.gradient(floor, axis=0).T[::-1])
+        jumps = np.repeat(rng.normal(0, [[0.7, 0.3]], (n // 16 + 1, 2)), 16, axis=0)[:n]
+        yaw, pitch = np.repeat(ahead[::16], 16)[:n] + jumps[:, 0], jumps[:, 1]
+        far = 2 * np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
+        hit = np.repeat(origin[::16], 16, axis=0)[:n] + far
+        d = hit - origin
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        kernel = np.hanning(41) / np.hanning(41).sum()
+        head = np.stack([np.convolve(np.pad(c, 20, mode="edge"), kernel, mode="valid") for c in d.T], axis=1)
+        d = d + rng.normal(0, 0.002, d.shape)
+        unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (d, head)]
+        parts.append((t, origin, unit[0], hit, unit[1]))
+    t, origin, d, hit, head = (np.concatenate(column) for column in zip(*parts))
+    names = ("ann", "bo", "cy", "di", "ed", "flo", "gus", "hal")[:people]
+    metadata = {"frame": dict(FRAME), "transform": np.eye(4).tolist()}
+    return Rays(t, np.repeat(np.arange(people), n), names, origin, d, np.ones(len(t)), hit, metadata, head=head)
+
+
+def change(rays, rows, **columns):
+    """``rays`` with other values in some rows."""
+    new = {}
+    for name, value in columns.items():
+        new[name] = getattr(rays, name).copy()
+        new[name][rows] = value(new[name][rows]) if callable(value) else value
+    return replace(rays, **new)

@@ -29,3 +29,9 @@ def test_a_kilometre_is_the_most_that_origins_in_metres_span(along):
         origin[:, along] *= span / np.ptp(origin[:, along])
         slow = replace(rays, origin=origin, t=rays.t * 40)  # nobody runs
         assert ("--units mm" in warnings_of(slow)) == warned
+
+
+def test_heights_over_a_floor_that_is_not_known():
+    rays = walk(hit=False)
+    low = replace(rays, origin=rays.origin - (0, 0, 1.8), metadata={**rays.metadata, "floor": "unknown"})
+    assert warnings_of(low) == ""

@@ -1,3 +1,4 @@
+from nerg_mi.rays.checks.registry import CHECKS, check_table
 from nerg_mi.rays.checks.walking import walking_agreement
 from tests.rays.checks.people import walk, warnings_of
 
@@ -5,3 +6,11 @@ from tests.rays.checks.people import walk, warnings_of
 def test_nothing_to_say_of_a_plausible_walk():
     assert warnings_of(walk()) == "" and warnings_of(walk(hit=False)) == ""
     assert (walking_agreement(walk())[:2] > 0.5).all()
+
+
+def test_what_they_are_called():
+    """A check is called as its file; what it looks for stands in the manual."""
+    assert len({check.name for check in CHECKS}) == len(CHECKS) and all(check.looks_for for check in CHECKS)
+    for check in CHECKS:
+        assert check.find.__module__.rpartition(".")[2] == check.name
+        assert f"| {check.name} | {check.looks_for} |" in check_table()

@@ -53,3 +53,26 @@ def test_walking_is_seen_through_the_noise_of_tracking():
     rays = walk()
     noisy = rays.origin + np.random.default_rng(1).normal(0, 0.03, rays.origin.shape)
     assert (walking_agreement(replace(rays, origin=noisy))[:2] > 0.5).all()
+
+
+def test_of_some_of_the_people():
+    """One who is reversed among others, by a walk that goes everywhere."""
+    rays = walk(hit=False)
+    two = replace(rays, person=np.repeat([0, 1], [4000, 2000]), persons=("ann", "bo"))
+    back = two.direction.copy()
+    back[4000:] *= (-1, -1, 1)
+    assert "bo look back to where they came from" in warnings_of(replace(two, direction=back))
+
+
+def test_gaze_that_stays_whichever_way_people_walk():
+    """Gaze in the head's frame, of whose head nothing is known."""
+    rays = walk(hit=False)
+    rng = np.random.default_rng(0)
+    local = rng.normal(0, 0.25, (6000, 3)) + (0, 1, 0)
+    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    said = warnings_of(replace(rays, direction=local))
+    assert "stay about one direction of the file, whichever way people walk" in said and "--preset unity_local" in said
+    both = replace(rays, person=np.repeat([0, 1], [4000, 2000]), persons=("ann", "bo"))
+    half = both.direction.copy()
+    half[:4000] = local[:4000]
+    assert "the directions of ann stay about one direction" in warnings_of(replace(both, direction=half))

@@ -1,0 +1,48 @@
+import numpy as np
+import pytest
+
+from nerg_mi.rays import frozen
+from nerg_mi.rays.frozen import find_frozen
+from nerg_mi.rays.sessions import find_sessions
+from tests.rays.checks.people import change, watch
+
+
+def found(rays):
+    return find_frozen(rays, find_sessions(rays))
+
+
+@pytest.mark.parametrize("block", [100, 1 << 18])
+def test_gaze_that_stands_still(monkeypatch, block):
+    monkeypatch.setattr(frozen, "_BLOCK", block)
+    rays = watch()
+    assert not found(rays).any()
+    still = slice(3100, 3400)
+    world = change(rays, still, direction=rays.direction[3100])
+    assert np.flatnonzero(found(world)).tolist() == list(range(3100, 3400))
+    # Less than a second is a fixation or a blink.
+    assert not found(change(rays, slice(3100, 3140), direction=rays.direction[3100])).any()
+    # The head in place of the eyes; without it, nothing is seen of that.
+    as_head = change(rays, still, direction=rays.head[still])
+    assert found(as_head)[3101:3399].all() and found(as_head).sum() <= 302
+    assert not found(type(rays)(**{**vars(as_head), "head": None})).any()
+
+
+def test_a_headset_on_a_table_is_not_frozen_gaze():
+    rays = watch()
+    rows = slice(3100, 3400)
+    put = change(rays, rows, direction=rays.direction[3100], head=rays.head[3100], origin=rays.origin[3100])
+    assert not found(put).any()
+
+
+def test_people_among_each_other():
+    rays = watch()
+    mixed = change(rays, slice(3000, 3600), direction=rays.direction[3000])
+    order = np.argsort(mixed.t, kind="stable")
+    assert set(order[found(mixed.select(order))]) == set(range(3000, 3600))
+
+
+def test_pauses_end_what_stands_still():
+    rays = watch(1)
+    still = change(rays, slice(0, 90), direction=rays.direction[0])
+    paused = change(still, slice(45, None), t=lambda t: t + 0.6)
+    assert found(still)[:90].all() and not found(paused).any()
