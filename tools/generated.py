@@ -41,6 +41,13 @@ def presets() -> str:
     return preset_table()
 
 
+def checks() -> str:
+    """What the sanity card of rays looks for."""
+    from nerg_mi.rays.checks.registry import check_table
+
+    return check_table()
+
+
 def recipes() -> str:
     """What each gaze recipe sets: its field, length, losses and probes."""
     from nerg_mi.training.gaze.recipes import RECIPES, FieldChoices
@@ -115,6 +122,7 @@ def _choose_variant() -> None:
 PARTS: dict[str, Callable[[], str]] = {
     "plugins": plugins,
     "presets": presets,
+    "checks": checks,
     "recipes": recipes,
     "registered": registered,
 }

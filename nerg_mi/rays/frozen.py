@@ -8,7 +8,7 @@ from .rays import Rays
 from .sessions import Sessions
 
 _STILL = 2e-4  # radians between one ray and the next; trackers that see the eyes make more noise
-_LASTS = 1.0  # seconds; such trackers reach 0.4 at most in 70 recordings
+_LASTS = 1.0  # seconds; such trackers reach 0.4 at most in 58 recordings
 _PAUSE = 0.5  # seconds without a ray after which gaze is new
 _MOVED, _TURNED = 0.02, 0.05  # metres and radians of a head that moves meanwhile
 _BLOCK = 1 << 18

@@ -62,3 +62,28 @@ def test05_rays_sizes_and_derivatives(benchmark, monkeypatch, capsys):
     printed, there = lines(capsys.readouterr().out), page("numerics.md")
     cases = {line.rsplit("|", 3)[0] for line in there}
     assert len(printed) > 10 and all(line.rsplit("|", 3)[0] in cases for line in printed)
+
+
+@pytest.fixture
+def made(benchmark):
+    """Recordings that are right, of four people who walk about for two minutes."""
+    return benchmark("tracking_people").make_recording(4, 120.0)
+
+
+def test06_checks_of_tracking(benchmark, monkeypatch, tmp_path, capsys, made):
+    checks = benchmark("tracking_checks")
+    monkeypatch.setattr(checks, "make_recording", lambda: made)
+    checks.main(["--data", str(tmp_path), "--mistake", "lengths in mm"])
+    head, _, row = lines(capsys.readouterr().out)
+    assert head in page("tracking.md") and row.startswith("| lengths in mm taken for m |")
+    assert checks.named(made) == [] and checks.named(checks.bare(made)) == []
+
+
+def test07_planted_mistakes_are_named(benchmark, made):
+    """Each of them, by the check that is there for it, in all of a recording or in the half of it."""
+    people, checks = benchmark("tracking_people"), benchmark("tracking_checks")
+    for mistake in people.MISTAKES:
+        spread = people.last_rows if "rays" in mistake.of else people.last_people
+        share = 1.0 if "all" in mistake.of and mistake.check != "frames" else 0.5
+        found = checks.named(mistake.plant(made, spread(made, share)))
+        assert mistake.check in found or (mistake.name == "ms taken for s" and "times" in found), mistake.name

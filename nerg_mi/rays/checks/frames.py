@@ -73,7 +73,9 @@ def _code(cells: np.ndarray) -> np.ndarray:
 def _check_heights(stays: _Stays, told: np.ndarray) -> tuple[list[str], np.ndarray]:
     """Heads at heights that differ by more than people do."""
     like_heads = (stays.height > _HEADS[0]) & (stays.height < _HEADS[1])
-    usual = float(np.median(stays.height[like_heads] if like_heads.any() else stays.height))
+    if like_heads.mean() < 0.5:
+        return [], told & False  # all of them are wrong, which another check tells
+    usual = float(np.median(stays.height[like_heads]))
     odd = (stays.height > usual + _HIGHER) | (stays.height < usual - _LOWER)
     if not odd.any() or odd.all():
         return [], told & False

@@ -35,7 +35,7 @@ def _check_head(figures: Figures) -> list[str]:
     off, all_ = (np.bincount(rays.person[mask], minlength=count) for mask in (beyond, known))
     who = np.flatnonzero((off >= _FEW) & (off > _SHARE * all_))
     if not who.size:
-        return _check_following(figures, known)
+        return _check_following(figures, rays.head, known)
     wrong = np.zeros(count, bool)
     wrong[who] = True
     share = 100 * off[who].sum() / all_[who].sum()
@@ -43,17 +43,17 @@ def _check_head(figures: Figures) -> list[str]:
     rows = np.flatnonzero(known & wrong[rays.person])
     return [
         f"{share:.0f} % of the directions{whose} lie more than 60 degrees from where the head points; "
-        + (_mirror(figures, rows) or _guess(figures, np.flatnonzero(beyond & wrong[rays.person])))
+        + (_mirror(figures, rays.head, rows) or _guess(figures, rays.head, np.flatnonzero(beyond & wrong[rays.person])))
     ]
 
 
-def _check_following(figures: Figures, known: np.ndarray) -> list[str]:
+def _check_following(figures: Figures, heads: np.ndarray, known: np.ndarray) -> list[str]:
     """Gaze that goes against the head along an axis of the file, or pays no heed to it: where heads turn, gaze does."""
     rays = figures.rays
     (rows,) = np.nonzero(known)
     rows = rows[:: max(1, len(rows) // MOST)]
     R, person, count = to_source(rays), rays.person[rows], len(rays.persons)
-    head, d, n = rays.head[rows] @ R.T, rays.direction[rows] @ R.T, np.bincount(person, minlength=count)
+    head, d, n = heads[rows] @ R.T, rays.direction[rows] @ R.T, np.bincount(person, minlength=count)
     mean = lambda v: np.stack([np.bincount(person, weights=c, minlength=count) for c in v.T]) / np.maximum(n, 1)
     (mh, md), cross = (mean(head), mean(d)), mean(head * d)
     spread = np.sqrt(np.maximum(mean(head**2) - mh**2, 0.0))
@@ -77,11 +77,11 @@ def _check_following(figures: Figures, known: np.ndarray) -> list[str]:
     return out
 
 
-def _mirror(figures: Figures, rows: np.ndarray) -> str:
+def _mirror(figures: Figures, heads: np.ndarray, rows: np.ndarray) -> str:
     """The remedy where the directions with some axes of the file negated would all be about the head."""
     rays, rows = figures.rays, rows[:: max(1, len(rows) // MOST)]
     R = to_source(rays)
-    head, d = rays.head[rows] @ R.T, rays.direction[rows] @ R.T
+    head, d = heads[rows] @ R.T, rays.direction[rows] @ R.T
     for signs in sorted(itertools.product((1.0, -1.0), repeat=3), key=lambda s: -sum(s))[1:]:
         if np.mean(np.einsum("ij,ij->i", head, d * signs) < _COSINE) < 0.5 * _SHARE:
             axes = " and ".join("xyz"[i] for i in range(3) if signs[i] < 0)
@@ -89,10 +89,10 @@ def _mirror(figures: Figures, rows: np.ndarray) -> str:
     return ""
 
 
-def _guess(figures: Figures, rows: np.ndarray) -> str:
+def _guess(figures: Figures, heads: np.ndarray, rows: np.ndarray) -> str:
     """The remedy, by what the directions (rows) that are far from the head have in common."""
     rays, rows = figures.rays, rows[:: max(1, len(rows) // MOST)]
-    head, d = rays.head[rows].astype(np.float64), rays.direction[rows]
+    head, d = heads[rows].astype(np.float64), rays.direction[rows]
     own = np.einsum("nij,nj->ni", head_frames(head), d)
     in_world, in_head = (np.linalg.norm(v.mean(axis=0)) for v in (d, own))
     if in_world > _ONE_WAY and in_head < _MANY_WAYS:

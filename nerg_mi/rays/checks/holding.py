@@ -14,7 +14,7 @@ from .protocol import Check
 
 _LAG = 0.08  # seconds between two directions that are compared; a fixation takes 0.2 and more
 _TURNS = 20.0, 200.0  # degrees a second of heads that are looked at
-_BETTER = 0.8  # of 56 recordings that are right, no exchange makes gaze turn less than 0.97 as fast
+_BETTER = 0.8  # of 58 recordings that are right, no exchange makes gaze turn less than 0.97 as fast
 _FEW = 300
 _MOST = 1 << 18, 1 << 10  # rays looked at in runs of so many
 _FLIPS = {"left and right": (1.0, -1.0, 1.0), "up and down": (1.0, 1.0, -1.0), "both": (1.0, -1.0, -1.0)}
@@ -24,7 +24,7 @@ def _check_holding(figures: Figures) -> list[str]:
     rays = figures.rays
     if rays.head is None or figures.selected:
         return []
-    turned, person = _turned(figures)
+    turned, person = _turned(figures, rays.head)
     if len(person) < _FEW:
         return []
     if found := _best_exchange(turned):
@@ -51,7 +51,7 @@ def _best_exchange(turned: np.ndarray) -> str:
     return list(_FLIPS)[best] if others[best] < _BETTER * now else ""
 
 
-def _turned(figures: Figures) -> tuple[np.ndarray, np.ndarray]:
+def _turned(figures: Figures, heads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """How far gaze turns (4, n) while the head does, as it is and with each of `_FLIPS`; and the persons (n,)."""
     rays, n, (most, run) = figures.rays, len(figures.rays), _MOST
     rows = np.arange(n)
@@ -68,7 +68,7 @@ def _turned(figures: Figures) -> tuple[np.ndarray, np.ndarray]:
     lag = max(1, round(_LAG / float(np.median(step))))
     if len(rows) <= lag:
         return nothing
-    dt, head = t[lag:] - t[:-lag], rays.head[rows].astype(np.float64)
+    dt, head = t[lag:] - t[:-lag], heads[rows].astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         speed = np.degrees(np.linalg.norm(head[lag:] - head[:-lag], axis=1)) / dt
     use = (person[lag:] == person[:-lag]) & (dt > 0) & (dt < 2 * _LAG) & (speed > _TURNS[0]) & (speed < _TURNS[1])
