@@ -57,7 +57,8 @@ def named(rays: Rays) -> list[str]:
 
 
 def read_eyenavgs(files: list[Path], scale: float) -> Rays:
-    """Recordings of EyeNavGS by their columns: the left eye's rows, and how far away the right eye is."""
+    """Recordings of EyeNavGS by their columns: the left eye's rows, and how far away the right eye is. The reader that
+    there is for them leaves out those whose gaze is frozen or locked to the head."""
     builder = RaysBuilder(Frame(up="y"))
     builder.note(floor="unknown")
     columns = {"Position": "XYZ", "Quaternion": "XYZW", "GazeQ": "XYZW"}
@@ -124,9 +125,13 @@ def clean_rows(made: Rays, recorded: Rays | None, data: Path) -> list[list[str]]
         files = sorted((data / "eyenavgs" / place).glob("*.csv.gz"))
         if files:
             rays = read_eyenavgs(files, scale)
-            frozen = np.bincount(rays.person[figures_of(rays).frozen], minlength=len(rays.persons)) > 0
-            sets[f"EyeNavGS, {place}: gaze that is frozen"] = rays.select(frozen[rays.person])
-            sets[f"EyeNavGS, {place}: all others"] = rays.select(~frozen[rays.person])
+            read = read_rays("eyenavgs", files)
+            sets[f"EyeNavGS, {place}"] = read
+            left_out = ~np.isin(rays.persons, read.persons)
+            sets[f"EyeNavGS, {place}, the recordings that its reader leaves out"] = rays.select(left_out[rays.person])
+    for name in ("gen1/mps_sample", "adt"):
+        if (data / "aria" / name).is_dir():
+            sets[f"Project Aria, {name}"] = read_rays("aria", data / "aria" / name)
     return [
         [name, str(len(np.unique(rays.person))), f"{len(rays):,}", ", ".join(named(rays)) or "-"]
         for name, rays in sets.items()

@@ -258,6 +258,13 @@ MISTAKES = (
         lambda r, m: _put(r, m, direction=r.head.astype(float)),
         head=True,
     ),
+    Mistake(
+        "the head's direction 0.06 s ago in place of gaze",
+        "locked",
+        lambda r, m: _put(r, m, direction=np.roll(r.head, round(0.06 * RATE), axis=0).astype(float)),
+        "people all",
+        head=True,
+    ),
     Mistake("a clock set back by 20 s", "clocks", _at_times(lambda t, start: t - 20.0), "rays"),
     Mistake("a clock set ahead by an hour", "clocks", _at_times(lambda t, start: t + 3600.0), "rays"),
     Mistake("ms taken for s", "clocks", _at_times(lambda t, start: start + 1000.0 * (t - start))),

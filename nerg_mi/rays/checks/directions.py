@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.rays.rays import Rays
 
-from .figures import MOST, Figures, name_some, to_source
+from .figures import ENOUGH, MOST, Figures, name_some, to_source
 from .protocol import Check
 from .walking import find_against_walking
 
@@ -68,7 +68,7 @@ def _check_hits(rays: Rays) -> list[str]:
 def _check_elevation(rays: Rays) -> list[str]:
     elevation = np.degrees(np.arcsin(np.clip(rays.direction[:: max(1, len(rays) // MOST), 2], -1, 1)))
     median = np.median(elevation)
-    if abs(median) <= _STEEP:
+    if abs(median) <= _STEEP or len(rays) < ENOUGH:
         return []
     return [
         f"half of the rays look more than {abs(median):.0f} degrees {'up' if median > 0 else 'down'}: "

@@ -15,6 +15,9 @@ from nerg_mi.rays.sessions import Sessions, find_sessions
 MOST = 200_000
 """Rays looked at, where a part of them says as much as all."""
 
+ENOUGH = 50
+"""Rays from which on something can be said of what most of them do: a second of a recording."""
+
 _NAMED = 3  # people
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from nerg_mi.rays.rays import Rays
 
-from .figures import MOST, Figures, to_source
+from .figures import ENOUGH, MOST, Figures, to_source
 from .protocol import Check
 
 _HEADS = 0.4, 2.3  # metres over the floor between which the median of all heads is
@@ -25,7 +25,7 @@ def _check_lengths(figures: Figures) -> list[str]:
             f"the origins span {extent.max():.0f} m, at a median height of {median:.0f} m: "
             "is the unit millimetres? (--units mm)"
         )
-    elif extent.max() < 0.05:
+    elif extent.max() < 0.05 and len(figures.rays) >= ENOUGH:
         out.append(f"the origins span {extent.max():.3f} m: is the unit larger than declared?")
     elif (extent[2] > 2.0 and extent[2] > min(extent[0], extent[1])) or (
         figures.floor_known and not _HEADS[0] <= median <= _HEADS[1]

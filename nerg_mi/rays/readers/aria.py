@@ -101,6 +101,7 @@ class Aria:
                 )
         others = sum((r.rows for r in recordings), Counter())
         builder.note(
+            floor="unknown",  # a world begins where the glasses were
             world=world,
             other_worlds={w: n for w, n in others.most_common(_WORLDS_NAMED + 1) if w != world},
             gaze=[
@@ -173,6 +174,7 @@ def _add(recording: _Recording, world: str, builder: RaysBuilder) -> None:
             origin,
             direction,
             rows=lines,
+            head=turn @ R[:, 2],
             hit=origin + distance[:, None] * direction,
             drop={_OTHER_WORLD: lost & elsewhere, "there is no pose of the glasses at that time": lost},
         )

@@ -120,6 +120,8 @@ def _add(path: Path, setting: SceneSetting, options: EyeNavGSOptions, builder: R
             eyes[:, side].mean(axis=1),
             sight[:, side].mean(axis=1),
             rows=lines,
+            head=(poses.rotations_from_quaternions(v[:, 0, 4:8]) @ _FORWARD) @ setting.upright.T,
+            eye_distance=np.where(paired, np.linalg.norm(eyes[:, 1] - eyes[:, 0], axis=1), np.nan),
             drop={**({fault: np.full(len(v), True)} if fault else {}), "the other eye's row is missing": ~paired},
         )
     return fault

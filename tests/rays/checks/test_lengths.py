@@ -35,3 +35,10 @@ def test_heights_over_a_floor_that_is_not_known():
     rays = walk(hit=False)
     low = replace(rays, origin=rays.origin - (0, 0, 1.8), metadata={**rays.metadata, "floor": "unknown"})
     assert warnings_of(low) == ""
+
+
+def test_a_moment_says_nothing_of_extents_and_elevations():
+    down = np.array([0.1, 0.1, -1.0]) / np.linalg.norm([0.1, 0.1, -1.0])
+    moment = walk(hit=False).select(slice(0, 2))
+    moment = replace(moment, direction=np.tile(down, (2, 1)))
+    assert warnings_of(moment) == ""
