@@ -7,7 +7,7 @@ import numpy as np
 from .figures import Figures, name_some
 from .protocol import Check
 
-_SHARE, _SECONDS = 0.01, 5.0  # of a person's rays: less is a moment without the eyes
+_SHARE, _SECONDS = 0.01, 10.0  # of a person's rays: less is a moment without the eyes
 
 
 def _check_frozen(figures: Figures) -> list[str]:

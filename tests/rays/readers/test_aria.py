@@ -113,6 +113,9 @@ def test_the_first_generation_against_a_computation_by_hand(recorded, gaze):
     assert len(rays) == 114 and rays.persons == ("mps_sample",)
     assert dropped(rays) == {"there is no pose of the glasses at that time": [[2, 8], [123, 124]]}
     assert rays.metadata["source_frame"]["up"] == "z" and rays.metadata["world"].startswith("ea7288b8")
+    assert rays.metadata["floor"] == "unknown"
+    ahead = rays_by_hand(folder / gaze, poses, GEN1, lambda row: np.array([0.0, 0, 1]))
+    assert np.allclose(rays.head, [direction for _, direction in ahead.values()], atol=1e-5)
 
 
 def test_ground_truth_of_a_digital_twin_against_a_computation_by_hand(recorded):

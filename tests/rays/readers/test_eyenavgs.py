@@ -57,6 +57,9 @@ def test_recordings_against_a_computation_by_hand(recorded, place, user):
     assert np.abs(rays.origin - upwards(area)).max() < 1e-3  # the rotation has four decimals
     sight = (ahead(left[:, 15:19]) + ahead(right[:, 15:19])) @ upright.T
     sight = upwards(sight / np.linalg.norm(sight, axis=1, keepdims=True))
+    assert np.abs(rays.head - upwards(ahead(left[:, 8:12]) @ upright.T)).max() < 1e-3
+    apart = np.median(np.linalg.norm(right[:, 5:8] - left[:, 5:8], axis=1)) / scale
+    assert abs(rays.metadata["eye_distance"][user] - apart) < 1e-4 and 0.058 < apart < 0.07
     assert np.abs(rays.direction - sight).max() < 1e-3
     assert np.allclose(rays.t, 1e-3 * left[:, 19]) and rays.persons == (user,)
     about = rays.metadata
