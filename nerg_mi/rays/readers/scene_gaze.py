@@ -118,7 +118,7 @@ class SceneGaze:
                 angles = angles_between(direction, other)
             self._angles.append(angles[np.isfinite(angles) & ~np.any(list(reasons.values()), axis=0)])
         reasons["no frame of the scene camera near that time has a pose"] = lost
-        self._builder.add(t, person, place, poses.rotate(turn, direction), rows=rows, drop=reasons)
+        self._builder.add(t, person, place, poses.rotate(turn, direction), rows=rows, head=turn[:, :, 2], drop=reasons)
 
     def finish(self, accounts: str) -> None:
         """Keep in the metadata how many frames were posed and how far the two ``accounts`` of the gaze differ ("pixels
@@ -130,7 +130,7 @@ class SceneGaze:
             middle, most = (round(float(x), 4) for x in np.percentile(found, [50, 95]))
             about |= {"compared": accounts, "median_degrees": middle, "p95_degrees": most}
         self._about.append(about)
-        self._builder.note(scene_camera=self._about, frames=str(self._options.frames or ""))
+        self._builder.note(scene_camera=self._about, frames=str(self._options.frames or ""), floor="unknown")
         if middle > _DIFFER:
             self._builder.complain(
                 f"{accounts} of the same gaze differ by {middle:.1f} degrees (median): is the calibration that of "
