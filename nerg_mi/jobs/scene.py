@@ -79,7 +79,7 @@ def write_scene(
         # The same scene, with a camera anywhere, to look around in.
         probe_file = Path(folder) / "scene.xml"
         write_text(
-            probe_file, scene.text(probe_file.parent, observer or upright(Eye(np.zeros(3), up), up), Lens(), 96).write()
+            probe_file, scene.text(probe_file.parent, observer or upright(Eye(np.zeros(3), up), up), Lens(), 96).xml()
         )
         taken = place.make(probe_file.parent, scene.lamps(1, 1)).taken
         values = {default_name(name, taken): value for name, value in probe_values().items()}
@@ -97,7 +97,7 @@ def write_scene(
     scene = replace(scene, usual=(max(away, usual), usual))
     text = scene.text(output.parent, camera, lens, options.width)
     text = replace(text, about=_about(output, text, place, scene), about_camera=chosen, about_observer=about)
-    write_text(output, text.write())
+    write_text(output, text.xml())
     written = [output, *made, *place.files]
     if walk is not None:
         write_frames(frames_file, _frames(walk, options.own, text.place.taken))

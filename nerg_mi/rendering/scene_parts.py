@@ -87,7 +87,7 @@ class SceneText:
     about_camera: str = ""
     about_observer: str = ""
 
-    def write(self) -> str:
+    def xml(self) -> str:
         """The text of the file."""
         return document(_nodes(self), self.about, self.place.version)
 

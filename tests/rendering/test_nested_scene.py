@@ -45,7 +45,7 @@ def shown(path, out):
     camera = Eye(np.array([0.3, 0, 4.0]), np.array([0, 0, 0.0]))
     place = nested_place(path, out.parent)
     scene = SceneText(place, Attention(), camera, None, np.array([0.0, 1, 0]), width=12)
-    out.write_text(scene.write())
+    out.write_text(scene.xml())
     return load_scene(out)
 
 

@@ -28,7 +28,7 @@ def written(folder, **more):
     eye, camera = Eye(np.array([0, 0, 5.0]), np.array([0, 0, 0.0])), Eye(np.array([4, 1, 2.0]), np.array([0, 0, 0.5]))
     given = {"place": CUBE, "attention": Attention(), "camera": camera, "observer": eye, "up": UP, "width": 24} | more
     scene = SceneText(**given)
-    (folder / "scene.xml").write_text(scene.write())
+    (folder / "scene.xml").write_text(scene.xml())
     return scene
 
 

@@ -21,7 +21,7 @@ def probe(rgb, tmp_path):
     """A cube of ±1, whose up is +y."""
     up = np.array([0.0, 1, 0])
     place = Place(beside=(element("shape", type="cube"),))
-    (tmp_path / "a.xml").write_text(SceneText(place, Attention(), EYE, EYE, up).write())
+    (tmp_path / "a.xml").write_text(SceneText(place, Attention(), EYE, EYE, up).xml())
     return Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
 
 
