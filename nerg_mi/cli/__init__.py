@@ -27,6 +27,7 @@ COMMANDS = {
     "render": "Render a scene file to an EXR or PNG file.",
     "rays": "Import tracking files as rays of attention, and look at what they hold.",
     "poses": "Find out from where photos, or frames of a video, were taken.",
+    "align": "Find how tracking lies in a place: from points, a twin, cameras, or the tracking alone.",
     "train": "Train a radiance field on posed photos, or a gaze field on rays.",
     "eval": "Score a trained radiance field on held-out views, or a gaze field on held-out rays.",
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",

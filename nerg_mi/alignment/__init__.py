@@ -1,0 +1,1 @@
+"""From one coordinate system to another: the similarity that leads from tracking, or a twin, into a place."""

@@ -1,0 +1,125 @@
+"""The similarity that carries points to points, in closed form.
+
+S. Umeyama: Least-squares estimation of transformation parameters between two point patterns, PAMI 13 (1991). Where up
+is known in both frames, what is left is a turn about it: the same in the plane.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+
+LINE = 0.01
+"""Points lie on a line where their second extent is less than this share of the first."""
+
+PLANE = 0.02
+"""Points lie in a plane, which looks the same in a mirror, where their third extent is less than this share."""
+
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+"""A mirrored frame: x negated. Of any other axis, or of all three, it is this and a rotation."""
+
+
+def fit_similarity(
+    source: np.ndarray,
+    target: np.ndarray,
+    weights: np.ndarray | None = None,
+    *,
+    upright: bool = False,
+    scale: float | None = None,
+) -> np.ndarray:
+    """The (4, 4) proper similarity that carries ``source`` (N, 3) to ``target`` (N, 3) with the least weighted sum of
+    squares.
+
+    ``upright``: z is up in both, and stays up; ``scale``: known, else found. Nothing is asked of the points: see
+    `check_points`.
+    """
+    w = np.full(len(source), 1 / len(source)) if weights is None else np.asarray(weights) / np.sum(weights)
+    x0, y0 = w @ source, w @ target
+    x, y = source - x0, target - y0
+    covariance = (y * w[:, None]).T @ x
+    rotation = _turn(covariance) if upright else _rotation(covariance)
+    spread = float(w @ np.sum(x * x, axis=1))
+    if scale is None:
+        scale = float(np.sum(covariance * rotation)) / spread if spread > 0 else 1.0
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * rotation
+    matrix[:3, 3] = y0 - matrix[:3, :3] @ x0
+    return matrix
+
+
+def _rotation(covariance: np.ndarray) -> np.ndarray:
+    u, _, vt = np.linalg.svd(covariance)
+    sign = np.ones(3)
+    # The nearest orthogonal matrix may be a mirror; the nearest rotation gives up the least of the three.
+    sign[2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    return (u * sign) @ vt
+
+
+def _turn(covariance: np.ndarray) -> np.ndarray:
+    c = covariance
+    angle = np.arctan2(c[1, 0] - c[0, 1], c[0, 0] + c[1, 1])
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def move(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """``points`` (..., 3) by a (4, 4) matrix."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def scale_of(matrix: np.ndarray) -> float:
+    """Length in the target of one unit of the source."""
+    return float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
+
+
+def errors(matrix: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """How far ``matrix`` carries points from where they belong, (N,), in units of the source."""
+    return np.linalg.norm(move(matrix, source) - target, axis=1) / scale_of(matrix)
+
+
+def leave_one_out(
+    source: np.ndarray, target: np.ndarray, *, upright: bool = False, scale: float | None = None
+) -> np.ndarray:
+    """How far each point is from where the others carry it, (N,) in units of the source; NaN where the others are too
+    few or lie on a line."""
+    out = np.full(len(source), np.nan)
+    for k in range(len(source)):
+        rest = np.arange(len(source)) != k
+        if not _refused(source[rest], upright) and not _refused(target[rest], upright):
+            matrix = fit_similarity(source[rest], target[rest], upright=upright, scale=scale)
+            if scale_of(matrix) > 0:
+                out[k] = errors(matrix, source[k : k + 1], target[k : k + 1])[0]
+    return out
+
+
+def check_points(source: np.ndarray, target: np.ndarray, what: str, *, upright: bool = False) -> None:
+    """Raise `NergError` for points that do not tell a similarity: too few, at one place, on a line, not finite.
+
+    ``what``: whose points they are, for the message ('the file "pairs.csv"').
+    """
+    if not (np.isfinite(source).all() and np.isfinite(target).all()):
+        raise NergError(f"{what} has a coordinate that is not a finite number; correct it or leave its pair out")
+    for points, frame in ((source, "tracking"), (target, "place")):
+        why = _refused(points, upright)
+        if why:
+            raise NergError(f"{what}: {why} in the frame of the {frame}, which leaves the alignment open; pick others")
+
+
+def _refused(points: np.ndarray, upright: bool) -> str:
+    """Why ``points`` tell no similarity; empty where they do."""
+    least = 2 if upright else 3
+    if len(points) < least:
+        return f"there are {len(points)} pairs of points where {least} or more are needed"
+    around = points - points.mean(axis=0)
+    around = around[:, :2] if upright else around
+    size = np.linalg.svd(around, compute_uv=False)
+    if not size[0] > 1e-9 * max(1.0, float(np.abs(points).max())):
+        return f"all points lie {'above one another' if upright else 'at one place'}"
+    return "" if upright or size[1] > LINE * size[0] else "all points lie on a line"
+
+
+def in_plane(points: np.ndarray) -> bool:
+    """Whether ``points`` (N, 3) lie in a plane, so that a mirrored frame fits them as well."""
+    size = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return len(size) < 3 or bool(size[2] < PLANE * size[0])
