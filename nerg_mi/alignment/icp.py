@@ -21,9 +21,9 @@ from .evidence import Fit, Target, Tell, angles, pair_covariance
 from .surface import PlaceSurface, surface_of_points, thinned
 from .umeyama import MIRROR, fit_similarity, move, scale_of
 
-_TURNS, _COARSE, _FINE = 1500, 220, 4000
+_TURNS, _COARSE, _FINE = 1000, 150, 2000
 _SCALES = np.exp(np.linspace(-0.25, 0.25, 5))
-_STARTS, _LAST = 40, 5
+_STARTS, _LAST = 30, 3
 # Share of the points of either side that the other one is taken to have too.
 _OVERLAP = 0.8
 # A mirrored twin is told where it fits so much better; a rival of another placement where it fits almost as well.
@@ -51,7 +51,7 @@ class Twin:
         s = scale_of(best.matrix)
         x, y, forth = _closest(twin, place.points, KDTree(place.points), KDTree(twin), best.matrix, _OVERLAP)
         basis = upright_basis(False) if target.upright else ALL
-        off = KDTree(place.points).query(move(best.matrix, twin))[0] / s
+        off = _nearest(KDTree(place.points), move(best.matrix, twin))[0] / s
         kept = np.sort(off)[: int(_OVERLAP * len(off))]
         notes = [
             f"{len(twin):,} points of the twin; {_OVERLAP:.0%} of them lie within {100 * kept[-1]:.2g} cm",
@@ -124,17 +124,17 @@ def _placed(twin: np.ndarray, place: PlaceSurface, target: Target) -> list[_Plac
         matrix = np.eye(4)
         matrix[:3, :3] = s * turn
         matrix[:3, 3] = y0 - s * turn @ x0
-        found.append(_icp(x, y, matrix, target, 25))
+        found.append(_icp(x, y, matrix, target, 15))
     found.sort(key=lambda f: f.cost / scale_of(f.matrix))
     x, y = few(twin, _FINE), few(place.points, 2 * _FINE)
-    last = [_icp(x, y, f.matrix, target, 40) for f in _different(found, place.diagonal)[:_LAST]]
+    last = [_icp(x, y, f.matrix, target, 25) for f in _different(found, place.diagonal)[:_LAST]]
     return sorted(last, key=lambda f: f.cost / scale_of(f.matrix))
 
 
 def _turns(upright: bool) -> list[np.ndarray]:
     if upright:
         return [Rotation.from_rotvec([0, 0, a]).as_matrix() for a in 2 * np.pi * np.arange(60) / 60]
-    return list(Rotation.random(_TURNS, random_state=0).as_matrix())
+    return list(Rotation.from_quat(np.random.default_rng(0).normal(size=(_TURNS, 4))).as_matrix())
 
 
 def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: Target, most: int) -> _Placed:
@@ -157,13 +157,18 @@ def _closest(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of ``x`` and of ``y`` that belong together, (M, 3) each, nearest from either side, without those that are
     farthest apart; and which were found from the side of ``x``, (M,) bool."""
-    forth, at = tree.query(move(matrix, x))
-    back, of = own.query(move(np.linalg.inv(matrix), y))
+    forth, at = _nearest(tree, move(matrix, x))
+    back, of = _nearest(own, move(np.linalg.inv(matrix), y))
     back = back * scale_of(matrix)
     a = np.flatnonzero(forth <= np.quantile(forth, share))
     b = np.flatnonzero(back <= np.quantile(back, share))
     side = np.arange(len(a) + len(b)) < len(a)
     return np.concatenate([x[a], x[of[b]]]), np.concatenate([y[at[a]], y[b]]), side
+
+
+def _nearest(tree: KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    distance, index = tree.query(points)
+    return np.asarray(distance), np.asarray(index)
 
 
 def _different(found: list[_Placed], size: float) -> list[_Placed]:

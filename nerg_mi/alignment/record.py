@@ -92,9 +92,10 @@ def _spread(values: np.ndarray, unit: str) -> dict[str, float | None]:
 
 
 def _uncertainty(fit: Fit) -> dict[str, float] | None:
-    if fit.covariance is None or not np.isfinite(fit.covariance).all():
+    covariance = fit.covariance
+    if covariance is None or not np.isfinite(covariance).all():
         return None
-    part = lambda a, b: float(np.sqrt(max(np.trace(fit.covariance[a:b, a:b]), 0.0)))
+    part = lambda a, b: float(np.sqrt(max(np.trace(covariance[a:b, a:b]), 0.0)))
     return {
         "cm": 100 * part(3, 6) / scale_of(fit.matrix),
         "degrees": float(np.degrees(part(0, 3))),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -66,7 +67,8 @@ def refine(
                 last[key] = weighed(q)
             return last[key]
 
-        q = least_squares(lambda q: at(q)[0], q, lambda q: at(q)[1], x_scale="jac", max_nfev=most).x
+        derivatives: Any = lambda q: at(q)[1]
+        q = least_squares(lambda q: at(q)[0], q, derivatives, x_scale="jac", max_nfev=most).x
     r, by = stacked(q)
     z = r * r * counts
     group = np.concatenate([s.group for s in scores])

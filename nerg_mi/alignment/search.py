@@ -77,8 +77,8 @@ class _Maps:
         on = np.exp(-0.5 * (surface.distance.at(nodes) / wide) ** 2)
         open_ = np.exp(-0.5 * (surface.blocked.at(nodes) / wide) ** 2)
         # Twice as wide, so that what leaves it on one side does not come in on the other.
-        self.size = [fft.next_fast_len(int(2 * n), real=True) for n in self.shape[:2]]
-        levels = lambda v: fft.rfft2(_by_level(v.reshape(self.shape)), self.size, axes=(1, 2))
+        self.size = [_fast(2 * int(n)) for n in self.shape[:2]]
+        levels = lambda v: np.asarray(fft.rfft2(_by_level(v.reshape(self.shape)), self.size, axes=(1, 2)))
         self.on, self.open = levels(on), levels(open_)
 
     def best(self, hits: np.ndarray, free: np.ndarray, angle: float, floor: tuple[float, float]) -> list[Guess]:
@@ -118,9 +118,21 @@ class _Maps:
         inside = ((index >= (0, 0, 0)) & (index < (*self.shape[:2], self.shape[2]))).all(axis=1)
         flat = np.ravel_multi_index(tuple(index[inside].T), self.shape)
         count = np.bincount(flat, minlength=int(np.prod(self.shape))).reshape(self.shape)
-        spectrum = fft.rfft2(_by_level(count), self.size, axes=(1, 2))
+        spectrum = np.asarray(fft.rfft2(_by_level(count), self.size, axes=(1, 2)))
         joint = np.einsum("zxy,zxy->xy", np.conj(spectrum), maps)
-        return fft.irfft2(joint, self.size) / max(len(moved), 1)
+        return np.asarray(fft.irfft2(joint, self.size)) / max(len(moved), 1)
+
+
+def _fast(length: int) -> int:
+    """The next length that factors into 2, 3 and 5, which transforms are fast at."""
+    while True:
+        rest = length
+        for p in (2, 3, 5):
+            while rest % p == 0:
+                rest //= p
+        if rest == 1:
+            return length
+        length += 1
 
 
 def _by_level(values: np.ndarray) -> np.ndarray:

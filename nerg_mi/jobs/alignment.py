@@ -188,8 +188,8 @@ def _refusal(fit: Fit, options: AlignOptions) -> str:
     """Why a fit is refused; empty where it is not."""
     if fit.mirrored is not None:
         return (
-            f"the tracking is mirrored: {fit.mirrored}; import it again with the other --hand, or correct the axis that "
-            "is negated in the evidence"
+            f"the tracking is mirrored: {fit.mirrored}; import it again with the other --hand, or correct the axis "
+            "that is negated in the evidence"
         )
     median = float(np.median(fit.centimetres)) if len(fit.centimetres) else 0.0
     if not median <= options.max_residual:

@@ -1,0 +1,270 @@
+"""How well each kind of evidence finds where tracking lies in a place whose frame is another one.
+
+    python benchmarks/alignment.py [--trials 50] [--only KIND] [--shoppers 12] [--update docs/tracking.md]
+
+The place is the demo store's trained field, carried into another frame by a random similarity: scale from 0.14 to 7.4,
+a shift of some ten metres, and any rotation, or, where up has to be known, any turn about it. The tracking is of
+generated shoppers, in metres; their hit points are those of rays cast at the store's mesh, with a noise of 2 cm.
+`right`: trials in which a fit was found, not refused, and is less than 10 cm (of the tracking) and 2 degrees from the
+truth. Errors are medians over these, of the median head of each; `95 %`: of all heads' errors in centimetres.
+`mirror named`: the same with the tracking's x axis negated, how often that is said. `residual cm`: the median that the
+fit itself states.
+
+Second table, where `../shared/data/fox` (or NERG_DATA) is: people looking about between the cameras of the fox photos,
+in a random other frame, from five picked points with errors of 1 % of the cameras' spread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.alignment.camera_poses import Cameras
+from nerg_mi.alignment.evidence import Evidence, Target
+from nerg_mi.alignment.icp import Twin
+from nerg_mi.alignment.pairs import Pairs
+from nerg_mi.alignment.point_file import read_surface
+from nerg_mi.alignment.surface import Felt, feel
+from nerg_mi.alignment.tracking import Tracking
+from nerg_mi.alignment.umeyama import MIRROR, errors, move, scale_of
+from nerg_mi.errors import NergError
+from nerg_mi.rays.rays import Rays
+from output import print_table, write_rows
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+ROOT = Path(__file__).resolve().parents[1]
+TITLE, FOX = "Alignment by evidence, in the store", "Fox, from five picked points"
+HEAD = "evidence|known besides|right|error cm|95 %|degrees|scale %|residual cm|mirror named|s".split("|")
+
+
+@dataclass(frozen=True)
+class World:
+    """The store: what rays found of its field, its mesh as points, and its shoppers with their hit points."""
+
+    felt: Felt
+    mesh: np.ndarray
+    rays: Rays
+
+
+def make_world(shoppers: int, rays: int) -> World:
+    from nerg_mi.jobs.backend import select_backend
+    from nerg_mi.scenes.store import twin
+    from nerg_mi.scenes.store.layout import build
+    from nerg_mi.scenes.store.shoppers import simulate
+    from nerg_mi.training.geometry.places import place_of_field
+
+    ns, folder = select_backend("llvm_ad_rgb"), Path(twin.__file__).parent
+    ids, times, origin, direction = simulate(build(0), shoppers=shoppers, seed=5)
+    persons, person = np.unique(ids, return_inverse=True)
+    hit = origin + direction * twin.cast(origin, direction)[:, None]
+    hit += np.random.default_rng(1).normal(0, 0.02, hit.shape)
+    walked = Rays(times / 1000, person, tuple(persons), origin, direction, np.ones(len(ids)), hit)
+    place = place_of_field(folder / "store.safetensors", ns)
+    assert place.medium is not None
+    felt = feel(place.medium, np.array(place.box.lower), np.array(place.box.upper), rays)
+    return World(felt, read_surface(folder / "twin.ply"), walked)
+
+
+def random_similarity(rng: np.random.Generator, upright: bool) -> np.ndarray:
+    turn = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)]) if upright else Rotation.random(random_state=rng)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.exp(rng.uniform(-2, 2)) * turn.as_matrix()
+    matrix[:3, 3] = rng.normal(0, 10, 3)
+    return matrix
+
+
+# ----------------------------------------------------------------------------
+# Evidence: what it is, given the truth from the tracking to the place
+# ----------------------------------------------------------------------------
+
+Maker = Callable[[World, np.ndarray, np.random.Generator, bool], tuple[Evidence, Target]]
+
+
+def pairs(count: int, upright: bool) -> Maker:
+    def make(world, truth, rng, mirrored):
+        x = world.mesh[rng.permutation(len(world.mesh))[:count]]
+        y = move(truth, x + rng.normal(0, 0.01, x.shape))
+        x = x + rng.normal(0, 0.01, x.shape)
+        return Pairs(move(MIRROR, x) if mirrored else x, y), Target(upright=upright)
+
+    return make
+
+
+def twin(upright: bool) -> Maker:
+    def make(world, truth, rng, mirrored):
+        mesh = world.mesh + rng.normal(0, 0.005, world.mesh.shape)
+        return Twin(move(MIRROR, mesh) if mirrored else mesh), Target(felt=world.felt.moved(truth), upright=upright)
+
+    return make
+
+
+def cameras(world, truth, rng, mirrored):
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :3, :3] = Rotation.random(40, random_state=rng).as_matrix()
+    poses[:, :3, 3] = rng.uniform((0.5, 0.5, 1.2), (7.5, 5.5, 1.9), (40, 3))
+    other = poses.copy()
+    turn = truth[:3, :3] / scale_of(truth)
+    noise = Rotation.from_rotvec(rng.normal(0, np.radians(0.5), (40, 3))).as_matrix()
+    other[:, :3, :3] = noise @ (turn @ poses[:, :3, :3])
+    other[:, :3, 3] = move(truth, poses[:, :3, 3] + rng.normal(0, 0.02, (40, 3)))
+    # One in ten is somewhere else.
+    other[:4, :3, 3] += rng.normal(0, 5 * scale_of(truth), (4, 3))
+    other[:4, :3, :3] = Rotation.random(4, random_state=rng).as_matrix()
+    if mirrored:
+        poses[:, :3, 3] = move(MIRROR, poses[:, :3, 3])
+    return Cameras(poses, other), Target(upright=False)
+
+
+def tracking(hits: bool) -> Maker:
+    def make(world, truth, rng, mirrored):
+        from dataclasses import replace
+
+        rays = world.rays if hits else replace(world.rays, hit=None)
+        if mirrored:
+            rays = replace(
+                rays,
+                origin=move(MIRROR, rays.origin),
+                direction=move(MIRROR, rays.direction),
+                hit=None if rays.hit is None else move(MIRROR, rays.hit),
+            )
+        return Tracking(rays), Target(felt=world.felt.moved(truth), scale=None if hits else scale_of(truth))
+
+    return make
+
+
+# Name, what is known besides, whether up is, how it is made.
+KINDS: dict[str, tuple[str, str, bool, Maker]] = {
+    "pairs": ("5 picked points, off by 1.4 cm an axis", "", False, pairs(5, False)),
+    "floor": ("2 picked points", "up", True, pairs(2, True)),
+    "twin": ("twin: the store's mesh", "", False, twin(False)),
+    "upright-twin": ("twin: the store's mesh", "up", True, twin(True)),
+    "cameras": ("40 cameras, 4 of them wrong", "", False, cameras),
+    "tracking": ("tracking with hit points", "up, floor", True, tracking(True)),
+    "heads": ("tracking without hit points", "up, floor, scale", True, tracking(False)),
+}
+
+
+def measure(world: World, kind: str, trials: int, mirrors: int) -> dict:
+    """One row."""
+    name, known, upright, make = KINDS[kind]
+    found, off, named = [], [], []
+    began = time.perf_counter()
+    for k in range(trials):
+        rng = np.random.default_rng([k, 7])
+        truth = random_similarity(rng, upright)
+        evidence, target = make(world, truth, rng, False)
+        try:
+            fit = evidence.fit(target, lambda *_: None)
+        except NergError as error:
+            print(f"{kind} {k}: {error}", flush=True)
+            continue
+        each = 100 * errors(fit.matrix, world.rays.origin, move(truth, world.rays.origin))
+        turned = fit.matrix[:3, :3] @ truth[:3, :3].T / scale_of(fit.matrix) / scale_of(truth)
+        angle = float(np.degrees(Rotation.from_matrix(turned).magnitude()))
+        scale = 100 * abs(scale_of(fit.matrix) / scale_of(truth) - 1)
+        residual = float(np.median(fit.centimetres))
+        right = np.median(each) < 10 and angle < 2 and residual < 10 and fit.mirrored is None
+        if not right:
+            print(
+                f"{kind} {k}: {np.median(each):.1f} cm, {angle:.1f} degrees, {fit.mirrored}, {fit.doubts}", flush=True
+            )
+        else:
+            found.append((np.median(each), angle, scale, residual))
+            off.append(each)
+    seconds = (time.perf_counter() - began) / trials
+    for k in range(mirrors if kind not in ("floor", "heads") else 0):
+        rng = np.random.default_rng([k, 7])
+        evidence, target = make(world, random_similarity(rng, upright), rng, True)
+        try:
+            named.append(evidence.fit(target, lambda *_: None).mirrored is not None)
+        except NergError as error:
+            named.append("mirror" in str(error))
+    median = np.median(np.array(found), axis=0) if found else np.full(4, np.nan)
+    return {
+        "kind": kind,
+        "evidence": name,
+        "known besides": known,
+        "right": len(found),
+        "trials": trials,
+        "error cm": median[0],
+        "95 %": np.percentile(np.concatenate(off), 95) if off else np.nan,
+        "degrees": median[1],
+        "scale %": median[2],
+        "residual cm": median[3],
+        "named": sum(named),
+        "mirrors": len(named),
+        "s": seconds,
+    }
+
+
+def cells(row: dict) -> list[str]:
+    numbers = [f"{row[k]:.2g}" for k in ("error cm", "95 %", "degrees", "scale %", "residual cm")]
+    named = f"{row['named']} of {row['mirrors']}" if row["mirrors"] else ""
+    right = f"{row['right']} of {row['trials']}"
+    return [row["evidence"], row["known besides"], right, *numbers, named, f"{row['s']:.2g}"]
+
+
+def measure_fox(trials: int) -> list[list[str]] | None:
+    """People about the fox, from five points; None where the photos are not there."""
+    path = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data")) / "fox" / "transforms.json"
+    if not path.is_file():
+        return None
+    poses = np.array([f["transform_matrix"] for f in json.loads(path.read_text())["frames"]], float)
+    centers = poses[:, :3, 3]
+    size = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    off, angle, stated = [], [], []
+    for k in range(trials):
+        rng = np.random.default_rng([k, 11])
+        # From metres of the tracking to the units of the photos' frame.
+        truth = random_similarity(rng, False)
+        heads = centers[rng.integers(0, len(centers), 400)] + rng.normal(0, 0.1 * size, (400, 3))
+        picked = centers.mean(axis=0) + rng.uniform(-0.7, 0.7, (5, 3)) * size
+        noisy = picked + rng.normal(0, 0.01 * size, picked.shape)
+        back = np.linalg.inv(truth)
+        fit = Pairs(move(back, picked), noisy).fit(Target(upright=False), lambda *_: None)
+        off.append(np.linalg.norm(move(fit.matrix, move(back, heads)) - heads, axis=1) / size)
+        turned = fit.matrix[:3, :3] @ truth[:3, :3].T / scale_of(fit.matrix) / scale_of(truth)
+        angle.append(np.degrees(Rotation.from_matrix(turned).magnitude()))
+        stated.append(np.median(fit.centimetres) / 100 * scale_of(fit.matrix) / size)
+    error = np.concatenate(off)
+    percent = [f"{100 * v:.2g}" for v in (np.median(error), np.percentile(error, 95), np.median(stated))]
+    return [[str(trials), *percent[:2], f"{np.median(angle):.2g}", f"{np.percentile(angle, 95):.2g}", percent[2]]]
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--trials", type=int, default=50, help="random similarities a kind of evidence")
+    parser.add_argument("--mirrors", type=int, help="of them with the tracking mirrored besides (default: a fifth)")
+    parser.add_argument("--only", action="append", choices=[*KINDS, "fox"], help="only this kind; repeatable")
+    parser.add_argument("--shoppers", type=int, default=12, help="people who are tracked")
+    parser.add_argument("--rays", type=int, default=150_000, help="rays by which the place is felt out")
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/alignment.csv"), help="CSV file to write")
+    parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
+    args = parser.parse_args(argv)
+
+    asked = args.only or [*KINDS, "fox"]
+    mirrors = max(1, args.trials // 5) if args.mirrors is None else args.mirrors
+    if [kind for kind in asked if kind != "fox"]:
+        world = make_world(args.shoppers, args.rays)
+        rows = []
+        for kind in (k for k in KINDS if k in asked):
+            rows.append(measure(world, kind, args.trials, mirrors))
+            print("; ".join(cells(rows[-1])), flush=True)
+        print_table(TITLE, HEAD, [cells(row) for row in rows], args.update)
+        write_rows(args.out, rows)
+    fox = measure_fox(args.trials) if "fox" in asked else None
+    if fox is not None:
+        head = "trials|error, % of the cameras' spread|95 %|degrees|95 %|residual, %".split("|")
+        print_table(FOX, head, fox, args.update)
+
+
+if __name__ == "__main__":
+    main()
