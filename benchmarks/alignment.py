@@ -152,6 +152,9 @@ KINDS: dict[str, tuple[str, str, bool, Maker]] = {
 }
 
 
+SEARCHED = ("twin", "upright-twin", "tracking", "heads")
+
+
 def measure(world: World, kind: str, trials: int, mirrors: int) -> dict:
     """One row."""
     name, known, upright, make = KINDS[kind]
@@ -242,6 +245,9 @@ def measure_fox(trials: int) -> list[list[str]] | None:
 def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--trials", type=int, default=50, help="random similarities a kind of evidence")
+    parser.add_argument(
+        "--searches", type=int, help="trials of kinds that search, some ten seconds each (default: all)"
+    )
     parser.add_argument("--mirrors", type=int, help="of them with the tracking mirrored besides (default: a fifth)")
     parser.add_argument("--only", action="append", choices=[*KINDS, "fox"], help="only this kind; repeatable")
     parser.add_argument("--shoppers", type=int, default=12, help="people who are tracked")
@@ -251,12 +257,13 @@ def main(argv=None) -> None:
     args = parser.parse_args(argv)
 
     asked = args.only or [*KINDS, "fox"]
-    mirrors = max(1, args.trials // 5) if args.mirrors is None else args.mirrors
+    counts = {kind: args.searches or args.trials if kind in SEARCHED else args.trials for kind in KINDS}
     if [kind for kind in asked if kind != "fox"]:
         world = make_world(args.shoppers, args.rays)
         rows = []
         for kind in (k for k in KINDS if k in asked):
-            rows.append(measure(world, kind, args.trials, mirrors))
+            mirrors = max(1, counts[kind] // 5) if args.mirrors is None else args.mirrors
+            rows.append(measure(world, kind, counts[kind], mirrors))
             print("; ".join(cells(rows[-1])), flush=True)
         print_table(TITLE, HEAD, [cells(row) for row in rows], args.update)
         write_rows(args.out, rows)

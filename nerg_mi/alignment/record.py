@@ -69,7 +69,10 @@ def read_similarity(path: Path, option: str, frames: str) -> Similarity:
     found: Any = read_json(path, f"similarity of {option}", _BYTES)
     if isinstance(found, dict):
         if found.get("kind") != KIND or "matrix" not in found:
-            raise NergError(f'"{path}" is no alignment; make one with "nerg align", or give the 4 rows of a matrix')
+            raise NergError(
+                f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": it is neither '
+                'that nor what "nerg align" writes'
+            )
         version = found.get("version")
         if not isinstance(version, int) or isinstance(version, bool) or not 1 <= version <= VERSION:
             raise NergError(

@@ -33,7 +33,7 @@ from nerg_mi.training.geometry.places import GazePlace
 
 from .backend import select_backend
 from .gaze import train_planned
-from .gaze_places import make_place, place_kind
+from .gaze_places import check_place, make_place, place_kind
 from .gaze_plan import plan_gaze
 from .options.ablation import AblationOptions
 from .options.gaze import GazeOptions
@@ -85,6 +85,8 @@ def ablate(
     _, account = hold_out(data, options.radius, options.zones, options.positions, 0, options.min_rays, options.people)
     train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")
     place = make_place(options, train, (), output / "place.vol", ns, reporter=reporter)
+    # Bad places are part of what may be compared: it is told, and no more.
+    check_place(place, train, f"--{place.kind} FILE", True, reporter)
     render = None
     if options.cameras:
         folder = output if options.field is None else Path(options.field).parent

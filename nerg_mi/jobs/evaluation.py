@@ -16,7 +16,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.rays import Rays
 
 from .backend import select_backend
-from .gaze_places import place_of_training
+from .gaze_places import check_place, place_of_training
 from .options.evaluation import GazeEvaluationOptions
 from .reporter import SILENT, Reporter
 
@@ -72,6 +72,9 @@ def evaluate_gaze(
         scored, centres, account["radius"], options.kappa, options.directions, options.min_rays, seed=seed
     )
     place = place_of_training(gaze, about, field.box, options, ns)
+    option = f"--{place.kind} {options.field or options.scene or 'FILE'}"
+    # What was trained by force is scored, and told.
+    check_place(place, scored, option, True, reporter)
     blind, others = standard_baselines(train, account["radius"], options.kappa, options.blind_kappa, seed)
     density = gaze_field(field, place.medium, place.align, about.get("probes", {}).get("depth", "median"))
     methods = {"gaze field": density, **others}

@@ -9,6 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
+from nerg_mi.alignment.record import read_similarity
 from nerg_mi.capture.salience.views import SalienceSet, open_salience
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.protocol import AnyGazeField
@@ -29,7 +30,7 @@ from nerg_mi.training.gaze.supervision import Supervision
 from nerg_mi.training.geometry.places import GazePlace
 
 from .backend import select_backend
-from .gaze_places import make_place, read_similarity
+from .gaze_places import check_place, make_place
 from .gaze_plan import check_plan, plan_gaze
 from .options.gaze import GazeOptions
 from .reporter import SILENT, Reporter
@@ -80,6 +81,7 @@ def train_gaze(
     volume = None if output is None else output.with_suffix(".vol")
     place = make_place(options, supervision.rays, supervision.views, volume, ns, options.voxel, reporter)
     place = replace(place, align=align)
+    check_place(place, supervision.rays, _place_option(options), options.force, reporter)
     about |= place.about
     plan = plan_gaze(options, place, views_alone=supervision.rays is None)
     if plan.initial and options.field is not None:
@@ -125,6 +127,11 @@ def train_planned(
     tell = lambda progress: reporter.progress(progress.done, _progress(progress))
     field, provenance = train(supervision, place, plan, ns, state=state, tell=tell, write=write)
     return GazeResult(field, {**state.about, **provenance}, output, provenance["interrupted"])
+
+
+def _place_option(options: GazeOptions) -> str:
+    """The option by which the place was given."""
+    return f"--field {options.field}" if options.field is not None else f"--scene {options.scene}"
 
 
 def _check_outputs(options: GazeOptions, output: Path, state: Path) -> None:

@@ -6,13 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import numpy as np
 
+from nerg_mi.alignment.check import check_alignment
 from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import plain, read_json
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.similarity import Similarity
@@ -126,13 +125,22 @@ def file_of_training(gaze: Path, provenance: dict, given: Path | None, where: st
     return path
 
 
-def read_similarity(path: Path, option: str, frames: str) -> Similarity:
-    """The similarity in a JSON file of four rows, which was given by ``option`` and leads from and to what ``frames``
-    says ("rays to field"). Raises `NergError` for a file that holds none."""
-    matrix: Any = read_json(path, f"similarity of {option}")
-    try:
-        return Similarity(np.array([[float(x) for x in row] for row in matrix]))
-    except (TypeError, ValueError, IndexError, OverflowError) as error:
+def check_place(place: GazePlace, rays: Rays | None, options: str, force: bool, reporter: Reporter = SILENT) -> None:
+    """Tell where ``rays`` do not lie in ``place`` as people do; ``options``: by which the place was given, for the
+    command that is named as the remedy.
+
+    Raises `NergError` where (nearly) all their gaze meets no surface, unless ``force``. A place of hit points is in the
+    rays' own frame, and where there is no geometry nothing can be met.
+    """
+    if rays is None or place.medium is None or place.kind == "hits":
+        return
+    found = check_alignment(place.medium, rays, place.align)
+    remedy = f"find the alignment with: nerg align RAYS {options} -o alignment.json, and give it with --align"
+    if found.impossible and not force:
         raise NergError(
-            f'{option} needs a JSON file with the 4 rows of a similarity from {frames}; "{path}": {plain(error)}'
-        ) from error
+            f"{100 * found.escaped:.1f} % of the gaze meets no surface of the place, so that the rays lie elsewhere; "
+            f"{remedy} (or go on all the same with --force)"
+        )
+    doubts = found.doubts()
+    if doubts:
+        reporter.warn(f"the rays may not lie where they belong: {', '.join(doubts)}; {remedy}")

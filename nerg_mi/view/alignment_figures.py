@@ -70,4 +70,4 @@ def _frame(axes, parts: Sequence[np.ndarray], at: tuple[int, int]) -> None:
     edge = 0.06 * max(float(np.max(high - low)), 1e-9)
     axes.set_xlim(low[0] - edge, high[0] + edge)
     axes.set_ylim(low[1] - edge, high[1] + edge)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")

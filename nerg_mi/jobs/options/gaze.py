@@ -29,8 +29,9 @@ class GazeOptions(PlaceOptions):
         None, "Edge of the voxels of --geometry hits in metres.  [default: 0.08, more in very large places]"
     )
     align: Path | None = option(
-        None, "JSON file with the 4x4 similarity from the rays' frame to the place's. Default: none."
+        None, "How the rays lie in the place: what nerg align writes, or JSON with the 4x4 similarity. Default: alike."
     )
+    force: bool = option(False, "Train even where no gaze meets a surface of the place.")
     radius: float | None = option(None, "Radius R of a probe in metres.")
     probes: int | None = option(None, "Number of probes at most.")
     placement: str | None = option(None, "Of probes: data, grid, random or blue.")
