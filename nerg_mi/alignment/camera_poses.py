@@ -19,10 +19,12 @@ from nerg_mi.errors import NergError
 
 from .chart import ALL
 from .evidence import Fit, Target, Tell, pair_covariance
-from .umeyama import MIRROR, errors, fit_similarity, in_plane, move
+from .umeyama import MIRROR, check_points, errors, fit_similarity, in_plane, move
 
 _ROUNDS = 50
 _CLEAR = 0.5
+# Degrees beyond which the cameras' axes are not the same in both models.
+_ASTRAY = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +49,21 @@ class Cameras:
                 f"{self.source} all stand at one place, which leaves the scale open; add pictures from others"
             )
         each = b[:, :3, :3] @ np.swapaxes(a[:, :3, :3], 1, 2)
-        rotation, turn_weight = mean_rotation(each)
-        scale, shift, weight = _scale_and_shift(x @ rotation.T, y, target.scale)
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = scale * rotation, shift
-        off = errors(matrix, x, y)
+        rotation = mean_rotation(each)
         angle = np.degrees(Rotation.from_matrix(each @ rotation.T).magnitude())
+        doubts = []
+        if np.median(angle) > _ASTRAY:
+            doubts.append(
+                f"the cameras' axes disagree by {np.median(angle):.0f} degrees (median), and only their centres were "
+                "used: are both models of the same convention (OpenGL poses in transforms.json, COLMAP's in a model)?"
+            )
+            check_points(x, y, self.source)
+            matrix = fit_similarity(x, y, scale=target.scale)
+        else:
+            scale, shift = _scale_and_shift(x @ rotation.T, y, target.scale)
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = scale * rotation, shift
+        off = errors(matrix, x, y)
         inliers = (off <= 5 * np.median(off) + 1e-9 * size) & (angle <= 5 * np.median(angle) + 1e-6)
         notes = [
             f"{len(a)} cameras in common, {int(inliers.sum())} agree: off by {100 * np.median(off):.2g} cm and "
@@ -67,26 +78,19 @@ class Cameras:
                     f"with the x axis negated the centres meet to {100 * np.median(off_flipped):.3g} cm, as they are "
                     f"to {100 * np.median(off):.3g} cm only"
                 )
-        doubts = []
-        if np.median(angle) > 20:
-            doubts.append(
-                f"the cameras' axes disagree by {np.median(angle):.0f} degrees (median): are both models of the same "
-                "convention (OpenGL poses in transforms.json, COLMAP's in a model)?"
-            )
         about = {"cameras": len(a), "agreeing": int(inliers.sum())}
         kept = inliers if inliers.sum() > 2 else np.ones(len(x), bool)
         covariance = pair_covariance(x[kept], y[kept], matrix, ALL)
         return Fit(matrix, 100 * off, angle, covariance, mirrored, x, y, about, notes, doubts)
 
 
-def mean_rotation(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rotation (3, 3) with the least sum of angles to ``rotations`` (N, 3, 3), and their weights (N,)."""
+def mean_rotation(rotations: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) with the least sum of angles to ``rotations`` (N, 3, 3)."""
     # From the one that is nearest to the others, so that a few wrong ones do not lead astray.
     some = rotations[:: max(1, len(rotations) // 200)]
     between = np.arccos(np.clip((np.einsum("aij,bij->ab", some, some) - 1) / 2, -1, 1))
     mean = Rotation.from_matrix(some[int(np.argmin(np.median(between, axis=1)))])
     all_of = Rotation.from_matrix(rotations)
-    weight = np.ones(len(rotations))
     for _ in range(_ROUNDS):
         away = (all_of * mean.inv()).as_rotvec()
         weight = 1 / np.maximum(np.linalg.norm(away, axis=1), 1e-4)
@@ -94,10 +98,10 @@ def mean_rotation(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         mean = Rotation.from_rotvec(step) * mean
         if np.linalg.norm(step) < 1e-12:
             break
-    return mean.as_matrix(), weight
+    return mean.as_matrix()
 
 
-def _scale_and_shift(x: np.ndarray, y: np.ndarray, given: float | None) -> tuple[float, np.ndarray, np.ndarray]:
+def _scale_and_shift(x: np.ndarray, y: np.ndarray, given: float | None) -> tuple[float, np.ndarray]:
     """The scale and shift that carry ``x`` to ``y``, both (N, 3), with the least sum of distances."""
     i, j = np.triu_indices(min(len(x), 200), 1)
     pick = np.linspace(0, len(x) - 1, min(len(x), 200)).astype(int)
@@ -106,7 +110,6 @@ def _scale_and_shift(x: np.ndarray, y: np.ndarray, given: float | None) -> tuple
     far = length >= np.median(length)
     scale = given or float(np.median(np.linalg.norm(y[i] - y[j], axis=1)[far] / np.maximum(length[far], 1e-300)))
     shift = np.median(y - scale * x, axis=0)
-    weight = np.ones(len(x))
     for _ in range(_ROUNDS):
         off = np.linalg.norm(scale * x + shift - y, axis=1)
         weight = 1 / np.maximum(off, 1e-6 * max(float(np.abs(y).max()), 1e-300))
@@ -121,7 +124,7 @@ def _scale_and_shift(x: np.ndarray, y: np.ndarray, given: float | None) -> tuple
             "the centres of the cameras run against their axes in the two frames: one of them is mirrored, or its "
             "poses are of another convention; correct one"
         )
-    return scale, shift, weight
+    return scale, shift
 
 
 def read_cameras(tracking: Path, place: Path) -> Cameras:

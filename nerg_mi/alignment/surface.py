@@ -28,7 +28,7 @@ VOXELS = 1 << 20
 
 _SURFACE_OPACITY = 0.5
 # Voxels around the place; a pocket has less than this share of the room of the largest.
-_PAD, _POCKET = 3, 0.1
+_PAD, _POCKET = 3, 0.2
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,57 @@
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from nerg_mi.alignment.check import Check, check_alignment
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.transport.media.volume import VolumeMedium
+from nerg_mi.transport.place import Place
+
+from . import rooms
+
+mi.set_variant("llvm_ad_rgb")
+RAYS = rooms.people(600)
+
+
+def moved(x, y, z):
+    m = np.diag([2.0, 2, 2, 1])
+    m[:3, 3] = np.array([x, y, z]) * 2
+    return Similarity(m)
+
+
+@pytest.fixture(scope="module")
+def room():
+    """The room at twice its size: shapes, and a floor that is the bottom of a box."""
+    cube = lambda low, high: {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate(list(low + high)).scale(list(high - low)),
+    }
+    blocks = {f"b{k}": cube(low, high) for k, (low, high) in enumerate(rooms.BOXES)}
+    scene = mi.load_dict({"type": "scene", "room": cube(np.zeros(3), rooms.SIZE), **blocks})
+    return Place(None, scene)
+
+
+def test_people_in_their_place_give_no_doubts(room):
+    found = check_alignment(room, RAYS, moved(0, 0, 0))
+    assert found == Check(0.0, 0.0, 0.0) and not found.doubts() and not found.impossible
+
+
+def test_people_elsewhere_below_the_floor_and_in_walls_are_told(room):
+    assert check_alignment(room, RAYS, moved(100, 0, 0)).impossible
+    below = check_alignment(room, RAYS, moved(0, 0, -2.0))
+    assert below.below > 0.9 and "below the floor" in " ".join(below.doubts())
+
+
+def test_heads_within_matter_are_inside_of_something():
+    solid = VolumeMedium(
+        mi.load_dict({"type": "constvolume", "value": 500.0, "to_world": mi.ScalarTransform4f().scale([9, 9, 9])})
+    )
+    found = check_alignment(solid, RAYS, moved(0, 0, 0))
+    assert found.inside > 0.9 and "inside of something solid" in " ".join(found.doubts())
+
+
+def test_no_rays_are_no_doubt(room):
+    assert check_alignment(room, RAYS.select(np.zeros(len(RAYS), bool)), moved(0, 0, 0)).doubts() == []
+    assert len(replace(RAYS, hit=None)) == len(RAYS)

@@ -1,0 +1,95 @@
+import json
+
+import numpy as np
+import pytest
+
+from nerg_mi.alignment.evidence import Target
+from nerg_mi.alignment.pairs import Pairs, read_pairs
+from nerg_mi.alignment.umeyama import MIRROR, errors
+from nerg_mi.errors import NergError
+
+from .rooms import carried, similarity
+
+FREE = Target(upright=False)
+HEAD = "name,x,y,z,place_x,place_y,place_z\n"
+
+
+def quiet(share, text):
+    assert 0 <= share <= 1 and text
+
+
+def made(count=6, seed=0, noise=0.01):
+    rng = np.random.default_rng(seed)
+    truth, x = similarity(rng), rng.uniform(0, 4, (count, 3))
+    return truth, x, carried(truth, x + rng.normal(0, noise, x.shape))
+
+
+def test_picked_points_give_the_alignment_its_errors_and_its_uncertainty():
+    truth, x, y = made()
+    fit = Pairs(x, y).fit(FREE, quiet)
+    assert errors(fit.matrix, x, carried(truth, x)).max() < 0.03
+    assert np.median(fit.centimetres) < 3 and len(fit.degrees) == 6 and fit.mirrored is None
+    assert fit.covariance.shape == (7, 7) and fit.about["leave_one_out_cm"]["largest"] > max(fit.centimetres)
+
+
+def test_a_mirrored_frame_is_named():
+    _, x, y = made()
+    assert "x axis negated the pairs meet to" in Pairs(carried(MIRROR, x), y).fit(FREE, quiet).mirrored
+
+
+def test_points_in_a_plane_do_not_tell_a_mirror():
+    truth, x, _ = made()
+    flat = x * (1, 1, 0)
+    fit = Pairs(flat, carried(truth @ MIRROR, flat)).fit(FREE, quiet)
+    assert fit.mirrored is None and any("in a plane" in note for note in fit.notes)
+
+
+def test_a_pair_that_was_picked_wrong_is_named():
+    _, x, y = made(7, noise=0.001)
+    y[3] += 2.0
+    (doubt,) = Pairs(x, y, names=tuple("abcdefg")).fit(FREE, quiet).doubts
+    assert 'pair 4 ("d")' in doubt and "picked wrong" in doubt
+
+
+def test_two_pairs_and_up_that_is_another_axis():
+    rng = np.random.default_rng(5)
+    truth, x = similarity(rng, upright=True), rng.uniform(0, 4, (2, 3))
+    turn = np.eye(4)[[0, 2, 1, 3]] * [[1], [-1], [1], [1]]
+    y_up = carried(np.linalg.inv(turn) @ truth, x)
+    fit = Pairs(x, y_up).fit(Target(turn=turn, upright=True), quiet)
+    np.testing.assert_allclose(fit.matrix, np.linalg.inv(turn) @ truth, atol=1e-9)
+
+
+def test_files_are_read_as_they_are_described(tmp_path):
+    rows = [[1, 2, 3, 4, 5, 6], [0, 0, 1, 1, 0, 0.5]]
+    (tmp_path / "p.csv").write_text(HEAD + "".join(f"n{k},{','.join(map(str, r))}\n" for k, r in enumerate(rows)))
+    pairs = [{"tracking": r[:3], "place": r[3:], "name": f"n{k}"} for k, r in enumerate(rows)]
+    (tmp_path / "p.json").write_text(json.dumps(pairs))
+    (tmp_path / "q.json").write_text(json.dumps({"pairs": pairs}))
+    for name in ("p.csv", "p.json", "q.json"):
+        found = read_pairs(tmp_path / name)
+        np.testing.assert_array_equal(np.c_[found.tracking, found.place], rows)
+        assert found.names == ("n0", "n1")
+
+
+@pytest.mark.parametrize(
+    "name, text, why",
+    [
+        ("a.csv", "x,y,z\n1,2,3\n", "no column place_x"),
+        ("a.csv", HEAD, "no pairs"),
+        ("a.json", "[]", "no pairs"),
+        ("a.json", '{"a": 1}', "cannot be used"),
+        ("a.json", '[{"tracking": [1, 2], "place": [1, 2]}]', "three coordinates"),
+        ("a.json", "[1, 2]", "cannot be used"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, name, text, why):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(NergError, match=why):
+        read_pairs(tmp_path / name)
+
+
+def test_empty_cells_are_no_coordinates(tmp_path):
+    (tmp_path / "a.csv").write_text(HEAD + "a,1,2,3,4,5,\nb,0,0,0,0,0,0\nc,1,0,0,1,0,0\n")
+    with pytest.raises(NergError, match="not a finite number"):
+        read_pairs(tmp_path / "a.csv").fit(FREE, quiet)

@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.alignment.umeyama import (
+    MIRROR,
+    check_points,
+    errors,
+    fit_similarity,
+    in_plane,
+    leave_one_out,
+    move,
+    scale_of,
+)  # fmt: skip
+from nerg_mi.errors import NergError
+
+from .rooms import carried, similarity
+
+
+@pytest.mark.parametrize("upright", [False, True])
+def test_exact_points_give_the_similarity(upright):
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        truth, x = similarity(rng, upright), rng.normal(size=(4, 3))
+        np.testing.assert_allclose(fit_similarity(x, carried(truth, x), upright=upright), truth, atol=1e-9)
+
+
+def test_noisy_points_give_the_least_squares_that_a_minimiser_finds():
+    rng = np.random.default_rng(1)
+    truth, x, w = similarity(rng), rng.normal(size=(7, 3)), rng.uniform(0.5, 2, 7)
+    y = carried(truth, x) + rng.normal(0, 0.1, x.shape)
+
+    def cost(p):
+        moved = np.exp(p[6]) * Rotation.from_rotvec(p[:3]).apply(x) + p[3:6]
+        return w @ np.sum((moved - y) ** 2, axis=1)
+
+    found = fit_similarity(x, y, w)
+    start = [*Rotation.from_matrix(found[:3, :3] / scale_of(found)).as_rotvec() + 0.1, *found[:3, 3], 0]
+    best = minimize(cost, start, method="BFGS", options={"gtol": 1e-10})
+    assert w @ np.sum((carried(found, x) - y) ** 2, axis=1) == pytest.approx(best.fun, rel=1e-6)
+
+
+def test_known_scale_and_flat_points():
+    rng = np.random.default_rng(2)
+    truth, x = similarity(rng, scale=2.0), rng.normal(size=(5, 3)) * (1, 1, 0)
+    assert in_plane(x) and not in_plane(rng.normal(size=(9, 3)))
+    np.testing.assert_allclose(fit_similarity(x, carried(truth, x), scale=2.0), truth, atol=1e-9)
+    assert np.linalg.det(fit_similarity(x, carried(truth @ MIRROR, x))[:3, :3]) > 0
+
+
+def test_two_points_are_enough_where_up_is_known():
+    rng = np.random.default_rng(3)
+    truth, x = similarity(rng, True), rng.normal(size=(2, 3))
+    check_points(x, x, "the pairs", upright=True)
+    np.testing.assert_allclose(fit_similarity(x, carried(truth, x), upright=True), truth, atol=1e-9)
+
+
+def test_leave_one_out_is_the_error_of_the_fit_to_the_others():
+    rng = np.random.default_rng(4)
+    truth, x = similarity(rng), rng.normal(size=(5, 3))
+    y = carried(truth, x)
+    y[2] += scale_of(truth) * np.array([0.5, 0, 0])
+    left = leave_one_out(x, y)
+    assert left[2] == pytest.approx(0.5, rel=1e-6) and errors(fit_similarity(x, y), x, y).max() < 0.5
+    assert np.isnan(leave_one_out(x[:3], y[:3])).all()
+
+
+@pytest.mark.parametrize(
+    "points, why",
+    [
+        (np.zeros((2, 3)), "2 pairs of points where 3"),
+        (np.zeros((4, 3)), "at one place"),
+        (np.outer(np.arange(5.0), [1, 2, 3]), "on a line"),
+        (np.full((4, 3), np.nan), "not a finite number"),
+    ],
+)
+def test_points_that_tell_nothing_are_refused(points, why):
+    with pytest.raises(NergError, match=why):
+        check_points(points, points, "the pairs")
+    with pytest.raises(NergError, match="above one another"):
+        check_points(*[np.outer(np.arange(4.0), [0, 0, 1])] * 2, "the pairs", upright=True)
+
+
+def test_moving_is_that_of_homogeneous_coordinates():
+    rng = np.random.default_rng(5)
+    m, x = similarity(rng), rng.normal(size=(6, 3))
+    np.testing.assert_allclose(move(m, x), carried(m, x))
