@@ -26,6 +26,7 @@ from . import llvm as _llvm
 from . import registration as _registration
 
 if TYPE_CHECKING:
+    from .api.alignment import align
     from .api.attention import attention
     from .api.camera import Camera
     from .api.evaluation import ablate, evaluate_gaze, evaluate_radiance, study
@@ -46,6 +47,7 @@ _WHERE = {
     "Rays": "rays.rays",
     "Scene": "api.scene",
     "ablate": "api.evaluation",
+    "align": "api.alignment",
     "attention": "api.attention",
     "evaluate_gaze": "api.evaluation",
     "evaluate_radiance": "api.evaluation",
@@ -69,6 +71,7 @@ __all__ = [
     "Rays",
     "Scene",
     "ablate",
+    "align",
     "attention",
     "evaluate_gaze",
     "evaluate_radiance",

@@ -3,7 +3,7 @@
 First all turns (and mirrors) on a lattice of rotations, judged by both distance fields at once, since a twin that
 shrinks onto a single spot of the place would lie on its surface too; then iterated closest points with scale (P. Besl,
 N. McKay, 1992; scale after T. Zinsser et al., 2005), in both directions for the same reason, trimmed of what only one
-of them has (D. Chetverikov et al., 2002).
+of them has (D. Chetverikov et al., 2002); and at last steps on the place's distance field (`refine`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from nerg_mi.errors import NergError
 
 from .chart import ALL, upright_basis
 from .evidence import Fit, Target, Tell, angles, pair_covariance
+from .refine import refine
+from .scores import OnSurface
 from .surface import PlaceSurface, surface_of_points, thinned
 from .umeyama import MIRROR, fit_similarity, move, scale_of
 
@@ -26,6 +28,8 @@ _SCALES = np.exp(np.linspace(-0.25, 0.25, 5))
 _STARTS, _LAST = 30, 3
 # Share of the points of either side that the other one is taken to have too.
 _OVERLAP = 0.8
+# At the end points farther from the surface than this share of the place's size count less and less.
+_NEAR = 0.005
 # A mirrored twin is told where it fits so much better; a rival of another placement where it fits almost as well.
 _CLEAR, _RIVAL = 0.6, 1.25
 
@@ -127,7 +131,7 @@ def _placed(twin: np.ndarray, place: PlaceSurface, target: Target) -> list[_Plac
         found.append(_icp(x, y, matrix, target, 15))
     found.sort(key=lambda f: f.cost / scale_of(f.matrix))
     x, y = few(twin, _FINE), few(place.points, 2 * _FINE)
-    last = [_icp(x, y, f.matrix, target, 25) for f in _different(found, place.diagonal)[:_LAST]]
+    last = [_settled(x, y, f.matrix, place, target) for f in _different(found, place.diagonal)[:_LAST]]
     return sorted(last, key=lambda f: f.cost / scale_of(f.matrix))
 
 
@@ -150,6 +154,19 @@ def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: Target, most:
             break
         cost = now
     return _Placed(matrix, cost)
+
+
+def _settled(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: PlaceSurface, target: Target) -> _Placed:
+    """Closest points slide along surfaces by small steps; the distance field has the slope that leads there at once."""
+    matrix = _icp(x, y, matrix, target, 8).matrix
+    near = _NEAR * place.diagonal / scale_of(matrix)
+    basis = upright_basis(False) if target.upright else ALL
+    basis = basis if target.scale is None else basis[:, :-1]
+    center, own = move(matrix, x).mean(axis=0), np.arange(len(x))
+    for wide in (3.0, 1.0):
+        matrix = refine([OnSurface(place, x, own, near)], matrix, center, basis, wide, 30).matrix
+    a, b, _ = _closest(x, y, KDTree(y), KDTree(x), matrix, _OVERLAP)
+    return _Placed(matrix, float(np.mean(np.linalg.norm(move(matrix, a) - b, axis=1))))
 
 
 def _closest(

@@ -45,7 +45,7 @@ class Alignment:
         residuals = {"count": len(fit.centimetres), **_spread(fit.centimetres, "cm"), **_spread(fit.degrees, "degrees")}
         return cls(fit.matrix, {"kind": kind, **fit.about}, residuals, _uncertainty(fit), dict(files), forced)
 
-    def write(self, path: Path) -> None:
+    def save(self, path: Path) -> None:
         """Write the file, whole or not at all."""
         about = {
             "kind": KIND,

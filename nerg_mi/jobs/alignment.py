@@ -84,7 +84,7 @@ def align(
         picture = output.with_suffix(".png")
         heads = None if data is None else data.origin
         save(_figure(fit, target, heads, found), picture)
-        found.write(output)
+        found.save(output)
         written = [output, picture]
         reporter.message(f"wrote {output} (look at {picture.name}); next: --align {output}")
     return AlignResult(found, written)

@@ -17,7 +17,7 @@ def written(path):
         about={"pairs": 5},
     )
     found = Alignment.of_fit("pairs", fit, {"rays": {"file": "a.npz", "sha256": "00"}}, False)
-    found.write(path)
+    found.save(path)
     return found
 
 

@@ -86,6 +86,7 @@ CASES = (
     Case("rays filter", "{i}/rays.npz -o {o}/a.parquet --person a", ("a.parquet",)),
     Case("rays split", "{i}/rays.npz -o {o}/a.npz --people 0.5", ("a-train.npz", "a-test.npz")),
     Case("rays plot", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
+    Case("align", "-o {o}/a.json --pairs {i}/pairs.csv", ("a.json", "a.png")),
     Case("rays plot", "{i}/rays.npz -o {o}/a.png --kind layout", ("a.png",)),
     Case(
         "train radiance",
@@ -185,6 +186,8 @@ def make_inputs(folder: Path) -> Path:
     (folder / "demo.json").write_text(json.dumps(write_standins(folder / "demo")))
     rows = [f"{t},a,{0.1 * t},0,1.6,0,1,0" for t in range(2000)]
     (folder / "day.csv").write_text("\n".join(["t,p,x,y,z,a,b,c", *rows]))
+    pairs = "x,y,z,place_x,place_y,place_z\n0,0,0,1,0,0\n1,0,0,2,0,0\n0,1,0,1,1,0\n0,0,1,1,0,1\n"
+    (folder / "pairs.csv").write_text(pairs)
     rays: Rays = crowd(3000)
     rays.save(folder / "rays.npz")
     fields.radiance(folder / "field.safetensors")

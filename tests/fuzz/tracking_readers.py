@@ -161,6 +161,57 @@ def _read_salt(folder: Path) -> None:
     read_salt(folder / "salt")
 
 
+_PAIRS = np.random.default_rng(0).normal(size=(5, 6)).tolist()
+
+
+def _make_pairs(folder: Path) -> None:
+    rows = "".join(f"p{k},{','.join(map(str, row))}\n" for k, row in enumerate(_PAIRS))
+    (folder / "pairs.csv").write_text("name,x,y,z,place_x,place_y,place_z\n" + rows)
+    (folder / "pairs.json").write_text(json.dumps([{"tracking": r[:3], "place": r[3:], "name": "p"} for r in _PAIRS]))
+
+
+def _pairs(name: str, kind: str) -> Reader:
+    def read(folder: Path) -> None:
+        from nerg_mi.alignment.evidence import Target
+        from nerg_mi.alignment.pairs import read_pairs
+
+        read_pairs(folder / name).fit(Target(upright=False), lambda *_: None)
+
+    return Reader(f"alignment {name}", _make_pairs, {name: (kind,)}, read)
+
+
+def _make_alignment(folder: Path) -> None:
+    from nerg_mi.alignment.record import Alignment
+
+    Alignment(np.diag([2.0, 2, 2, 1]), {"kind": "pairs"}, {"count": 5}, None).save(folder / "alignment.json")
+
+
+def _read_alignment(folder: Path) -> None:
+    from nerg_mi.alignment.record import read_similarity
+
+    read_similarity(folder / "alignment.json", "--align", "rays to field")
+
+
+def _surface(name: str, *kinds: str) -> Reader:
+    def make(folder: Path) -> None:
+        import trimesh
+
+        box = trimesh.creation.box((1, 2, 3))
+        if name.endswith(".npy"):
+            np.save(folder / name, box.vertices)
+        elif name.endswith(".csv"):
+            (folder / name).write_text("x,y,z\n" + "".join(f"{x},{y},{z}\n" for x, y, z in box.vertices))
+        else:
+            box.export(folder / name)
+
+    def read(folder: Path) -> None:
+        from nerg_mi.alignment.point_file import read_surface
+
+        read_surface(folder / name, 500)
+
+    return Reader(f"surface {name}", make, {name: kinds}, read)
+
+
 TRACKING = [
     _rays_file("rays.npz", "zip"),
     _rays_file("rays.parquet"),
@@ -177,6 +228,13 @@ TRACKING = [
     _guess("gaze.parquet", _make_parquet),
     _skeletons("day.csv", "text"),
     _skeletons("day.csv.gz", "gzip"),
+    _pairs("pairs.csv", "text"),
+    _pairs("pairs.json", "json"),
+    Reader("alignment", _make_alignment, {"alignment.json": ("json",)}, _read_alignment),
+    _surface("points.ply"),
+    _surface("points.obj", "text"),
+    _surface("points.csv", "text"),
+    _surface("points.npy", "npy"),
     Reader("salt", _make_salt, {"salt": ()}, _read_salt),
 ]
 """Every reader of the registry is among them; one without an example is an error here."""
