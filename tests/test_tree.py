@@ -18,6 +18,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/field/gaze/__init__.py": "it only imports the kinds, which tests/field/gaze/test_registry.py asks for",
     "nerg_mi/jobs/options/__init__.py": _OPTIONS,
     "nerg_mi/jobs/options/ablation.py": _OPTIONS,
+    "nerg_mi/jobs/options/alignment.py": _OPTIONS,
     "nerg_mi/jobs/options/checkpoints.py": _OPTIONS,
     "nerg_mi/jobs/options/evaluation.py": _OPTIONS,
     "nerg_mi/jobs/options/export.py": _OPTIONS,

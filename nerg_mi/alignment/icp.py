@@ -115,12 +115,13 @@ def _placed(twin: np.ndarray, place: PlaceSurface, target: Target) -> list[_Plac
     wide = 0.06 * place.diagonal
     starts = []
     for turn in _turns(target.upright):
-        for s in scales:
-            moved = s * (x - x0) @ turn.T + y0
-            back = (y - y0) @ turn / s + x0
-            near = np.exp(-0.5 * (place.distance.at(moved) / wide) ** 2).mean()
-            near += np.exp(-0.5 * (own.at(back) * s / wide) ** 2).mean()
-            starts.append((near, s, turn))
+        # All scales at once.
+        moved = scales[:, None, None] * ((x - x0) @ turn.T) + y0
+        back = ((y - y0) @ turn) / scales[:, None, None] + x0
+        forth = place.distance.at(moved.reshape(-1, 3)).reshape(len(scales), -1)
+        away = own.at(back.reshape(-1, 3)).reshape(len(scales), -1) * scales[:, None]
+        near = np.exp(-0.5 * (forth / wide) ** 2).mean(axis=1) + np.exp(-0.5 * (away / wide) ** 2).mean(axis=1)
+        starts += [(n, s, turn) for n, s in zip(near.tolist(), scales)]
     starts.sort(key=lambda g: -g[0])
     found = []
     x, y = few(twin, 500), few(place.points, 500)

@@ -12,7 +12,7 @@ from nerg_mi.alignment.umeyama import (
     leave_one_out,
     move,
     scale_of,
-)  # fmt: skip
+)
 from nerg_mi.errors import NergError
 
 from .rooms import carried, similarity
