@@ -18,6 +18,7 @@ from nerg_mi.errors import NergError
 
 from .chart import ALL, upright_basis
 from .evidence import Fit, Target, Tell, angles, pair_covariance
+from .grid import DistanceGrid
 from .refine import refine
 from .scores import OnSurface
 from .surface import PlaceSurface, surface_of_points, thinned
@@ -30,8 +31,9 @@ _STARTS, _LAST = 30, 3
 _OVERLAP = 0.8
 # At the end points farther from the surface than this share of the place's size count less and less.
 _NEAR = 0.005
+_FAR = 0.04
 # A mirrored twin is told where it fits so much better; a rival of another placement where it fits almost as well.
-_CLEAR, _RIVAL = 0.6, 1.25
+_CLEAR, _RIVAL = 0.8, 1.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +101,12 @@ def _even(points: np.ndarray, source: str) -> np.ndarray:
     size = np.linalg.norm(np.ptp(points, axis=0))
     if not size > 0:
         raise NergError(f"all points of {source} are one; give a mesh or points on surfaces")
-    return thinned(points, float(size) / 150)
+    return thinned(points, float(size) / 250)
 
 
 def _placed(twin: np.ndarray, place: PlaceSurface, target: Target) -> list[_Placed]:
     """The best placements of the points ``twin``, best first."""
-    own = surface_of_points(twin, 1 << 17).distance
+    own = surface_of_points(twin, 1 << 19).distance
     rng = np.random.default_rng(0)
     few = lambda p, n: p[rng.permutation(len(p))[:n]]
     x, y = few(twin, _COARSE), few(place.points, _COARSE)
@@ -132,7 +134,7 @@ def _placed(twin: np.ndarray, place: PlaceSurface, target: Target) -> list[_Plac
         found.append(_icp(x, y, matrix, target, 15))
     found.sort(key=lambda f: f.cost / scale_of(f.matrix))
     x, y = few(twin, _FINE), few(place.points, 2 * _FINE)
-    last = [_settled(x, y, f.matrix, place, target) for f in _different(found, place.diagonal)[:_LAST]]
+    last = [_settled(x, y, f.matrix, place, own, target) for f in _different(found, place.diagonal)[:_LAST]]
     return sorted(last, key=lambda f: f.cost / scale_of(f.matrix))
 
 
@@ -157,8 +159,14 @@ def _icp(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, target: Target, most:
     return _Placed(matrix, cost)
 
 
-def _settled(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: PlaceSurface, target: Target) -> _Placed:
-    """Closest points slide along surfaces by small steps; the distance field has the slope that leads there at once."""
+def _settled(
+    x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: PlaceSurface, twin: DistanceGrid, target: Target
+) -> _Placed:
+    """Closest points slide along surfaces by small steps; the distance field has the slope that leads there at once.
+
+    The mean distance is that of both fields (``twin``: that of the twin), with what is far counted as no farther than
+    it has to be to tell that it is.
+    """
     matrix = _icp(x, y, matrix, target, 8).matrix
     near = _NEAR * place.diagonal / scale_of(matrix)
     basis = upright_basis(False) if target.upright else ALL
@@ -166,8 +174,10 @@ def _settled(x: np.ndarray, y: np.ndarray, matrix: np.ndarray, place: PlaceSurfa
     center, own = move(matrix, x).mean(axis=0), np.arange(len(x))
     for wide in (3.0, 1.0):
         matrix = refine([OnSurface(place, x, own, near)], matrix, center, basis, wide, 30).matrix
-    a, b, _ = _closest(x, y, KDTree(y), KDTree(x), matrix, _OVERLAP)
-    return _Placed(matrix, float(np.mean(np.linalg.norm(move(matrix, a) - b, axis=1))))
+    s, most = scale_of(matrix), _FAR * place.diagonal
+    forth = np.minimum(place.distance.at(move(matrix, x)), most)
+    back = np.minimum(twin.at(move(np.linalg.inv(matrix), y)) * s, most)
+    return _Placed(matrix, float(0.5 * (forth.mean() + back.mean())))
 
 
 def _closest(

@@ -48,7 +48,7 @@ def alignment_figure(
             axes.set_xlabel("xyz"[a], fontsize=7, color=INK, labelpad=1)
             axes.set_ylabel("xyz"[b], fontsize=7, color=INK, labelpad=1)
             axes.tick_params(labelsize=7, colors=INK, length=2)
-    figure.axes[0].legend(fontsize=7, frameon=False, markerscale=2, loc="upper right")
+    figure.axes[0].legend(fontsize=7, frameon=False, markerscale=5, loc="upper right")
     figure.suptitle(title, fontsize=10, color=INK)
     figure.tight_layout()
     return figure
