@@ -1,4 +1,4 @@
-"""Surfaces in files, as points: meshes and clouds (PLY, OBJ), tables of points (CSV), arrays (.npy)."""
+"""Surfaces in files, as points: meshes and clouds (PLY, OBJ), tables (CSV, Project Aria's too), arrays (.npy)."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.capture.semidense import read_semidense
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.bounded import read_bytes, reading
 from nerg_mi.files.npy import read_npy
-from nerg_mi.rays.readers.parsing.tables import iterate_table
+from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 from nerg_mi.rendering.mesh_file import check_ply
 
-SUFFIXES = (".ply", ".obj", ".csv", ".npy")
+SUFFIXES = (".ply", ".obj", ".csv", ".csv.gz", ".npy")
 """Files that are read."""
 
 POINTS = 200_000
@@ -26,13 +27,12 @@ BYTES = 1 << 30
 def read_surface(path: Path, count: int = POINTS) -> np.ndarray:
     """At most ``count`` points (N, 3) on the surface in ``path``, in its own frame and units; drawn at random, with the
     same result every time. Raises `NergError` for a file without finite points."""
-    if path.suffix.lower() not in SUFFIXES:
+    if not path.name.lower().endswith(SUFFIXES):
         raise NergError(f'"{path}" is no surface that is read; give a mesh or points in {", ".join(SUFFIXES)}')
     if not path.is_file():
         raise MissingFile(f'there is no surface "{path}"; correct its name')
-    if path.suffix.lower() == ".csv":
-        blocks = [b.numbers for b in iterate_table(path, ("x", "y", "z"))]
-        points = np.concatenate(blocks) if blocks else np.zeros((0, 3))
+    if path.name.lower().endswith((".csv", ".csv.gz")):
+        points = _table(path)
     elif path.suffix.lower() == ".npy":
         points = _array(path)
     else:
@@ -42,6 +42,13 @@ def read_surface(path: Path, count: int = POINTS) -> np.ndarray:
         raise NergError(f'the surface "{path}" has no points; export it again')
     rng = np.random.default_rng(0)
     return points if len(points) <= count else points[np.sort(rng.permutation(len(points))[:count])]
+
+
+def _table(path: Path) -> np.ndarray:
+    if "px_world" in table_columns(path):
+        return read_semidense(path).astype(np.float64)
+    blocks = [b.numbers for b in iterate_table(path, ("x", "y", "z"))]
+    return np.concatenate(blocks) if blocks else np.zeros((0, 3))
 
 
 def _array(path: Path) -> np.ndarray:

@@ -1,3 +1,5 @@
+import gzip
+
 import numpy as np
 import pytest
 import trimesh
@@ -24,7 +26,10 @@ def test_clouds_tables_and_arrays(tmp_path):
     write_columns(tmp_path / "a.ply", dict(zip("xyz", p.T)))
     np.save(tmp_path / "a.npy", p)
     (tmp_path / "a.csv").write_text("x,y,z\n" + "".join(f"{a},{b},{c}\n" for a, b, c in p.tolist()) + "nan,1,2\n")
-    for name in ("a.ply", "a.npy", "a.csv"):
+    head = "uid,graph_uid,px_world,py_world,pz_world,inv_dist_std,dist_std\n"
+    rows = "".join(f"{k},g,{x},{y},{z},0.001,0.01\n" for k, (x, y, z) in enumerate(p.tolist()))
+    (tmp_path / "s.csv.gz").write_bytes(gzip.compress((head + rows).encode()))
+    for name in ("a.ply", "a.npy", "a.csv", "s.csv.gz"):
         np.testing.assert_allclose(read_surface(tmp_path / name), p, atol=1e-6)
     assert len(read_surface(tmp_path / "a.npy", 10)) == 10
 
