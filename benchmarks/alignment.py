@@ -210,6 +210,8 @@ def measure(world: World, kind: str, trials: int, mirrors: int) -> dict:
 
 def cells(row: dict) -> list[str]:
     numbers = [f"{row[k]:.2g}" for k in ("error cm", "95 %", "degrees", "scale %", "residual cm")]
+    # Of a scale that was given nothing is found.
+    numbers[3] = "" if row["scale %"] < 1e-9 else numbers[3]
     named = f"{row['named']} of {row['mirrors']}" if row["mirrors"] else ""
     right = f"{row['right']} of {row['trials']}"
     return [row["evidence"], row["known besides"], right, *numbers, named, f"{row['s']:.2g}"]

@@ -64,6 +64,9 @@ class Tracking:
             )
         tell(0.1, "looking for the place of the tracking")
         proper = _searched(some, surface, target)
+        if not len(some.hits):
+            # Free space has room for many placements, mirrored ones too: heads cannot tell them apart.
+            return self._told(proper[0], some, target, [], None)
         tell(0.55, "looking for the place of the mirrored tracking")
         mirrored = _searched(some.mirrored(), surface, target)
         doubts = []

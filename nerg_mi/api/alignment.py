@@ -45,4 +45,4 @@ def align(
 
     job = options_of(AlignOptions, "align", options, changes)
     given = Path(rays) if isinstance(rays, str) else rays
-    return alignment.align(given, output, job, reporter).alignment  # pyright: ignore[reportArgumentType] # a path
+    return alignment.align(given, output, job, reporter).alignment
