@@ -87,3 +87,16 @@ def test07_planted_mistakes_are_named(benchmark, made):
         share = 1.0 if "all" in mistake.of and mistake.check != "frames" else 0.5
         found = checks.named(mistake.plant(made, spread(made, share)))
         assert mistake.check in found or (mistake.name == "ms taken for s" and "times" in found), mistake.name
+
+
+def test07_alignments(benchmark):
+    from tests.alignment import rooms
+
+    alignment = benchmark("alignment")
+    world = alignment.World(rooms.felt(2000), rooms.felt(2000).end, rooms.people(200))
+    there = page("tracking.md")
+    assert f"| {' | '.join(alignment.HEAD)} |" in there
+    for kind in ("pairs", "cameras"):
+        cells = alignment.cells(alignment.measure(world, kind, 2, 1))
+        assert cells[2] == "2 of 2" and cells[-2] == "1 of 1"
+        assert any(line.startswith(f"| {cells[0]} |") for line in there)
