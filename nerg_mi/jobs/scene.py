@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.alignment.record import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
@@ -22,7 +23,6 @@ from nerg_mi.training.geometry.places import place_of_hits
 from nerg_mi.view.overview import Frame, Seen
 
 from .backend import select_backend
-from .gaze_places import read_similarity
 from .options.scene import SceneOptions
 from .reporter import SILENT, Reporter
 from .scenes.cameras import Probe, best_camera, best_photo, given_point, probe_values, turned_ahead, upright

@@ -62,6 +62,7 @@ FLAGS = {
     "fresh": "--fresh-directions",
     "normalized": "--normalized",
     "semantic_own": "--semantic-own",
+    "force": "--force",
     "freeze": "--freeze",
     "refit": "--no-refit",
     "resume": "--resume",
