@@ -89,7 +89,7 @@ def test07_planted_mistakes_are_named(benchmark, made):
         assert mistake.check in found or (mistake.name == "ms taken for s" and "times" in found), mistake.name
 
 
-def test07_alignments(benchmark):
+def test08_alignments(benchmark):
     from tests.alignment import rooms
 
     alignment = benchmark("alignment")
