@@ -19,6 +19,9 @@ from .frames import RAYS, Frame
 BAD_LINES = 0.01
 """Share of a file's lines that may be left out since they cannot be read."""
 
+STREAMED = 1 << 20
+"""So many rays are kept at a time where somebody takes them as they come."""
+
 NAMED_RUNS = 500_000
 """So many runs of dropped rows are named; of more, as where every other row is a blink, only the number is kept."""
 
@@ -53,13 +56,20 @@ class RaysBuilder:
 
     ``frame``: that of all that is added. ``skip_bad_lines``: leave out lines that cannot be read, with an account of
     them too, as long as they are at most `BAD_LINES` of a file's, or one. ``on_source``: called with the name of each
-    source as it is begun.
+    source as it is begun. ``on_rays``: takes the rays as soon as there are `STREAMED` of them, with no metadata but
+    their frame, so that memory is bounded whatever the size of the sources; `build` then gives the last ones.
     """
 
     def __init__(
-        self, frame: Frame = RAYS, *, skip_bad_lines: bool = False, on_source: Callable[[str], None] | None = None
+        self,
+        frame: Frame = RAYS,
+        *,
+        skip_bad_lines: bool = False,
+        on_source: Callable[[str], None] | None = None,
+        on_rays: Callable[[Rays], None] | None = None,
     ) -> None:
         self._frame, self._transform, self._on_source = frame, frame.to_rays(), on_source
+        self._on_rays = on_rays
         self._notes: dict[str, Any] = {}
         self._parts: list[dict[str, np.ndarray]] = []
         self._kept: list[int] = []
@@ -184,6 +194,8 @@ class RaysBuilder:
             part["cohort"] = self._cohorts.codes(cohort, n)[keep]
         self._parts.append(part)
         self._kept.append(int(keep.sum()))
+        if self._on_rays is not None and sum(self._kept) >= STREAMED:
+            self._on_rays(self._take({"frame": dict(FRAME)}))
 
     def _drop(self, reason: str, rows: np.ndarray) -> None:
         name = self._sources[-1]["file"] if self._sources else ""
@@ -202,9 +214,10 @@ class RaysBuilder:
             )
 
     def build(self) -> Rays:
-        """The rays collected; the builder is empty afterwards. Raises `NergError` when no ray is left."""
+        """The rays collected, with the metadata of all; the builder is empty afterwards. Raises `NergError` when no ray
+        is left, unless somebody has taken the rays as they came: then these may be none."""
         self._end_source()
-        if not sum(self._kept):
+        if not sum(self._kept) and self._on_rays is None:
             why = "; ".join(f"{d['count']} rows: {d['reason']}" for d in self._dropped[:4]) or "the files hold no rows"
             raise NergError(f"no ray is left of {self._rows_read} rows ({why}); check the column map and the preset")
         metadata = {
@@ -216,6 +229,13 @@ class RaysBuilder:
             "dropped": self._dropped,
             **self._notes,
         }
+        return self._take(metadata)
+
+    def _take(self, metadata: dict[str, Any]) -> Rays:
+        """The rays that are here, which the builder then has no more."""
+        if not self._parts:
+            none = np.zeros((0, 3))
+            return Rays(none[:, 0], np.zeros(0, np.int32), (), none, none, none[:, 0], metadata=metadata)
         columns = {name: self._column(name) for name in COLUMNS if any(name in part for part in self._parts)}
         columns["person"], persons = self._persons.sorted(columns["person"])
         if any(_EYES in part for part in self._parts):
@@ -224,6 +244,7 @@ class RaysBuilder:
         if "cohort" in columns:
             columns["cohort"], cohorts = self._cohorts.sorted(columns["cohort"])
             cohorts = tuple(c or "unknown" for c in cohorts)
+        self._parts, self._kept = [], []
         return Rays(**columns, persons=persons, cohorts=cohorts, metadata=metadata)
 
     def _column(self, name: str) -> np.ndarray:

@@ -115,12 +115,14 @@ def read_rays(
     *,
     skip_bad_lines: bool = False,
     on_source: Callable[[str], None] | None = None,
+    on_rays: Callable[[Rays], None] | None = None,
 ) -> Rays:
     """The rays of ``files``, right-handed, z up, in metres and seconds, with the account of what was dropped.
 
     ``reader``: one, or its name. ``options``: an object of its ``Options`` (default: all as they are by default).
     ``skip_bad_lines``: leave out lines that cannot be read, at most 1 % of a file's. ``on_source``: called with the
-    name of each file as it is begun. The metadata say by which reader,
+    name of each file as it is begun. ``on_rays``: takes rays block by block as they are read, so that files of any size
+    are read in bounded memory; returned are the last of them, maybe none, with the metadata of all. The metadata say by which reader,
     with which options, from which files and frame the rays were made. Raises `NergError` for files that are not of the
     format, or give no ray; ``TypeError`` for options of another reader.
     """
@@ -131,7 +133,9 @@ def read_rays(
     paths = [Path(p) for p in ([files] if isinstance(files, (str, os.PathLike)) else files)]
     if not paths:
         raise NergError("there are no tracking files to read; name one or more")
-    builder = RaysBuilder(reader.frame(paths, options), skip_bad_lines=skip_bad_lines, on_source=on_source)
+    builder = RaysBuilder(
+        reader.frame(paths, options), skip_bad_lines=skip_bad_lines, on_source=on_source, on_rays=on_rays
+    )
     builder.note(preset=reader.name, **recorded_options(options))
     reader.read(paths, options, builder)
     return builder.build()

@@ -140,3 +140,25 @@ def test_heads_and_eyes(tmp_path):
     rays = builder.build()
     assert np.allclose(rays.head[0], [0, 1, 0]) and np.isnan(rays.head[1:]).all() and len(rays.head) == 8
     assert rays.metadata["eye_distance"] == {"ann": 0.062, "bo": 0.064}
+
+
+def test_rays_are_handed_over_as_they_come(monkeypatch):
+    """In blocks, whose rows are together those that are built at once; the metadata come with the last."""
+    monkeypatch.setattr("nerg_mi.rays.readers.builder.STREAMED", 30)
+    taken: list = []
+
+    def added(builder):
+        for k in range(7):
+            t = np.arange(10.0) + 10 * k
+            t[3] = np.nan
+            ahead = np.tile([1.0, 0.0, 0.0], (10, 1))
+            builder.add(t, ["bo", "ann"] * 5, ahead, ahead, rows=np.arange(10) + 10 * k, cohort=["x"] * 10)
+        return builder.build()
+
+    whole, last = added(RaysBuilder()), added(RaysBuilder(on_rays=taken.append))
+    assert [len(part) for part in taken] == [36] and len(last) == 27 and last.metadata == whole.metadata
+    assert np.array_equal(np.concatenate([part.t for part in (*taken, last)]), whole.t)
+    assert all(part.persons == ("ann", "bo") and part.cohorts == ("x",) for part in (*taken, last))
+    assert taken[0].metadata == {"frame": whole.metadata["frame"]}
+    none = RaysBuilder(on_rays=taken.append).build()
+    assert len(none) == 0 and none.metadata["rows_read"] == 0
