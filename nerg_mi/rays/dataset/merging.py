@@ -1,0 +1,76 @@
+"""Rays of several blocks or sources as one, and what their metadata say of all of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.rays.io import COLUMNS
+from nerg_mi.rays.rays import FRAME, Rays
+
+from .manifest import Source
+
+_MERGED = ("sources", "dropped", "rows_read")
+_EMPTY = np.zeros((0, 3))
+
+
+def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -> Rays:
+    """The rays of all ``blocks``, in this order, with the sorted persons and cohorts that are named in any of them.
+
+    Blocks without hit points get NaN, and those without cohorts the cohort "unknown", where others have some.
+    """
+    held = [(block.columns(), block.persons, block.cohorts, len(block)) for block in blocks]
+    metadata = {"frame": dict(FRAME)} if metadata is None else metadata
+    if not held:
+        none = _EMPTY[:, 0]
+        return Rays(none, np.zeros(0, np.int32), (), _EMPTY, _EMPTY, none, metadata=metadata)
+    persons = tuple(sorted({name for _, names, _, _ in held for name in names}))
+    grouped = any("cohort" in columns for columns, *_ in held)
+    alike = {"unknown"} if any("cohort" not in columns for columns, *_ in held) else set()
+    cohorts = tuple(sorted({name for _, _, names, _ in held for name in names} | alike)) if grouped else ()
+    for columns, known, groups, n in held:
+        columns["person"] = _renumbered(columns["person"], known, persons)
+        if grouped:
+            codes, groups = (
+                (columns["cohort"], groups) if "cohort" in columns else (np.zeros(n, np.int32), ("unknown",))
+            )
+            columns["cohort"] = _renumbered(codes, groups, cohorts)
+        if "hit" not in columns and any("hit" in other for other, *_ in held):
+            columns["hit"] = np.full((n, 3), np.nan)
+    # Column by column, so that no more than one is there twice.
+    joined = {
+        name: np.concatenate([columns.pop(name) for columns, *_ in held]) for name in COLUMNS if name in held[0][0]
+    }
+    return Rays(**joined, persons=persons, cohorts=cohorts, metadata=metadata)
+
+
+def _renumbered(codes: np.ndarray, names: Sequence[str], into: Sequence[str]) -> np.ndarray:
+    if tuple(names) == tuple(into):
+        return codes
+    place = {name: k for k, name in enumerate(into)}
+    return np.array([place[name] for name in names], np.int32)[codes]
+
+
+def merge_metadata(sources: Sequence[Source]) -> dict[str, Any]:
+    """What holds for all sources, what was dropped of any, and how many rows were read; ``steps`` that all have had."""
+    about = [source.metadata for source in sources]
+    first = about[0] if about else {"frame": dict(FRAME)}
+    same = {k: v for k, v in first.items() if k not in _MERGED and all(other.get(k) == v for other in about)}
+    return {
+        **same,
+        "frame": first["frame"],
+        "sources": [entry for other in about for entry in other.get("sources", [])],
+        "rows_read": sum(other.get("rows_read", 0) for other in about),
+        "dropped": [entry for other in about for entry in other.get("dropped", [])],
+    }
+
+
+def merge_counts(counts: Iterable[dict[str, int]]) -> dict[str, int]:
+    """Sums by name, in the order of names."""
+    total: Counter[str] = Counter()
+    for found in counts:
+        total.update(found)
+    return dict(sorted(total.items()))
