@@ -112,7 +112,8 @@ def load_rays(path: FilePath) -> Rays:
     """Read rays of attention: who looked from where to where, and when.
 
     ``path``: a file (.npz or .parquet) that ``nerg rays import``, `import_rays` or the method ``save`` of rays has
-    written. Right-handed, z up, metres and seconds (`Rays`). Raises `NergError` for a file that is missing or damaged.
+    written; or a dataset (.rays), of at most 50 million rays. Right-handed, z up, metres and seconds (`Rays`). Raises
+    `NergError` for a file that is missing or damaged.
 
     >>> import nerg_mi as nerg
     >>> rays = nerg.Rays(t=[0, 0.1], person=[0, 0], persons=("Ada",), origin=[[1, 1, 1.6]] * 2,
@@ -121,9 +122,9 @@ def load_rays(path: FilePath) -> Rays:
     >>> len(nerg.load_rays(folder / "rays.npz"))
     2
     """
-    from nerg_mi.rays.rays import Rays
+    from nerg_mi.rays.dataset.opening import load_rays as load
 
-    return Rays.load(_existing(path))
+    return load(_existing(path))
 
 
 def _existing(path: FilePath) -> Path:

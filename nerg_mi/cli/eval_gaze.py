@@ -18,7 +18,7 @@ def eval_gaze(
     gaze: Annotated[
         Path, typer.Argument(help="Checkpoint of a gaze field that was trained with --test-zones (.safetensors).")
     ],
-    rays: Annotated[Path, typer.Argument(help="The rays file that it was trained on.")],
+    rays: Annotated[Path, typer.Argument(help="The rays file or dataset that it was trained on.")],
     options: GazeEvaluationOptions,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for tables and pictures. Default: GAZE.eval")

@@ -19,7 +19,9 @@ def train_gaze(
     options: GazeOptions,
     rays: Annotated[
         Path | None,
-        typer.Argument(help="Rays file (.npz or .parquet), as nerg rays import writes it. None: --views alone."),
+        typer.Argument(
+            help="Rays file (.npz or .parquet) or dataset, as nerg rays import writes it. None: --views alone."
+        ),
     ] = None,
 ) -> None:
     """Train a gaze field on rays of attention, and report its scores at positions that were held out."""

@@ -24,6 +24,7 @@ from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.fields import save_gaze
+from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.plan import GazePlan
 from nerg_mi.training.gaze.recipes import gaze_recipe
@@ -81,7 +82,7 @@ def ablate(
     truth = _law(options.law) if options.law else None
     check_folder(output)
     ns = select_backend(options.mode, options.threads)
-    data = rays if isinstance(rays, Rays) else Rays.load(rays)
+    data = rays if isinstance(rays, Rays) else load_rays(rays)
     _, account = hold_out(data, options.radius, options.zones, options.positions, 0, options.min_rays, options.people)
     train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")
     place = make_place(options, train, (), output / "place.vol", ns, reporter=reporter)

@@ -11,8 +11,8 @@ from nerg_mi.evaluation.gaze.baselines import standard_baselines
 from nerg_mi.evaluation.gaze.report import side_by_side, write_report
 from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
 from nerg_mi.files.atomic import check_folder
-from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.rays.dataset.opening import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 
 from .backend import select_backend
@@ -104,9 +104,13 @@ def _rays_of_training(gaze: Path, about: dict, rays: Rays | str | Path) -> Rays:
         )
     if isinstance(rays, Rays):
         return rays
-    if about.get("rays_file", {}).get("sha256") not in (None, file_sha256(Path(rays))):
-        raise NergError(f'"{gaze}" was trained on other rays than "{rays}"; give the file {about["rays_file"]["file"]}')
-    return Rays.load(rays)
+    trained = about.get("rays_file", {})
+    if trained.get("sha256") not in (None, rays_digest(rays)):
+        raise NergError(
+            f'"{gaze}" was trained on other rays than "{rays}"; give the file {trained["file"]}, as it was then'
+        )
+    # Of a dataset the same sample.
+    return load_rays(rays, trained.get("most"), trained.get("seed", 0))
 
 
 def _notes(

@@ -14,10 +14,11 @@ from nerg_mi.capture.salience.views import SalienceSet, open_salience
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.files.atomic import check_writable
-from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.dataset.layout import is_dataset
+from nerg_mi.rays.dataset.opening import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze import run
 from nerg_mi.training.gaze.ensemble import train_ensemble
@@ -56,7 +57,8 @@ def train_gaze(
     options: GazeOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> GazeResult:
-    """Train a gaze field on ``rays`` of attention, or their file (.npz or .parquet); None: on salience images alone.
+    """Train a gaze field on ``rays`` of attention, or their file (.npz or .parquet) or dataset; None: on salience
+    images alone.
 
     ``output``: checkpoint to write (.safetensors). Beside it are kept the state of the run while that is not done
     (.run), from which it can be resumed, and a place of hit points (.vol). After Ctrl-C the result so far and the state
@@ -151,8 +153,11 @@ def _supervision(
     if isinstance(rays, Rays):
         data = rays
     elif rays is not None:
-        path, data = Path(rays), Rays.load(rays)
-        about["rays_file"] = {"file": path.name, "sha256": file_sha256(path), "persons": len(data.persons)}
+        path, data = Path(rays), load_rays(rays, options.most, options.seed)
+        about["rays_file"] = {"file": path.name, "sha256": rays_digest(path), "persons": len(data.persons)}
+        if is_dataset(path):
+            about["rays_file"] |= {"most": options.most, "seed": options.seed, "rays": len(data)}
+            reporter.message(f"{len(data):,} rays of {path}")
     views = []
     if options.views is not None and options.salience is not None:
         found, similarity = _open_views(options, options.views, options.salience)

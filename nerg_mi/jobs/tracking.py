@@ -13,16 +13,20 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
-from nerg_mi.rays import filters, fixations, splits
+from nerg_mi.rays import splits
+from nerg_mi.rays.dataset.layout import is_dataset
+from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.guess.proposal import Proposal, propose_import
 from nerg_mi.rays.io import SUFFIXES
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
-from nerg_mi.rays.readers.registry import TABLE, read_rays
+from nerg_mi.rays.readers.registry import read_rays
 from nerg_mi.rays.summary import RaysSummary, summarise
 from nerg_mi.view import figures, ray_figures
 
-from .options.rays import FilterOptions, SplitOptions
+from .datasets import dataset_cards, filter_dataset, import_dataset
+from .filtering import FilterSteps
+from .options.rays import FilterOptions, ImportOptions, SplitOptions
 from .reporter import SILENT, Reporter
 
 if TYPE_CHECKING:
@@ -32,40 +36,31 @@ FileName = str | os.PathLike
 KINDS = ("density", "layout")
 
 
-@dataclass(frozen=True, kw_only=True)
-class ImportOptions:
-    """How tracking files become rays. Raises `NergError` for a salt without pseudonyms."""
-
-    reader: str = TABLE  # name of a registered reader (`nerg_mi.rays.readers.registry`)
-    settings: Any = None  # an object of the reader's Options; None: as they are by default
-    skip_bad_lines: bool = False  # leave out lines that cannot be read, at most 1 % of a file's
-    pseudonyms: bool = False  # replace the names of persons by salted hashes
-    salt: FileName | None = None  # of the hashes: a file of 16 bytes or more; None: random, not kept
-    output: FileName | None = None  # rays file to write, .npz or .parquet; None: none
-    align_output: FileName | None = None  # JSON file to write: the similarity from rays to the files' frame; None: none
-
-    def __post_init__(self) -> None:
-        if self.salt is not None and not self.pseudonyms:
-            raise NergError("--salt belongs to --pseudonyms; add it, or leave out --salt")
-
-
 @dataclass(frozen=True, eq=False)
 class ImportResult:
-    """Rays, whose metadata hold the account of what was dropped, and their figures."""
+    """Rays, whose metadata hold the account of what was dropped, and their figures.
+
+    Of a dataset of more than a million they are a sample, as its metadata say, and the figures are of all of them.
+    """
 
     rays: Rays
     summary: RaysSummary
+    # Further lines of the card, of a dataset: names and texts.
+    lines: tuple[tuple[str, str], ...] = ()
 
 
 def import_rays(
-    files: FileName | Sequence[FileName], options: ImportOptions = ImportOptions(), reporter: Reporter = SILENT
+    files: FileName | Sequence[FileName], options: ImportOptions | None = None, reporter: Reporter = SILENT
 ) -> ImportResult:
     """Tracking files (or folders, by the reader) as rays: right-handed, z up, metres, seconds.
 
     Raises `NergError` for what the reader refuses, or an output that cannot be written, before anything is read; for an
     alignment with files whose frame is the other hand's.
     """
+    options = options or ImportOptions()
     files = [files] if isinstance(files, (str, os.PathLike)) else list(files)
+    if options.into_dataset:
+        return ImportResult(*import_dataset(files, options, reporter))
     _check_outputs(options.output)
     if options.align_output is not None:
         check_writable(options.align_output, ".json")
@@ -106,11 +101,20 @@ def guess_import(file: FileName, reporter: Reporter = SILENT) -> Proposal:
     return propose_import(Path(file))
 
 
+def card_of(path: FileName) -> list[tuple[str, ImportResult]]:
+    """Titles, figures and lines of the sanity cards of a file of rays, or of each place of a dataset."""
+    if not is_dataset(path):
+        rays = Rays.load(path)
+        return [(str(path), ImportResult(rays, summarise(rays)))]
+    return [(title, ImportResult(*card)) for title, card in dataset_cards(path)]
+
+
 @dataclass(frozen=True, eq=False)
 class FilterResult:
     """The rays that were kept, and how many fixations there were, if they were asked for."""
 
-    rays: Rays
+    # None: they were written to another dataset.
+    rays: Rays | None
     fixations: int | None
 
 
@@ -119,52 +123,17 @@ def filter_rays(rays: Rays | FileName, options: FilterOptions, reporter: Reporte
 
     Raises `NergError` where a step leaves no ray, and for what `nerg_mi.rays.filters` and `.fixations` refuse.
     """
+    if not isinstance(rays, Rays) and is_dataset(rays):
+        return FilterResult(*filter_dataset(rays, options, reporter))
     _check_outputs(options.output)
-    steps = _Steps(rays, reporter)
+    steps = FilterSteps(_load(rays), own=not isinstance(rays, Rays), reporter=reporter)
     if options.conditions:
-        steps.keep(filters.select_mask(steps.rays, **options.conditions), "filter", options.conditions)
-    count = None
-    if options.fixations is not None:
-        by_velocity = options.fixations == "ivt"
-        limit = {"velocity": options.velocity} if by_velocity else {"dispersion": options.dispersion}
-        limit |= {} if options.least is None else {"least": options.least}
-        label = (fixations.ivt if by_velocity else fixations.idt)(steps.rays, **limit)
-        count = len(np.unique(label[label >= 0]))
-        reporter.message(f"{count:,} fixations ({options.fixations})")
-        what = {"by": options.fixations, **limit}
-        if options.one_ray:
-            steps.replace(fixations.fixation_rays(steps.rays, label)[0], "fixations", {**what, "one_ray": True})
-        else:
-            steps.keep(label >= 0, "fixations", what)
-    if options.thin is not None:
-        what = {"seconds": options.thin, "distance": options.thin_distance}
-        steps.keep(filters.thin_mask(steps.rays, **what), "thin", what)
+        steps.select(options.conditions)
+    count = steps.follow(options)
+    if options.sample is not None:
+        steps.sample(options.sample, options.seed)
     _save(steps.rays, options.output)
     return FilterResult(steps.rays, count)
-
-
-class _Steps:
-    """Rays to which one thing after the other is done."""
-
-    def __init__(self, rays: Rays | FileName, reporter: Reporter) -> None:
-        self.rays, self.reporter = _load(rays), reporter
-        # Rays that somebody else holds stay as they are.
-        self.own = self.rays is not rays
-
-    def keep(self, mask: np.ndarray, step: str, what: dict[str, Any]) -> None:
-        """Keep the rays of a mask (N,); in their own memory, if nobody else holds them."""
-        rays, count = self.rays, int(mask.sum())
-        if not count:
-            raise NergError(f"{step} leaves none of {len(rays):,} rays; widen its conditions")
-        self.reporter.message(f"{step}: {count:,} of {len(rays):,} rays")
-        kept = rays.keep_in_place(mask) if self.own else rays.select(mask)
-        self.rays, self.own = kept.with_step(step=step, kept=count, of=len(rays), **what), True
-
-    def replace(self, rays: Rays, step: str, what: dict[str, Any]) -> None:
-        """Go on with other rays that were made of these."""
-        before = len(self.rays)
-        self.reporter.message(f"{step}: one ray each, {len(rays):,} of {before:,} rays")
-        self.rays, self.own = rays.with_step(step=step, kept=len(rays), of=before, **what), True
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +217,7 @@ def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions()) -> Fi
 
 
 def _load(rays: Rays | FileName) -> Rays:
-    return rays if isinstance(rays, Rays) else Rays.load(rays)
+    return rays if isinstance(rays, Rays) else load_rays(rays)
 
 
 def _check_outputs(*outputs: FileName | None) -> None:

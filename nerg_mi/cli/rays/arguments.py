@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,12 +12,15 @@ if TYPE_CHECKING:
     from nerg_mi.rays.rays import Rays
     from nerg_mi.rays.summary import RaysSummary
 
-RaysFile = Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet).")]
-Output = Annotated[Path, typer.Option("-o", "--output", help="Rays file to write (.npz or .parquet).")]
+RaysFile = Annotated[Path, typer.Argument(help="Rays file (.npz or .parquet), or dataset (a folder).")]
+Output = Annotated[
+    Path, typer.Option("-o", "--output", help="Rays file (.npz or .parquet) or dataset (.rays) to write.")
+]
 
 
-def print_card(rays: Rays, summary: RaysSummary, path: Path) -> None:
-    """The sanity card of the rays in the file ``path``, as a table on the terminal."""
+def print_card(rays: Rays, summary: RaysSummary, path: Path | str, lines: Sequence[tuple[str, str]] = ()) -> None:
+    """The sanity card of the rays in the file ``path``, as a table on the terminal; ``lines``: further ones, before
+    what is implausible."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -27,6 +31,7 @@ def print_card(rays: Rays, summary: RaysSummary, path: Path) -> None:
     # Names come from files: they are neither markup nor control characters of a terminal.
     safe = lambda text: escape(plain(text, 10_000))
     card = Table(show_header=False, box=None, title=safe(path), title_justify="left")
-    for name, text in card_lines(rays, summary):
+    found = card_lines(rays, summary)
+    for name, text in sorted([*found, *lines], key=lambda line: line[0] == WARNING):
         card.add_row(f"[bold]{name}[/bold]" if name == WARNING else name, safe(text))
     Console().print(card)

@@ -49,6 +49,19 @@ def _own_options(
             "is in that frame."
         ),
     ] = None,
+    place: Annotated[str | None, typer.Option(help="Of a dataset: the place of all files.  [default: unknown]")] = None,
+    day: Annotated[
+        str | None,
+        typer.Option(
+            help="Of a dataset: the day of all rays, as 2026-11-22.  [default: by their times, in UTC, else unknown]"
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            help="Of a dataset: processes that import files beside each other.  [default: a core each]", min=1
+        ),
+    ] = None,
     skip_bad_lines: Annotated[
         bool,
         typer.Option(
@@ -85,14 +98,7 @@ def _parameter(option: SharedOption) -> inspect.Parameter:
 
 
 def _import_rays(
-    files: list[Path],
-    output: Path,
-    preset: str | None,
-    write_align: Path | None,
-    skip_bad_lines: bool,
-    pseudonyms: bool,
-    salt: Path | None,
-    settings: dict[str, Any],
+    files: list[Path], output: Path, preset: str | None, write_align: Path | None, settings: dict[str, Any], **more: Any
 ) -> None:
     from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.jobs.tracking import ImportOptions, import_rays
@@ -102,17 +108,11 @@ def _import_rays(
         raise NergError("say what the files are: either --preset NAME or --map COLUMNS")
     reader = preset or TABLE
     options = ImportOptions(
-        reader=reader,
-        settings=parse_options(reader, settings),
-        skip_bad_lines=skip_bad_lines,
-        pseudonyms=pseudonyms,
-        salt=salt,
-        output=output,
-        align_output=write_align,
+        reader=reader, settings=parse_options(reader, settings), output=output, align_output=write_align, **more
     )
     with TerminalReporter() as reporter:
         result = import_rays(files, options, reporter)
-    print_card(result.rays, result.summary, output)
+    print_card(result.rays, result.summary, output, result.lines)
     typer.echo(f"wrote {output}")
     if write_align is not None:
         typer.echo(f"wrote {write_align}")

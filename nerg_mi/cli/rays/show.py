@@ -6,9 +6,11 @@ from .arguments import RaysFile, print_card
 
 
 def command(rays: RaysFile) -> None:
-    """The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height."""
-    from nerg_mi.rays.rays import Rays
-    from nerg_mi.rays.summary import summarise
+    """The sanity card: rays, persons, duration, rate, what was dropped, extent, eye height.
 
-    data = Rays.load(rays)
-    print_card(data, summarise(data), rays)
+    Of a dataset one for each place; of very many rays some figures are of a sample, as it says.
+    """
+    from nerg_mi.jobs.tracking import card_of
+
+    for title, found in card_of(rays):
+        print_card(found.rays, found.summary, title, found.lines)

@@ -33,6 +33,9 @@ class GazeOptions(PlaceOptions):
     )
     force: bool = option(False, "Train even where no gaze meets a surface of the place.")
     radius: float | None = option(None, "Radius R of a probe in metres.")
+    most: int = option(
+        10_000_000, "Rays of a dataset at most; of more, a sample by --seed in which each is as likely.", min=1
+    )
     probes: int | None = option(None, "Number of probes at most.")
     placement: str | None = option(None, "Of probes: data, grid, random or blue.")
     cap: int | None = option(None, "Rays in a probe at most, the nearest.")

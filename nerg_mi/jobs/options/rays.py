@@ -1,4 +1,4 @@
-"""Options of what is done to rays of attention: filtering and splitting."""
+"""Options of what is done to rays of attention: importing, filtering and splitting."""
 
 from __future__ import annotations
 
@@ -11,6 +11,47 @@ from nerg_mi.errors import NergError
 from . import option, parse_numbers
 
 DETECTORS = ("ivt", "idt")
+DATASET = ".rays"
+"""How the name of a dataset ends where one is written; any other name is that of a file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """How tracking files become rays. Raises `NergError` for a salt without pseudonyms, and for what only a dataset
+    has."""
+
+    reader: str = option("table", "Name of a registered reader (nerg_mi.rays.readers.registry).")
+    settings: Any = option(None, "An object of the reader's Options. Default: as they are by default.")
+    place: str | None = option(None, "Of a dataset: the place of all files. Default: unknown.")
+    day: str | None = option(None, "Of a dataset: the day of all rays, as 2026-11-22. Default: by their times.")
+    workers: int | None = option(
+        None, "Of a dataset: processes that import files beside each other. Default: a core each."
+    )
+    skip_bad_lines: bool = option(False, "Leave out lines that cannot be read, at most 1 % of a file's.")
+    pseudonyms: bool = option(False, "Replace the names of persons by salted hashes.")
+    salt: Path | str | None = option(None, "Of the hashes: a file of 16 bytes or more. Default: random, not kept.")
+    output: Path | str | None = option(None, "Rays file (.npz or .parquet) or dataset (.rays) to write.")
+    align_output: Path | str | None = option(
+        None, "Of a file: JSON to write, the similarity from rays to the files' own frame.", "--write-align"
+    )
+
+    def __post_init__(self) -> None:
+        if self.salt is not None and not self.pseudonyms:
+            raise NergError("--salt belongs to --pseudonyms; add it, or leave out --salt")
+        given = [n for n in ("place", "day", "workers") if getattr(self, n) is not None]
+        if given and not self.into_dataset:
+            raise NergError(f"--{given[0]} belongs to datasets; let the name of the output end in {DATASET}")
+        if self.align_output is not None and self.into_dataset:
+            raise NergError(
+                "--write-align belongs to files of rays; the sources of a dataset may differ in their frames"
+            )
+        if self.workers is not None and self.workers < 1:
+            raise NergError(f"--workers is a number of processes from 1 on, got {self.workers}")
+
+    @property
+    def into_dataset(self) -> bool:
+        """Whether a dataset is to be written."""
+        return self.output is not None and Path(self.output).suffix.lower() == DATASET
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,18 +76,29 @@ class FilterOptions:
     one_ray: bool = option(False, "One ray a fixation, its mean.")
     thin: float | None = option(None, "A stop counts as at most this many seconds of rays.")
     thin_distance: float = option(0.1, "With --thin, a stop is a stay within this many metres.")
-    output: Path | str | None = option(None, "Rays file to write (.npz or .parquet).", "-o", "--output")
+    sample: int | None = option(None, "So many of the rays that are left, each as likely as any other.", min=1)
+    seed: int = option(0, "Seed of --sample.")
+    output: Path | str | None = option(
+        None, "Rays file to write (.npz or .parquet), or of a dataset another (.rays).", "-o", "--output"
+    )
 
     def __post_init__(self) -> None:
+        if self.sample is not None and self.sample < 1:
+            raise NergError(f"--sample is a number of rays from 1 on, got {self.sample}")
         if self.fixations not in (None, *DETECTORS):
             raise NergError(f'--fixations is "{self.fixations}"; it is ivt or idt')
         if self.one_ray and self.fixations is None:
             raise NergError("--one-ray is of fixations; add --fixations ivt or --fixations idt")
-        if not self.conditions and self.fixations is None and self.thin is None:
+        if not self.conditions and not self.follows and self.sample is None:
             raise NergError(
-                "say which rays to keep, for instance with --from, --person, --box, --fixations or --thin "
+                "say which rays to keep, for instance with --from, --person, --box, --fixations, --thin or --sample "
                 "(--help lists all)"
             )
+
+    @property
+    def follows(self) -> bool:
+        """Whether it is asked for what must see the rays of a person one after the other."""
+        return self.fixations is not None or self.thin is not None
 
     @property
     def conditions(self) -> dict[str, Any]:

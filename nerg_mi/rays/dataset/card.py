@@ -18,7 +18,7 @@ SAMPLE = 1 << 20
 _RUNS = 64
 
 
-def summarise_dataset(dataset: RayDataset, most: int = SAMPLE) -> tuple[Rays, RaysSummary, list[tuple[str, str]]]:
+def summarise_dataset(dataset: RayDataset, most: int = SAMPLE) -> tuple[Rays, RaysSummary, tuple[tuple[str, str], ...]]:
     """Rays of a dataset of one place, its figures, and lines of the card that a file has not.
 
     The rays are all of them, or of more than ``most`` 64 runs of neighbours: of these are the heights, the speed, the
@@ -53,13 +53,14 @@ def summarise_dataset(dataset: RayDataset, most: int = SAMPLE) -> tuple[Rays, Ra
                 f"eye height, speed, rate, distances and what is implausible are of {len(rays):,} rays in {_RUNS} runs",
             )
         )
-    return rays, whole, lines
+    return rays, whole, tuple(lines)
 
 
 def _extent(dataset: RayDataset) -> str:
     days = dataset.days
     spanned = days[0] if len(days) == 1 else f"{len(days)} from {days[0]} to {days[-1]}"
+    some = lambda found, what: f"{len(found):,} {what}{'' if len(found) == 1 else 's'}"
     return (
-        f"{len(dataset.sources):,} sources in {len(dataset.parts):,} parts ({dataset.bytes / 1e6:,.1f} MB), "
+        f"{some(dataset.sources, 'source')} in {some(dataset.parts, 'part')} ({dataset.bytes / 1e6:,.1f} MB), "
         f"place {', '.join(dataset.places)}, day {spanned}"
     )

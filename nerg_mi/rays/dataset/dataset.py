@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -103,6 +103,12 @@ class RayDataset:
         """SHA-256 of which sources and parts there are; another one as soon as rays are added or replaced."""
         named = "\n".join(f"{source.id} {part.path(source.id)} {part.rays} {part.bytes}" for source, part in self.parts)
         return hashlib.sha256(named.encode()).hexdigest()
+
+    def of_place(self, place: str) -> RayDataset:
+        """Its rays of one place, and the sources that have some there or gave none at all."""
+        parts = tuple(found for found in self.parts if found[1].place == place)
+        there = {source.id for source, _ in parts}
+        return replace(self, parts=parts, sources=tuple(s for s in self.sources if s.id in there or not s.parts))
 
     def one_place(self) -> RayDataset:
         """Itself. Raises `NergError` where it holds several places, each of which has a frame of its own."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,11 @@ _EMPTY = np.zeros((0, 3))
 
 
 def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -> Rays:
-    """The rays of all ``blocks``, in this order, with the sorted persons and cohorts that are named in any of them.
+    """The rays of all ``blocks``, in this order, with the sorted persons and cohorts that occur.
 
     Blocks without hit points get NaN, and those without cohorts the cohort "unknown", where others have some.
     """
-    held = [(block.columns(), block.persons, block.cohorts, len(block)) for block in blocks]
+    held = [(block.columns(), block.persons, block.cohorts, len(block)) for block in map(_compact, blocks)]
     metadata = {"frame": dict(FRAME)} if metadata is None else metadata
     if not held:
         none = _EMPTY[:, 0]
@@ -45,6 +46,23 @@ def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -
         name: np.concatenate([columns.pop(name) for columns, *_ in held]) for name in COLUMNS if name in held[0][0]
     }
     return Rays(**joined, persons=persons, cohorts=cohorts, metadata=metadata)
+
+
+def _compact(rays: Rays) -> Rays:
+    """The same rays, without the names of people and cohorts that have none of them."""
+    persons, cohorts = _used(rays.person, rays.persons), _used(rays.cohort, rays.cohorts)
+    if persons == rays.persons and cohorts == rays.cohorts:
+        return rays
+    cohort = None if rays.cohort is None else _places(rays.cohort)
+    return replace(rays, person=_places(rays.person), persons=persons, cohort=cohort, cohorts=cohorts)
+
+
+def _used(codes: np.ndarray | None, names: tuple[str, ...]) -> tuple[str, ...]:
+    return () if codes is None else tuple(names[k] for k in np.unique(codes).tolist())
+
+
+def _places(codes: np.ndarray) -> np.ndarray:
+    return np.unique(codes, return_inverse=True)[1]
 
 
 def _renumbered(codes: np.ndarray, names: Sequence[str], into: Sequence[str]) -> np.ndarray:

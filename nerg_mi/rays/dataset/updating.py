@@ -64,7 +64,7 @@ def update_dataset(
     done = Update()
     with _locked(folder):
         known = {source.where: source for source in read_sources(folder, head)}
-        _clean(folder, known.values())
+        _clean(folder, list(known.values()))
         tasks = []
         for where, path in named.items():
             found = known.get(where)

@@ -122,9 +122,11 @@ def read_rays(
     ``reader``: one, or its name. ``options``: an object of its ``Options`` (default: all as they are by default).
     ``skip_bad_lines``: leave out lines that cannot be read, at most 1 % of a file's. ``on_source``: called with the
     name of each file as it is begun. ``on_rays``: takes rays block by block as they are read, so that files of any size
-    are read in bounded memory; returned are the last of them, maybe none, with the metadata of all. The metadata say by which reader,
-    with which options, from which files and frame the rays were made. Raises `NergError` for files that are not of the
-    format, or give no ray; ``TypeError`` for options of another reader.
+    are read in bounded memory; returned are the last of them, maybe none. The metadata are those of all: they say by
+    which reader, with which options, from which files and frame the rays were made.
+
+    Raises `NergError` for files that are not of the format, or give no ray; ``TypeError`` for options of another
+    reader.
     """
     reader = reader_named(reader) if isinstance(reader, str) else reader
     options = reader.Options() if options is None else options
