@@ -212,6 +212,39 @@ def _surface(name: str, *kinds: str) -> Reader:
     return Reader(f"surface {name}", make, {name: kinds}, read)
 
 
+_SOURCE = "0" * 32
+_PART = f"a.rays/place=shop/day=unknown/bucket=0/part-{_SOURCE}-0.parquet"
+
+
+def _make_dataset(folder: Path) -> None:
+    from nerg_mi.rays.dataset.manifest import Head, write_head
+    from nerg_mi.rays.dataset.writing import SourceWriter
+
+    rays = _rays()
+    write_head(folder / "a.rays", Head(1))
+    writer = SourceWriter(folder / "a.rays", _SOURCE, 1)
+    writer.add(rays, "shop")
+    writer.finish(rays.metadata, file="a.csv", where="w", stamp=None, recipe="r", generation=0)
+
+
+def _read_dataset(folder: Path) -> None:
+    from nerg_mi.cli.rays.arguments import print_card
+    from nerg_mi.jobs.tracking import card_of
+    from nerg_mi.rays.dataset.conditions import Conditions
+    from nerg_mi.rays.dataset.dataset import RayDataset
+
+    with contextlib.redirect_stdout(io.StringIO()):
+        for title, card in card_of(folder / "a.rays"):
+            print_card(card.rays, card.summary, title, card.lines)
+    dataset = RayDataset.open(folder / "a.rays")
+    dataset.sample(7, runs=2)
+    list(dataset.scan(Conditions(time=(0, 0.3), box=[0, 1, 0, 1, 0, 3], with_hit=True), whole=True))
+
+
+def _dataset(name: str, target: str, *kinds: str) -> Reader:
+    return Reader(f"dataset {name}", _make_dataset, {f"a.rays/{target}": kinds}, _read_dataset, "pyarrow")
+
+
 TRACKING = [
     _rays_file("rays.npz", "zip"),
     _rays_file("rays.parquet"),
@@ -235,6 +268,9 @@ TRACKING = [
     _surface("points.obj", "text"),
     _surface("points.csv", "text"),
     _surface("points.npy", "npy"),
+    _dataset("head", "_dataset.json", "json"),
+    _dataset("account", f"_sources/{_SOURCE}.json", "json"),
+    _dataset("part", _PART.partition("/")[2]),
     Reader("salt", _make_salt, {"salt": ()}, _read_salt),
 ]
 """Every reader of the registry is among them; one without an example is an error here."""

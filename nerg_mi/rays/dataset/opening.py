@@ -18,7 +18,7 @@ def load_rays(path: str | os.PathLike, most: int | None = None, seed: int = 0) -
     ``most``: of a dataset, take so many at most: of more, a sample by ``seed`` in which each is as likely as any other.
     None: all, of which there may be 50 million. Raises `NergError` for what is neither, or damaged.
     """
-    if not is_dataset(path):
+    if not Path(path).is_dir():
         return Rays.load(path)
     found = RayDataset.open(path)
     if most is not None and len(found) > most:

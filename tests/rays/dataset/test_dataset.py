@@ -1,0 +1,206 @@
+"""What is asked of a dataset, against the rays of the same files in memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.rays.dataset import writing
+from nerg_mi.rays.dataset.conditions import Conditions
+from nerg_mi.rays.dataset.dataset import RayDataset
+from nerg_mi.rays.dataset.parts import read_groups
+from nerg_mi.rays.dataset.updating import update_dataset
+from nerg_mi.rays.filters import select_mask
+
+from .making import DAY, assert_same, recipe, write_dataset, write_source
+
+pytest.importorskip("pyarrow")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A dataset of small row groups, and the same rays at once."""
+    with pytest.MonkeyPatch.context() as change:
+        change.setattr(writing, "GROUP_ROWS", 16)
+        return write_dataset(tmp_path_factory.mktemp("made"))
+
+
+def test_all_rays_are_those_of_the_files(made):
+    dataset, rays = made
+    assert_same(dataset.load(), rays)
+    assert len(dataset) == len(rays) and dataset.persons == rays.persons and dataset.places == ("shop",)
+    assert dataset.days == ("2024-10-04", "2024-10-05")
+    assert dataset.cohorts == {name: int((rays.cohort == k).sum()) for k, name in enumerate(rays.cohorts)}
+    about = dataset.metadata
+    for key in ("rows_read", "frame", "transform", "source_frame", "preset", "columns", "tick"):
+        assert about[key] == rays.metadata[key]
+    by_file = lambda entry: entry["file"]
+    assert sorted(about["sources"], key=by_file) == rays.metadata["sources"]
+    assert sorted(about["dropped"], key=by_file) == sorted(rays.metadata["dropped"], key=by_file)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"persons": ["p0_1", "p2_0"]},
+        {"without_persons": ["p0_1"]},
+        {"time": (DAY + 2, DAY + 43_203)},
+        {"box": [1.0, 4.5, 0.0, 3.0, 1.5, 1.8]},
+        {"min_confidence": 0.7},
+        {"with_hit": True},
+        {"cohorts": ["y"]},
+        {"cohorts": ["y"], "box": [0, 3, 0, 6, 0, 3], "time": (None, DAY + 5), "persons": ["p0_0"]},
+    ],
+)
+def test_conditions_are_those_of_a_file(made, given):
+    dataset, rays = made
+    found = dataset.load(Conditions(**given))
+    assert 0 < len(found) < len(rays)
+    assert_same(found, rays.select(select_mask(rays, **given)))
+    whole = list(dataset.scan(Conditions(**given), whole=True))
+    assert sum(map(len, whole)) == len(found)
+    for block in whole:
+        names = [block.persons[k] for k in block.person]
+        assert list(zip(names, block.t)) == sorted(zip(names, block.t))
+
+
+def test_what_cannot_hold_a_ray_is_not_read(made, monkeypatch):
+    dataset, rays = made
+    read = []
+
+    def counted(folder, source, part, wanted, hits=True):
+        for found in read_groups(folder, source, part, wanted, hits):
+            read.append(len(found[1]))
+            yield found
+
+    monkeypatch.setattr("nerg_mi.rays.dataset.dataset.read_groups", counted)
+    found = sum(map(len, dataset.scan(Conditions(persons=["p1_2"]))))
+    assert found == np.sum(np.array(rays.persons)[rays.person] == "p1_2") and sum(read) < found + 32
+    read.clear()
+    dataset.sample(1)
+    assert len(read) == 1
+    read.clear()
+    assert len(dataset.sample(64, runs=2)) == 64 and sum(read) <= 32 * 2 + 4 * 16 < len(rays) / 4
+
+
+def test_unknown_names(made):
+    for given, why in (
+        ({"persons": ["p9"]}, "no person is called 'p9'; there are p0_0, p0_1"),
+        ({"without_persons": ["p9"]}, "no person"),
+        ({"cohorts": ["z"]}, "no cohort is called 'z'"),
+        ({"box": [0, 1, 2]}, "a box is"),
+    ):
+        with pytest.raises(NergError, match=why):
+            list(made[0].scan(Conditions(**given)))
+
+
+def test_more_than_fits(made):
+    dataset, rays = made
+    with pytest.raises(NergError, match=r"holds 1,197 such rays, and 1,000 .*--sample"):
+        dataset.load(most=1000)
+    with pytest.raises(NergError, match="more than .* such rays"):
+        dataset.load(Conditions(with_hit=True), most=300)
+    assert len(dataset.load(Conditions(persons=["p0_0"]), most=300)) == 134
+
+
+def test_samples(made):
+    dataset, rays = made
+    one, two = dataset.sample(200, 3), dataset.sample(200, 3)
+    assert np.array_equal(one.t, two.t) and np.array_equal(one.person, two.person) and len(one) == 200
+    assert one.metadata["steps"] == [{"step": "sample", "kept": 200, "of": len(rays), "seed": 3}]
+    whole = dataset.load()
+    key = lambda r: set(zip(r.t.tolist(), (r.persons[k] for k in r.person), r.origin[:, 0].tolist()))
+    assert len(key(one)) == 200 and key(one) < key(whole)
+    assert not np.array_equal(dataset.sample(200, 4).t, one.t)
+    every = dataset.sample(10_000)
+    assert np.array_equal(every.t, whole.t) and "steps" not in every.metadata
+    assert dataset.sample(200, hits=False).hit is None and dataset.load(hits=False).hit is None
+
+
+def test_places_have_frames_of_their_own(tmp_path):
+    write_dataset(tmp_path, 2)
+    update_dataset(tmp_path / "shop.rays", [write_source(tmp_path / "n.csv", 7)], recipe(place="north"))
+    both = RayDataset.open(tmp_path / "shop.rays")
+    for ask in (both.load, lambda: both.sample(3)):
+        with pytest.raises(NergError, match="2 places, each in a frame of its own; name one .*place=north"):
+            ask()
+    north = RayDataset.open(tmp_path / "shop.rays" / "place=north")
+    assert north.persons == ("p7_0", "p7_1", "p7_2") and len(north.load()) == 399 == len(both.of_place("north"))
+    day = RayDataset.open(tmp_path / "shop.rays" / "place=shop" / "day=2024-10-04")
+    assert day.days == ("2024-10-04",) and 0 < len(day) == len(day.load())
+    with pytest.raises(NergError, match="holds no rays of place south"):
+        RayDataset.open(tmp_path / "shop.rays" / "place=south")
+
+
+def test_the_digest_is_that_of_the_content(tmp_path):
+    dataset, _ = write_dataset(tmp_path, 2)
+    shutil.copytree(tmp_path / "shop.rays", tmp_path / "copy.rays")
+    assert RayDataset.open(tmp_path / "copy.rays").digest == dataset.digest and len(dataset.digest) == 64
+    update_dataset(tmp_path / "shop.rays", [write_source(tmp_path / "n.csv", 7)], recipe())
+    assert RayDataset.open(tmp_path / "shop.rays").digest != dataset.digest
+
+
+def test_what_is_no_dataset(tmp_path):
+    for path in (tmp_path, tmp_path / "absent.rays"):
+        with pytest.raises(NergError, match="no dataset of rays; make one"):
+            RayDataset.open(path)
+
+
+def test_damaged_parts(tmp_path):
+    """Each in one sentence that names the file."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    dataset, _ = write_dataset(tmp_path, 1)
+    source, part = dataset.parts[0]
+    path = dataset.folder / part.path(source.id)
+    good, table = path.read_bytes(), pq.read_table(path, partitioning=None)
+
+    def rewritten(change) -> bytes:
+        pq.write_table(change(table), tmp_path / "x.parquet")
+        return (tmp_path / "x.parquet").read_bytes()
+
+    def exchanged(name, values):
+        return lambda t: t.set_column(t.schema.get_field_index(name), name, values)
+
+    n = part.rays
+    cases = {
+        "bytes, and": good[:-10],
+        "cannot be read": bytes(len(good)),
+        "has 3 rays, and": rewritten(lambda t: t.slice(0, 3)),
+        'no column "t"': rewritten(lambda t: t.drop_columns(["t"])),
+        'column "origin_x" is not of the kind': rewritten(exchanged("origin_x", pa.array(["a"] * n))),
+        'column "person" is not of the kind': rewritten(exchanged("person", pa.array(range(n)))),
+        "somebody whom the account does not name": rewritten(exchanged("person", pa.array(["eve"] * n))),
+        "names are missing": rewritten(exchanged("person", pa.array([None] * n, pa.string()))),
+        "a direction that is not of unit length": rewritten(exchanged("direction_x", pa.array([9.0] * n))),
+        "an origin that is not finite": rewritten(exchanged("origin_y", pa.array([float("nan")] * n))),
+    }
+    account = dataset.folder / "_sources" / f"{source.id}.json"
+    kept = account.read_text()
+    for why, content in cases.items():
+        path.write_bytes(content)
+        if why != "bytes, and":  # its size is right then
+            about = json.loads(kept)
+            about["parts"][part.number]["bytes"] = len(content)
+            account.write_text(json.dumps(about))
+        with pytest.raises(NergError, match=why) as error:
+            RayDataset.open(dataset.folder).load()
+        assert str(path) in str(error.value) and "\n" not in str(error.value)
+        account.write_text(kept)
+    path.unlink()
+    with pytest.raises(NergError, match="there is no part of a dataset"):
+        dataset.load()
+    (tmp_path / "elsewhere.parquet").write_bytes(good)
+    path.symlink_to(tmp_path / "elsewhere.parquet")
+    with pytest.raises(NergError, match="a link that leaves"):
+        dataset.load()
+    os.remove(path)
+    path.mkdir()
+    with pytest.raises(NergError, match="is a folder"):
+        dataset.load()
