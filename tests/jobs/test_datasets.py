@@ -1,0 +1,143 @@
+"""Jobs on datasets: imported, summed up and filtered as files are, and trained and scored on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.jobs import datasets
+from nerg_mi.jobs.options.rays import FilterOptions, ImportOptions
+from nerg_mi.jobs.tracking import card_of, filter_rays, import_rays
+from nerg_mi.rays.dataset.dataset import RayDataset
+from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.rays import Rays
+from tests.rays.dataset.making import DAY, assert_same, settings, write_dataset, write_source
+
+from .recorder import Recorder
+
+pytest.importorskip("pyarrow")
+
+
+def options(**given) -> ImportOptions:
+    return ImportOptions(**{"settings": settings(), "workers": 1, **given})
+
+
+@pytest.fixture
+def files(tmp_path):
+    return [write_source(tmp_path / "files" / f"{k}.csv", k, 200, start=DAY) for k in range(3)]
+
+
+def test_import(files, tmp_path):
+    heard, output = Recorder(), tmp_path / "shop.rays"
+    found = import_rays(files, options(output=output, place="shop"), heard)
+    at_once = import_rays(files, options(workers=None))
+    assert_same(found.rays, at_once.rays)
+    assert found.summary.rays == 597 and found.lines[0][0] == "dataset" and at_once.lines == ()
+    assert heard.messages == ["imported 3 sources, 597 rays"]
+    import_rays(files, options(output=output, place="shop"), heard)
+    assert heard.messages[1] == "nothing to import; 3 unchanged"
+    more = write_source(tmp_path / "north.csv", 5, 100)
+    card = import_rays([more], options(output=output, place="north"), heard)
+    assert card.summary.rays == 99 and len(RayDataset.open(output)) == 696
+    assert [(title, c.summary.rays) for title, c in card_of(output)] == [
+        (f"{output}: north", 99),
+        (f"{output}: shop", 597),
+    ]
+    assert [title for title, _ in card_of(output / "place=north")] == [str(output / "place=north")]
+
+
+def test_what_could_not_be_imported_is_told_in_the_end(files, tmp_path):
+    files[1].write_text("t\n")
+    with pytest.raises(NergError, match=r"1\.csv.*\(1 of 3 could not be imported; the others are\)"):
+        import_rays(files, options(output=tmp_path / "shop.rays"))
+    assert len(RayDataset.open(tmp_path / "shop.rays")) == 398
+
+
+def test_pseudonyms(files, tmp_path):
+    (tmp_path / "salt").write_bytes(bytes(range(32)))
+    salted = {"pseudonyms": True, "salt": tmp_path / "salt"}
+    found = import_rays(files, options(output=tmp_path / "a.rays", **salted))
+    assert found.rays.persons == import_rays(files, ImportOptions(settings=settings(), **salted)).rays.persons
+    random = import_rays(files, options(output=tmp_path / "b.rays", pseudonyms=True))
+    assert len(random.rays.persons) == 9 and not set(random.rays.persons) & set(found.rays.persons)
+    with pytest.raises(NergError, match="random salt"):
+        import_rays(files, options(output=tmp_path / "b.rays", pseudonyms=True))
+
+
+@pytest.mark.parametrize(
+    "given, why",
+    [
+        ({"place": "x"}, "--place belongs to datasets"),
+        ({"day": "2024-01-01", "output": "a.npz"}, "--day belongs to datasets"),
+        ({"workers": 0, "output": "a.rays"}, "--workers is a number"),
+    ],
+)
+def test_options_of_datasets(given, why):
+    with pytest.raises(NergError, match=why):
+        ImportOptions(**given)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"persons": ("p0_0", "p2_1")},
+        {"start": DAY + 1, "end": DAY + 2, "with_hit": True},
+        {"fixations": "ivt", "velocity": 1e5, "start": DAY + 1},
+        {"fixations": "idt", "dispersion": 170.0, "one_ray": True, "least": 0.05},
+        {"thin": 0.5, "thin_distance": 9.0, "box": (0, 4, 0, 4, 0, 3)},
+    ],
+)
+def test_filters_are_those_of_a_file(tmp_path, given):
+    dataset, rays = write_dataset(tmp_path)
+    heard, expected = Recorder(), Recorder()
+    found = filter_rays(dataset.folder, FilterOptions(**given, output=tmp_path / "a.parquet"), heard)
+    # What is found of a person may depend on the rounding of places.
+    rays = dataset.load()
+    whole = filter_rays(rays, FilterOptions(**given), expected)
+    assert_same(found.rays, whole.rays)
+    assert_same(Rays.load(tmp_path / "a.parquet"), whole.rays)
+    assert found.fixations == whole.fixations and sorted(heard.messages) == sorted(
+        m.replace(": one ray each,", ":") for m in expected.messages
+    )
+    counts = lambda r: [(s["step"], s["kept"], s["of"]) for s in r.metadata["steps"]]
+    assert counts(found.rays) == counts(whole.rays)
+    # Into another dataset: the same rays.
+    other = filter_rays(dataset.folder, FilterOptions(**given, output=tmp_path / "b.rays"))
+    assert other.rays is None and other.fixations == whole.fixations
+    assert_same(load_rays(tmp_path / "b.rays"), whole.rays)
+    assert counts(load_rays(tmp_path / "b.rays")) == counts(whole.rays)
+    with pytest.raises(NergError, match="was filtered from another"):
+        import_rays([tmp_path / "files" / "0.csv"], options(output=tmp_path / "b.rays"))
+
+
+def test_samples(tmp_path):
+    dataset, rays = write_dataset(tmp_path)
+    plain = filter_rays(dataset.folder, FilterOptions(sample=50, seed=2)).rays
+    assert np.array_equal(plain.t, dataset.sample(50, 2).t)
+    counts = np.zeros(len(rays))
+    place = {(t, x): k for k, (t, x) in enumerate(zip(rays.t.tolist(), rays.origin[:, 0].astype(np.float32).tolist()))}
+    for seed in range(30):
+        some = filter_rays(dataset.folder, FilterOptions(sample=40, seed=seed, cohorts=("x",))).rays
+        assert len(some) == 40 and some.cohorts == ("x",)
+        assert [s["step"] for s in some.metadata["steps"]] == ["filter", "sample"]
+        counts[[place[t, x] for t, x in zip(some.t.tolist(), some.origin[:, 0].tolist())]] += 1
+    # In all blocks as likely: a third of the rays is of each source.
+    thirds = np.array(
+        [counts[np.array(rays.persons)[rays.person] == f"p{k}_{j}"].sum() for k in range(3) for j in range(3)]
+    )
+    assert counts.sum() == 1200 and counts.max() <= 8 and thirds.min() > 80 and thirds.max() < 190
+    with pytest.raises(NergError, match="--sample is written to a file"):
+        filter_rays(dataset.folder, FilterOptions(sample=4, output=tmp_path / "c.rays"))
+
+
+def test_filters_that_cannot_be(tmp_path, monkeypatch):
+    dataset, _ = write_dataset(tmp_path)
+    with pytest.raises(NergError, match="nothing is left of 1,197 rays"):
+        filter_rays(dataset.folder, FilterOptions(start=0, end=1, output=tmp_path / "a.rays"))
+    assert not (tmp_path / "a.rays").exists()
+    monkeypatch.setattr(datasets, "MOST", 500)
+    with pytest.raises(NergError, match="more than 500 rays are left"):
+        filter_rays(dataset.folder, FilterOptions(with_hit=True))
+    with pytest.raises(NergError, match="not empty"):
+        filter_rays(dataset.folder, FilterOptions(with_hit=True, output=dataset.folder))
