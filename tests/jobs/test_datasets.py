@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs import datasets
+from nerg_mi.jobs.evaluation import evaluate_gaze
+from nerg_mi.jobs.gaze import train_gaze
 from nerg_mi.jobs.options.rays import FilterOptions, ImportOptions
 from nerg_mi.jobs.tracking import card_of, filter_rays, import_rays
 from nerg_mi.rays.dataset.dataset import RayDataset
+from nerg_mi.rays.dataset.manifest import Head, write_head
 from nerg_mi.rays.dataset.opening import load_rays
-from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.dataset.writing import SourceWriter
+from nerg_mi.rays.rays import FRAME, Rays
+from tests.evaluation.gaze.test_evaluation import crowd
 from tests.rays.dataset.making import DAY, assert_same, settings, write_dataset, write_source
 
 from .recorder import Recorder
+from .test_evaluation import OPTIONS, TRAINING
 
 pytest.importorskip("pyarrow")
 
@@ -141,3 +149,39 @@ def test_filters_that_cannot_be(tmp_path, monkeypatch):
         filter_rays(dataset.folder, FilterOptions(with_hit=True))
     with pytest.raises(NergError, match="not empty"):
         filter_rays(dataset.folder, FilterOptions(with_hit=True, output=dataset.folder))
+
+
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory):
+    """A dataset of 3,000 rays of four people in a corridor."""
+    folder = tmp_path_factory.mktemp("crowded") / "corridor.rays"
+    write_head(folder, Head(2))
+    writer = SourceWriter(folder, "0" * 32, 2)
+    writer.add(crowd(3000), "corridor")
+    writer.finish({"frame": dict(FRAME)}, file="a", where="w", stamp=None, recipe="r", generation=0)
+    return folder
+
+
+@pytest.mark.parametrize("most", [10_000, 2500])
+def test_training_and_scores_are_of_the_same_rays(crowded, tmp_path, most):
+    heard, gaze = Recorder(), tmp_path / "gaze.safetensors"
+    trained = train_gaze(crowded, gaze, replace(TRAINING, most=most, seed=3), heard)
+    about = trained.provenance["rays_file"]
+    count = min(most, 3000)
+    assert about["file"] == "corridor.rays" and (about["rays"], about["most"], about["seed"]) == (count, most, 3)
+    assert trained.provenance["test"]["rays"] == count and f"{count:,} rays of {crowded}" in heard.messages
+    found = evaluate_gaze(gaze, crowded, options=OPTIONS)
+    # As of the rays themselves.
+    rays = load_rays(crowded, most, 3)
+    alone = train_gaze(rays, tmp_path / "alone.safetensors", replace(TRAINING, seed=3))
+    assert alone.provenance["test"] == trained.provenance["test"]
+    assert [row["KLD"] for row in evaluate_gaze(tmp_path / "alone.safetensors", rays, options=OPTIONS).rows] == [
+        row["KLD"] for row in found.rows
+    ]
+
+
+def test_another_dataset_is_not_scored(crowded, tmp_path):
+    train_gaze(crowded, tmp_path / "gaze.safetensors", TRAINING)
+    dataset, _ = write_dataset(tmp_path, 1)
+    with pytest.raises(NergError, match=r"other rays than .*; give the file corridor\.rays, as it was then"):
+        evaluate_gaze(tmp_path / "gaze.safetensors", dataset.folder, options=OPTIONS)

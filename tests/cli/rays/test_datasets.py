@@ -1,0 +1,89 @@
+"""``nerg rays`` on datasets: a name that ends in .rays, and whatever may happen while one is written."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from nerg_mi.rays.dataset.dataset import RayDataset
+from nerg_mi.rays.rays import Rays
+from tests.cli.rays.running import run
+from tests.cli.test_outputs import interrupting, largest_file, nerg, told_in_a_sentence
+from tests.rays.dataset.making import MAP, write_source
+
+pytest.importorskip("pyarrow")
+
+
+@pytest.fixture
+def given(tmp_path):
+    """The arguments of an import of two files, without the output."""
+    files = [write_source(tmp_path / "files" / f"{k}.csv", k, 2000) for k in range(2)]
+    return ["rays", "import", *files, "--map", MAP, "--place", "shop"]
+
+
+def test_in_and_out(given, tmp_path):
+    output = tmp_path / "a.rays"
+    done = run(*given[1:], "-o", output, "--workers", 1, "--day", "2024-05-06")
+    shown = " ".join(done.output.split())
+    assert done.exit_code == 0 and "imported 2 sources, 3,998 rays" in shown and "3,998 of 4,000 rows" in shown
+    assert "2 sources in" in shown and "place shop, day 2024-05-06" in shown
+    assert "nothing to import; 2 unchanged" in run(*given[1:], "-o", output, "--day", "2024-05-06").output
+    for path in (output, output / "place=shop" / "day=2024-05-06"):
+        shown = run("show", path)
+        assert shown.exit_code == 0 and "3,998 of 4,000 rows" in shown.output
+    done = run("filter", output, "-o", tmp_path / "b.npz", "--person", "p0_1", "--sample", 100)
+    assert done.exit_code == 0 and len(Rays.load(tmp_path / "b.npz")) == 100, done.output
+    assert run("filter", output, "-o", tmp_path / "b.rays", "--person", "p0_1").exit_code == 0
+    assert RayDataset.open(tmp_path / "b.rays").persons == ("p0_1",)
+    assert run("split", output, "-o", tmp_path / "c.npz", "--people", 0.5).exit_code == 0
+    assert run("plot", output, "-o", tmp_path / "c.png").exit_code == 0
+    assert len(Rays.load(tmp_path / "c-train.npz")) + len(Rays.load(tmp_path / "c-test.npz")) == 3998
+
+
+def test_what_stands_in_the_way(given, tmp_path, capsys):
+    (tmp_path / "file.rays").write_text("x")
+    (tmp_path / "mine.rays").mkdir()
+    (tmp_path / "mine.rays" / "a").write_text("x")
+    for output, why in (
+        (tmp_path / "file.rays", "one of its parents is a file"),
+        (tmp_path / "file.rays" / "a.rays", "one of its parents is a file"),
+        (tmp_path / "mine.rays", "is there and no dataset"),
+    ):
+        code, said = nerg(capsys, *given, "-o", output)
+        assert told_in_a_sentence(code, said) and why in said, said
+    code, said = nerg(capsys, *given, "-o", tmp_path / "a.npz")
+    assert told_in_a_sentence(code, said) and "--place belongs to datasets" in said
+
+
+def test_no_room_and_ctrl_c(given, tmp_path, capsys, monkeypatch):
+    """What is finished is kept, and the next import goes on to the same end."""
+    arguments, output = [*given, "--workers", 1, "-o", tmp_path / "a.rays"], tmp_path / "a.rays"
+    with largest_file(20_000):
+        code, said = nerg(capsys, *arguments)
+    assert told_in_a_sentence(code, said) and "largest size" in said, said
+    assert not list(output.rglob("*.parquet")) and not list(output.rglob(".*"))
+    with monkeypatch.context() as change:
+        calls = []
+
+        def late(handle):
+            calls.append(handle)
+            return interrupt(handle) if len(calls) > 12 else flush(handle)
+
+        flush, interrupt = os.fsync, interrupting(os.fsync)
+        change.setattr(os, "fsync", late)
+        code, said = nerg(capsys, *arguments)
+    assert code == 130 and said.strip()
+    assert not [p for p in output.rglob(".*") if p.is_file()]
+    code, _ = nerg(capsys, *arguments)
+    assert code == 0 and len(RayDataset.open(output).load()) == 3998
+    code, _ = nerg(capsys, *given, "-o", tmp_path / "b.rays")
+    parts = lambda folder: {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*.parquet")}
+    assert code == 0 and parts(output) == parts(tmp_path / "b.rays")
+    # A filter writes all or nothing.
+    for limit, signal in ((3000, False), (None, True)):
+        with monkeypatch.context() as change, largest_file(limit or 1 << 40):
+            if signal:
+                change.setattr(os, "fsync", interrupting(os.fsync))
+            code, said = nerg(capsys, "rays", "filter", output, "-o", tmp_path / "c.rays", "--with-hit")
+        assert code == (130 if signal else 1) and not list(tmp_path.glob("*c.rays*")), said
