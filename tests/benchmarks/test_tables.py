@@ -5,6 +5,7 @@ import importlib
 import pytest
 
 from tests.conftest import ROOT
+from tests.rays.readers.examples import EXAMPLES
 
 
 @pytest.fixture
@@ -100,3 +101,16 @@ def test08_alignments(benchmark):
         cells = alignment.cells(alignment.measure(world, kind, 2, 1))
         assert cells[2] == "2 of 2" and cells[-2] == "1 of 1"
         assert any(line.startswith(f"| {cells[0]} |") for line in there)
+
+
+def test09_a_dataset_of_rays(benchmark, tmp_path, capsys):
+    """Imported twice, asked, and compared with its files by other means; the folder is gone afterwards."""
+    pytest.importorskip("pyarrow")
+    (tmp_path / "data" / "vr_supermarket").mkdir(parents=True)
+    EXAMPLES["vr_supermarket"].make(tmp_path / "data" / "vr_supermarket")
+    given = ["--rays", "100", "--files", "4", "--workers", "2", "--no-train", "--data", tmp_path / "data"]
+    benchmark("ray_dataset").main([*map(str, given), "--folder", str(tmp_path / "dataset")])
+    printed = capsys.readouterr().out
+    head, _, *rows = lines(printed)
+    assert head in page("tracking.md") and len(rows) == 10 and rows[0].startswith("| import of 4 files")
+    assert "| 100 |" in rows[-1] and "people, 100 rays; means" in printed and not (tmp_path / "dataset").exists()
