@@ -3,14 +3,14 @@
     python benchmarks/ray_dataset.py [--rays 100000000] [--files 200] [--workers 2] [--data FOLDER]
                                      [--folder FOLDER] [--no-train] [--update docs/tracking.md]
 
-The rays are those of the VR supermarket, resampled: in each file, copies of all recordings an hour apart, each
-shifted by some decimetres, jittered by a centimetre and a degree and of people of their own; ten files a day. Every
-other file is a CSV, the others are Parquet. They are imported by so many processes, and again; then the dataset is asked
-for the rays of a box, a person and an hour, for samples, for its card and for a training. All rays of the files are read
-once more with NumPy and pyarrow alone: counts, and sums of all coordinates by person, must be those of the dataset.
-Seconds are wall-clock time of first runs, whose files may lie in the cache, and processor time of all processes, which
-says more on a machine that does other things besides; memory is the largest that a process
-ever held (VmHWM). FOLDER needs some 140 bytes a ray, and is removed in the end.
+The rays are those of the VR supermarket, resampled: in each file, copies of all recordings an hour apart, each shifted
+by some decimetres, jittered by a centimetre and a degree and of people of their own; ten files a day. Every other file
+is a CSV, the others are Parquet. They are imported by so many processes, and again; then the dataset is asked for the
+rays of a box, a person and an hour, for samples, for its card and for a training. All rays of the files are read once
+more with NumPy and pyarrow alone: counts, and sums of all coordinates by person, must be those of the dataset. Seconds
+are wall-clock time of first runs, whose files may lie in the cache, and processor time of all processes, which says
+more on a machine that does other things besides; memory is the largest that a process ever held (VmHWM). FOLDER needs
+some 140 bytes a ray, and is removed in the end.
 """
 
 from __future__ import annotations

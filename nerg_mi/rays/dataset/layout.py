@@ -4,7 +4,7 @@
     shop.rays/_sources/ID.json                  what became of one source: its account, and its parts
     shop.rays/place=P/day=D/bucket=B/part-ID-N.parquet
 
-The folders are those of Hive, which pyarrow, DuckDB and Spark read as columns ``place``, ``day`` and ``bucket``; names
+The folders are those of Hive, which pyarrow, DuckDB and others read as columns ``place``, ``day`` and ``bucket``; names
 that begin with an underscore they pass over. Rows of a part are in the order of persons and times. Times are float64
 seconds, as those of rays: exact for any clock that a reader can give, where whole nanoseconds would round some times
 and end after 292 years. Origins, directions and hit points are float32.
