@@ -33,5 +33,7 @@ def _distinct(count: int, n: int, rng: np.random.Generator) -> np.ndarray:
     at random."""
     found = np.zeros(0, np.int64)
     while len(found) < n:
-        found = np.union1d(found, rng.integers(0, count, n - len(found) + 16))
+        # Sorted, where numpy.unique would make a table of hashes: several times as fast.
+        found = np.sort(np.concatenate([found, rng.integers(0, count, n - len(found) + 16)]))
+        found = found[np.r_[True, found[1:] != found[:-1]]]
     return np.delete(found, rng.choice(len(found), len(found) - n, replace=False))

@@ -139,6 +139,6 @@ def table_of(rays: Rays, rows: np.ndarray) -> Any:
 
 def _names(pa: Any, codes: np.ndarray, names: tuple[str, ...]) -> Any:
     """Names as a dictionary of those that occur."""
-    used, places = np.unique(codes, return_inverse=True)
-    known = pa.array([names[k] for k in used], pa.string())
-    return pa.DictionaryArray.from_arrays(pa.array(places.astype(np.int32)), known)
+    there = np.bincount(codes, minlength=len(names)) > 0
+    known = pa.array([names[k] for k in np.flatnonzero(there)], pa.string())
+    return pa.DictionaryArray.from_arrays(pa.array((np.cumsum(there) - 1)[codes].astype(np.int32)), known)

@@ -32,13 +32,14 @@ def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -
     grouped = any("cohort" in columns for columns, *_ in held)
     alike = {"unknown"} if any("cohort" not in columns for columns, *_ in held) else set()
     cohorts = tuple(sorted({name for _, _, names, _ in held for name in names} | alike)) if grouped else ()
+    place, group = ({name: k for k, name in enumerate(names)} for names in (persons, cohorts))
     for columns, known, groups, n in held:
-        columns["person"] = _renumbered(columns["person"], known, persons)
+        columns["person"] = _renumbered(columns["person"], known, place)
         if grouped:
             codes, groups = (
                 (columns["cohort"], groups) if "cohort" in columns else (np.zeros(n, np.int32), ("unknown",))
             )
-            columns["cohort"] = _renumbered(codes, groups, cohorts)
+            columns["cohort"] = _renumbered(codes, groups, group)
         if "hit" not in columns and any("hit" in other for other, *_ in held):
             columns["hit"] = np.full((n, 3), np.nan)
     # Column by column, so that no more than one is there twice.
@@ -58,17 +59,15 @@ def _compact(rays: Rays) -> Rays:
 
 
 def _used(codes: np.ndarray | None, names: tuple[str, ...]) -> tuple[str, ...]:
-    return () if codes is None else tuple(names[k] for k in np.unique(codes).tolist())
+    return () if codes is None else tuple(names[k] for k in np.flatnonzero(np.bincount(codes)).tolist())
 
 
 def _places(codes: np.ndarray) -> np.ndarray:
-    return np.unique(codes, return_inverse=True)[1]
+    """The codes (N,) among those that occur."""
+    return (np.cumsum(np.bincount(codes) > 0) - 1)[codes]
 
 
-def _renumbered(codes: np.ndarray, names: Sequence[str], into: Sequence[str]) -> np.ndarray:
-    if tuple(names) == tuple(into):
-        return codes
-    place = {name: k for k, name in enumerate(into)}
+def _renumbered(codes: np.ndarray, names: Sequence[str], place: dict[str, int]) -> np.ndarray:
     return np.array([place[name] for name in names], np.int32)[codes]
 
 

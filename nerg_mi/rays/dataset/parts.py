@@ -130,9 +130,9 @@ def _codes(pa: Any, column: Any, path: Path) -> tuple[np.ndarray, tuple[str, ...
     chunk = chunk.chunk(0) if isinstance(chunk, pa.ChunkedArray) else chunk
     chunk = chunk if pa.types.is_dictionary(chunk.type) else chunk.dictionary_encode()
     known, codes = chunk.dictionary.to_pylist(), chunk.indices.to_numpy()
-    used = np.unique(codes)
-    if used.size and (used[0] < 0 or used[-1] >= len(known) or None in known):
+    if codes.size and (codes.min() < 0 or codes.max() >= len(known) or None in known):
         raise _foreign(path, "its names are damaged")
+    used = np.flatnonzero(np.bincount(codes))
     # A dictionary may name somebody twice.
     persons = tuple(sorted({known[k] for k in used.tolist()}))
     place = {name: k for k, name in enumerate(persons)}

@@ -147,8 +147,8 @@ def _is_text(name: str) -> bool:
 
 
 def _counts(codes: np.ndarray, names: tuple[str, ...]) -> Counter[str]:
-    used, counts = np.unique(codes, return_counts=True)
-    return Counter(dict(zip((names[k] for k in used), counts.tolist())))
+    counts = np.bincount(codes, minlength=len(names))
+    return Counter({names[k]: int(counts[k]) for k in np.flatnonzero(counts)})
 
 
 def _shortened(entry: dict[str, Any]) -> dict[str, Any]:
