@@ -146,12 +146,15 @@ class RayDataset:
     def _check(self, conditions: Conditions) -> None:
         """Raise `NergError` for names that are not known, and a box that is none."""
         conditions.check()
-        asked = [
-            ("person", conditions.persons, set(self.persons)),
-            ("person", conditions.without_persons, set(self.persons)),
-        ]
-        for what, names, known in [*asked, ("cohort", conditions.cohorts, set(self.cohorts) | {"unknown"})]:
-            unknown = [name for name in names or () if name not in known]
+        for what, names in (
+            ("person", conditions.persons),
+            ("person", conditions.without_persons),
+            ("cohort", conditions.cohorts),
+        ):
+            if names is None:
+                continue
+            known = set(self.persons) if what == "person" else {*self.cohorts, "unknown"}
+            unknown = [name for name in names if name not in known]
             if unknown:
                 some = sorted(known)
                 listed = ", ".join(some[:20]) + (", ..." if len(some) > 20 else "")
