@@ -27,7 +27,7 @@ def import_rays(
     ``files``: one or several. ``reader``: the format's name, as for ``nerg rays import --preset``; ``table`` reads any
     CSV or Parquet table through the option ``columns``. ``output``: rays file to write besides (.npz or .parquet), or a
     dataset (.rays), of which large ones are given as a sample (`nerg_mi.jobs.tracking.ImportResult`).
-    ``options``: those of the reader, and ``skip_bad_lines``, ``pseudonyms`` and ``salt``, of a dataset ``place``,
+    ``options``: those of the reader, and ``skip_bad_lines``, ``pseudonyms`` and ``salt``, of a dataset ``place_name``,
     ``day`` and ``workers`` (`nerg_mi.jobs.tracking.ImportOptions`). What was dropped, and why, is in the rays'
     ``metadata``. Raises `NergError`.
 

@@ -40,7 +40,7 @@ def import_dataset(files: Sequence[FileName], options: ImportOptions, reporter: 
 
     Raises `NergError` where some could not be imported, after the others were.
     """
-    folder, place = Path(options.output or ""), options.place or UNKNOWN
+    folder, place = Path(options.output or ""), options.place_name or UNKNOWN
     key = None
     if options.pseudonyms:
         key = secrets.token_bytes(32) if options.salt is None else read_salt(options.salt)

@@ -38,15 +38,15 @@ def files(tmp_path):
 
 def test_import(files, tmp_path):
     heard, output = Recorder(), tmp_path / "shop.rays"
-    found = import_rays(files, options(output=output, place="shop"), heard)
+    found = import_rays(files, options(output=output, place_name="shop"), heard)
     at_once = import_rays(files, options(workers=None))
     assert_same(found.rays, at_once.rays)
     assert found.summary.rays == 597 and found.lines[0][0] == "dataset" and at_once.lines == ()
     assert heard.messages == ["imported 3 sources, 597 rays"]
-    import_rays(files, options(output=output, place="shop"), heard)
+    import_rays(files, options(output=output, place_name="shop"), heard)
     assert heard.messages[1] == "nothing to import; 3 unchanged"
     more = write_source(tmp_path / "north.csv", 5, 100)
-    card = import_rays([more], options(output=output, place="north"), heard)
+    card = import_rays([more], options(output=output, place_name="north"), heard)
     assert card.summary.rays == 99 and len(RayDataset.open(output)) == 696
     assert [(title, c.summary.rays) for title, c in card_of(output)] == [
         (f"{output}: north", 99),
@@ -76,9 +76,10 @@ def test_pseudonyms(files, tmp_path):
 @pytest.mark.parametrize(
     "given, why",
     [
-        ({"place": "x"}, "--place belongs to datasets"),
+        ({"place_name": "x"}, "--place-name belongs to datasets"),
         ({"day": "2024-01-01", "output": "a.npz"}, "--day belongs to datasets"),
         ({"workers": 0, "output": "a.rays"}, "--workers is a number"),
+        ({"align_output": "a.json", "output": "a.rays"}, "--write-align belongs to files"),
     ],
 )
 def test_options_of_datasets(given, why):

@@ -49,7 +49,9 @@ def _own_options(
             "is in that frame."
         ),
     ] = None,
-    place: Annotated[str | None, typer.Option(help="Of a dataset: the place of all files.  [default: unknown]")] = None,
+    place_name: Annotated[
+        str | None, typer.Option(help="Of a dataset: the place of all files.  [default: unknown]")
+    ] = None,
     day: Annotated[
         str | None,
         typer.Option(

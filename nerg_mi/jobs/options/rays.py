@@ -22,7 +22,7 @@ class ImportOptions:
 
     reader: str = option("table", "Name of a registered reader (nerg_mi.rays.readers.registry).")
     settings: Any = option(None, "An object of the reader's Options. Default: as they are by default.")
-    place: str | None = option(None, "Of a dataset: the place of all files. Default: unknown.")
+    place_name: str | None = option(None, "Of a dataset: the place of all files. Default: unknown.")
     day: str | None = option(None, "Of a dataset: the day of all rays, as 2026-11-22. Default: by their times.")
     workers: int | None = option(
         None, "Of a dataset: processes that import files beside each other. Default: a core each."
@@ -38,9 +38,11 @@ class ImportOptions:
     def __post_init__(self) -> None:
         if self.salt is not None and not self.pseudonyms:
             raise NergError("--salt belongs to --pseudonyms; add it, or leave out --salt")
-        given = [n for n in ("place", "day", "workers") if getattr(self, n) is not None]
+        given = [n for n in ("place_name", "day", "workers") if getattr(self, n) is not None]
         if given and not self.into_dataset:
-            raise NergError(f"--{given[0]} belongs to datasets; let the name of the output end in {DATASET}")
+            raise NergError(
+                f"--{given[0].replace('_', '-')} belongs to datasets; let the name of the output end in {DATASET}"
+            )
         if self.align_output is not None and self.into_dataset:
             raise NergError(
                 "--write-align belongs to files of rays; the sources of a dataset may differ in their frames"

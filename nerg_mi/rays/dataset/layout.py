@@ -67,7 +67,7 @@ def days_of(t: np.ndarray) -> np.ndarray | None:
 def check_place(place: str) -> str:
     """``place``, if it can be the name of one. Raises `NergError`."""
     if not place or len(place) > _PLACE or not place.isprintable() or place != place.strip():
-        raise NergError(f"a place has a name of 1 to {_PLACE} characters, got {place[:80]!r} (--place)")
+        raise NergError(f"a place has a name of 1 to {_PLACE} characters, got {place[:80]!r} (--place-name)")
     return place
 
 

@@ -14,7 +14,7 @@ from nerg_mi.rays.rays import FRAME, Rays
 
 from .manifest import Source
 
-_MERGED = ("sources", "dropped", "rows_read")
+_MERGED = ("sources", "dropped", "rows_read", "complaints")
 _EMPTY = np.zeros((0, 3))
 
 
@@ -76,8 +76,10 @@ def merge_metadata(sources: Sequence[Source]) -> dict[str, Any]:
     about = [source.metadata for source in sources]
     first = about[0] if about else {"frame": dict(FRAME)}
     same = {k: v for k, v in first.items() if k not in _MERGED and all(other.get(k) == v for other in about)}
+    complaints = list(dict.fromkeys(sentence for other in about for sentence in other.get("complaints", [])))
     return {
         **same,
+        **({"complaints": complaints} if complaints else {}),
         "frame": first["frame"],
         "sources": [entry for other in about for entry in other.get("sources", [])],
         "rows_read": sum(other.get("rows_read", 0) for other in about),

@@ -19,7 +19,7 @@ pytest.importorskip("pyarrow")
 def given(tmp_path):
     """The arguments of an import of two files, without the output."""
     files = [write_source(tmp_path / "files" / f"{k}.csv", k, 2000) for k in range(2)]
-    return ["rays", "import", *files, "--map", MAP, "--place", "shop"]
+    return ["rays", "import", *files, "--map", MAP, "--place-name", "shop"]
 
 
 def test_in_and_out(given, tmp_path):
@@ -53,7 +53,7 @@ def test_what_stands_in_the_way(given, tmp_path, capsys):
         code, said = nerg(capsys, *given, "-o", output)
         assert told_in_a_sentence(code, said) and why in said, said
     code, said = nerg(capsys, *given, "-o", tmp_path / "a.npz")
-    assert told_in_a_sentence(code, said) and "--place belongs to datasets" in said
+    assert told_in_a_sentence(code, said) and "--place-name belongs to datasets" in said
 
 
 def test_no_room_and_ctrl_c(given, tmp_path, capsys, monkeypatch):

@@ -43,7 +43,7 @@ def test_a_place_may_be_called_as_its_people_do():
 
 @pytest.mark.parametrize("place", ["", " a", "a\n", "x" * 65, "\x1b[2J"])
 def test_what_is_no_place(place):
-    with pytest.raises(NergError, match="--place"):
+    with pytest.raises(NergError, match="--place-name"):
         layout.check_place(place)
 
 

@@ -34,10 +34,19 @@ def test_nothing():
 def test_metadata_are_what_holds_for_all():
     about = {"frame": dict(FRAME), "preset": "table", "tick": 1.0, "rows_read": 4, "sources": [{"file": "a"}]}
     about["dropped"] = [{"reason": "blink", "file": "a", "count": 1, "rows": [[1, 1]]}]
-    other = {**about, "tick": 2.0, "rows_read": 5, "sources": [{"file": "b"}], "dropped": []}
+    about["complaints"] = ["the frame is mirrored", "the clock jumps"]
+    other = {
+        **about,
+        "complaints": ["the clock jumps", "the gaze is frozen"],
+        "tick": 2.0,
+        "rows_read": 5,
+        "sources": [{"file": "b"}],
+        "dropped": [],
+    }
     fields = dict(where="", stamp=None, recipe="", generation=0, persons={}, cohorts={}, parts=[])
     found = merge_metadata([Source(id=n, file=n, metadata=m, **fields) for n, m in (("a", about), ("b", other))])
     assert found["rows_read"] == 9 and found["sources"] == [{"file": "a"}, {"file": "b"}]
+    assert found["complaints"] == ["the frame is mirrored", "the clock jumps", "the gaze is frozen"]
     assert found["dropped"] == about["dropped"] and found["preset"] == "table" and "tick" not in found
 
 
