@@ -68,8 +68,8 @@ def main(argv=None) -> None:
         f"{data.source['width']} x {data.source['height']}"
     )
     print(
-        f"{'from':>7s} {'minutes':>8s} {'steps':>6s} {'PSNR dB':>8s} {'SSIM':>6s} {'median cm':>10s} {'mean cm':>8s} "
-        f"{'> 10 %':>7s} {'opacity':>8s} {'< 0.9':>6s} {'load':>5s}"
+        f"{'from':>7s} {'minutes':>8s} {'steps':>6s} {'PSNR dB':>8s} {'fitted':>7s} {'SSIM':>6s} "
+        f"{'median cm':>10s} {'mean cm':>8s} {'> 10 %':>7s} {'opacity':>8s} {'< 0.9':>6s} {'load':>5s}"
     )
     rows = []
     for source in ("images", "depth") if args.only is None else (args.only,):
@@ -98,6 +98,7 @@ def main(argv=None) -> None:
                 "cpu_minutes": cpu / 60,
                 "steps": trainer.steps,
                 "psnr": scores.psnr_mean,
+                "psnr_fitted": scores.psnr_fitted_mean,
                 "ssim": scores.ssim_mean,
                 "depth_median": depth.median,
                 "depth_mean": depth.mean,
@@ -108,9 +109,9 @@ def main(argv=None) -> None:
             }
         )
         print(
-            f"{source:>7s} {minutes:8.1f} {trainer.steps:6d} {scores.psnr_mean:8.2f} {scores.ssim_mean:6.3f} "
-            f"{100 * depth.median:10.2f} {100 * depth.mean:8.2f} {depth.off:7.2%} {depth.opacity:8.4f} "
-            f"{depth.translucent:6.2%} {load:5.1f}",
+            f"{source:>7s} {minutes:8.1f} {trainer.steps:6d} {scores.psnr_mean:8.2f} {scores.psnr_fitted_mean:7.2f} "
+            f"{scores.ssim_mean:6.3f} {100 * depth.median:10.2f} {100 * depth.mean:8.2f} {depth.off:7.2%} "
+            f"{depth.opacity:8.4f} {depth.translucent:6.2%} {load:5.1f}",
             flush=True,
         )
     table = args.out / "store_radiance.csv"
