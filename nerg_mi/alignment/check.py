@@ -8,6 +8,7 @@ import numpy as np
 
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.checks.mirror import hit_shares, mirror_warning
 from nerg_mi.rays.rays import Rays
 from nerg_mi.transport.media.protocol import Medium
 from nerg_mi.transport.place import Place
@@ -32,11 +33,13 @@ _TIGHT, _MOSTLY, _DIRECTIONS = 0.06, 0.8, 16
 @dataclass(frozen=True)
 class Check:
     """Shares, from 0 to 1: ``escaped`` of the gaze, which meets no surface; ``inside`` of the heads, which are in
-    something solid; ``below`` of the heads, which are below the floor."""
+    something solid; ``below`` of the heads, which are below the floor. ``mirrored``: a sentence where more of the gaze
+    ends on surfaces with an axis negated."""
 
     escaped: float
     inside: float
     below: float
+    mirrored: str | None = None
 
     @property
     def impossible(self) -> bool:
@@ -50,7 +53,8 @@ class Check:
             "inside": f"{100 * self.inside:.0f} % of the heads are inside of something solid",
             "below": f"{100 * self.below:.0f} % of the heads are below the floor",
         }
-        return [text for name, text in said.items() if getattr(self, name) > DOUBTFUL[name]]
+        found = [text for name, text in said.items() if getattr(self, name) > DOUBTFUL[name]]
+        return [*found, self.mirrored] if self.mirrored else found
 
 
 def check_alignment(subject: Medium | Place, rays: Rays, align: Similarity, seed: int = 0) -> Check:
@@ -69,4 +73,14 @@ def check_alignment(subject: Medium | Place, rays: Rays, align: Similarity, seed
     tight = (met & (depth < _TIGHT * align.scale))[:, 2:].mean(axis=1)
     # Something is above, and nothing below: what is above is the floor.
     below = ~met[:, 0] & met[:, 1]
-    return Check(float((opacity < _SURFACE_OPACITY).mean()), float((tight >= _MOSTLY).mean()), float(below.mean()))
+    escaped = float((opacity < _SURFACE_OPACITY).mean())
+    mirrored = None
+    # People look out of windows too: a mirror is asked for only where something is wrong.
+    if escaped > DOUBTFUL["escaped"]:
+
+        def trace(at: np.ndarray, along: np.ndarray) -> np.ndarray:
+            depth, met = trace_depth(subject, at, along)
+            return np.where(met >= _SURFACE_OPACITY, depth, np.inf)
+
+        mirrored = mirror_warning(hit_shares(trace, origin, direction, turn.T), len(origin))
+    return Check(escaped, float((tight >= _MOSTLY).mean()), float(below.mean()), mirrored)

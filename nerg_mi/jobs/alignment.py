@@ -11,6 +11,7 @@ import numpy as np
 from nerg_mi.alignment.camera_poses import read_cameras
 from nerg_mi.alignment.check import check_alignment
 from nerg_mi.alignment.evidence import Evidence, Fit, Target
+from nerg_mi.alignment.flips import DECLARED, compare_flips
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.pairs import read_pairs
 from nerg_mi.alignment.point_file import read_surface
@@ -79,6 +80,8 @@ def align(
     _tell_found(found, reporter)
     if place is not None and place.medium is not None and data is not None:
         _tell_check(place, data, found.matrix, reporter)
+    if target.points is not None and data is not None:
+        _tell_flips(target.points, data, found.matrix, reporter)
     written: list[Path] = []
     if output is not None:
         picture = output.with_suffix(".png")
@@ -230,6 +233,17 @@ def _tell_check(place: GazePlace, rays: Rays, matrix: np.ndarray, reporter: Repo
         f"{100 * check.escaped:.1f} % of the gaze meets no surface, {100 * check.inside:.1f} % of the heads are inside "
         f"of something, {100 * check.below:.1f} % below the floor"
     )
+    if check.mirrored is not None:
+        reporter.warn(check.mirrored)
+
+
+def _tell_flips(points: np.ndarray, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
+    flips = compare_flips(points, matrix, rays.origin, rays.direction, rays.head)
+    median = float(np.median(flips.degrees[DECLARED]))
+    reporter.message(f"the gaze passes {median:.2g} degrees from the nearest point of the place (median)")
+    said = flips.warning()
+    if said is not None:
+        reporter.warn(said)
 
 
 def _figure(fit: Fit, target: Target, heads: np.ndarray | None, found: Alignment):

@@ -55,3 +55,13 @@ def test_heads_within_matter_are_inside_of_something():
 def test_no_rays_are_no_doubt(room):
     assert check_alignment(room, RAYS.select(np.zeros(len(RAYS), bool)), moved(0, 0, 0)).doubts() == []
     assert len(replace(RAYS, hit=None)) == len(RAYS)
+
+
+def test_gaze_that_would_meet_more_with_an_axis_negated_is_told():
+    """A wall on one side: people who look at it, and the same in a mirror."""
+    place = mi.ScalarTransform4f().translate([20, 0, 0]).scale([0.1, 60, 60])
+    wall = Place(None, mi.load_dict({"type": "scene", "wall": {"type": "cube", "to_world": place}}))
+    rays = replace(RAYS, direction=np.tile([0.8, 0.6, 0.0], (len(RAYS), 1)))
+    assert check_alignment(wall, rays, moved(0, 0, 0)) == Check(0.0, 0.0, 0.0)
+    mirrored = check_alignment(wall, replace(rays, direction=rays.direction * (-1, 1, 1)), moved(0, 0, 0))
+    assert "with x of the directions negated" in mirrored.doubts()[-1] and mirrored.escaped > 0.9
