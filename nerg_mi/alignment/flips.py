@@ -40,7 +40,8 @@ class Flips:
         there, here = float(np.median(self.degrees[best])), float(np.median(declared))
         if best == DECLARED or there > _BETTER * here:
             return None
-        if wilcoxon(self.degrees[best], declared, alternative="less").pvalue > _CHANCE:
+        # Statistic and probability.
+        if wilcoxon(self.degrees[best], declared, alternative="less")[1] > _CHANCE:
             return None
         return (
             f"the gaze passes {here:.2g} degrees from the nearest point of the place (median), and {there:.2g} with "
@@ -66,7 +67,7 @@ def compare_flips(
     kinds = {DECLARED: direction}
     kinds |= {f"{'xyz'[k]} of the directions negated": direction * np.where(np.arange(3) == k, -1, 1) for k in range(3)}
     if head is not None:
-        known = np.isfinite(head[some]).all(axis=1)[:, None]
+        known = np.all(np.isfinite(head[some]), axis=1, keepdims=True)
         left = np.cross(_UP, head[some])
         left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
         above = np.cross(head[some], left)
