@@ -25,7 +25,7 @@ from .parts import read_groups
 MOST = 50_000_000
 """So many rays are loaded at once, unless another bound is given."""
 
-RAY_BYTES = 100
+RAY_BYTES = 110
 """Memory of a ray that is loaded, roughly."""
 
 

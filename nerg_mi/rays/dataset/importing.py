@@ -91,10 +91,14 @@ def _import_source(task: Task) -> Outcome:
     def take(rays: Rays) -> None:
         writer.add(rays if recipe.key is None else pseudonymise(rays, recipe.key), recipe.place, recipe.day)
         names.update(rays.persons)
+        # Of somebody who is in several blocks, that of the first.
+        for name, metres in rays.metadata.get("eye_distance", {}).items():
+            eyes.setdefault(name, metres)
 
-    names: set[str] = set()
+    names, eyes = set[str](), dict[str, float]()
     rest = read_rays(recipe.reader, task.path, recipe.settings, skip_bad_lines=recipe.skip_bad_lines, on_rays=take)
     take(rest)
+    rest = replace(rest, metadata={**rest.metadata, **({"eye_distance": eyes} if eyes else {})})
     metadata, name = rest.metadata, task.path.name
     if recipe.key is not None:
         metadata, name = _without_names(rest, tuple(sorted(names)), recipe, name)

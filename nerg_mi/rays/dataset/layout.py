@@ -7,7 +7,8 @@
 The folders are those of Hive, which pyarrow, DuckDB and others read as columns ``place``, ``day`` and ``bucket``; names
 that begin with an underscore they pass over. Rows of a part are in the order of persons and times. Times are float64
 seconds, as those of rays: exact for any clock that a reader can give, where whole nanoseconds would round some times
-and end after 292 years. Origins, directions and hit points are float32.
+and end after 292 years. Origins, directions, hit points and heads are
+float32, NaN where they are unknown.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ GROUP_ROWS = 1 << 17
 REACH = 8192.0
 """Origins lie within so many metres of zero: float32 places them there to half a millimetre."""
 
-VECTORS = ("origin", "direction", "hit")
+VECTORS = ("origin", "direction", "hit", "head")
 _EPOCH = 946_684_800.0, 4_102_444_800.0  # the years 2000 to 2100
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
 _PLACE = 64  # characters
@@ -115,6 +116,7 @@ def schema() -> Any:
             ("confidence", pa.float64()),
             *vector("hit"),
             ("cohort", names),
+            *vector("head"),
         ]
     )
 

@@ -57,6 +57,7 @@ class Part:
     duplicates: int  # rays with person and time of the one before
     hits: int  # rays whose hit point is known
     cohorts: bool  # whether rays have one
+    heads: bool  # whether it is known of some where the head points
 
     def path(self, source: str) -> Path:
         """Its file within the dataset; ``source``: id of the account that it is named in."""
@@ -156,7 +157,8 @@ def _part(path: Path, found: dict[str, Any], head: Head, persons: dict[str, int]
         _check(path, key, is_count(found[key]), "count")
     _check(path, "bucket", found["bucket"] < head.buckets, "bucket of this dataset")
     _check(path, "rays", 0 < found["rays"] <= PART_ROWS, "number of rays of a part")
-    _check(path, "cohorts", isinstance(found["cohorts"], bool), "yes or no")
+    for key in ("cohorts", "heads"):
+        _check(path, key, isinstance(found[key], bool), "yes or no")
     for key in ("start", "end", "recorded"):
         _check(path, key, _number(found[key]), "number")
     for key in ("low", "high"):

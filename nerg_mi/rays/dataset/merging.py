@@ -14,14 +14,14 @@ from nerg_mi.rays.rays import FRAME, Rays
 
 from .manifest import Source
 
-_MERGED = ("sources", "dropped", "rows_read", "complaints")
+_MERGED = ("sources", "dropped", "rows_read", "complaints", "eye_distance")
 _EMPTY = np.zeros((0, 3))
 
 
 def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -> Rays:
     """The rays of all ``blocks``, in this order, with the sorted persons and cohorts that occur.
 
-    Blocks without hit points get NaN, and those without cohorts the cohort "unknown", where others have some.
+    Blocks without hit points or heads get NaN, and those without cohorts the cohort "unknown", where others have some.
     """
     held = [(block.columns(), block.persons, block.cohorts, len(block)) for block in map(_compact, blocks)]
     metadata = {"frame": dict(FRAME)} if metadata is None else metadata
@@ -40,8 +40,9 @@ def merge_rays(blocks: Iterable[Rays], metadata: dict[str, Any] | None = None) -
                 (columns["cohort"], groups) if "cohort" in columns else (np.zeros(n, np.int32), ("unknown",))
             )
             columns["cohort"] = _renumbered(codes, groups, group)
-        if "hit" not in columns and any("hit" in other for other, *_ in held):
-            columns["hit"] = np.full((n, 3), np.nan)
+        for name, kind in (("hit", np.float64), ("head", np.float32)):
+            if name not in columns and any(name in other for other, *_ in held):
+                columns[name] = np.full((n, 3), np.nan, kind)
     # Column by column, so that no more than one is there twice.
     joined = {
         name: np.concatenate([columns.pop(name) for columns, *_ in held]) for name in COLUMNS if name in held[0][0]
@@ -76,10 +77,12 @@ def merge_metadata(sources: Sequence[Source]) -> dict[str, Any]:
     about = [source.metadata for source in sources]
     first = about[0] if about else {"frame": dict(FRAME)}
     same = {k: v for k, v in first.items() if k not in _MERGED and all(other.get(k) == v for other in about)}
+    eyes = {name: metres for other in about for name, metres in other.get("eye_distance", {}).items()}
     complaints = list(dict.fromkeys(sentence for other in about for sentence in other.get("complaints", [])))
     return {
         **same,
         **({"complaints": complaints} if complaints else {}),
+        **({"eye_distance": eyes} if eyes else {}),
         "frame": first["frame"],
         "sources": [entry for other in about for entry in other.get("sources", [])],
         "rows_read": sum(other.get("rows_read", 0) for other in about),

@@ -18,7 +18,8 @@ from nerg_mi.rays.rays import Rays
 from .layout import GROUP_ROWS, VECTORS
 from .manifest import Part, Source
 
-_COLUMNS = {"t": "f", "person": "s", "origin": "f", "direction": "f", "confidence": "f", "hit": "f", "cohort": "s"}
+# Columns of rays: of floats, or of texts.
+_KINDS = dict(t="f", person="s", origin="f", direction="f", confidence="f", hit="f", cohort="s", head="f")
 _WHAT = "part of a dataset"
 
 
@@ -49,7 +50,8 @@ def read_groups(
             raise _foreign(path, f"it claims more than its {size:,} bytes warrant")
         if sum(group.num_rows for group in groups) != part.rays or any(g.num_rows > GROUP_ROWS for g in groups):
             raise _foreign(path, "its row groups are not those that are written here")
-        columns = _needed(pa, file.schema_arrow, path, hits and part.hits > 0, part.cohorts)
+        left_out = {"hit": not (hits and part.hits), "cohort": not part.cohorts, "head": not part.heads}
+        columns = _needed(pa, file.schema_arrow, path, [name for name in _KINDS if not left_out.get(name)])
         first = 0
         for k, group in enumerate(groups):
             if group.num_rows and wanted(first, group.num_rows, _bounds(group)):
@@ -70,18 +72,17 @@ def _foreign(path: Path, why: str) -> NergError:
     return NergError(f'"{path}" is not the part that the account names: {why}; import its source again')
 
 
-def _needed(pa: Any, schema: Any, path: Path, hits: bool, cohorts: bool) -> list[str]:
-    """The columns that are read. Raises `NergError` where they are not there, or not of their kinds."""
+def _needed(pa: Any, schema: Any, path: Path, names: list[str]) -> list[str]:
+    """The columns that hold those of rays with these names. Raises `NergError` where they are not there, or not of
+    their kinds."""
     found = []
-    for name, kind in _COLUMNS.items():
-        if (name == "hit" and not hits) or (name == "cohort" and not cohorts):
-            continue
+    for name in names:
         for column in [f"{name}_{axis}" for axis in "xyz"] if name in VECTORS else [name]:
             if schema.names.count(column) != 1:
                 raise _foreign(path, f'it has no column "{column}"')
             type_ = schema.field(column).type
             type_ = type_.value_type if pa.types.is_dictionary(type_) else type_
-            if not (pa.types.is_floating(type_) if kind == "f" else pa.types.is_string(type_)):
+            if not (pa.types.is_floating(type_) if _KINDS[name] == "f" else pa.types.is_string(type_)):
                 raise _foreign(path, f'its column "{column}" is not of the kind that it has here')
             found.append(column)
     return found
@@ -115,6 +116,7 @@ def _rays(pa: Any, table: Any, path: Path, source: Source) -> Rays:
             direction=vector("direction"),
             confidence=number("confidence"),
             hit=vector("hit") if "hit_x" in names else None,
+            head=vector("head") if "head_x" in names else None,
             cohort=cohort,
             cohorts=cohorts,
         )

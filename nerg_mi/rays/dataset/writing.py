@@ -100,6 +100,7 @@ class SourceWriter:
             "duplicates": int(np.count_nonzero(step == 0)),
             "hits": 0 if rays.hit is None else int(np.isfinite(rays.hit[rows]).all(axis=1).sum()),
             "cohorts": rays.cohort is not None,
+            "heads": rays.head is not None and bool(np.isfinite(rays.head[rows]).any()),
         }
         path = self._folder / Part(**about).path(self._source)
         table = table_of(rays, rows)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from nerg_mi.rays.dataset.dataset import RayDataset
 from nerg_mi.rays.dataset.identity import Marks
 from nerg_mi.rays.dataset.importing import Task, has_parts, import_source
 from nerg_mi.rays.dataset.manifest import Head, read_sources, write_head
+from nerg_mi.rays.readers.frames import Frame
+from nerg_mi.rays.readers.options import NoOptions
 from nerg_mi.rays.readers.registry import read_rays
 
 from .making import assert_same, recipe, settings, write_source
@@ -44,6 +47,42 @@ def test_in_blocks_as_at_once(tmp_path, monkeypatch, key):
         assert source.metadata["dropped"] == rays.metadata["dropped"]
     assert_same(RayDataset.open(folder).load(), rays)
     assert import_source(task(folder, path, key=key)).unchanged
+
+
+class Headset:
+    """A reader of heads and distances of eyes, in cm, that makes its rays itself."""
+
+    name, files, world, checked_on, Options = "headset", "", "", "", NoOptions
+
+    def frame(self, files, options):
+        return Frame(units="cm")
+
+    def read(self, files, options, builder):
+        builder.source(files[0])
+        for k, (name, metres) in enumerate((("ann", 6.0), ("bo", 6.4), ("ann", 7.0))):
+            ahead = np.tile([0.0, 2.0, 0.0], (50, 1))
+            heads = np.where(np.arange(50)[:, None] < 25, ahead, np.nan)
+            t, eyes = np.arange(50) + 50.0 * k, np.full(50, metres)
+            builder.add(t, name, ahead, ahead, rows=np.arange(50), head=heads, eye_distance=eyes)
+        builder.complain("the headset was put on askew")
+
+
+@pytest.mark.parametrize("key", [None, bytes(range(16))])
+def test_heads_eyes_and_complaints(tmp_path, monkeypatch, key):
+    monkeypatch.setattr("nerg_mi.rays.readers.builder.STREAMED", 40)
+    (tmp_path / "a.bin").write_bytes(b"x")
+    write_head(tmp_path / "a.rays", HEAD)
+    given = task(tmp_path / "a.rays", tmp_path / "a.bin", reader=Headset(), settings=None, key=key)
+    assert import_source(given).rays == 150
+    rays = RayDataset.open(tmp_path / "a.rays").load()
+    assert rays.metadata["complaints"] == ["the headset was put on askew"]
+    known = np.isfinite(rays.head).all(axis=1)
+    assert rays.head.dtype == np.float32 and (rays.head[known] == [0, 1, 0]).all()
+    assert np.array_equal(known, rays.t % 50 < 25)
+    # Of the first block of each.
+    eyes = rays.metadata["eye_distance"]
+    assert set(eyes) == set(rays.persons) and np.allclose(sorted(eyes.values()), [0.06, 0.064])
+    assert (set(eyes) == {"ann", "bo"}) is (key is None)
 
 
 def test_a_source_without_a_ray_has_an_account(tmp_path):

@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.dataset.manifest import Head, Part, Source, read_head, read_sources, write_head, write_source
 from nerg_mi.rays.rays import FRAME
 
-PART = Part("shop", "unknown", 3, 0, 5, 100, "a", "b", 0.0, 1.0, [0.0] * 3, [1.0] * 3, 0.5, 0, 2, False)
+PART = Part("shop", "unknown", 3, 0, 5, 100, "a", "b", 0.0, 1.0, [0.0] * 3, [1.0] * 3, 0.5, 0, 2, False, False)
 SOURCE = Source("0" * 32, "a.csv", "w", None, "r", 0, {"a": 2, "b": 3}, {}, [PART], {"frame": dict(FRAME)})
 HEAD = Head(16)
 
@@ -61,6 +61,7 @@ def test_of_one_path_the_latest_counts(tmp_path):
                 ({"start": None}, '"start" is no number'),
                 ({"first": "nobody"}, '"first" is no person'),
                 ({"cohorts": 1}, "yes or no"),
+                ({"heads": None}, "yes or no"),
             )
         ),
         ({"parts": [{}, {}]}, "the same number|not as many"),

@@ -23,6 +23,8 @@ def test_people_who_occur_and_what_some_lack():
     assert found.t.tolist() == [0, 1, 2] and np.isnan(found.hit[[0, 2]]).all() and found.hit[1].tolist() == [0, 2, 0]
     assert [found.cohorts[k] for k in found.cohort] == ["unknown", "y", "unknown"]
     assert found.metadata == {"frame": FRAME}
+    headed = merge_rays([ray(0, "b"), ray(1, "b", head=AHEAD)])
+    assert headed.head.dtype == np.float32 and np.isnan(headed.head[0]).all() and headed.head[1].tolist() == [0, 1, 0]
     without = merge_rays([ray(0, "b"), ray(1, "b")])
     assert without.hit is None and without.cohort is None and without.cohorts == ()
 
@@ -34,10 +36,12 @@ def test_nothing():
 def test_metadata_are_what_holds_for_all():
     about = {"frame": dict(FRAME), "preset": "table", "tick": 1.0, "rows_read": 4, "sources": [{"file": "a"}]}
     about["dropped"] = [{"reason": "blink", "file": "a", "count": 1, "rows": [[1, 1]]}]
+    about["eye_distance"] = {"ann": 0.06}
     about["complaints"] = ["the frame is mirrored", "the clock jumps"]
     other = {
         **about,
         "complaints": ["the clock jumps", "the gaze is frozen"],
+        "eye_distance": {"bo": 0.07},
         "tick": 2.0,
         "rows_read": 5,
         "sources": [{"file": "b"}],
@@ -46,6 +50,7 @@ def test_metadata_are_what_holds_for_all():
     fields = dict(where="", stamp=None, recipe="", generation=0, persons={}, cohorts={}, parts=[])
     found = merge_metadata([Source(id=n, file=n, metadata=m, **fields) for n, m in (("a", about), ("b", other))])
     assert found["rows_read"] == 9 and found["sources"] == [{"file": "a"}, {"file": "b"}]
+    assert found["eye_distance"] == {"ann": 0.06, "bo": 0.07}
     assert found["complaints"] == ["the frame is mirrored", "the clock jumps", "the gaze is frozen"]
     assert found["dropped"] == about["dropped"] and found["preset"] == "table" and "tick" not in found
 
