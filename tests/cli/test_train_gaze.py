@@ -53,6 +53,7 @@ ASKED = {
     "test_people": 0.5,
     "ensemble": 3,
     "save_every": 7.0,
+    "most": 1000,
     "seed": 6,
     "threads": 2,
     "mode": "llvm_ad_mono",
