@@ -150,6 +150,7 @@ READS_ONLY = {"doctor", "rays guess", "rays show"}
 INPUTS = {
     "scene": {"files", "photos", "align"},
     "render": {"scene", "frames"},
+    "align": {"rays", "field", "scene", "surface", "pairs", "twin", "cameras", "place_cameras", "start"},
     "rays import": {"files", "salt", "poses", "place"},
     "rays guess": {"file"},
     "rays show": {"rays"},

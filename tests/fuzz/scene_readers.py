@@ -69,7 +69,7 @@ def _nest(folder: Path) -> object:
 
     place = nested_place(folder / "theirs.xml", folder / "ours")
     camera = Eye(np.zeros(3), np.ones(3))
-    return SceneText(place, Attention(), camera, None, np.array([0.0, 0, 1])).write()
+    return SceneText(place, Attention(), camera, None, np.array([0.0, 0, 1])).xml()
 
 
 def _make_nested(folder: Path) -> None:

@@ -101,12 +101,12 @@ MENDINGS = (
             ["tests/cli/test_render.py::test09_ctrl_c_ends_it_and_leaves_nothing[out.exr]"],
             (
                 "nerg_mi/jobs/pictures.py",
-                "            stop.check()\n            speed = done",
-                "            speed = done",
+                "            stop.check()\n            share = (done",
+                "            share = (done",
             ),
             (
                 "nerg_mi/jobs/pictures.py",
-                "write(bitmap, band.rows)\n                stop.check()\n",
+                "write(bitmap, band.rows)\n            stop.check()\n",
                 "write(bitmap, band.rows)\n",
             ),
         ),
