@@ -30,7 +30,7 @@ from nerg_mi.alignment.evidence import Evidence, Target
 from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.pairs import Pairs
 from nerg_mi.alignment.point_file import read_surface
-from nerg_mi.alignment.surface import Felt, feel
+from nerg_mi.alignment.surface import PlaceTraces, trace_place
 from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.alignment.umeyama import MIRROR, errors, move, scale_of
 from nerg_mi.errors import NergError
@@ -49,7 +49,7 @@ HEAD = "evidence|known besides|right|error cm|95 %|degrees|scale %|residual cm|m
 class World:
     """The store: what rays found of its field, its mesh as points, and its shoppers with their hit points."""
 
-    felt: Felt
+    traces: PlaceTraces
     mesh: np.ndarray
     rays: Rays
 
@@ -69,8 +69,8 @@ def make_world(shoppers: int, rays: int) -> World:
     walked = Rays(times / 1000, person, tuple(persons), origin, direction, np.ones(len(ids)), hit)
     place = place_of_field(folder / "store.safetensors", ns)
     assert place.medium is not None
-    felt = feel(place.medium, np.array(place.box.lower), np.array(place.box.upper), rays)
-    return World(felt, read_surface(folder / "twin.ply"), walked)
+    traces = trace_place(place.medium, np.array(place.box.lower), np.array(place.box.upper), rays)
+    return World(traces, read_surface(folder / "twin.ply"), walked)
 
 
 def random_similarity(rng: np.random.Generator, upright: bool) -> np.ndarray:
@@ -101,7 +101,7 @@ def pairs(count: int, upright: bool) -> Maker:
 def twin(upright: bool) -> Maker:
     def make(world, truth, rng, mirrored):
         mesh = world.mesh + rng.normal(0, 0.005, world.mesh.shape)
-        return Twin(move(MIRROR, mesh) if mirrored else mesh), Target(felt=world.felt.moved(truth), upright=upright)
+        return Twin(move(MIRROR, mesh) if mirrored else mesh), Target(traces=world.traces.moved(truth), upright=upright)
 
     return make
 
@@ -135,7 +135,7 @@ def tracking(hits: bool) -> Maker:
                 direction=move(MIRROR, rays.direction),
                 hit=None if rays.hit is None else move(MIRROR, rays.hit),
             )
-        return Tracking(rays), Target(felt=world.felt.moved(truth), scale=None if hits else scale_of(truth))
+        return Tracking(rays), Target(traces=world.traces.moved(truth), scale=None if hits else scale_of(truth))
 
     return make
 
@@ -254,7 +254,7 @@ def main(argv=None) -> None:
     parser.add_argument("--only", action="append", choices=[*KINDS, "fox"], help="only this kind; repeatable")
     parser.add_argument("--seed", type=int, default=0, help="of the random similarities")
     parser.add_argument("--shoppers", type=int, default=12, help="people who are tracked")
-    parser.add_argument("--rays", type=int, default=150_000, help="rays by which the place is felt out")
+    parser.add_argument("--rays", type=int, default=150_000, help="rays by which the place is traced")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/alignment.csv"), help="CSV file to write")
     parser.add_argument("--update", type=Path, help="page of the documentation to put the tables into")
     args = parser.parse_args(argv)

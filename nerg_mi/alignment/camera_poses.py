@@ -18,7 +18,7 @@ from nerg_mi.capture.sources import find_source, read_posed
 from nerg_mi.errors import NergError
 
 from .chart import ALL
-from .evidence import Fit, Target, Tell, pair_covariance
+from .evidence import Fit, Progress, Target, pair_covariance
 from .umeyama import MIRROR, check_points, errors, fit_similarity, in_plane, move
 
 _ROUNDS = 50
@@ -37,7 +37,7 @@ class Cameras:
 
     kind = "cameras"
 
-    def fit(self, target: Target, tell: Tell) -> Fit:
+    def fit(self, target: Target, progress: Progress) -> Fit:
         """The robust mean. Raises `NergError` where all cameras stand at one place."""
         a, b = self.tracking, self.place
         if len(a) < 2:

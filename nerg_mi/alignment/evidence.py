@@ -15,10 +15,10 @@ import numpy as np
 from nerg_mi.errors import NergError
 
 from .chart import Chart
-from .surface import Felt, PlaceSurface, surface_of_felt, surface_of_points
+from .surface import PlaceSurface, PlaceTraces, surface_of_points, surface_of_traces
 from .umeyama import move
 
-Tell = Callable[[float, str], None]
+Progress = Callable[[float, str], None]
 """Told of a share of the work that is done, and of what is being done."""
 
 
@@ -26,14 +26,14 @@ Tell = Callable[[float, str], None]
 class Target:
     """The place that tracking is aligned with, and what is known beforehand.
 
-    ``felt``: what rays found of it, or ``points`` (N, 3) on its surfaces; neither where only its frame is needed.
+    ``traces``: what rays found of it, or ``points`` (N, 3) on its surfaces; neither where only its frame is needed.
     ``turn``: (4, 4) rotation from its frame to one in which z is up; ``upright``: whether that is known, so that the
     tracking's z stays up; ``floor``: height of the floor in the tracking, metres, None where it is not known;
     ``place_floor``: that of the place, along its up, None: to be found; ``scale``: units of the place a unit of the
     tracking, None: to be found.
     """
 
-    felt: Felt | None = None
+    traces: PlaceTraces | None = None
     points: np.ndarray | None = None
     turn: np.ndarray = field(default_factory=lambda: np.eye(4))
     upright: bool = True
@@ -44,8 +44,8 @@ class Target:
     @cached_property
     def surface(self) -> PlaceSurface:
         """Its surface, z up. Raises `NergError` where no place was given."""
-        if self.felt is not None:
-            return surface_of_felt(self.felt.moved(self.turn))
+        if self.traces is not None:
+            return surface_of_traces(self.traces.moved(self.turn))
         if self.points is not None:
             return surface_of_points(move(self.turn, self.points))
         raise NergError(
@@ -93,7 +93,7 @@ class Evidence(Protocol):
         """Its name, as alignment.json has it."""
         ...
 
-    def fit(self, target: Target, tell: Tell) -> Fit:
+    def fit(self, target: Target, progress: Progress) -> Fit:
         """The similarity from the tracking to the place of ``target``. Raises `NergError` where the evidence leaves it
         open, saying what would settle it."""
         ...

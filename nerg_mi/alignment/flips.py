@@ -11,18 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import wilcoxon
 
+from nerg_mi.rays.checks.head import EXCHANGES, head_frames
+from nerg_mi.rays.checks.mirror import DECLARED
+
 from .umeyama import move, scale_of
 
 RAYS, POINTS = 400, 100_000
 """So many rays are looked at, and so many points."""
 
-DECLARED = "as declared"
-"""Name of the directions with no axis negated."""
-
 # A flip is told where it is so much better at the median, and better in more rays than chance would have it.
 _BETTER, _CHANCE = 0.75, 1e-4
 _FEWEST = 30
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +67,11 @@ def compare_flips(
     kinds |= {f"{'xyz'[k]} of the directions negated": direction * np.where(np.arange(3) == k, -1, 1) for k in range(3)}
     if head is not None:
         known = np.all(np.isfinite(head[some]), axis=1, keepdims=True)
-        left = np.cross(_UP, head[some])
-        left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
-        above = np.cross(head[some], left)
-        for name, axis in (
-            ("left and right of the eyes exchanged", left),
-            ("up and down of the eyes exchanged", above),
-        ):
-            mirrored = direction - 2 * np.sum(direction * axis, axis=1, keepdims=True) * axis
-            kinds[name] = np.where(known, mirrored, direction)
+        frames = head_frames(head[some])
+        own = np.einsum("nij,nj->ni", frames, direction)
+        for what, signs in EXCHANGES.items():
+            mirrored = np.einsum("nij,ni->nj", frames, own * signs)
+            kinds[f"{what} of the eyes exchanged"] = np.where(known, mirrored, direction)
     turned = np.stack([kind @ turn.T for kind in kinds.values()], axis=1)
     found = np.empty(turned.shape[:2])
     for k, (eye, ways) in enumerate(zip(origin, turned)):

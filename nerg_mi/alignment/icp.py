@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.errors import NergError
 
 from .chart import ALL, upright_basis
-from .evidence import Fit, Target, Tell, angles, pair_covariance
+from .evidence import Fit, Progress, Target, angles, pair_covariance
 from .grid import DistanceGrid
 from .refine import refine
-from .scores import OnSurface
+from .scores import AtZero
 from .surface import PlaceSurface, surface_of_points, thinned
 from .umeyama import MIRROR, fit_similarity, move, scale_of
 
@@ -45,13 +45,13 @@ class Twin:
 
     kind = "twin"
 
-    def fit(self, target: Target, tell: Tell) -> Fit:
+    def fit(self, target: Target, progress: Progress) -> Fit:
         """The best placement. Raises `NergError` for a twin of too few points."""
         place = target.surface
         twin = _even(self.points, self.source)
         found: dict[bool, list[_Placed]] = {}
         for flip in (False, True):
-            tell(0.1 + 0.4 * flip, "placing the mirrored twin" if flip else "placing the twin")
+            progress(0.1 + 0.4 * flip, "placing the mirrored twin" if flip else "placing the twin")
             found[flip] = _placed(move(MIRROR, twin) if flip else twin, place, target)
         best = found[False][0]
         s = scale_of(best.matrix)
@@ -172,8 +172,9 @@ def _settled(
     basis = upright_basis(False) if target.upright else ALL
     basis = basis if target.scale is None else basis[:, :-1]
     center, own = move(matrix, x).mean(axis=0), np.arange(len(x))
+    on_surface = AtZero(place.distance, x, own, "points of the twin on surfaces", near)
     for wide in (3.0, 1.0):
-        matrix = refine([OnSurface(place, x, own, near)], matrix, center, basis, wide, 30).matrix
+        matrix = refine([on_surface], matrix, center, basis, wide, 30).matrix
     s, most = scale_of(matrix), _FAR * place.diagonal
     forth = np.minimum(place.distance.at(move(matrix, x)), most)
     back = np.minimum(twin.at(move(np.linalg.inv(matrix), y)) * s, most)

@@ -13,7 +13,7 @@ from nerg_mi.files.bounded import plain, read_json, size_of
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 
 from .chart import ALL, upright_basis
-from .evidence import Fit, Target, Tell, angles, pair_covariance
+from .evidence import Fit, Progress, Target, angles, pair_covariance
 from .umeyama import MIRROR, check_points, errors, fit_similarity, in_plane, leave_one_out, move
 
 PAIRS_BYTES = 4 << 20
@@ -40,7 +40,7 @@ class Pairs:
 
     kind = "pairs"
 
-    def fit(self, target: Target, tell: Tell) -> Fit:
+    def fit(self, target: Target, progress: Progress) -> Fit:
         """Umeyama's solution. Raises `NergError` for points that are too few or degenerate."""
         x, y = self.tracking, move(target.turn, self.place)
         check_points(x, y, self.source, upright=target.upright)
@@ -49,7 +49,7 @@ class Pairs:
         off, left_out = errors(matrix, x, y), leave_one_out(x, y, **options)
         flipped = move(MIRROR, x)
         turned = fit_similarity(flipped, y, **options)
-        notes = [self._told(off, left_out)]
+        notes = [self._describe(off, left_out)]
         mirrored = None
         if not target.upright and in_plane(x):
             notes.append("the points lie in a plane, so that they do not tell a mirrored frame; add one off the plane")
@@ -76,7 +76,7 @@ class Pairs:
             self._doubts(off, left_out),
         )
 
-    def _told(self, off: np.ndarray, left_out: np.ndarray) -> str:
+    def _describe(self, off: np.ndarray, left_out: np.ndarray) -> str:
         known = left_out[np.isfinite(left_out)]
         left = (
             f"; each from the others: {100 * np.median(known):.2g} cm (median), {100 * known.max():.2g} cm (worst)"

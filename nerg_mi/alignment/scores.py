@@ -49,31 +49,18 @@ class Score(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class OnSurface:
-    """Hit points (N, 3) lie on surfaces."""
+class AtZero:
+    """Points (N, 3) are where a distance of the place is 0: hit points on its surface (`PlaceSurface.distance`), heads
+    and what gaze passes in its free space (`PlaceSurface.blocked`)."""
 
-    surface: PlaceSurface
+    grid: DistanceGrid
     points: np.ndarray
     group: np.ndarray
+    name: str
     scale: float = 0.1
-    name: str = "hit points on surfaces"
 
     def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _of_grid(self.surface.distance, self.points, chart, q)
-
-
-@dataclass(frozen=True, eq=False)
-class InFreeSpace:
-    """Points (N, 3) are where nothing is: heads, and what gaze passes before it ends."""
-
-    surface: PlaceSurface
-    points: np.ndarray
-    group: np.ndarray
-    scale: float = 0.1
-    name: str = "heads in free space"
-
-    def residuals(self, chart: Chart, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _of_grid(self.surface.blocked, self.points, chart, q)
+        return _of_grid(self.grid, self.points, chart, q)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from .grid import DistanceGrid
 from .umeyama import move
 
 RAYS = 150_000
-"""Rays by which a place is felt out."""
+"""Rays by which a place is traced."""
 
 VOXELS = 1 << 20
 """Voxels of its lattice, about."""
@@ -32,16 +32,16 @@ _PAD, _POCKET = 3, 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Felt:
+class PlaceTraces:
     """What rays found of a place: they ``begin`` and ``end``, (N, 3), the latter on surfaces where ``met`` (N,)."""
 
     begin: np.ndarray
     end: np.ndarray
     met: np.ndarray
 
-    def moved(self, matrix: np.ndarray) -> Felt:
+    def moved(self, matrix: np.ndarray) -> PlaceTraces:
         """The same in another frame, to which ``matrix`` (4, 4) leads."""
-        return Felt(move(matrix, self.begin), move(matrix, self.end), self.met)
+        return PlaceTraces(move(matrix, self.begin), move(matrix, self.end), self.met)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,9 @@ class PlaceSurface:
         return float(np.median(near)) if len(near) else float(edges[k])
 
 
-def feel(subject: Medium | Place, lower: np.ndarray, upper: np.ndarray, rays: int = RAYS, seed: int = 0) -> Felt:
+def trace_place(
+    subject: Medium | Place, lower: np.ndarray, upper: np.ndarray, rays: int = RAYS, seed: int = 0
+) -> PlaceTraces:
     """Trace ``rays`` from all over the box between two corners of a place. Raises `NergError` where none meets
     anything."""
     rng = np.random.default_rng(seed)
@@ -93,20 +95,20 @@ def feel(subject: Medium | Place, lower: np.ndarray, upper: np.ndarray, rays: in
     if met.mean() < 1e-3:
         raise NergError("the place has no surfaces that rays could meet, so that nothing can be aligned with it")
     far = np.linalg.norm(np.subtract(upper, lower))
-    return Felt(begin, begin + along * np.where(met, depth, far)[:, None], met)
+    return PlaceTraces(begin, begin + along * np.where(met, depth, far)[:, None], met)
 
 
-def surface_of_felt(felt: Felt, voxels: int = VOXELS) -> PlaceSurface:
-    """The surface that rays have felt."""
-    points = felt.end[felt.met]
+def surface_of_traces(traces: PlaceTraces, voxels: int = VOXELS) -> PlaceSurface:
+    """The surface that rays have met."""
+    points = traces.end[traces.met]
     box = np.percentile(points, [0.2, 99.8], axis=0)
     lower, step, shape = _lattice(box[0], box[1], voxels)
-    length = np.linalg.norm(felt.end - felt.begin, axis=1)
+    length = np.linalg.norm(traces.end - traces.begin, axis=1)
     # Rays that end where they begin began in something solid.
     real = length > 1.5 * step
-    solid, means = _voxels(felt.end[felt.met & real], lower, step, shape)
+    solid, means = _voxels(traces.end[traces.met & real], lower, step, shape)
     passed = np.zeros(shape, bool)
-    begin, way, length = felt.begin[real], (felt.end - felt.begin)[real], length[real]
+    begin, way, length = traces.begin[real], (traces.end - traces.begin)[real], length[real]
     for t in np.arange(0, min(length.max(initial=0), float(np.linalg.norm(box[1] - box[0]))), 0.8 * step):
         on = length - 0.7 * step > t
         _mark(passed, begin[on] + way[on] * (t / length[on, None]), lower, step)

@@ -11,9 +11,9 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
 from .chart import ALL, upright_basis
-from .evidence import Fit, Target, Tell
+from .evidence import Fit, Progress, Target
 from .refine import Refined, groups_of, refine
-from .scores import GazeEnds, HeadHeight, InFreeSpace, OnSurface, Score
+from .scores import AtZero, GazeEnds, HeadHeight, Score
 from .search import Guess, close, scale_range, search
 from .surface import PlaceSurface
 from .umeyama import MIRROR, move, scale_of
@@ -42,14 +42,14 @@ class Tracking:
 
     kind = "tracking"
 
-    def fit(self, target: Target, tell: Tell) -> Fit:
+    def fit(self, target: Target, progress: Progress) -> Fit:
         """The best placement. Raises `NergError` where the rays leave it open."""
         surface = target.surface
         some = _sample(self.rays)
         if self.start is not None:
-            tell(0.5, "refining")
+            progress(0.5, "refining")
             coarse = _refined(some, surface, target, target.turn @ self.start, 3.0, 30)
-            return self._told(_refined(some, surface, target, coarse.matrix, 1.0, 60), some, target, [], None)
+            return self._fit_of(_refined(some, surface, target, coarse.matrix, 1.0, 60), some, target, [], None)
         if not target.upright:
             raise NergError(
                 "from the tracking alone only its turn about the vertical is looked for: say which way is up in the "
@@ -62,12 +62,12 @@ class Tracking:
                 "rays without hit points do not tell how large the place is: give --scale (1 where the place is in "
                 "metres), or other evidence (--pairs)"
             )
-        tell(0.1, "looking for the place of the tracking")
+        progress(0.1, "looking for the place of the tracking")
         proper = _searched(some, surface, target)
         if not len(some.hits):
             # Free space has room for many placements, mirrored ones too: heads cannot tell them apart.
-            return self._told(proper[0], some, target, [], None)
-        tell(0.55, "looking for the place of the mirrored tracking")
+            return self._fit_of(proper[0], some, target, [], None)
+        progress(0.55, "looking for the place of the mirrored tracking")
         mirrored = _searched(some.mirrored(), surface, target)
         doubts = []
         for other in proper[1:]:
@@ -84,9 +84,9 @@ class Tracking:
                 f"with an axis of the tracking negated it agrees with the place (cost {mirrored[0].cost:.3f}), and as "
                 f"it is it does not (cost {proper[0].cost:.3f})"
             )
-        return self._told(proper[0], some, target, doubts, sentence)
+        return self._fit_of(proper[0], some, target, doubts, sentence)
 
-    def _told(self, best: Refined, some: _Sample, target: Target, doubts: list[str], mirrored: str | None) -> Fit:
+    def _fit_of(self, best: Refined, some: _Sample, target: Target, doubts: list[str], mirrored: str | None) -> Fit:
         surface, s = target.surface, scale_of(best.matrix)
         points = some.hits if len(some.hits) else some.heads
         grid = surface.distance if len(some.hits) else surface.blocked
@@ -167,13 +167,13 @@ class _Sample:
         """What is known of them in the place; free space is not, where the place is bare points."""
         out: list[Score] = [HeadHeight(target.place_level, self.heads, self.group)] if target.upright else []
         if len(self.hits):
-            out.append(OnSurface(surface, self.hits, self.group[self.at]))
+            out.append(AtZero(surface.distance, self.hits, self.group[self.at], "hit points on surfaces"))
         else:
             some = slice(None, None, _SPARED)
             out.append(GazeEnds(surface, self.heads[some], self.directions[some], self.group[some]))
         if surface.bounded:
-            out.append(InFreeSpace(surface, self.heads, self.group))
-            out.append(InFreeSpace(surface, self.passed, self.group[self.of], name="gaze through free space"))
+            out.append(AtZero(surface.blocked, self.heads, self.group, "heads in free space"))
+            out.append(AtZero(surface.blocked, self.passed, self.group[self.of], "gaze through free space"))
         return out
 
 

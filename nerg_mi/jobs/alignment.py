@@ -16,7 +16,7 @@ from nerg_mi.alignment.icp import Twin
 from nerg_mi.alignment.pairs import read_pairs
 from nerg_mi.alignment.point_file import read_surface
 from nerg_mi.alignment.record import Alignment, read_similarity
-from nerg_mi.alignment.surface import feel
+from nerg_mi.alignment.surface import trace_place
 from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.alignment.umeyama import move
 from nerg_mi.capture.upright import turn_to_z
@@ -68,20 +68,20 @@ def align(
     place, target = _target(options, evidence.kind, reporter)
     fit = evidence.fit(target, reporter.progress)
     if options.refine and data is not None:
-        _tell(fit, reporter)
+        _report_notes(fit, reporter)
         evidence = Tracking(data, fit.matrix)
         fit = evidence.fit(target, reporter.progress)
-    _tell(fit, reporter)
+    _report_notes(fit, reporter)
     refused = _refusal(fit, options)
     if refused and not options.force:
         raise NergError(f"{refused}; or write it all the same with --force")
     files = {name: _identity(path) for name, path in _sources(rays, options).items()}
     found = Alignment.of_fit(evidence.kind, fit, files, bool(refused))
-    _tell_found(found, reporter)
+    _report_found(found, reporter)
     if place is not None and place.medium is not None and data is not None:
-        _tell_check(place, data, found.matrix, reporter)
+        _report_check(place, data, found.matrix, reporter)
     if target.points is not None and data is not None:
-        _tell_flips(target.points, data, found.matrix, reporter)
+        _report_flips(target.points, data, found.matrix, reporter)
     written: list[Path] = []
     if output is not None:
         picture = output.with_suffix(".png")
@@ -149,7 +149,7 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
     if options.surface is not None:
         return None, Target(points=read_surface(options.surface), **common)
     ns = select_backend(options.mode, options.threads)
-    reporter.progress(0.02, "feeling out the place")
+    reporter.progress(0.02, "tracing the place")
     place = (
         places.place_of_field(options.field, ns)
         if options.field is not None
@@ -157,8 +157,8 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
     )
     assert place.medium is not None
     core = place.box.core
-    felt = feel(place.medium, np.array(core.lower), np.array(core.upper), seed=options.seed)
-    return place, Target(felt=felt, **common)
+    traces = trace_place(place.medium, np.array(core.lower), np.array(core.upper), seed=options.seed)
+    return place, Target(traces=traces, **common)
 
 
 def _turn(up: str | None) -> np.ndarray:
@@ -203,14 +203,14 @@ def _refusal(fit: Fit, options: AlignOptions) -> str:
     return ""
 
 
-def _tell(fit: Fit, reporter: Reporter) -> None:
+def _report_notes(fit: Fit, reporter: Reporter) -> None:
     for line in fit.notes:
         reporter.message(line)
     for line in fit.doubts:
         reporter.warn(line)
 
 
-def _tell_found(found: Alignment, reporter: Reporter) -> None:
+def _report_found(found: Alignment, reporter: Reporter) -> None:
     r, u = found.residuals, found.uncertainty
     parts = [
         f"{r[f'median_{unit}']:.2g} {unit} (95 %: {r[f'p95_{unit}']:.2g})"
@@ -226,7 +226,7 @@ def _tell_found(found: Alignment, reporter: Reporter) -> None:
         )
 
 
-def _tell_check(place: GazePlace, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
+def _report_check(place: GazePlace, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
     assert place.medium is not None
     check = check_alignment(place.medium, rays, Similarity(matrix))
     reporter.message(
@@ -237,7 +237,7 @@ def _tell_check(place: GazePlace, rays: Rays, matrix: np.ndarray, reporter: Repo
         reporter.warn(check.mirrored)
 
 
-def _tell_flips(points: np.ndarray, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
+def _report_flips(points: np.ndarray, rays: Rays, matrix: np.ndarray, reporter: Reporter) -> None:
     flips = compare_flips(points, matrix, rays.origin, rays.direction, rays.head)
     median = float(np.median(flips.degrees[DECLARED]))
     reporter.message(f"the gaze passes {median:.2g} degrees from the nearest point of the place (median)")
@@ -248,7 +248,7 @@ def _tell_flips(points: np.ndarray, rays: Rays, matrix: np.ndarray, reporter: Re
 
 def _figure(fit: Fit, target: Target, heads: np.ndarray | None, found: Alignment):
     """Before and after, z up."""
-    surface = None if target.felt is None and target.points is None else target.surface
+    surface = None if target.traces is None and target.points is None else target.surface
     points = np.zeros((0, 3)) if fit.points is None else fit.points
     same = heads is not None and len(points) == len(heads) and np.array_equal(points, heads)
     median = found.residuals["median_cm"]

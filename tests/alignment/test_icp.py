@@ -8,7 +8,7 @@ from nerg_mi.errors import NergError
 
 from . import rooms
 
-PLACE = rooms.felt(12_000).end
+PLACE = rooms.traces(12_000).end
 
 
 def quiet(share, text):
@@ -17,7 +17,7 @@ def quiet(share, text):
 
 def test_a_twin_in_millimetres_is_placed_and_a_mirrored_one_named():
     truth = rooms.similarity(np.random.default_rng(1), upright=True, scale=0.001)
-    twin = rooms.carried(np.linalg.inv(truth), rooms.felt(9000).end)
+    twin = rooms.carried(np.linalg.inv(truth), rooms.traces(9000).end)
     target = Target(points=PLACE, upright=True)
     fit = Twin(twin).fit(target, quiet)
     off = errors(fit.matrix, twin, rooms.carried(truth, twin))

@@ -2,8 +2,8 @@ import numpy as np
 
 from nerg_mi.alignment.chart import ALL
 from nerg_mi.alignment.refine import groups_of, refine
-from nerg_mi.alignment.scores import InFreeSpace, OnSurface
-from nerg_mi.alignment.surface import surface_of_felt
+from nerg_mi.alignment.scores import AtZero
+from nerg_mi.alignment.surface import surface_of_traces
 from nerg_mi.alignment.umeyama import errors
 
 from . import rooms
@@ -11,12 +11,15 @@ from . import rooms
 
 def test_a_near_start_comes_to_the_truth_and_says_how_sure_it_is():
     rays, truth = rooms.people(1500), rooms.similarity(np.random.default_rng(6))
-    surface = surface_of_felt(rooms.felt().moved(truth), 1 << 18)
+    surface = surface_of_traces(rooms.traces().moved(truth), 1 << 18)
     nudge = np.eye(4)
     nudge[:2, :2] = 1.03 * np.array([[np.cos(0.06), -np.sin(0.06)], [np.sin(0.06), np.cos(0.06)]])
     nudge[2, 2], nudge[:3, 3] = 1.03, (0.12, -0.1, 0.05)
     start = truth @ nudge
-    scores = [OnSurface(surface, rays.hit, rays.person), InFreeSpace(surface, rays.origin, rays.person)]
+    scores = [
+        AtZero(surface.distance, rays.hit, rays.person, "hits"),
+        AtZero(surface.blocked, rays.origin, rays.person, "heads"),
+    ]
     center = rooms.carried(truth, rays.origin).mean(axis=0)
     found = refine(scores, start, center, ALL)
     target = rooms.carried(truth, rays.origin)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.alignment.chart import ALL, Chart
-from nerg_mi.alignment.scores import GazeEnds, HeadHeight, InFreeSpace, OnSurface
-from nerg_mi.alignment.surface import surface_of_felt
+from nerg_mi.alignment.scores import AtZero, GazeEnds, HeadHeight
+from nerg_mi.alignment.surface import surface_of_traces
 
 from . import rooms
 
@@ -13,13 +13,13 @@ GROUP = RAYS.person
 
 @pytest.fixture(scope="module")
 def surface():
-    return surface_of_felt(rooms.felt(), 1 << 16)
+    return surface_of_traces(rooms.traces(), 1 << 16)
 
 
 def scores(surface):
     return [
-        OnSurface(surface, RAYS.hit, GROUP),
-        InFreeSpace(surface, RAYS.origin, GROUP),
+        AtZero(surface.distance, RAYS.hit, GROUP, "hits"),
+        AtZero(surface.blocked, RAYS.origin, GROUP, "heads"),
         GazeEnds(surface, RAYS.origin, RAYS.direction, GROUP),
         HeadHeight(0.0, RAYS.origin, GROUP),
     ]
@@ -49,7 +49,7 @@ def test_all_is_well_in_the_right_place_and_not_elsewhere(surface, which):
 
 
 def test_residuals_are_metres_of_the_tracking_whatever_the_scale_of_the_place(surface):
-    grown = surface_of_felt(rooms.felt().moved(np.diag([7.0, 7, 7, 1])), 1 << 16)
+    grown = surface_of_traces(rooms.traces().moved(np.diag([7.0, 7, 7, 1])), 1 << 16)
     for a, b in zip(scores(surface), scores(grown)):
         if isinstance(a, HeadHeight):
             continue

@@ -1,14 +1,14 @@
 import numpy as np
 
 from nerg_mi.alignment.search import close, scale_range, search
-from nerg_mi.alignment.surface import surface_of_felt
+from nerg_mi.alignment.surface import surface_of_traces
 
 from . import rooms
 
 
 def test_turn_shift_and_scale_are_guessed_from_hit_points_and_heads():
     rays, truth = rooms.people(1500), rooms.similarity(np.random.default_rng(2), upright=True)
-    surface = surface_of_felt(rooms.felt().moved(truth), 1 << 16)
+    surface = surface_of_traces(rooms.traces().moved(truth), 1 << 16)
     scales = scale_range(surface, rays.hit)
     scale = np.cbrt(np.linalg.det(truth[:3, :3]))
     assert scales[0] > scale > scales[-1] and np.abs(np.log(scales / scale)).min() < 0.04

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.alignment.surface import Felt, feel, surface_of_felt, surface_of_points, thinned
+from nerg_mi.alignment.surface import PlaceTraces, surface_of_points, surface_of_traces, thinned, trace_place
 from nerg_mi.errors import NergError
 
 from . import rooms
@@ -9,7 +9,7 @@ from . import rooms
 
 @pytest.fixture(scope="module")
 def surface():
-    return surface_of_felt(rooms.felt(), 1 << 17)
+    return surface_of_traces(rooms.traces(), 1 << 17)
 
 
 def exact(points):
@@ -36,17 +36,17 @@ def test_solids_are_blocked_and_the_room_is_free(surface):
 
 
 def test_the_inside_of_a_hollow_thing_is_no_free_space():
-    room, block = rooms.felt(80_000), rooms.BOXES[0]
+    room, block = rooms.traces(80_000), rooms.BOXES[0]
     rng = np.random.default_rng(2)
     begin = rng.uniform(*block, (4000, 3))
     along = rooms.directions(4000, rng)
     to_wall = np.where(along > 0, (block[1] - begin) / along, (block[0] - begin) / along).min(axis=1)
-    both = Felt(
+    both = PlaceTraces(
         np.concatenate([room.begin, begin]),
         np.concatenate([room.end, begin + along * to_wall[:, None]]),
         np.ones(len(room.met) + 4000, bool),
     )
-    found = surface_of_felt(both, 1 << 16)
+    found = surface_of_traces(both, 1 << 16)
     middle = block.mean(axis=0)[None]
     assert found.blocked.at(middle)[0] > 0.2
 
@@ -56,7 +56,7 @@ def test_the_floor_is_found(surface):
 
 
 def test_bare_points_know_no_free_space_and_must_be_some():
-    points = rooms.felt().end
+    points = rooms.traces().end
     found = surface_of_points(points, 1 << 15)
     assert not found.bounded and found.distance.at(points[:500]).max() < 2 * found.step
     with pytest.raises(NergError, match="99 points, and 100"):
@@ -77,4 +77,4 @@ class _Nothing:
 def test_a_place_without_surfaces_is_refused(monkeypatch):
     monkeypatch.setattr("nerg_mi.alignment.surface.trace_depth", lambda s, o, d: (np.zeros(len(o)), np.zeros(len(o))))
     with pytest.raises(NergError, match="no surfaces that rays could meet"):
-        feel(_Nothing(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing
+        trace_place(_Nothing(), np.zeros(3), np.ones(3), 1000)  # pyright: ignore[reportArgumentType] # traced by nothing

@@ -19,7 +19,7 @@ def quiet(share, text):
 
 def test_the_tracking_alone_finds_its_place_and_a_mirrored_one_is_named():
     truth = rooms.similarity(np.random.default_rng(7), upright=True)
-    target = Target(felt=rooms.felt(25_000).moved(truth))
+    target = Target(traces=rooms.traces(25_000).moved(truth))
     fit = Tracking(RAYS).fit(target, quiet)
     off = errors(fit.matrix, RAYS.origin, rooms.carried(truth, RAYS.origin))
     assert np.median(off) < 0.03 and fit.mirrored is None and np.median(fit.centimetres) < 6
@@ -37,7 +37,7 @@ def test_a_start_is_refined_to_any_rotation():
     truth = rooms.similarity(np.random.default_rng(8))
     nudge = np.eye(4)
     nudge[:3, 3] = 0.08, -0.06, 0.05
-    fit = Tracking(RAYS, truth @ nudge).fit(Target(felt=rooms.felt(25_000).moved(truth), upright=False), quiet)
+    fit = Tracking(RAYS, truth @ nudge).fit(Target(traces=rooms.traces(25_000).moved(truth), upright=False), quiet)
     assert np.median(errors(fit.matrix, RAYS.origin, rooms.carried(truth, RAYS.origin))) < 0.02
 
 
@@ -51,9 +51,9 @@ def test_a_start_is_refined_to_any_rotation():
 )
 def test_rays_that_leave_it_open_are_refused(changes, known, why):
     with pytest.raises(NergError, match=why):
-        Tracking(replace(RAYS, **changes)).fit(Target(felt=rooms.felt(5000), **known), quiet)
+        Tracking(replace(RAYS, **changes)).fit(Target(traces=rooms.traces(5000), **known), quiet)
 
 
 def test_no_rays_are_no_evidence():
     with pytest.raises(NergError, match="no rays to align"):
-        Tracking(RAYS.select(np.zeros(len(RAYS), bool))).fit(Target(felt=rooms.felt(5000)), quiet)
+        Tracking(RAYS.select(np.zeros(len(RAYS), bool))).fit(Target(traces=rooms.traces(5000)), quiet)

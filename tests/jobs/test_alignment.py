@@ -76,7 +76,7 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, options, rays, wh
 
 def test_another_up_axis_and_a_start_lead_to_the_same_frame(tmp_path, monkeypatch):
     truth, path = pairs(tmp_path)
-    np.save(tmp_path / "points.npy", rooms.carried(truth, rooms.felt(8000).end))
+    np.save(tmp_path / "points.npy", rooms.carried(truth, rooms.traces(8000).end))
     aligned = align(None, tmp_path / "a.json", AlignOptions(pairs=path))
     options = AlignOptions(start=tmp_path / "a.json", surface=tmp_path / "points.npy")
     again = align(RAYS, None, options).alignment

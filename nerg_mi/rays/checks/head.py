@@ -112,6 +112,14 @@ def _guess(figures: Figures, heads: np.ndarray, rows: np.ndarray) -> str:
     )
 
 
+EXCHANGES = {
+    "left and right": (1.0, -1.0, 1.0),
+    "up and down": (1.0, 1.0, -1.0),
+    "left and right, and up and down,": (1.0, -1.0, -1.0),
+}
+"""Signs of a direction ahead, to the right and up in the head (`head_frames`), by what they exchange of the eyes."""
+
+
 def head_frames(head: np.ndarray) -> np.ndarray:
     """Rotations (n, 3, 3) from the world to ahead, right and up of heads (n, 3) that are not tilted sideways."""
     right = np.cross(head, (0.0, 0.0, 1.0))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from .figures import Figures, name_some
-from .head import head_frames
+from .head import EXCHANGES, head_frames
 from .protocol import Check
 
 _LAG = 0.08  # seconds between two directions that are compared; a fixation takes 0.2 and more
@@ -17,7 +17,6 @@ _TURNS = 20.0, 200.0  # degrees a second of heads that are looked at
 _BETTER = 0.88  # in 44 recordings that are right, each exchange makes gaze turn 1.26 times as fast and more
 _FEW = 300
 _MOST = 1 << 18, 1 << 10  # rays looked at in runs of so many
-_FLIPS = {"left and right": (1.0, -1.0, 1.0), "up and down": (1.0, 1.0, -1.0), "both": (1.0, -1.0, -1.0)}
 
 
 def _check_holding(figures: Figures) -> list[str]:
@@ -37,9 +36,8 @@ def _check_holding(figures: Figures) -> list[str]:
 
 
 def _sentence(found: str, whose: str) -> str:
-    what = "left and right, and up and down," if found == "both" else found
     return (
-        f"the gaze{whose} turns with the head where eyes turn against it; with {what} of the eyes exchanged it would "
+        f"the gaze{whose} turns with the head where eyes turn against it; with {found} of the eyes exchanged it would "
         "hold still: negate that part of the direction in the head's frame, or check the frame (--hand)"
     )
 
@@ -48,11 +46,11 @@ def _best_exchange(turned: np.ndarray) -> str:
     """The exchange with which gaze turns least (medians of (4, n)), if it is clearly less than without."""
     now, *others = np.median(turned, axis=1)
     best = int(np.argmin(others))
-    return list(_FLIPS)[best] if others[best] < _BETTER * now else ""
+    return list(EXCHANGES)[best] if others[best] < _BETTER * now else ""
 
 
 def _turned(figures: Figures, heads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far gaze turns (4, n) while the head does, as it is and with each of `_FLIPS`; and the persons (n,)."""
+    """How far gaze turns (4, n) while the head does, as it is and with each of `EXCHANGES`; and the persons (n,)."""
     rays, n, (most, run) = figures.rays, len(figures.rays), _MOST
     rows = np.arange(n)
     if n > most:
@@ -77,7 +75,7 @@ def _turned(figures: Figures, heads: np.ndarray) -> tuple[np.ndarray, np.ndarray
     frames = [head_frames(head[first + k]) for k in (0, lag)]
     own = [np.einsum("nij,nj->ni", f, rays.direction[rows[first + k]]) for f, k in zip(frames, (0, lag))]
     turned = []
-    for signs in ((1.0, 1.0, 1.0), *_FLIPS.values()):
+    for signs in ((1.0, 1.0, 1.0), *EXCHANGES.values()):
         before, after = (np.einsum("nij,ni->nj", f, v * signs) for f, v in zip(frames, own))
         turned.append(np.linalg.norm(after - before, axis=1))
     return np.array(turned), person[first]
