@@ -30,7 +30,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/jobs/options/scene.py": _OPTIONS,
     "nerg_mi/jobs/options/study.py": _OPTIONS,
     "nerg_mi/rays/checks/protocol.py": "only fields: tests/rays/checks/test_registry.py looks at every check",
-    "nerg_mi/rays/readers/parsing/usual_names.py": "names only: tests/rays/readers/test_unity.py finds columns by them",
+    "nerg_mi/rays/readers/parsing/usual_names.py": "names only: headsets/test_unity.py finds columns by them",
     "nerg_mi/maths/types.py": "names for signatures",
     "nerg_mi/transport/media/local_ray.py": "only fields: tests/transport/media/test_protocol.py makes them",
     "tools/mending/__init__.py": _MENDINGS,

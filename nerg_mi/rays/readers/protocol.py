@@ -1,9 +1,10 @@
 """What a reader of tracking files is.
 
-To add a format, write a module of this folder with a class that has what :class:`Reader` names, and an object of it in
-its ``READERS``; add the module to the list in :mod:`nerg_mi.rays.readers.registry`. The command line, its help and the
-manual's table are made from it. A reader takes files apart and says in which frame they are; dropping rows, converting
-the frame and keeping the account is the builder's work, the same for all.
+To add a format, write a module (in `glasses` or `headsets` where it is of one) with a class that has what
+:class:`Reader` names, and an object of it in its ``READERS``; add the module to the list in
+:mod:`nerg_mi.rays.readers.registry`. The command line, its help and the manual's table are made from it. A reader takes
+files apart and says in which frame they are; dropping rows, converting the frame and keeping the account is the
+builder's work, the same for all.
 """
 
 from __future__ import annotations

@@ -12,26 +12,10 @@ from typing import Any
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import (
-    arett,
-    aria,
-    eyenavgs,
-    glassestools,
-    hololens,
-    neon,
-    openxr,
-    pupil,
-    qualisys,
-    quest,
-    skeleton22,
-    sranipal,
-    table,
-    tobii3,
-    unity,
-    varjo,
-    vr_supermarket,
-)
+from . import qualisys, skeleton22, table
 from .builder import RaysBuilder
+from .glasses import aria, glassestools, neon, pupil, tobii3
+from .headsets import arett, eyenavgs, hololens, openxr, quest, sranipal, unity, varjo, vr_supermarket
 from .options import Option, options_of, recorded_options
 from .protocol import Reader
 

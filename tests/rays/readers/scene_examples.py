@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from nerg_mi.rays.readers.parsing.frame_names import FrameNames
+from nerg_mi.rays.readers.glasses.frame_names import FrameNames
 
 START = 1_700_000_000_000_000_000  # nanoseconds: what times of day look like
 LENS = {"k1": -0.13, "k2": 0.11, "p1": 0.0005, "p2": -0.0004, "k3": 0.01, "k4": 0.17, "k5": 0.05, "k6": 0.02}

@@ -1,0 +1,102 @@
+"""The common format of glassesTools and gazeMapper (github: dcnieho/glassesTools), into which they convert a dozen
+glasses: AdHawk, Pupil Core, Invisible and Neon, SeeTrue, SMI, Tobii Glasses 2 and 3, Viewpointsystem and others."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import read_bytes
+from nerg_mi.rays.readers.builder import RaysBuilder
+from nerg_mi.rays.readers.frames import Frame
+from nerg_mi.rays.readers.parsing.tables import iterate_table
+from nerg_mi.rays.readers.protocol import DESCRIPTION
+
+from .scene_camera import SceneCamera
+from .scene_gaze import Recording, SceneGaze, SceneOptions, check_recordings, recording_folder
+
+_MILLISECOND = 1e-3
+_XML = 1 << 20  # bytes of a calibration, at most
+# A matrix of OpenCV's FileStorage; what else XML can hold is not looked at.
+_MATRIX = r"<{0}\s[^>]*>\s*<rows>\d+</rows>\s*<cols>\d+</cols>\s*<dt>\w+</dt>\s*<data>([^<]*)</data>\s*</{0}>"
+
+
+class GlassesTools:
+    """Folders with ``gazeData.tsv``, ``frameTimestamps.tsv`` and ``calibration.xml``.
+
+    A ray starts at the scene camera's centre and goes through the undistorted point of gaze in its video. Times are
+    milliseconds of the video's clock. Rows without gaze are dropped. The person is the folder.
+    """
+
+    name = "glassestools"
+    files = (
+        "folders of glassesTools and gazeMapper (or the `gazeData.tsv` in them), beside the scene camera's poses; with "
+        "them Pupil Invisible, Tobii Glasses 2, SMI, AdHawk, SeeTrue and others"
+    )
+    world = "the place's, whose axis `--up` points up"
+    checked_on = DESCRIPTION
+    Options = SceneOptions
+
+    def frame(self, files: Sequence[Path], options: SceneOptions) -> Frame:
+        return options.frame
+
+    def read(self, files: Sequence[Path], options: SceneOptions, builder: RaysBuilder) -> None:
+        check_recordings(files, options)
+        about: list[dict[str, Any]] = []
+        for given in files:
+            folder, gaze = recording_folder(given, "gazeData.tsv")
+            person = folder.resolve().name
+            camera = _camera(folder, builder)
+            frames = _frame_times(folder, builder)
+            scene = SceneGaze(options, Recording(person, frames), builder, about)
+            builder.source(gaze, f"{person}/{gaze.name}")
+            columns = ["timestamp", "gaze_pos_vid_x", "gaze_pos_vid_y"]
+            for v, _, lines in iterate_table(gaze, columns, on_bad=builder.on_bad):
+                none = np.asarray(~np.isfinite(v[:, 1:]).all(axis=1))
+                direction = camera.directions(v[:, 1:])
+                scene.add(v[:, 0] * _MILLISECOND, person, direction, rows=lines, drop={"there is no gaze": none})
+            scene.finish("")
+
+
+READERS = (GlassesTools(),)
+
+
+def _camera(folder: Path, builder: RaysBuilder) -> SceneCamera:
+    path = folder / "calibration.xml"
+    text = read_bytes(path, "calibration of the scene camera", _XML).decode("utf-8", "replace")
+    builder.source(path)
+    found = {name: _matrix(text, name, path) for name in ("cameraMatrix", "distCoeff", "resolution")}
+    if found["cameraMatrix"] is None or found["distCoeff"] is None:
+        raise NergError(
+            f'"{path}" lacks the cameraMatrix or the distCoeff of the scene camera; calibrate it with glassesTools'
+        )
+    size = found["resolution"]
+    size = None if size is None or len(size) != 2 else size
+    return SceneCamera.of_opencv(found["cameraMatrix"], found["distCoeff"], size, f'the calibration "{path}"')
+
+
+def _matrix(text: str, name: str, path: Path) -> list[float] | None:
+    found = re.search(_MATRIX.format(name), text)
+    try:
+        return None if found is None else [float(word) for word in found.group(1).split()]
+    except ValueError:
+        raise NergError(f'{name} in "{path}" holds what is no number; calibrate the camera again') from None
+
+
+def _frame_times(folder: Path, builder: RaysBuilder) -> np.ndarray | None:
+    """Seconds of the video's frames, by their numbers from 0, where they are there."""
+    path = folder / "frameTimestamps.tsv"
+    if not path.is_file():
+        return None
+    builder.source(path)
+    blocks = iterate_table(path, ["frame_idx", "timestamp"], on_bad=builder.on_bad)
+    rows = np.concatenate([block.numbers for block in blocks] or [np.empty((0, 2))])
+    builder.count_lines(len(rows))
+    if not np.array_equal(rows[:, 0], np.arange(len(rows))):
+        raise NergError(f'"{path}" does not count its frames 0, 1, 2, ...; convert the recording again')
+    return rows[:, 1] * _MILLISECOND

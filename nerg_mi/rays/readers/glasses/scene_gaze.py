@@ -1,0 +1,245 @@
+"""What readers of glasses with a scene camera have in common: where that camera was, and gaze in its frame as rays.
+
+The poses come from a model in which frames of the scene video were registered together with the photos of the place, so
+that nothing has to be aligned: rays are in the coordinates that the place was trained in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.capture.named_poses import NamedPoses, find_source, read_named_poses
+from nerg_mi.capture.upright import find_up
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import plain
+from nerg_mi.rays.readers.builder import RaysBuilder
+from nerg_mi.rays.readers.frames import Frame
+from nerg_mi.rays.readers.options import option
+from nerg_mi.rays.readers.parsing import poses
+from nerg_mi.rays.readers.parsing.pose_track import PoseTrack
+
+from .frame_names import FrameNames
+from .place_frame import PlaceFrame
+from .scene_camera import angles_between
+from .timed_poses import is_timed, read_timed_poses
+
+_OPENCV = np.diag([1.0, -1.0, -1.0])  # from an OpenCV camera's frame to an OpenGL one's
+_AT_A_FRAME = 1e-6  # seconds: so near to a posed frame nothing has to be interpolated
+_LEVEL = 25.0  # degrees between up as the place tells it and as it is declared
+_DIFFER = 1.0  # degrees between two accounts of one gaze
+_COMPARED = 1 << 20  # rows of a recording whose two accounts are compared
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Where the scene camera was. Raises `NergError` for a scale beside a place, or a rate or gap that is none."""
+
+    poses: Path | None = option(  # needed
+        None,
+        "The model that holds frames of the scene video and the place's photos: its transforms.json, or the folder of "
+        "a COLMAP model; or aligned_poses.csv of tag-aligner, camera_pose.json of the Reference Image Mapper.",
+    )
+    frames: FrameNames | None = option(
+        None,
+        'Names of the video\'s frames in the model: "frame_{frame1}" (number from 1; {frame0}: from 0), {s} '
+        "(seconds) or {ns} (time stamps); * for anything, {recording} for the recording's name.",
+        parse=FrameNames.parse,
+        recorded=False,
+    )
+    fps: float | None = option(
+        None, "Numbers of frames count this many a second (ffmpeg's -vf fps=5), not each frame of the video."
+    )
+    place: Path | None = option(
+        None, "Checkpoint of the place (nerg train radiance): rays are in the coordinates that it was trained in."
+    )
+    scale: float = option(1.0, "Without --place: length of a unit of the model in metres, as in training.")
+    gap: float = option(0.2, "Seconds between posed frames; farther apart, nothing is interpolated.")
+    up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
+
+    def __post_init__(self) -> None:
+        if self.place is not None and self.scale != 1.0:
+            raise NergError("the checkpoint of the place knows its scale; leave out --scale, or --place")
+        if self.fps is not None and not 0 < self.fps <= 1e5:
+            raise NergError(f"a rate of frames is a positive number a second, got {self.fps} (--fps)")
+        if not 0 < self.gap <= 3600:
+            raise NergError(f"the gap between posed frames is a positive number of seconds, got {self.gap} (--gap)")
+
+    @property
+    def frame(self) -> Frame:
+        """The frame of the place, whose up is declared."""
+        return Frame(up=self.up)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What a reader has found of a recording: its ``name`` (of its folder), the seconds of the scene video's ``frames``
+    (F,) on the clock of the gaze, or None, and ``start``, the nanoseconds at which that clock is 0."""
+
+    name: str
+    frames: np.ndarray | None = None
+    start: float = 0.0
+
+
+class SceneGaze:
+    """Gaze of one recording, to be added block by block, with the camera's poses in the place's coordinates."""
+
+    def __init__(
+        self, options: SceneOptions, recording: Recording, builder: RaysBuilder, about: list[dict[str, Any]]
+    ) -> None:
+        """``about``: what is known of the recordings before, to which this one is added."""
+        self._builder, self._options, self._about = builder, options, about
+        self._angles: list[np.ndarray] = []
+        self._compared = 0
+        self._track = _camera_track(options, recording, builder)
+
+    def add(
+        self,
+        t: np.ndarray,
+        person: str,
+        direction: np.ndarray,
+        *,
+        rows: np.ndarray,
+        drop: Mapping[str, np.ndarray],
+        other: np.ndarray | None = None,
+    ) -> None:
+        """Add n rows: seconds ``t``, and gaze ``direction`` (n, 3) in the scene camera's frame (OpenCV), NaN beyond its
+        picture. ``other``: the same by another account, which is compared with it."""
+        turn, place, lost = self._at(t)
+        beyond = np.asarray(~np.isfinite(direction).all(axis=1))
+        reasons = {**drop, "gaze lies beyond the scene camera's picture": beyond}
+        if other is not None and self._compared < _COMPARED:
+            self._compared += len(t)
+            with np.errstate(invalid="ignore"):
+                angles = angles_between(direction, other)
+            self._angles.append(angles[np.isfinite(angles) & ~np.any(list(reasons.values()), axis=0)])
+        reasons["no frame of the scene camera near that time has a pose"] = lost
+        self._builder.add(t, person, place, poses.rotate(turn, direction), rows=rows, head=turn[:, :, 2], drop=reasons)
+
+    def finish(self, accounts: str) -> None:
+        """Keep in the metadata how many frames were posed and how far the two ``accounts`` of the gaze differ ("pixels
+        and angles"), if there were two; beyond a degree, at the median, it is a complaint."""
+        about: dict[str, Any] = {"posed_frames": len(self._track.times)}
+        found = np.concatenate(self._angles or [np.empty(0)])
+        middle = 0.0
+        if found.size:
+            middle, most = (round(float(x), 4) for x in np.percentile(found, [50, 95]))
+            about |= {"compared": accounts, "median_degrees": middle, "p95_degrees": most}
+        self._about.append(about)
+        self._builder.note(scene_camera=self._about, frames=str(self._options.frames or ""), floor="unknown")
+        if middle > _DIFFER:
+            self._builder.complain(
+                f"{accounts} of the same gaze differ by {middle:.1f} degrees (median): is the calibration that of "
+                "these glasses, and of pictures of this size?"
+            )
+
+    def _at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `PoseTrack.at`; lost is, too, what lies between posed frames farther apart than the gap."""
+        turn, place, lost = self._track.at(t, self._options.gap)
+        times = self._track.times
+        after = np.clip(np.searchsorted(times, t), 1, len(times) - 1)
+        nearest = np.minimum(np.abs(t - times[after]), np.abs(t - times[after - 1]))
+        apart = times[after] - times[after - 1] > self._options.gap
+        return turn, place, lost | (apart & (nearest > _AT_A_FRAME))
+
+
+def _camera_track(options: SceneOptions, recording: Recording, builder: RaysBuilder) -> PoseTrack:
+    """Where the camera was in the place, OpenCV's axes to the place's."""
+    if options.poses is None:
+        raise NergError(
+            "the scene camera's poses are needed: name the model in which frames of its video were registered with the "
+            "place's photos (--poses transforms.json)"
+        )
+    to_place = PlaceFrame.scaled(options.scale)
+    if options.place is not None:
+        to_place = PlaceFrame.of_checkpoint(options.place)
+        builder.source(options.place)
+    if is_timed(options.poses):
+        builder.source(options.poses)
+        track, count = read_timed_poses(options.poses, builder.on_bad)
+        builder.count_lines(count)
+        up = to_place.up
+    else:
+        track, up = _of_model(options, recording, to_place, builder)
+    _check_up(up, options, builder)
+    return _moved(track, to_place)
+
+
+def _of_model(
+    options: SceneOptions, recording: Recording, to_place: PlaceFrame, builder: RaysBuilder
+) -> tuple[PoseTrack, np.ndarray | None]:
+    """The track of the model's frames in its own coordinates, and up in the place."""
+    assert options.poses is not None
+    model = read_named_poses(find_source(options.poses))
+    builder.source(model.path)
+    if options.frames is None:
+        raise NergError(
+            f'which images of "{model.path}" are frames of the video, and when they were taken, has to be said, such '
+            f'as --frames "frame_{{frame1}}"; its first are {", ".join(plain(n, 60) for n in model.names[:3])}'
+        )
+    times = options.frames.times(model.names, recording.name, recording.frames, options.fps, recording.start)
+    track = _track(model, times)
+    if track is None:
+        raise NergError(
+            f'one image of "{model.path}" alone is a frame of the recording "{plain(recording.name, 60)}"; two are '
+            "needed to interpolate between: register more of them"
+        )
+    if to_place.sha256 is not None and to_place.sha256 != model.sha256:
+        builder.complain(
+            f'the place was trained on another file than "{model.path.name}": are its coordinates the same? If it was '
+            "registered anew, train the place on it"
+        )
+    if to_place.up is None:
+        found = find_up(model.to_world, np.zeros((0, 3)))
+        up = to_place.rotation @ found.direction if found.sure else None
+    else:
+        up = to_place.up
+    return track, up
+
+
+def _track(model: NamedPoses, times: np.ndarray) -> PoseTrack | None:
+    from scipy.spatial.transform import Rotation
+
+    vectors = Rotation.from_matrix(model.to_world[:, :3, :3] @ _OPENCV).as_rotvec()
+    return PoseTrack.of_samples(times, vectors, model.to_world[:, :3, 3])
+
+
+def _moved(track: PoseTrack, to_place: PlaceFrame) -> PoseTrack:
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_matrix(to_place.rotation) * Rotation.from_rotvec(track.vectors)
+    return PoseTrack(track.times, turned.as_rotvec(), to_place.points(track.places))
+
+
+def _check_up(up: np.ndarray | None, options: SceneOptions, builder: RaysBuilder) -> None:
+    if up is None:
+        return
+    up = up / np.linalg.norm(up)
+    off = float(np.degrees(np.arccos(np.clip(up @ poses.axis(options.up, "up"), -1, 1))))
+    if off > _LEVEL:
+        axis = max(poses.AXES, key=lambda name: poses.AXES[name] @ up)
+        builder.complain(
+            f"up in the place is ({', '.join(f'{x:.2f}' for x in up)}), {off:.0f} degrees from {options.up}: train it "
+            f"with --coordinates upright, or import with --up {axis} and give training the matrix of --write-align"
+        )
+
+
+def recording_folder(given: Path, gaze: str) -> tuple[Path, Path]:
+    """The folder of a recording and the file of its gaze, where either was ``given``; ``gaze``: the file's name."""
+    path = given / gaze if given.is_dir() else given
+    if not path.is_file():
+        raise NergError(f"there is no {path}; give the folder of a recording, or the {gaze} in it")
+    return path.parent, path
+
+
+def check_recordings(files: Sequence[Path], options: SceneOptions) -> None:
+    """Raise `NergError` for several recordings whose frames the model's names do not tell apart."""
+    if len(files) > 1 and (options.frames is None or not options.frames.of_recording):
+        raise NergError(
+            "frames of several recordings are told apart by {recording} in their names (--frames); import them one by "
+            'one, or name them as in --frames "{recording}/frame_{frame1}"'
+        )

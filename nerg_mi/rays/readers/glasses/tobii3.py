@@ -1,0 +1,142 @@
+"""Tobii Pro Glasses 3: a recording's folder as the recording unit writes it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import parse_json, read_json
+from nerg_mi.files.line_blocks import OnBadLine, line_blocks
+from nerg_mi.rays.readers.builder import RaysBuilder
+from nerg_mi.rays.readers.frames import Frame
+from nerg_mi.rays.readers.protocol import DESCRIPTION
+
+from .scene_camera import SceneCamera, angles_between
+from .scene_gaze import Recording, SceneGaze, SceneOptions, check_recordings, recording_folder
+
+_FPS = 25.0  # of the scene camera
+_BLOCK = 1 << 14  # lines taken apart at a time
+_JSON = 1 << 20  # bytes of recording.g3, at most
+
+
+@dataclass(frozen=True, eq=False)
+class _Glasses:
+    """``camera``, ``size`` of its pictures in pixels, and how the head unit's axes lie in it."""
+
+    camera: SceneCamera
+    size: tuple[float, float]
+    rotation: np.ndarray  # (3, 3)
+    position: np.ndarray  # (3,) millimetres
+
+
+class Tobii3:
+    """Folders with ``gazedata.gz`` (JSON, a line a sample) and ``recording.g3``, whose scene camera is calibrated.
+
+    A ray starts at the scene camera's centre, and goes through the undistorted ``gaze2d``. ``gaze3d``, millimetres in
+    the head unit's axes, is turned into the camera by the calibration's rotation and compared. Samples without gaze are
+    dropped. Seconds count from the recording's start, as those of its video, which is taken to have 25 frames a second
+    without ``fps``. The person is the folder.
+    """
+
+    name = "tobii3"
+    files = "folders of Tobii Pro Glasses 3 (or the `gazedata.gz` in them), beside the scene camera's poses"
+    world = "the place's, whose axis `--up` points up"
+    checked_on = DESCRIPTION
+    Options = SceneOptions
+
+    def frame(self, files: Sequence[Path], options: SceneOptions) -> Frame:
+        return options.frame
+
+    def read(self, files: Sequence[Path], options: SceneOptions, builder: RaysBuilder) -> None:
+        check_recordings(files, options)
+        options = replace(options, fps=options.fps or _FPS)
+        about: list[dict[str, Any]] = []
+        for given in files:
+            folder, gaze = recording_folder(given, "gazedata.gz")
+            person = folder.resolve().name
+            glasses = _calibration(folder, builder)
+            scene = SceneGaze(options, Recording(person), builder, about)
+            builder.source(gaze, f"{person}/{gaze.name}")
+            for rows, lines in _samples(gaze, builder):
+                direction = glasses.camera.directions(rows[:, 1:3] * glasses.size)
+                other = _seen_from_camera(rows[:, 3:], glasses, direction)
+                none = np.asarray(~np.isfinite(rows[:, 1:3]).all(axis=1))
+                scene.add(rows[:, 0], person, direction, rows=lines, drop={"there is no gaze": none}, other=other)
+            scene.finish("gaze2d and gaze3d")
+
+
+READERS = (Tobii3(),)
+
+
+def _seen_from_camera(points: np.ndarray, glasses: _Glasses, direction: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of the head unit, millimetres, in the camera. Whether ``position`` is the camera's in the head unit
+    or the head unit's in the camera is not documented: what fits the ``direction`` (n, 3) better."""
+    turned = points @ glasses.rotation.T
+    ways = turned + glasses.position, turned - glasses.rotation @ glasses.position
+    with np.errstate(invalid="ignore"):
+        off = [np.nan_to_num(angles_between(way, direction)).sum() for way in ways]
+    return ways[int(np.argmin(off))]
+
+
+def _calibration(folder: Path, builder: RaysBuilder) -> _Glasses:
+    path = folder / "recording.g3"
+    found: Any = read_json(path, "Tobii recording", _JSON)
+    builder.source(path)
+    try:
+        c = found["scenecamera"]["camera-calibration"]
+        (fx, fy), (cx, cy), (w, h) = c["focal-length"], c["principal-point"], c["resolution"]
+        (k1, k2, k3), (p1, p2) = c["radial-distortion"], c["tangential-distortion"]
+        rotation = np.array(c["rotation"], np.float64).reshape(3, 3)
+        position = np.array(c["position"], np.float64).reshape(3)
+        matrix = [[fx, c["skew"], cx], [0, fy, cy], [0, 0, 1]]
+        size = float(w), float(h)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise NergError(
+            f'"{path}" has no whole camera calibration of the scene camera; copy the recording again'
+        ) from error
+    if not (np.isfinite(position).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-2):
+        raise NergError(f'the calibration in "{path}" turns the camera by no rotation; copy the recording again')
+    camera = SceneCamera.of_opencv(matrix, [k1, k2, p1, p2, k3], size, f'the calibration in "{path}"')
+    return _Glasses(camera, size, rotation, position)
+
+
+def _samples(path: Path, builder: RaysBuilder) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Blocks of seconds, gaze2d and gaze3d (n, 6), NaN where there is none, and their lines (n,)."""
+    count = 0
+    for raw in line_blocks(path, "gaze of Tobii glasses", _BLOCK):
+        rows, lines = [], []
+        for line, text in enumerate(raw, count + 1):
+            row = _sample(text, path, line, builder.on_bad) if not text.isspace() else None
+            if row is not None:
+                rows.append(row)
+                lines.append(line)
+        count += len(raw)
+        if rows:
+            yield np.array(rows, np.float64), np.array(lines)
+
+
+def _sample(text: str, path: Path, line: int, on_bad: OnBadLine | None) -> list[float] | None:
+    """The six numbers of a line; None for one of another type, and for a bad one that ``on_bad`` is told of."""
+    try:
+        found: Any = parse_json(text, path, f"line {line} of the gaze")
+        if found["type"] != "gaze":
+            return None
+        data = found["data"]
+        gaze = [float(x) for x in data.get("gaze2d") or (np.nan,) * 2]
+        point = [float(x) for x in data.get("gaze3d") or (np.nan,) * 3]
+        if len(gaze) != 2 or len(point) != 3:
+            raise ValueError
+        return [float(found["timestamp"]), *gaze, *point]
+    except (NergError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        why = ": it is no JSON object of a sample with its type, timestamp and data"
+        if on_bad is None:
+            raise NergError(
+                f"{path}, line {line}{why}; mend it, or leave such lines out with --skip-bad-lines"
+            ) from error
+        on_bad(line, why)
+        return None

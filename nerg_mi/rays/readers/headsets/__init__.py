@@ -1,0 +1,1 @@
+"""Headsets whose world is rendered or mixed: the exports of their programs."""

@@ -1,0 +1,81 @@
+"""Eye gaze of people in a VR supermarket, one CSV a person, 50 Hz.
+
+Recorded with "Fixation-based Self-calibration for Eye Tracking in VR Headsets" (github: ryuryu0226).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.rays.readers.builder import RaysBuilder
+from nerg_mi.rays.readers.frames import UNITY, Frame
+from nerg_mi.rays.readers.options import option
+from nerg_mi.rays.readers.parsing import poses
+from nerg_mi.rays.readers.parsing.tables import iterate_table
+from nerg_mi.rays.readers.protocol import RECORDINGS
+from nerg_mi.rays.readers.table import person_from_filename
+
+_MATRIX = [f"ctw_{i}{j}" for i in range(3) for j in range(4)]
+_COLUMNS = [
+    *_MATRIX,
+    *("ray_x", "ray_y", "ray_z", "eye_x", "eye_y", "eye_z"),
+    *("xc", "yc", "zc", "opennessl", "opennessr", "time"),
+]
+# From the eyes' frame, +z forward, to the camera's of the matrix.
+_FLIP = np.array([1.0, 1.0, -1.0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class SupermarketOptions:
+    """Which rows are kept."""
+
+    min_openness: float = option(0.5, "Drop rows in which an eye is open no more than this, from 0 to 1.")
+
+
+class VrSupermarket:
+    """``ctw_ij`` is camera-to-world in Unity's world (y up, left-handed, metres), whose camera looks along minus
+    column 2.
+
+    ``ray`` and ``eye`` are in the camera frame with +z forward, so with R, t of that matrix: direction =
+    R (rx, ry, -rz), origin = t + R (ex, ey, -ez). ``xc, yc, zc`` is where the combined gaze met the shop, empty where
+    it met nothing. A row is kept when both eyes are open by more than ``min_openness``; the smaller openness becomes
+    the confidence. The person is ``userN`` of the file name.
+    """
+
+    name = "vr_supermarket"
+    files = "one CSV a person of the VR supermarket (github: ryuryu0226)"
+    world = "Unity"
+    checked_on = RECORDINGS
+    Options = SupermarketOptions
+
+    def frame(self, files: Sequence[Path], options: SupermarketOptions) -> Frame:
+        return UNITY
+
+    def read(self, files: Sequence[Path], options: SupermarketOptions, builder: RaysBuilder) -> None:
+        least = options.min_openness
+        for path in files:
+            builder.source(path)
+            user = re.search(r"user\d+", path.name)
+            for v, _, lines in iterate_table(path, _COLUMNS, on_bad=builder.on_bad):
+                pose = v[:, :12].reshape(-1, 3, 4)
+                turn, place = pose[:, :, :3], pose[:, :, 3]
+                openness = np.minimum(v[:, 21], v[:, 22])
+                builder.add(
+                    v[:, 23],
+                    user.group() if user else person_from_filename(path),
+                    place + poses.rotate(turn, v[:, 15:18] * _FLIP),
+                    poses.rotate(turn, v[:, 12:15] * _FLIP),
+                    rows=lines,
+                    confidence=np.clip(openness, 0.0, 1.0),
+                    hit=v[:, 18:21],
+                    head=-turn[:, :, 2],
+                    drop={f"an eye is closed (openness at most {least:g})": openness <= least},
+                )
+
+
+READERS = (VrSupermarket(),)
