@@ -230,8 +230,8 @@ def measure_display(folder: Path, width: int, files: dict, shapes: bool = False)
 
 def picture(folder: Path, path: Path, width: int, spp: int, files: dict) -> None:
     """The display in colour, the gaze without it, and with it, side by side."""
-    from nerg_mi.view.overlay import Heat, overlay, top_of
-    from nerg_mi.view.tonemap import srgb, write_png
+    from nerg_mi.figures.overlay import Heat, overlay, top_of
+    from nerg_mi.figures.tonemap import srgb, write_png
 
     scene = load(folder / "display.xml", width, **files)
     there = channels(scene, spp)

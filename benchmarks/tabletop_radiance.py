@@ -36,9 +36,9 @@ def score(field: Path, views: list, box, center, spp: int, pictures: Path) -> di
     ``box``, and errors of depth near ``center`` and far."""
     from nerg_mi.capture.cameras import pixel_directions
     from nerg_mi.evaluation.images import Renderer, ssim
+    from nerg_mi.figures.tonemap import write_png
     from nerg_mi.files.atomic import make_folder
     from nerg_mi.maths.psnr import decibels, psnr
-    from nerg_mi.view.tonemap import write_png
 
     make_folder(pictures)
     render, rows, parts = Renderer(field, spp), [], []

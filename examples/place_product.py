@@ -235,7 +235,7 @@ def elevation(attention: Attention, at: float, spacing: float):
 
 def figure(attention: Attention, sweep, paths, checks, settings: Settings):
     """The shelf before and after, the sweep with the ascents, and the derivatives, above one common axis."""
-    from nerg_mi.view.overlay import Heat, overlay, top_of
+    from nerg_mi.figures.overlay import Heat, overlay, top_of
 
     from matplotlib.figure import Figure
 
@@ -321,7 +321,7 @@ def main(argv=None) -> dict:
     print(f"  all pairs of observer and patch               {100 * off[0]:6.2f} %")
     print(f"  without pairs that an edge passes ({100 * checks[:, 5].mean():.2f} %)   {100 * off[1]:6.2f} %")
 
-    from nerg_mi.view.figures import save
+    from nerg_mi.figures.plots import save
 
     save(figure(attention, (at, values), paths, checks, settings), args.out)
     print(f"wrote {args.out}")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.jobs import demo
-from tests.view.standins import write_standins
+from tests.figures.standins import write_standins
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 

@@ -21,14 +21,14 @@ from nerg_mi.alignment.tracking import Tracking
 from nerg_mi.alignment.umeyama import move
 from nerg_mi.capture.upright import turn_to_z
 from nerg_mi.errors import NergError
+from nerg_mi.figures.alignment_figures import alignment_figure
+from nerg_mi.figures.plots import save
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace
-from nerg_mi.view.alignment_figures import alignment_figure
-from nerg_mi.view.figures import save
 
 from .backend import select_backend
 from .options import parse_numbers

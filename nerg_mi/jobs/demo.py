@@ -17,6 +17,9 @@ import numpy as np
 
 from nerg_mi import __version__
 from nerg_mi.errors import NergError
+from nerg_mi.figures import plots as figures
+from nerg_mi.figures.overlay import Heat, top_of
+from nerg_mi.figures.tonemap import srgb, write_png
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.files.tables import write_json
@@ -26,9 +29,6 @@ from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.rendering.projection import pixel_of
 from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.panorama import pixel_solid_angles
-from nerg_mi.view import figures
-from nerg_mi.view.overlay import Heat, top_of
-from nerg_mi.view.tonemap import srgb, write_png
 
 from .options.pictures import DemoOptions
 from .reporter import SILENT, Reporter

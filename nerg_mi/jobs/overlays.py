@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.figures import plots as figures
+from nerg_mi.figures.overlays import Layers, Limits, Overlay, find_overlay, shared_limits
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.asked import render_asked
 from nerg_mi.rendering.projection import pixel_of
 from nerg_mi.transport.observer.viewpoint import center
-from nerg_mi.view import figures
-from nerg_mi.view.overlays import Layers, Limits, Overlay, find_overlay, shared_limits
 
 from .options.pictures import PictureOptions
 

@@ -15,10 +15,10 @@ from nerg_mi.capture.structure.pictures import Folders, Picture
 from nerg_mi.capture.structure.reconstruction import Reconstruction, Settings, check_installed, reconstruct
 from nerg_mi.capture.structure.video import copy_frames
 from nerg_mi.errors import NergError, plain
+from nerg_mi.figures.camera_figures import camera_figure
+from nerg_mi.figures.plots import save
 from nerg_mi.files.atomic import check_new_folder, make_folder, replacing_folder
 from nerg_mi.files.tables import write_json
-from nerg_mi.view.camera_figures import camera_figure
-from nerg_mi.view.figures import save
 
 from .options.poses import PoseOptions
 from .reporter import SILENT, Reporter

@@ -11,6 +11,7 @@ import numpy as np
 
 from nerg_mi.alignment.record import read_similarity
 from nerg_mi.errors import NergError
+from nerg_mi.figures.overview import Frame, Seen
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.similarity import Similarity
@@ -20,7 +21,6 @@ from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.scene_parts import Attention, Eye, Lens, SceneText, default_name, relative_name
 from nerg_mi.rendering.scene_writer import numbers, value_of
 from nerg_mi.training.geometry.places import place_of_hits
-from nerg_mi.view.overview import Frame, Seen
 
 from .backend import select_backend
 from .options.scene import SceneOptions

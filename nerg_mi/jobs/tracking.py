@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.figures import plots as figures
+from nerg_mi.figures import ray_figures
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.rays import splits
@@ -22,7 +24,6 @@ from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.registry import read_rays
 from nerg_mi.rays.summary import RaysSummary, summarise
-from nerg_mi.view import figures, ray_figures
 
 from .datasets import dataset_cards, filter_dataset, import_dataset
 from .filtering import FilterSteps

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import store_twin
 from nerg_mi.jobs.demo import store_scene
-from tests.view.standins import write_standins
+from tests.figures.standins import write_standins
 
 
 @pytest.fixture(scope="module")

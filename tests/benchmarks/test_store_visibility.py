@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.store_visibility import PAIRS, measure, near_edges
 from nerg_mi.jobs.demo import store_scene
-from tests.view.standins import write_standins
+from tests.figures.standins import write_standins
 
 
 def test01_pixels_near_jumps_are_left_out():

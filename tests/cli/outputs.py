@@ -12,11 +12,11 @@ import numpy as np
 
 from nerg_mi.rays.rays import Rays
 from tests.evaluation.gaze.test_evaluation import crowd
+from tests.figures.standins import write_standins
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
 from tests.plugins import fields
 from tests.reference.torch_ngp_numpy import nerf_state
-from tests.view.standins import write_standins
 
 from .test_render import SCENE
 

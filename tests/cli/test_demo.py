@@ -10,8 +10,8 @@ import nerg_mi.cli
 from nerg_mi.jobs import demo
 from nerg_mi.rendering.channels import render_channels
 from tests.cli.test_render import NERG, interrupt
+from tests.figures.standins import write_standins
 from tests.pictures import mitsuba_bitmap
-from tests.view.standins import write_standins
 
 NAMES = {
     "occlusion.png",

@@ -1,8 +1,8 @@
 """The demo as a job: its stages, and its result. `tests/cli/test_demo` looks at the pictures."""
 
 from nerg_mi.jobs.demo import STAGES, DemoOptions, make_demo
+from tests.figures.standins import write_standins
 from tests.jobs.recorder import Recorder
-from tests.view.standins import write_standins
 
 
 def test_every_stage_is_told_and_every_file_is_there(tmp_path):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.figures.overlay import top_of
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.pictures import render_file
 from nerg_mi.rendering.asked import render_asked
 from nerg_mi.rendering.pictures import load_scene
-from nerg_mi.view.overlay import top_of
 from tests.jobs.recorder import Recorder
 from tests.pictures import mitsuba_bitmap
 from tests.plugins import fields

@@ -166,7 +166,7 @@ def test_the_other_ways_in_are_guarded(tmp_path):
     from nerg_mi.evaluation.study import subject as study_subject
     from nerg_mi.jobs.demo import DemoOptions, make_demo
     from nerg_mi.training.geometry.places import place_of_scene
-    from tests.view.standins import write_standins
+    from tests.figures.standins import write_standins
 
     (tmp_path / "s.xml").write_text(scene(DEEP))
     with pytest.raises(NergError, match="deep"):

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.figures.overview import Frame, Judge, Seen, Shot, around_observer, of_place
 from nerg_mi.maths.contraction import box_of
 from nerg_mi.rendering.channels import render_channels
 from nerg_mi.rendering.scene_parts import Eye, ahead_level
 from nerg_mi.transport.panorama import pixel_directions, pixel_solid_angles
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import trace_depth
-from nerg_mi.view.overview import Frame, Judge, Seen, Shot, around_observer, of_place
 
 from .photos import PhotoCamera
 

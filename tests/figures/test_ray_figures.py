@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from nerg_mi.figures.plots import DPI
+from nerg_mi.figures.ray_figures import floor_plan, layout_figure
 from nerg_mi.rays.rays import Rays
-from nerg_mi.view.figures import DPI
-from nerg_mi.view.ray_figures import floor_plan, layout_figure
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 
-from . import figures
+from . import plots
 from .overlay import Heat, top_of
 
 Limits = tuple[float, float] | None
@@ -48,7 +48,7 @@ def _heat(name: str, summary: str, title: str, label: str) -> Overlay:
 
     def draw(of: Layers, limits: Limits) -> Any:
         heat = Heat(1.0 if limits is None else limits[1])
-        return figures.gaze_figure(of.color, of.values, of.mask, heat, title, label, of.marker)
+        return plots.gaze_figure(of.color, of.values, of.mask, heat, title, label, of.marker)
 
     return Overlay(name, summary, limits, draw)
 
@@ -66,14 +66,14 @@ OVERLAYS = {
             "visibility",
             "what the observer sees",
             lambda of: None,
-            lambda of, limits: figures.visibility_figure(of.color, of.values, of.mask),
+            lambda of, limits: plots.visibility_figure(of.color, of.values, of.mask),
             scaled=False,
         ),
         Overlay(
             "depth",
             "distance from the camera",
-            lambda of: figures.depth_limits(of.values, of.mask),
-            lambda of, limits: figures.depth_figure(of.values, of.mask, unit="scene units", limits=limits),
+            lambda of: plots.depth_limits(of.values, of.mask),
+            lambda of, limits: plots.depth_figure(of.values, of.mask, unit="scene units", limits=limits),
         ),
     )
 }

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.view import figures
-from nerg_mi.view.overlays import OVERLAYS, Layers, find_overlay, shared_limits
+from nerg_mi.figures import plots as figures
+from nerg_mi.figures.overlays import OVERLAYS, Layers, find_overlay, shared_limits
 
 X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
 LAYERS = Layers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from nerg_mi.view.camera_figures import camera_figure
-from nerg_mi.view.figures import save
+from nerg_mi.figures.camera_figures import camera_figure
+from nerg_mi.figures.plots import save
 
 
 def poses() -> np.ndarray:

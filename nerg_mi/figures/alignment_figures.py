@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .figures import DPI, INK, PAPER
+from .plots import DPI, INK, PAPER
 
 _PLACE, _HITS, _HEADS, _WANTED = "#b9b4aa", "#d9730d", "#2b6cb0", "#1c7c3c"
 _MOST = 20_000  # points drawn of a kind; more of them only hide each other

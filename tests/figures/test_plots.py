@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from nerg_mi.view import figures
-from nerg_mi.view.overlay import Heat, overlay
+from nerg_mi.figures import plots as figures
+from nerg_mi.figures.overlay import Heat, overlay
 
 RNG = np.random.default_rng(0)
 COLOR, GAZE = RNG.random((24, 36, 3)), RNG.random((24, 36))

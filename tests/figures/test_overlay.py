@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.view.overlay import Heat, overlay, scale_strip, top_of, underlay
+from nerg_mi.figures.overlay import Heat, overlay, scale_strip, top_of, underlay
 
 COLOR = np.random.default_rng(0).random((6, 8, 3))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .figures import DPI, INK, PAPER
+from .plots import DPI, INK, PAPER
 
 _POINTS, _SURFACES = "#2b6cb0", "#b9b4aa"
 _MOST_POINTS = 60_000  # drawn; more of them only hide each other

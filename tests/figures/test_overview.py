@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nerg_mi.figures.overview import Frame, Judge, Seen, around_observer, of_place
 from nerg_mi.maths.ray_box import box_interval
 from nerg_mi.maths.sphere import fibonacci_directions
-from nerg_mi.view.overview import Frame, Judge, Seen, around_observer, of_place
 
 UP = np.array([0.0, 0, 1])
 FRAME = Frame(70, 1.5, UP)

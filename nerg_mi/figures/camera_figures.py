@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .figures import DPI, INK, PAPER
+from .plots import DPI, INK, PAPER
 
 _CAMERA, _PATH = "#c0392b", "#e2a49c"
 _MOST_POINTS = 40_000  # drawn; more of them only hide each other
