@@ -4,21 +4,21 @@ glasses: AdHawk, Pupil Core, Invisible and Neon, SeeTrue, SMI, Tobii Glasses 2 a
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import read_bytes
 from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import Frame
 from nerg_mi.rays.readers.parsing.tables import iterate_table
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 
 from .scene_camera import SceneCamera
-from .scene_gaze import Recording, SceneGaze, SceneOptions, check_recordings, recording_folder
+from .scene_gaze import GazeBlock, Recording
+from .scene_reader import SceneReader
 
 _MILLISECOND = 1e-3
 _XML = 1 << 20  # bytes of a calibration, at most
@@ -26,7 +26,12 @@ _XML = 1 << 20  # bytes of a calibration, at most
 _MATRIX = r"<{0}\s[^>]*>\s*<rows>\d+</rows>\s*<cols>\d+</cols>\s*<dt>\w+</dt>\s*<data>([^<]*)</data>\s*</{0}>"
 
 
-class GlassesTools:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Glasses(Recording):
+    camera: SceneCamera
+
+
+class GlassesTools(SceneReader[_Glasses]):
     """Folders with ``gazeData.tsv``, ``frameTimestamps.tsv`` and ``calibration.xml``.
 
     A ray starts at the scene camera's centre and goes through the undistorted point of gaze in its video. Times are
@@ -38,29 +43,20 @@ class GlassesTools:
         "folders of glassesTools and gazeMapper (or the `gazeData.tsv` in them), beside the scene camera's poses; with "
         "them Pupil Invisible, Tobii Glasses 2, SMI, AdHawk, SeeTrue and others"
     )
-    world = "the place's, whose axis `--up` points up"
     checked_on = DESCRIPTION
-    Options = SceneOptions
+    gaze_file = "gazeData.tsv"
 
-    def frame(self, files: Sequence[Path], options: SceneOptions) -> Frame:
-        return options.frame
+    def open(self, folder: Path, builder: RaysBuilder) -> _Glasses:
+        name = folder.resolve().name
+        camera = _camera(folder, builder)
+        return _Glasses(name=name, person=name, frames=_frame_times(folder, builder), camera=camera)
 
-    def read(self, files: Sequence[Path], options: SceneOptions, builder: RaysBuilder) -> None:
-        check_recordings(files, options)
-        about: list[dict[str, Any]] = []
-        for given in files:
-            folder, gaze = recording_folder(given, "gazeData.tsv")
-            person = folder.resolve().name
-            camera = _camera(folder, builder)
-            frames = _frame_times(folder, builder)
-            scene = SceneGaze(options, Recording(person, frames), builder, about)
-            builder.source(gaze, f"{person}/{gaze.name}")
-            columns = ["timestamp", "gaze_pos_vid_x", "gaze_pos_vid_y"]
-            for v, _, lines in iterate_table(gaze, columns, on_bad=builder.on_bad):
-                none = np.asarray(~np.isfinite(v[:, 1:]).all(axis=1))
-                direction = camera.directions(v[:, 1:])
-                scene.add(v[:, 0] * _MILLISECOND, person, direction, rows=lines, drop={"there is no gaze": none})
-            scene.finish("")
+    def blocks(self, gaze: Path, recording: _Glasses, builder: RaysBuilder) -> Iterator[GazeBlock]:
+        columns = ["timestamp", "gaze_pos_vid_x", "gaze_pos_vid_y"]
+        for v, _, lines in iterate_table(gaze, columns, on_bad=builder.on_bad):
+            none = np.asarray(~np.isfinite(v[:, 1:]).all(axis=1))
+            direction = recording.camera.directions(v[:, 1:])
+            yield GazeBlock(v[:, 0] * _MILLISECOND, direction, lines, {"there is no gaze": none})
 
 
 READERS = (GlassesTools(),)

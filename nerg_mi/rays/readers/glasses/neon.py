@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,12 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import read_json
 from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import Frame
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 
 from .scene_camera import SceneCamera, directions_from_angles
-from .scene_gaze import Recording, SceneGaze, SceneOptions, check_recordings, recording_folder
+from .scene_gaze import GazeBlock, Recording
+from .scene_reader import SceneReader
 
 _TIME = "timestamp [ns]"
 _PIXELS = ("gaze x [px]", "gaze y [px]")
@@ -25,7 +26,12 @@ _SIZE = (1600, 1200)  # of Neon's scene camera, pixels
 _JSON = 1 << 20  # bytes of its JSON files, at most
 
 
-class Neon:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Neon(Recording):
+    camera: SceneCamera | None  # where its calibration is there
+
+
+class Neon(SceneReader[_Neon]):
     """Folders with ``gaze.csv``, ``info.json``, ``scene_camera.json`` and ``world_timestamps.csv``.
 
     A ray starts at the scene camera's centre. Its direction is that of azimuth (right) and elevation (up), or, where
@@ -39,51 +45,44 @@ class Neon:
         'folders of Pupil Cloud\'s "Timeseries" download of a Neon (or the `gaze.csv` in them), beside the scene '
         "camera's poses"
     )
-    world = "the place's, whose axis `--up` points up"
     checked_on = DESCRIPTION
-    Options = SceneOptions
+    gaze_file = "gaze.csv"
+    accounts = "pixels and angles"
 
-    def frame(self, files: Sequence[Path], options: SceneOptions) -> Frame:
-        return options.frame
+    def open(self, folder: Path, builder: RaysBuilder) -> _Neon:
+        start, person = _info(folder, builder)
+        camera = _camera(folder, builder)
+        frames = _frame_times(folder, start, builder)
+        return _Neon(name=folder.resolve().name, person=person, frames=frames, start=start, camera=camera)
 
-    def read(self, files: Sequence[Path], options: SceneOptions, builder: RaysBuilder) -> None:
-        check_recordings(files, options)
-        about: list[dict[str, Any]] = []
-        for given in files:
-            folder, gaze = recording_folder(given, "gaze.csv")
-            start, person = _info(folder, builder)
-            camera = _camera(folder, builder)
-            frames = _frame_times(folder, start, builder)
-            scene = SceneGaze(options, Recording(folder.resolve().name, frames, start), builder, about)
-            builder.source(gaze, f"{person}/{gaze.name}")
-            _add_gaze(gaze, start, person, camera, scene, builder)
-            scene.finish("pixels and angles")
+    def blocks(self, gaze: Path, recording: _Neon, builder: RaysBuilder) -> Iterator[GazeBlock]:
+        there = set(table_columns(gaze))
+        angles = set(_ANGLES) <= there
+        camera = recording.camera
+        if not angles and camera is None:
+            raise NergError(f"{gaze} has no angles, and pixels need scene_camera.json; download it beside the gaze")
+        numbers = [_TIME, *_PIXELS, *(_ANGLES if angles else ())]
+        texts = [name for name in ("worn", "blink id") if name in there]
+        for v, words, lines in iterate_table(gaze, numbers, texts, on_bad=builder.on_bad):
+            found = [directions_from_angles(v[:, 3:5])] if angles else []
+            found += [] if camera is None else [camera.directions(v[:, 1:3])]
+            t = (v[:, 0] - recording.start) * 1e-9
+            drop = _unusable(dict(zip(texts, np.char.lower(words).T)))
+            yield GazeBlock(t, found[0], lines, drop, found[1] if len(found) == 2 else None)
 
 
 READERS = (Neon(),)
 
 
-def _add_gaze(
-    gaze: Path, start: float, person: str, camera: SceneCamera | None, scene: SceneGaze, builder: RaysBuilder
-) -> None:
-    there = set(table_columns(gaze))
-    angles = set(_ANGLES) <= there
-    if not angles and camera is None:
-        raise NergError(f"{gaze} has no angles, and pixels need scene_camera.json; download it beside the gaze")
-    numbers = [_TIME, *_PIXELS, *(_ANGLES if angles else ())]
-    texts = [name for name in ("worn", "blink id") if name in there]
-    for v, words, lines in iterate_table(gaze, numbers, texts, on_bad=builder.on_bad):
-        found = [directions_from_angles(v[:, 3:5])] if angles else []
-        found += [] if camera is None else [camera.directions(v[:, 1:3])]
-        word = dict(zip(texts, np.char.lower(words).T))
-        drop = {}
-        if "worn" in word:
-            # Spelt as a truth or as a number, by the version of the export.
-            drop["the glasses were not worn"] = np.isin(word["worn"], ["0", "0.0", "false"])
-        if "blink id" in word:
-            drop["a blink"] = ~np.isin(word["blink id"], ["", "nan"])
-        t = (v[:, 0] - start) * 1e-9
-        scene.add(t, person, found[0], rows=lines, drop=drop, other=found[1] if len(found) == 2 else None)
+def _unusable(word: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Rows that say no gaze, by reason, from the words of a block's columns."""
+    drop = {}
+    if "worn" in word:
+        # Spelt as a truth or as a number, by the version of the export.
+        drop["the glasses were not worn"] = np.isin(word["worn"], ["0", "0.0", "false"])
+    if "blink id" in word:
+        drop["a blink"] = ~np.isin(word["blink id"], ["", "nan"])
+    return drop
 
 
 def _info(folder: Path, builder: RaysBuilder) -> tuple[float, str]:

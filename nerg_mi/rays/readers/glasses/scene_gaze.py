@@ -6,7 +6,7 @@ that nothing has to be aligned: rays are in the coordinates that the place was t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,14 +75,29 @@ class SceneOptions:
         return Frame(up=self.up)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """What a reader has found of a recording: its ``name`` (of its folder), the seconds of the scene video's ``frames``
-    (F,) on the clock of the gaze, or None, and ``start``, the nanoseconds at which that clock is 0."""
+    """What a reader has found of a recording: its ``name`` (of its folder), the ``person`` who wore the glasses, the
+    seconds of the scene video's ``frames`` (F,) on the clock of the gaze, or None, and ``start``, the nanoseconds at
+    which that clock is 0."""
 
     name: str
+    person: str
     frames: np.ndarray | None = None
     start: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class GazeBlock:
+    """n rows of a recording: seconds ``t``, gaze ``direction`` (n, 3) in the scene camera's frame (OpenCV), NaN beyond
+    its picture, the 1-based ``rows`` of the file, and reasons of the format's own to ``drop`` some. ``other``: the
+    direction by another account of the file, to be compared."""
+
+    t: np.ndarray
+    direction: np.ndarray
+    rows: np.ndarray
+    drop: Mapping[str, np.ndarray]
+    other: np.ndarray | None = None
 
 
 class SceneGaze:
@@ -93,32 +108,25 @@ class SceneGaze:
     ) -> None:
         """``about``: what is known of the recordings before, to which this one is added."""
         self._builder, self._options, self._about = builder, options, about
+        self._person = recording.person
         self._angles: list[np.ndarray] = []
         self._compared = 0
         self._track = _camera_track(options, recording, builder)
 
-    def add(
-        self,
-        t: np.ndarray,
-        person: str,
-        direction: np.ndarray,
-        *,
-        rows: np.ndarray,
-        drop: Mapping[str, np.ndarray],
-        other: np.ndarray | None = None,
-    ) -> None:
-        """Add n rows: seconds ``t``, and gaze ``direction`` (n, 3) in the scene camera's frame (OpenCV), NaN beyond its
-        picture. ``other``: the same by another account, which is compared with it."""
-        turn, place, lost = self._at(t)
+    def add(self, block: GazeBlock) -> None:
+        """Add rows as rays of the place, and compare the two accounts of them where there are two."""
+        turn, place, lost = self._at(block.t)
+        direction = block.direction
         beyond = np.asarray(~np.isfinite(direction).all(axis=1))
-        reasons = {**drop, "gaze lies beyond the scene camera's picture": beyond}
-        if other is not None and self._compared < _COMPARED:
-            self._compared += len(t)
+        drop = {**block.drop, "gaze lies beyond the scene camera's picture": beyond}
+        if block.other is not None and self._compared < _COMPARED:
+            self._compared += len(block.t)
             with np.errstate(invalid="ignore"):
-                angles = angles_between(direction, other)
-            self._angles.append(angles[np.isfinite(angles) & ~np.any(list(reasons.values()), axis=0)])
-        reasons["no frame of the scene camera near that time has a pose"] = lost
-        self._builder.add(t, person, place, poses.rotate(turn, direction), rows=rows, head=turn[:, :, 2], drop=reasons)
+                angles = angles_between(direction, block.other)
+            self._angles.append(angles[np.isfinite(angles) & ~np.any(list(drop.values()), axis=0)])
+        drop["no frame of the scene camera near that time has a pose"] = lost
+        ray = poses.rotate(turn, direction)
+        self._builder.add(block.t, self._person, place, ray, rows=block.rows, head=turn[:, :, 2], drop=drop)
 
     def finish(self, accounts: str) -> None:
         """Keep in the metadata how many frames were posed and how far the two ``accounts`` of the gaze differ ("pixels
@@ -225,21 +233,4 @@ def _check_up(up: np.ndarray | None, options: SceneOptions, builder: RaysBuilder
         builder.complain(
             f"up in the place is ({', '.join(f'{x:.2f}' for x in up)}), {off:.0f} degrees from {options.up}: train it "
             f"with --coordinates upright, or import with --up {axis} and give training the matrix of --write-align"
-        )
-
-
-def recording_folder(given: Path, gaze: str) -> tuple[Path, Path]:
-    """The folder of a recording and the file of its gaze, where either was ``given``; ``gaze``: the file's name."""
-    path = given / gaze if given.is_dir() else given
-    if not path.is_file():
-        raise NergError(f"there is no {path}; give the folder of a recording, or the {gaze} in it")
-    return path.parent, path
-
-
-def check_recordings(files: Sequence[Path], options: SceneOptions) -> None:
-    """Raise `NergError` for several recordings whose frames the model's names do not tell apart."""
-    if len(files) > 1 and (options.frames is None or not options.frames.of_recording):
-        raise NergError(
-            "frames of several recordings are told apart by {recording} in their names (--frames); import them one by "
-            'one, or name them as in --frames "{recording}/frame_{frame1}"'
         )

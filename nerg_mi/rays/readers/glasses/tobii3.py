@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,11 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import parse_json, read_json
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
 from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.frames import Frame
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 
 from .scene_camera import SceneCamera, angles_between
-from .scene_gaze import Recording, SceneGaze, SceneOptions, check_recordings, recording_folder
+from .scene_gaze import GazeBlock, Recording
+from .scene_reader import SceneReader
 
 _FPS = 25.0  # of the scene camera
 _BLOCK = 1 << 14  # lines taken apart at a time
@@ -34,7 +34,12 @@ class _Glasses:
     position: np.ndarray  # (3,) millimetres
 
 
-class Tobii3:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Tobii(Recording):
+    glasses: _Glasses
+
+
+class Tobii3(SceneReader[_Tobii]):
     """Folders with ``gazedata.gz`` (JSON, a line a sample) and ``recording.g3``, whose scene camera is calibrated.
 
     A ray starts at the scene camera's centre, and goes through the undistorted ``gaze2d``. ``gaze3d``, millimetres in
@@ -45,29 +50,22 @@ class Tobii3:
 
     name = "tobii3"
     files = "folders of Tobii Pro Glasses 3 (or the `gazedata.gz` in them), beside the scene camera's poses"
-    world = "the place's, whose axis `--up` points up"
     checked_on = DESCRIPTION
-    Options = SceneOptions
+    gaze_file = "gazedata.gz"
+    accounts = "gaze2d and gaze3d"
+    fps = _FPS
 
-    def frame(self, files: Sequence[Path], options: SceneOptions) -> Frame:
-        return options.frame
+    def open(self, folder: Path, builder: RaysBuilder) -> _Tobii:
+        name = folder.resolve().name
+        return _Tobii(name=name, person=name, glasses=_calibration(folder, builder))
 
-    def read(self, files: Sequence[Path], options: SceneOptions, builder: RaysBuilder) -> None:
-        check_recordings(files, options)
-        options = replace(options, fps=options.fps or _FPS)
-        about: list[dict[str, Any]] = []
-        for given in files:
-            folder, gaze = recording_folder(given, "gazedata.gz")
-            person = folder.resolve().name
-            glasses = _calibration(folder, builder)
-            scene = SceneGaze(options, Recording(person), builder, about)
-            builder.source(gaze, f"{person}/{gaze.name}")
-            for rows, lines in _samples(gaze, builder):
-                direction = glasses.camera.directions(rows[:, 1:3] * glasses.size)
-                other = _seen_from_camera(rows[:, 3:], glasses, direction)
-                none = np.asarray(~np.isfinite(rows[:, 1:3]).all(axis=1))
-                scene.add(rows[:, 0], person, direction, rows=lines, drop={"there is no gaze": none}, other=other)
-            scene.finish("gaze2d and gaze3d")
+    def blocks(self, gaze: Path, recording: _Tobii, builder: RaysBuilder) -> Iterator[GazeBlock]:
+        glasses = recording.glasses
+        for rows, lines in _samples(gaze, builder):
+            direction = glasses.camera.directions(rows[:, 1:3] * glasses.size)
+            other = _seen_from_camera(rows[:, 3:], glasses, direction)
+            none = np.asarray(~np.isfinite(rows[:, 1:3]).all(axis=1))
+            yield GazeBlock(rows[:, 0], direction, lines, {"there is no gaze": none}, other)
 
 
 READERS = (Tobii3(),)
