@@ -2,7 +2,9 @@
 
 import importlib
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.conftest import ROOT
 from tests.rays.readers.examples import EXAMPLES
@@ -94,7 +96,7 @@ def test08_alignments(benchmark):
     from tests.alignment import rooms
 
     alignment = benchmark("alignment")
-    world = alignment.World(rooms.felt(2000), rooms.felt(2000).end, rooms.people(200))
+    world = alignment.World(rooms.traces(2000), rooms.traces(2000).end, rooms.people(200))
     there = page("tracking.md")
     assert f"| {' | '.join(alignment.HEAD)} |" in there
     for kind in ("pairs", "cameras"):
@@ -114,3 +116,36 @@ def test09_a_dataset_of_rays(benchmark, tmp_path, capsys):
     head, _, *rows = lines(printed)
     assert head in page("tracking.md") and len(rows) == 10 and rows[0].startswith("| import of 4 files")
     assert "| 100 |" in rows[-1] and "people, 100 rays; means" in printed and not (tmp_path / "dataset").exists()
+
+
+def some_walks(device_files, count=20):
+    """Two people who look about, each at a point of their own a sample."""
+    rng = np.random.default_rng(0)
+    for name in ("ann", "bo"):
+        eye = np.c_[rng.uniform(1, 3, (count, 2)), rng.uniform(1.5, 1.7, count)]
+        head = Rotation.from_euler("zx", np.c_[rng.uniform(0, 360, count), rng.uniform(-30, 30, count)], degrees=True)
+        gaze = head.apply([0, 1, 0]) + rng.normal(0, 0.1, (count, 3))
+        gaze /= np.linalg.norm(gaze, axis=1, keepdims=True)
+        yield device_files.Walk(name, 0.2 * np.arange(count), eye, gaze, eye + 2 * gaze, head)
+
+
+@pytest.mark.parametrize("name", ["aria", "quest", "neon", "arett", "qualisys", "angles"])
+def test09_files_of_devices(benchmark, tmp_path, name):
+    """Each device's reader gives the rays back that its files were made of."""
+    pictures = benchmark("tracking_pictures")
+    device = next(d for d in pictures.DEVICES if d.name == name)
+    walks = list(some_walks(benchmark("device_files")))
+    device.writer(walks, tmp_path)
+    rays = pictures.read_files(device, tmp_path, device.files.replace("shopper-*", "[ab]*"))
+    assert rays.persons == ("ann", "bo") and len(rays) >= 36
+    eyes, turns = pictures.compare(rays, np.eye(4), walks)
+    assert eyes == turns == "0, 0"
+
+
+def test10_recordings(benchmark, recorded, capsys):
+    recordings = benchmark("tracking_recordings")
+    head, rows = recordings.aria_rows(recorded("aria") / "gen1" / "mps_sample")
+    row = recordings.navgs_row(recorded("eyenavgs") / "truck")
+    printed = set(page("tracking.md"))
+    for cells in (head, *rows, row):
+        assert f"| {' | '.join(cells)} |" in printed

@@ -33,6 +33,6 @@ class AlignOptions:
     scale: float | None = option(None, "Units of the place a metre of the tracking, where that is known.")
     max_residual: float = option(10.0, "Centimetres of the median residual beyond which a fit is refused.")
     force: bool = option(False, "Write a fit that is refused, too.")
-    seed: int = option(0, "Seed of the rays by which the place is felt out.")
+    seed: int = option(0, "Seed of the rays by which the place is traced.")
     threads: int | None = option(None, "CPU threads. Default: all.")
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
