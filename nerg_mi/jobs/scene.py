@@ -30,6 +30,7 @@ from .scenes.files import GivenFiles, recognise
 from .scenes.observers import Walk, eye_of_person, support_of_rays, to_place, walk_of_person
 from .scenes.photos import camera_of_photo, cameras_of_photos
 from .scenes.places import LAMP, WrittenPlace, colors_of, place_of_files
+from .scenes.scene_rays import check_rays, load_scene_rays
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ def write_scene(
     A place is a radiance field, a mesh (.ply, .obj), a scene (.xml) or hit points (.vol); of a gaze field without one
     it is what that was trained in, found beside it. The scene has the sensors and the `<default>`s of the demo store's:
     sensor 0 is a camera, 1 the observer's own view, 2 all that the observer could turn to. Names of files are relative
-    to the scene's folder where that is possible. Raises `NergError` for what the user can mend.
+    to the scene's folder where that is possible. Of a dataset of rays a million at most, a fair sample, are written
+    beside the scene. Raises `NergError` for what the user can mend.
     """
     options, output = options or SceneOptions(), Path(output)
     check_writable(output, ".xml")
@@ -63,16 +65,19 @@ def write_scene(
     if options.times is not None:
         check_writable(frames_file)
     given = recognise([Path(file) for file in files], options.geometry, reporter)
+    check_rays(given.rays, output)
     if given.kind == "hits":
         check_writable(colors_of(output))
         check_writable(output.with_suffix(".vol") if given.place is None else output)
     ns = select_backend(options.mode)
     align = given.align if options.align is None else read_similarity(options.align, "--align", "rays to place")
-    rays = None if given.rays is None else Rays.load(given.rays)
+    found = load_scene_rays(given.rays, output, reporter)
+    given, rays = replace(given, rays=found.file), found.rays
     given, made = _with_hits(given, rays, output, reporter)
     place = place_of_files(given, output)
     up = _up(given, align, options)
-    observer, walk, about = _observer(given, rays, align, ns, options, reporter)
+    theirs = rays if options.person is None else found.of_person(options.person)
+    observer, walk, about = _observer(given, theirs, align, ns, options, reporter)
     tracked = given.gaze is not None or given.rays is not None
     scene = _Draft(given, place, align, up, observer, tracked)
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +103,7 @@ def write_scene(
     text = scene.text(output.parent, camera, lens, options.width)
     text = replace(text, about=_about(output, text, place, scene), about_camera=chosen, about_observer=about)
     write_text(output, text.xml())
-    written = [output, *made, *place.files]
+    written = [output, *found.made, *made, *place.files]
     if walk is not None:
         write_frames(frames_file, _frames(walk, options.own, text.place.taken))
         written.append(frames_file)

@@ -12,9 +12,14 @@ from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.jobs.gaze_places import align_of_training, file_of_training, place_key
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.dataset.layout import is_dataset
+from nerg_mi.rays.dataset.opening import load_rays
 
 KINDS = {".npz": "rays", ".parquet": "rays", ".ply": "mesh", ".obj": "mesh", ".vol": "hits", ".xml": "scene"}
 """Suffixes of what is not a checkpoint, and what they hold."""
+
+_SOME = 4096
+"""Rays of a dataset that tell whether it has hit points."""
 
 PLACES = ("field", "mesh", "hits", "scene")
 
@@ -42,6 +47,8 @@ def kind_of_file(path: Path) -> str:
     """What ``path`` holds: "field", "gaze", or a value of `KINDS`. Raises `NergError` for anything else."""
     if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
+    if is_dataset(path):
+        return "rays"
     suffix = path.suffix.lower()
     if suffix == ".safetensors":
         kind = read_metadata(path).get("kind")
@@ -52,8 +59,8 @@ def kind_of_file(path: Path) -> str:
         raise NergError(f'"{path}" is a checkpoint of torch; make fields of it with "nerg import"')
     if suffix not in KINDS:
         raise NergError(
-            f"a scene is written for checkpoints (.safetensors), rays, meshes and scenes ({', '.join(KINDS)}), and "
-            f'"{path}" is none of these'
+            f"a scene is written for checkpoints (.safetensors), rays and datasets of them, meshes and scenes "
+            f'({", ".join(KINDS)}), and "{path}" is none of these'
         )
     return KINDS[suffix]
 
@@ -125,9 +132,7 @@ def _compare(place: Path, gaze: Path, about: dict, reporter: Reporter) -> None:
 def _have_hits(rays: Path | None) -> bool:
     import numpy as np
 
-    from nerg_mi.rays.rays import Rays
-
     if rays is None:
         return False
-    hit = Rays.load(rays).hit
+    hit = load_rays(rays, most=_SOME).hit
     return hit is not None and bool(np.isfinite(hit).all(axis=1).any())
