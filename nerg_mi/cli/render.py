@@ -19,15 +19,16 @@ from .progress import TerminalReporter
 def command(
     scene: Annotated[Path, typer.Argument(help="Mitsuba scene file (.xml).")],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Picture to write: .exr (all channels) or .png (colour).")
+        Path, typer.Option("-o", "--output", help="Picture to write: .exr (all channels), .png; .svg, .mp4.")
     ],
     options: PictureOptions,
     define: Defines = None,
 ) -> None:
-    """Render a scene file to an EXR or PNG file, with the integrator that the scene names.
+    """Render a scene file to a picture or a video, with the integrator that the scene names.
 
     An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour, tonemapped to
-    sRGB, or an overlay with its scale. Pictures of a sequence have a number added to their names.
+    sRGB, or an overlay with its scale, which an SVG file can hold, too. Pictures of a sequence have a number added to
+    their names, or are the frames of an MP4 file.
     """
     options = replace(options, defaults=parse_defines(define))
     from nerg_mi.jobs import pictures

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .plots import DPI, INK, PAPER
+from .sheet import INK, new_page
 
 _PLACE, _HITS, _HEADS, _WANTED = "#b9b4aa", "#d9730d", "#2b6cb0", "#1c7c3c"
 _MOST = 20_000  # points drawn of a kind; more of them only hide each other
@@ -27,11 +27,7 @@ def alignment_figure(
 
     ``cut``: height above which the place is left out of the plans from above, so that no ceiling hides it.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(2 * _SIDE / DPI, (2 * _SIDE + 60) / DPI), dpi=DPI, facecolor=PAPER)
-    FigureCanvasAgg(figure)
+    figure = new_page(2 * _SIDE, 2 * _SIDE + 60)
     moved = lambda p: p @ matrix[:3, :3].T + matrix[:3, 3]
     rows = ((points, heads, "before"), (moved(points), None if heads is None else moved(heads), "after"))
     for line, (p, h, when) in zip(figure.subplots(2, 2), rows):

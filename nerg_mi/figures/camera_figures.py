@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .plots import DPI, INK, PAPER
+from .sheet import INK, new_page
 
 _CAMERA, _PATH = "#c0392b", "#e2a49c"
 _MOST_POINTS = 40_000  # drawn; more of them only hide each other
@@ -17,11 +17,7 @@ def camera_figure(to_world: np.ndarray, points: np.ndarray, colors: np.ndarray, 
 
     Points far beyond the others are left out of the plans.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(2 * _SIDE / DPI, (_SIDE + 50) / DPI), dpi=DPI, facecolor=PAPER)
-    FigureCanvasAgg(figure)
+    figure = new_page(2 * _SIDE, _SIDE + 50)
     centers = to_world[:, :3, 3]
     low, high = _bounds(centers, points)
     size = 0.04 * float(np.max(high - low)) or 1.0

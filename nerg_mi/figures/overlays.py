@@ -6,7 +6,7 @@ One more is one more entry. Values are the AOVs of the integrator `nerg`, (h, w)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,58 +22,92 @@ Limits = tuple[float, float] | None
 @dataclass(frozen=True, eq=False)
 class Layers:
     """A picture and what lies over it: linear ``color`` (h, w, 3), ``values`` (h, w), ``mask`` (h, w) bool where there
-    is a surface; ``marker``: pixel (x, y) of the observer, or None."""
+    is a surface; ``marker``: pixel (x, y) of the observer, or None; ``supported``: whether anything was recorded around
+    the observer, so that their gaze is known."""
 
     color: np.ndarray
     values: np.ndarray
     mask: np.ndarray
     marker: tuple[float, float] | None = None
+    supported: bool = True
+
+
+@dataclass(frozen=True)
+class Style:
+    """How an overlay is drawn: the ``colors`` of its scale (None: those usual for it), over how many ``decades`` that
+    is logarithmic (0: linear), whether what is not known is hatched (``hatched``), and the ``title`` (None: the usual
+    one)."""
+
+    colors: str | None = None
+    decades: float = 0.0
+    hatched: bool = True
+    title: str | None = None
+
+
+USUAL = Style()
 
 
 @dataclass(frozen=True)
 class Overlay:
     """``name`` of the AOV; ``summary`` for people; ``limits(layers)``: ends of the scale of one picture, None where it
-    shows nothing of it; ``draw(layers, limits)``: a figure; ``scaled``: whether it needs a scale."""
+    shows nothing of it; ``draw(layers, limits, style)``: a figure; ``scaled``: whether it needs a scale; ``low``: the
+    lower end of every scale, or None where it depends on the pictures; ``of_gaze``: whether it is known only where rays
+    were recorded."""
 
     name: str
     summary: str
     limits: Callable[[Layers], Limits]
-    draw: Callable[[Layers, Limits], Any]
+    draw: Callable[..., Any]
     scaled: bool = True
+    low: float | None = 0.0
+    of_gaze: bool = False
 
 
-def _heat(name: str, summary: str, title: str, label: str) -> Overlay:
+def _heat(name: str, summary: str, title: str, label: str, of_gaze: bool = False) -> Overlay:
     def limits(of: Layers) -> Limits:
         return (0.0, top_of(of.values, of.mask)) if np.any(of.values[of.mask] > 0) else None
 
-    def draw(of: Layers, limits: Limits) -> Any:
-        heat = Heat(1.0 if limits is None else limits[1])
-        return plots.gaze_figure(of.color, of.values, of.mask, heat, title, label, of.marker)
+    def draw(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
+        heat = Heat(1.0 if limits is None else limits[1], decades=style.decades)
+        heat = heat if style.colors is None else replace(heat, colors=style.colors)
+        shown = style.title or (title if of.supported or not of_gaze else f"{title}: nobody recorded around here")
+        unknown = unknown_of(of, of_gaze) if style.hatched else None
+        return plots.gaze_figure(of.color, of.values, of.mask, heat, shown, label, of.marker, unknown)
 
-    return Overlay(name, summary, limits, draw)
+    return Overlay(name, summary, limits, draw, of_gaze=of_gaze)
+
+
+def unknown_of(layers: Layers, of_gaze: bool) -> np.ndarray:
+    """Where nothing is known (h, w), bool: where there is no surface, and everywhere for gaze without support."""
+    void = ~np.asarray(layers.mask, bool)
+    return void if layers.supported or not of_gaze else np.ones_like(void)
+
+
+def _draw_visibility(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
+    return plots.visibility_figure(of.color, of.values, of.mask, style.title or "Visible to the observer")
+
+
+def _draw_depth(of: Layers, limits: Limits, style: Style = USUAL) -> Any:
+    colors = style.colors or "viridis_r"
+    return plots.depth_figure(of.values, of.mask, style.title or "Depth", "scene units", limits, colors)
 
 
 OVERLAYS = {
     overlay.name: overlay
     for overlay in (
-        _heat("gaze", "how much the observer attends to what is seen", "Gaze", "gaze density [1/sr]"),
+        _heat("gaze", "how much the observer attends to what is seen", "Gaze", plots.GAZE, of_gaze=True),
         _heat("kde", "where tracked people looked", "Where people looked", "tracked gaze [1/sr]"),
-        _heat("gaze_std", "how sure that is", "Uncertainty of gaze", "standard deviation of gaze [1/sr]"),
+        _heat("gaze_std", "how sure that is", "Uncertainty of gaze", "standard deviation of gaze [1/sr]", of_gaze=True),
         _heat("emit", "how much surfaces attract", "What surfaces attract", "emitted attention"),
         _heat("capture", "how much the observer gives", "What the observer gives", "captured attention"),
         _heat("support", "how many rays the gaze rests on", "Support", "training rays around the observer"),
-        Overlay(
-            "visibility",
-            "what the observer sees",
-            lambda of: None,
-            lambda of, limits: plots.visibility_figure(of.color, of.values, of.mask),
-            scaled=False,
-        ),
+        Overlay("visibility", "what the observer sees", lambda of: None, _draw_visibility, scaled=False),
         Overlay(
             "depth",
             "distance from the camera",
             lambda of: plots.depth_limits(of.values, of.mask),
-            lambda of, limits: plots.depth_figure(of.values, of.mask, unit="scene units", limits=limits),
+            _draw_depth,
+            low=None,
         ),
     )
 }

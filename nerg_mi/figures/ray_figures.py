@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .plots import DPI, INK, PAPER
+from .sheet import INK, PAPER, new_page
 
 _POINTS, _SURFACES = "#2b6cb0", "#b9b4aa"
 _MOST_POINTS = 60_000  # drawn; more of them only hide each other
@@ -159,17 +159,13 @@ def _dimension(axes, low, high) -> None:
 def _sheet(low, high, title: str, bar: bool = False, pad: float = 0.0):
     """A figure with axes in metres, of equal scale: so large that the plan's longer side has a fixed number of
     pixels. ``bar``: the figure's second axes are those of a colour bar."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     # Room for the lines of dimension, outside of what they measure.
     room = pad * (high - low).max()
     low, high = low - (0, room), high + (room, 0)
     size = np.maximum((high - low) / (high - low).max() * _SIDE, 160)
     left, foot, head, right = 48, 40, 46, 96 if bar else 14
     width, height = left + size[0] + right, foot + size[1] + head
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
-    FigureCanvasAgg(figure)
+    figure = new_page(width, height)
     axes = figure.add_axes((left / width, foot / height, size[0] / width, size[1] / height))
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])

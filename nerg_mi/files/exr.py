@@ -129,12 +129,14 @@ def _channel_order(name: str) -> str:
 
 
 @contextmanager
-def exr_rows(path: str | os.PathLike, width: int, height: int) -> Iterator[Callable[[Mapping[str, np.ndarray]], None]]:
+def exr_rows(
+    path: str | os.PathLike, width: int, height: int, attributes: Mapping[str, str] | None = None
+) -> Iterator[Callable[[Mapping[str, np.ndarray]], None]]:
     """A single-part scanline file that is written from the top in pieces, so that it need not lie in memory as a whole.
 
     Gives a function that writes the next rows, from the name of each channel to an array (rows, width) of float32; the
-    names of the first call are those of the file. The file is whole or absent; it is absent also where rows are missing
-    at the end. Raises `NergError` where it cannot be written.
+    names of the first call are those of the file. ``attributes``: text for the header. The file is whole or absent; it
+    is absent also where rows are missing at the end. Raises `NergError` where it cannot be written.
     """
     import Imath
     import OpenEXR
@@ -149,6 +151,7 @@ def exr_rows(path: str | os.PathLike, width: int, height: int) -> Iterator[Calla
                 header["compression"] = Imath.Compression(Imath.Compression.ZIP_COMPRESSION)
                 kind = Imath.Channel(Imath.PixelType(Imath.PixelType.FLOAT))
                 header["channels"] = dict.fromkeys(channels, kind)
+                header.update({key: value.encode() for key, value in (attributes or {}).items()})
                 file = OpenEXR.OutputFile(str(temporary), header)
             count = len(next(iter(channels.values())))
             data = {name: np.ascontiguousarray(value, np.float32).tobytes() for name, value in channels.items()}

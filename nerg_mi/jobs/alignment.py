@@ -22,7 +22,7 @@ from nerg_mi.alignment.umeyama import move
 from nerg_mi.capture.upright import turn_to_z
 from nerg_mi.errors import NergError
 from nerg_mi.figures.alignment_figures import alignment_figure
-from nerg_mi.figures.plots import save
+from nerg_mi.figures.saving import save
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.similarity import Similarity

@@ -15,10 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi import __version__
 from nerg_mi.errors import NergError
 from nerg_mi.figures import plots as figures
 from nerg_mi.figures.overlay import Heat, top_of
+from nerg_mi.figures.provenance import Provenance, provenance
+from nerg_mi.figures.saving import save
+from nerg_mi.figures.sphere_figures import sphere_figure
 from nerg_mi.figures.tonemap import srgb, write_png
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.exr import write_bitmap_exr
@@ -93,7 +95,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         stop.check()
 
     clock.start("pictures")
-    header = {"Software": f"nerg_mi {__version__}", "Comment": f"seed {seed}, {spp} samples a pixel, {mode}"}
+    about = provenance("nerg demo", inputs, seed, {"spp": spp, "mode": mode, **sizes, "defaults": defaults})
     # One scale for all pictures of gaze, so that a colour means the same in each of them.
     tops = [top_of(r.aovs["gaze"], r.mask) for r in (own, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)]
     if not tops:
@@ -101,8 +103,9 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
             f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer.'
         )
     heat = Heat(max(tops))
-    files = _write_pictures(out, camera, own, sphere, without, heat, observer_pixel(seen), header)
-    camera.bitmap.metadata()["seed"] = seed
+    files = _write_pictures(out, camera, own, sphere, without, heat, observer_pixel(seen), about)
+    for key, value in about.text().items():
+        camera.bitmap.metadata()[key] = value
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
     clock.stop()
@@ -182,7 +185,7 @@ def _write_pictures(
     without: Channels,
     heat: Heat,
     marker: tuple[float, float] | None,
-    header: dict[str, str],
+    about: Provenance,
 ) -> list[Path]:
     total = sphere_integral(sphere)
     drawn = {
@@ -196,7 +199,7 @@ def _write_pictures(
         "gaze": lambda: figures.gaze_figure(
             camera.color, camera.aovs["gaze"], camera.mask, heat, "Where the observer looks"
         ),
-        "gaze_sphere": lambda: figures.sphere_figure(
+        "gaze_sphere": lambda: sphere_figure(
             sphere.color,
             sphere.aovs["gaze"],
             sphere.mask,
@@ -209,9 +212,9 @@ def _write_pictures(
     files = []
     for name, draw in drawn.items():
         files.append(out / f"{name}.png")
-        figures.save(draw(), files[-1], header)
+        save(draw(), files[-1], about)
     files.append(out / "color.png")
-    write_png(files[-1], srgb(camera.color), header)
+    write_png(files[-1], srgb(camera.color), about.text())
     return files
 
 

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.figures import plots as figures
-from nerg_mi.figures.overlays import Layers, Limits, Overlay, find_overlay, shared_limits
+from nerg_mi.figures import saving
+from nerg_mi.figures.colors import find_colors
+from nerg_mi.figures.overlay import MOST_DECADES
+from nerg_mi.figures.overlays import Layers, Limits, Overlay, Style, find_overlay, shared_limits
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.asked import render_asked
@@ -35,6 +37,8 @@ class Picture:
     whole: str | None = None
 
 
+OVERLAY_FORMATS = (*saving.FORMATS, ".mp4")
+
 OnStrip = Callable[[int, int], None]
 """Is told how many samples are done, and of how many."""
 
@@ -42,72 +46,92 @@ Make = Callable[[Any, Any, OnStrip], Picture]
 """Makes a picture of a scene, a sensor, and a function that is told of each strip."""
 
 
+_OF_OVERLAYS = (("top", None), ("cmap", None), ("decades", 0.0), ("hatching", True))
+
+SUPPORT = 1.0
+"""Rays around an observer below which their gaze counts as not known: of less than one no field can have learnt it."""
+
+
 def check_overlay(output: Path, options: PictureOptions) -> None:
     """Raise `NergError` for options of an overlay that contradict each other."""
     if options.overlay is None:
-        if options.top is not None:
-            raise NergError("--top is the end of an overlay's scale, and there is none; give --overlay, too")
+        for name, default in _OF_OVERLAYS:
+            if getattr(options, name) != default:
+                flag = "--no-hatching" if name == "hatching" else f"--{name}"
+                raise NergError(f"{flag} is about an overlay, and there is none; give --overlay, too")
         return
     find_overlay(options.overlay)
-    if output.suffix.lower() != ".png":
+    if output.suffix.lower() not in OVERLAY_FORMATS:
         raise NergError(
-            f'an overlay is a picture to look at, and "{output}" is none: let its name end in .png (an .exr holds the '
-            "quantity itself, if the scene's aovs name it)"
+            f'an overlay is a picture to look at, and "{output}" is none: let its name end in '
+            f"{' or '.join(OVERLAY_FORMATS)} (an .exr holds the quantity itself, if the scene's aovs name it)"
         )
     if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
         raise NergError(f"--top must be positive, got {options.top}")
+    if not 0 <= options.decades <= MOST_DECADES:
+        raise NergError(f"--decades must be from 0 (a linear scale) to {MOST_DECADES:.0f}, got {options.decades}")
+    if options.cmap is not None:
+        find_colors(options.cmap)
 
 
 def overlay_pictures(
     path: Path,
     frames: Sequence[Mapping[str, str]],
-    files: Sequence[Path],
+    write: Callable[[Any], None],
     options: PictureOptions,
     render: Callable[[Mapping[str, str], Make], Picture],
     stop: Interruption,
 ) -> tuple[Picture, float | None]:
-    """Write a picture with the overlay of ``options`` for each of ``frames``, values of `<default>`s of the scene file
-    ``path``, to ``files``. Gives the last one, and the upper end of the scale of all, None where there is none.
+    """Give ``write`` a figure with the overlay of ``options`` for each of ``frames``, values of `<default>`s of the
+    scene file ``path``, one after the other. Gives the last one, and the upper end of the scale of all, None where
+    there is none.
 
     ``render``: loads the scene of a frame and lets a picture be made of it. Pictures of a sequence wait on the disk
-    until the scale is known. Raises `NergError` where the quantity is 0 everywhere.
+    until the scale is known, and not at all where it is given. Raises `NergError` where the quantity is 0 everywhere.
     """
     overlay = find_overlay(options.overlay or "")
+    style = Style(options.cmap, options.decades, options.hatching)
     limits: list[Limits] = []
     last = Picture((0, 0), 0)
+    waits = len(frames) > 1 and overlay.scaled and (options.top is None or overlay.low is None)
+
+    def finish(layers: Layers, ends: Limits) -> None:
+        if ends is None and overlay.scaled:
+            raise NergError(
+                f'"{overlay.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
+            )
+        write(overlay.draw(layers, ends, style))
+        stop.check()
+
     with tempfile.TemporaryDirectory() as folder:
-        kept: list[tuple[Path, tuple[int, ...], Any]] = []
+        kept: list[tuple[Path, tuple[int, ...], Any, bool]] = []
 
         def make(loaded: Any, camera: Any, on_strip: OnStrip) -> Picture:
             _check_memory(path, camera, options)
             layers = _layers(path, loaded, camera, overlay, options, on_strip)
             limits.append(overlay.limits(layers))
-            array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
-            # Alone it need not wait.
-            file = Path(folder, str(len(kept)))
-            if len(frames) > 1:
-                write_bytes(file, np.ascontiguousarray(array, np.float32).data)
-            kept.append((file, array.shape, layers.marker if len(frames) > 1 else layers))
             height, width = layers.mask.shape
+            if waits:
+                array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
+                file = Path(folder, str(len(kept)))
+                write_bytes(file, np.ascontiguousarray(array, np.float32).data)
+                kept.append((file, array.shape, layers.marker, layers.supported))
+            else:
+                finish(layers, shared_limits(limits[-1:], options.top))
             return Picture((width, height), 3)
 
         for frame in frames:
             last = render(frame, make)
         ends = shared_limits(limits, options.top)
-        if ends is None and overlay.scaled:
-            raise NergError(
-                f'"{overlay.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
-            )
-        for (file, shape, rest), output in zip(kept, files):
-            layers = rest if isinstance(rest, Layers) else _read(file, shape, rest)
-            figures.save(overlay.draw(layers, ends), output)
-            stop.check()
+        for file, shape, marker, supported in kept:
+            finish(_read(file, shape, marker, supported), ends)
+            file.unlink()
     return last, None if ends is None else ends[1]
 
 
-def _read(file: Path, shape: tuple[int, ...], marker: Any) -> Layers:
+def _read(file: Path, shape: tuple[int, ...], marker: Any, supported: bool) -> Layers:
     array = np.fromfile(file, np.float32).reshape(shape)
-    return Layers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker)
+    return Layers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported)
 
 
 def _check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
@@ -126,10 +150,23 @@ def _layers(
     asked = list(dict.fromkeys([overlay.name, "opacity", "depth"]))
     with mitsuba_says():
         found = render_asked(path, loaded, camera, asked, options.spp, options.seed, on_strip)
-    return Layers(found.color, found.aovs[overlay.name], found.mask, _marker(loaded, camera, found.aovs["depth"]))
+    marker = observer_pixel(loaded, camera, found.aovs["depth"])
+    supported = not overlay.of_gaze or is_supported(loaded, camera)
+    return Layers(found.color, found.aovs[overlay.name], found.mask, marker, supported)
 
 
-def _marker(loaded: Any, camera: Any, depth: np.ndarray) -> tuple[float, float] | None:
+def is_supported(loaded: Any, camera: Any) -> bool:
+    """Whether anybody was recorded around the observer, that of the scene or else the ``camera``: `SUPPORT` rays at
+    least. A gaze field that does not tell where it learnt counts as knowing."""
+    integrator = loaded.integrator()
+    gaze = integrator.gaze
+    if gaze is None or gaze.field.support is None:
+        return True
+    eye = center(integrator.observer or camera)
+    return float(np.ravel(np.array(gaze.field.support.at(gaze.to_world.point_to_local(eye))))[0]) >= SUPPORT
+
+
+def observer_pixel(loaded: Any, camera: Any, depth: np.ndarray) -> tuple[float, float] | None:
     """The pixel at which the scene's observer stands, if the ``camera`` sees them."""
     observer = loaded.integrator().observer
     if observer is None or camera.class_name() != "PerspectiveCamera":

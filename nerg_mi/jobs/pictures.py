@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.figures.provenance import Provenance, provenance
+from nerg_mi.figures.saving import rasterize, save
 from nerg_mi.files.atomic import check_writable
+from nerg_mi.files.video import check_video, video_frames
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
 from nerg_mi.rendering.frames_file import numbered, read_frames
-from nerg_mi.rendering.picture_file import FORMATS, picture_rows
+from nerg_mi.rendering.picture_file import FORMATS, DisplayRows, picture_rows
 from nerg_mi.rendering.pictures import activate, load_scene
-from nerg_mi.rendering.scene_file import check_samples
+from nerg_mi.rendering.scene_file import check_samples, files_of_scene
 from nerg_mi.threads import set_thread_count
 
 from .options.pictures import PictureOptions
-from .overlays import Make, OnStrip, Picture, check_overlay, overlay_pictures
+from .overlays import OVERLAY_FORMATS, Make, OnStrip, Picture, check_overlay, overlay_pictures
 from .reporter import SILENT, Reporter
+
+VIDEO = ".mp4"
+
+_OF_PICTURES = ("overlay", "top", "cmap", "decades", "hatching")
 
 RESERVE = 150e6
 """Bytes kept free beside a band, for the strips in it and for the kernel that is compiled first."""
@@ -50,9 +60,11 @@ def render_file(
     """Render the scene file ``scene`` and write the picture ``output``, whose folder is made.
 
     ``output`` ends in .exr (all channels of the film, AOVs among them, as float32) or in .png (its colour, tonemapped
-    to sRGB). With ``options.overlay`` it is a .png of the colour with that quantity over it and a scale beside it; the
-    scene's list of AOVs need not have it. With ``options.frames`` there is a picture for each line of that file, with a
-    number added to its name; one scale serves all overlays, for which all are rendered before the first is written.
+    to sRGB). With ``options.overlay`` it is a .png or .svg of the colour with that quantity over it and a scale beside
+    it; the scene's list of AOVs need not have it. With ``options.frames`` there is a picture for each line of that
+    file, with a number added to its name, or one video where that ends in .mp4; one scale serves all overlays, for
+    which all are rendered before the first is drawn, unless ``options.top`` gives it. Each file says in its header what
+    it was made of (`nerg_mi.figures.provenance`).
 
     A picture that needs more than ``options.memory`` is rendered in bands of rows, as large as fit beside what the
     scene itself takes. Its pixels do not depend on that where the film has a box filter; with wider filters they differ
@@ -66,7 +78,7 @@ def render_file(
     """
     options = options or PictureOptions()
     scene, output = Path(scene), Path(output)
-    check_writable(output, *FORMATS)
+    check_writable(output, *dict.fromkeys((*FORMATS, *OVERLAY_FORMATS)))
     if not options.memory > 0:
         raise NergError(f"the memory to render in is {options.memory} GB: give it more than 0.")
     if options.spp:
@@ -74,11 +86,12 @@ def render_file(
     if not scene.is_file():
         raise NergError(f'there is no scene file "{scene}".')
     check_overlay(output, options)
+    video = _check_video(output, options)
     frames: Sequence[Mapping[str, str]] = [{}]
     files = [output]
     if options.frames is not None:
         frames = read_frames(options.frames)
-        files = [numbered(output, k + 1, len(frames)) for k in range(len(frames))]
+        files = [output] if video else [numbered(output, k + 1, len(frames)) for k in range(len(frames))]
         for file in files:
             check_writable(file)
     mode = activate(options.mode)
@@ -86,7 +99,7 @@ def render_file(
     if options.threads:
         set_thread_count(options.threads)
     start = time.perf_counter()
-    done, top = 0, None
+    done, top, picture = 0, None, Picture((0, 0), 0)
     with Interruption() as stop:
 
         def on_strip(part: int, total: int) -> None:
@@ -104,17 +117,21 @@ def render_file(
             done += 1
             return made
 
-        if options.overlay is not None:
-            picture, top = overlay_pictures(scene, frames, files, options, render, stop)
-        else:
-            made = [render(frame, partial(_picture, file, options, stop)) for frame, file in zip(frames, files)]
-            picture = made[-1]
+        each = _provenances(scene, frames, options, mode, video)
+        with _writer(files, options, each, video) as write:
+            if options.overlay is not None:
+                drawn = lambda figure: write(lambda path, about: save(figure, path, about), lambda: rasterize(figure))
+                picture, top = overlay_pictures(scene, frames, drawn, options, render, stop)
+            else:
+                for frame in frames:
+                    picture = render(frame, partial(_picture, write, options, stop))
         # The picture is there, and yet whoever called this does not go on.
         stop.check()
     seconds = time.perf_counter() - start
     note = f" It was rendered in one piece, beyond {options.memory:g} GB, because of {picture.whole}."
     width, height = picture.size
-    what = str(output) if options.frames is None else f"{len(files)} pictures, {files[0]} to {files[-1]}"
+    what = str(output) if len(files) == 1 else f"{len(files)} pictures, {files[0]} to {files[-1]}"
+    what += f", {len(frames)} pictures at {options.fps:g} a second" if video else ""
     scale = "" if top is None else f", scale to {top:.4g}"
     reporter.message(
         f"Wrote {what} ({width} x {height}, {picture.channels} channels, {mode}, {seconds:.1f} s{scale})."
@@ -123,21 +140,80 @@ def render_file(
     return PictureResult(files[0], picture.size, picture.channels, mode, seconds, picture.whole, tuple(files), top)
 
 
+Write = Callable[[Callable[[Path, Provenance], None], Callable[[], np.ndarray]], None]
+"""Writes the next picture: as a file by the first function, or as a frame of a video by the pixels that the second
+gives."""
+
+
+@contextmanager
+def _writer(files: Sequence[Path], options: PictureOptions, each: Iterator[Provenance], video: bool) -> Iterator[Write]:
+    """What takes the pictures one after the other: ``files``, or the one video that they name."""
+    if not video:
+        remaining = iter(files)
+        yield lambda to_file, pixels: to_file(next(remaining), next(each))
+        return
+    with video_frames(files[0], options.fps, next(each).text()) as add:
+        yield lambda to_file, pixels: add(pixels())
+
+
+def _provenances(
+    scene: Path, frames: Sequence[Mapping[str, str]], options: PictureOptions, mode: str, video: bool
+) -> Iterator[Provenance]:
+    """What each picture was made of, or the one video."""
+    known: dict[Path, str] = {}
+    given = {name: getattr(options, name) for name in _OF_PICTURES} if options.overlay else {}
+    given |= {"mode": mode, "sensor": options.sensor, "spp": options.spp}
+    for frame in frames[:1] if video else frames:
+        values = {**(options.defaults or {}), **({} if video else frame)}
+        inputs = files_of_scene(scene, {**values, **frame})
+        if video and options.frames is not None:
+            inputs, given["fps"] = [*inputs, options.frames], options.fps
+        yield provenance("nerg render", inputs, options.seed, given | {"defaults": values}, known)
+
+
+def _check_video(output: Path, options: PictureOptions) -> bool:
+    """Whether ``output`` is a video. Raises `NergError` for options that contradict that."""
+    if output.suffix.lower() == VIDEO:
+        if options.frames is None:
+            raise NergError(f'"{output}" is a video, and there is one picture; give --frames, or another name (.png)')
+        check_video(options.fps)
+        return True
+    if options.fps != PictureOptions().fps:
+        raise NergError(f'--fps is of a video, and "{output}" is none; let its name end in {VIDEO}')
+    if options.overlay is None and output.suffix.lower() not in FORMATS:
+        raise NergError(f'"{output}" holds an overlay; give --overlay, or a name that ends in {" or ".join(FORMATS)}')
+    return False
+
+
 def _picture(
-    output: Path, options: PictureOptions, stop: Interruption, loaded: Any, camera: Any, on_strip: OnStrip
+    write: Write, options: PictureOptions, stop: Interruption, loaded: Any, camera: Any, on_strip: OnStrip
 ) -> Picture:
-    """Render what ``camera`` sees, and write it to ``output``."""
+    """Render what ``camera`` sees, and ``write`` it."""
     width, height = map(int, camera.film().crop_size())
     rows = bands.rows_for(loaded, camera, 1e9 * options.memory - resident_bytes() - RESERVE)
     whole = bands.why_whole(loaded, camera) if rows < height else None
     channels = 0
-    with mitsuba_says(), picture_rows(output, width, height) as write:
+
+    def fill(add: Callable[[Any, int], None]) -> None:
+        nonlocal channels
         pieces = bands.render_bands(loaded, camera, spp=options.spp, seed=options.seed, rows=rows, on_strip=on_strip)
         for band in pieces:
             bitmap = band.film.bitmap()
             channels = bitmap.channel_count()
-            write(bitmap, band.rows)
+            add(bitmap, band.rows)
             stop.check()
+
+    def to_file(path: Path, about: Provenance) -> None:
+        with picture_rows(path, width, height, about.text()) as add:
+            fill(add)
+
+    def pixels() -> np.ndarray:
+        display = DisplayRows(width, height)
+        fill(display.add)
+        return display.pixels()
+
+    with mitsuba_says():
+        write(to_file, pixels)
     return Picture((width, height), channels, whole)
 
 

@@ -16,7 +16,7 @@ from nerg_mi.capture.structure.reconstruction import Reconstruction, Settings, c
 from nerg_mi.capture.structure.video import copy_frames
 from nerg_mi.errors import NergError, plain
 from nerg_mi.figures.camera_figures import camera_figure
-from nerg_mi.figures.plots import save
+from nerg_mi.figures.saving import save
 from nerg_mi.files.atomic import check_new_folder, make_folder, replacing_folder
 from nerg_mi.files.tables import write_json
 

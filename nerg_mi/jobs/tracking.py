@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures import plots as figures
-from nerg_mi.figures import ray_figures
+from nerg_mi.figures import ray_figures, saving
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.rays import splits
@@ -205,7 +204,7 @@ class PlotOptions:
 def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions()) -> Figure:
     """The floor plan of rays, or of a file of them, as a figure of matplotlib."""
     if options.output is not None:
-        check_writable(options.output, ".png")
+        check_writable(options.output, *saving.FORMATS)
     if options.kind == "density":
         figure = ray_figures.floor_plan(_load(rays), options.cell)
     else:
@@ -213,7 +212,7 @@ def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions()) -> Fi
         where = {} if test is None else splits.position_of_split(test)
         figure = ray_figures.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
     if options.output is not None:
-        figures.save(figure, options.output)
+        saving.save(figure, options.output)
     return figure
 
 

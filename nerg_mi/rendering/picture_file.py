@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,30 +19,39 @@ _DITHER = 256
 
 
 @contextmanager
-def picture_rows(path: str | Path, width: int, height: int) -> Iterator[Callable[[object, int], None]]:
+def picture_rows(
+    path: str | Path, width: int, height: int, text: Mapping[str, str] | None = None
+) -> Iterator[Callable[[object, int], None]]:
     """A picture file of ``width`` x ``height`` pixels, whole or absent.
 
     Gives a function that writes the next rows: the first ``rows`` of a Mitsuba bitmap. Float32 in .exr, tonemapped to
-    sRGB in .png.
+    sRGB in .png. ``text``: what the header says, by PNG's names.
     """
     check_writable(path, *FORMATS)
     if Path(path).suffix.lower() == ".exr":
-        with exr_rows(path, width, height) as write:
+        with exr_rows(path, width, height, text) as write:
             yield lambda bitmap, rows: write({name: values[:rows] for name, values in bitmap_channels(bitmap).items()})
         return
     # Opened first, so that a folder that cannot be written to is found before anything is rendered.
     with replacing(path) as temporary:
-        png = _Png(width, height)
-        yield png.add
-        temporary.write_bytes(encode_png(png.bitmap()))
+        display = DisplayRows(width, height)
+        yield display.add
+        bitmap = display.bitmap()
+        for key, value in (text or {}).items():
+            bitmap.metadata()[key] = value
+        temporary.write_bytes(encode_png(bitmap))
 
 
-class _Png:
+class DisplayRows:
+    """The colour of a picture of ``width`` x ``height`` pixels in 8 bits, tonemapped to sRGB, put together from the
+    top."""
+
     def __init__(self, width: int, height: int):
         self._pixels, self._done = np.empty((height, width, 3), np.uint8), 0
         self._waiting, self._format = [], None
 
     def add(self, bitmap, rows: int) -> None:
+        """Add the first ``rows`` of a Mitsuba bitmap."""
         import mitsuba as mi
 
         # With AOVs the bitmap has many channels, of which the colour is the layer without a name.
@@ -67,8 +76,13 @@ class _Png:
         self._done += len(values)
 
     def bitmap(self):
+        """All of it as a Mitsuba bitmap. Raises ``ValueError`` while rows are missing."""
         import mitsuba as mi
 
+        return mi.Bitmap(self.pixels())
+
+    def pixels(self) -> np.ndarray:
+        """All of it (height, width, 3), uint8. Raises ``ValueError`` while rows are missing."""
         if self._done != len(self._pixels):
             raise ValueError(f"{self._done} of {len(self._pixels)} rows were written")
-        return mi.Bitmap(self._pixels)
+        return self._pixels

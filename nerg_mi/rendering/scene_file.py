@@ -56,6 +56,15 @@ def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None
     _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).read(path, 0, ())
 
 
+def files_of_scene(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
+    """The scene file ``path`` and the files that it names, as far as they are there: what it includes, meshes, fields,
+    textures; ``defaults`` and errors as of `check_scene_file`."""
+    path = Path(path)
+    reader = _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()})
+    reader.read(path, 0, ())
+    return list(dict.fromkeys([path, *reader.files]))
+
+
 def check_scene(path: str | Path, scene) -> None:
     """Look at what Mitsuba has made of the file: films and samplers. Raises `NergError`."""
     for index, sensor in enumerate(scene.sensors()):
@@ -79,6 +88,7 @@ class _Scene:
         self._folders, self._values = [folder], dict(defaults)
         self._given = set(defaults)
         self._elements = self._bytes = 0
+        self.files: list[Path] = []
 
     def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
         whole = path.resolve()
@@ -146,6 +156,7 @@ class _Scene:
         elif tag == "include":
             found = self._find(values.get("filename", ""))
             if found is not None:
+                self.files.append(found)
                 self.read(found, depth, within)
         elif name == "sample_count" and parent[0] == "sampler" and tag == "integer":
             try:
@@ -157,6 +168,7 @@ class _Scene:
             found = self._find(value)
             if found is None:
                 return
+            self.files.append(found)
             if parent[1] in _CHECKS:
                 _CHECKS[parent[1]](found)
             elif parent[1] in ("bitmap", "envmap") and found.suffix.lower() in _PICTURES:

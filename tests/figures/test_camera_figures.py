@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from nerg_mi.figures.camera_figures import camera_figure
-from nerg_mi.figures.plots import save
+from nerg_mi.figures.saving import save
 
 
 def poses() -> np.ndarray:

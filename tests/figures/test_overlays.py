@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.figures import plots as figures
 from nerg_mi.figures.overlays import OVERLAYS, Layers, find_overlay, shared_limits
+from nerg_mi.figures.saving import save
 
 X, Y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, 1, 16))
 LAYERS = Layers(np.repeat(X[..., None], 3, -1), 2 * Y, X > 0.1, (5.0, 4.0))
@@ -18,7 +18,7 @@ def test_each_is_drawn(name, tmp_path):
     overlay = find_overlay(name)
     limits = overlay.limits(LAYERS)
     assert overlay.name == name and overlay.summary and (limits is None) == (not overlay.scaled)
-    figures.save(overlay.draw(LAYERS, limits), tmp_path / "a.png")
+    save(overlay.draw(LAYERS, limits), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 500
 
 

@@ -23,14 +23,20 @@ class PictureOptions:
     threads: int = option(0, "Worker threads; 0: one a core.", "-t", "--threads", min=0)
     memory: float = option(1.0, "GB that rendering may take; larger pictures are made in bands.")
     overlay: str | None = option(
-        None, "Lay this over the colour, with its scale (.png): gaze, kde, visibility, depth, support, ..."
+        None, "Lay this over the colour, with its scale (.png, .svg, .mp4): gaze, kde, visibility, depth, support, ..."
     )
     top: float | None = option(
         None, "Upper end of the overlay's scale, for gaze in 1/sr.  [default: the 99.5th percentile]"
     )
+    cmap: str | None = option(
+        None, "Colour map of the overlay: inferno, magma, plasma, viridis, cividis.  [default: the overlay's own]"
+    )
+    decades: float = option(0.0, "Powers of ten that the overlay's scale spans; 0: a linear scale.")
+    hatching: bool = option(True, "Hatch the overlay where nothing is known.")
     frames: Path | None = option(
         None, "Render a sequence: CSV file whose header names <default>s, a line of values for each picture."
     )
+    fps: float = option(25.0, "Pictures a second of an .mp4.")
 
 
 @dataclass(frozen=True, kw_only=True)
