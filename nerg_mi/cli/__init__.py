@@ -25,6 +25,7 @@ COMMANDS = {
     "doctor": "Say what works on this machine, and how to mend what does not.",
     "scene": "Write a scene file for a field, a mesh, a gaze field or rays, with a camera and an observer.",
     "render": "Render a scene file to a picture or a video.",
+    "draw": "Draw a figure: a gaze sphere, occlusion, a floor plan, a contact sheet, a difference.",
     "rays": "Import tracking files as rays of attention, and look at what they hold.",
     "poses": "Find out from where photos, or frames of a video, were taken.",
     "align": "Find how tracking lies in a place: from points, a twin, cameras, or the tracking alone.",

@@ -32,4 +32,4 @@ def hatch(display: Any, unknown: Any, unit: int = 1) -> np.ndarray:
 
 def swatch(height: int, width: int, unit: int = 1) -> np.ndarray:
     """What stands in a legend (``height``, ``width``, 3): the hatching over a middle grey."""
-    return hatch(np.full((height, width, 3), 0.5), np.ones((height, width), bool), unit)
+    return hatch(np.full((height, width, 3), 0.5), np.full((height, width), True), unit)

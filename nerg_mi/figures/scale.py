@@ -34,7 +34,7 @@ def ticks_of(low: float, high: float, most: int, log: bool = False) -> tuple[lis
     digits = max(0, -math.floor(math.log10(gap) + 1e-9)) if gap > 0 else 0
     if gap > 0 and abs(round(gap, digits) - gap) > 1e-6 * gap:
         digits += 1
-    names = [f"{v + 0.0:.{digits}f}" if abs(v) > 1e-12 * span else f"{0:.{digits}f}" for v in values]
+    names = [f"{0.0 if abs(v) < 1e-12 * span else v:.{digits}f}".replace("-", "−") for v in values]
     return [(v - low / unit) / span for v in values], names, "" if power == 0 else f" × {_power(power)}"
 
 

@@ -14,6 +14,7 @@ from .sheet import INK, SMALL, Sheet
 
 _LINES = dict(color="white", alpha=0.3, linewidth=0.6)
 _FINE = 181
+_LEFT = 0.2
 
 
 def sphere_figure(
@@ -59,14 +60,20 @@ def _graticule(axes: Any, projection: Projection, step: int, unit: float) -> Non
     axes.set_ylim(-1, 1)
     # Meridians meet at the poles of some maps: they are numbered where they cross the horizon.
     crossing = projection.forward(np.radians(list(meridians)), np.zeros(len(meridians)))[0]
-    axes.set_xticks(crossing, [f"{d}°" for d in meridians])
+    axes.set_xticks(crossing, [_degrees(d) for d in meridians])
     axes.set_yticks([])
     for degrees in parallels:
         x, y = (float(v) for v in projection.forward(-np.pi, np.radians(degrees)))
+        if x > -_LEFT:
+            continue  # a pole that is a point, where the title is
         where = dict(textcoords="offset points", ha="right", va="center", annotation_clip=False)
-        axes.annotate(f"{degrees}°", (x, y), (-4 * unit, 0), fontsize=SMALL * unit, color=INK, **where)
+        axes.annotate(_degrees(degrees), (x, y), (-4 * unit, 0), fontsize=SMALL * unit, color=INK, **where)
     axes.tick_params(labelsize=SMALL * unit, colors=INK, length=2 * unit, pad=2 * unit)
     axes.set_xlabel("azimuth, to the right of the front", fontsize=SMALL * unit, color=INK, labelpad=2 * unit)
     room = 30 * unit / 72 * axes.figure.dpi / axes.bbox.width
     text = dict(rotation=90, ha="right", va="center", transform=axes.transAxes, fontsize=SMALL * unit, color=INK)
     axes.text(-room, 0.5, "elevation", **text)
+
+
+def _degrees(value: int) -> str:
+    return f"{value}°".replace("-", "−")

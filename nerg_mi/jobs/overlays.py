@@ -108,7 +108,7 @@ def overlay_pictures(
 
         def make(loaded: Any, camera: Any, on_strip: OnStrip) -> Picture:
             _check_memory(path, camera, options)
-            layers = _layers(path, loaded, camera, overlay, options, on_strip)
+            layers = layers_of(path, loaded, camera, overlay, options.spp, options.seed, on_strip)
             limits.append(overlay.limits(layers))
             height, width = layers.mask.shape
             if waits:
@@ -144,12 +144,13 @@ def _check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
         )
 
 
-def _layers(
-    path: Path, loaded: Any, camera: Any, overlay: Overlay, options: PictureOptions, on_strip: OnStrip
+def layers_of(
+    path: Path, loaded: Any, camera: Any, overlay: Overlay, spp: int = 0, seed: int = 0, on_strip: OnStrip | None = None
 ) -> Layers:
+    """What ``camera`` sees of the scene ``loaded`` from ``path`` with the quantity of ``overlay``, and who is there."""
     asked = list(dict.fromkeys([overlay.name, "opacity", "depth"]))
     with mitsuba_says():
-        found = render_asked(path, loaded, camera, asked, options.spp, options.seed, on_strip)
+        found = render_asked(path, loaded, camera, asked, spp, seed, on_strip)
     marker = observer_pixel(loaded, camera, found.aovs["depth"])
     supported = not overlay.of_gaze or is_supported(loaded, camera)
     return Layers(found.color, found.aovs[overlay.name], found.mask, marker, supported)

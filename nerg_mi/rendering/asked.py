@@ -42,6 +42,18 @@ class AskedLayer:
         return [(radiance, shown, channels)]
 
 
+def nerg_of(path: Path, scene: Any) -> Any:
+    """The integrator of ``scene``, which was read from ``path``. Raises `NergError` where it is not `nerg`."""
+    integrator = scene.integrator()
+    if type(integrator).__name__ != "NergIntegrator":
+        kind = "none" if integrator is None else f'"{integrator.class_name()}"'
+        raise NergError(
+            f'an overlay needs the integrator "nerg", and "{path}" has {kind}; "nerg scene {path} -o new.xml" writes '
+            "one around it"
+        )
+    return integrator
+
+
 def render_asked(
     path: Path,
     scene: Any,
@@ -56,13 +68,7 @@ def render_asked(
     Raises `NergError` for a scene whose integrator is not `nerg`, for AOVs that this cannot compute, and for pictures
     that are made in one piece only (`bands.why_whole`).
     """
-    integrator = scene.integrator()
-    if type(integrator).__name__ != "NergIntegrator":
-        kind = "none" if integrator is None else f'"{integrator.class_name()}"'
-        raise NergError(
-            f'an overlay needs the integrator "nerg", and "{path}" has {kind}; "nerg scene {path} -o new.xml" writes '
-            "one around it"
-        )
+    integrator = nerg_of(path, scene)
     reason = why_whole(scene, sensor)
     if reason is not None:
         raise NergError(f'"{path}" cannot be rendered with an overlay because of {reason}; choose another sensor')

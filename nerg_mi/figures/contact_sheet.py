@@ -1,0 +1,58 @@
+"""Several pictures on one page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .overlay import Heat
+from .plots import add_scale
+from .sheet import Sheet
+
+
+def contact_sheet(
+    pictures: Sequence[np.ndarray],
+    titles: Sequence[str],
+    columns: int | None = None,
+    heat: Heat | None = None,
+    label: str = "",
+    values: Sequence[tuple[Any, Any]] = (),
+    unknown: bool = False,
+) -> Any:
+    """``pictures`` (h, w, 3), display values, each under its title, in rows of ``columns`` (default: about as many as
+    rows); smaller ones lie in the middle of their place.
+
+    ``heat``: the one scale of all, with its ``label``; ``values``: pairs (values, mask) that it explains; ``unknown``:
+    whether some are hatched.
+    """
+    if not pictures:
+        raise ValueError("a contact sheet needs at least one picture")
+    columns = columns or math.ceil(math.sqrt(len(pictures)))
+    height, width = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
+    sheet = Sheet([_padded(p, height, width) for p in pictures], titles, scale=heat is not None, columns=columns)
+    if heat is not None:
+        add_scale(sheet, heat, label, values, unknown)
+    return sheet.page
+
+
+def shrink(picture: Any, width: int) -> np.ndarray:
+    """``picture`` (h, w, 3) at most ``width`` pixels wide: means of squares of whole pixels, so that nothing is
+    invented; what lacks to a square at the right and lower edge is left out."""
+    picture = np.asarray(picture, np.float64)
+    by = max(math.ceil(picture.shape[1] / width), 1)
+    h, w = (max(n // by, 1) for n in picture.shape[:2])
+    if by == 1:
+        return picture
+    some = picture[: h * by, : w * by]
+    return some.reshape(h, some.shape[0] // h, w, some.shape[1] // w, 3).mean(axis=(1, 3))
+
+
+def _padded(picture: np.ndarray, height: int, width: int) -> np.ndarray:
+    out = np.ones((height, width, 3))
+    h, w = picture.shape[:2]
+    top, left = (height - h) // 2, (width - w) // 2
+    out[top : top + h, left : left + w] = picture
+    return out

@@ -1,0 +1,51 @@
+"""How two pictures differ in a quantity: the first less the second."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.figures.colors import find_colors
+from nerg_mi.figures.plots import difference_figure
+from nerg_mi.jobs.options import option
+from nerg_mi.jobs.reporter import Reporter
+
+from .files import read_stored
+from .kind import Drawing, Kind
+
+
+@dataclass(frozen=True, kw_only=True)
+class DifferenceOptions:
+    """How a difference is drawn."""
+
+    channel: str = option("gaze", "Channel of both files.")
+    top: float | None = option(None, "Both ends of the scale.  [default: the 99.5th percentile]")
+    cmap: str = option("RdBu_r", "Colour map: RdBu_r, PuOr_r, BrBG_r, PRGn_r.")
+
+
+def draw(files: Sequence[Path], options: DifferenceOptions, reporter: Reporter) -> Drawing:
+    """The first of two files less the second."""
+    find_colors(options.cmap, diverging=True)
+    if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
+        raise NergError(f"--top must be positive, got {options.top}")
+    if len(files) != 2:
+        raise NergError(f"a difference is of two pictures, and {len(files)} were given; name two .exr files")
+    first, second = (read_stored(path, options.channel) for path in files)
+    if first.values.shape != second.values.shape:
+        sizes = " and ".join(f"{v.shape[1]} x {v.shape[0]}" for v in (first.values, second.values))
+        raise NergError(f"pictures of {sizes} pixels cannot be compared; render both with one size")
+    name, mask = options.channel.partition(".")[0], first.mask & second.mask
+    title = f"{files[0].stem} less {files[1].stem}"
+    unit = " [1/sr]" if name in ("gaze", "kde", "gaze_std") else ""
+    label = f"difference of {name}{unit}"
+    figure = difference_figure(first.values, second.values, mask, title, label, options.top, options.cmap)
+    return Drawing(figure, list(files))
+
+
+KIND = Kind(
+    "difference", "A quantity of one picture less that of another.", "two pictures (.exr)", 2, DifferenceOptions, draw
+)

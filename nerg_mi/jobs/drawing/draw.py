@@ -1,0 +1,80 @@
+"""A figure of any kind, drawn and written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.saving import FORMATS, save
+from nerg_mi.files.atomic import check_writable
+from nerg_mi.jobs.reporter import SILENT, Reporter
+
+from .kind import Kind
+from .registry import find_kind
+
+FileName = str | os.PathLike
+
+
+def draw(
+    kind: str,
+    files: FileName | Sequence[FileName],
+    output: FileName | None = None,
+    reporter: Reporter = SILENT,
+    **options: Any,
+) -> Any:
+    """The figure of matplotlib that the command ``nerg draw KIND FILES`` draws, with its options as keywords.
+
+    ``output``: where it is written, too (.png or .svg). Raises `NergError` for what the user can mend.
+    """
+    chosen = find_kind(kind)
+    types = {f.name: str(f.type) for f in fields(chosen.options)}
+    unknown = next((name for name in options if name not in types), None)
+    if unknown is not None:
+        raise NergError(f'a figure "{kind}" has no option "{unknown}"; it has {", ".join(types)}')
+    options = {k: Path(v) if isinstance(v, str) and "Path" in types[k] else v for k, v in options.items()}
+    several = [files] if isinstance(files, (str, os.PathLike)) else files
+    return draw_kind(
+        chosen,
+        [Path(f) for f in several],
+        None if output is None else Path(output),
+        chosen.options(**options),
+        reporter,
+    )
+
+
+def draw_kind(kind: Kind, files: Sequence[Path], output: Path | None, options: Any, reporter: Reporter = SILENT) -> Any:
+    """The figure of ``kind`` of ``files``, with an object of its ``options``; written to ``output``, with its
+    provenance, where that is given."""
+    if output is not None:
+        check_writable(output, *FORMATS)
+    if not 1 <= len(files) <= kind.most:
+        raise NergError(f'a figure "{kind.name}" is drawn of 1 to {kind.most} files, and {len(files)} were given')
+    for path in files:
+        if not path.exists():
+            raise MissingFile(f'there is no file "{path}".')
+    made = kind.draw(files, options, reporter)
+    if output is not None:
+        about = provenance(f"nerg draw {kind.name}", _inputs(made.inputs, options), made.seed, options)
+        save(made.figure, output, about)
+        reporter.message(f"Wrote {output} ({' x '.join(f'{v:.0f}' for v in made.figure.bbox.size)}).")
+    return made.figure
+
+
+def _inputs(paths: Sequence[Path], options: Any) -> list[Path]:
+    """The files that were read: of a scene those that it names, too, and of a folder all that are in it."""
+    from nerg_mi.rendering.scene_file import files_of_scene
+
+    found: list[Path] = []
+    for path in paths:
+        if path.suffix.lower() == ".xml":
+            found += files_of_scene(path, getattr(options, "defaults", None))
+        elif path.is_dir():
+            found += sorted(f for f in path.rglob("*") if f.is_file())
+        else:
+            found.append(path)
+    return found

@@ -1,0 +1,40 @@
+"""Pictures in files: colour, and quantities that were rendered with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.exr import read_exr
+from nerg_mi.rendering.channels import SURFACE
+
+EXR = ".exr"
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """Linear ``color`` (h, w, 3), the ``values`` (h, w) of a quantity, and where there is a surface, ``mask`` (h, w)
+    bool: everywhere, for a file without opacity."""
+
+    color: np.ndarray
+    values: np.ndarray
+    mask: np.ndarray
+
+
+def read_stored(path: Path, channel: str) -> Stored:
+    """The EXR file ``path`` with the quantity ``channel``, "gaze" or "gaze.Y". Raises `NergError` for other files and
+    for one that has no such channel."""
+    if path.suffix.lower() != EXR:
+        raise NergError(f'"{path}" holds no quantities, which an EXR file does; give one that "nerg render" wrote')
+    found = read_exr(path, "picture")
+    values = next((found[name] for name in found if channel in (name, name.partition(".")[0])), None)
+    if values is None:
+        raise NergError(f'"{path}" has no "{channel}"; it has {", ".join(found)}')
+    color = [found[name] for name in "RGB"] if {"R", "G", "B"} <= set(found) else [np.zeros_like(values)] * 3
+    opacity = found.get("opacity.Y")
+    mask = np.ones(values.shape, bool) if opacity is None else opacity >= SURFACE
+    as_floats = lambda array: np.nan_to_num(np.asarray(array, np.float32))
+    return Stored(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask)

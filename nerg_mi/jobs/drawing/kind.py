@@ -1,0 +1,81 @@
+"""A kind of figure: what it is called, which files and options it takes, and how it is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.figures.colors import find_colors
+from nerg_mi.figures.overlay import MOST_DECADES
+from nerg_mi.figures.overlays import Overlay, Style
+from nerg_mi.jobs.options import option
+from nerg_mi.jobs.reporter import Reporter
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A ``figure`` of matplotlib, the files that it was made of (``inputs``), and the ``seed`` of what is random in it,
+    or None."""
+
+    figure: Any
+    inputs: Sequence[Path]
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class Kind:
+    """``name`` and ``summary`` for people; ``takes``: what its files are; ``most``: how many of them at most;
+    ``options``: a dataclass, frozen and of keywords alone, whose fields ``option`` makes (`nerg_mi.jobs.options`);
+    ``draw(files, options, reporter)``. Raises `NergError` for what the user can mend."""
+
+    name: str
+    summary: str
+    takes: str
+    most: int
+    options: type
+    draw: Callable[[Sequence[Path], Any, Reporter], Drawing]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions:
+    """The scale of a figure's values."""
+
+    top: float | None = option(None, "Upper end of the scale, for gaze in 1/sr.  [default: the 99.5th percentile]")
+    cmap: str | None = option(None, "Colour map: inferno, magma, plasma, viridis, cividis.  [default: inferno]")
+    decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.")
+    hatching: bool = option(True, "Hatch where nothing is known.")
+
+    def style(self, title: str | None = None) -> Style:
+        """How overlays are drawn by these options. Raises `NergError` for what cannot be drawn."""
+        if self.top is not None and not (np.isfinite(self.top) and self.top > 0):
+            raise NergError(f"--top must be positive, got {self.top}")
+        if not 0 <= self.decades <= MOST_DECADES:
+            raise NergError(f"--decades must be from 0 (a linear scale) to {MOST_DECADES:.0f}, got {self.decades}")
+        if self.cmap is not None:
+            find_colors(self.cmap)
+        return Style(self.cmap, self.decades, self.hatching, title)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(ScaleOptions):
+    """How a scene file is rendered for a figure."""
+
+    defaults: Mapping[str, str] | None = option(None, "Values for $KEYs and <default>s of the scene, by name.")
+    spp: int = option(0, "Samples a pixel; 0: as the scene says.", min=0)
+    seed: int = option(0, "Seed of the random numbers.", min=0)
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+
+
+def need_scale(overlay: Overlay, limits: Any) -> None:
+    """Raise `NergError` where ``overlay`` has nothing to take a scale from."""
+    if limits is None and overlay.scaled:
+        raise NergError(
+            f'"{overlay.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
+        )
