@@ -13,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.saving import save
+from nerg_mi.figures.sheet import new_page
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.png import write_figure
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.recipes import gaze_recipe
@@ -186,12 +188,9 @@ def write_ablation(folder: Path, rows: list[dict], notes: str) -> list[Path]:
 
 def _plot(summary: list[dict], path: Path) -> None:
     """Bars of the relative losses on training and on held-out positions, a pair a variant."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axis = plt.subplots(figsize=(1.5 + 1.0 * len(summary), 4), layout="constrained")
+    figure = new_page(180 + 120 * len(summary), 480)
+    figure.set_layout_engine("constrained")
+    axis = figure.subplots()
     x = np.arange(len(summary))
     for side, shift, colour in (("train", -0.2, "#9db7d5"), ("test", 0.2, "#2f5f93")):
         bars = [r.get(f"{side}_relative", np.nan) for r in summary]
@@ -202,5 +201,4 @@ def _plot(summary: list[dict], path: Path) -> None:
     axis.set_xticks(x, [f"{r['variant']}\n({r['recipe']})" for r in summary], fontsize=8, rotation=30, ha="right")
     axis.set_ylabel("KLD + (1 - CC) + MAE, emit_capture = 1")
     figure.legend(loc="outside upper right", ncols=2)
-    write_figure(path, figure, dpi=120)
-    plt.close(figure)
+    save(figure, path, provenance("nerg ablate"))

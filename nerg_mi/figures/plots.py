@@ -77,7 +77,7 @@ def visibility_figure(color, visibility, mask, title: str = "Visible to the obse
     sheet = Sheet([_hatched(hidden + v * (srgb(color) - hidden), unknown)], [title], scale=True)
     grey = np.linspace(0, 1, _STEPS)[:, None]
     strip = HIDDEN * 0.8 + grey * (0.85 - HIDDEN * 0.8)
-    sheet.bar(strip, 0.0, 1.0, "visibility (0 hidden, 1 visible)", unknown=bool(unknown.any()))
+    sheet.bar(strip, 0.0, 1.0, "0 hidden, 1 visible", unknown=bool(unknown.any()))
     return sheet.page
 
 
@@ -146,4 +146,5 @@ def mark_observer(sheet: Sheet, panel: int, at: tuple[float, float]) -> None:
 
 
 def _hatched(shown, unknown) -> np.ndarray:
-    return hatch(shown, unknown) if np.any(unknown) else shown
+    """``shown`` (h, w, 3), hatched over a middle grey where ``unknown`` (h, w)."""
+    return hatch(np.where(np.asarray(unknown)[..., None], 0.5, shown), unknown) if np.any(unknown) else shown

@@ -9,7 +9,7 @@ _SUPER = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def ticks_of(low: float, high: float, most: int, log: bool = False) -> tuple[list[float], list[str], str]:
     """``(places, names, factor)``: where ticks stand on a scale from 0 (``low``) to 1 (``high``), what is written
-    there, and what belongs behind the unit, such as " × 10⁻⁶" of values that are so small. About ``most`` of them;
+    there, and what belongs before the unit, such as "10⁻⁶" of values that are so small. About ``most`` of them;
     ``log``: at powers of ten of a logarithmic scale."""
     from matplotlib.ticker import MaxNLocator
 
@@ -35,7 +35,7 @@ def ticks_of(low: float, high: float, most: int, log: bool = False) -> tuple[lis
     if gap > 0 and abs(round(gap, digits) - gap) > 1e-6 * gap:
         digits += 1
     names = [f"{0.0 if abs(v) < 1e-12 * span else v:.{digits}f}".replace("-", "−") for v in values]
-    return [(v - low / unit) / span for v in values], names, "" if power == 0 else f" × {_power(power)}"
+    return [(v - low / unit) / span for v in values], names, "" if power == 0 else _power(power)
 
 
 def _power(p: int) -> str:

@@ -26,6 +26,7 @@ SMALL, TITLE = 8, 10
 USUAL = 700.0
 _LEAST = 150  # pixels: the room that a title and a scale need
 _PER_POINT = DPI / 72
+_HAIR = 1e-6
 _WIDE = 0.62  # mean width of a letter, in sizes of the text
 _BAR, _GAP, _EDGE, _TIP, _SIDE = 14, 12, 10, 9, 104
 
@@ -33,7 +34,9 @@ _BAR, _GAP, _EDGE, _TIP, _SIDE = 14, 12, 10, 9, 104
 def new_page(width: float, height: float) -> Any:
     """An empty figure of matplotlib of so many pixels, which notebooks show by themselves; pyplot, and with it any
     window, stays out of it."""
-    return _page_type()(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
+    # Inches times dots an inch must not fall short of a whole pixel.
+    size = (width + _HAIR) / DPI, (height + _HAIR) / DPI
+    return _page_type()(figsize=size, dpi=DPI, facecolor=PAPER)
 
 
 @functools.cache
@@ -136,11 +139,12 @@ class Sheet:
         axes.set_xticks([])
         axes.yaxis.tick_right()
         axes.yaxis.set_label_position("right")
-        places, names, factor = ticks_of(low, high, max(int(long / (36 * unit)), 2), log)
+        places, names, factor = ticks_of(low, high, int(np.clip(long / (26 * unit), 3, 9)), log)
         axes.set_yticks(places, names)
         axes.tick_params(labelsize=SMALL * unit, colors=INK, length=2 * unit, width=0.6 * unit, pad=2 * unit)
-        text = wrap(label + factor, long, SMALL * unit)
-        axes.set_ylabel(text, fontsize=SMALL * unit, color=INK, labelpad=4 * unit)
+        axes.set_ylabel(
+            wrap(_scaled(label, factor), long, SMALL * unit), fontsize=SMALL * unit, color=INK, labelpad=4 * unit
+        )
         for spine in axes.spines.values():
             spine.set_linewidth(0.6 * unit)
         for shown, end, base, color in ((above, 1 + tip / long, 1.0, strip[-1]), (below, -tip / long, 0.0, strip[0])):
@@ -166,6 +170,13 @@ class Sheet:
             spine.set_linewidth(0.6 * self.unit)
         where = dict(xycoords="axes fraction", textcoords="offset points", va="center", annotation_clip=False)
         axes.annotate(text, (1, 0.5), (5 * self.unit, 0), fontsize=SMALL * self.unit, color=INK, **where)
+
+
+def _scaled(label: str, factor: str) -> str:
+    """``label`` with ``factor`` before its unit."""
+    if not factor:
+        return label
+    return label.replace("[", f"[{factor} ", 1) if "[" in label else f"{label} [{factor}]"
 
 
 def even(pixels: float) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 
 from .atomic import write_bytes
@@ -18,13 +17,6 @@ def encode_png(bitmap) -> bytes:
     stream = mi.MemoryStream()
     bitmap.write(stream, mi.Bitmap.FileFormat.PNG)
     return stream.raw_buffer()
-
-
-def write_figure(path: str | os.PathLike, figure, **options) -> None:
-    """Write a matplotlib figure as PNG; ``options``: those of its ``savefig``. See `atomic.replacing`."""
-    out = io.BytesIO()
-    figure.savefig(out, format="png", **options)
-    write_bytes(path, out.getbuffer())
 
 
 def write_png(path: str | os.PathLike, bitmap) -> None:

@@ -87,7 +87,7 @@ def test_the_plot_has_as_much_room_for_each_variant_however_many_there_are(tmp_p
     from nerg_mi.evaluation import ablation
 
     drawn = []
-    monkeypatch.setattr(ablation, "write_figure", lambda path, figure, **options: drawn.append(figure))
+    monkeypatch.setattr(ablation, "save", lambda figure, path, about: drawn.append(figure))
     many = [dict(rows()[1], variant=f"v{k}") for k in range(9)]
     for count in (3, 6, 9):
         write_ablation(tmp_path, many[:count], "notes")

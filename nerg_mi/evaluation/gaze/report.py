@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.figures.colors import find_colors
+from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.saving import save
+from nerg_mi.figures.sheet import new_page
 from nerg_mi.files.atomic import write_text
-from nerg_mi.files.png import write_figure
 from nerg_mi.files.tables import markdown_table, write_csv, write_json
 from nerg_mi.maths.sphere import Z_UP, latlong_grid
 
@@ -62,28 +65,23 @@ def write_report(folder: Path, rows: list[dict], persons: list[dict], about: dic
 
 def side_by_side(test: GazeTest, methods: dict[str, Baseline], path: Path, count: int = 4, height: int = 48) -> None:
     """Truth and each of ``methods`` at ``count`` test positions, as panoramas (z up) on one scale a row, in 1/sr."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     d, _ = latlong_grid(2 * height, height, Z_UP)
     which = np.unique(np.linspace(0, len(test.centres) - 1, count).astype(int))
     near = np.argmax(test.directions @ d.T, axis=0)  # the truth is smooth at the scale of its directions
     pictures = [("truth", test.truth[which][:, near])] + [
         (k, np.asarray(m(test.centres[which], d))) for k, m in methods.items()
     ]
-    figure, axes = plt.subplots(
-        len(which), len(pictures), figsize=(3.4 * len(pictures), 1.9 * len(which)), squeeze=False, layout="constrained"
-    )
+    figure = new_page(374 * len(pictures), 209 * len(which))
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots(len(which), len(pictures), squeeze=False)
     for i, row in enumerate(axes):
         top, images = np.quantile(pictures[0][1][i], 0.995), []
         for (name, maps), axis in zip(pictures, row):
-            images.append(axis.imshow(maps[i].reshape(height, 2 * height), vmin=0, vmax=top, cmap="inferno"))
+            shown = maps[i].reshape(height, 2 * height)
+            images.append(axis.imshow(shown, vmin=0, vmax=top, cmap=find_colors("inferno")))
             axis.set(xticks=[], yticks=[])
             if i == 0:
                 axis.set_title(name, fontsize=10)
         row[0].set_ylabel(", ".join(f"{x:.1f}" for x in test.centres[which[i]]) + " m", fontsize=8)
         figure.colorbar(images[-1], ax=row.tolist(), shrink=0.9).set_label("1/sr", fontsize=8)
-    write_figure(path, figure, dpi=110)
-    plt.close(figure)
+    save(figure, path, provenance("nerg eval gaze"))

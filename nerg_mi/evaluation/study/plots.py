@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.files.png import write_figure
+from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.saving import save
+from nerg_mi.figures.sheet import new_page
 
 from .settings import PAPER
 from .tables import comparable
@@ -24,12 +26,9 @@ FLOOR = 1e-9
 def plot_errors(path: Path, rows: list[dict], title: str) -> None:
     """Four panels of error against seconds, a colour a factor, the front as a line, the paper's marching as crosses."""
     import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator
 
-    figure = Figure(figsize=(9.6, 7.2), dpi=100)
-    FigureCanvasAgg(figure)
+    figure = new_page(960, 720)
     able = [r for r in rows if comparable(r)]
     groups = list(dict.fromkeys(r["group"] for r in able))
     colors = matplotlib.colormaps["tab20"](np.linspace(0, 1, 20))[: len(groups)]
@@ -65,16 +64,12 @@ def plot_errors(path: Path, rows: list[dict], title: str) -> None:
     figure.suptitle(title, fontsize=10)
     figure.legend(handles.values(), handles, loc="lower center", ncol=6, fontsize=7, frameon=False)
     figure.tight_layout(rect=(0, 0.06, 1, 1))
-    write_figure(path, figure, metadata={"Software": None}, pil_kwargs={"optimize": True})
+    save(figure, path, provenance("nerg study"))
 
 
 def plot_scaling(path: Path, rows: list[dict], title: str) -> None:
     """Seconds against pixels, samples a pixel and extent, log-log, with the exponent of the upper half of each."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.6, 3.2), dpi=100)
-    FigureCanvasAgg(figure)
+    figure = new_page(960, 320)
     names = {"pixels": "pixels", "samples": "samples a pixel", "extent": "extent of the scene at equal step"}
     varied = [axis for axis in names if any(r["axis"] == axis for r in rows)]
     for axes, axis in zip(figure.subplots(1, len(varied)), varied):
@@ -88,7 +83,7 @@ def plot_scaling(path: Path, rows: list[dict], title: str) -> None:
         axes.grid(True, which="major", color="0.9", linewidth=0.6)
     figure.suptitle(title, fontsize=10)
     figure.tight_layout()
-    write_figure(path, figure, metadata={"Software": None}, pil_kwargs={"optimize": True})
+    save(figure, path, provenance("nerg study"))
 
 
 def exponent(x, y) -> float:

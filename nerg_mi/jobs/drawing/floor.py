@@ -150,11 +150,4 @@ def _ahead(rays: Rays, some: np.ndarray) -> np.ndarray:
     return rays.origin[some, :2] + _REACH * rays.direction[some, :2]
 
 
-KIND = Kind(
-    "floor",
-    "The floor plan of rays in their place.",
-    "file of rays (.npz)",
-    1,
-    FloorOptions,
-    draw,
-)
+KIND = Kind("floor", "The floor plan of rays in their place.", "file of rays (.npz)", 1, FloorOptions, draw)

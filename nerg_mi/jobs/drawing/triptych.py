@@ -82,11 +82,4 @@ def _own_camera(observer: Any, camera: Any) -> Any:
     return mi.load_dict(own)
 
 
-KIND = Kind(
-    "triptych",
-    "Occlusion: three views of a gaze.",
-    "scene file (.xml)",
-    1,
-    TriptychOptions,
-    draw,
-)
+KIND = Kind("triptych", "Occlusion: three views of a gaze.", "scene file (.xml)", 1, TriptychOptions, draw)

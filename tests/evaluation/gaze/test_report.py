@@ -65,7 +65,7 @@ def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
     centres = np.arange(15.0).reshape(5, 3)
     truth = np.exp(3 * d @ np.array([1.0, 0, 0])) * np.arange(1, 6)[:, None]
     test, drawn = SimpleNamespace(centres=centres, directions=d, truth=truth), []
-    monkeypatch.setattr(gaze_report, "write_figure", lambda path, figure, **options: drawn.append(figure))
+    monkeypatch.setattr(gaze_report, "save", lambda figure, path, about: drawn.append(figure))
     asked = []
 
     def twice(positions, directions):

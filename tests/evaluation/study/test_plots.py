@@ -14,7 +14,7 @@ from nerg_mi.evaluation.study import plots as study_plots
 @pytest.fixture
 def drawn(monkeypatch):
     figures = []
-    monkeypatch.setattr(study_plots, "write_figure", lambda path, figure, **options: figures.append(figure))
+    monkeypatch.setattr(study_plots, "save", lambda figure, path, about: figures.append(figure))
     return figures
 
 
