@@ -30,7 +30,4 @@ def write_png(path, display, text: dict[str, str] | None = None) -> None:
     """Write display values (h, w, 3) in 0..1 as an 8-bit PNG. ``text``: what its header says (tEXt chunks)."""
     import mitsuba as mi
 
-    bitmap = mi.Bitmap(to_bytes(display))
-    for key, value in (text or {}).items():
-        bitmap.metadata()[key] = value
-    png.write_png(path, bitmap)
+    png.write_png(path, mi.Bitmap(to_bytes(display)), text)

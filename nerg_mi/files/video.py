@@ -19,7 +19,7 @@ CODEC = "libx264"
 _QUALITY = "17"  # x264's constant rate factor: no difference is seen from about 18 down
 _MOST_FPS = 1000.0
 _LEAST, _MOST = 16, 8192
-_NAMES = {"Software": "encoder", "Comment": "comment", "Title": "title"}
+_NAMES = {"Software": "artist", "Comment": "comment", "Title": "title"}
 
 
 def check_video(fps: float) -> None:

@@ -36,10 +36,7 @@ def picture_rows(
     with replacing(path) as temporary:
         display = DisplayRows(width, height)
         yield display.add
-        bitmap = display.bitmap()
-        for key, value in (text or {}).items():
-            bitmap.metadata()[key] = value
-        temporary.write_bytes(encode_png(bitmap))
+        temporary.write_bytes(encode_png(display.bitmap(), text))
 
 
 class DisplayRows:

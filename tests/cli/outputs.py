@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.files.exr import write_exr
 from nerg_mi.rays.rays import Rays
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.figures.standins import write_standins
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
+from tests.jobs.drawing.scenes import write_scene
 from tests.plugins import fields
 from tests.reference.torch_ngp_numpy import nerf_state
 
@@ -69,6 +71,14 @@ CASES = (
         "{i}/ball.xml -o {o}/a.png -m llvm_ad_rgb --frames {i}/frames.csv --overlay depth",
         ("a_0001.png", "a_0002.png"),
     ),
+    Case("render", "{i}/ball.xml -o {o}/a.svg -m llvm_ad_rgb --overlay depth", ("a.svg",)),
+    Case("render", "{i}/ball.xml -o {o}/a.mp4 -m llvm_ad_rgb --frames {i}/frames.csv --overlay depth", ("a.mp4",)),
+    Case("draw floor", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
+    Case("draw floor", "{i}/rays.npz -o {o}/a.svg --scene {i}/ball.xml -m llvm_ad_rgb", ("a.svg",)),
+    Case("draw sheet", "{i}/a.exr {i}/b.exr -o {o}/a.png --overlay gaze", ("a.png",)),
+    Case("draw difference", "{i}/a.exr {i}/b.exr -o {o}/a.svg", ("a.svg",)),
+    Case("draw sphere", "{i}/watched/gaze.xml -o {o}/a.png -m llvm_ad_rgb --width 64 --spp 1", ("a.png",)),
+    Case("draw triptych", "{i}/watched/gaze.xml -o {o}/a.png -m llvm_ad_rgb --spp 1", ("a.png",)),
     Case("scene", "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none", ("a.xml",)),
     Case("scene", "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb", ("a.xml", "a.vol", "a.color.vol")),
     Case(
@@ -150,6 +160,11 @@ READS_ONLY = {"doctor", "rays guess", "rays show"}
 INPUTS = {
     "scene": {"files", "photos", "align"},
     "render": {"scene", "frames"},
+    "draw sphere": {"files"},
+    "draw triptych": {"files"},
+    "draw floor": {"files", "scene"},
+    "draw sheet": {"files"},
+    "draw difference": {"files"},
     "align": {"rays", "field", "scene", "surface", "pairs", "twin", "cameras", "place_cameras", "start"},
     "rays import": {"files", "salt", "poses", "place"},
     "rays guess": {"file"},
@@ -189,6 +204,9 @@ def make_inputs(folder: Path) -> Path:
     (folder / "day.csv").write_text("\n".join(["t,p,x,y,z,a,b,c", *rows]))
     pairs = "x,y,z,place_x,place_y,place_z\n0,0,0,1,0,0\n1,0,0,2,0,0\n0,1,0,1,1,0\n0,0,1,1,0,1\n"
     (folder / "pairs.csv").write_text(pairs)
+    write_scene(folder / "watched", "gaze.xml")
+    for k, name in enumerate("ab"):
+        write_exr(folder / f"{name}.exr", {"gaze.Y": np.full((12, 16), 1.0 + k, np.float32)})
     rays: Rays = crowd(3000)
     rays.save(folder / "rays.npz")
     fields.radiance(folder / "field.safetensors")

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from nerg_mi.files.png import write_png
 
@@ -39,3 +40,13 @@ def test_a_picture_that_does_not_fit_leaves_the_old_one(tmp_path):
     done = subprocess.run([sys.executable, "-c", _LIMITED, str(path)], capture_output=True, text=True, env=env)
     assert done.returncode == 1 and "largest size" in done.stderr
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["a.png"]
+
+
+def test_text_by_another_library(tmp_path, rgb):
+    image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+    text = {"Comment": '{"a": "b"}', "Title": "Läden", "Author": "Łukasz 店"}
+    write_png(tmp_path / "a.png", picture(rgb), text)
+    with image.open(tmp_path / "a.png") as found:
+        found.load()
+        assert found.text == text
+        np.testing.assert_array_equal(np.asarray(found), np.array(picture(rgb)))

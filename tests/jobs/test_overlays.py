@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import top_of
+from nerg_mi.files.atomic import write_bytes
+from nerg_mi.jobs import overlays
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.pictures import render_file
 from nerg_mi.rendering.asked import render_asked
@@ -94,6 +99,77 @@ def test_a_sequence_without_an_overlay(rgb, scene, tmp_path):
     assert shares == sorted(shares) and shares[-1] == 1 and "2 pictures" in told.messages[0]
 
 
+def decoded(av, path):
+    with av.open(str(path)) as found:
+        frames = [f.reformat(format="rgb24", src_colorspace="ITU709").to_ndarray() for f in found.decode(video=0)]
+        return found.metadata, float(found.streams.video[0].average_rate), frames
+
+
+@pytest.mark.parametrize("top", [None, 3.0])
+def test_a_video_has_the_pictures_of_the_sequence(rgb, scene, tmp_path, top, monkeypatch):
+    av = pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[video]")')
+    kept = []
+    monkeypatch.setattr(overlays, "write_bytes", lambda path, *parts: kept.append(path) or write_bytes(path, *parts))
+    options = PictureOptions(overlay="gaze", frames=scene.with_name("walk.csv"), top=top, mode=MODE)
+    render_file(scene, tmp_path / "walk.png", options)
+    # With a scale that is given no picture waits for the others.
+    assert len(kept) == (0 if top else 2)
+    made = render_file(scene, tmp_path / "walk.mp4", replace(options, fps=5.0))
+    metadata, rate, frames = decoded(av, made.path)
+    assert made.files == (tmp_path / "walk.mp4",) and rate == 5 and len(frames) == 2
+    for k, frame in enumerate(frames):
+        picture = np.array(mitsuba_bitmap(tmp_path / f"walk_000{k + 1}.png").convert(rgb.Bitmap.PixelFormat.RGB))
+        assert frame.shape == picture.shape and np.abs(frame.astype(int) - picture).mean() < 3
+    about = json.loads(metadata["comment"])
+    assert about["settings"]["fps"] == 5.0 and set(about["inputs"]) == {
+        "scene.xml",
+        "walk.csv",
+        "field.safetensors",
+        "gaze.safetensors",
+    }
+    assert str(tmp_path) not in str(metadata) and str(scene.parent) not in str(metadata)
+
+
+def test_a_video_of_the_colour(rgb, scene, tmp_path):
+    av = pytest.importorskip("av", reason='PyAV is not installed (pip install "nerg-mi[video]")')
+    options = PictureOptions(frames=scene.with_name("walk.csv"), mode=MODE, defaults={"size": "16"})
+    with pytest.raises(NergError, match="18 x 15 pixels, and a video that plays everywhere needs even sides"):
+        render_file(scene, tmp_path / "odd.mp4", replace(options, defaults={"size": "15"}))
+    assert not list(tmp_path.iterdir())
+    _, rate, frames = decoded(av, render_file(scene, tmp_path / "walk.mp4", options).path)
+    assert rate == 25 and [f.shape for f in frames] == [(16, 18, 3)] * 2
+
+
+def test_each_picture_of_a_sequence_says_its_own_values(rgb, scene, tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+    made = render_file(scene, tmp_path / "walk.png", PictureOptions(frames=scene.with_name("walk.csv"), mode=MODE))
+    eyes = []
+    for path in made.files:
+        with image.open(path) as found:
+            eyes.append(json.loads(found.text["Comment"])["settings"]["defaults"]["eye"])
+    assert eyes == ["0.2, 0.1, -2.5", "-1.5, 0.4, -2"]
+
+
+def test_hatched_where_no_surface_is(rgb, scene, tmp_path):
+    """The picture within the page, against the opacity that the scene itself renders."""
+    made = render_file(scene, tmp_path / "a.png", PictureOptions(overlay="gaze", top=1.0, mode=MODE))
+    plain = render_file(scene, tmp_path / "b.png", PictureOptions(overlay="gaze", top=1.0, hatching=False, mode=MODE))
+    loaded = load_scene(scene)
+    mask = render_asked(scene, loaded, loaded.sensors()[0], ["gaze", "opacity"]).mask
+    assert 0 < mask.sum() < mask.size
+    a, b = (np.array(mitsuba_bitmap(m.path)).astype(int)[..., :3] for m in (made, plain))
+    # Each pixel is a square of 9 x 9; the scale and its legend lie to the right of the picture.
+    differ = np.any(a != b, axis=-1)[:, : 10 + 9 * 18]
+    rows, columns = np.nonzero(differ)
+    shown = differ[rows.min() :, 10:]
+    found = np.zeros(mask.shape, bool)
+    first = int(np.flatnonzero((~mask).any(axis=1))[0])
+    for y in range(first, mask.shape[0]):
+        for x in range(mask.shape[1]):
+            found[y, x] = shown[9 * (y - first) : 9 * (y - first) + 9, 9 * x : 9 * x + 9].mean() > 0.5
+    np.testing.assert_array_equal(found, ~mask)
+
+
 def test_ctrl_c_leaves_whole_pictures(rgb, scene, tmp_path):
     class Impatient(Recorder):
         def progress(self, share, text=""):
@@ -112,8 +188,15 @@ def test_ctrl_c_leaves_whole_pictures(rgb, scene, tmp_path):
     "output, options, said",
     [
         ("a.exr", {"overlay": "gaze"}, r"let its name end in .png"),
+        ("a.svg", {}, '"[^"]*a.svg" holds an overlay; give --overlay'),
+        ("a.mp4", {}, "is a video, and there is one picture; give --frames"),
+        ("a.png", {"fps": 10.0}, "--fps is of a video"),
+        ("a.png", {"cmap": "viridis"}, "--cmap is about an overlay"),
+        ("a.png", {"hatching": False}, "--no-hatching is about an overlay"),
+        ("a.png", {"overlay": "gaze", "cmap": "jet"}, '"jet" is no perceptually uniform'),
+        ("a.png", {"overlay": "gaze", "decades": 99.0}, "--decades must be from 0"),
         ("a.png", {"overlay": "gase"}, 'no overlay "gase"'),
-        ("a.png", {"top": 1.0}, "give --overlay, too"),
+        ("a.png", {"top": 1.0}, "--top is about an overlay, and there is none; give --overlay, too"),
         ("a.png", {"overlay": "gaze", "top": -1.0}, "--top must be positive"),
         ("a.png", {"overlay": "kde"}, '"kde", which needs'),
         ("a.png", {"overlay": "gaze", "memory": 1e-5}, "is drawn in one piece, for which it takes"),

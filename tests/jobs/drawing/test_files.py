@@ -1,0 +1,32 @@
+"""Quantities in EXR files."""
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.exr import write_exr
+from nerg_mi.jobs.drawing.files import read_stored
+
+RNG = np.random.default_rng(0)
+COLOR, GAZE = RNG.random((6, 8, 3)).astype(np.float32), RNG.random((6, 8)).astype(np.float32)
+OPACITY = np.where(np.arange(8) < 3, 0.2, 0.9).astype(np.float32) * np.ones((6, 1), np.float32)
+
+
+def write(path, **more):
+    write_exr(path, {name: COLOR[..., k] for k, name in enumerate("RGB")} | {"gaze.Y": GAZE} | more)
+    return path
+
+
+def test_colour_values_and_mask(tmp_path):
+    found = read_stored(write(tmp_path / "a.exr", **{"opacity.Y": OPACITY}), "gaze")
+    np.testing.assert_array_equal(found.color, COLOR)
+    np.testing.assert_array_equal(found.values, GAZE)
+    np.testing.assert_array_equal(found.mask, np.tile(np.arange(8) >= 3, (6, 1)))
+    assert read_stored(write(tmp_path / "b.exr"), "gaze.Y").mask.all()
+
+
+def test_what_is_refused(tmp_path):
+    with pytest.raises(NergError, match='has no "depth"; it has R, G, B, gaze.Y'):
+        read_stored(write(tmp_path / "a.exr"), "depth")
+    with pytest.raises(NergError, match="holds no quantities"):
+        read_stored(tmp_path / "a.png", "gaze")
