@@ -90,10 +90,12 @@ def try_commands(there: Environment, out: Path) -> str:
 def try_missing_extras(there: Environment, out: Path) -> str:
     """The commands that need an extra say its name and how to get it, in one line; how many did."""
     field = there.python("from nerg_mi.jobs.demo import store_scene; print(store_scene().parent / 'store.safetensors')")
+    scene = Path(field).with_name("scene.xml")
     asked = {
         "nerg-mi[mesh]": ("nerg", "export", "mesh", field, "-o", out / "field.ply", "--resolution", 8),
         "nerg-mi[parquet]": ("nerg", "rays", "show", out / "rays.parquet"),
         "nerg-mi[poses]": ("nerg", "poses", out, "-o", out / "capture"),
+        "nerg-mi[video]": ("nerg", "render", scene, "-o", out / "a.mp4", "--frames", out / "frames.csv"),
         "nerg-mi[torch]": ("python", "-c", "import nerg_mi.interop.torch"),
     }
     (out / "rays.parquet").write_bytes(b"PAR1")

@@ -26,7 +26,8 @@ def hatch(display: Any, unknown: Any, unit: int = 1) -> np.ndarray:
     shown = np.asarray(display, np.float64)
     where = np.asarray(unknown, bool)[..., None]
     pale = shown + _MIXED * (PALE - shown)
-    drawn = np.where(lines(*shown.shape[:2], unit)[..., None], LINE, pale)
+    height, width = shown.shape[:2]
+    drawn = np.where(lines(height, width, unit)[..., None], LINE, pale)
     return np.where(where, drawn, shown)
 
 

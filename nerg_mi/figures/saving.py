@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ _OF_SVG = {"Software": "Creator", "Comment": "Description", "Title": "Title"}
 _SALT = "nerg_mi"
 
 
-def save(figure: Any, path: str | Path, about: Provenance | Mapping[str, str] | None = None) -> None:
+def save(figure: Any, path: str | os.PathLike, about: Provenance | Mapping[str, str] | None = None) -> None:
     """Write a matplotlib figure as .png, or as .svg with its pictures embedded and all else as lines and text.
 
     ``about``: what its header says, names of PNG's texts (such as ``Comment``) in a mapping; no time is in it, so that

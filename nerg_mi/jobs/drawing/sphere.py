@@ -53,7 +53,7 @@ def draw(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> D
     assert limits is not None
     heat = Heat(limits[1], style.colors or "inferno", decades=style.decades)
     integral = float((seen.values.astype(np.float64) * pixel_solid_angles(width, width // 2)).sum())
-    title = f"All that the observer could turn to; the integral is {integral:.3g}"
+    title = f"All that the observer can turn to: integral {integral:.3g}"
     unknown = unknown_of(seen, True) if style.hatched else None
     figure = sphere_figure(seen.color, seen.values, seen.mask, heat, title, options.projection, unknown)
     return Drawing(figure, [path], options.seed)

@@ -57,8 +57,8 @@ def draw(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) ->
     need_scale(overlay, limits)
     assert limits is not None
     heat = Heat(limits[1], style.colors or "inferno", decades=style.decades)
-    parts = [(of.color, of.values, of.mask) for of in (own, without, seen)]
-    return Drawing(occlusion_figure(*parts, heat, marker, style.hatched), [path], options.seed)
+    first, second, third = ((of.color, of.values, of.mask) for of in (own, without, seen))
+    return Drawing(occlusion_figure(first, second, third, heat, marker, style.hatched), [path], options.seed)
 
 
 def _own_camera(observer: Any, camera: Any) -> Any:
@@ -75,7 +75,7 @@ def _own_camera(observer: Any, camera: Any) -> Any:
         "fov_axis": "x",
         "near_clip": camera.near_clip(),
         "far_clip": camera.far_clip(),
-        "to_world": mi.ScalarTransform4f(matrix),
+        "to_world": mi.ScalarTransform4f(matrix.tolist()),
         "film": film(width, height),
         "sampler": sampler_like(camera),
     }
