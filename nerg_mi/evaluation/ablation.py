@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.saving import save
 from nerg_mi.figures.sheet import new_page
 from nerg_mi.files.atomic import write_text
@@ -175,18 +176,18 @@ def table(summary: list[dict]) -> str:
     return markdown_table(head, lines, head[2:]) + "\n"
 
 
-def write_ablation(folder: Path, rows: list[dict], notes: str) -> list[Path]:
+def write_ablation(folder: Path, rows: list[dict], notes: str, about: Provenance | None = None) -> list[Path]:
     """Write ``ablation.md`` (below ``notes``), ``.csv``, ``.json`` and the plot ``.png`` into ``folder``; returns their
     paths."""
     summary, files = summarise(rows), [folder / f"ablation.{e}" for e in ("md", "csv", "json", "png")]
     write_text(files[0], f"{notes}\n\n{table(summary)}")
     write_csv(files[1], rows, COLUMNS)
     write_json(files[2], {"rows": rows, "summary": summary})
-    _plot(summary, files[3])
+    save(_figure(summary), files[3], about)
     return files
 
 
-def _plot(summary: list[dict], path: Path) -> None:
+def _figure(summary: list[dict]) -> Any:
     """Bars of the relative losses on training and on held-out positions, a pair a variant."""
     figure = new_page(180 + 120 * len(summary), 480)
     figure.set_layout_engine("constrained")
@@ -201,4 +202,4 @@ def _plot(summary: list[dict], path: Path) -> None:
     axis.set_xticks(x, [f"{r['variant']}\n({r['recipe']})" for r in summary], fontsize=8, rotation=30, ha="right")
     axis.set_ylabel("KLD + (1 - CC) + MAE, emit_capture = 1")
     figure.legend(loc="outside upper right", ncols=2)
-    save(figure, path, provenance("nerg ablate"))
+    return figure

@@ -17,6 +17,7 @@ from nerg_mi.capture.cameras import Camera, pixel_directions, sensor_dict
 from nerg_mi.capture.images import View
 from nerg_mi.capture.undistort import pinhole, through_lens
 from nerg_mi.errors import NergError
+from nerg_mi.figures.provenance import provenance
 from nerg_mi.figures.tonemap import srgb, write_png
 from nerg_mi.files.atomic import make_folder
 from nerg_mi.maths.color_fit import psnr_of_fitted_half
@@ -192,8 +193,10 @@ def score_views(
     if not views:
         raise NergError("there are no views to score; the data set holds none out, so give --holdout 8 or --train")
     render, rows, depths = Renderer(field, spp), [], []
+    text: dict[str, str] = {}
     if pictures is not None:
         make_folder(pictures)
+        text = provenance("nerg eval radiance", [field], None, {"spp": spp}).text()
     for k, view in enumerate(views):
         seen, truth = render(view.camera, k), view.over(0)
         mask = seen.mask if view.mask is None else seen.mask & view.mask
@@ -203,7 +206,8 @@ def score_views(
         if view.depth is not None:
             depths.append(depth_score(seen.depth, seen.opacity, np.where(mask, view.depth, 0)))
         if pictures is not None:
-            write_png(pictures / f"{Path(view.name).stem}.png", np.concatenate([seen.color, truth], axis=1))
+            both = np.concatenate([seen.color, truth], axis=1)
+            write_png(pictures / f"{Path(view.name).stem}.png", both, text)
         on_view(view.name, *rows[-1][:2])
     known = [d for d in depths if d is not None]
     return ViewScores(

@@ -155,6 +155,9 @@ def _legend_entries(
     if walls is not None:
         found.append((f"cut at {walls.level:g} m", {**square, "color": str(_CUT)}))
         found.append(("lower things", {**square, "color": str(_GREYS[1])}))
+        if np.isnan(walls.height[~walls.cut]).any():
+            edge = dict(color=PAPER, markeredgecolor="0.6", markeredgewidth=0.6)
+            found.append(("nothing below", {**square, **edge}))
     for k, walk in enumerate(walks[:_NAMED]):
         found.append(
             (walk.name if len(walk.name) <= 22 else walk.name[:21] + "…", dict(color=color_of(k), linewidth=1.4))

@@ -7,6 +7,7 @@ that equal inputs give equal files.
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
@@ -16,6 +17,7 @@ from typing import Any
 
 from nerg_mi import __version__
 from nerg_mi.files.checksum import file_sha256
+from nerg_mi.rays.dataset.opening import rays_digest
 
 _PROGRAMS = ("mitsuba", "drjit")
 
@@ -48,7 +50,7 @@ def provenance(
     settings: Any = None,
     known: dict[Path, str] | None = None,
 ) -> Provenance:
-    """That of what is made of the files ``inputs`` by ``settings``.
+    """That of what is made of the files, or datasets of rays, ``inputs`` by ``settings``.
 
     ``settings``: a mapping, or a dataclass of options, of which those are said that differ from their defaults.
     ``known``: checksums by path that need not be computed again; those that are computed are added. Raises `NergError`
@@ -61,11 +63,16 @@ def provenance(
         while name in sums:
             name, number = f"{path.name} ({number})", number + 1
         if path not in known:
-            known[path] = file_sha256(path)
+            known[path] = rays_digest(path) if path.is_dir() else file_sha256(path)
         sums[name] = known[path]
     given = _given(settings)
     given.pop("seed", None)
     return Provenance(what, sums, seed, {k: _plain(v) for k, v in given.items()}, versions())
+
+
+def files_among(*values: Any) -> list[Path]:
+    """Those of ``values`` that name files or folders which are there; others, such as rays in memory, have no name."""
+    return [Path(v) for v in values if isinstance(v, (str, os.PathLike)) and Path(v).exists()]
 
 
 def versions() -> dict[str, str]:
@@ -92,4 +99,4 @@ def _plain(value: Any) -> Any:
         return value.name
     if isinstance(value, str):
         return re.split(r"[/\\]", value)[-1] if re.search(r"[/\\]", value) else value
-    return value if isinstance(value, (bool, int, float)) or value is None else str(value)
+    return value if isinstance(value, (bool, int, float)) or value is None else type(value).__name__

@@ -20,6 +20,7 @@ from nerg_mi.evaluation.frame_time import frame_timer
 from nerg_mi.evaluation.gaze.baselines import Baseline
 from nerg_mi.evaluation.gaze.evaluation import GazeTest, held_out_rays
 from nerg_mi.evaluation.gaze.scores import gaze_field
+from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json
@@ -105,7 +106,8 @@ def ablate(
         )
     ablation.relate(rows)
     notes = _notes(len(centres), len(account["people"]), (len(train), len(data)), options, render is not None)
-    files = ablation.write_ablation(output, rows, notes)
+    made = provenance("nerg ablate", files_among(rays, options.field, options.scene), None, options)
+    files = ablation.write_ablation(output, rows, notes, made)
     for path in files:
         reporter.message(f"wrote {path}")
     return AblationResult(rows, files)

@@ -22,6 +22,7 @@ from nerg_mi.alignment.umeyama import move
 from nerg_mi.capture.upright import turn_to_z
 from nerg_mi.errors import NergError
 from nerg_mi.figures.alignment_figures import alignment_figure
+from nerg_mi.figures.provenance import provenance
 from nerg_mi.figures.saving import save
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.checksum import file_sha256
@@ -86,7 +87,8 @@ def align(
     if output is not None:
         picture = output.with_suffix(".png")
         heads = None if data is None else data.origin
-        save(_figure(fit, target, heads, found), picture)
+        about = provenance("nerg align", _sources(rays, options).values(), None, options)
+        save(_figure(fit, target, heads, found), picture, about)
         found.save(output)
         written = [output, picture]
         reporter.message(f"wrote {output} (look at {picture.name}); next: --align {output}")

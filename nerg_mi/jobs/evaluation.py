@@ -10,6 +10,7 @@ from nerg_mi.evaluation.gaze import evaluation
 from nerg_mi.evaluation.gaze.baselines import standard_baselines
 from nerg_mi.evaluation.gaze.report import side_by_side, write_report
 from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
+from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.dataset.opening import load_rays, rays_digest
@@ -92,7 +93,9 @@ def evaluate_gaze(
         if options.pictures:
             reporter.progress(0.9, "pictures")
             files.append(output / "positions.png")
-            side_by_side(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures)
+            sources = files_among(gaze, rays, options.field, options.scene)
+            made = provenance("nerg eval gaze", sources, seed, options)
+            side_by_side(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures, about=made)
     return GazeEvaluation(rows, persons, split, len(test.centres), len(test.persons), files)
 
 

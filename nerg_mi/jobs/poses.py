@@ -16,6 +16,7 @@ from nerg_mi.capture.structure.reconstruction import Reconstruction, Settings, c
 from nerg_mi.capture.structure.video import copy_frames
 from nerg_mi.errors import NergError, plain
 from nerg_mi.figures.camera_figures import camera_figure
+from nerg_mi.figures.provenance import provenance
 from nerg_mi.figures.saving import save
 from nerg_mi.files.atomic import check_new_folder, make_folder, replacing_folder
 from nerg_mi.files.tables import write_json
@@ -86,7 +87,8 @@ def find_poses(
         report = _report(copies, unregistered, skipped, found, options)
         write_json(folder / "poses.json", report)
         title = f"{len(registered)} of {len(copies)} pictures, {found.points:,} points"
-        save(camera_figure(found.to_world, found.surface, found.colors, title), folder / "poses.png")
+        about = provenance("nerg poses", (folders.images / name for name in sorted(registered)), None, options)
+        save(camera_figure(found.to_world, found.surface, found.colors, title), folder / "poses.png", about)
     result = PosesResult(output, found.parts[0], unregistered, skipped, found.error, found.points, report)
     _tell_result(result, found, options, reporter)
     return result

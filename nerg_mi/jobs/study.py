@@ -12,8 +12,10 @@ from nerg_mi.errors import NergError
 from nerg_mi.evaluation.study import errors, measure, plots, tables
 from nerg_mi.evaluation.study.settings import Setting, settings
 from nerg_mi.evaluation.study.subject import ExactSurfaces, Subject, open_subject
+from nerg_mi.figures.provenance import Provenance, files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.rendering.pictures import activate
+from nerg_mi.rendering.scene_file import files_of_scene
 
 from .options.study import StudyOptions
 from .reporter import SILENT, Reporter
@@ -86,7 +88,8 @@ def run_study(
         "rows": table,
         "scaling": scaling,
     }
-    files = _write(out, subject, report)
+    sources = files_of_scene(scene, options.defaults) if files_among(scene) else []
+    files = _write(out, subject, report, provenance("nerg study", sources, measure.SEED, options))
     for line in tables.summary(report):
         reporter.message(line)
     for path in files:
@@ -123,10 +126,10 @@ def twin_beside(scene: Path) -> ExactSurfaces | None:
     return ExactSurfaces(partial(twin.cast, scene=shapes), partial(twin.visible, scene=shapes))
 
 
-def _write(out: Path, subject: Subject, report: dict) -> list[Path]:
+def _write(out: Path, subject: Subject, report: dict, about: Provenance) -> list[Path]:
     files = tables.write_tables(out, report)
     width, height = report["size"]
     title = f"{subject.name}, {width} x {height}, {report['variant']}"
-    plots.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}")
-    plots.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}")
+    plots.plot_errors(out / "errors.png", report["rows"], f"Error against time: {title}", about)
+    plots.plot_scaling(out / "scaling.png", report["scaling"], f"Cost of the default: {title}", about)
     return [*files, out / "errors.png", out / "scaling.png"]

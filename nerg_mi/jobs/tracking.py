@@ -12,6 +12,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.figures import ray_figures, saving
+from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.files.tables import write_json
 from nerg_mi.rays import splits
@@ -192,7 +193,7 @@ class PlotOptions:
     kind: str = "density"  # "density": rays/m² with mean directions; "layout": each ray's place, with dimensions
     cell: float | None = None  # density: edge of a cell, metres; None: a fiftieth of the plan
     test: Rays | FileName | None = None  # layout: test rays of a split, drawn beside
-    output: FileName | None = None  # picture to write, .png; None: none
+    output: FileName | None = None  # picture to write, .png or .svg; None: none
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -212,7 +213,8 @@ def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions()) -> Fi
         where = {} if test is None else splits.position_of_split(test)
         figure = ray_figures.layout_figure(_load(rays), test, where.get("test_centres"), where.get("radius"))
     if options.output is not None:
-        saving.save(figure, options.output)
+        about = provenance("nerg rays plot", files_among(rays, options.test), None, options)
+        saving.save(figure, options.output, about)
     return figure
 
 

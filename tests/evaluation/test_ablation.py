@@ -91,8 +91,10 @@ def test_the_plot_has_as_much_room_for_each_variant_however_many_there_are(tmp_p
     many = [dict(rows()[1], variant=f"v{k}") for k in range(9)]
     for count in (3, 6, 9):
         write_ablation(tmp_path, many[:count], "notes")
-    widths, heights = np.array([f.get_size_inches() for f in drawn]).T
-    assert widths[1] - widths[0] == widths[2] - widths[1] > 0 and np.ptp(heights) == 0
+    widths, heights = np.round(np.array([f.get_size_inches() for f in drawn]).T, 6)
+    assert (
+        widths[1] - widths[0] == pytest.approx(widths[2] - widths[1]) and widths[1] > widths[0] and np.ptp(heights) == 0
+    )
     # Two bars a variant, of training and of test probes, and their names below.
     (axis,) = drawn[1].axes
     assert len(axis.patches) == 12

@@ -28,7 +28,11 @@ def test_walls_lie_where_they_are():
     grey = image.get_array()[..., 0]
     assert np.all(grey[0] == grey[0, 0]) and grey[0, 0] < 0.3  # the cut is darkest
     assert np.all(grey[1:, 30:] == 1) and grey[15, 15] < grey[5, 5] < 1  # nothing is white; the higher, the darker
-    assert [t.get_text() for t in page.axes[0].get_legend().get_texts()] == ["cut at 1.2 m", "lower things"]
+    assert [t.get_text() for t in page.axes[0].get_legend().get_texts()] == [
+        "cut at 1.2 m",
+        "lower things",
+        "nothing below",
+    ]
 
 
 def test_paths_have_gaps_where_nobody_was_recorded():
@@ -65,7 +69,7 @@ def test_many_people_share_a_legend_and_nothing_overlaps():
     page = floor_figure(LOW, HIGH, walls(), [walk(k) for k in range(20)], title="20 people")
     page.canvas.draw()
     texts = page.axes[0].get_legend().get_texts()
-    assert len(texts) == 11 and texts[-1].get_text() == "and 12 more people"
+    assert len(texts) == 12 and texts[-1].get_text() == "and 12 more people"
     boxes = [t.get_window_extent().extents for t in (*texts, *page.texts)]
     for k, a in enumerate(boxes):
         assert a[0] >= 0 and a[3] <= page.bbox.height and a[2] <= page.bbox.width

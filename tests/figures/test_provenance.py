@@ -12,7 +12,7 @@ import pytest
 
 import nerg_mi
 from nerg_mi.errors import NergError
-from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.jobs.options.pictures import PictureOptions
 
 
@@ -57,3 +57,13 @@ def test_files_of_one_name_and_of_one_path(tmp_path):
 def test_one_that_is_not_there(tmp_path):
     with pytest.raises(NergError, match="gone.xml"):
         provenance("x", [tmp_path / "gone.xml"])
+
+
+def test_files_among_other_things(tmp_path):
+    (tmp_path / "a.csv").write_text("x")
+    assert files_among(tmp_path / "a.csv", str(tmp_path / "a.csv"), None, 3, tmp_path / "gone") == [
+        tmp_path / "a.csv",
+        tmp_path / "a.csv",
+    ]
+    # What has no name is told by its kind alone.
+    assert provenance("x", settings={"rays": object()}).settings == {"rays": "object"}

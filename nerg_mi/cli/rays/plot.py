@@ -12,7 +12,7 @@ from .arguments import RaysFile
 
 def command(
     rays: RaysFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write (.png).")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write (.png or .svg).")],
     kind: Annotated[
         str, typer.Option(help="density: rays/m² with mean directions; layout: each ray's place, with dimensions.")
     ] = "density",

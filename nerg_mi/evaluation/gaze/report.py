@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.figures.colors import find_colors
-from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.saving import save
 from nerg_mi.figures.sheet import new_page
 from nerg_mi.files.atomic import write_text
@@ -63,7 +63,14 @@ def write_report(folder: Path, rows: list[dict], persons: list[dict], about: dic
     return files
 
 
-def side_by_side(test: GazeTest, methods: dict[str, Baseline], path: Path, count: int = 4, height: int = 48) -> None:
+def side_by_side(
+    test: GazeTest,
+    methods: dict[str, Baseline],
+    path: Path,
+    count: int = 4,
+    height: int = 48,
+    about: Provenance | None = None,
+) -> None:
     """Truth and each of ``methods`` at ``count`` test positions, as panoramas (z up) on one scale a row, in 1/sr."""
     d, _ = latlong_grid(2 * height, height, Z_UP)
     which = np.unique(np.linspace(0, len(test.centres) - 1, count).astype(int))
@@ -84,4 +91,4 @@ def side_by_side(test: GazeTest, methods: dict[str, Baseline], path: Path, count
                 axis.set_title(name, fontsize=10)
         row[0].set_ylabel(", ".join(f"{x:.1f}" for x in test.centres[which[i]]) + " m", fontsize=8)
         figure.colorbar(images[-1], ax=row.tolist(), shrink=0.9).set_label("1/sr", fontsize=8)
-    save(figure, path, provenance("nerg eval gaze"))
+    save(figure, path, about)

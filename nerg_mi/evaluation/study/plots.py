@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.saving import save
 from nerg_mi.figures.sheet import new_page
 
@@ -23,7 +23,7 @@ PANELS = (
 FLOOR = 1e-9
 
 
-def plot_errors(path: Path, rows: list[dict], title: str) -> None:
+def plot_errors(path: Path, rows: list[dict], title: str, about: Provenance | None = None) -> None:
     """Four panels of error against seconds, a colour a factor, the front as a line, the paper's marching as crosses."""
     import matplotlib
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator
@@ -64,10 +64,10 @@ def plot_errors(path: Path, rows: list[dict], title: str) -> None:
     figure.suptitle(title, fontsize=10)
     figure.legend(handles.values(), handles, loc="lower center", ncol=6, fontsize=7, frameon=False)
     figure.tight_layout(rect=(0, 0.06, 1, 1))
-    save(figure, path, provenance("nerg study"))
+    save(figure, path, about)
 
 
-def plot_scaling(path: Path, rows: list[dict], title: str) -> None:
+def plot_scaling(path: Path, rows: list[dict], title: str, about: Provenance | None = None) -> None:
     """Seconds against pixels, samples a pixel and extent, log-log, with the exponent of the upper half of each."""
     figure = new_page(960, 320)
     names = {"pixels": "pixels", "samples": "samples a pixel", "extent": "extent of the scene at equal step"}
@@ -83,7 +83,7 @@ def plot_scaling(path: Path, rows: list[dict], title: str) -> None:
         axes.grid(True, which="major", color="0.9", linewidth=0.6)
     figure.suptitle(title, fontsize=10)
     figure.tight_layout()
-    save(figure, path, provenance("nerg study"))
+    save(figure, path, about)
 
 
 def exponent(x, y) -> float:

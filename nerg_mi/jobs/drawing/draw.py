@@ -66,15 +66,13 @@ def draw_kind(kind: Kind, files: Sequence[Path], output: Path | None, options: A
 
 
 def _inputs(paths: Sequence[Path], options: Any) -> list[Path]:
-    """The files that were read: of a scene those that it names, too, and of a folder all that are in it."""
+    """The files that were read: of a scene those that it names, too."""
     from nerg_mi.rendering.scene_file import files_of_scene
 
     found: list[Path] = []
     for path in paths:
         if path.suffix.lower() == ".xml":
             found += files_of_scene(path, getattr(options, "defaults", None))
-        elif path.is_dir():
-            found += sorted(f for f in path.rglob("*") if f.is_file())
         else:
             found.append(path)
     return found

@@ -14,6 +14,7 @@ from nerg_mi.capture.dataset import Dataset
 from nerg_mi.capture.images import View
 from nerg_mi.errors import NergError
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.figures.provenance import provenance
 from nerg_mi.files.png import write_png
 from nerg_mi.interruption import Interruption
 from nerg_mi.training.common.run_state import kept_unless, load_run, save_run
@@ -189,4 +190,4 @@ def write_preview(trainer: RadianceTrainer, view: View, path: Path) -> None:
     every = trainer.pixels_within([view], _LOOK_SAMPLES)
     seen = trainer.render(view, every)
     both = np.concatenate([np.clip(seen.color, 0, 1), view.over(0)[every // 2 :: every, every // 2 :: every]], axis=1)
-    write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)))
+    write_png(path, mi.Bitmap((255 * both + 0.5).astype(np.uint8)), provenance("nerg train radiance").text())
