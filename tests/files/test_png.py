@@ -48,5 +48,6 @@ def test_text_by_another_library(tmp_path, rgb):
     write_png(tmp_path / "a.png", picture(rgb), text)
     with image.open(tmp_path / "a.png") as found:
         found.load()
-        assert found.text == text
+        # Mitsuba adds its version.
+        assert {k: v for k, v in found.text.items() if k != "generated_by"} == text
         np.testing.assert_array_equal(np.asarray(found), np.array(picture(rgb)))
