@@ -12,6 +12,7 @@ from nerg_mi.evaluation.gaze.report import side_by_side, write_report
 from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
 from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.dataset.opening import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
@@ -87,7 +88,15 @@ def evaluate_gaze(
     persons = evaluation.person_rows(test, {k: methods[k] for k in _BY_PERSON}, blind, options.min_rays)
     files = []
     if output is not None:
-        summary = {"gaze": gaze.name, "split": split, "kappa": options.kappa, "positions": len(test.centres)}
+        summary = {
+            "gaze": gaze.name,
+            "gaze_sha256": file_sha256(gaze),
+            "split": split,
+            "kappa": options.kappa,
+            "positions": len(test.centres),
+            "people": len(test.persons),
+            "resamples": options.resamples,
+        }
         notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options)
         files = write_report(output, rows, persons, summary, notes)
         if options.pictures:

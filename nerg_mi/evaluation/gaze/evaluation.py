@@ -149,8 +149,8 @@ def evaluate_gaze(
     ``blind``: the density that bits are counted from. An interval is 1.96 standard errors of the bootstrap either way;
     not its quantiles, since the truth of a resample has fewer persons and narrower peaks, which every map meets worse.
     The resamples are the same for all methods: the last method is the bar, and of the first one the row has ``.less``,
-    how much it is above the bar, with ``.less.low`` and ``.less.high``. With fewer than three persons there are no
-    intervals.
+    how much it is above the bar, with ``.less.low`` and ``.less.high``. The row of every other method has ``.gap``, how
+    much the first method is above it, likewise. With fewer than three persons there are no intervals.
     """
     rng, N = np.random.default_rng(seed), len(test.persons)
     answers = _answers(test, methods, blind)
@@ -177,14 +177,21 @@ def evaluate_gaze(
             reach = 1.96 * np.std([b[k] for b in kept])
             row[f"{k}.low"], row[f"{k}.high"] = float(row[k] - reach), float(row[k] + reach)
         row["integral"] = float(4 * np.pi * maps.mean())
+    for other, kept in zip(rows[1:], boot[1:]):
+        for k in SCORES:
+            other |= _difference(f"{k}.gap", rows[0][k] - other[k], [a[k] - b[k] for a, b in zip(boot[0], kept)])
     if len(rows) > 1:
         for k in SCORES:
-            less = rows[0][k] - rows[-1][k]
-            rows[0][f"{k}.less"] = less
-            if boot[0]:
-                reach = 1.96 * np.std([a[k] - b[k] for a, b in zip(boot[0], boot[-1])])
-                rows[0] |= {f"{k}.less.low": float(less - reach), f"{k}.less.high": float(less + reach)}
+            rows[0] |= {key.replace(".gap", ".less"): v for key, v in rows[-1].items() if key.startswith(f"{k}.gap")}
     return rows
+
+
+def _difference(name: str, value: float, resampled: list[float]) -> dict[str, float]:
+    """``value`` by ``name``, and the ends of its 95 % interval, where it was ``resampled``."""
+    if not resampled:
+        return {name: value}
+    reach = 1.96 * np.std(resampled)
+    return {name: value, f"{name}.low": float(value - reach), f"{name}.high": float(value + reach)}
 
 
 def _answers(

@@ -78,6 +78,9 @@ def test_scores_of_the_truth_and_of_nothing(test_set):
         and best["KLD.less.low"] < best["KLD.less"] < best["KLD.less.high"]
     )
     assert flat["bits.low"] == 0 and flat["KLD.low"] < flat["KLD"] < flat["KLD.high"]
+    for end in ("", ".low", ".high"):
+        assert flat[f"KLD.gap{end}"] == best[f"KLD.less{end}"]
+    assert not any(".gap" in key for key in best)
 
 
 def test_other_rays_are_of_positions_farther_than_two_radii_where_there_are_any(rays):
