@@ -31,6 +31,7 @@ COMMANDS = {
     "align": "Find how tracking lies in a place: from points, a twin, cameras, or the tracking alone.",
     "train": "Train a radiance field on posed photos, or a gaze field on rays.",
     "eval": "Score a trained radiance field on held-out views, or a gaze field on held-out rays.",
+    "report": "Write a report on a gaze field: one HTML file with a verdict, pictures, scores and the place in 3D.",
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
     "export": "Write a radiance field as a mesh, points, grid volumes or a torch-ngp checkpoint.",
     "ablate": "Train every variant of a gaze field alike, and compare them.",

@@ -37,7 +37,7 @@ from .scenes.scene_rays import check_rays, load_scene_rays
 class SceneResult:
     """``path``: the scene; ``files``: all that was written; ``camera``, ``observer``: where they are and what they look
     at, in the place's coordinates (no observer: the camera is it); ``quantity``: the AOV of attention, or None;
-    ``frames``: how many of a walk there are."""
+    ``frames``: how many of a walk there are; ``taken``: names of `<default>`s that another file has taken."""
 
     path: Path
     files: tuple[Path, ...]
@@ -45,6 +45,7 @@ class SceneResult:
     observer: Eye | None
     quantity: str | None
     frames: int = 0
+    taken: frozenset[str] = frozenset()
 
 
 def write_scene(
@@ -115,7 +116,8 @@ def write_scene(
     for path in written:
         reporter.message(f"wrote {path}")
     quantity = text.attention.quantity
-    return SceneResult(output, tuple(written), camera, observer, quantity, 0 if walk is None else len(walk.eyes))
+    count = 0 if walk is None else len(walk.eyes)
+    return SceneResult(output, tuple(written), camera, observer, quantity, count, text.place.taken)
 
 
 @dataclass(frozen=True, eq=False)

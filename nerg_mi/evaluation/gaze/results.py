@@ -19,9 +19,9 @@ _WORD = 200
 
 @dataclass(frozen=True)
 class GazeResults:
-    """``gaze``: name of the scored checkpoint, and its ``sha256`` ("" where it is not known); ``split``; ``positions`` and
-    ``people`` of the test; ``rows``: a row a method, the field's first; ``persons``: a row a method and person; ``kappa``:
-    of the truth's kernel."""
+    """``gaze``: name of the scored checkpoint, and its ``sha256`` ("" where it is not known); ``split``;
+    ``positions`` and ``people`` of the test; ``rows``: a row a method, the field's first; ``persons``: a row a method
+    and person; ``kappa``: of the truth's kernel."""
 
     gaze: str
     sha256: str
@@ -67,7 +67,9 @@ def _rows(given: object, path: str | Path, name: str) -> tuple[dict[str, Any], .
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and -1e300 < value < 1e300 or value != value
+    return (
+        isinstance(value, (int, float)) and not isinstance(value, bool) and -1e300 < value < 1e300
+    ) or value != value
 
 
 def _damaged(path: str | Path, why: str) -> NergError:

@@ -3,18 +3,18 @@
 The rule, for one split:
 
 1. Fewer than `LEAST_PEOPLE` people or `LEAST_POSITIONS` positions give no verdict, whatever the scores are.
-2. The field is compared with three references: the uniform density; the position-blind one, of whose kernels that with
-   the higher log score is taken; and the nearest rays. The scores are the log score (bits a ray), CC and KLD. One of them
-   decides where the 95 % interval of the field's lead leaves out zero.
+2. The field is compared with three references: the uniform density; the position-blind one, of whose kernels that
+   with the higher log score is taken; and the nearest rays. The scores are the log score (bits a ray), CC and KLD.
+   One of them decides where the 95 % interval of the field's lead leaves out zero.
 3. The field is better where at least two of the three scores decide for it and none against it, worse where two decide
    against it and none for it, and undecided otherwise.
-4. Worse than uniform or than position-blind: do not use it. Undecided beside position-blind: not shown to be of use. Better
-   than position-blind: of use, and the nearest rays say whether it is worth a field.
+4. Worse than uniform or than position-blind: do not use it. Undecided beside position-blind: not shown to be of use.
+   Better than position-blind: of use, and the nearest rays say whether it is worth a field.
 
-Intervals are those of the bootstrap over people (`evaluation.evaluate_gaze`), made wider for few: by sqrt(n / (n - 1)),
-since a bootstrap of n people is too narrow by as much, and by Student's quantile of n - 1 degrees of freedom in place of
-1.96 (Hesterberg, What Teachers Should Know About the Bootstrap, 2015). Where only the two methods' own intervals are
-known, the reach of the lead is the sum of theirs, which is never too small.
+Intervals are those of the bootstrap over people (`evaluation.evaluate_gaze`), made wider for few: by sqrt(n / (n -
+1)), since a bootstrap of n people is too narrow by as much, and by Student's quantile of n - 1 degrees of freedom in
+place of 1.96 (Hesterberg, What Teachers Should Know About the Bootstrap, 2015). Where only the two methods' own
+intervals are known, the reach of the lead is the sum of theirs, which is never too small.
 """
 
 from __future__ import annotations
@@ -97,7 +97,8 @@ def judge(rows: Sequence[Mapping[str, Any]], split: str, people: int, positions:
     if people < LEAST_PEOPLE or positions < LEAST_POSITIONS:
         return Verdict(
             "none",
-            f"No verdict for {whom}: {_count(people, 'person', 'people')} at {_count(positions, 'place', 'places')} are "
+            f"No verdict for {whom}: {_count(people, 'person', 'people')} at {_count(positions, 'place', 'places')} "
+            "are "
             f"too few; it takes {LEAST_PEOPLE} people and {LEAST_POSITIONS} places.",
         )
     field, blind = rows[0], _blind(rows)

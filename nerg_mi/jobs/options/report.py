@@ -1,0 +1,39 @@
+"""Options of the report on a gaze field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import option, parse_numbers
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions:
+    """What a report shows. Positions are in the coordinates of the place."""
+
+    objects: Path | None = option(None, 'JSON file of named objects: {"shelf": [[x0, y0, z0], [x1, y1, z1]], ...}.')
+    evaluate: bool = option(
+        False, "Score the field on the rays that were held out of its training (about a minute a split)."
+    )
+    names: bool = option(False, "Show the names of people. Without it they are numbered.")
+    min_persons: int = option(1, "Hide shares of objects that fewer people could see.", min=1)
+    paths: bool = option(True, "Draw people's paths in 3D. How somebody walks can tell who it is.")
+    title: str | None = option(None, "Title.  [default: the gaze field's name]")
+    observer: tuple[float, ...] | None = option(
+        None, "Position of the observer in the pictures, x,y,z.  [default: where most rays are]", parse=parse_numbers
+    )
+    camera_from: tuple[float, ...] | None = option(
+        None, "Position of the camera, x,y,z.  [default: the best overview]", "--from", parse=parse_numbers
+    )
+    camera_to: tuple[float, ...] | None = option(None, "Point that it looks at, x,y,z.", "--to", parse=parse_numbers)
+    fov: float | None = option(None, "Degrees between the left and right border of its picture.  [default: 70]")
+    eyes: int = option(96, "Places of people from which objects are looked for.", min=1, max=10_000)
+    points: int = option(60_000, "Points of the 3D scene at most.", min=100, max=120_000)
+    width: int = option(600, "Width of the pictures in pixels.", min=24, max=1200)
+    spp: int = option(4, "Samples a pixel.", min=1)
+    seed: int = option(0, "Seed of the random numbers.", min=0)
+    threads: int | None = option(None, "CPU threads. Default: all.")
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )

@@ -1,0 +1,1 @@
+"""A report on a gaze field: one HTML file that holds everything it shows and asks no network for anything."""

@@ -1,0 +1,89 @@
+"""How much attention named objects have: by the field, and by the rays; of people, each of whom counts alike.
+
+Intervals are of 95 %, of the mean over people: Student's t with n - 1 degrees of freedom, which for means is what the
+bootstrap over people comes to with many resamples, widened for few (`nerg_mi.evaluation.gaze.verdict.widening`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerg_mi.evaluation.gaze.verdict import widening
+
+from .boxes import Box
+from .glances import Glances
+
+LEAST_PEOPLE = 3
+"""Fewer people than these give no interval."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """A mean share of attention over people, and the 95 % interval of that mean; NaN where people are too few for
+    it."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class ObjectAttention:
+    """Of what is called ``name``: ``field``: the share of gaze that the field says people give it where they stood;
+    ``recorded``: the share of their rays that end at it (None without rays); ``saw``: people who stood somewhere from
+    where it can be seen, and ``looked``: who have a ray on it, of ``people``; None where nobody was recorded."""
+
+    name: str
+    field: Share
+    recorded: Share | None
+    saw: int | None
+    looked: int | None
+    people: int | None
+
+
+def attention_on(
+    boxes: Sequence[Box], glances: Glances, margin: float, recorded: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[ObjectAttention, ...]:
+    """Attention on each of ``boxes``, which are taken to be larger by ``margin`` (scene units) on all sides, for
+    surfaces are known no better.
+
+    ``recorded``: ``(points (N, 3), person (N,))`` of `glances.points_of_rays`, NaN where a ray ends at nothing; without
+    it the eyes are nobody's.
+    """
+    out, who = [], glances.eyes.person
+    for box in boxes:
+        inside = box.holds(glances.points, margin) & glances.met
+        share = np.where(inside, glances.share, 0).sum(axis=1)
+        if recorded is None:
+            out.append(
+                ObjectAttention(box.name, Share(float(share.mean()), math.nan, math.nan), None, None, None, None)
+            )
+            continue
+        points, person = recorded
+        on = box.holds(np.nan_to_num(points, nan=np.inf), margin).astype(float)
+        rays = _each(on, person)
+        saw = _each(inside.any(axis=1).astype(float), who)
+        field, people = mean_over_people(_each(share, who)), len(np.unique(person))
+        seen, looked = int(np.sum(saw > 0)), int(np.sum(rays > 0))
+        out.append(ObjectAttention(box.name, field, mean_over_people(rays), max(seen, looked), looked, people))
+    return tuple(out)
+
+
+def mean_over_people(values: np.ndarray) -> Share:
+    """The mean of ``values`` (N,), one a person, between 0 and 1, and its interval."""
+    mean, n = float(values.mean()), len(values)
+    if n < LEAST_PEOPLE:
+        return Share(mean, math.nan, math.nan)
+    # The bootstrap's standard error of a mean is that of the population: divided by n, not by n - 1.
+    reach = 1.96 * float(values.std()) / math.sqrt(n) * widening(n)
+    return Share(mean, max(mean - reach, 0.0), min(mean + reach, 1.0))
+
+
+def _each(values: np.ndarray, person: np.ndarray) -> np.ndarray:
+    """Mean of ``values`` for each person there is."""
+    _, who, count = np.unique(person, return_inverse=True, return_counts=True)
+    return np.bincount(who, weights=values) / count

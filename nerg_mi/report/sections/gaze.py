@@ -1,0 +1,29 @@
+"""The gaze: pictures of it."""
+
+from __future__ import annotations
+
+from nerg_mi.report.html import Html, element, figure, image, markup, paragraph
+from nerg_mi.report.run import Run
+
+from .protocol import Section
+
+
+def body(run: Run) -> Html:
+    """The overview, and the observer's own view and sphere."""
+    shown = lambda names: [
+        figure(image(p.png, p.alt), p.caption) for p in (run.pictures.get(n) for n in names) if p is not None
+    ]
+    words = (
+        f"{run.observer} Densities are in 1/sr: what a colour stands for, times the solid angle that it covers for the "
+        "observer, is the probability that they look there."
+    )
+    return markup([paragraph(words), *shown(["gaze"]), element("div", shown(["own", "sphere"]), class_="side")])
+
+
+def absent(run: Run) -> str | None:
+    if {"gaze", "own", "sphere"} & set(run.pictures):
+        return None
+    return "There are no pictures of the gaze, for it is nowhere above zero around the observer."
+
+
+SECTION = Section("gaze", "The gaze", body, absent)
