@@ -166,7 +166,7 @@ class _Work:
             eyes = self._eyes(place, scene)
             objects = self._objects(boxes, onlooker, place, eyes)
             top = gaze_top(views)
-            stage, sizes = self._stage(scene, onlooker, place, eyes, boxes, top)
+            stage, sizes = self._stage(scene, onlooker, place, eyes, boxes)
         known = given.scene.kind != "none"
         pictures: dict[str, Picture] = pictures_of_views(views, top, marker, known)
         self._step(0.95, "writing")
@@ -278,13 +278,7 @@ class _Work:
         return attention_on(boxes, glances, MARGIN * self.align.scale, recorded)
 
     def _stage(
-        self,
-        scene: SceneResult,
-        onlooker: Onlooker,
-        place: GazePlace,
-        eyes: Eyes,
-        boxes: Sequence[Box],
-        top: float | None,
+        self, scene: SceneResult, onlooker: Onlooker, place: GazePlace, eyes: Eyes, boxes: Sequence[Box]
     ) -> tuple[str | None, tuple[int, int, int, int]]:
         """The packed 3D scene, None where there are no surfaces, and how many observers, paths, points and boxes it
         has."""
@@ -307,7 +301,7 @@ class _Work:
             return nothing
         paths = paths_of(self.rays, place) if self.rays is not None and o.paths else []
         camera = Camera(np.asarray(scene.camera.origin, float), np.asarray(scene.camera.target, float))
-        packed = pack(Stage(proxy, observers, paths, boxes, up, camera, top or 1.0))
+        packed = pack(Stage(proxy, observers, paths, boxes, up, camera))
         return packed, (len(observers), len(paths), len(proxy.vertices), len(boxes))
 
     def _up(self) -> np.ndarray:

@@ -18,7 +18,7 @@ _WORD = 3
 
 
 class Labels:
-    """ "person 1", "person 2" and so on in place of names: by the number of rays, the most first, and then those who
+    """Numbered people, as in "person 1", in place of names: by the number of rays, the most first, and then those who
     are only named by evaluations."""
 
     def __init__(self, rays: Rays | None, results: Iterable[GazeResults] = ()):
@@ -28,11 +28,16 @@ class Labels:
             names = [rays.persons[i] for i in np.argsort(-count, kind="stable")]
         for found in results:
             names += [str(row["person"]) for row in found.persons if "person" in row]
-        self._label = {name: f"person {k + 1}" for k, name in enumerate(dict.fromkeys(names))}
+        self._number = {name: k + 1 for k, name in enumerate(dict.fromkeys(names))}
+        self._label = {name: f"person {number}" for name, number in self._number.items()}
 
     def of(self, name: str) -> str:
         """What stands for ``name``."""
         return self._label.get(name, "a person")
+
+    def number(self, name: str) -> int:
+        """The number that stands for ``name``, 0 for nobody's."""
+        return self._number.get(name, 0)
 
     def hide(self, text: str) -> str:
         """``text``, such as a file's name, with what stands for people in place of their names: also within words, but
@@ -52,7 +57,13 @@ def rays_without_names(rays: Rays, labels: Labels) -> Rays:
     about["dropped"] = [{**d, "file": number[d.get("file")]} for d in rays.metadata.get("dropped", [])]
     words = ("step", "side", "kept", "of")
     about["steps"] = [{k: step[k] for k in words if k in step} for step in rays.metadata.get("steps", [])]
-    return replace(rays, persons=tuple(labels.of(name) for name in rays.persons), metadata=about)
+    # In the order of the labels, since that of names or files can be guessed.
+    order = sorted(range(len(rays.persons)), key=lambda i: labels.number(rays.persons[i]))
+    code = np.empty(len(order), np.int32)
+    code[order] = np.arange(len(order))
+    return replace(
+        rays, person=code[rays.person], persons=tuple(labels.of(rays.persons[i]) for i in order), metadata=about
+    )
 
 
 def results_without_names(found: GazeResults, labels: Labels) -> GazeResults:

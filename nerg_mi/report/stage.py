@@ -1,7 +1,7 @@
 """The embedded 3D scene: what the page's own viewer (``viewer.js``) draws, packed into a few bytes a point.
 
 Positions are 16 bits an axis of the points' box, normals and colours 8 bits a component, gaze the square root of its
-share of a common scale in 8 bits.
+share of the observer's own scale in 8 bits.
 """
 
 from __future__ import annotations
@@ -18,15 +18,17 @@ import numpy as np
 from .boxes import Box
 from .proxy import Proxy
 
-PATH_POINTS = 6000
+PATH_POINTS = 16_000
 """Positions of all people's paths together, at most."""
 
+# Angle above the level from which the scene is shown at first, in radians.
+_RISE = 0.85
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
 
 
 @dataclass(frozen=True)
 class Camera:
-    """From where the scene is shown at first: a camera at ``origin`` that looks at ``target`` (3,)."""
+    """From where the pictures are taken: a camera at ``origin`` that looks at ``target`` (3,)."""
 
     origin: np.ndarray
     target: np.ndarray
@@ -35,7 +37,7 @@ class Camera:
 @dataclass(frozen=True, eq=False)
 class Stage:
     """What is drawn: the ``proxy`` of the place; ``observers`` (M, 3), of whom it has the gaze; people's ``paths``,
-    (n, 3) each; ``boxes``; ``up`` (3,); the ``camera``; ``top``: gaze (1/sr) at the end of the scale."""
+    (n, 3) each; ``boxes``; ``up`` (3,); the ``camera``."""
 
     proxy: Proxy
     observers: np.ndarray
@@ -43,7 +45,6 @@ class Stage:
     boxes: Sequence[Box]
     up: np.ndarray
     camera: Camera
-    top: float
 
 
 def pack(stage: Stage) -> str:
@@ -54,9 +55,10 @@ def pack(stage: Stage) -> str:
     corners = [
         np.where([[a >> k & 1 for k in range(3)]], b.upper, b.lower)[0] for b in stage.boxes for e in _EDGES for a in e
     ]
-    gaze = np.concatenate([np.zeros((0, len(proxy.vertices))), proxy.gaze])
-    mean = gaze.mean(axis=0, keepdims=True) if M > 1 else gaze[:0]
-    heat = np.sqrt(np.clip(np.concatenate([mean, gaze]) / stage.top, 0, 1)) if M else np.zeros((1, len(proxy.vertices)))
+    mean = proxy.gaze.mean(axis=0, keepdims=True) if M > 1 else proxy.gaze[:0]
+    gaze = np.concatenate([mean, proxy.gaze, np.zeros((int(M == 0), len(proxy.vertices)))])
+    tops = np.array([_top(values) for values in gaze])
+    heat = np.sqrt(np.clip(gaze / np.where(tops > 0, tops, 1)[:, None], 0, 1))
     arrays = {
         "place": place(proxy.vertices),
         "paths": place(np.concatenate([np.zeros((0, 3)), *stage.paths])),
@@ -71,8 +73,8 @@ def pack(stage: Stage) -> str:
     for name, array in arrays.items():
         parts[name] = [start, array.nbytes]
         start += array.nbytes
-    names = [{"marks": [k]} for k in range(M)]
-    everyone = [{"marks": list(range(M))}] if M != 1 else []
+    marks = [list(range(M))] if M != 1 else []
+    marks += [[k] for k in range(M)]
     ends = np.cumsum([0, *(len(p) for p in stage.paths)]).tolist()
     about = {
         "count": len(proxy.vertices),
@@ -82,7 +84,7 @@ def pack(stage: Stage) -> str:
         "up": _rounded(stage.up),
         "reach": float(f"{np.linalg.norm(size):.6g}"),
         "camera": _orbit(stage),
-        "observers": [*everyone, *names],
+        "observers": [{"marks": m, "top": float(f"{top:.3g}")} for m, top in zip(marks, tops)],
         "marks": M,
         "paths": [[a, b - a] for a, b in pairwise(ends)],
         "parts": parts,
@@ -106,16 +108,24 @@ def _frame(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     return lower, np.maximum(points.max(axis=0) - lower, 1e-6)
 
 
+def _top(gaze: np.ndarray) -> float:
+    """The end of the scale of ``gaze`` (V,): what all but a few of the points that have any stay below; 0 for none."""
+    positive = gaze[gaze > 0]
+    return float(np.percentile(positive, 99)) if len(positive) else 0.0
+
+
 def _orbit(stage: Stage) -> dict:
-    """The camera as the viewer has it: angles around a target. Its axes beside ``up`` are made as in ``viewer.js``."""
+    """From where the scene is shown at first: above the middle of it, on the side of the camera. The axes beside ``up``
+    are made as in ``viewer.js``."""
     up = np.asarray(stage.up, float)
     east = np.cross([0.0, 1, 0] if abs(up[1]) < 0.9 else [1.0, 0, 0], up)
     east /= np.linalg.norm(east)
-    back = np.subtract(stage.camera.origin, stage.camera.target)
-    away = float(np.linalg.norm(back))
-    rise = math.asin(float(np.clip(back @ up / max(away, 1e-9), -1, 1)))
+    # A few points lie far away from all others.
+    low, high = np.percentile(stage.proxy.vertices.astype(np.float64), [3, 97], axis=0)
+    back = np.subtract(stage.camera.origin, (low + high) / 2)
     turn = math.atan2(float(back @ np.cross(up, east)), float(back @ east))
-    return {"turn": turn, "rise": rise, "away": away, "target": _rounded(stage.camera.target)}
+    away = 1.05 * float(np.linalg.norm(high - low))
+    return {"turn": float(f"{turn:.6g}"), "rise": _RISE, "away": away, "target": _rounded((low + high) / 2)}
 
 
 def _bits(shares: np.ndarray, bits: int) -> np.ndarray:

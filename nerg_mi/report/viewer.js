@@ -161,6 +161,8 @@
     set(lines, "round", [1]); set(lines, "dot", [13 * ratio]);
     for (let k = 0; k < about.marks; k++)
       if (about.observers[number].marks.includes(k)) strip(marks, [0.21, 0.76, 1, 1], gl.POINTS, k, 1);
+    const top = about.observers[number].top;
+    stage.querySelector("output").textContent = top ? `brightest from ${top} 1/sr on` : "no gaze";
     canvas.dataset.drawn = "true";
   }
 

@@ -26,6 +26,7 @@ def body(run: Run) -> Html:
     controls = element(
         "div",
         element("label", "Gaze of ", element("select", choices)),
+        element("output"),
         switches,
         element("button", "Back to the start", type="button"),
         class_="controls",
