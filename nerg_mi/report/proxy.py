@@ -41,7 +41,7 @@ def place_proxy(
     up: np.ndarray,
     observers: np.ndarray,
     gaze: GazeAt,
-    most: int = 60_000,
+    most: int = 80_000,
     size: tuple[int, int] = (320, 160),
     on_eye: Callable[[int, int], None] | None = None,
 ) -> Proxy | None:

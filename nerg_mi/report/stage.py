@@ -93,13 +93,6 @@ def pack(stage: Stage) -> str:
     return json.dumps(about, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
-def thin_path(points: np.ndarray, most: int) -> np.ndarray:
-    """Up to ``most`` of ``points`` (n, 3), evenly chosen, with the first and the last."""
-    return (
-        points[np.unique(np.linspace(0, len(points) - 1, max(2, most)).round().astype(int))] if len(points) else points
-    )
-
-
 def _frame(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     """Lower corner and edges of the box that holds everything that is drawn."""
     every = [stage.proxy.vertices, stage.observers, *stage.paths, *(b.lower for b in stage.boxes)]

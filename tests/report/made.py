@@ -41,7 +41,10 @@ def cube(side: int = 12) -> Proxy:
     return Proxy(p.astype(np.float32), n.astype(np.float32), colors, gaze.astype(np.float32), 4 / side)
 
 
-def stage(boxes=(Box("shelf", np.zeros(3), np.ones(3)),)) -> Stage:
+SHELF = Box("shelf", np.zeros(3), np.ones(3))
+
+
+def stage(boxes=(SHELF,)) -> Stage:
     path = np.stack([np.linspace(1, 3, 9), np.full(9, 2.0), np.full(9, 1.6)], axis=1)
     camera = Camera(np.array([7.0, 6, 5]), np.array([2.0, 2, 1]))
     eyes = np.array([[1.0, 2, 1.6], [3, 2, 1.6]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.report.boxes import Box
-from nerg_mi.report.stage import pack, thin_path
+from nerg_mi.report.stage import pack
 from tests.report.made import stage
 
 
@@ -68,10 +68,3 @@ def test_nothing_but_points():
 
 def test_equal_scenes_are_equal_bytes_and_safe_in_a_page():
     assert pack(stage()) == pack(stage()) and "<" not in pack(stage())
-
-
-def test_paths_are_thinned_with_their_ends():
-    path = np.arange(300.0).reshape(100, 3)
-    thin = thin_path(path, 10)
-    assert len(thin) == 10 and np.array_equal(thin[[0, -1]], path[[0, -1]])
-    assert len(thin_path(path, 0)) == 2 and np.array_equal(thin_path(path[:1], 5), path[:1])

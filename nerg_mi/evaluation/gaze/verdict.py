@@ -98,8 +98,7 @@ def judge(rows: Sequence[Mapping[str, Any]], split: str, people: int, positions:
         return Verdict(
             "none",
             f"No verdict for {whom}: {_count(people, 'person', 'people')} at {_count(positions, 'place', 'places')} "
-            "are "
-            f"too few; it takes {LEAST_PEOPLE} people and {LEAST_POSITIONS} places.",
+            f"are too few; it takes {LEAST_PEOPLE} people and {LEAST_POSITIONS} places.",
         )
     field, blind = rows[0], _blind(rows)
     found = {name: _row(rows, name) for name in (UNIFORM, NEAREST)}

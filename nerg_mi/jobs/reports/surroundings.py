@@ -9,7 +9,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.report.glances import Onlooker
 from nerg_mi.report.proxy import spread_out
-from nerg_mi.report.stage import PATH_POINTS, thin_path
+from nerg_mi.report.stage import PATH_POINTS
 from nerg_mi.training.geometry.places import GazePlace
 
 PANORAMAS = 8
@@ -21,6 +21,8 @@ _CELLS, _AROUND = 14, 64
 _FREE = 0.1
 # Nobody is followed over a longer pause, in seconds, or step, in metres.
 _PAUSE, _STEP = 2.0, 2.0
+# Edge of the cubes by which a path is drawn, in metres.
+_STRIDE = 0.15
 
 
 def panorama_eyes(standing: np.ndarray, observer: np.ndarray, count: int = PANORAMAS) -> np.ndarray:
@@ -58,7 +60,8 @@ def company(rays: Rays, eyes: np.ndarray, place: GazePlace, radius: float) -> tu
 
 
 def paths_of(rays: Rays, place: GazePlace) -> list[np.ndarray]:
-    """People's paths, (n, 3) each, in the coordinates of the place, with gaps where nobody was followed."""
+    """People's paths, (n, 3) each, in the coordinates of the place, with gaps where nobody was followed: of more than a
+    page can hold evenly chosen ones."""
     parts = []
     for person in np.unique(rays.person):
         own = np.flatnonzero(rays.person == person)
@@ -66,8 +69,19 @@ def paths_of(rays: Rays, place: GazePlace) -> list[np.ndarray]:
         jump = np.diff(rays.t[own]) > _PAUSE
         jump |= np.linalg.norm(np.diff(rays.origin[own], axis=0), axis=1) > _STEP
         parts += [rows for rows in np.split(own, np.flatnonzero(jump) + 1) if len(rows) > 1]
-    total = sum(map(len, parts))
-    # The longest first: of very many pieces the shortest are left out.
-    parts = sorted(parts, key=len, reverse=True)[: PATH_POINTS // 4]
-    share = min(1.0, 0.5 * PATH_POINTS / max(total, 1))
-    return [thin_path(place.points_from_rays(rays.origin[rows]), int(len(rows) * share)) for rows in parts]
+    walked = [path for path in (_walked(rays.origin[rows]) for rows in parts) if len(path) > 1]
+    total = sum(map(len, walked))
+    if total > PATH_POINTS:
+        # As many whole ones as fit if all are alike, and no more than fit.
+        count = max(1, len(walked) * PATH_POINTS // total)
+        walked = [walked[k] for k in np.linspace(0, len(walked) - 1, count).astype(int)]
+        ends = np.cumsum([len(path) for path in walked])
+        walked = [path for path, end in zip(walked, ends) if end <= PATH_POINTS] or [walked[0][:PATH_POINTS]]
+    return [place.points_from_rays(path) for path in walked]
+
+
+def _walked(points: np.ndarray) -> np.ndarray:
+    """Those of ``points`` (N, 3) of a path at which it enters another cube of edge `_STRIDE`: somebody who stands is
+    one point."""
+    cell = np.floor(points / _STRIDE)
+    return points[np.r_[True, (cell[1:] != cell[:-1]).any(axis=1)]]

@@ -71,10 +71,10 @@ def _words(run: Run, recorded: bool) -> str:
     least = f" What fewer than {run.least} people could see is hidden." if run.least > 1 else ""
     return (
         f"The share of gaze that the field says people give each object, at {run.eyes} places where they stood, and "
-        "the "
-        "share of their rays that end at it. Each person counts alike; brackets are 95 % intervals over people. Who "
-        "could "
-        f"see it stood at one of these places in view of it, or looked at it.{least}"
+        "the share of their rays that end at it. Each person counts alike; brackets are 95 % intervals over "
+        "people. Who could see it stood at one of these places in view of it, or looked at it. A field is as smooth as "
+        "the kernel it learnt from: small things that many look at have a smaller share of it than of the rays."
+        f"{least}"
     )
 
 

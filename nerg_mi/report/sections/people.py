@@ -23,10 +23,8 @@ def _company(run: Run) -> list[str]:
     alone, middle = sum(n <= 1 for n in run.company), sorted(run.company)[len(run.company) // 2]
     return [
         f"At the {len(run.company)} places that were looked from, the median number of people within {within} is "
-        f"{middle}; "
-        f"at {alone} of them there was only one person. What a field says of a place where one person stood is what "
-        "one "
-        "person did."
+        f"{middle}; at {alone} of them there was only one person. What a field says of a place where one person "
+        "stood is what one person did."
     ]
 
 

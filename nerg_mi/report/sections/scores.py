@@ -14,7 +14,7 @@ from nerg_mi.report.run import Run
 
 from .protocol import Section
 
-COLUMNS = {"bits": "log score, bits", "CC": "CC", "KLD": "KLD, nats", "SIM": "SIM", "NSS": "NSS", "AUC": "AUC"}
+COLUMNS = {"bits": "log score, bits", "CC": "CC", "KLD": "KLD, nats", "NSS": "NSS", "AUC": "AUC"}
 """The scores that are shown, and their names."""
 
 _PANELS = ("bits", "CC", "KLD")
@@ -25,12 +25,9 @@ def body(run: Run) -> Html:
     parts = [
         paragraph(
             "Truth at a place is the density of the rays of people who stood there. The log score is how many bits "
-            "better a "
-            "ray is told than by the position-blind density, higher is better, as are CC, SIM, NSS and AUC; of KLD "
-            "less is "
-            "better. Intervals are of 95 %, over people. The split half, half of the people as told by the other "
-            "half, is a "
-            "reference and no bound.",
+            "better a ray is told than by the position-blind density, higher is better, as are CC, NSS and AUC; of "
+            "KLD less is better. Intervals are of 95 %, over people. The split half, half of the people as told by "
+            "the other half, is a reference and no bound.",
             kind="note",
         )
     ]

@@ -34,11 +34,10 @@ def body(run: Run) -> Html:
     canvas = element("canvas", aria_label="The place in 3D with the gaze of observers", role="img")
     data = element("script", Html(run.stage), type="application/json", id="stage-data")
     words = (
-        f"{run.stage_points:,} points of surfaces as they were seen from where people can stand. Drag to turn, shift "
-        "and drag "
-        "to move, the wheel comes closer; backs of surfaces are left out, so that one looks into rooms from outside. "
-        "Blue "
-        "marks are observers. On paper, and where scripts or WebGL are off, the picture stands for it."
+        f"{run.stage_points:,} points of surfaces as they were seen from where people can stand. Drag to turn, "
+        "shift and drag to move, the wheel comes closer; backs of surfaces are left out, so that one looks into "
+        "rooms from outside. Blue marks are observers. On paper, and where scripts or WebGL are off, the picture "
+        "stands for it."
     )
     return markup([paragraph(words), element("div", controls, canvas, picture, data, id="stage")])
 

@@ -14,8 +14,7 @@ def body(run: Run) -> Html:
     shown = [
         paragraph(
             "Which people came is what is most uncertain: intervals of scores and shares are over people, of whom "
-            "each is "
-            "taken whole. They say nothing of other places, other days or other crowds."
+            "each is taken whole. They say nothing of other places, other days or other crowds."
         )
     ]
     spread = run.pictures.get("spread")
@@ -26,18 +25,16 @@ def body(run: Run) -> Html:
         shown.append(
             paragraph(
                 "This is a single field, which says nothing of its own uncertainty; nerg train gaze --ensemble 5 "
-                "trains one "
-                "that does."
+                "trains one that does."
             )
         )
     validation = run.provenance.get("validation")
     if isinstance(validation, dict) and {"cc", "kld", "zones", "probes"} <= set(validation):
         shown.append(
             paragraph(
-                f"While it was trained, {validation['probes']} probes in {validation['zones']} zones were watched: CC "
-                f"{validation['cc']:.3f}, KLD {validation['kld']:.3f}. The length of the training was chosen by "
-                "them, so that "
-                "they are no test."
+                f"While it was trained, {validation['probes']} probes in {validation['zones']} zones were watched: "
+                f"CC {validation['cc']:.3f}, KLD {validation['kld']:.3f}. The length of the training was chosen by "
+                "them, so that they are no test."
             )
         )
     return markup(shown)

@@ -1,0 +1,116 @@
+"""What people could look at, in a hall of four walls where depths are known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.encoding.hashgrid import HashGridConfig
+from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.maths.box import Box
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.report.glances import Eyes, Onlooker, eyes_of, points_of_rays
+from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.transport.place import Place
+from tests.evaluation.gaze.test_evaluation import crowd
+
+LOW, HIGH = np.array([-2.0, -6.0, 0.0]), np.array([2.0, 6.0, 3.0])
+
+
+@pytest.fixture
+def hall(rgb):
+    """An onlooker, and the place: the inside of a box in metres, with a random field."""
+    to_world = rgb.ScalarTransform4f().translate((0.5 * (LOW + HIGH)).tolist()).scale((0.5 * (HIGH - LOW)).tolist())
+    scene = rgb.load_dict({"type": "scene", "box": {"type": "cube", "to_world": to_world, "flip_normals": True}})
+    box = Box(tuple(LOW), tuple(HIGH))
+    config = GazeConfig(grid=HashGridConfig(levels=4, log2_rows=10, base=4, finest=16), width=16, normalized=True)
+    field = GazeField.random(config, box, namespace(rgb.variant()), 3)
+    place = GazePlace(Place(None, scene), box, "scene")
+    return Onlooker(field, place), place
+
+
+def to_wall(o, d):
+    """Distance from ``o`` within the box to its walls along ``d``, axis by axis."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(d == 0, np.inf, np.where(d > 0, (HIGH - o) / d, (LOW - o) / d)).min(axis=-1)
+
+
+def test_all_around_an_eye(hall):
+    onlooker, _ = hall
+    eyes = Eyes(np.array([[0.3, -2.0, 1.6], [-1.0, 4.0, 1.5]]), np.array([0, 1]))
+    seen = onlooker.glances(eyes, 512)
+    assert seen.met.all() and np.allclose(seen.share.sum(axis=1), 1) and (seen.share >= 0).all()
+    for eye, points in zip(eyes.positions, seen.points):
+        d = points - eye
+        distance = np.linalg.norm(d, axis=1)
+        assert np.allclose(distance, to_wall(eye, d / distance[:, None]), atol=1e-4)
+    assert np.ptp(seen.share) > 0
+
+
+def test_gaze_on_points_is_the_density_where_nothing_hides_them(hall):
+    onlooker, _ = hall
+    eye = np.array([0.3, -2.0, 1.6])
+    on_wall, behind = np.array([2.0, 1.0, 1.0]), np.array([4.0, 4.0, 0.4])
+    points = np.array([on_wall, behind])
+    away = points - eye
+    direction = away / np.linalg.norm(away, axis=1, keepdims=True)
+    found = onlooker.on_points(eye, points, 0.02)
+    assert found[0] == pytest.approx(onlooker.density(eye, direction)[0], rel=1e-5) and found[0] > 0
+    assert found[1] == 0
+
+
+def test_an_integral_of_few_directions_is_enough_for_a_picture(hall):
+    onlooker, _ = hall
+    d = fibonacci_directions(8192)
+    assert 4 * np.pi * onlooker.density(np.array([0.3, -2.0, 1.6]), d).mean() == pytest.approx(1, abs=0.02)
+
+
+def test_eyes_are_as_many_of_each_person(hall):
+    _, place = hall
+    rays = crowd(1000)
+    eyes = eyes_of(rays, place, 12)
+    assert np.bincount(eyes.person).tolist() == [3, 3, 3, 3]
+    times = [np.flatnonzero((rays.origin == p).all(axis=1))[0] for p in eyes.positions[eyes.person == 0]]
+    assert (np.diff(times) > 200).all()  # spread over the whole of the time
+    few = eyes_of(rays, place, 2)
+    assert len(few.positions) == 2 and len(set(few.person)) == 2
+
+
+def test_rays_end_at_their_own_points_or_at_the_place(hall):
+    onlooker, place = hall
+    rays = crowd(300)
+    points, person = points_of_rays(rays, place, onlooker, 100)
+    assert points.shape == (100, 3) and person.shape == (100,) and np.isfinite(points).all()
+    rows = np.linspace(0, 299, 100).round().astype(int)
+    assert np.allclose(points, rays.hit[rows])
+    met, _ = points_of_rays(replace(rays, hit=None), place, onlooker, 300)
+    inside = ((rays.origin > LOW) & (rays.origin < HIGH)).all(axis=1)
+    assert np.allclose(
+        met[inside], (rays.origin + to_wall(rays.origin, rays.direction)[:, None] * rays.direction)[inside], atol=1e-4
+    )
+
+
+def test_rays_of_another_frame(hall, rgb):
+    """Turned by 90 degrees about z, twice as large and moved."""
+    onlooker, place = hall
+    matrix = np.array([[0, -0.1, 0, 1], [0.1, 0, 0, 0], [0, 0, 0.1, 0.5], [0, 0, 0, 1.0]])
+    turned = GazePlace(place.medium, place.box, "scene", align=Similarity(matrix))
+    rays = crowd(50)
+    eyes = eyes_of(rays, turned, 4)
+    every = rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
+    assert all(np.isclose(every, e).all(axis=1).any() for e in eyes.positions)
+    points, _ = points_of_rays(rays, turned, onlooker, 50)
+    assert np.allclose(points, rays.hit @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+def test_where_no_place_is_known_nothing_is_met(rgb):
+    box = Box((-2.0,) * 3, (2.0,) * 3)
+    grid = HashGridConfig(levels=2, log2_rows=8, base=4, finest=8)
+    field = GazeField.random(GazeConfig(grid=grid, width=16), box, namespace(rgb.variant()), 1)
+    onlooker = Onlooker(field, GazePlace(None, box, "none"))
+    depth, met = onlooker.meet(np.zeros((3, 3)), np.eye(3))
+    assert not met.any() and not depth.any()
