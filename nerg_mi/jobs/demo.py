@@ -33,6 +33,8 @@ from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.panorama import pixel_solid_angles
 
 from .options.pictures import DemoOptions
+from .options.report import ReportOptions
+from .report import make_report
 from .reporter import SILENT, Reporter
 from .versions import versions
 
@@ -41,8 +43,12 @@ CAMERA, OWN, SPHERE = range(3)
 
 CHECKPOINTS = {"field": "store.safetensors", "gaze": "shoppers.safetensors"}
 MAKE = "python -m nerg_mi.scenes.store.make"
+REPORT_POINTS = 60_000
+"""Points of the report's 3D scene."""
 
-STAGES = ("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures")
+STAGES = ("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures", "report")
+OBJECTS = "regions.json"
+"""The file of named objects, where it stands beside the scene."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +114,21 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         camera.bitmap.metadata()[key] = value
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
+    clock.start("report")
+    # Named by the scene, or that beside it of which the demo is made.
+    objects = scene.parent / OBJECTS
+    shown = ReportOptions(
+        objects=objects if objects.is_file() else None,
+        observer=tuple(float(v) for v in np.ravel(center(seen.sensors()[OWN]))),
+        **_camera_of(seen.sensors()[CAMERA]),
+        width=min(max(width, 24), 1200),
+        points=REPORT_POINTS,
+        seed=seed,
+        mode=mode,
+        title="The demo store and its shoppers" if options.scene is None else None,
+    )
+    rendered = {"camera": camera, "own": own, "sphere": sphere}
+    files.append(make_report(inputs[1:], out / "report.html", shown, rendered=rendered).path)
     clock.stop()
 
     report = {
@@ -158,6 +179,16 @@ def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
             raise NergError(f'the {name} checkpoint "{path}" is missing: make it with "{MAKE}" (about 20 minutes).')
         paths.append(path)
     return paths
+
+
+def _camera_of(sensor) -> dict:
+    """Where a perspective ``sensor`` is, what it looks at and how wide, as options of a report."""
+    import mitsuba as mi
+
+    pose = sensor.world_transform()
+    at, ahead = (np.ravel(np.array(pose @ mi.Point3f(*p), np.float64)) for p in ((0, 0, 0), (0, 0, 1)))
+    fov = float(np.ravel(np.array(mi.traverse(sensor)["x_fov"]))[0])
+    return {"camera_from": tuple(at.tolist()), "camera_to": tuple(ahead.tolist()), "fov": fov}
 
 
 def observer_pixel(scene) -> tuple[float, float] | None:

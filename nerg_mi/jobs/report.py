@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.errors import NergError, mitsuba_says, plain
-from nerg_mi.evaluation.gaze.results import GazeResults, read_results
+from nerg_mi.errors import mitsuba_says
+from nerg_mi.evaluation.gaze.results import GazeResults
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.checksum import file_sha256
@@ -38,17 +38,20 @@ from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.place import Place
 
 from .backend import select_backend
-from .evaluation import evaluate_gaze
-from .options.evaluation import GazeEvaluationOptions
 from .options.report import ReportOptions
 from .options.scene import SceneOptions
 from .reporter import SILENT, Reporter
 from .reports.files import ReportFiles, sort_files
 from .reports.pictures import gaze_top, pictures_of_rays, pictures_of_views
+from .reports.results import given_results, made_results
 from .reports.surroundings import company, free_places, panorama_eyes, paths_of
+from .reports.words import observer_words, place_words, setting_words
 from .scene import SceneResult, write_scene
 from .scenes.observers import support_of_rays, to_place
 from .versions import versions
+
+VIEWS = ("camera", "own", "sphere")
+"""The pictures, which are those of the written scene's sensors."""
 
 MARGIN = 0.03
 """Metres by which boxes of objects are taken to be larger: surfaces are known no better."""
@@ -69,24 +72,30 @@ class ReportResult:
 
 
 def make_report(
-    files: Sequence[str | Path], output: str | Path, options: ReportOptions | None = None, reporter: Reporter = SILENT
+    files: Sequence[str | Path],
+    output: str | Path,
+    options: ReportOptions | None = None,
+    reporter: Reporter = SILENT,
+    rendered: Mapping[str, Channels] | None = None,
 ) -> ReportResult:
     """Write the report ``output`` (.html) of a gaze field, of which ``files`` are the checkpoint and, in any order,
     what there is besides: its place, rays, evaluations, or folders of these.
 
-    The place is found beside the gaze field where it is not given. Raises `NergError` for what the user can mend.
+    The place is found beside the gaze field where it is not given. ``rendered``: pictures with the gaze of the observer
+    that somebody has rendered already, of the "camera", of the observer's "own" view and of the "sphere"; they must be
+    of the observer and the camera in ``options``. Raises `NergError` for what the user can mend.
     """
     options, output = options or ReportOptions(), Path(output)
     check_writable(output, ".html", ".htm")
     given = sort_files([Path(file) for file in files])
     boxes = () if options.objects is None else read_boxes(options.objects)
-    results, doubts = _results(given)
+    results, doubts = given_results(given)
     ns = select_backend(options.mode, options.threads)
     if options.evaluate:
-        results += _evaluated(given, options, results, reporter)
+        results += made_results(given, options, results, reporter)
     with Interruption() as stop:
         work = _Work(given, ns, options, reporter, stop)
-        run = work.run(boxes, results, doubts)
+        run = work.run(boxes, results, doubts, rendered)
     write_text(output, page(run))
     size = output.stat().st_size / 1e6
     for _, verdict in run.verdicts:
@@ -95,48 +104,6 @@ def make_report(
         reporter.message("no evaluation is at hand, so that the report has no verdict; --evaluate makes one of rays")
     reporter.message(f"wrote {output} ({size:.1f} MB)")
     return ReportResult(output, run)
-
-
-def _results(given: ReportFiles) -> tuple[list[GazeResults], list[str]]:
-    """The evaluations that were given, and doubts about them. Raises `NergError` for those of another field."""
-    found, doubts, own = [], [], file_sha256(given.gaze)
-    for path in given.results:
-        results = read_results(path)
-        if results.sha256 and results.sha256 != own:
-            raise NergError(f'"{path}" is an evaluation of another gaze field than "{given.gaze}"; leave it out')
-        if not results.sha256 and results.gaze != given.gaze.name:
-            doubts.append(
-                f"An evaluation is of a field called {plain(results.gaze, 80)}; whether it is this one is not known."
-            )
-        found.append(results)
-    splits = [r.split for r in found]
-    twice = next((s for s in splits if splits.count(s) > 1), None)
-    if twice is not None:
-        raise NergError(f'two of the evaluations are of the split "{plain(twice, 40)}"; leave out one of them')
-    return found, doubts
-
-
-def _evaluated(
-    given: ReportFiles, options: ReportOptions, have: Sequence[GazeResults], reporter: Reporter
-) -> list[GazeResults]:
-    """Evaluations of the splits that there are and that nobody ``have``."""
-    if given.rays is None:
-        raise NergError("--evaluate scores the field on rays, and there are none; name the file that it was trained on")
-    account = given.scene.about.get("test") or {}
-    wanted = ("both", "pos", "people") if account.get("people") else ("pos",)
-    place = {"field": "field", "scene": "scene", "hits": "geometry"}.get(given.scene.kind)
-    where = {} if place is None else {place: given.scene.place}
-    found = []
-    for split in wanted:
-        if split in {r.split for r in have}:
-            continue
-        more = {"threads": options.threads, "seed": options.seed, "mode": options.mode or "llvm_ad_rgb"}
-        job = GazeEvaluationOptions(split=split, pictures=0, **where, **more)
-        reporter.message(f"scoring the split {split}")
-        scored = evaluate_gaze(given.gaze, given.rays, None, job, reporter)
-        about = given.gaze.name, file_sha256(given.gaze), split, scored.positions, scored.people, job.kappa
-        found.append(GazeResults(*about, tuple(scored.rows), tuple(scored.persons)))
-    return found
 
 
 class _Work:
@@ -152,7 +119,13 @@ class _Work:
         self.rays = None if given.rays is None else _load(given, given.rays)
         self.align = given.scene.align
 
-    def run(self, boxes: Sequence[Box], results: Sequence[GazeResults], doubts: Sequence[str]) -> Run:
+    def run(
+        self,
+        boxes: Sequence[Box],
+        results: Sequence[GazeResults],
+        doubts: Sequence[str],
+        rendered: Mapping[str, Channels] | None,
+    ) -> Run:
         """All that is shown."""
         given, options = self.given, self.options
         labels = Labels(self.rays, results)
@@ -160,7 +133,7 @@ class _Work:
         hide = (lambda text: text) if options.names else labels.hide
         with tempfile.TemporaryDirectory() as folder:
             scene = self._scene(Path(folder))
-            views, marker = self._views(scene)
+            views, marker = self._views(scene, rendered)
             place = self._place(scene)
             onlooker = Onlooker(self.field, place, self._kind())
             eyes = self._eyes(place, scene)
@@ -180,10 +153,10 @@ class _Work:
         return Run(
             options.title or hide(f"The gaze field {given.gaze.stem}"),
             self.about,
-            hide(_words(given)),
+            hide(place_words(given)),
             given.scene.kind,
             given.scene.field_about,
-            _observer_words(scene, options, self.rays is not None),
+            observer_words(scene, options.observer is not None),
             rays,
             None if rays is None else summarise(rays),
             tuple(shown),
@@ -197,13 +170,14 @@ class _Work:
             *sizes,
             tuple((role, hide(name), digest) for role, name, digest in self._inputs()),
             versions(_variant()),
-            _settings(options),
+            setting_words(options),
         )
 
     def _inputs(self) -> list[tuple[str, str, str]]:
         found = self.given.inputs()
         if self.options.objects is not None:
-            found.append(("objects", self.options.objects.name, file_sha256(self.options.objects)))
+            path = Path(self.options.objects)
+            found.append(("objects", path.name, file_sha256(path)))
         return found
 
     def _step(self, share: float, text: str) -> None:
@@ -233,21 +207,29 @@ class _Work:
         named = {default_name(name, scene.taken): str(value) for name, value in values.items()}
         return load_scene(scene.path, named)
 
-    def _views(self, scene: SceneResult) -> tuple[dict[str, Channels], tuple[float, float] | None]:
+    def _views(
+        self, scene: SceneResult, rendered: Mapping[str, Channels] | None
+    ) -> tuple[Mapping[str, Channels], tuple[float, float] | None]:
         """The pictures of the camera, of the observer's own view and sphere, and where in the first the observer is."""
         o = self.options
         spread = len(self.field.members) > 1
         aovs = "depth,opacity,gaze" + (",gaze_std" if spread else "")
         loaded = self._load(scene, aovs=aovs, sphere_width=o.width, sphere_height=o.width // 2)
-        views = {}
-        for number, name in enumerate(("camera", "own", "sphere")):
+        views = dict(rendered or {})
+        for number, name in enumerate(VIEWS):
+            if name in views:
+                continue
             self._step(0.2 + 0.12 * number, f"rendering: {name}")
-            check = lambda done, total: self.stop.check()
             with mitsuba_says():
-                views[name] = render_channels(loaded, loaded.sensors()[number], o.spp, o.seed, check)
+                views[name] = render_channels(
+                    loaded, loaded.sensors()[number], o.spp, o.seed, lambda done, total: self.stop.check()
+                )
         marker = None
         if scene.observer is not None:
-            marker = pixel_of(loaded.sensors()[0], center(loaded.sensors()[1]))
+            camera, width = loaded.sensors()[0], views["camera"].mask.shape[1]
+            found = pixel_of(camera, center(loaded.sensors()[1]))
+            share = width / camera.film().crop_size()[0]
+            marker = None if found is None else tuple((v + 0.5) * share - 0.5 for v in found)
         return views, marker
 
     def _place(self, scene: SceneResult) -> GazePlace:
@@ -339,33 +321,3 @@ def _variant() -> str:
     import mitsuba as mi
 
     return str(mi.variant())
-
-
-def _words(given: ReportFiles) -> str:
-    name = "" if given.scene.place is None else given.scene.place.name
-    return {
-        "field": f"A radiance field trained on photos, {name}.",
-        "mesh": f"The mesh {name}.",
-        "scene": f"The Mitsuba scene {name}.",
-        "hits": f"No pictures of the place are at hand: it is made of what people looked at, {name}, in greys.",
-        "none": "Nothing is known of the place: directions alone are shown.",
-    }[given.scene.kind]
-
-
-def _observer_words(scene: SceneResult, options: ReportOptions, recorded: bool) -> str:
-    if scene.observer is None:
-        return "The camera is the observer, for nothing says where people were."
-    at = ", ".join(f"{v:.2f}" for v in scene.observer.origin)
-    where = "where it was asked for" if options.observer is not None else "where most rays are"
-    return f"The observer stands {where}, at ({at})."
-
-
-def _settings(options: ReportOptions) -> dict[str, str]:
-    return {
-        "width": f"{options.width} pixels",
-        "samples a pixel": str(options.spp),
-        "seed": str(options.seed),
-        "places looked from": f"{options.eyes} at most",
-        "names of people": "shown" if options.names else "numbered",
-        "fewest people of a share": str(options.min_persons),
-    }

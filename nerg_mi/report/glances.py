@@ -86,17 +86,17 @@ class Onlooker:
     def glances(self, eyes: Eyes, count: int = DIRECTIONS, on_eye: Callable[[int, int], None] | None = None) -> Glances:
         """What is looked at from all ``eyes``, in ``count`` directions. ``on_eye`` is told the eyes done, and of how
         many."""
-        d = fibonacci_directions(count)
-        points, met, share = [], [], []
-        for number, eye in enumerate(eyes.positions):
-            depth, found = self.meet(np.broadcast_to(eye, d.shape), d)
-            gaze = np.maximum(self.density(eye, d).astype(np.float64), 0)
-            points.append(eye + depth[:, None] * d)
-            met.append(found)
-            share.append(gaze / gaze.sum() if gaze.sum() > 0 else np.zeros(count))
+        d, eye = fibonacci_directions(count), np.asarray(eyes.positions, float)
+        # All at once, since a launch takes as long to prepare as to run.
+        depth, met = self.meet(np.repeat(eye, count, axis=0), np.tile(d, (len(eye), 1)))
+        points = eye[:, None] + depth.reshape(len(eye), count, 1) * d
+        share = np.zeros((len(eye), count))
+        for number, position in enumerate(eye):
+            gaze = np.maximum(self.density(position, d).astype(np.float64), 0)
+            share[number] = gaze / gaze.sum() if gaze.sum() > 0 else 0
             if on_eye is not None:
-                on_eye(number + 1, len(eyes.positions))
-        return Glances(eyes, np.array(points), np.array(met), np.array(share))
+                on_eye(number + 1, len(eye))
+        return Glances(eyes, points, met.reshape(len(eye), count), share)
 
 
 def eyes_of(rays: Rays, place: GazePlace, most: int) -> Eyes:

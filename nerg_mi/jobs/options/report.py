@@ -30,8 +30,8 @@ class ReportOptions:
     fov: float | None = option(None, "Degrees between the left and right border of its picture.  [default: 70]")
     eyes: int = option(96, "Places of people from which objects are looked for.", min=1, max=10_000)
     points: int = option(80_000, "Points of the 3D scene at most.", min=100, max=100_000)
-    width: int = option(600, "Width of the pictures in pixels.", min=24, max=1200)
-    spp: int = option(4, "Samples a pixel.", min=1)
+    width: int = option(480, "Width of the pictures in pixels.", min=24, max=1200)
+    spp: int = option(2, "Samples a pixel.", min=1)
     seed: int = option(0, "Seed of the random numbers.", min=0)
     threads: int | None = option(None, "CPU threads. Default: all.")
     mode: str | None = option(
