@@ -11,6 +11,8 @@ LONGEST = 350
 
 _MENDINGS = "a list only: tests/tools/test_mendings.py holds it to the sources, the tests and the page"
 _OPTIONS = "only fields: tests/jobs/test_options.py looks at every one, and each job's tests set them"
+_REPORT = "parts of one job: tests/jobs/test_report.py reads in the page what they give"
+_SECTIONS = "tests/report/sections/test_registry.py shows every section, whole and bare, and reads what it says"
 
 TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/__init__.py": "tests/api/test_names.py asks for every public name",
@@ -27,11 +29,27 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/jobs/options/place.py": _OPTIONS,
     "nerg_mi/jobs/options/poses.py": _OPTIONS,
     "nerg_mi/jobs/options/radiance.py": _OPTIONS,
+    "nerg_mi/jobs/options/report.py": _OPTIONS,
     "nerg_mi/jobs/options/scene.py": _OPTIONS,
     "nerg_mi/jobs/options/study.py": _OPTIONS,
     "nerg_mi/rays/checks/protocol.py": "only fields: tests/rays/checks/test_registry.py looks at every check",
     "nerg_mi/rays/readers/parsing/usual_names.py": "names only: headsets/test_unity.py finds columns by them",
+    "nerg_mi/jobs/reports/results.py": _REPORT,
+    "nerg_mi/jobs/reports/words.py": _REPORT,
     "nerg_mi/maths/types.py": "names for signatures",
+    "nerg_mi/report/sections/data.py": _SECTIONS,
+    "nerg_mi/report/sections/gaze.py": _SECTIONS,
+    "nerg_mi/report/sections/limits.py": _SECTIONS,
+    "nerg_mi/report/sections/objects.py": _SECTIONS,
+    "nerg_mi/report/sections/people.py": _SECTIONS,
+    "nerg_mi/report/sections/place.py": _SECTIONS,
+    "nerg_mi/report/sections/protocol.py": _SECTIONS,
+    "nerg_mi/report/sections/provenance.py": _SECTIONS,
+    "nerg_mi/report/sections/scores.py": _SECTIONS,
+    "nerg_mi/report/sections/settings.py": _SECTIONS,
+    "nerg_mi/report/sections/stage.py": _SECTIONS,
+    "nerg_mi/report/sections/uncertainty.py": _SECTIONS,
+    "nerg_mi/report/sections/verdict.py": _SECTIONS,
     "nerg_mi/transport/media/local_ray.py": "only fields: tests/transport/media/test_protocol.py makes them",
     "tools/mending/__init__.py": _MENDINGS,
     "tools/mending/house.py": _MENDINGS,

@@ -22,7 +22,7 @@ from tests.reference.torch_ngp_numpy import nerf_state
 
 from .test_render import SCENE
 
-DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr run.json"
+DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr report.html run.json"
 STUDY = "study.csv study.md scaling.csv study.json errors.png scaling.png"
 ABLATION = (
     "ablation.md ablation.csv ablation.json ablation.png place.vol "
@@ -85,6 +85,11 @@ CASES = (
         "scene",
         "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none --person a --times 0,2 --gap 100",
         ("a.xml", "a.frames.csv"),
+    ),
+    Case(
+        "report",
+        "{i}/gaze.safetensors {i}/rays.npz -o {o}/a.html --width 24 --spp 1 --points 200 -m llvm_ad_rgb",
+        ("a.html",),
     ),
     Case("rays import", "{i}/day.csv -o {o}/a.npz --map 'origin=x,y,z direction=a,b,c t=t person=p'", ("a.npz",)),
     Case(

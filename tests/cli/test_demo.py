@@ -21,6 +21,7 @@ NAMES = {
     "visibility.png",
     "color.png",
     "scene.exr",
+    "report.html",
     "run.json",
 }
 TINY = ("--width", 48, "--spp", 1, "-m", "llvm_ad_rgb")
