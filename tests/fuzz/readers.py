@@ -2,9 +2,10 @@
 
 from tests.fuzz.capture_readers import CAPTURES
 from tests.fuzz.checkpoint_readers import CHECKPOINTS
+from tests.fuzz.report_readers import REPORTS
 from tests.fuzz.scene_readers import SCENES
 from tests.fuzz.structure_readers import STRUCTURE
 from tests.fuzz.tracking_readers import TRACKING
 
-ALL = [*CHECKPOINTS, *CAPTURES, *STRUCTURE, *SCENES, *TRACKING]
+ALL = [*CHECKPOINTS, *CAPTURES, *STRUCTURE, *SCENES, *REPORTS, *TRACKING]
 READERS = [r for r in ALL if r.installed]
