@@ -54,7 +54,7 @@ def _section(section, run: Run) -> Html:
 
 
 def _part(name: str) -> str:
-    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+    return files("nerg_mi.report").joinpath(name).read_text(encoding="utf-8")
 
 
 def _hash(text: str) -> str:

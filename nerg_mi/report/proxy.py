@@ -56,21 +56,23 @@ def place_proxy(
         parts.append(_panorama(scene, np.asarray(eye, float), np.asarray(up, float), size))
         if on_eye is not None:
             on_eye(number + 1, len(eyes))
-    points, normals, colors, distance = (np.concatenate(columns) for columns in zip(*parts))
+    points, normals, facing, colors, distance = (np.concatenate(columns) for columns in zip(*parts))
     if not len(points):
         return None
     near = distance <= _FAR * np.median(distance)
-    points, normals, colors, spacing = thin(points[near], normals[near], colors[near], most)
+    values = np.concatenate([colors, facing], axis=1)
+    points, values, spacing = thin(points[near], normals[near], values[near], most)
+    colors, normals = values[:, :3], smooth_normals(points, values[:, 3:])
     baked = [gaze(np.asarray(observer, float), points, spacing) for observer in observers]
-    values = np.stack(baked).astype(np.float32) if baked else np.zeros((0, len(points)), np.float32)
-    return Proxy(points.astype(np.float32), normals.astype(np.float32), to_bytes(srgb(colors)), values, spacing)
+    heat = np.stack(baked).astype(np.float32) if baked else np.zeros((0, len(points)), np.float32)
+    return Proxy(points.astype(np.float32), normals.astype(np.float32), to_bytes(srgb(colors)), heat, spacing)
 
 
 def thin(
-    points: np.ndarray, normals: np.ndarray, colors: np.ndarray, most: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """``points`` (N, 3), their ``normals`` and ``colors``: the means of those in each of at most ``most`` cubes, and
-    the cubes' edge. Surfaces that face opposite ways are kept apart, as the two sides of a thin wall are."""
+    points: np.ndarray, normals: np.ndarray, values: np.ndarray, most: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """The means of ``points`` (N, 3) and of their ``values`` (N, C) in each of at most ``most`` cubes, and the cubes'
+    edge. Surfaces whose ``normals`` face opposite ways are kept apart, as the two sides of a thin wall are."""
     edge = float(np.ptp(points, axis=0).max()) / _FINE or 1.0
     side = np.argmax(np.abs(normals), axis=1)
     facing = 2 * side + (np.take_along_axis(normals, side[:, None], axis=1)[:, 0] > 0)
@@ -82,14 +84,30 @@ def thin(
             break
         edge *= 1.1
     mean = lambda v: np.stack([np.bincount(which, weights=c) for c in v.T], axis=1) / count[:, None]
-    n = mean(normals)
-    return mean(points), n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9), mean(colors), edge
+    return mean(points), mean(values), edge
+
+
+def smooth_normals(points: np.ndarray, towards: np.ndarray, count: int = 12) -> np.ndarray:
+    """Unit normals (N, 3) of the surface through ``points`` (N, 3), on the side of ``towards`` (N, 3): of the plane
+    that lies nearest to each one's ``count`` nearest neighbours (its covariance's least axis). ``towards`` itself for
+    fewer than three points."""
+    from scipy.spatial import KDTree
+
+    facing = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    count = min(count, len(points))
+    if count < 3:
+        return facing
+    near = points[KDTree(points).query(points, k=count)[1]]
+    apart = near - near.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", apart, apart))[1][:, :, 0]
+    return np.where((normals * facing).sum(axis=1, keepdims=True) < 0, -normals, normals)
 
 
 def _panorama(
     scene: Any, eye: np.ndarray, up: np.ndarray, size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points, normals, linear colours, (N, 3) each, and distances (N,) of what is met around ``eye``."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals, directions to the eye, linear colours, (N, 3) each, and distances (N,) of what is met around
+    ``eye``."""
     import mitsuba as mi
 
     level = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
@@ -104,7 +122,8 @@ def _panorama(
     distance = np.linalg.norm(away, axis=-1)
     met &= distance > 0
     normals = surface_normals(np.where(met[..., None], points, np.nan), away)
-    return points[met], normals[met], np.array(found.color, np.float64)[met], distance[met]
+    facing = away[met] / distance[met][:, None]
+    return points[met], normals[met], facing, np.array(found.color, np.float64)[met], distance[met]
 
 
 def surface_normals(points: np.ndarray, towards: np.ndarray) -> np.ndarray:
