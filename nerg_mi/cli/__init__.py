@@ -18,6 +18,7 @@ import typer
 
 from nerg_mi import __version__
 
+from .completion import completed_command
 from .ending import INTERRUPTED, CtrlC, end_of, flush_output
 
 COMMANDS = {
@@ -59,7 +60,8 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = [a for a in arguments if a not in _DEBUG]
     with CtrlC() as ctrl_c:
         try:
-            build_app(next((a for a in arguments if not a.startswith("-")), None))(arguments, prog_name="nerg")
+            asked = completed_command(os.environ, COMMANDS) or next((a for a in arguments if a[:1] != "-"), None)
+            build_app(asked)(arguments, prog_name="nerg")
         except BaseException as error:
             interrupt = ctrl_c.behind(error)
             if interrupt is not None:
@@ -80,7 +82,6 @@ def build_app(asked: str | None) -> typer.Typer:
     app = typer.Typer(
         name="nerg",
         help="Neural radiance and gaze fields for Mitsuba 3.",
-        add_completion=False,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
