@@ -1,4 +1,4 @@
-"""Parts of the documentation that are made of the code: tables of presets, recipes, rules, AOVs and parameters.
+"""Parts of the documentation that are made of the code: tables of presets, recipes, rules, AOVs, commands and so on.
 
     python -m tools.generated [--check]
 
@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before Dr.Jit and Mitsuba)
-from tools import manual
+from tools import command_pages, manual
 from tools.imports import ROOT
 from tools.page import table
 
@@ -123,6 +123,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "plugins": plugins,
     "presets": presets,
     "checks": checks,
+    "commands": command_pages.reference,
     "recipes": recipes,
     "registered": registered,
 }

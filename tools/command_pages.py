@@ -1,0 +1,83 @@
+"""The reference of the command line as Markdown: every command, option and default, as its parser has them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from tools.page import table
+
+
+def commands() -> Iterator[tuple[str, Any, Any]]:
+    """Each command that does something: its words, as "nerg train gaze", its parser's command, and a context for it."""
+    import typer
+
+    from nerg_mi import cli
+
+    for name in cli.COMMANDS:
+        root = typer.main.get_command(cli.build_app(name))
+        context = root.make_context("nerg", [name], resilient_parsing=True)
+        _, command, _ = root.resolve_command(context, [name])
+        yield from _below(command, name, context)
+
+
+def _below(command: Any, name: str, parent: Any) -> Iterator[tuple[str, Any, Any]]:
+    context = command.make_context(name, [], parent=parent, resilient_parsing=True)
+    for below, other in getattr(command, "commands", {}).items():
+        yield from _below(other, below, context)
+    if not hasattr(command, "commands"):
+        yield context.command_path, command, context
+
+
+def reference() -> str:
+    """A section for each command: what it does, how it is called, its arguments and its options."""
+    sections = []
+    for path, command, context in commands():
+        sections += [f"## {path}", _paragraphs(command.help or "")]
+        usage = " ".join([path, *command.collect_usage_pieces(context)])
+        sections += [f"Usage: `{usage}`", *_tables(command, context)]
+    return "\n\n".join(sections)
+
+
+def _tables(command: Any, context: Any) -> Iterator[str]:
+    """One of arguments and one of options, those that there are."""
+    rows: dict[str, list[tuple[str, ...]]] = {"argument": [], "option": []}
+    for parameter in command.params:
+        record = parameter.get_help_record(context)
+        if record is None or parameter.name == "help":
+            continue
+        meaning, default = split_default(record[1])
+        cells = (f"`{record[0]}`", cell(meaning), f"`{default}`" if default else "")
+        rows[parameter.param_type_name].append(cells)
+    for kind, found in rows.items():
+        if found:
+            yield table((kind, "meaning", "default"), found)
+
+
+_RANGE = re.compile(r"(?:[-\w.]+<=?)?x(?:[<>]=?[-\w.]+)?")
+
+
+def split_default(text: str) -> tuple[str, str]:
+    """The help of a parameter with its range, and its default or "required"; the parser adds them in brackets."""
+    found = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", text, re.S)
+    notes = [note.strip() for note in found[2].split(";")] if found else []
+    ranges = [note for note in notes if _RANGE.fullmatch(note)]
+    rest = [note for note in notes if note not in ranges and note != "required"]
+    if found is None or not (ranges or "required" in notes or (rest and rest[0].startswith("default:"))):
+        return text, ""
+    # A default in words stands in the help itself, in brackets of its own.
+    meaning, default = split_default(found[1]) if not rest else (found[1], "; ".join(rest).removeprefix("default:"))
+    meaning += "".join(f" ({note})" for note in ranges)
+    return meaning, default.strip() or ("required" if "required" in notes else "")
+
+
+def cell(text: str) -> str:
+    """Text of a help line within a table: what Markdown would take for markup is kept as it stands."""
+    text = " ".join(text.split())
+    return re.sub(r"([*<]|(?<!\w)_|_(?!\w))", r"\\\1", text)
+
+
+def _paragraphs(text: str) -> str:
+    """The help of a command, whose lines may be broken anywhere."""
+    return "\n\n".join(cell(part) for part in re.split(r"\n\s*\n", text.strip()))
