@@ -10,6 +10,7 @@
 #   make types     what a type checker finds
 #   make format    put right what of it can be put right by itself
 #   make docs      write what the pages say about the code: tables, pictures
+#   make manual    build the manual into out/manual/html (Python 3.11 or newer); any warning is an error
 #   make onecore   the tests that render, write pictures and train, on one core, where Dr.Jit has one thread
 #   make coverage  all tests, and which branches of the package they reach
 #   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
@@ -31,7 +32,7 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
-.PHONY: demo test check lint types format docs onecore coverage fuzz mutants mendings faults soak packages setup
+.PHONY: demo test check lint types format docs manual onecore coverage fuzz mutants mendings faults soak packages setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
@@ -42,6 +43,8 @@ test: setup
 	$(PYTEST) $(ARGS)
 
 lint types format docs: EXTRAS = lint
+
+manual: EXTRAS = manual
 
 lint: setup
 	$(RUN) -m ruff check
@@ -58,6 +61,9 @@ format: setup
 docs: setup
 	$(RUN) -m tools.generated
 	$(RUN) -m tools.architecture
+
+manual: setup
+	$(RUN) -m tools.site $(ARGS)
 
 check: setup
 	$(PYTEST) -q -m "not slow" $(ARGS)

@@ -1,0 +1,38 @@
+"""Notebooks as pages of the manual: their text, their code, and what it gave."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+_ANSI = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def write_page(path: Path, folder: Path, name: str) -> None:
+    """Write the notebook ``path`` as the page ``name`` into ``folder``, its pictures into images/ there."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    parts = []
+    for number, cell in enumerate(cells):
+        text = "".join(cell["source"]).rstrip()
+        if cell["cell_type"] == "markdown":
+            parts.append(text)
+        elif cell["cell_type"] == "code" and text:
+            parts.append(f"```python\n{text}\n```")
+            for i, output in enumerate(cell["outputs"]):
+                parts.append(_output(output, folder, f"{name}-{number}-{i}"))
+    note = f"*This page is the notebook `examples/{path.name}`.*"
+    (folder / f"{name}.md").write_text("\n\n".join([parts[0], note, *parts[1:]]) + "\n", encoding="utf-8")
+
+
+def _output(output: dict[str, Any], folder: Path, name: str) -> str:
+    """An output of a cell: its picture, else its text."""
+    data = output.get("data", {})
+    if "image/png" in data:
+        picture = folder / "images" / f"{name}.png"
+        picture.write_bytes(base64.b64decode("".join(data["image/png"])))
+        return f"![Output](images/{picture.name})"
+    text = "".join(output.get("text") or data.get("text/plain") or output.get("traceback") or "")
+    return f"```text\n{_ANSI.sub('', text).rstrip()}\n```" if text.strip() else ""
