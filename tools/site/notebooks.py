@@ -11,8 +11,9 @@ from typing import Any
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
-def write_page(path: Path, folder: Path, name: str) -> None:
-    """Write the notebook ``path`` as the page ``name`` into ``folder``, its pictures into images/ there."""
+def page_of(path: Path, folder: Path, name: str) -> str:
+    """The notebook ``path`` as the text of the page ``name`` in ``folder``; its pictures are written into images/
+    there."""
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     parts = []
     for number, cell in enumerate(cells):
@@ -24,7 +25,7 @@ def write_page(path: Path, folder: Path, name: str) -> None:
             for i, output in enumerate(cell["outputs"]):
                 parts.append(_output(output, folder, f"{name}-{number}-{i}"))
     note = f"*This page is the notebook `examples/{path.name}`.*"
-    (folder / f"{name}.md").write_text("\n\n".join([parts[0], note, *parts[1:]]) + "\n", encoding="utf-8")
+    return "\n\n".join([parts[0], note, *parts[1:]]) + "\n"
 
 
 def _output(output: dict[str, Any], folder: Path, name: str) -> str:

@@ -13,7 +13,7 @@ import re
 import shutil
 from pathlib import Path
 
-from tools.site.notebooks import write_page
+from tools.site.notebooks import page_of
 
 ROOT_PAGES = {"CONTRIBUTING.md": "contributing", "CHANGELOG.md": "changelog"}
 """Pages at the root that belong to the manual -> their names in it."""
@@ -40,7 +40,8 @@ def assemble(root: Path, folder: Path) -> None:
             text = re.sub(r"^## [^\n]*\n\s*(?=^## |\Z)", "", text, flags=re.M)
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
     for path, name in books.items():
-        write_page(path, folder, name)
+        text = linked(page_of(path, folder, name), path, known, docs)
+        (folder / f"{name}.md").write_text(text, encoding="utf-8")
 
 
 def page_names(docs: Path) -> list[str]:

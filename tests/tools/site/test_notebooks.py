@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 
-from tools.site.notebooks import write_page
+from tools.site.notebooks import page_of
 
 
 def test_a_notebook_is_a_page(tmp_path):
@@ -25,8 +25,7 @@ def test_a_notebook_is_a_page(tmp_path):
     ]
     (tmp_path / "a.ipynb").write_text(json.dumps({"cells": cells}))
     (tmp_path / "images").mkdir()
-    write_page(tmp_path / "a.ipynb", tmp_path, "a")
-    page = (tmp_path / "a.md").read_text()
+    page = page_of(tmp_path / "a.ipynb", tmp_path, "a")
     assert page.startswith(
         "# Title\nwords\n\n*This page is the notebook `examples/a.ipynb`.*\n\n```python\na = 1\na\n```"
     )
