@@ -102,14 +102,12 @@ def sentence(error: BaseException) -> str:
     """
     text = str(error).strip()
     if isinstance(error, MemoryError):
-        text = f"there is not enough memory{': ' + text if text else ''}; ask for less, or close other programs."
+        text = f"there is not enough memory{': ' + text if text else ''}; ask for less, or close other programs"
     elif isinstance(error, OSError) and error.strerror:
-        said = f"{error.strerror[:1].lower()}{error.strerror[1:]}."
+        said = f"{error.strerror[:1].lower()}{error.strerror[1:]}"
         if error.filename is not None:
             said = (
-                f'there is no file "{error.filename}".'
-                if error.errno == errno.ENOENT
-                else f'"{error.filename}": {said}'
+                f'there is no file "{error.filename}"' if error.errno == errno.ENOENT else f'"{error.filename}": {said}'
             )
         text = said
     before, marker, trace = text.partition(_TRACEBACK)

@@ -174,12 +174,12 @@ class Panorama(mi.Sensor):
             # mi.Transform4f.rotate does not normalise its axis, and gives a shear for one that is no unit vector.
             raise NergError(
                 '"to_world" of a panorama must be a rotation and a translation: remove its scale or shear, '
-                "and give rotations an axis of unit length."
+                "and give rotations an axis of unit length"
             )
 
     def _check_film(self):
         if self.film().size()[1] < 2:
-            raise NergError('"height" of the film of a panorama must be at least 2 pixels, one for each pole.')
+            raise NergError('"height" of the film of a panorama must be at least 2 pixels, one for each pole')
 
 
 register("sensor", "panorama", Panorama)

@@ -73,10 +73,10 @@ def test_a_mistake_in_a_plugin_is_none_of_the_scene():
 @pytest.mark.parametrize(
     "error, words",
     [
-        (caught(lambda: open("/nowhere/a.txt")), 'there is no file "/nowhere/a.txt".'),
-        (PermissionError(13, "Permission denied", "a.txt"), '"a.txt": permission denied.'),
-        (OSError(28, "No space left on device"), "no space left on device."),
-        (MemoryError(), "there is not enough memory; ask for less, or close other programs."),
+        (caught(lambda: open("/nowhere/a.txt")), 'there is no file "/nowhere/a.txt"'),
+        (PermissionError(13, "Permission denied", "a.txt"), '"a.txt": permission denied'),
+        (OSError(28, "No space left on device"), "no space left on device"),
+        (MemoryError(), "there is not enough memory; ask for less, or close other programs"),
         (RuntimeError("[film.cpp:12] two\nlines"), "two lines"),
         (KeyError(), "KeyError"),
     ],

@@ -92,7 +92,10 @@ def sensor_dict(camera: Camera) -> dict:
             f"{'a fisheye lens' if i.fisheye else f'k1, k2, p1, p2 = {i.distortion[:4]}'}; undistort the images first"
         )
     if abs(i.fx / i.fy - 1) > 1e-3:
-        raise NergError(f"Mitsuba's perspective sensor has square pixels, but this camera has fx={i.fx:g}, fy={i.fy:g}")
+        raise NergError(
+            f"Mitsuba's perspective sensor has square pixels, but this camera has fx={i.fx:g}, fy={i.fy:g}; "
+            "resize the images first"
+        )
     return {
         "type": "perspective",
         "to_world": mi.ScalarTransform4f((camera.to_world @ _OPENGL_FROM_MITSUBA).tolist()),

@@ -21,6 +21,6 @@ def parse_defines(pairs: Iterable[str] | None) -> dict[str, str]:
     for pair in pairs or ():
         key, equals, value = pair.partition("=")
         if not (key and equals):
-            raise NergError(f'"-D {pair}" is no definition: write -D key=value.')
+            raise NergError(f'"-D {pair}" is no definition: write -D key=value')
         values[key] = value
     return values

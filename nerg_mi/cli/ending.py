@@ -26,7 +26,7 @@ def end_of(error: Exception) -> tuple[int, str]:
     text = " ".join(str(error).split())
     return FAULT, (
         f"internal error ({type(error).__name__}{': ' + text if text else ''}): this is a fault of nerg_mi and not of "
-        "your input; run again with --debug and report the traceback."
+        "your input; run again with --debug and report the traceback"
     )
 
 

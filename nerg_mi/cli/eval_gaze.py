@@ -21,7 +21,7 @@ def eval_gaze(
     rays: Annotated[Path, typer.Argument(help="The rays file or dataset that it was trained on.")],
     options: GazeEvaluationOptions,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Folder for tables and pictures. Default: GAZE.eval")
+        Path | None, typer.Option("-o", "--output", help="Folder for tables and pictures. Default: GAZE.eval.")
     ] = None,
 ) -> None:
     """Scores beside uniform, position-blind, nearest probes, nearest rays and the other half of the people."""

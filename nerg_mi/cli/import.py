@@ -30,7 +30,7 @@ def command(
     from nerg_mi.jobs import checkpoints
 
     if output is None and gaze is None:
-        raise NergError("nothing is asked for: give -o FIELD.safetensors, --gaze GAZE.safetensors, or both.")
+        raise NergError("nothing is asked for: give -o FIELD.safetensors, --gaze GAZE.safetensors, or both")
     options = replace(options, mode=mode_of(options.mode, variant))
     with TerminalReporter() as reporter:
         checkpoints.import_checkpoint(file, output, gaze, options, reporter)

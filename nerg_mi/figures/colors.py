@@ -28,7 +28,7 @@ def find_colors(name: str, diverging: bool = False) -> Any:
     known = DIVERGING if diverging else SEQUENTIAL
     if name.removesuffix("_r") not in {of.removesuffix("_r") for of in known}:
         kind = "diverging" if diverging else "perceptually uniform"
-        raise NergError(f'"{name}" is no {kind} colour map: choose one of {", ".join(known)}.')
+        raise NergError(f'"{name}" is no {kind} colour map: choose one of {", ".join(known)}')
     return matplotlib.colormaps[name]
 
 

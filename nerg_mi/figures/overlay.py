@@ -41,9 +41,9 @@ class Heat:
 
     def __post_init__(self):
         if not (np.isfinite(self.top) and self.top > 0):
-            raise NergError(f"the top of a heat map's scale must be positive, got {self.top}: give it a range.")
+            raise NergError(f"the top of a heat map's scale must be positive, got {self.top}: give it a range")
         if not 0 <= self.decades <= MOST_DECADES:
-            raise NergError(f"a scale has 0 (linear) to {MOST_DECADES:.0f} decades, and {self.decades} were asked for.")
+            raise NergError(f"a scale has 0 (linear) to {MOST_DECADES:.0f} decades, and {self.decades} were asked for")
         find_colors(self.colors)
 
     @property
@@ -74,7 +74,7 @@ def top_of(values, mask, percentile: float = 99.5) -> float:
     if top <= 0 and inside.size:
         top = float(inside.max())  # all attention may lie on fewer pixels than the percentile leaves out
     if not top > 0:
-        raise NergError("there is no gaze in this picture to take a scale from: move the camera, or give a range.")
+        raise NergError("there is no gaze in this picture to take a scale from: move the camera, or give a range")
     return top
 
 

@@ -103,7 +103,7 @@ def check_new_folder(path: str | os.PathLike) -> None:
     check_folder(path)
     with writing(path):
         if os.path.isdir(path) and any(os.scandir(path)):
-            raise NergError(f'the folder "{path}" is there and not empty: choose another name, or remove it first.')
+            raise NergError(f'the folder "{path}" is there and not empty: choose another name, or remove it first')
 
 
 def write_bytes(path: str | os.PathLike, *parts: bytes | memoryview) -> None:
@@ -125,7 +125,7 @@ def check_writable(path: str | os.PathLike, *suffixes: str) -> None:
     there are any). Nothing is made. A disk that fills meanwhile, or permissions that change, are found by `replacing`.
     """
     if suffixes and Path(path).suffix.lower() not in suffixes:
-        raise NergError(f'"{path}" has no format that is written here: let its name end in {" or ".join(suffixes)}.')
+        raise NergError(f'"{path}" has no format that is written here: let its name end in {" or ".join(suffixes)}')
     with writing(path):
         target = Path(os.path.realpath(path))
         if target.is_dir():
@@ -155,7 +155,7 @@ def writing(path: str | os.PathLike) -> Iterator[None]:
         yield
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
-        raise NergError(f'"{path}" could not be written ({error.strerror or error}): {remedy}.') from error
+        raise NergError(f'"{path}" could not be written ({error.strerror or error}): {remedy}') from error
 
 
 def _check_unprotected(target: Path) -> None:

@@ -61,7 +61,7 @@ def write_exr(
         except RuntimeError as error:
             _raise_if_full(temporary)
             raise NergError(
-                f'"{path}" could not be written ({str(error).strip()}); choose another name or folder.'
+                f'"{path}" could not be written ({str(error).strip()}); choose another name or folder'
             ) from error
         if not _whole(temporary, rows):
             # The library does not look at what becomes of the last kilobytes, which leave its buffer as the file is
@@ -160,7 +160,7 @@ def exr_rows(
             except (OSError, RuntimeError) as error:
                 _raise_if_full(temporary)
                 raise NergError(
-                    f'"{path}" could not be written ({str(error).strip()}); choose another name or folder.'
+                    f'"{path}" could not be written ({str(error).strip()}); choose another name or folder'
                 ) from error
             rows += count
 

@@ -59,7 +59,7 @@ def video_frames(
             if (width, height) != (stream.width, stream.height):
                 raise NergError(
                     f'"{path}" has pictures of {stream.width} x {stream.height} pixels, and one of {width} x {height} '
-                    "follows: give all of them one size."
+                    "follows: give all of them one size"
                 )
             picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
             picture = picture.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
@@ -71,7 +71,7 @@ def video_frames(
                 container.metadata[_NAMES.get(key, key)] = value
             yield write
             if stream is None:
-                raise NergError(f'"{path}" would be a video without pictures: give at least one.')
+                raise NergError(f'"{path}" would be a video without pictures: give at least one')
             with _encoding(path, av):
                 container.mux(stream.encode(None))
         finally:
@@ -95,11 +95,11 @@ def _check_size(path: str | os.PathLike, width: int, height: int) -> None:
     if width % 2 or height % 2:
         raise NergError(
             f'"{path}" would have pictures of {width} x {height} pixels, and a video that plays everywhere needs even '
-            "sides: change the film's size by one pixel."
+            "sides: change the film's size by one pixel"
         )
     if not (_LEAST <= min(width, height) and max(width, height) <= _MOST):
         raise NergError(
-            f'"{path}" would have pictures of {width} x {height} pixels: give a video sides of {_LEAST} to {_MOST}.'
+            f'"{path}" would have pictures of {width} x {height} pixels: give a video sides of {_LEAST} to {_MOST}'
         )
 
 
@@ -111,7 +111,7 @@ def _encoding(path: str | os.PathLike, av: Any) -> Iterator[None]:
     except av.error.FFmpegError as error:
         if isinstance(error, OSError):
             raise
-        raise NergError(f'"{path}" could not be encoded ({plain(error)}); choose another size or rate.') from error
+        raise NergError(f'"{path}" could not be encoded ({plain(error)}); choose another size or rate') from error
 
 
 def _pyav() -> Any:

@@ -48,16 +48,17 @@ def import_checkpoint(
         if path is not None:
             check_writable(path, ".safetensors")
     given = Given(options.color_space, options.finest, options.bg_radius)
+    reporter.progress(0.0, f"converting {Path(file).name}")
     ns = select_backend(options.mode)
     if is_nerg(open_checkpoint(file)[1]):
         field, attention, origin = read_nerg(file, ns, options.ema, given)
     else:
         if gaze is not None:
-            raise NergError(f'"{file}" holds no gaze field: leave out --gaze.')
+            raise NergError(f'"{file}" holds no gaze field: leave out --gaze')
         (field, origin), attention = read_torch_ngp(file, ns, options.ema, given), None
     if output is not None:
         if field is None:
-            raise NergError(f'"{file}" holds a gaze field without its NeRF: import that from its own file.')
+            raise NergError(f'"{file}" holds a gaze field without its NeRF: import that from its own file')
         save_radiance(field, output, origin, options.half)
         reporter.message(_about(field, origin))
         _tell(output, reporter)

@@ -69,7 +69,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     options = options or DemoOptions()
     width, spp, seed = options.width, options.spp, options.seed
     if width < 12 or spp < 1:
-        raise NergError(f"the demo needs pictures of at least 12 pixels and 1 sample a pixel, got {width} and {spp}.")
+        raise NergError(f"the demo needs pictures of at least 12 pixels and 1 sample a pixel, got {width} and {spp}")
     out = Path(out)
     check_folder(out)
     scene = store_scene() if options.scene is None else Path(options.scene)
@@ -87,7 +87,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         unhidden = load_scene(scene, values | {"occlusion": "false", "radiance": "false", "aovs": "opacity,gaze"})
         if len(seen.sensors()) < 3:
             raise NergError(
-                f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama.'
+                f'"{scene}" has {len(seen.sensors())} sensor(s): give it a camera, the own view and a panorama'
             )
         render = lambda of, index: render_channels(of, of.sensors()[index], spp, seed, lambda done, total: stop.check())
         clock.start("camera")
@@ -106,7 +106,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     tops = [top_of(r.aovs["gaze"], r.mask) for r in (own, camera, sphere, without) if np.any(r.aovs["gaze"] > 0)]
     if not tops:
         raise NergError(
-            f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer.'
+            f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer'
         )
     heat = Heat(max(tops))
     files = _write_pictures(out, camera, own, sphere, without, heat, observer_pixel(seen), about)
@@ -171,12 +171,12 @@ def checksum(path: Path) -> str:
 
 def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
     if not scene.is_file():
-        raise NergError(f'there is no scene file "{scene}".')
+        raise NergError(f'there is no scene file "{scene}"')
     paths = [scene]
     for name, file in CHECKPOINTS.items():
         path = scene.parent / defaults.get(name, file)  # an absolute name stays as it is
         if not path.is_file():
-            raise NergError(f'the {name} checkpoint "{path}" is missing: make it with "{MAKE}" (about 20 minutes).')
+            raise NergError(f'the {name} checkpoint "{path}" is missing: make it with "{MAKE}" (about 20 minutes)')
         paths.append(path)
     return paths
 

@@ -123,8 +123,10 @@ def export_torch_ngp(
 
 
 def _load(field: str | Path | RadianceField, mode: str, reporter: Reporter) -> RadianceField:
+    reporter.progress(0.0, "reading the field")
     ns = select_backend(mode)
     loaded = field if isinstance(field, RadianceField) else load_radiance(field, ns)[0]
+    reporter.progress(0.01, "looking through its volume")
     if loaded.box.contracted:
         reporter.message("the place has no end: written is the box that it resolves best, not what is around it")
     return loaded
@@ -132,7 +134,7 @@ def _load(field: str | Path | RadianceField, mode: str, reporter: Reporter) -> R
 
 def _surface_writer(output: Path, up: str) -> Callable[[Surface, Path], None]:
     if up not in ("y", "z"):
-        raise NergError(f'--up must be z or y, not "{up}".')
+        raise NergError(f'--up must be z or y, not "{up}"')
     check_writable(output, ".ply", ".glb")
     if output.suffix.lower() == ".ply":
         return write_ply

@@ -80,11 +80,11 @@ def render_file(
     scene, output = Path(scene), Path(output)
     check_writable(output, *dict.fromkeys((*FORMATS, *OVERLAY_FORMATS)))
     if not options.memory > 0:
-        raise NergError(f"the memory to render in is {options.memory} GB: give it more than 0.")
+        raise NergError(f"the memory to render in is {options.memory} GB: give it more than 0")
     if options.spp:
         check_samples(options.spp, "the picture")
     if not scene.is_file():
-        raise NergError(f'there is no scene file "{scene}".')
+        raise NergError(f'there is no scene file "{scene}"')
     check_overlay(output, options)
     video = _check_video(output, options)
     frames: Sequence[Mapping[str, str]] = [{}]
@@ -94,6 +94,7 @@ def render_file(
         files = [output] if video else [numbered(output, k + 1, len(frames)) for k in range(len(frames))]
         for file in files:
             check_writable(file)
+    reporter.progress(0.0, "reading the scene")
     mode = activate(options.mode)
 
     if options.threads:
@@ -221,7 +222,7 @@ def _sensor(path: Path, scene, index: int):
     """The sensor of ``scene`` with this ``index``."""
     count = len(scene.sensors())
     if not 0 <= index < count:
-        raise NergError(f'"{path}" has {count} sensor(s) and number {index} was asked for: choose -s from 0 on.')
+        raise NergError(f'"{path}" has {count} sensor(s) and number {index} was asked for: choose -s from 0 on')
     return scene.sensors()[index]
 
 

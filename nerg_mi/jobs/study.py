@@ -43,7 +43,7 @@ def run_study(
     if min(width, height) < 4 or options.repeats < 1:
         raise NergError(
             "a study needs pictures of at least 4 x 4 pixels and one timed render, "
-            f"got {width} x {height} and {options.repeats}."
+            f"got {width} x {height} and {options.repeats}"
         )
     wanted = _expression(options.only)
     out = Path(out)
@@ -101,7 +101,7 @@ def _expression(only: str) -> re.Pattern:
     try:
         return re.compile(only)
     except re.error as error:
-        raise NergError(f'"{only}" is no regular expression ({error}): name settings as in "depth|paper".') from error
+        raise NergError(f'"{only}" is no regular expression ({error}): name settings as in "depth|paper"') from error
 
 
 def _chosen(all_settings: list[Setting], wanted: re.Pattern, only: str) -> list[Setting]:
@@ -110,7 +110,7 @@ def _chosen(all_settings: list[Setting], wanted: re.Pattern, only: str) -> list[
     rows = [default, *(row for row in others if wanted.search(row.name))]
     if only and len(rows) == 1:
         raise NergError(
-            f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}".'
+            f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}"'
         )
     return rows
 

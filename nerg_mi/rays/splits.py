@@ -145,7 +145,8 @@ def split_by_time(
     """
     if of not in ("all", "person") or not 0 < test_share < 1 or not gap >= 0:
         raise NergError(
-            f'of "{of}", test_share {test_share}, gap {gap}: need "all" or "person", a share in (0, 1), a gap >= 0'
+            'a split by time needs the clock "all" or "person", a share between 0 and 1 and a gap of 0 s or more, '
+            f'got "{of}", {test_share} and {gap}'
         )
     group = np.zeros(len(rays), np.int64) if of == "all" else rays.person
     first, last = np.full(group.max(initial=0) + 1, np.inf), np.full(group.max(initial=0) + 1, -np.inf)

@@ -56,15 +56,15 @@ def check_ply(path: str | os.PathLike, faces: bool = True) -> None:
         start, length = file.tell(), path.stat().st_size
         count = {element.name: element.count for element in elements}
         if not count.get("vertex"):
-            raise NergError(f'the mesh "{path}" has no vertices; export it again.')
+            raise NergError(f'the mesh "{path}" has no vertices; export it again')
         if faces and not count.get("face"):
-            raise NergError(f'the mesh "{path}" has no faces; export it with them, as triangles.')
+            raise NergError(f'the mesh "{path}" has no faces; export it with them, as triangles')
         dtypes = [np.dtype([(name, order + kind) for name, kind in e.fields]) for e in elements]
         # In text every value takes a character and a separator at least.
         needed = sum(e.count * (2 * len(e.fields) if not order else d.itemsize) for e, d in zip(elements, dtypes))
         if needed > length - start + (1 if not order else 0):
             raise NergError(
-                f'the mesh "{path}" ends before the {sum(count.values()):,} rows that it announces; export it again.'
+                f'the mesh "{path}" ends before the {sum(count.values()):,} rows that it announces; export it again'
             )
         tables = _text_tables(file, elements) if not order else _binary_tables(path, start, elements, dtypes)
         for element, rows in zip(elements, tables):
@@ -140,14 +140,14 @@ def _check_faces(path: Path, element: _Element, rows, vertices: int) -> None:
             part = rows[first : first + _ROWS]
             if np.any(part[f"{name}.count"] != 3):
                 raise NergError(
-                    f'the mesh "{path}" has faces of more or fewer than three corners; export it as triangles.'
+                    f'the mesh "{path}" has faces of more or fewer than three corners; export it as triangles'
                 )
             for k in range(3):
                 corner = part[f"{name}.{k}"]
                 if np.any(corner < 0) or np.any(corner >= vertices):
                     raise NergError(
                         f'the mesh "{path}" has a face with a corner that is none of its {vertices:,} vertices; '
-                        "export it again."
+                        "export it again"
                     )
 
 
@@ -155,7 +155,7 @@ def check_obj(path: str | os.PathLike) -> None:
     """Raise `NergError` for an OBJ file without a face."""
     with reading(path, "mesh"), Path(path).open("rb") as file:
         if not any(line.lstrip().startswith((b"f ", b"f\t")) for line in file):
-            raise NergError(f'the mesh "{path}" has no faces; export it with them.')
+            raise NergError(f'the mesh "{path}" has no faces; export it with them')
 
 
 def check_vol(path: str | os.PathLike) -> None:

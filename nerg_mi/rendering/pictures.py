@@ -27,7 +27,7 @@ def activate(variant: str | None = None) -> str:
     import mitsuba as mi
 
     if variant is not None and variant not in mi.variants():
-        raise NergError(f'there is no variant "{variant}"; this Mitsuba has {", ".join(mi.variants())}.')
+        raise NergError(f'there is no variant "{variant}"; this Mitsuba has {", ".join(mi.variants())}')
     wanted = [variant] if variant else [v for v in _PREFERRED if not v.startswith("cuda") or llvm.has_cuda()]
     reason = ""
     for choice in wanted:
@@ -38,7 +38,7 @@ def activate(variant: str | None = None) -> str:
             raise
         except ImportError as error:  # Mitsuba says so where the backend of a variant cannot start
             reason = sentence(error)
-    raise NergError(f'the variant "{wanted[-1]}" does not work here ({reason}); "nerg doctor" says how to mend it.')
+    raise NergError(f'the variant "{wanted[-1]}" does not work here ({reason}); "nerg doctor" says how to mend it')
 
 
 def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
@@ -49,12 +49,12 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
     import mitsuba as mi
 
     if not Path(path).is_file():
-        raise NergError(f'there is no scene file "{path}".')
+        raise NergError(f'there is no scene file "{path}"')
     # Values of any type, among which Mitsuba looks for its own parameters.
     given: dict[str, Any] = dict(defaults or {})
     for name in _OWN:
         if name in given:
-            raise NergError(f'"{name}" is a name that Mitsuba keeps for itself: give the value in "{path}" another.')
+            raise NergError(f'"{name}" is a name that Mitsuba keeps for itself: give the value in "{path}" another')
     check_scene_file(path, defaults)
     with mitsuba_says(), threads_for_mitsuba():
         try:
@@ -65,13 +65,11 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
             )
             if unused:
                 raise NergError(
-                    f'the scene "{path}" asks for no "${unused[0]}": correct the name that is given a value.'
+                    f'the scene "{path}" asks for no "${unused[0]}": correct the name that is given a value'
                 ) from error
             raise
         except UnicodeDecodeError as error:
             # Mitsuba quotes what it cannot read, and that is no text.
-            raise NergError(
-                f'a mesh or another file that the scene "{path}" names is damaged: make it anew.'
-            ) from error
+            raise NergError(f'a mesh or another file that the scene "{path}" names is damaged: make it anew') from error
     check_scene(path, loaded)
     return loaded

@@ -72,7 +72,7 @@ def check_scene(path: str | Path, scene) -> None:
         width, height = map(int, film.crop_size())
         if not 0 < width * height <= PIXELS:
             raise NergError(
-                f'the film of sensor {index} of "{path}" has {width:,} x {height:,} pixels: give it 1 to {PIXELS:,}.'
+                f'the film of sensor {index} of "{path}" has {width:,} x {height:,} pixels: give it 1 to {PIXELS:,}'
             )
         check_samples(count, f'the sampler of sensor {index} of "{path}"')
 
@@ -80,7 +80,7 @@ def check_scene(path: str | Path, scene) -> None:
 def check_samples(count: int, what: str) -> None:
     """Raise `NergError` for no samples and for more than `SAMPLES`."""
     if not 1 <= count <= SAMPLES:
-        raise NergError(f"{what} takes {count:,} samples a pixel: give it 1 to {SAMPLES:,}.")
+        raise NergError(f"{what} takes {count:,} samples a pixel: give it 1 to {SAMPLES:,}")
 
 
 class _Scene:
@@ -93,9 +93,9 @@ class _Scene:
     def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
         whole = path.resolve()
         if whole in within:
-            raise NergError(f'the scene file "{path}" includes itself; take that <include> out.')
+            raise NergError(f'the scene file "{path}" includes itself; take that <include> out')
         if len(within) > INCLUDES:
-            raise NergError(f'the scene file "{path}" is included more than {INCLUDES} files deep; include fewer.')
+            raise NergError(f'the scene file "{path}" is included more than {INCLUDES} files deep; include fewer')
         parser = expat.ParserCreate()
         # The parser itself would grow the text of entities without bound.
         parser.EntityDeclHandler = lambda *_: self._refuse(
@@ -124,14 +124,14 @@ class _Scene:
                     parser.Parse(part, False)
             parser.Parse(b"", True)
         except expat.ExpatError as error:
-            raise NergError(f'the scene file "{path}" is no well-formed XML ({error}); correct it.') from error
+            raise NergError(f'the scene file "{path}" is no well-formed XML ({error}); correct it') from error
         except OSError as error:
             raise NergError(
-                f'the scene file "{path}" could not be read ({error.strerror}); check its name and permissions.'
+                f'the scene file "{path}" could not be read ({error.strerror}); check its name and permissions'
             ) from error
 
     def _refuse(self, path, parser, why):
-        raise NergError(f'the scene file "{path}" (line {parser.CurrentLineNumber}) {why}.')
+        raise NergError(f'the scene file "{path}" (line {parser.CurrentLineNumber}) {why}')
 
     def _count(self, more: int, path, parser) -> None:
         self._bytes += more

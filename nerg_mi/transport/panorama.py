@@ -18,7 +18,7 @@ from nerg_mi.errors import NergError
 
 def _check(width: int, height: int) -> None:
     if width < 1 or height < 2:
-        raise NergError(f"a panorama needs at least 1 x 2 pixels and {width} x {height} were asked for.")
+        raise NergError(f"a panorama needs at least 1 x 2 pixels and {width} x {height} were asked for")
 
 
 def pixel_directions(width: int, height: int) -> np.ndarray:

@@ -63,14 +63,14 @@ def failing(monkeypatch, error):
     [
         (NergError('there is no "x": write "y".'), 'nerg: there is no "x": write "y".'),
         (MissingFile('there is no file "a".'), 'nerg: there is no file "a".'),
-        (FileNotFoundError(2, "No such file or directory", "a.xml"), 'nerg: there is no file "a.xml".'),
-        (PermissionError(13, "Permission denied", "a.exr"), 'nerg: "a.exr": permission denied.'),
-        (OSError(28, "No space left on device"), "nerg: no space left on device."),
+        (FileNotFoundError(2, "No such file or directory", "a.xml"), 'nerg: there is no file "a.xml"'),
+        (PermissionError(13, "Permission denied", "a.exr"), 'nerg: "a.exr": permission denied'),
+        (OSError(28, "No space left on device"), "nerg: no space left on device"),
         (UnusableLLVM("LLVM 15 cannot run."), "nerg: LLVM 15 cannot run."),
         (ModuleNotFoundError("No module named 'torch'", name="torch"), "nerg: No module named 'torch'"),
         (
             MemoryError("Unable to allocate 9 GiB"),
-            "nerg: there is not enough memory: Unable to allocate 9 GiB; ask for less, or close other programs.",
+            "nerg: there is not enough memory: Unable to allocate 9 GiB; ask for less, or close other programs",
         ),
     ],
 )
@@ -118,7 +118,7 @@ def test07_a_mistake_in_the_program_is_shown_as_one(monkeypatch, capsys, error, 
     assert end.value.code == 70 and not out.out
     assert out.err == (
         f"nerg: internal error ({said}): this is a fault of nerg_mi and not of your input; run again with --debug and "
-        "report the traceback.\n"
+        "report the traceback\n"
     )
 
 

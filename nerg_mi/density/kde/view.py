@@ -40,7 +40,7 @@ class KdeView:
         backend: Backend = None,
     ) -> None:
         if len(rays) == 0:
-            raise NergError("there are no rays to show the density of")
+            raise NergError("there are no rays to show the density of; give a file that has some")
         self.to_world, self.backend = to_world or Similarity(), backend
         self.count, self.kappa = min(count, len(rays)), kappa
         self._origin, self._direction = rays.origin, rays.direction

@@ -24,7 +24,7 @@ def triangles(scene) -> np.ndarray:
     for shape in scene.shapes():
         if not shape.is_mesh():
             raise NergError(
-                f"a study of shapes needs meshes, and this scene has a {shape.class_name()}: give it as triangles."
+                f"a study of shapes needs meshes, and this scene has a {shape.class_name()}: give it as triangles"
             )
         params = mi.traverse(shape)
         corners = np.array(params["vertex_positions"], float).reshape(-1, 3)

@@ -64,14 +64,14 @@ def open_subject(
     in a scene file stands for. Raises NergError for what the user can mend.
     """
     if kind not in KINDS:
-        raise NergError(f'there is no kind of scene "{kind}": choose one of {", ".join(KINDS)}.')
+        raise NergError(f'there is no kind of scene "{kind}": choose one of {", ".join(KINDS)}')
     if kind == "analytic" or (kind == "auto" and scene in study_scenes.SCENES):
         if scene not in study_scenes.SCENES:
-            raise NergError(f'there is no analytic scene "{scene}": choose one of {", ".join(study_scenes.SCENES)}.')
+            raise NergError(f'there is no analytic scene "{scene}": choose one of {", ".join(study_scenes.SCENES)}')
         return AnalyticSubject(study_scenes.SCENES[scene], width, height)
     if not Path(scene).is_file():
         names = ", ".join(study_scenes.SCENES)
-        raise NergError(f'there is no scene file "{scene}", and no analytic scene of that name; those are {names}.')
+        raise NergError(f'there is no scene file "{scene}", and no analytic scene of that name; those are {names}')
     return load_subject(Path(scene), width, height, defaults or {}, surfaces)
 
 
@@ -106,7 +106,7 @@ class Subject:
         import mitsuba as mi
 
         if resolution:
-            raise NergError(f'"{self.name}" has no grids of other resolutions; only analytic scenes do.')
+            raise NergError(f'"{self.name}" has no grids of other resolutions; only analytic scenes do')
         return mi.load_dict({"type": "nerg", **self.base, **params})
 
     def aovs(self) -> str:
@@ -320,15 +320,15 @@ def load_subject(
     """The scene in the file ``path``, of a field or of shapes; as `open_subject` has it."""
     loaded = load_scene(path, defaults)
     if type(loaded.integrator()).__name__ != "NergIntegrator":
-        raise NergError(f'the integrator of "{path}" is not "nerg": name a scene whose integrator is.')
+        raise NergError(f'the integrator of "{path}" is not "nerg": name a scene whose integrator is')
     if not loaded.sensors():
-        raise NergError(f'"{path}" has no sensor: add the camera that takes the pictures.')
+        raise NergError(f'"{path}" has no sensor: add the camera that takes the pictures')
     if not loaded.sensors()[0].film().rfilter().is_box_filter():
         raise NergError(
-            f'the film of "{path}" does not have a box filter, without which depths cannot be compared: give it one.'
+            f'the film of "{path}" does not have a box filter, without which depths cannot be compared: give it one'
         )
     if loaded.integrator().medium is not None and len(loaded.shapes()) > 0:
-        raise NergError(f'"{path}" holds a field and shapes, of which there is no reference: study each alone.')
+        raise NergError(f'"{path}" holds a field and shapes, of which there is no reference: study each alone')
     if loaded.integrator().medium is None:
         return ShapesSubject(path, loaded, width, height)
     return FileSubject(path, loaded, width, height, surfaces(path))

@@ -71,7 +71,10 @@ def _variant(state: StateDict, stored) -> str:
             f'"{state.path}" captures gaze by a mixture of von Mises-Fisher lobes; only a linear head is read'
         )
     if ("Emit" in name and not emit) or ("Capture" in name and not capture):
-        raise NergError(f'"{state.path}" is of the variant {name} and lacks one of its heads')
+        raise NergError(
+            f'"{state.path}" is of the variant {name} and lacks one of its heads; '
+            "take another checkpoint of its training"
+        )
     return _VARIANTS[name]
 
 
@@ -83,7 +86,7 @@ def gaze_field(state: StateDict, variant: str, ns: ModuleType) -> GazeField:
     position, direction = read(state, "net1", ns), read(state, "net2", ns)
     width, geometry = direction.outputs, position.outputs
     if position.weights[0].shape[0] != width or direction.weights[0].shape[0] != width:
-        raise NergError(f'the networks of "{state.path}" are not all {width} wide')
+        raise NergError(f'the networks of "{state.path}" are not all {width} wide; networks of one width are read')
     sizes = grid_config(state, "encoder", 256 * bound)
     config = GazeConfig(
         sizes,

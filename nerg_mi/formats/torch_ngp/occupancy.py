@@ -27,7 +27,10 @@ def read_occupancy(state: StateDict, bound: float, ns: ModuleType, mean_density)
     else:
         return None
     if bits.size != levels * _CELLS**3:
-        raise NergError(f'"{state.path}" has {bits.size} density bits where a bound of {bound:g} has {levels} x 128^3')
+        raise NergError(
+            f'"{state.path}" has {bits.size} density bits where a bound of {bound:g} has {levels} x 128^3; '
+            "take another checkpoint of its training"
+        )
     bits = bits.reshape(levels, -1)
     if density is not None and not bits.all():
         # The largest density that the grid calls empty: cells never seen hold -1.

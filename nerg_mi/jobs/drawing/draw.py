@@ -56,7 +56,7 @@ def draw_kind(kind: Kind, files: Sequence[Path], output: Path | None, options: A
         raise NergError(f'a figure "{kind.name}" is drawn of 1 to {kind.most} files, and {len(files)} were given')
     for path in files:
         if not path.exists():
-            raise MissingFile(f'there is no file "{path}".')
+            raise MissingFile(f'there is no file "{path}"')
     made = kind.draw(files, options, reporter)
     if output is not None:
         about = provenance(f"nerg draw {kind.name}", _inputs(made.inputs, options), made.seed, options)

@@ -42,7 +42,7 @@ class OpenScene:
         count = len(self.scene.sensors())
         if not 0 <= index < count:
             raise NergError(
-                f'"{self.path}" has {count} sensor(s) and number {index} was asked for: choose -s from 0 on.'
+                f'"{self.path}" has {count} sensor(s) and number {index} was asked for: choose -s from 0 on'
             )
         return self.scene.sensors()[index]
 

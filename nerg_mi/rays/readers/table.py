@@ -50,7 +50,7 @@ class TableOptions:
         check_tick(self.tick)
         poses.axis(self.looks_along, "forward")
         if self.person_from not in ("column", "filename"):
-            raise NergError(f'person_from is "{self.person_from}"; it is "column" or "filename" (--person-from)')
+            raise NergError(f'persons are named by "column" or "filename" (--person-from), not by "{self.person_from}"')
 
     @property
     def frame(self) -> Frame:

@@ -79,7 +79,10 @@ def place_of_scene(path: Path) -> GazePlace:
     if place.scene is not None:
         bounds.append(place.corners())
     if not bounds:
-        raise NergError(f'the scene "{path}" has neither shapes nor a field in which people could have looked around')
+        raise NergError(
+            f'the scene "{path}" has neither shapes nor a field in which people could have looked around; '
+            "name one that has"
+        )
     lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
     # A plane has no thickness, and a field needs some.
     pad = 0.01 * max(upper - lower)
