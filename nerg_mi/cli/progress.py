@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-EVERY = 30.0
+EVERY = 10.0
 """Seconds between two lines of progress where no terminal shows a bar."""
+
+SOON = 2.0
+"""Seconds after which it is guessed how long the rest takes."""
 
 
 class TerminalReporter:
@@ -18,12 +22,20 @@ class TerminalReporter:
 
     Messages go to the standard output and warnings to the standard error. The bar is on the standard error, from the
     first ``progress`` on and only where that is a terminal, so that neither a pipe nor a file ever holds it. Where it
-    is none, as in the log of a job that runs for hours, the standard error gets a line every half minute.
+    is none, as in the log of a job that runs for hours, the standard error gets a line every ten seconds, also while a
+    long step tells nothing. What a job does not say itself is added: how many seconds are left, if the rest goes as
+    fast as what is done; how long it has taken, where that cannot be guessed.
     """
 
     def __enter__(self) -> TerminalReporter:
         self._bar: Progress | None = None
+        self._lock = threading.Lock()
         self._told = time.monotonic()
+        self._begun: float | None = None
+        self._counted = self._told
+        self._now = (0.0, "")
+        self._ended = threading.Event()
+        self._pulse: threading.Thread | None = None
         return self
 
     def message(self, text: str) -> None:
@@ -33,14 +45,49 @@ class TerminalReporter:
         self._print(f"warning: {text}", sys.stderr)
 
     def progress(self, share: float, text: str = "") -> None:
-        if self._bar is None:
+        if self._begun is None:
+            self._begun = time.monotonic()
             self._bar = self._start()
+            if self._bar is None:
+                # What computes for minutes without a word is spoken for.
+                self._pulse = threading.Thread(target=self._beat, name="progress", daemon=True)
+                self._pulse.start()
+        if share <= 0:
+            # What is prepared is no measure of how fast the rest goes.
+            self._counted = time.monotonic()
+        self._now = (share, text)
         if self._bar is not None:
             (task,) = self._bar.task_ids
-            self._bar.update(task, completed=share, description=text)
-        elif time.monotonic() - self._told >= EVERY:
+            self._bar.update(task, completed=share, description=self.line())
+        else:
+            self.tell_when_due()
+
+    def line(self) -> str:
+        """What is being done, and how long the rest takes, or how long it has taken."""
+        share, text = self._now
+        elapsed = 0.0 if self._begun is None else time.monotonic() - self._begun
+        if text.endswith(" left") or " left, " in text:
+            return text
+        counted = time.monotonic() - self._counted
+        if share > 0.01 and counted >= SOON:
+            rest = f"{duration(counted * (1 - share) / share)} left"
+        elif elapsed >= EVERY and self._bar is None:
+            rest = f"{duration(elapsed)} so far"
+        else:
+            return text
+        return f"{text}, {rest}" if text else rest
+
+    def tell_when_due(self) -> None:
+        """A line of a log, if the last one is `EVERY` seconds ago."""
+        with self._lock:
+            if time.monotonic() - self._told < EVERY:
+                return
             self._told = time.monotonic()
-            print(f"{share:4.0%} {text}".rstrip(), file=sys.stderr, flush=True)
+            print(f"{self._now[0]:4.0%} {self.line()}".rstrip(), file=sys.stderr, flush=True)
+
+    def _beat(self) -> None:
+        while not self._ended.wait(1.0):
+            self.tell_when_due()
 
     def _start(self) -> Progress | None:
         """The bar, with its one task; None where it would not be seen."""
@@ -66,5 +113,15 @@ class TerminalReporter:
             print(text, file=stream, flush=True)
 
     def __exit__(self, *error) -> None:
+        self._ended.set()
         if self._bar is not None:
             self._bar.stop()
+        if self._pulse is not None:
+            self._pulse.join()
+
+
+def duration(seconds: float) -> str:
+    """A time as one says it: 40 s, 12 min, 3.5 h."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"

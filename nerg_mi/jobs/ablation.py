@@ -83,6 +83,7 @@ def ablate(
     truth = _law(options.law) if options.law else None
     check_folder(output)
     ns = select_backend(options.mode, options.threads)
+    reporter.progress(0.0, "preparing")
     data = rays if isinstance(rays, Rays) else load_rays(rays)
     _, account = hold_out(data, options.radius, options.zones, options.positions, 0, options.min_rays, options.people)
     train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")

@@ -64,6 +64,7 @@ def align(
     if output is not None:
         check_writable(output, ".json")
         check_writable(output.with_suffix(".png"))
+    reporter.progress(0.0, "reading")
     data = rays if rays is None or isinstance(rays, Rays) else Rays.load(rays)
     evidence = _evidence(options, data)
     place, target = _target(options, evidence.kind, reporter)

@@ -68,6 +68,7 @@ def train_radiance(
     settings = _settings(options)
     if options.resume and (state is None or not state.is_file()):
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
+    reporter.progress(0.0, "reading photos")
     data = _open(photos, options)
     _tell_about(data, reporter)
     field, provenance = run.train_field(

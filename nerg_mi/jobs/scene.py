@@ -65,6 +65,7 @@ def write_scene(
     frames_file = output.with_suffix(".frames.csv")
     if options.times is not None:
         check_writable(frames_file)
+    reporter.progress(0.0, "reading the files")
     given = recognise([Path(file) for file in files], options.geometry, reporter)
     check_rays(given.rays, output)
     if given.kind == "hits":
@@ -77,6 +78,7 @@ def write_scene(
     given, made = _with_hits(given, rays, output, reporter)
     place = place_of_files(given, output)
     up = _up(given, align, options)
+    reporter.progress(0.1, "placing the observer")
     theirs = rays if options.person is None else found.of_person(options.person)
     observer, walk, about = _observer(given, theirs, align, ns, options, reporter)
     tracked = given.gaze is not None or given.rays is not None
@@ -90,12 +92,14 @@ def write_scene(
         taken = place.make(probe_file.parent, scene.lamps(1, 1)).taken
         values = {default_name(name, taken): value for name, value in probe_values().items()}
         probe = Probe(load_scene(probe_file, values), scene.attention(probe_file.parent).quantity, up)
+        reporter.progress(0.3, "looking around")
         seen = None if observer is None else probe.around(observer)
         if seen is not None and observer is not None and not seen.met.any() and given.kind != "none":
             reporter.warn("the observer meets no surface at all; give --observer another place, or check the alignment")
         if observer is not None and seen is not None and walk is None and options.person is None:
             observer = turned_ahead(observer, seen)
             scene = replace(scene, observer=observer)
+        reporter.progress(0.5, "looking for the best overview")
         camera, lens, chosen = _camera(scene, probe, seen, options, reporter)
     camera = upright(camera, up)
     usual = seen.usual if seen is not None and seen.usual > 0 else 0.0

@@ -98,12 +98,13 @@ def guess_import(file: FileName, reporter: Reporter = SILENT) -> Proposal:
 
     Raises `NergError` for a file that is no table, or is damaged.
     """
-    reporter.message(f"looking at {file}")
+    reporter.progress(0.0, f"reading {Path(file).name}")
     return propose_import(Path(file))
 
 
-def card_of(path: FileName) -> list[tuple[str, ImportResult]]:
+def card_of(path: FileName, reporter: Reporter = SILENT) -> list[tuple[str, ImportResult]]:
     """Titles, figures and lines of the sanity cards of a file of rays, or of each place of a dataset."""
+    reporter.progress(0.0, f"reading {Path(path).name}")
     if not is_dataset(path):
         rays = Rays.load(path)
         return [(str(path), ImportResult(rays, summarise(rays)))]
@@ -124,6 +125,7 @@ def filter_rays(rays: Rays | FileName, options: FilterOptions, reporter: Reporte
 
     Raises `NergError` where a step leaves no ray, and for what `nerg_mi.rays.filters` and `.fixations` refuse.
     """
+    reporter.progress(0.0, "reading rays")
     if not isinstance(rays, Rays) and is_dataset(rays):
         return FilterResult(*filter_dataset(rays, options, reporter))
     _check_outputs(options.output)
@@ -152,7 +154,9 @@ def split_rays(rays: Rays | FileName, options: SplitOptions, reporter: Reporter 
     ``rays``: those, or a file of them. Raises `NergError` for what `nerg_mi.rays.splits` refuses.
     """
     _check_outputs(options.train_output, options.test_output)
+    reporter.progress(0.0, "reading rays")
     data, seed = _load(rays), options.seed
+    reporter.progress(0.01, "splitting")
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     about: dict[str, Any] = {}
     if options.zones:
@@ -202,8 +206,9 @@ class PlotOptions:
             raise NergError("--test is drawn in the layout; add --kind layout")
 
 
-def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions()) -> Figure:
+def plot_rays(rays: Rays | FileName, options: PlotOptions = PlotOptions(), reporter: Reporter = SILENT) -> Figure:
     """The floor plan of rays, or of a file of them, as a figure of matplotlib."""
+    reporter.progress(0.0, "drawing rays")
     if options.output is not None:
         check_writable(options.output, *saving.FORMATS)
     if options.kind == "density":

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from nerg_mi.cli.progress import TerminalReporter
+
 
 def command(
     file: Annotated[Path, typer.Argument(help="Tracking file, or folder of a recording, that is not known.")],
@@ -18,7 +20,8 @@ def command(
     from nerg_mi.files.bounded import plain
     from nerg_mi.jobs.tracking import guess_import
 
-    found = guess_import(file)
+    with TerminalReporter() as reporter:
+        found = guess_import(file, reporter)
     for name, sentences in (("sure", found.sure), ("guess", found.guessed), ("open", found.open)):
         for sentence in sentences:
             # Names of columns are no control characters of a terminal.

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from nerg_mi.cli.progress import TerminalReporter
+
 from .arguments import RaysFile
 
 
@@ -24,5 +26,6 @@ def command(
     """The floor plan: where people stood and how densely, or the layout."""
     from nerg_mi.jobs.tracking import PlotOptions, plot_rays
 
-    plot_rays(rays, PlotOptions(kind=kind, cell=cell, test=test, output=output))
+    with TerminalReporter() as reporter:
+        plot_rays(rays, PlotOptions(kind=kind, cell=cell, test=test, output=output), reporter)
     typer.echo(f"wrote {output}")

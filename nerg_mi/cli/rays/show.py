@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from nerg_mi.cli.progress import TerminalReporter
+
 from .arguments import RaysFile, print_card
 
 
@@ -12,5 +14,7 @@ def command(rays: RaysFile) -> None:
     """
     from nerg_mi.jobs.tracking import card_of
 
-    for title, found in card_of(rays):
+    with TerminalReporter() as reporter:
+        cards = card_of(rays, reporter)
+    for title, found in cards:
         print_card(found.rays, found.summary, title, found.lines)
