@@ -100,7 +100,8 @@ def _rays(scene: Any) -> Any:
     axes.plot(*EYE[:2], "o", color="#1b6ca8", markersize=9, label="the observer: $p_o$")
     axes.plot(*ASIDE[:2], "s", color="#333333", markersize=8, label="a camera elsewhere")
     axes.set(title=f"{kept.sum()} rays of one observer, from above", xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    axes.legend(loc="upper left", fontsize=8)
+    axes.set_ylim(-0.4, 7.2)
+    axes.legend(loc="upper center", fontsize=8, ncols=3)
     return figure
 
 

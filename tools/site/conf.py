@@ -10,6 +10,8 @@ release = version = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "tools.site.mathml"]
 source_suffix = {".md": "markdown"}
 language = "en"
+# Two dashes begin an option.
+smartquotes = False
 nitpicky = False
 
 # Pages are read as a code host reads them.

@@ -5,21 +5,22 @@ from __future__ import annotations
 import base64
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 _ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
-def page_of(path: Path, folder: Path, name: str) -> str:
+def page_of(path: Path, folder: Path, name: str, link: Callable[[str], str] = str) -> str:
     """The notebook ``path`` as the text of the page ``name`` in ``folder``; its pictures are written into images/
-    there."""
+    there. ``link`` makes links of a notebook's text those of the page."""
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     parts = []
     for number, cell in enumerate(cells):
         text = "".join(cell["source"]).rstrip()
         if cell["cell_type"] == "markdown":
-            parts.append(text)
+            parts.append(link(text))
         elif cell["cell_type"] == "code" and text:
             parts.append(f"```python\n{text}\n```")
             for i, output in enumerate(cell["outputs"]):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 
 from tools.site.notebooks import page_of
@@ -29,18 +30,20 @@ def assemble(root: Path, folder: Path) -> None:
     shutil.copytree(docs / "images", folder / "images")
     pages = {(docs / f"{name}.md"): name for name in page_names(docs)}
     pages |= {root / file: name for file, name in ROOT_PAGES.items()}
-    books = {path: path.stem for path in sorted((root / "examples").glob("*.ipynb"))}
+    # A notebook may be called as a page of docs/ is.
+    books = {path: f"notebook-{path.stem.replace('_', '-')}" for path in sorted((root / "examples").glob("*.ipynb"))}
     known = {path.resolve(): name for path, name in (pages | books).items()}
     for path, name in pages.items():
         text = path.read_text(encoding="utf-8")
         if name == "index":
-            text += toctrees(text, {*known.values()})
+            text += toctrees(text, known, docs)
         text = linked(text, path, known, docs)
         if name == "index":
             text = re.sub(r"^## [^\n]*\n\s*(?=^## |\Z)", "", text, flags=re.M)
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
     for path, name in books.items():
-        text = linked(page_of(path, folder, name), path, known, docs)
+        link = partial(linked, page=path, known=known, docs=docs)
+        text = page_of(path, folder, name, link)
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
 
 
@@ -49,19 +52,19 @@ def page_names(docs: Path) -> list[str]:
     return sorted(path.stem for path in docs.glob("*.md"))
 
 
-def toctrees(index: str, known: set[str]) -> str:
+def toctrees(index: str, known: dict[Path, str], docs: Path) -> str:
     """The contents, hidden, after the lists of links of ``index``: one for each of its headings. A page that is not
     there is left out; one that is there and in no list follows at the end."""
     trees, named = [], set()
     for part in re.split(r"^## ", index, flags=re.M)[1:]:
         title, _, body = part.partition("\n")
         targets = re.findall(r"^- \[[^\]]*\]\(([^()#\s]+)", body, flags=re.M)
-        names = [Path(target).stem.lower() for target in targets]
-        names = [name for name in dict.fromkeys(names) if name in known and name not in named]
+        names = [known.get((docs / target).resolve(), "") for target in targets]
+        names = [name for name in dict.fromkeys(names) if name and name not in named]
         named |= set(names)
         if names:
             trees.append((title.strip(), names))
-    if rest := sorted(known - named - {"index"}):
+    if rest := sorted(set(known.values()) - named - {"index"}):
         trees.append(("More", rest))
     blocks = ["```{toctree}", ":hidden:", ":caption: "]
     return "".join(

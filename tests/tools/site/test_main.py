@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from html.parser import HTMLParser
 
@@ -72,6 +73,21 @@ def test_every_public_name_and_command_has_its_place(built):
     assert [name for name in nerg.__all__ if f'id="nerg_mi.{name}"' not in reference] == []
     commands = (built / "commands.html").read_text(encoding="utf-8")
     assert [path for path, *_ in command_pages.commands() if f'id="{path.replace(" ", "-")}"' not in commands] == []
+
+
+@pytest.mark.slow
+def test_notebooks_are_pages_with_their_pictures(built):
+    for path in (ROOT / "examples").glob("*.ipynb"):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        pictures = sum("image/png" in o.get("data", {}) for cell in cells for o in cell.get("outputs", ()))
+        page = (built / f"notebook-{path.stem.replace('_', '-')}.html").read_text(encoding="utf-8")
+        assert page.count('<img alt="Output"') == pictures > 0
+        assert "".join(cells[0]["source"]).splitlines()[0].removeprefix("# ") in page
+
+
+@pytest.mark.slow
+def test_options_keep_their_dashes(built):
+    assert "at --time or --times" in (built / "commands.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
