@@ -163,14 +163,17 @@ class ViewScores:
 
     @property
     def psnr_mean(self) -> float:
+        """The mean over the views, in dB."""
         return float(np.mean(self.psnr))
 
     @property
     def psnr_fitted_mean(self) -> float:
+        """The mean over the views whose colours could be fitted, in dB."""
         return float(np.nanmean(self.psnr_fitted))
 
     @property
     def ssim_mean(self) -> float:
+        """The mean over the views."""
         return float(np.mean(self.ssim))
 
     def to_dict(self) -> dict:
