@@ -31,6 +31,7 @@ RUN_ELSEWHERE = {
 NOT_RUN = {
     ("applications.md", "text"): "a formula",
     ("plugins.md", "math"): "a formula",
+    ("pictures.md", "py"): "pieces of a session; tests/jobs/drawing and tests/figures call what they name",
     ("python-reference.md", "{eval-rst}"): "what Sphinx is told; tests/tools/site/test_main.py builds the page",
     ("quickstart.md", "text"): "what commands print",
     ("tracking.md", ""): "what commands print, and a list of files",

@@ -66,6 +66,11 @@ FOREIGN = {
     "__name__": "Python's own, in the line that a script needs",
     "__main__": "Python's own, in the line that a script needs",
     "emit_capture": "a value of --variant",
+    "gaze_std": "an AOV",
+    "PRGn_r": "a colour map of matplotlib",
+    "RdBu_r": "a colour map of matplotlib",
+    "PuOr_r": "a colour map of matplotlib",
+    "BrBG_r": "a colour map of matplotlib",
 }
 """Names with an underscore that people meet elsewhere -> what they are."""
 

@@ -24,7 +24,7 @@ class SphereOptions(SceneOptions):
     """How an observer's sphere is drawn."""
 
     sensor: int = option(0, "Where no observer is: whose place it is, counted from 0.", "-s", "--sensor")
-    projection: str = option("mollweide", "mollweide (equal areas) or equirectangular.")
+    projection: str = option("mollweide", "Projection: mollweide (equal areas) or equirectangular.")
     width: int = option(800, "Width of the map in pixels; it is half as high.", min=64, max=5792)
 
 
