@@ -25,6 +25,7 @@ COMMANDS = {
     "demo": "Render the demo store: pictures of what a gaze field is.",
     "doctor": "Say what works on this machine, and how to mend what does not.",
     "scene": "Write a scene file for a field, a mesh, a gaze field or rays, with a camera and an observer.",
+    "view": "Show a place with its gaze in the browser, where the observer is dragged.",
     "render": "Render a scene file to a picture or a video.",
     "draw": "Draw a figure: a gaze sphere, occlusion, a floor plan, a contact sheet, a difference.",
     "rays": "Import tracking files as rays of attention, and look at what they hold.",

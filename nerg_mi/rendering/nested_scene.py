@@ -31,9 +31,7 @@ def nested_place(path: Path, folder: Path) -> Place:
 
     Raises `NergError` for what is no scene file, and for one whose integrator is `nerg` already or one of several.
     """
-    check_scene_file(path)
-    root = _root(path)
-    children = list(_inlined(root, path, [path.parent]))
+    version, children = scene_elements(path)
     defaults = [child for child in children if child.tag == "default"]
     values: dict[str, str] = {}
     for default in defaults:
@@ -44,15 +42,31 @@ def nested_place(path: Path, folder: Path) -> Place:
     others = [child for child in children if child.tag not in ("default", "integrator", "path")]
     light: tuple[Node, ...] = ()
     if integrators:
-        light = (Comment(f"What lights the shapes: the integrator of {path.name}."), *map(_verbatim, integrators))
+        light = (Comment(f"What lights the shapes: the integrator of {path.name}."), *map(verbatim, integrators))
     return Place(
         inside=light,
-        beside=(Comment(f"What follows is {path.name}; its sensors are counted after ours."), *map(_verbatim, others)),
-        first=(*_paths(path, children, folder), *map(_verbatim, defaults), Blank()),
+        beside=(Comment(f"What follows is {path.name}; its sensors are counted after ours."), *map(verbatim, others)),
+        first=(*_paths(path, children, folder), *map(verbatim, defaults), Blank()),
         spp=SPP,
-        version=root.get("version", "3.0.0"),
+        version=version,
         taken=frozenset(values) | frozenset(ids),
     )
+
+
+def scene_elements(path: Path) -> tuple[str, list[ElementTree.Element]]:
+    """The version of the scene file ``path``, and its elements, with those that it includes in their place. Raises
+    `NergError` for what is no scene file."""
+    check_scene_file(path)
+    root = _root(path)
+    return root.get("version", "3.0.0"), list(_inlined(root, path, [path.parent]))
+
+
+def verbatim(found: ElementTree.Element) -> Verbatim:
+    """An element of a scene file as a part of another."""
+    found = deepcopy(found)
+    found.tail = None
+    ElementTree.indent(found, " " * 4)
+    return Verbatim(ElementTree.tostring(found, encoding="unicode"))
 
 
 def _root(path: Path) -> ElementTree.Element:
@@ -103,10 +117,3 @@ def _paths(path: Path, children: list[ElementTree.Element], folder: Path) -> lis
     given = [path.parent, *(path.parent / child.get("value", "") for child in children if child.tag == "path")]
     names = [relative_name(place, folder) for place in given]
     return [element("path", value=value_of(name)) for name in dict.fromkeys(names) if name != "."]
-
-
-def _verbatim(found: ElementTree.Element) -> Verbatim:
-    found = deepcopy(found)
-    found.tail = None
-    ElementTree.indent(found, " " * 4)
-    return Verbatim(ElementTree.tostring(found, encoding="unicode"))

@@ -160,10 +160,11 @@ CASES = (
 MAKES_A_FOLDER = {"poses": "tests/cli/test_poses.py"}
 """Commands that make a folder as a whole, which must not be there before -> where their output is tried."""
 
-READS_ONLY = {"doctor", "rays guess", "rays show"}
+READS_ONLY = {"doctor", "view", "rays guess", "rays show"}
 """Commands that write no file."""
 INPUTS = {
     "scene": {"files", "photos", "align"},
+    "view": {"files", "regions", "align"},
     "render": {"scene", "frames"},
     "draw sphere": {"files"},
     "draw triptych": {"files"},

@@ -85,6 +85,21 @@ def _make_frames(folder: Path) -> None:
     (folder / "walk.frames.csv").write_text('eye,ahead,falloff\n"1, 2, 3","4, 5, 6",0.1\n"1,2,3","""a"" b",\n')
 
 
+def _make_regions(folder: Path) -> None:
+    first, second = (
+        '{"name": "a", "min": [0, 0, 0], "max": [1, 1, 1]}',
+        '{"name": "b", "min": [0, 1, 2], "max": [3, 4, 5]}',
+    )
+    text = f'{{"regions": [{first}, {second}]}}'
+    (folder / "areas.json").write_text(text)
+
+
+def _read_regions(folder: Path) -> object:
+    from nerg_mi.viewer.regions import read_regions
+
+    return read_regions(folder / "areas.json")
+
+
 def _read_frames(folder: Path) -> object:
     from nerg_mi.rendering.frames_file import read_frames
 
@@ -102,5 +117,6 @@ SCENES = [
     _reader("a.obj", "text"),
     _reader("fog.vol"),
     Reader("scene to be nested", _make_nested, {"theirs.xml": ("text",), "more.xml": ("text",)}, _nest),
+    Reader("areas of interest", _make_regions, {"areas.json": ("json",)}, _read_regions),
     Reader("frames of a sequence", _make_frames, {"walk.frames.csv": ("text",)}, _read_frames),
 ]

@@ -1,0 +1,136 @@
+"""The viewer in a headless Chromium: prints the table of docs/viewer.md, and makes its picture.
+
+    python -m benchmarks.viewer [--screenshot docs/images/viewer.png] [--threads 2]
+
+Chromium draws without a graphics card here, on the same processors that render: frames a second are those of software,
+and a floor of what a browser with a card shows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import time
+from pathlib import Path
+
+from nerg_mi.files.tables import markdown_table
+from nerg_mi.jobs import demo
+from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.viewer.serving import viewer
+
+import numpy as np
+from tests.viewer.browser import chromium
+from tests.viewer.test_in_chromium import drag, on_screen, until
+
+FRAMES = """
+const done = arguments[0]; let count = 0, start = performance.now(), longest = 0, last = start;
+function frame(now) {
+    count += 1; longest = Math.max(longest, now - last); last = now;
+    if (now - start < 3000) requestAnimationFrame(frame); else window.found = [1000 * count / (now - start), longest];
+}
+requestAnimationFrame(frame); done(true);
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--screenshot", type=Path)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--width", type=int, default=480)
+    given = parser.parse_args()
+    regions = demo.store_scene().parent / "regions.json"
+    rows = []
+    begun = time.perf_counter()
+    with viewer([demo.store_scene()], ViewOptions(port=0, width=given.width, regions=regions)) as running:
+        from nerg_mi.threads import set_thread_count
+
+        running.page.session.worker.call(lambda: set_thread_count(given.threads)).result()
+        rows.append(("command to address (kernels compiled before)", f"{time.perf_counter() - begun:.1f} s"))
+        with chromium(1100, 760) as driver:
+            rows += measure(running, driver, given.screenshot)
+    print(markdown_table(("what", "figure"), rows, right=("figure",)))
+
+
+def measure(running, driver, screenshot: Path | None) -> list[tuple[str, str]]:
+    """Rows of the table."""
+    page, session = running.page, running.page.session
+    start = time.perf_counter()
+    driver.get(running.address)
+    window = until(lambda: next(iter(page.windows.values()), None))
+    until(lambda: window.cloud is not None)
+    rows = [("page asked for to points in the browser", f"{time.perf_counter() - start:.1f} s")]
+    until(lambda: window.last is not None)
+    rows.append(("to a first picture of the integrator", f"{time.perf_counter() - start:.1f} s"))
+    whole = lambda: window.picture and window.last is not None and window.last[0].whole
+    until(whole, 120)
+    until(lambda: session.worker.idle, 120)
+
+    page.place_observer(np.array([5.6, 3.6, 1.6]), np.eye(3))
+    until(whole, 120)
+    until(lambda: session.worker.idle, 120)
+    driver.execute_async_script(FRAMES)
+    began = time.perf_counter()
+    while time.perf_counter() - began < 2.6:
+        drag(driver, (400, 500), (520, 510))
+        drag(driver, (520, 510), (400, 500))
+    fps, longest = until(lambda: driver.execute_script("return window.found"))
+    rows.append(("frames a second while the camera moves (no graphics card)", f"{fps:.0f}"))
+    rows.append(("longest time between two of them", f"{longest:.0f} ms"))
+    until(whole, 120)
+    until(lambda: session.worker.idle, 120)
+
+    waits = {"points": [], "coarse": [], "full": [], "whole": [], "shares": []}
+    for k in range(5):
+        page.place_observer(np.array([5.6, 3.6, 1.6]), np.eye(3))
+        until(whole, 120)
+        until(lambda: session.worker.idle, 120)
+        at = session.observer.copy()
+        first = on_screen(driver, window.view, at + np.array([0.3, 0, 0]))
+        drag(driver, first, (first[0] + 60 + 10 * k, first[1] + 20))
+        end = time.perf_counter()
+        until(lambda at=at: not np.array_equal(session.observer, at))
+        seconds = lambda end=end: time.perf_counter() - end
+        pending = {
+            "points": lambda: session.baked_for is not None and np.array_equal(session.baked_for, session.observer),
+            "coarse": lambda: window.picture,
+            "full": lambda: window.picture and window.last[0].share == 1,
+            "whole": whole,
+            "shares": session.follow_shares,
+        }
+        while pending:
+            for name in [name for name, there in pending.items() if there()]:
+                waits[name].append(seconds())
+                del pending[name]
+            time.sleep(0.01)
+    session.worker.wait_idle(120)
+    words = {
+        "points": "drag's end to its gaze on all points",
+        "coarse": "drag's end to a picture, a quarter as wide",
+        "full": "drag's end to a picture of full size, one sample a pixel",
+        "whole": f"drag's end to the refined picture, {session.spp} samples a pixel",
+        "shares": f"drag's end to the shares of {len(session.regions)} areas",
+    }
+    size = "{1} x {0}".format(*window.last[1].shape[:2])
+    for name, text in words.items():
+        low, middle, high = np.percentile(waits[name], [0, 50, 100])
+        rows.append((f"{text}{f' ({size})' if name == 'full' else ''}", f"{middle:.1f} s ({low:.1f} to {high:.1f})"))
+    if screenshot is not None:
+        save(driver, screenshot)
+    return rows
+
+
+def save(driver, path: Path) -> None:
+    """What the browser shows, as a small PNG of 160 colours."""
+    from PIL import Image
+    from selenium.webdriver.common.by import By
+
+    for button in driver.find_elements(By.CSS_SELECTOR, ".mantine-Notification-closeButton"):
+        button.click()
+    time.sleep(1.5)
+    picture = Image.open(io.BytesIO(driver.get_screenshot_as_png())).convert("RGB")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture.quantize(160, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+if __name__ == "__main__":
+    main()

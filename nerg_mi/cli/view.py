@@ -1,0 +1,35 @@
+"""`nerg view`: the command line of `nerg_mi.viewer`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nerg_mi.jobs.options.view import ViewOptions
+
+from .options import takes
+from .progress import TerminalReporter
+
+
+@takes(ViewOptions)
+def command(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            help="In any order: a scene, or a place (radiance field, .ply, .obj, .vol), a gaze field, rays; a folder.",
+            metavar="FILES",
+        ),
+    ],
+    options: ViewOptions,
+) -> None:
+    """Show a place with its gaze in the browser, where the observer is dragged.
+
+    The page is served to this machine alone, until Ctrl-C; nothing is fetched from anywhere else. At another --host its
+    address has a token.
+    """
+    from nerg_mi.viewer import serving
+
+    with TerminalReporter() as reporter:
+        serving.view_files(files, options, reporter)

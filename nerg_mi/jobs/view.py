@@ -1,0 +1,130 @@
+"""From files and folders to the scene that a viewer shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from nerg_mi.alignment.record import read_similarity
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.formats.checkpoint import read_metadata
+from nerg_mi.jobs.gaze_places import align_of_training
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.pictures import load_scene
+
+from .backend import select_backend
+from .options.scene import SceneOptions
+from .options.view import ViewOptions
+from .reporter import SILENT, Reporter
+from .scene import write_scene
+from .scenes.cameras import given_point
+from .scenes.files import KINDS, kind_of_file
+
+RAYS = 2_000_000
+"""Of larger datasets so many rays are shown, drawn at random."""
+
+_SUFFIXES = {*KINDS, ".safetensors", ".rays"}
+_NERG = "NergIntegrator"
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceToView:
+    """``scene``: a scene file with the integrator `nerg`; ``made``: whether it was written for the viewer, and ends
+    with it; ``rays`` in their own frame, or None, and ``align`` from there to the place; ``up`` (3,), a unit vector;
+    ``name`` for people."""
+
+    scene: Path
+    made: bool
+    rays: Rays | None
+    align: Similarity
+    up: np.ndarray
+    name: str
+
+
+def place_to_view(
+    files: Sequence[str | Path], folder: Path, options: ViewOptions | None = None, reporter: Reporter = SILENT
+) -> PlaceToView:
+    """The scene of ``files``: a scene file with `nerg`, or whatever `write_scene` makes one of, in ``folder``.
+
+    A folder stands for the files in it, of which there must be one of a kind, or is a dataset of rays (.rays). Rays
+    beside a scene are shown in it. Raises `NergError` for what the user can mend.
+    """
+    options = options or ViewOptions()
+    select_backend(options.mode)
+    found = [path for file in files for path in _expanded(Path(file))]
+    if not found:
+        raise NergError(
+            "there is nothing to view; name a scene, a field, a mesh, a gaze field, rays, or a run's folder"
+        )
+    kinds = {path: "rays" if path.suffix.lower() == ".rays" else kind_of_file(path) for path in found}
+    rays_files = [path for path, kind in kinds.items() if kind == "rays"]
+    if len(rays_files) > 1:
+        raise NergError(f'"{rays_files[0]}" and "{rays_files[1]}" are both rays; a viewer shows one of them')
+    rays = load_rays(rays_files[0], RAYS) if rays_files else None
+    name = " + ".join(path.name for path in found)
+    scenes = [path for path, kind in kinds.items() if kind == "scene"]
+    if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays"} and _is_nerg(scenes[0]):
+        align = _given_align(options) or Similarity(np.eye(4))
+        return PlaceToView(scenes[0], False, rays, align, _up(options, np.array([0.0, 0, 1])), name)
+    given = [path for path in found if path.suffix.lower() != ".rays"]
+    if rays is not None and rays_files[0] not in given:
+        copy = folder / "rays.npz"
+        rays.save(copy)
+        given.append(copy)
+    output = folder / "scene.xml"
+    chosen = SceneOptions(
+        observer=options.observer, up=options.up, align=options.align, geometry=options.geometry, mode=options.mode
+    )
+    write_scene(given, output, chosen, reporter)
+    gaze = [path for path, kind in kinds.items() if kind == "gaze"]
+    align = _given_align(options)
+    if align is None:
+        align = align_of_training(read_metadata(gaze[0]).get("provenance", {}) if gaze else {})
+    return PlaceToView(output, True, rays, align, _up(options, _up_of(output)), name)
+
+
+def _expanded(path: Path) -> list[Path]:
+    """A file itself; of a folder the files in it that a viewer knows."""
+    if not path.exists():
+        raise MissingFile(f'there is no file "{path}"; correct its name')
+    if not path.is_dir() or path.suffix.lower() == ".rays":
+        return [path]
+    inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES)
+    if not inside:
+        raise NergError(f'the folder "{path}" holds nothing that a viewer shows; name a file, or another folder')
+    ready = [p for p in inside if p.suffix.lower() == ".xml"]
+    if len(ready) > 1:
+        ready = [p for p in ready if p.name == "scene.xml"] or ready
+    if len(ready) > 1:
+        raise NergError(f'the folder "{path}" has {len(ready)} scenes; name the one to view')
+    return ready or inside
+
+
+def _is_nerg(path: Path) -> bool:
+    return type(load_scene(path).integrator()).__name__ == _NERG
+
+
+def _given_align(options: ViewOptions) -> Similarity | None:
+    return None if options.align is None else read_similarity(options.align, "--align", "rays to place")
+
+
+def _up(options: ViewOptions, otherwise: np.ndarray) -> np.ndarray:
+    up = given_point(options.up, "--up")
+    up = otherwise if up is None else up
+    length = float(np.linalg.norm(up))
+    if not length > 0:
+        raise NergError("up must be a direction, three numbers that are not all 0; give --up x,y,z")
+    return up / length
+
+
+def _up_of(written: Path) -> np.ndarray:
+    """Up in a scene that `write_scene` wrote."""
+    defaults = {d.get("name"): d.get("value", "") for d in ElementTree.parse(written).getroot().iter("default")}
+    text = defaults.get("nerg_up", defaults.get("up", "0, 0, 1"))
+    return np.array([float(v) for v in text.split(",")])

@@ -1,0 +1,298 @@
+"""The panel: what is shown and how, the observer's own view, the numbers, and the camera."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError, sentence
+from nerg_mi.files.png import encode_png
+
+from . import layers
+from .copied_scene import Shown, copied
+from .flights import flight, frames_csv
+from .page import Page, Window
+from .session import heading_of
+from .view import View
+
+INSET = 240
+"""Width of the observer's own view, in pixels."""
+
+_ROWS = 12
+_AGAIN = 0.4
+
+
+def tell(event_or_client: Any, title: str, text: str) -> None:
+    """A note in the corner of one page."""
+    client = getattr(event_or_client, "client", event_or_client)
+    if client is not None:
+        client.add_notification(title=title, body=text, with_close_button=True, auto_close_seconds=12.0)
+
+
+class Controls:
+    """The panel of a `Page`."""
+
+    def __init__(self, page: Page):
+        self.page, self.session, self.gui = page, page.session, page.server.gui
+        self._kept: list[View] = []
+        self._insets_at, self._insets_late = 0.0, False
+        self._lock = threading.Lock()
+        with self.gui.add_folder("Show"):
+            self._show()
+        with self.gui.add_folder("Observer"):
+            self._observer()
+        if self.session.scene.has_gaze:
+            with self.gui.add_folder("Attention"):
+                self._table = self.gui.add_markdown("…")
+        with self.gui.add_folder("Camera", expand_by_default=False):
+            self._camera()
+        page.on_moved.append(self.refresh)
+
+    # What is shown
+
+    def _show(self) -> None:
+        session, gui = self.session, self.gui
+        titles = [layer.title for layer in session.layers]
+        layer = gui.add_dropdown("Layer", titles, initial_value=session.shade.layer.title)
+        self._legend = gui.add_html(layers.legend(session.shade.layer, session.scale()))
+        colors = gui.add_dropdown("Colours", layers.MAPS, initial_value="inferno")
+        automatic = gui.add_checkbox("Automatic range", True)
+        ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
+        falloff = gui.add_slider("Fall-off", 0.0, 1.0, 0.01, min(session.falloff, 1.0))
+
+        def change(event: Any) -> None:
+            fixed = None
+            ends.disabled = automatic.value
+            if automatic.value:
+                scale = session.scale()
+            elif event.target is automatic:
+                scale = session.scale()
+                ends.value = (float(scale.low), float(scale.high))
+                fixed = ends.value
+            else:
+                fixed = ends.value
+            if fixed is not None and not fixed[0] < fixed[1]:
+                tell(event, "Range", "The range goes from a number to a larger one.")
+                return
+            session.set_shade(layer=layers.LAYERS[layer.value], colors=colors.value, fixed=fixed)
+            self._shown_anew()
+
+        for handle in (layer, colors, automatic, ends):
+            handle.on_update(change)
+
+        @falloff.on_update
+        def _(event: Any) -> None:
+            session.set_falloff(falloff.value)
+            self.page.follow()
+            self._shown_anew()
+
+    def _shown_anew(self) -> None:
+        self.page.recolor()
+        self.page.renew()
+        self.refresh()
+
+    # The observer
+
+    def _observer(self) -> None:
+        session, gui = self.session, self.gui
+        self._at = gui.add_vector3("At", tuple(map(float, session.observer)), step=0.05)
+        to_camera = gui.add_button("Observer to the camera")
+        to_observer = gui.add_button("Camera to the observer")
+        empty = np.zeros((INSET * 2 // 3, INSET, 3), np.uint8)
+        self._own = gui.add_image(empty, label="Own view")
+        self._sphere = gui.add_image(np.zeros((INSET // 2, INSET, 3), np.uint8), label="All around")
+
+        @self._at.on_update
+        def _(event: Any) -> None:
+            if event.client is not None and not np.allclose(self._at.value, session.observer, atol=1e-4):
+                self.page.place_observer(np.array(self._at.value))
+
+        @to_camera.on_click
+        def _(event: Any) -> None:
+            view = View.of_page(event.client.camera)
+            self.page.place_observer(view.origin, heading_of(view.ahead, session.place.up))
+
+        @to_observer.on_click
+        def _(event: Any) -> None:
+            look(event.client, session.observer, session.observer + 2 * session.heading[:, 0], session.place.up)
+
+    def refresh(self) -> None:
+        """Numbers, scale and insets as they are now; insets not more often than they can be looked at."""
+        session = self.session
+        self._legend.content = layers.legend(session.shade.layer, session.scale())
+        if session.scene.has_gaze:
+            self._table.content = table(session.shares)
+        at = tuple(float(round(v, 4)) for v in session.observer)
+        if not np.allclose(self._at.value, at, atol=1e-4):
+            self._at.value = at
+        with self._lock:
+            if time.monotonic() - self._insets_at < _AGAIN:
+                if not self._insets_late:
+                    self._insets_late = True
+                    timer = threading.Timer(_AGAIN, self._insets_later)
+                    timer.daemon = True
+                    timer.start()
+                return
+            self._insets_at = time.monotonic()
+        self._insets()
+
+    def _insets_later(self) -> None:
+        with self._lock:
+            self._insets_late, self._insets_at = False, time.monotonic()
+        self._insets()
+
+    def _insets(self) -> None:
+        session = self.session
+
+        def own(picture: Any, colors: np.ndarray) -> None:
+            if picture.whole:
+                self._own.image = colors
+
+        def sphere(colors: np.ndarray) -> None:
+            self._sphere.image = colors
+
+        ahead, up = session.heading[:, 0], session.heading[:, 2]
+        view = View.of(session.observer, session.observer + ahead, up, np.radians(60), 1.5)
+        session.inset("own", view, own, INSET)
+        session.sphere(sphere, INSET)
+
+    # The camera
+
+    def _camera(self) -> None:
+        session, gui, place = self.session, self.gui, self.session.place
+        home = gui.add_button("First view")
+        above = gui.add_button("From above")
+        cut = gui.add_checkbox("Cut the ceiling off", False)
+        height = gui.add_slider("Height of the cut", 0.0, 1.0, 0.01, 0.8)
+        shot = gui.add_button("Save the picture (PNG)")
+        copy = gui.add_button("Copy as a scene (XML)")
+        keep = gui.add_button("Keep this view for a flight")
+        seconds = gui.add_number("Seconds of the flight", 6.0, min=0.1, max=3600.0, step=0.5)
+        fps = gui.add_number("Frames a second", 25.0, min=1.0, max=120.0, step=1.0)
+        frames = gui.add_button("Save the flight (CSV)")
+        forget = gui.add_button("Forget its views")
+
+        @home.on_click
+        def _(event: Any) -> None:
+            view = session.home
+            look(event.client, view.origin, view.origin + 3 * view.ahead, place.up)
+
+        def change_cut(event: Any) -> None:
+            lower, upper = self._heights()
+            session.ceiling = lower + height.value * (upper - lower) if cut.value else None
+            self._shown_anew()
+
+        cut.on_update(change_cut)
+        height.on_update(change_cut)
+
+        @above.on_click
+        def _(event: Any) -> None:
+            if session.proxy is None:
+                return
+            cut.value = True
+            change_cut(event)
+            lower, upper = (np.asarray(corner, float) for corner in session.proxy.bounds)
+            middle, size = (lower + upper) / 2, float(np.linalg.norm(upper - lower))
+            # Straight down there is no up: a little to the side keeps the picture the right way round.
+            side = session.heading[:, 0] * 0.02 * size
+            look(event.client, middle + 0.95 * size * place.up - side, middle, place.up)
+
+        @shot.on_click
+        def _(event: Any) -> None:
+            window = self._window(event)
+            if window is None or window.last is None:
+                tell(event, "Picture", "There is no picture yet: wait until the view rests.")
+                return
+            event.client.send_file_download("view.png", png_bytes(session, window.last[1]), save_immediately=True)
+
+        @copy.on_click
+        def _(event: Any) -> None:
+            window = self._window(event)
+            if window is None or window.view is None:
+                return
+            try:
+                text = copied_view(session, window.view)
+            except NergError as error:
+                tell(event, "Scene", sentence(error))
+                return
+            event.client.send_file_download("view.xml", text.encode(), save_immediately=True)
+
+        @keep.on_click
+        def _(event: Any) -> None:
+            self._kept.append(View.of_page(event.client.camera))
+            tell(event, "Flight", f"{len(self._kept)} views are kept.")
+
+        @forget.on_click
+        def _(event: Any) -> None:
+            self._kept.clear()
+
+        @frames.on_click
+        def _(event: Any) -> None:
+            try:
+                text = frames_csv(flight(self._kept, seconds.value, fps.value))
+            except NergError as error:
+                tell(event, "Flight", sentence(error))
+                return
+            event.client.send_file_download("view.frames.csv", text.encode(), save_immediately=True)
+            tell(event, "Flight", "nerg render view.xml -o flight.png --frames view.frames.csv renders it.")
+
+    def _window(self, event: Any) -> Window | None:
+        return None if event.client is None else self.page.windows.get(event.client.client_id)
+
+    def _heights(self) -> tuple[float, float]:
+        """Lowest and highest of the points along up."""
+        proxy = self.session.proxy
+        if proxy is None:
+            return 0.0, 1.0
+        along = proxy.points @ self.session.place.up
+        return float(np.percentile(along, 0.5)), float(np.percentile(along, 99.5))
+
+
+def look(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
+    """Turn one page's camera."""
+    if client is None:
+        return
+    with client.atomic():
+        client.camera.up_direction = tuple(up)
+        client.camera.position = tuple(origin)
+        client.camera.look_at = tuple(target)
+
+
+def table(shares: dict[str, float]) -> str:
+    """Shares of attention as Markdown, the largest first."""
+    if not shares:
+        return "Name areas to see their share of attention."
+    rows = sorted(shares.items(), key=lambda item: -item[1])
+    lines = ["| area | share |", "|---|---:|"]
+    lines += [f"| {plain_cell(name)} | {100 * share:.1f} % |" for name, share in rows[:_ROWS]]
+    rest = sum(share for _, share in rows[_ROWS:])
+    return "\n".join([*lines, *([f"| {len(rows) - _ROWS} more | {100 * rest:.1f} % |"] if len(rows) > _ROWS else [])])
+
+
+def plain_cell(name: str) -> str:
+    """``name`` as text in a cell of Markdown, where nothing of it is markup."""
+    return "".join(c if c.isalnum() or c in " -." else f"&#{ord(c)};" for c in name)
+
+
+def png_bytes(session: Any, colors: np.ndarray) -> bytes:
+    """The bytes of a PNG of ``colors`` (height, width, 3) uint8, made on the render thread."""
+
+    def encode() -> bytes:
+        import mitsuba as mi
+
+        return encode_png(mi.Bitmap(np.ascontiguousarray(colors)))
+
+    return session.worker.call(encode).result()
+
+
+def copied_view(session: Any, view: View) -> str:
+    """A scene file of ``view`` with the observer, the layer and the settings of ``session``."""
+    if session.place.made and session.place.scene.with_suffix(".vol").exists():
+        raise NergError('the place was made of rays for this viewer; "nerg scene" writes it as a scene of its own')
+    asked = tuple(name for name in layers.quantities(session.shade.layer) if name != "color")
+    falloff = session.falloff
+    shown = Shown(view, session.observer, asked, session.options.width, session.spp, falloff)
+    return copied(session.place.scene, shown)

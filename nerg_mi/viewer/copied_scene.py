@@ -1,0 +1,114 @@
+"""What a page shows as a scene file, which `nerg render` renders alike."""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.rendering.nested_scene import scene_elements, verbatim
+from nerg_mi.rendering.scene_writer import Comment, document, element, numbers, prop, value_of
+
+from .view import View
+
+CAMERA, TARGET, OBSERVER = "view_camera", "view_target", "view_observer"
+"""`<default>`s of a copied scene."""
+
+_FILES = ("filename",)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What a page shows: its ``view``, the ``observer`` (3,) or None where the camera is it, AOVs, the ``width`` of the
+    picture in pixels, samples ``spp`` a pixel, and the integrator's ``falloff``."""
+
+    view: View
+    observer: np.ndarray | None
+    aovs: tuple[str, ...]
+    width: int
+    spp: int
+    falloff: float
+
+
+def copied(path: Path, shown: Shown) -> str:
+    """The scene file ``path`` as text, with the camera, the observer and the settings of what is ``shown``; names of
+    files are absolute, so that it may be saved anywhere.
+
+    Raises `NergError` for a scene whose integrator is not written in the file.
+    """
+    version, children = scene_elements(path)
+    folders = [path.parent, *(path.parent / c.get("value", "") for c in children if c.tag == "path")]
+    own = [deepcopy(child) for child in children if child.tag != "path"]
+    integrators = [child for child in own if child.tag == "integrator"]
+    if len(integrators) != 1:
+        raise NergError(f'"{path}" has {len(integrators)} integrators, and a copy needs one; leave one of them')
+    for child in own:
+        _name_files(child, folders)
+    _observe(integrators[0], shown)
+    eye = [] if shown.observer is None else [element("default", name=OBSERVER, value=numbers(shown.observer))]
+    target = shown.view.origin + shown.view.ahead
+    nodes = [
+        element("default", name=CAMERA, value=numbers(shown.view.origin)),
+        element("default", name=TARGET, value=numbers(target)),
+        *eye,
+        _sensor(shown),
+        Comment("What follows is from the scene that was viewed; its sensors are counted after ours."),
+        *map(verbatim, own),
+    ]
+    return document(nodes, f"A view of {path.name}, copied from the viewer.", version)
+
+
+def _observe(integrator: Element, shown: Shown) -> None:
+    """Put observer, fall-off and AOVs into the ``integrator``."""
+    names = {"observer", "falloff", "aovs"} if shown.observer is not None else {"falloff", "aovs"}
+    for child in [c for c in integrator if c.get("name") in names]:
+        integrator.remove(child)
+    if shown.observer is not None:
+        sensor = SubElement(integrator, "sensor", name="observer", type="perspective")
+        SubElement(SubElement(sensor, "transform", name="to_world"), "translate", value=f"${OBSERVER}")
+    SubElement(integrator, "float", name="falloff", value=f"{shown.falloff:.9g}")
+    SubElement(integrator, "string", name="aovs", value=",".join(shown.aovs))
+
+
+def _sensor(shown: Shown):
+    view = shown.view
+    up = numbers(view.up)
+    film = element(
+        "film",
+        prop("integer", "width", shown.width),
+        prop("integer", "height", view.height(shown.width)),
+        element("rfilter", type="box"),
+        prop("string", "component_format", "float32"),
+        prop("string", "pixel_format", "rgb"),
+        type="hdrfilm",
+    )
+    # The angle between the left and the right border, which a picture's whole pixels may differ from by a trifle.
+    across = math.degrees(2 * math.atan(math.tan(view.fov / 2) * view.aspect))
+    look = element("lookat", origin=f"${CAMERA}", target=f"${TARGET}", up=up)
+    return element(
+        "sensor",
+        prop("float", "fov", f"{across:.9g}"),
+        prop("string", "fov_axis", "x"),
+        element("transform", look, name="to_world"),
+        element("sampler", prop("integer", "sample_count", shown.spp), type="independent"),
+        film,
+        type="perspective",
+        id="view",
+    )
+
+
+def _name_files(found: Element, folders: list[Path]) -> None:
+    """Make names of files that are there absolute, in ``found`` and below, and in the values of `<default>`s."""
+    for one in found.iter():
+        named = one.tag == "default" or (one.tag == "string" and one.get("name") in _FILES)
+        value = one.get("value", "")
+        if not named or not value or value.startswith("$"):
+            continue
+        there = next((f / value for f in folders if (f / value).is_file()), None)
+        if there is not None:
+            one.set("value", value_of(str(there.resolve())))

@@ -1,0 +1,305 @@
+"""The page: each browser's camera and picture, and the observer that all of them drag.
+
+While a camera moves its browser draws points by itself; when it rests a picture of the integrator stands in their
+place, first small, then fine. Nothing here waits for rendering: a clock looks what is to be done.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.errors import expected, sentence
+
+from .refining import Picture
+from .server import stop_server
+from .session import Session
+from .view import View
+
+REST = 0.12
+"""Seconds without movement after which a picture is refined."""
+
+TICK = 0.04
+"""Seconds between two looks of the clock."""
+
+_NEAR = 0.4
+
+_POINT = 1.15
+"""Width of a drawn point, in cells of the grid that points lie in."""
+
+
+@dataclass(eq=False)
+class Window:
+    """One browser: its ``client`` and the points in it; when it ``moved`` last and whether that was ``noticed``; the
+    ``version`` of its view, and whether it shows a ``picture``; the ``last`` one, with its colours."""
+
+    client: Any
+    status: Any
+    cloud: Any = None
+    view: View | None = None
+    moved: float = 0.0
+    noticed: bool = False
+    version: int = 0
+    picture: bool = False
+    last: tuple[Picture, np.ndarray] | None = None
+    lines: list[str] = field(default_factory=list)
+
+
+class Page:
+    """A running page of ``server`` (viser) for what a `Session` finds; it is the session's listener."""
+
+    def __init__(self, server: Any):
+        self.server = server
+        self.session: Session
+        self.windows: dict[int, Window] = {}
+        self.problem = ""
+        self._lock = threading.RLock()
+        self._follow = self._count = False
+        self._stop = threading.Event()
+        self._observer: Any = None
+        self._clock = threading.Thread(target=self._tick, name="nerg-view-clock", daemon=True)
+        self.on_moved: list[Any] = []
+
+    def open(self, session: Session) -> None:
+        """Show ``session``, which has started."""
+        self.session = session
+        scene, home = self.server.scene, session.home
+        scene.set_up_direction(tuple(session.place.up))
+        camera = self.server.initial_camera
+        camera.position, camera.look_at = tuple(home.origin), tuple(home.origin + self._reach() * home.ahead)
+        camera.up, camera.fov = tuple(session.place.up), home.fov
+        self._observer = scene.add_transform_controls(
+            "/observer",
+            scale=0.45,
+            line_width=3.0,
+            depth_test=False,
+            position=tuple(session.observer),
+            wxyz=self._turn(),
+        )
+        scene.add_icosphere("/observer/eye", radius=0.08, color=(40, 160, 255))
+        scene.add_label("/observer/name", "observer", position=(0.0, 0.0, 0.25), anchor="bottom-center")
+
+        @self._observer.on_update
+        async def _(event: Any) -> None:
+            self._dragged(event.phase)
+
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._disconnected)
+        self._follow = self._count = True
+        self._clock.start()
+
+    def close(self) -> None:
+        """End the clock, the session's thread and the server."""
+        self._stop.set()
+        if self._clock.is_alive():
+            self._clock.join(5)
+        if hasattr(self, "session"):
+            self.session.stop()
+        stop_server(self.server)
+
+    # The observer
+
+    def place_observer(self, at: np.ndarray, heading: np.ndarray | None = None) -> None:
+        """Let the observer stand at ``at`` (3,), as if dragged there."""
+        self.session.place_observer(at, heading)
+        self._observer.position = tuple(np.asarray(at, float))
+        self._observer.wxyz = self._turn()
+        self._observer_moved(True)
+
+    def _dragged(self, phase: str) -> None:
+        w, x, y, z = self._observer.wxyz
+        self.session.place_observer(self._observer.position, Rotation.from_quat([x, y, z, w]).as_matrix())
+        self._observer_moved(phase == "end")
+
+    def _observer_moved(self, at_rest: bool) -> None:
+        with self._lock:
+            self._follow, self._count = True, True
+            if self.session.shade.layer.of_observer:
+                self.renew(REST if not at_rest else 0.0)
+        for told in self.on_moved:
+            told()
+
+    def _show_gizmo(self) -> None:
+        """The gizmo, but not to somebody alone who looks out of the observer's eye: it would fill the view."""
+        near = [w for w in self.windows.values() if w.view is not None]
+        away = [float(np.linalg.norm(w.view.origin - self.session.observer)) for w in near if w.view is not None]
+        visible = len(away) != 1 or away[0] > _NEAR
+        if self._observer.visible != visible:
+            self._observer.visible = visible
+
+    def _turn(self) -> tuple[float, ...]:
+        x, y, z, w = Rotation.from_matrix(self.session.heading).as_quat()
+        return w, x, y, z
+
+    # Pictures
+
+    def follow(self) -> None:
+        """Have the gaze on the points, and the shares, computed anew."""
+        self._follow = self._count = True
+
+    def count(self) -> None:
+        """Have the shares of attention counted, since there are other areas."""
+        self._count = True
+
+    def renew(self, wait: float = 0.0) -> None:
+        """Make all pictures anew, ``wait`` seconds from now, since what they show has changed."""
+        with self._lock:
+            for window in self.windows.values():
+                self._moving(window, time.monotonic() - REST + wait)
+
+    def recolor(self) -> None:
+        """Colour the points anew."""
+        colors = self.session.point_colors()
+        proxy = self.session.proxy
+        if colors is None or proxy is None:
+            return
+        with self._lock:
+            for window in self.windows.values():
+                if window.cloud is None or len(window.cloud.points) != len(colors):
+                    self._add_cloud(window, proxy, colors)
+                else:
+                    window.cloud.colors = colors
+
+    def _moving(self, window: Window, when: float) -> None:
+        """The view of ``window``, or what it shows, is another one now: its points take the picture's place."""
+        window.version += 1
+        window.moved, window.noticed = when, False
+        self.session.cancel(window.client.client_id)
+        if window.picture and window.cloud is not None:
+            window.picture = False
+            with window.client.atomic():
+                window.cloud.visible = True
+                window.client.scene.set_background_image(None)
+
+    def _refine(self, window: Window) -> None:
+        version, began = window.version, time.monotonic()
+        window.lines = []
+        client = window.client
+
+        def deliver(picture: Picture, colors: np.ndarray) -> None:
+            with self._lock:
+                if window.version != version or client.client_id not in self.windows:
+                    return
+                window.last = picture, colors
+                window.picture = True
+                with client.atomic():
+                    client.scene.set_background_image(colors, format="jpeg", jpeg_quality=92)
+                    if window.cloud is not None:
+                        window.cloud.visible = False
+                height, width = colors.shape[:2]
+                took = time.monotonic() - began
+                window.lines.append(f"{width} × {height}, {picture.samples} a pixel: {took:.2f} s")
+                self._say(window, " — done" if picture.whole else " …")
+
+        assert window.view is not None
+        self.session.picture(client.client_id, window.view, deliver, self.session.options.width, self.session.spp)
+
+    def _say(self, window: Window, end: str) -> None:
+        text = (window.lines[-1] if window.lines else "points") + end
+        window.status.content = text + (f"\n\n**{self.problem}**" if self.problem else "")
+
+    def _add_cloud(self, window: Window, proxy: Any, colors: np.ndarray) -> None:
+        if window.cloud is not None:
+            window.cloud.remove()
+        window.cloud = window.client.scene.add_point_cloud(
+            "/points",
+            proxy.points,
+            colors,
+            point_size=_POINT * proxy.size,
+            point_shape="square",
+            point_shading="flat",
+            precision="float32",
+            visible=not window.picture,
+        )
+
+    # The session's listener
+
+    def on_proxy(self) -> None:
+        """Show the points."""
+        self._follow = True
+        self.recolor()
+
+    def on_baked(self) -> None:
+        """Show the gaze on the points."""
+        self.recolor()
+        for told in self.on_moved:
+            told()
+
+    def on_shares(self) -> None:
+        """Nothing to be done here: whoever shows them has asked to be told."""
+        for told in self.on_moved:
+            told()
+
+    def on_error(self, error: BaseException) -> None:
+        """Show what went wrong; a mistake of the program by its name as well."""
+        text = sentence(error)
+        self.problem = text if expected(error) else f"{type(error).__name__}: {text} (a mistake in the program)"
+        with self._lock:
+            for window in self.windows.values():
+                self._say(window, "")
+
+    # Browsers
+
+    def _connected(self, client: Any) -> None:
+        status = client.gui.add_markdown("points …", order=-10)
+        window = Window(client, status)
+        with self._lock:
+            self.windows[client.client_id] = window
+            self._look(window)
+
+        @client.camera.on_update
+        async def _(camera: Any) -> None:
+            with self._lock:
+                self._look(window)
+
+        colors, proxy = self.session.point_colors(), self.session.proxy
+        if colors is not None and proxy is not None:
+            with self._lock:
+                self._add_cloud(window, proxy, colors)
+
+    def _look(self, window: Window) -> None:
+        view = View.of_page(window.client.camera)
+        old = window.view
+        # The browser tells its camera again where nothing has changed.
+        names = ("origin", "ahead", "up", "fov", "aspect")
+        if old is not None and all(np.allclose(getattr(view, n), getattr(old, n), atol=1e-6) for n in names):
+            return
+        window.view = view
+        self._moving(window, time.monotonic())
+
+    def _disconnected(self, client: Any) -> None:
+        with self._lock:
+            self.windows.pop(client.client_id, None)
+            self.session.cancel(client.client_id)
+
+    def _tick(self) -> None:
+        while not self._stop.wait(TICK):
+            try:
+                self._turn_of_clock()
+            except Exception as error:
+                self.on_error(error)
+
+    def _turn_of_clock(self) -> None:
+        now = time.monotonic()
+        with self._lock:
+            waiting = [w for w in self.windows.values() if not w.noticed and now - w.moved >= REST]
+            if waiting:
+                self._show_gizmo()
+            for window in waiting:
+                window.noticed = True
+                self._refine(window)
+            if self._follow:
+                self._follow = not self.session.follow_observer()
+            if self._count:
+                self._count = not self.session.follow_shares()
+
+    def _reach(self) -> float:
+        """How far ahead of the first camera its centre of rotation is: where the place's middle is level with it."""
+        session = self.session
+        away = float((session.observer - session.home.origin) @ session.home.ahead)
+        return max(away, 1.0)

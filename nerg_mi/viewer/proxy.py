@@ -1,0 +1,121 @@
+"""What the browser draws by itself: points on the surfaces of a place, with the gaze that they attract.
+
+Rays in all directions, from places that see different parts of it, end on surfaces; of points that lie in one cell of a
+grid one is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerg_mi.api.queries import observe, trace
+from nerg_mi.api.scene import Scene
+from nerg_mi.maths.sphere import fibonacci_directions
+
+RAYS = 1 << 14
+"""Rays from each place."""
+
+PLACES = 12
+"""So many places are looked from."""
+
+POINTS = 60_000
+"""So many points are kept at most: what a browser without a graphics card still moves."""
+
+BATCH = 1 << 14
+"""Points whose gaze is computed in one step."""
+
+LIGHT_SEEDS = 4
+"""Samples of the light on shapes, which is random."""
+
+
+@dataclass(frozen=True, eq=False)
+class Proxy:
+    """``points`` (N, 3) in scene units, their linear ``color`` (N, 3), and the ``size`` of the cells that they
+    lie in."""
+
+    points: np.ndarray
+    color: np.ndarray
+    size: float
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of what nearly all points lie in: a few may be far off."""
+        return np.percentile(self.points, 0.5, axis=0), np.percentile(self.points, 99.5, axis=0)
+
+
+def gather(scene: Scene, eyes: Sequence[np.ndarray], places: int = PLACES) -> Iterator[Proxy | None]:
+    """Points seen from ``eyes`` (3,), and from places between them and what they see; None between steps, a first
+    proxy of ``eyes`` alone, and in the end that of all."""
+    directions = np.asarray(fibonacci_directions(RAYS), float)
+    seeds = 1 if scene.integrator.medium is not None else LIGHT_SEEDS
+    found: list[tuple[np.ndarray, np.ndarray]] = []
+    free: list[np.ndarray] = []
+    visited: list[np.ndarray] = []
+    waiting = [np.asarray(eye, float) for eye in eyes]
+    while len(visited) < places:
+        if len(visited) == len(eyes) and found:
+            yield thin(found)
+        at = waiting.pop(0) if waiting else _farthest(free, visited)
+        if at is None:
+            break
+        visited.append(at)
+        seen = trace(scene, at, directions, ["color", "depth", "opacity"])
+        color = np.asarray(seen.color, float) / seeds
+        yield None
+        for seed in range(1, seeds):
+            color += (
+                np.asarray(trace(scene, at, directions, ["color", "depth", "opacity"], seed=seed).color, float) / seeds
+            )
+            yield None
+        met = (np.asarray(seen.opacity) > 0.5) & (seen.depth > 0) & np.isfinite(seen.depth)
+        depth = np.asarray(seen.depth, float)
+        points = at + depth[:, None] * directions
+        found.append((points[met], color[met]))
+        # Half way to a surface that is not near there is room to look from.
+        roomy = np.flatnonzero(met & (depth > np.median(depth[met])))[::97] if met.any() else []
+        free += [at + 0.5 * depth[k] * directions[k] for k in roomy]
+    yield thin(found)
+
+
+def thin(found: Sequence[tuple[np.ndarray, np.ndarray]], most: int = POINTS) -> Proxy:
+    """``found`` points (N, 3) with their colours (N, 3): one of those in each cell, ``most`` in all at most."""
+    points, color = (np.concatenate([pair[k] for pair in found]) for k in (0, 1))
+    if not len(points):
+        return Proxy(points.astype(np.float32), color.astype(np.float32), 1.0)
+    lower, upper = np.percentile(points, 0.5, axis=0), np.percentile(points, 99.5, axis=0)
+    size = max(float(np.linalg.norm(upper - lower)), 1e-6) / 400
+    while True:
+        cells = np.floor((points - lower) / size).astype(np.int64)
+        first = np.unique(cells, axis=0, return_index=True)[1]
+        if len(first) <= most:
+            break
+        size *= max((len(first) / most) ** 0.5, 1.02)
+    first = np.sort(first)
+    return Proxy(points[first].astype(np.float32), color[first].astype(np.float32), size)
+
+
+def bake(scene: Scene, points: np.ndarray, observer: np.ndarray) -> Iterator[dict[str, np.ndarray] | None]:
+    """``gaze`` (1/sr) and ``visibility`` (N,) of ``points`` for the ``observer`` (3,); None between steps. Without a
+    gaze field there is no gaze."""
+    names = ["gaze", "visibility"] if scene.has_gaze else ["visibility"]
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for a in range(0, len(points), BATCH):
+        part = points[a : a + BATCH]
+        # Kernels are compiled for a number of points.
+        filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
+        seen = observe(scene, filled, observers=observer[None], quantities=names)
+        for name in names:
+            parts[name].append(seen[name][0, : len(part)])
+        yield None
+    yield {name: np.concatenate(found) for name, found in parts.items()}
+
+
+def _farthest(free: Sequence[np.ndarray], visited: Sequence[np.ndarray]) -> np.ndarray | None:
+    """The one of ``free`` places that is farthest from all that were ``visited``."""
+    if not free:
+        return None
+    away = np.linalg.norm(np.array(free)[:, None] - np.array(visited)[None], axis=2).min(axis=1)
+    return free[int(np.argmax(away))]

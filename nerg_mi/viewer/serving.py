@@ -1,0 +1,88 @@
+"""From files to a page that is served."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.jobs.reporter import SILENT, Reporter
+from nerg_mi.jobs.view import place_to_view
+
+from .areas import Areas
+from .controls import Controls
+from .guard import Guard, is_loopback, new_token
+from .page import Page
+from .people import People
+from .server import require_viser, start_server
+from .session import Session
+
+
+@dataclass(frozen=True)
+class Viewing:
+    """A running viewer: ``address`` to open, and its ``page``."""
+
+    address: str
+    page: Page
+
+
+@contextmanager
+def viewer(
+    files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT
+) -> Iterator[Viewing]:
+    """Serve ``files`` as a page for as long as the block lasts: what `jobs.view.place_to_view` takes.
+
+    Bound to this machine alone by default; at another host the address has a token. Raises `NergError` for files that
+    cannot be shown, for a port that is taken, and where the extra "viewer" is missing.
+    """
+    options = options or ViewOptions()
+    require_viser()
+    token = None if is_loopback(options.host) else new_token()
+    guard = Guard(options.host, token, options.names)
+    with tempfile.TemporaryDirectory() as folder:
+        server = start_server(guard, options.port, "nerg view")
+        page = Page(server)
+        try:
+            session = Session(lambda: place_to_view(files, Path(folder), options, reporter), options, page)
+            page.session = session
+            session.start()
+            page.open(session)
+            Controls(page)
+            if session.tracks is not None:
+                People(page, session.tracks)
+            if session.scene.has_gaze:
+                Areas(page)
+            shown = "localhost" if options.host in ("0.0.0.0", "::") else options.host
+            shown = f"[{shown}]" if ":" in shown else shown
+            query = "" if token is None else f"?token={token}"
+            yield Viewing(f"http://{shown}:{server.get_port()}/{query}", page)
+        finally:
+            page.close()
+
+
+def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT) -> None:
+    """Serve ``files`` until Ctrl-C, which is the way to end it. Raises as `viewer`."""
+    options = options or ViewOptions()
+    with viewer(files, options, reporter) as running:
+        if not is_loopback(options.host):
+            reporter.warn("whoever has the address sees the place, and moves its observer; it is not encrypted")
+        reporter.message(f"open {running.address}")
+        reporter.message("Ctrl-C ends the viewer")
+        if options.open:
+            import webbrowser
+
+            webbrowser.open(running.address)
+        try:
+            _wait()
+        except KeyboardInterrupt:
+            reporter.message("the viewer has ended")
+
+
+def _wait() -> None:
+    """Until Ctrl-C."""
+    while True:
+        threading.Event().wait(3600)

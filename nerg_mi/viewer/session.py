@@ -1,0 +1,329 @@
+"""What is viewed, whoever looks: the scene, its observer, the layer that is shown, and the tasks that compute them.
+
+All of Mitsuba and Dr.Jit is used on the thread of the `Worker`. What is found is told to a `Listener`, on that thread.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from nerg_mi.api.attention import attention
+from nerg_mi.api.queries import trace
+from nerg_mi.api.scene import Scene
+from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.jobs.scenes.cameras import given_point
+from nerg_mi.jobs.view import PlaceToView
+from nerg_mi.rendering.pictures import load_scene
+
+from . import layers
+from .layers import Layer, Scale
+from .proxy import Proxy, bake, gather
+from .refining import SIZES, Pace, Picture, filled, refine
+from .regions import Region, read_regions
+from .tracks import Tracks
+from .view import View
+from .worker import Worker
+
+URGENCY = 1
+"""Of all tasks alike, so that they take turns: the first picture is coarse, and nobody waits long for numbers."""
+
+STEP_SECONDS = 0.2
+"""Shares of attention are counted for so long in one step."""
+
+DIVISIONS = 8
+"""A side of a triangle of an area is cut into so many parts."""
+
+_MOST_SPP = 256
+_SHAPES = 60
+
+
+class Listener(Protocol):
+    """Whoever shows what a session finds."""
+
+    def on_proxy(self) -> None:
+        """There are points, or more of them."""
+        ...
+
+    def on_baked(self) -> None:
+        """The points have the gaze of the observer."""
+        ...
+
+    def on_shares(self) -> None:
+        """The shares of attention are those of the observer."""
+        ...
+
+    def on_error(self, error: BaseException) -> None:
+        """A task has failed."""
+        ...
+
+
+@dataclass(frozen=True)
+class Shade:
+    """How a layer is coloured: ``layer``, ``colors``, and a range (low, high), or None for an automatic one."""
+
+    layer: Layer
+    colors: str = "inferno"
+    fixed: tuple[float, float] | None = None
+
+
+class Session:
+    """A place that is viewed. ``start`` loads it; until then there is nothing to see."""
+
+    def __init__(self, place: Callable[[], PlaceToView], options: ViewOptions, listener: Listener):
+        self.options, self.listener = options, listener
+        self._place = place
+        self.worker = Worker(listener.on_error)
+        self.lock = threading.RLock()
+        self.proxy: Proxy | None = None
+        self.baked: dict[str, np.ndarray] = {}
+        self.baked_for: np.ndarray | None = None
+        self.shares: dict[str, float] = {}
+        self.ceiling: float | None = None
+        self.regions: list[Region] = []
+        self.pace = Pace()
+        self._ranges: dict[str, tuple[float, float]] = {}
+        self._busy: set[str] = set()
+        self._shares_for: tuple[np.ndarray, tuple[Region, ...], float] | None = None
+
+    def start(self) -> None:
+        """Load the place, and begin to gather its points. Raises `NergError` for what cannot be shown."""
+        self.worker.call(self._load).result()
+        self.worker.submit("proxy", URGENCY, self._gather())
+
+    def stop(self) -> None:
+        """End the render thread."""
+        self.worker.stop()
+
+    def _load(self) -> None:
+        self.place = self._place()
+        self.scene = Scene(load_scene(self.place.scene))
+        self.layers = layers.available(self.scene)
+        first = next((la for la in self.layers if la.quantity in ("gaze", "kde")), layers.LAYERS["colour"])
+        self.shade = Shade(first)
+        sensors = self.scene.mitsuba.sensors()
+        if not sensors:
+            raise NergError(f'"{self.place.scene}" has no sensor to begin with; give it one')
+        self.home = View.of_sensor(sensors[0])
+        self.spp = min(self.options.spp or int(sensors[0].sampler().sample_count()), _MOST_SPP)
+        given = given_point(self.options.observer, "--observer")
+        own = self.scene.observer
+        if given is None:
+            given = self._ahead_of_home() if own is None else np.asarray(own, float)
+        self.observer = np.array(given, float)
+        self.heading = heading_of(self.home.ahead if own is None else _ahead(self.scene), self.place.up)
+        self.falloff = float(np.ravel(np.array(self.scene.integrator.falloff))[0])
+        self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
+        self.regions = read_regions(self.options.regions) if self.options.regions is not None else []
+        shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]
+        self.shapes = [name for name in shapes if name and not name.startswith("__")][:_SHAPES]
+
+    def _ahead_of_home(self) -> np.ndarray:
+        """Where the observer stands of a scene whose camera it is: half way to what that looks at, so as to be seen."""
+        seen = trace(self.scene, self.home.origin, filled(self.home.ahead[None], SIZES[0]), ["depth"])
+        depth = float(seen.depth[0])
+        return self.home.origin + (0.5 * depth if np.isfinite(depth) else 0.0) * self.home.ahead
+
+    # What changes
+
+    def place_observer(self, at: np.ndarray, heading: np.ndarray | None = None) -> None:
+        """The observer stands at ``at`` (3,), turned by ``heading`` (3, 3): columns ahead, left and up."""
+        with self.lock:
+            self.observer = np.array(at, float)
+            if heading is not None:
+                self.heading = np.array(heading, float)
+
+    def set_falloff(self, value: float) -> None:
+        """How far behind a surface is still seen a little, in scene units."""
+
+        def change() -> None:
+            import mitsuba as mi
+
+            with mitsuba_says():
+                params: Any = mi.traverse(self.scene.integrator)
+                params["falloff"] = float(value)
+                params.update()
+            self.falloff = float(value)
+            self.baked_for = None
+
+        self.worker.call(change).result()
+
+    def set_shade(self, **changes: Any) -> None:
+        """Another layer, other colours, or another range."""
+        with self.lock:
+            self.shade = replace(self.shade, **changes)
+
+    # What is computed
+
+    def follow_observer(self) -> bool:
+        """Begin to compute the gaze on the points, and the shares of attention, of the observer as they stand now,
+        where that is not being done yet; whether there is nothing left to begin."""
+        with self.lock:
+            at = self.observer
+            fresh = self.baked_for is not None and np.array_equal(self.baked_for, at)
+            if not fresh and self.proxy is not None and "gaze" not in self._busy:
+                self._busy.add("gaze")
+                self.worker.submit("gaze", URGENCY, self._bake(at))
+            return fresh
+
+    def follow_shares(self) -> bool:
+        """The same for the shares of attention of named areas and shapes."""
+        with self.lock:
+            if not self.scene.has_gaze:
+                return True
+            asked = self.observer, tuple(self.regions), self.falloff
+            fresh = self._shares_for is not None and _same(self._shares_for, asked)
+            if not fresh and "shares" not in self._busy:
+                self._busy.add("shares")
+                self.worker.submit("shares", URGENCY, self._shares(asked))
+            return fresh
+
+    def picture(
+        self, name: Hashable, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int
+    ) -> None:
+        """Refine the picture of ``view`` from now on, in place of one of the same ``name``; ``deliver`` is given each
+        with its colours (height, width, 3) uint8."""
+        self.worker.submit(("picture", name), URGENCY, self._refined(view, deliver, width, spp))
+
+    def inset(self, name: Hashable, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int) -> None:
+        """The same for a small picture that nobody waits for."""
+        self.worker.submit(("inset", name), URGENCY, self._refined(view, deliver, width, 1))
+
+    def sphere(self, deliver: Callable[[np.ndarray], None], width: int) -> None:
+        """All that the observer could turn to, as an equirectangular picture whose middle is ahead of them."""
+        self.worker.submit(("inset", "sphere"), URGENCY, self._sphere(deliver, width))
+
+    def cancel(self, name: Hashable) -> None:
+        """Refine the picture ``name`` no further."""
+        self.worker.cancel(("picture", name))
+
+    def scale(self) -> Scale:
+        """The scale of the layer that is shown."""
+        shade = self.shade
+        low, high = shade.fixed or self._ranges.get(shade.layer.title) or (0.0, 1.0)
+        return Scale(low, high, shade.colors)
+
+    def point_colors(self) -> np.ndarray | None:
+        """Colours (N, 3) uint8 of the points, as the layer shows them; None where there are no points yet."""
+        with self.lock:
+            proxy, baked, shade = self.proxy, self.baked, self.shade
+        if proxy is None:
+            return None
+        values = baked.get(shade.layer.quantity)
+        mask = np.ones(len(proxy.points), bool)
+        if values is None or len(values) != len(mask):
+            return layers.colored(layers.LAYERS["colour"], proxy.color, None, mask, Scale())
+        return layers.colored(shade.layer, proxy.color, values, mask, self.scale())
+
+    def _gather(self) -> Iterator[None]:
+        for proxy in gather(self.scene, [self.observer, self.home.origin]):
+            if proxy is not None:
+                with self.lock:
+                    self.proxy, self.baked, self.baked_for = proxy, {}, None
+                self.listener.on_proxy()
+            yield None
+
+    def _bake(self, at: np.ndarray) -> Iterator[None]:
+        try:
+            proxy = self.proxy
+            assert proxy is not None
+            for found in bake(self.scene, proxy.points, at):
+                if found is not None:
+                    with self.lock:
+                        if self.proxy is not proxy:
+                            break
+                        self.baked, self.baked_for = found, at
+                        for name, values in found.items():
+                            self._learn(name, values, found["visibility"] > 0.5)
+                    self.listener.on_baked()
+                yield None
+        finally:
+            self._busy.discard("gaze")
+
+    def _shares(self, asked: tuple[np.ndarray, tuple[Region, ...], float]) -> Iterator[None]:
+        try:
+            at, regions, _ = asked
+            found: dict[str, float] = {}
+            began = time.monotonic()
+            for name, surface in [*((r.name, r.corners) for r in regions), *((name, name) for name in self.shapes)]:
+                box = not isinstance(surface, str)
+                divisions = DIVISIONS if box else 1
+                seen = attention(self.scene, surface, at[None], divisions=divisions, two_sided=not box)
+                found[name] = float(seen.share[0])
+                if time.monotonic() - began > STEP_SECONDS:
+                    yield None
+                    began = time.monotonic()
+            with self.lock:
+                self.shares, self._shares_for = found, asked
+            self.listener.on_shares()
+        finally:
+            self._busy.discard("shares")
+
+    def _refined(
+        self, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int
+    ) -> Iterator[None]:
+        with self.lock:
+            shade, at = self.shade, self.observer
+            ceiling = None if self.ceiling is None else (self.place.up, self.ceiling)
+        layer = shade.layer
+        asked = layers.quantities(layer)
+        for found in refine(self.scene, view, at, asked, width, spp, self.pace, ceiling=ceiling):
+            if found is not None:
+                mask = found.values["opacity"] > 0.5
+                values = found.values.get(layer.quantity)
+                if values is not None and (layer.quantity not in self.baked):
+                    with self.lock:
+                        self._learn(layer.quantity, values, mask)
+                deliver(found, layers.colored(layer, found.values["color"], values, mask, self.scale()))
+            yield None
+
+    def _sphere(self, deliver: Callable[[np.ndarray], None], width: int) -> Iterator[None]:
+        with self.lock:
+            at, heading, layer = self.observer, self.heading, self.shade.layer
+        height = width // 2
+        across = (0.5 - (np.arange(width) + 0.5) / width) * 2 * np.pi
+        rise = (0.5 - (np.arange(height) + 0.5) / height) * np.pi
+        across, rise = np.meshgrid(across, rise)
+        local = np.stack([np.cos(rise) * np.cos(across), np.cos(rise) * np.sin(across), np.sin(rise)], axis=-1)
+        directions = local.reshape(-1, 3) @ heading.T
+        asked = layers.quantities(layer)
+        seen = trace(self.scene, at, filled(directions, self.pace.rays), asked, observers=at[None])
+        count = len(directions)
+        values = {k: np.asarray(seen[k][0])[:count].reshape(height, width, *seen[k].shape[2:]) for k in asked}
+        yield None
+        mask = values["opacity"] > 0.5
+        deliver(layers.colored(layer, values["color"], values.get(layer.quantity), mask, self.scale()))
+
+    def _learn(self, quantity: str, values: np.ndarray, mask: np.ndarray) -> None:
+        """Take the automatic range of the layers of ``quantity`` from ``values``."""
+        for layer in self.layers:
+            if layer.quantity == quantity:
+                found = layers.automatic(layer, values, mask)
+                if found is not None:
+                    self._ranges[layer.title] = found
+
+
+def _same(one: tuple, other: tuple) -> bool:
+    return np.array_equal(one[0], other[0]) and one[1:] == other[1:]
+
+
+def heading_of(ahead: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) with the columns ahead, left and up, level by ``up``."""
+    level = ahead - up * (ahead @ up)
+    if np.linalg.norm(level) < 1e-6:
+        level = np.eye(3)[np.argmin(np.abs(up))]
+        level = level - up * (level @ up)
+    level = level / np.linalg.norm(level)
+    return np.stack([level, np.cross(up, level), up], axis=1)
+
+
+def _ahead(scene: Scene) -> np.ndarray:
+    """Where the observer of ``scene`` is turned to."""
+    pose = np.array(scene.integrator.observer.world_transform().matrix, float).reshape(4, 4)
+    return pose[:3, 2]

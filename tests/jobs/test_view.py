@@ -1,0 +1,67 @@
+"""From files and folders to the scene that a viewer shows."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.errors import NergError
+from nerg_mi.jobs import demo
+from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.jobs.view import place_to_view
+from tests.jobs.recorder import Recorder
+
+MESH = "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n"
+
+
+@pytest.fixture
+def rays(tmp_path):
+    path = tmp_path / "rays.npz"
+    ahead = [[1.0, 0, 0]] * 3
+    nerg.Rays([0, 1, 2], [0, 0, 0], ("Ada",), [[0, 0, 1.6]] * 3, ahead, np.ones(3)).save(path)
+    return path
+
+
+def test01_a_scene_with_nerg_is_taken_as_it_is(rgb, tmp_path, rays):
+    store = demo.store_scene()
+    place = place_to_view([store, rays], tmp_path / "new", ViewOptions(up=(0, 0, 2)))
+    assert place.scene == store and not place.made and len(place.rays) == 3
+    assert np.array_equal(place.up, [0, 0, 1]) and place.name == f"{store.name} + rays.npz"
+
+
+def test02_of_others_a_scene_is_made(rgb, tmp_path):
+    (tmp_path / "a.obj").write_text(MESH)
+    told = Recorder()
+    place = place_to_view([tmp_path / "a.obj"], tmp_path, ViewOptions(up=(0, 1, 0)), told)
+    assert place.made and place.rays is None and np.allclose(place.up, [0, 1, 0])
+    assert type(nerg.Scene.load(place.scene)).__name__ == "Scene"
+
+
+def test03_a_folder_stands_for_what_is_in_it(rgb, tmp_path, rays):
+    run = tmp_path / "run"
+    run.mkdir()
+    with pytest.raises(NergError, match="holds nothing"):
+        place_to_view([run], tmp_path)
+    (run / "a.obj").write_text(MESH)
+    (run / "notes.txt").write_text("x")
+    assert place_to_view([run], tmp_path).name == "a.obj"
+    for name in ("scene.xml", "other.xml"):
+        shutil.copy(demo.store_scene().parent / "shapes.xml", run / name)
+    for name in ("twin.ply", "twin_lights.ply", "display.xml"):
+        shutil.copy(demo.store_scene().parent / name, run / name)
+    (run / "scene.xml").unlink()
+    with pytest.raises(NergError, match="name the one to view"):
+        place_to_view([run], tmp_path)
+
+
+def test04_two_of_a_kind_are_told(rgb, tmp_path, rays):
+    shutil.copy(rays, tmp_path / "more.npz")
+    with pytest.raises(NergError, match="both rays"):
+        place_to_view([rays, tmp_path / "more.npz"], tmp_path)
+    with pytest.raises(NergError, match="nothing to view"):
+        place_to_view([], tmp_path)
+    with pytest.raises(NergError, match="up must be a direction"):
+        place_to_view([demo.store_scene()], tmp_path, ViewOptions(up=(0, 0, 0)))

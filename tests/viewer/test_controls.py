@@ -1,0 +1,51 @@
+"""The panel's tables and files."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.errors import NergError
+from nerg_mi.viewer.controls import copied_view, png_bytes, table
+from nerg_mi.viewer.layers import LAYERS
+from nerg_mi.viewer.session import Shade
+from nerg_mi.viewer.view import View
+from nerg_mi.viewer.worker import Worker
+
+
+def test01_the_largest_share_first():
+    text = table({"a": 0.1, "b|<b>": 0.25, "c": 0.0})
+    assert text.splitlines()[2:] == ["| b&#124;&#60;b&#62; | 25.0 % |", "| a | 10.0 % |", "| c | 0.0 % |"]
+    many = table({f"n{k}": 0.01 for k in range(20)}).splitlines()
+    assert len(many) == 15 and many[-1] == "| 8 more | 8.0 % |"
+    assert "Name areas" in table({})
+
+
+def test02_a_scene_of_what_is_shown(store, tmp_path):
+    place = SimpleNamespace(scene=store, made=False)
+    options = SimpleNamespace(width=48)
+    view = View.of((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
+    shown = SimpleNamespace(
+        place=place, shade=Shade(LAYERS["gaze"]), observer=np.array([5, 3, 1.6]), options=options, spp=1, falloff=0.1
+    )
+    (tmp_path / "view.xml").write_text(copied_view(shown, view))
+    scene = nerg.Scene.load(tmp_path / "view.xml")
+    assert scene.integrator.aov_names() == ["depth.T", "opacity.Y", "gaze.Y"] and np.allclose(
+        scene.observer, [5, 3, 1.6]
+    )
+    shown.place = SimpleNamespace(scene=tmp_path / "scene.xml", made=True)
+    (tmp_path / "scene.vol").touch()
+    with pytest.raises(NergError, match="nerg scene"):
+        copied_view(shown, view)
+
+
+def test03_a_png(rgb):
+    worker = Worker(lambda error: None)
+    try:
+        data = png_bytes(SimpleNamespace(worker=worker), np.zeros((4, 6, 3), np.uint8))
+    finally:
+        worker.stop()
+    assert data.startswith(b"\x89PNG") and int.from_bytes(data[16:20], "big") == 6

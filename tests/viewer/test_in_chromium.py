@@ -1,0 +1,208 @@
+"""The page in a real browser: it loads, the observer is dragged, the picture changes, nothing leaves the machine."""
+
+from __future__ import annotations
+
+import json
+import time
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.viewer.serving import viewer
+from nerg_mi.viewer.view import View
+from tests.viewer.browser import chromium, require
+
+pytestmark = pytest.mark.slow
+
+
+def until(what, seconds=60.0):
+    """Wait for ``what`` to be true, and give it."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        found = what()
+        if found:
+            return found
+        time.sleep(0.05)
+    raise AssertionError("it did not come about in time")
+
+
+def pixels(driver):
+    """What the browser shows (height, width, 3), float."""
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()
+    data = driver.get_screenshot_as_png()
+    stream.write(data)
+    stream.seek(0)
+    return np.array(mi.Bitmap(stream))[..., :3].astype(float)
+
+
+def on_screen(driver, view: View, point) -> tuple[int, int]:
+    """Where ``point`` is in the window, in pixels."""
+    away = np.asarray(point, float) - view.origin
+    depth, rise = away @ view.ahead, np.tan(view.fov / 2)
+    right = np.cross(view.ahead, view.up)
+    x = 0.5 + away @ right / (depth * rise * view.aspect) / 2
+    y = 0.5 - away @ view.up / (depth * rise) / 2
+    width, height = driver.execute_script("return [window.innerWidth, window.innerHeight]")
+    return round(x * width), round(y * height)
+
+
+def drag(driver, start, end):
+    """With the mouse, from pixel to pixel."""
+    from selenium.webdriver.common.actions.action_builder import ActionBuilder
+    from selenium.webdriver.common.actions.mouse_button import MouseButton
+
+    steps = ActionBuilder(driver, duration=60)
+    steps.pointer_action.move_to_location(*start).pause(0.3).pointer_down(button=MouseButton.LEFT)
+    for share in np.linspace(0, 1, 9)[1:]:
+        x, y = (round(a + share * (b - a)) for a, b in zip(start, end))
+        steps.pointer_action.move_to_location(x, y)
+    steps.pointer_action.pause(0.1).pointer_up(button=MouseButton.LEFT)
+    steps.perform()
+
+
+@pytest.fixture(scope="module")
+def running():
+    from nerg_mi.jobs import demo
+    from nerg_mi.rendering.pictures import activate
+
+    require("viser")
+    activate("llvm_ad_rgb")
+    path = demo.store_scene()
+    if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
+        pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
+    with viewer([path], ViewOptions(port=0, width=160, spp=1)) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def driver(running):
+    with chromium() as found:
+        found.get(running.address)
+        yield found
+
+
+def window_of(running):
+    return until(lambda: list(running.page.windows.values()))[-1]
+
+
+def refined(running, window):
+    """The window's picture, once it is whole, and the browser has had time to show it."""
+    until(lambda: window.picture and window.last is not None and window.last[0].whole)
+    until(lambda: running.page.session.worker.idle)
+    time.sleep(0.7)
+    return window.last
+
+
+def test01_it_loads_and_is_refined(running, driver):
+    window = window_of(running)
+    until(lambda: window.cloud is not None)
+    refined(running, window)
+    shown = pixels(driver)
+    assert running.page.problem == ""
+    # The left half, beside the panel and below the note on software rendering: a picture, no empty canvas.
+    assert shown[250:600, :800].std() > 20
+    # It is the picture that was rendered: its mean colours, cell by cell.
+    colors = window.last[1].astype(float)
+    height, width = shown.shape[:2]
+    rows, columns = np.linspace(0, 1, 24)[14:22], np.linspace(0, 1, 24)[1:14]
+    own = np.array([[colors[int(r * colors.shape[0]), int(c * colors.shape[1])] for c in columns] for r in rows])
+    seen = np.array([[shown[int(r * height), int(c * width)] for c in columns] for r in rows])
+    assert np.corrcoef(own.ravel(), seen.ravel())[0, 1] > 0.8
+
+
+def test02_the_observer_is_dragged_and_the_picture_changes(running, driver):
+    session, window = running.page.session, window_of(running)
+    running.page.place_observer(np.array([5.6, 3.6, 1.6]), np.eye(3))
+    refined(running, window)
+    before, numbers, at = pixels(driver), window.last[0].values["gaze"].copy(), session.observer.copy()
+    start = on_screen(driver, window.view, at + np.array([0.3, 0, 0]))
+    drag(driver, start, (start[0] + 90, start[1] + 30))
+    until(lambda: not np.array_equal(session.observer, at), 10)
+    assert np.abs(session.observer - at)[1:].max() < 1e-3 and abs(session.observer[0] - at[0]) > 0.05, "along its arrow"
+    refined(running, window)
+    assert np.abs(pixels(driver) - before)[250:600, :800].mean() > 1
+    gaze = window.last[0].values["gaze"]
+    assert np.abs(gaze - numbers).max() > 0.05 * numbers.max()
+    assert session.baked_for is not None and np.array_equal(session.baked_for, session.observer)
+    assert np.allclose(running.page._observer.position, session.observer)
+
+
+def test03_the_camera_is_moved_by_mouse(running, driver):
+    window = window_of(running)
+    refined(running, window)
+    before, at = pixels(driver), window.view
+    drag(driver, (500, 450), (650, 470))
+    until(lambda: not np.allclose(window.view.origin, at.origin), 10)
+    refined(running, window)
+    assert np.abs(pixels(driver) - before)[250:600, :800].mean() > 3
+
+
+def test04_two_browsers_have_one_observer_and_cameras_of_their_own(running, driver):
+    first = window_of(running)
+    with chromium(700, 500) as other:
+        other.get(running.address)
+        second = until(lambda: next((w for w in running.page.windows.values() if w is not first), None))
+        refined(running, second)
+        assert len(running.page.windows) == 2
+        view = first.view
+        drag(other, (60, 200), (150, 210))
+        until(
+            lambda: second.view.origin is not None and not np.allclose(second.view.origin, view.origin, atol=0.05), 10
+        )
+        assert first.view is view
+        running.page.place_observer(np.array([4.4, 2.8, 1.6]))
+        for window in (first, second):
+            refined(running, window)
+        assert not np.array_equal(first.last[1], second.last[1])
+    until(lambda: len(running.page.windows) == 1, 20)
+
+
+def test05_reloaded_it_is_as_before(running, driver):
+    running.page.place_observer(np.array([6.2, 3.0, 1.6]))
+    old = window_of(running)
+    driver.refresh()
+    window = until(lambda: next((w for w in running.page.windows.values() if w is not old), None))
+    refined(running, window)
+    assert np.allclose(running.page.session.observer, [6.2, 3.0, 1.6])
+    assert pixels(driver)[250:600, :800].std() > 20
+    assert running.page.problem == ""
+
+
+def test06_no_request_leaves_the_machine(running, driver):
+    asked = []
+    for entry in driver.get_log("performance"):
+        event = json.loads(entry["message"])["message"]
+        if event["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated"):
+            asked.append(event["params"].get("request", event["params"])["url"])
+    own = urlsplit(running.address).netloc
+    assert any(urlsplit(url).netloc == own for url in asked)
+    others = [url for url in asked if urlsplit(url.removeprefix("blob:")).netloc != own]
+    assert all(url.startswith(("data:", "chrome:")) for url in others), others
+    assert not [e for e in driver.get_log("browser") if e["level"] == "SEVERE"]
+
+
+def test07_the_page_may_reach_nobody_else(running, driver):
+    said = driver.execute_async_script(
+        "const done = arguments[0];"
+        "document.addEventListener('securitypolicyviolation', e => done(e.violatedDirective));"
+        "fetch('http://127.0.0.2:8099/').then(() => done('let through'), e => setTimeout(() => done('failed'), 3000));"
+    )
+    assert said == "connect-src"
+
+
+def test08_nothing_is_left_running(rgb, room):
+    import threading
+
+    require("viser")
+    before = threading.active_count()
+    with viewer([room], ViewOptions(port=0)) as found:
+        port = urlsplit(found.address).port
+    until(lambda: threading.active_count() <= before, 10)
+    import socket
+
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", port)) != 0

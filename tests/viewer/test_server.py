@@ -1,0 +1,144 @@
+"""A running server refuses what its guard refuses, over HTTP and before a websocket opens."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.viewer.guard import MESSAGE_BYTES, Guard
+from nerg_mi.viewer.server import start_server
+from tests.viewer.browser import require
+
+OPEN = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+}
+
+
+@pytest.fixture(scope="module")
+def viser():
+    return require("viser")
+
+
+@pytest.fixture(scope="module")
+def local(viser):
+    server = start_server(Guard("127.0.0.1"), 0, "test")
+    yield server
+    server.stop()
+
+
+def ask(server, path="/", **headers):
+    """Status, headers and body of a GET whose headers are these alone."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=10)
+    try:
+        connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
+        for name, value in headers.items():
+            connection.putheader(name.replace("_", "-"), value)
+        connection.endheaders()
+        response = connection.getresponse()
+        body = b"" if response.status == 101 else response.read()
+        return response.status, dict(response.getheaders()), body
+    finally:
+        connection.close()
+
+
+def opening(server, **headers):
+    headers.setdefault("Host", f"127.0.0.1:{server.get_port()}")
+    return ask(server, "/", **headers, **{k.replace("-", "_"): v for k, v in OPEN.items()})[0]
+
+
+def test01_the_page_is_served_to_this_machine(local):
+    status, headers, body = ask(local, Host=f"localhost:{local.get_port()}")
+    assert status == 200 and b"<html" in body[:1000].lower()
+    assert "connect-src 'self'" in headers["Content-Security-Policy"]
+
+
+def test02_forged_headers_are_refused(local):
+    port = local.get_port()
+    assert ask(local, Host="evil.example")[0] == 403
+    assert ask(local)[0] in (400, 403)
+    assert ask(local, Host=f"localhost:{port}", Origin="http://evil.example")[0] == 403
+    assert opening(local) == 101
+    assert opening(local, Origin=f"http://127.0.0.1:{port}") == 101
+    assert opening(local, Origin="http://evil.example") == 403
+    assert opening(local, Origin="null") == 403
+    assert opening(local, Origin=f"http://localhost:{port}") == 403
+    assert opening(local, Host=f"evil.example:{port}", Origin=f"http://evil.example:{port}") == 403
+
+
+def test03_two_headers_of_a_kind_are_refused(local):
+    port = local.get_port()
+    lines = ["GET / HTTP/1.1", f"Host: localhost:{port}", "Host: evil.example", "", ""]
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall("\r\n".join(lines).encode())
+        assert connection.recv(4096).split()[1] in (b"403", b"400")
+
+
+def test04_a_token_where_others_reach_it(viser):
+    server = start_server(Guard("0.0.0.0", "secret"), 0, "test")
+    try:
+        host = f"127.0.0.1:{server.get_port()}"
+        assert ask(server, Host=host)[0] == 403 and opening(server) == 403
+        status, headers, _ = ask(server, "/?token=secret", Host=host)
+        assert status == 200
+        cookie = headers["Set-Cookie"].partition(";")[0]
+        assert ask(server, Host=host, Cookie=cookie)[0] == 200
+        assert opening(server, Cookie=cookie) == 101
+        assert opening(server, Cookie=cookie, Origin="http://evil.example") == 403
+        assert opening(server, Cookie=cookie[:-1]) == 403
+    finally:
+        server.stop()
+
+
+def test05_messages_are_capped(local, viser):
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    address = f"ws://127.0.0.1:{local.get_port()}"
+    with connect(address, subprotocols=[f"viser-v{viser.__version__}"], max_size=None, compression=None) as page:
+        with pytest.raises(ConnectionClosed) as closed:
+            page.send(bytes(MESSAGE_BYTES + 1))
+            while True:
+                page.recv(timeout=10)
+        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
+
+
+def test06_no_link_is_shared(local, monkeypatch):
+    import viser._viser
+
+    def tunnel(*given, **more):
+        raise AssertionError("a tunnel was asked for")
+
+    monkeypatch.setattr(viser._viser, "ViserTunnel", tunnel)
+    assert local.request_share_url() is None
+
+
+def test07_a_port_that_is_taken_is_told(local):
+    with pytest.raises(NergError, match="choose another with --port"):
+        start_server(Guard("127.0.0.1"), local.get_port(), "test")
+
+
+def test08_a_viser_that_serves_otherwise_is_not_used(viser, monkeypatch):
+    import contextlib
+
+    import nerg_mi.viewer.server as module
+
+    stopped = []
+    monkeypatch.setattr(module, "_guarding", lambda guard: contextlib.nullcontext([]))
+    monkeypatch.setattr(viser.ViserServer, "stop", lambda self: stopped.append(self._websock_server.stop()))
+    with pytest.raises(NergError, match="cannot be guarded"):
+        start_server(Guard("127.0.0.1"), 0, "test")
+    assert stopped
+
+
+def test09_without_the_extra_a_sentence(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(NergError, match=r'pip install "nerg-mi\[viewer\]"'):
+        start_server(Guard("127.0.0.1"), 0, "test")

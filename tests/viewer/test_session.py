@@ -1,0 +1,158 @@
+"""What is viewed: the observer's gaze, numbers and pictures, on one thread."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.errors import NergError
+from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.jobs.view import place_to_view
+from nerg_mi.viewer.layers import LAYERS
+from nerg_mi.viewer.regions import Region
+from nerg_mi.viewer.session import Session, heading_of
+
+
+class Heard:
+    """A listener that counts."""
+
+    def __init__(self):
+        self.proxies = self.baked = self.shares = 0
+        self.errors = []
+
+    def on_proxy(self):
+        self.proxies += 1
+
+    def on_baked(self):
+        self.baked += 1
+
+    def on_shares(self):
+        self.shares += 1
+
+    def on_error(self, error):
+        self.errors.append(error)
+
+
+@pytest.fixture
+def session_of(tmp_path):
+    made = []
+
+    def make(path, **options) -> Session:
+        chosen = ViewOptions(**options)
+        session = Session(lambda: place_to_view([path], tmp_path, chosen), chosen, Heard())
+        made.append(session)
+        session.start()
+        return session
+
+    yield make
+    for session in made:
+        session.stop()
+
+
+def settle(session):
+    assert session.worker.wait_idle(120)
+    while not (session.follow_observer() and session.follow_shares()):
+        assert session.worker.wait_idle(120)
+    assert not session.listener.errors
+
+
+def test01_points_and_what_is_seen_of_them(session_of, room):
+    session = session_of(room)
+    settle(session)
+    assert session.listener.proxies == 2 and session.listener.baked >= 1
+    hidden = session.baked["visibility"] < 0.5
+    behind = (session.proxy.points[:, 0] > 2.2) & (np.abs(session.proxy.points[:, 1]) < 0.2)
+    assert hidden[behind].all() and 0.5 < (~hidden).mean() < 1
+    before = session.baked["visibility"]
+    session.place_observer(np.array([3.0, 0, 0.5]))
+    assert not session.follow_observer()
+    settle(session)
+    assert (
+        not np.array_equal(before, session.baked["visibility"])
+        and not (session.baked["visibility"] < 0.5)[behind].any()
+    )
+
+
+def test02_a_picture_is_replaced_by_the_next(session_of, room):
+    session = session_of(room, spp=4)
+    settle(session)
+    first, second = [], []
+    session.picture("a", session.home, lambda p, c: first.append(p), 400, 256)
+    session.picture("a", session.home, lambda p, c: second.append((p, c)), 48, 4)
+    settle(session)
+    assert not first or not first[-1].whole
+    picture, colors = second[-1]
+    assert picture.whole and picture.samples == 4 and colors.shape == (32, 48, 3) and colors.dtype == np.uint8
+    session.picture("a", session.home, lambda p, c: first.append(p), 400, 256)
+    session.cancel("a")
+    assert session.worker.wait_idle(60) and not any(p.whole for p in first)
+
+
+def test03_layers_have_ranges_of_their_own(session_of, room):
+    session = session_of(room)
+    settle(session)
+    session.set_shade(layer=LAYERS["depth"])
+    session.picture("a", session.home, lambda p, c: None, 48, 1)
+    settle(session)
+    scale = session.scale()
+    assert 0.5 < scale.low < 2 and 2 < scale.high < 10
+    session.set_shade(fixed=(1.0, 4.0))
+    assert (session.scale().low, session.scale().high) == (1.0, 4.0)
+    session.set_falloff(0.25)
+    assert float(np.ravel(np.array(session.scene.integrator.falloff))[0]) == pytest.approx(0.25)
+
+
+@pytest.mark.slow
+def test04_shares_are_those_of_the_library(session_of, store):
+    session = session_of(store, observer=(4.6, 3.0, 1.6))
+    session.regions = [
+        Region.of("drinks", (4.4, 4.65, 0), (4.9, 5.0, 1.45)),
+        Region.of("floor", (4, 2, -0.1), (5, 3, 0)),
+    ]
+    settle(session)
+    session.set_falloff(0.05)
+    settle(session)
+    scene = nerg.Scene.load(store)
+    for region in session.regions:
+        true = nerg.attention(scene, region.corners, observers=[(4.6, 3.0, 1.6)], divisions=8).share[0]
+        assert session.shares[region.name] == pytest.approx(float(true), rel=1e-3)
+    assert session.point_colors().shape == session.proxy.points.shape
+    counted = session.listener.shares
+    assert session.follow_shares() and session.listener.shares == counted
+    session.regions = session.regions[:1]
+    assert not session.follow_shares()
+    settle(session)
+    assert set(session.shares) == {"drinks"}
+
+
+def test05_the_sphere_is_level_and_ahead_in_its_middle(session_of, room):
+    session = session_of(room)
+    settle(session)
+    session.set_shade(layer=LAYERS["visibility"])
+    shown = []
+    session.sphere(shown.append, 64)
+    settle(session)
+    (sphere,) = shown
+    assert sphere.shape == (32, 64, 3)
+    # The box is 1 m ahead, and half a metre higher than the eye: 27 degrees. Beside it and above there is nothing.
+    hatched = {tuple(c) for c in np.unique(sphere[:10].reshape(-1, 3), axis=0)}
+    assert len(hatched) == 2
+    is_hatched = lambda part: {tuple(c) for c in part.reshape(-1, 3)} <= hatched
+    assert not is_hatched(sphere[12:16, 28:36]) and is_hatched(sphere[:15, :20]) and is_hatched(sphere[:15, 44:])
+
+
+def test06_what_cannot_be_shown_is_told(session_of, room, tmp_path):
+    with pytest.raises(NergError, match="no file"):
+        session_of(Path("nowhere.xml"))
+    with pytest.raises(NergError, match="three numbers"):
+        session_of(room, observer=(1.0, 2.0))
+
+
+def test07_a_heading_is_level():
+    for ahead in ((1, 2, -0.7), (0, 0, -1), (0, 0, 1)):
+        turn = heading_of(np.array(ahead, float) / np.linalg.norm(ahead), np.array([0.0, 0, 1]))
+        assert np.allclose(turn.T @ turn, np.eye(3)) and np.linalg.det(turn) == pytest.approx(1)
+        assert np.allclose(turn[:, 2], [0, 0, 1])
