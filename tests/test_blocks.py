@@ -112,6 +112,14 @@ def test03_every_line_of_a_shell_is_known():
                 assert {e for found in re.findall(r"\[([\w,]+)\]", line) for e in found.split(",")} <= extras, line
 
 
+def test04_areas_are_read(tmp_path):
+    from nerg_mi.formats.regions import read_regions
+
+    for block in blocks("json", page="report.md"):
+        (tmp_path / "a.json").write_text(block.text)
+        assert all(region.holds(region.corners).all() for region in read_regions(tmp_path / "a.json"))
+
+
 XML_PAGES = ("gaze-training.md", "plugins.md", "shapes-and-fields.md")
 
 
@@ -144,7 +152,7 @@ def as_scene(text: str) -> str:
 
 
 @pytest.mark.parametrize("block", [b for b in blocks("xml") if b.page in XML_PAGES], ids=lambda b: b.page)
-def test04_xml_is_a_scene(rgb, place, block):
+def test05_xml_is_a_scene(rgb, place, block):
     (place / "a.xml").write_text(as_scene(block.text))
     scene = rgb.load_file(str(place / "a.xml"))
     if "integrator" in as_scene(block.text) or "include" in block.text:
@@ -154,7 +162,7 @@ def test04_xml_is_a_scene(rgb, place, block):
 
 
 @pytest.mark.parametrize("block", blocks("python", page="plugins.md"), ids=lambda b: b.text.split("\n")[0])
-def test05_dicts_of_plugins_are_loaded(rgb, place, block):
+def test06_dicts_of_plugins_are_loaded(rgb, place, block):
     made = eval("{" + block.text + "}", {"mi": rgb})
     if "type" in made:
         assert rgb.load_dict(made) is not None
@@ -165,7 +173,7 @@ def test05_dicts_of_plugins_are_loaded(rgb, place, block):
     assert type(rgb.load_dict({"type": "scene", "integrator": integrator}).integrator()).__name__ == "NergIntegrator"
 
 
-def test06_torch(rgb, place):
+def test07_torch(rgb, place):
     pytest.importorskip("torch", reason="torch is not installed")
     names: dict = {}
     (block,) = blocks("python", page="interchange.md")
@@ -173,7 +181,7 @@ def test06_torch(rgb, place):
     assert names["sigma"].shape == (100,) and names["color"].shape == (100, 3)
 
 
-def test07_datasets(tmp_path, monkeypatch):
+def test08_datasets(tmp_path, monkeypatch):
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     from tests.rays.dataset.making import write_dataset
 
@@ -188,7 +196,7 @@ def test07_datasets(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test08_from_recordings(rgb, place, monkeypatch):
+def test09_from_recordings(rgb, place, monkeypatch):
     """The block of trainings, whose inputs are a table of four people and photos of the store, with fewer steps."""
     import nerg_mi as nerg
 

@@ -16,6 +16,7 @@ from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.formats.regions import Region, read_regions
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.rays.dataset.opening import load_rays
@@ -25,7 +26,6 @@ from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.projection import pixel_of
 from nerg_mi.rendering.scene_parts import default_name
-from nerg_mi.report.boxes import Box, read_boxes
 from nerg_mi.report.glances import Eyes, Onlooker, eyes_of, points_of_rays
 from nerg_mi.report.names import Labels, rays_without_names, results_without_names
 from nerg_mi.report.objects import ObjectAttention, attention_on
@@ -88,7 +88,7 @@ def make_report(
     options, output = options or ReportOptions(), Path(output)
     check_writable(output, ".html", ".htm")
     given = sort_files([Path(file) for file in files])
-    boxes = () if options.objects is None else read_boxes(options.objects)
+    boxes = () if options.objects is None else read_regions(options.objects)
     results, doubts = given_results(given)
     ns = select_backend(options.mode, options.threads)
     if options.evaluate:
@@ -121,7 +121,7 @@ class _Work:
 
     def run(
         self,
-        boxes: Sequence[Box],
+        boxes: Sequence[Region],
         results: Sequence[GazeResults],
         doubts: Sequence[str],
         rendered: Mapping[str, Channels] | None,
@@ -248,7 +248,7 @@ class _Work:
         return Eyes(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
     def _objects(
-        self, boxes: Sequence[Box], onlooker: Onlooker, place: GazePlace, eyes: Eyes
+        self, boxes: Sequence[Region], onlooker: Onlooker, place: GazePlace, eyes: Eyes
     ) -> tuple[ObjectAttention, ...]:
         if not boxes or self.given.scene.kind == "none":
             return ()
@@ -260,7 +260,7 @@ class _Work:
         return attention_on(boxes, glances, MARGIN * self.align.scale, recorded)
 
     def _stage(
-        self, scene: SceneResult, onlooker: Onlooker, place: GazePlace, eyes: Eyes, boxes: Sequence[Box]
+        self, scene: SceneResult, onlooker: Onlooker, place: GazePlace, eyes: Eyes, boxes: Sequence[Region]
     ) -> tuple[str | None, tuple[int, int, int, int]]:
         """The packed 3D scene, None where there are no surfaces, and how many observers, paths, points and boxes it
         has."""

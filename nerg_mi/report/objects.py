@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.evaluation.gaze.verdict import widening
+from nerg_mi.formats.regions import Region
 
-from .boxes import Box
 from .glances import Glances
 
 LEAST_PEOPLE = 3
@@ -46,7 +46,7 @@ class ObjectAttention:
 
 
 def attention_on(
-    boxes: Sequence[Box], glances: Glances, margin: float, recorded: tuple[np.ndarray, np.ndarray] | None = None
+    boxes: Sequence[Region], glances: Glances, margin: float, recorded: tuple[np.ndarray, np.ndarray] | None = None
 ) -> tuple[ObjectAttention, ...]:
     """Attention on each of ``boxes``, which are taken to be larger by ``margin`` (scene units) on all sides, for
     surfaces are known no better.

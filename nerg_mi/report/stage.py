@@ -15,7 +15,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from .boxes import Box
+from nerg_mi.formats.regions import Region
+
 from .proxy import Proxy
 
 PATH_POINTS = 16_000
@@ -42,7 +43,7 @@ class Stage:
     proxy: Proxy
     observers: np.ndarray
     paths: Sequence[np.ndarray]
-    boxes: Sequence[Box]
+    boxes: Sequence[Region]
     up: np.ndarray
     camera: Camera
 

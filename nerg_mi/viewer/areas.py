@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, sentence
+from nerg_mi.formats.regions import MOST, Region, to_json
 
 from .controls import tell
 from .page import Page
-from .regions import MOST, Region, to_json
 from .view import View
 
 COLOR = (90, 200, 255)

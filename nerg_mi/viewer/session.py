@@ -17,6 +17,7 @@ from nerg_mi.api.attention import attention
 from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import Scene
 from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.formats.regions import Region, read_regions
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.jobs.view import PlaceToView
@@ -26,7 +27,6 @@ from . import layers
 from .layers import Layer, Scale
 from .proxy import Proxy, bake, gather
 from .refining import SIZES, Pace, Picture, filled, refine
-from .regions import Region, read_regions
 from .tracks import Tracks
 from .view import View
 from .worker import Worker

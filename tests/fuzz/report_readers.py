@@ -38,14 +38,14 @@ def _make_boxes(folder: Path) -> None:
     (folder / "objects.json").write_text(json.dumps(boxes))
 
 
-def _read_boxes(folder: Path) -> None:
-    from nerg_mi.report.boxes import read_boxes
+def _read_regions(folder: Path) -> None:
+    from nerg_mi.formats.regions import read_regions
 
-    for box in read_boxes(folder / "objects.json"):
-        box.holds(box.lower)
+    for box in read_regions(folder / "objects.json"):
+        box.holds(box.corners)
 
 
 REPORTS = [
     Reader("evaluation of gaze", _make_results, {"gaze.json": ("json",)}, _read_results),
-    Reader("boxes of objects", _make_boxes, {"objects.json": ("json",)}, _read_boxes),
+    Reader("boxes of objects", _make_boxes, {"objects.json": ("json",)}, _read_regions),
 ]

@@ -7,8 +7,8 @@ import json
 import numpy as np
 
 from nerg_mi.evaluation.gaze.results import GazeResults
+from nerg_mi.formats.regions import Region
 from nerg_mi.rays.summary import summarise
-from nerg_mi.report.boxes import Box
 from nerg_mi.report.objects import ObjectAttention, Share
 from nerg_mi.report.proxy import Proxy
 from nerg_mi.report.run import Picture, Run
@@ -41,7 +41,7 @@ def cube(side: int = 12) -> Proxy:
     return Proxy(p.astype(np.float32), n.astype(np.float32), colors, gaze.astype(np.float32), 4 / side)
 
 
-SHELF = Box("shelf", np.zeros(3), np.ones(3))
+SHELF = Region.of("shelf", np.zeros(3), np.ones(3))
 
 
 def stage(boxes=(SHELF,)) -> Stage:
@@ -70,7 +70,8 @@ def whole(name: str = "shelf") -> Run:
         "validation": {"cc": 0.7, "kld": 0.4, "zones": 3, "probes": 60},
         "rays_file": {"file": name},
     }
-    packed = stage((Box(name, np.zeros(3), np.ones(3)),))
+    # Areas have no such names as turn text round.
+    packed = stage((Region.of(name.replace("\u202e", "")[:80], np.zeros(3), np.ones(3)),))
     return Run(
         f"Gaze of {name}",
         {"provenance": provenance, "architecture": {"kind": name, "members": [1, 2]}, "box": {}},

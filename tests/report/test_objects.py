@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.gaze.verdict import widening
-from nerg_mi.report.boxes import Box
+from nerg_mi.formats.regions import Region
 from nerg_mi.report.glances import Eyes, Glances
 from nerg_mi.report.objects import attention_on, mean_over_people
 
-UNIT = Box("unit", np.zeros(3), np.ones(3))
+UNIT = Region.of("unit", np.zeros(3), np.ones(3))
 
 
 def glances(person, rng):

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.report.boxes import Box
+from nerg_mi.formats.regions import Region
 from nerg_mi.report.stage import pack
 from tests.report.made import stage
 
@@ -51,7 +51,7 @@ def test_gaze_of_all_and_of_each():
 
 
 def test_boxes_are_their_twelve_edges():
-    about, arrays = unpacked(pack(stage((Box("b", np.array([0.0, 1, 2]), np.array([1.0, 3, 4])),))))
+    about, arrays = unpacked(pack(stage((Region.of("b", np.array([0.0, 1, 2]), np.array([1.0, 3, 4])),))))
     edges = positions(about, arrays["boxes"]).reshape(12, 2, 3)
     lengths = np.sort(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))
     assert np.allclose(lengths, [1] * 4 + [2] * 8, atol=1e-3)

@@ -9,10 +9,10 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
+from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.view import place_to_view
 from nerg_mi.viewer.layers import LAYERS
-from nerg_mi.viewer.regions import Region
 from nerg_mi.viewer.session import Session, heading_of
 
 

@@ -1,4 +1,4 @@
-"""Areas of interest: boxes with names, as JSON."""
+"""Areas of interest: boxes with names, as JSON: drawn in the viewer, counted by a report, written by hand."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ MOST = 1000
 """And so many areas."""
 
 _LETTERS = 80
+_EXAMPLE = '{"shelf": [[0, 0, 0], [1, 2, 3]]}'
 
 
 @dataclass(frozen=True)
@@ -51,30 +53,47 @@ class Region:
         """(2, 3)."""
         return np.array([self.lower, self.upper], float)
 
+    def holds(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """Whether ``points`` (..., 3) lie in it, or no farther than ``margin`` from it along each axis."""
+        lower, upper = self.corners
+        return np.all((points >= lower - margin) & (points <= upper + margin), axis=-1)
+
 
 def read_regions(path: str | Path) -> list[Region]:
-    """The areas of a JSON file as `to_json` writes it, ``{"regions": [{"name": ..., "min": [x, y, z], "max": ...}]}``;
-    whatever else is in it is passed over. Raises `NergError` for anything else."""
+    """The areas of a JSON file, in its order.
+
+    Either as `to_json` writes them, ``{"regions": [{"name": "shelf", "min": [x, y, z], "max": [x, y, z]}]}`` with
+    anything beside, or names and boxes alone: ``{"shelf": [[x, y, z], [x, y, z]]}``, or ``{"shelf": {"min": [...],
+    "max": [...]}}``. Raises `NergError` for what is neither.
+    """
     found = read_json(path, "file of areas", BYTES)
-    listed = found.get("regions") if isinstance(found, dict) else None
-    if not isinstance(listed, list) or len(listed) > MOST:
-        raise NergError(f'"{path}" is no file of areas: it needs "regions", a list of at most {MOST} boxes')
-    regions = []
-    for k, one in enumerate(listed):
-        try:
-            name, lower, upper = one["name"], list(one["min"]), list(one["max"])
-            if not isinstance(name, str) or not all(is_number(v) for v in (*lower, *upper)):
-                raise ValueError
-        except (TypeError, KeyError, ValueError) as error:
-            raise NergError(f'"{path}": area {k + 1} needs "name", "min" and "max", three numbers each') from error
-        try:
-            regions.append(Region.of(name, lower, upper))
-        except (NergError, OverflowError) as error:
-            raise NergError(f'"{path}", area {k + 1}: {error}') from error
+    if isinstance(found, dict) and isinstance(found.get("regions"), list):
+        listed = [(one.get("name"), one) if isinstance(one, dict) else (None, one) for one in found["regions"]]
+    elif isinstance(found, dict):
+        listed = list(found.items())
+    else:
+        raise NergError(f'"{path}" names no areas; write {_EXAMPLE} in the coordinates of the place')
+    if not 0 < len(listed) <= MOST:
+        raise NergError(f'"{path}" has {len(listed)} areas, and 1 to {MOST} are read; write {_EXAMPLE}')
+    regions = [_region(name, given, f'"{path}", area {k + 1}') for k, (name, given) in enumerate(listed)]
     names = [region.name for region in regions]
     if len(set(names)) < len(names):
         raise NergError(f'"{path}" has two areas of one name; rename one of them')
     return regions
+
+
+def _region(name: object, given: object, where: str) -> Region:
+    corners: Any = (given.get("min"), given.get("max")) if isinstance(given, dict) else given
+    try:
+        lower, upper = (list(corner) for corner in corners)
+        if not isinstance(name, str) or not all(is_number(v) for v in (*lower, *upper)):
+            raise ValueError
+    except (TypeError, ValueError) as error:
+        raise NergError(f"{where} needs a name, and two corners of three numbers each, as in {_EXAMPLE}") from error
+    try:
+        return Region.of(name, lower, upper)
+    except (NergError, OverflowError) as error:
+        raise NergError(f"{where}: {error}") from error
 
 
 def is_number(value: object) -> bool:
