@@ -72,8 +72,8 @@ def _words(run: Run, recorded: bool) -> str:
     return (
         f"The share of gaze that the field says people give each object, at {run.eyes} places where they stood, and "
         "the share of their rays that end at it. Each person counts alike; brackets are 95 % intervals over "
-        "people. Who could see it stood at one of these places in view of it, or looked at it. A field is as smooth as "
-        "the kernel it learnt from: small things that many look at have a smaller share of it than of the rays."
+        "people. Who could see it stood at one of these places in view of it, or looked at it. A field is smooth: "
+        "small things that many look at may have a smaller share of it than of the rays."
         f"{least}"
     )
 
