@@ -42,6 +42,7 @@ EXCEPTIONS = {
     "nerg_mi/files/exr.py:_raise_if_full": "finds out why the file that `replacing` has named does not take any more",
     "nerg_mi/formats/torch_ngp/pickling.py": "puts a pickle together in memory before it opens the file",
     "nerg_mi/files/png.py": "encodes in memory",
+    "nerg_mi/figures/saving.py:encode": "encodes in memory",
     "nerg_mi/capture/structure/worker.py": "fills a folder that `replacing_folder` has named, in its own process",
     "nerg_mi/rays/readers/parsing/skeleton_file.py:_written": "is given the name that `replacing` has chosen",
 }

@@ -79,7 +79,8 @@ def train_gaze(
     if options.resume and not options.ensemble and (state is None or not state.is_file()):
         raise NergError(f'there is nothing to resume: "{state}" does not exist; leave out --resume to start')
     align = Similarity() if options.align is None else read_similarity(options.align, "--align", "rays to field")
-    reporter.progress(0.0, "reading rays")
+    if not isinstance(rays, Rays):
+        reporter.progress(0.0, "reading rays")
     supervision, about = _supervision(rays, options, probes, align, reporter)
     volume = None if output is None else output.with_suffix(".vol")
     place = make_place(options, supervision.rays, supervision.views, volume, ns, options.voxel, reporter)

@@ -151,7 +151,7 @@ def _writer(files: Sequence[Path], options: PictureOptions, each: Iterator[Prove
     """What takes the pictures one after the other: ``files``, or the one video that they name."""
     if not video:
         remaining = iter(files)
-        yield lambda to_file, pixels: to_file(next(remaining), next(each))
+        yield lambda store, pixels: store(next(remaining), next(each))
         return
     with video_frames(files[0], options.fps, next(each).text()) as add:
         yield lambda to_file, pixels: add(pixels())

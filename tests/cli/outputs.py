@@ -188,6 +188,7 @@ INPUTS = {
     "export volume": {"field"},
     "export torch-ngp": {"field"},
     "ablate": {"rays", "field", "scene"},
+    "report": {"files", "objects"},
 }
 """Parameters of commands that name what is read; all others that are paths are written."""
 

@@ -14,8 +14,8 @@ class Impatient(Recorder):
     """Presses Ctrl-C when it is told of the first step."""
 
     def progress(self, share, text=""):
-        super().progress(share, text)
-        raise KeyboardInterrupt
+        if "step" in text:
+            raise KeyboardInterrupt
 
 
 def test_a_result_without_any_file(place):  # noqa: F811
@@ -27,7 +27,7 @@ def test_a_result_without_any_file(place):  # noqa: F811
     assert "2 views to train on, 1 held out, 16 x 14 pixels" in told.messages
     assert told.warnings == result.provenance["complaints"] and told.warnings
     shares = [share for share, _ in told.steps]
-    assert shares == sorted(shares) and shares[-1] == 1 and told.steps[0][1].endswith("step 1")
+    assert shares == sorted(shares) and shares[-1] == 1 and told.steps[1][1].endswith("step 1")
 
 
 def test_an_interrupted_run_without_any_file_is_a_result(place):  # noqa: F811

@@ -106,8 +106,8 @@ MENDINGS = (
             ),
             (
                 "nerg_mi/jobs/pictures.py",
-                "write(bitmap, band.rows)\n            stop.check()\n",
-                "write(bitmap, band.rows)\n",
+                "add(bitmap, band.rows)\n            stop.check()\n",
+                "add(bitmap, band.rows)\n",
             ),
         ),
         undo(

@@ -78,8 +78,8 @@ MENDINGS = (
             [_SCENE_FILE + "test_values_given_count_and_not_the_defaults"],
             (
                 "nerg_mi/rendering/scene_file.py",
-                "_Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()})",
-                "_Scene(path.parent, {})",
+                "_Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).read(",
+                "_Scene(path.parent, {}).read(",
             ),
         ),
     ),
