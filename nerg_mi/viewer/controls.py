@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, sentence
+from nerg_mi.figures.provenance import Provenance, provenance
 from nerg_mi.files.png import encode_png
+from nerg_mi.rendering.scene_file import files_of_scene
 
 from . import layers
 from .copied_scene import Shown, copied
-from .flights import flight, frames_csv
 from .page import Page, Window
 from .session import heading_of
 from .view import View
@@ -37,9 +38,8 @@ class Controls:
 
     def __init__(self, page: Page):
         self.page, self.session, self.gui = page, page.session, page.server.gui
-        self._kept: list[View] = []
         self._insets_at, self._insets_late = 0.0, False
-        self._lock = threading.Lock()
+        self._lock, self._scaling = threading.Lock(), threading.Lock()
         with self.gui.add_folder("Show"):
             self._show()
         with self.gui.add_folder("Observer"):
@@ -50,6 +50,7 @@ class Controls:
         with self.gui.add_folder("Camera", expand_by_default=False):
             self._camera()
         page.on_moved.append(self.refresh)
+        page.on_ranged.append(self._rescale)
 
     # What is shown
 
@@ -61,7 +62,8 @@ class Controls:
         colors = gui.add_dropdown("Colours", layers.MAPS, initial_value="inferno")
         automatic = gui.add_checkbox("Automatic range", True)
         ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
-        falloff = gui.add_slider("Fall-off", 0.0, 1.0, 0.01, min(session.falloff, 1.0))
+        # As Mitsuba has it, in single precision, it would be written with all its digits.
+        falloff = gui.add_slider("Fall-off", 0.0, 1.0, 0.01, round(min(session.falloff, 1.0), 4))
 
         def change(event: Any) -> None:
             fixed = None
@@ -70,7 +72,7 @@ class Controls:
                 scale = session.scale()
             elif event.target is automatic:
                 scale = session.scale()
-                ends.value = (float(scale.low), float(scale.high))
+                ends.value = (float(f"{scale.low:.3g}"), float(f"{scale.high:.3g}"))
                 fixed = ends.value
             else:
                 fixed = ends.value
@@ -98,7 +100,7 @@ class Controls:
 
     def _observer(self) -> None:
         session, gui = self.session, self.gui
-        self._at = gui.add_vector3("At", tuple(map(float, session.observer)), step=0.05)
+        self._at = gui.add_vector3("At", rounded(session.observer), step=0.05)
         to_camera = gui.add_button("Observer to the camera")
         to_observer = gui.add_button("Camera to the observer")
         empty = np.zeros((INSET * 2 // 3, INSET, 3), np.uint8)
@@ -107,7 +109,7 @@ class Controls:
 
         @self._at.on_update
         def _(event: Any) -> None:
-            if event.client is not None and not np.allclose(self._at.value, session.observer, atol=1e-4):
+            if event.client is not None and not np.allclose(self._at.value, session.observer, atol=1e-3):
                 self.page.place_observer(np.array(self._at.value))
 
         @to_camera.on_click
@@ -122,11 +124,11 @@ class Controls:
     def refresh(self) -> None:
         """Numbers, scale and insets as they are now; insets not more often than they can be looked at."""
         session = self.session
-        self._legend.content = layers.legend(session.shade.layer, session.scale())
+        self._rescale()
         if session.scene.has_gaze:
             self._table.content = table(session.shares)
-        at = tuple(float(round(v, 4)) for v in session.observer)
-        if not np.allclose(self._at.value, at, atol=1e-4):
+        at = rounded(session.observer)
+        if not np.allclose(self._at.value, at, atol=1e-3):
             self._at.value = at
         with self._lock:
             if time.monotonic() - self._insets_at < _AGAIN:
@@ -138,6 +140,11 @@ class Controls:
                 return
             self._insets_at = time.monotonic()
         self._insets()
+
+    def _rescale(self) -> None:
+        # Several threads come here, and the last to write should be the last to have looked.
+        with self._scaling:
+            self._legend.content = layers.legend(self.session.shade.layer, self.session.scale())
 
     def _insets_later(self) -> None:
         with self._lock:
@@ -169,11 +176,6 @@ class Controls:
         height = gui.add_slider("Height of the cut", 0.0, 1.0, 0.01, 0.8)
         shot = gui.add_button("Save the picture (PNG)")
         copy = gui.add_button("Copy as a scene (XML)")
-        keep = gui.add_button("Keep this view for a flight")
-        seconds = gui.add_number("Seconds of the flight", 6.0, min=0.1, max=3600.0, step=0.5)
-        fps = gui.add_number("Frames a second", 25.0, min=1.0, max=120.0, step=1.0)
-        frames = gui.add_button("Save the flight (CSV)")
-        forget = gui.add_button("Forget its views")
 
         @home.on_click
         def _(event: Any) -> None:
@@ -206,7 +208,13 @@ class Controls:
             if window is None or window.last is None:
                 tell(event, "Picture", "There is no picture yet: wait until the view rests.")
                 return
-            event.client.send_file_download("view.png", png_bytes(session, window.last[1]), save_immediately=True)
+            try:
+                about = about_picture(session, window)
+            except NergError as error:
+                tell(event, "Picture", sentence(error))
+                return
+            data = png_bytes(session, window.last[1], about.text())
+            event.client.send_file_download("view.png", data, save_immediately=True)
 
         @copy.on_click
         def _(event: Any) -> None:
@@ -219,25 +227,6 @@ class Controls:
                 tell(event, "Scene", sentence(error))
                 return
             event.client.send_file_download("view.xml", text.encode(), save_immediately=True)
-
-        @keep.on_click
-        def _(event: Any) -> None:
-            self._kept.append(View.of_page(event.client.camera))
-            tell(event, "Flight", f"{len(self._kept)} views are kept.")
-
-        @forget.on_click
-        def _(event: Any) -> None:
-            self._kept.clear()
-
-        @frames.on_click
-        def _(event: Any) -> None:
-            try:
-                text = frames_csv(flight(self._kept, seconds.value, fps.value))
-            except NergError as error:
-                tell(event, "Flight", sentence(error))
-                return
-            event.client.send_file_download("view.frames.csv", text.encode(), save_immediately=True)
-            tell(event, "Flight", "nerg render view.xml -o flight.png --frames view.frames.csv renders it.")
 
     def _window(self, event: Any) -> Window | None:
         return None if event.client is None else self.page.windows.get(event.client.client_id)
@@ -277,22 +266,52 @@ def plain_cell(name: str) -> str:
     return "".join(c if c.isalnum() or c in " -." else f"&#{ord(c)};" for c in name)
 
 
-def png_bytes(session: Any, colors: np.ndarray) -> bytes:
-    """The bytes of a PNG of ``colors`` (height, width, 3) uint8, made on the render thread."""
+def rounded(at: np.ndarray) -> tuple[float, float, float]:
+    """A position as the panel shows it: to a thousandth of a unit."""
+    x, y, z = (float(round(float(v), 3)) for v in at)
+    return x, y, z
+
+
+def about_picture(session: Any, window: Window) -> Provenance:
+    """What the last picture of ``window`` was made of. Raises `NergError` for files of the scene that are gone."""
+    assert window.last is not None and window.view is not None
+    view, shade, scale = window.view, session.shade, session.scale()
+    settings = {
+        "layer": shade.layer.title,
+        "colors": scale.colors,
+        "range": [scale.low, scale.high],
+        "observer": session.observer.tolist(),
+        "falloff": session.falloff,
+        "camera": {"origin": view.origin.tolist(), "ahead": view.ahead.tolist(), "up": view.up.tolist()},
+        "degrees": view.across,
+        "samples": window.last[0].samples,
+        "ceiling": session.ceiling,
+    }
+    return provenance("nerg view", files_of_scene(session.place.scene), 0, settings, session.checksums)
+
+
+def png_bytes(session: Any, colors: np.ndarray, text: dict[str, str] | None = None) -> bytes:
+    """The bytes of a PNG of ``colors`` (height, width, 3) uint8 with ``text`` in its header, made on the render
+    thread."""
 
     def encode() -> bytes:
         import mitsuba as mi
 
-        return encode_png(mi.Bitmap(np.ascontiguousarray(colors)))
+        return encode_png(mi.Bitmap(np.ascontiguousarray(colors)), text)
 
     return session.worker.call(encode).result()
 
 
 def copied_view(session: Any, view: View) -> str:
     """A scene file of ``view`` with the observer, the layer and the settings of ``session``."""
-    if session.place.made and session.place.scene.with_suffix(".vol").exists():
-        raise NergError('the place was made of rays for this viewer; "nerg scene" writes it as a scene of its own')
+    check_copied(session)
     asked = tuple(name for name in layers.quantities(session.shade.layer) if name != "color")
     falloff = session.falloff
     shown = Shown(view, session.observer, asked, session.options.width, session.spp, falloff)
     return copied(session.place.scene, shown)
+
+
+def check_copied(session: Any) -> None:
+    """Raise `NergError` for a place that ends with the viewer, so that no copy of it could be rendered."""
+    if session.place.made and session.place.scene.with_suffix(".vol").exists():
+        raise NergError('the place was made of rays for this viewer; "nerg scene" writes it as a scene of its own')

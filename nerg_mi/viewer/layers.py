@@ -9,11 +9,9 @@ import numpy as np
 from nerg_mi.api.scene import COLOR, Scene
 from nerg_mi.errors import NergError
 from nerg_mi.figures.colors import SEQUENTIAL as MAPS
+from nerg_mi.figures.hatching import hatch
 from nerg_mi.figures.overlay import Heat, overlay, top_of
 from nerg_mi.figures.tonemap import srgb, to_bytes
-
-HATCH = 6
-"""Pixels from one stripe to the next where there is no data."""
 
 
 @dataclass(frozen=True)
@@ -117,13 +115,6 @@ def colored(
     if hatched and len(shape) == 2 and layer.kind != "color":
         shown = hatch(shown, ~mask)
     return to_bytes(shown).reshape(*shape, 3)
-
-
-def hatch(shown: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Display values (h, w, 3) with grey stripes where there is no data, (h, w)."""
-    rows, columns = np.indices(where.shape)
-    stripe = np.asarray((rows + columns) % HATCH < HATCH // 3)[..., None]
-    return np.where(where[..., None], np.where(stripe, 0.55, 0.28), shown)
 
 
 def legend(layer: Layer, scale: Scale) -> str:

@@ -64,6 +64,7 @@ class Page:
         self._observer: Any = None
         self._clock = threading.Thread(target=self._tick, name="nerg-view-clock", daemon=True)
         self.on_moved: list[Any] = []
+        self.on_ranged: list[Any] = []
 
     def open(self, session: Session) -> None:
         """Show ``session``, which has started."""
@@ -233,6 +234,11 @@ class Page:
     def on_shares(self) -> None:
         """Nothing to be done here: whoever shows them has asked to be told."""
         for told in self.on_moved:
+            told()
+
+    def on_range(self) -> None:
+        """Have the scale beside the picture be that of the picture."""
+        for told in self.on_ranged:
             told()
 
     def on_error(self, error: BaseException) -> None:

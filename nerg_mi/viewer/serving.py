@@ -15,6 +15,7 @@ from nerg_mi.jobs.view import place_to_view
 
 from .areas import Areas
 from .controls import Controls
+from .flying import Flying
 from .guard import Guard, is_loopback, new_token
 from .page import Page
 from .people import People
@@ -52,6 +53,7 @@ def viewer(
             session.start()
             page.open(session)
             Controls(page)
+            Flying(page)
             if session.tracks is not None:
                 People(page, session.tracks)
             if session.scene.has_gaze:

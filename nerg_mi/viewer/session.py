@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from nerg_mi.api.attention import attention
 from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import Scene
+from nerg_mi.api.variant import active_mitsuba
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.formats.regions import Region, read_regions
 from nerg_mi.jobs.options.view import ViewOptions
@@ -59,6 +61,10 @@ class Listener(Protocol):
         """The shares of attention are those of the observer."""
         ...
 
+    def on_range(self) -> None:
+        """The automatic range of the layer that is shown is another one."""
+        ...
+
     def on_error(self, error: BaseException) -> None:
         """A task has failed."""
         ...
@@ -88,6 +94,7 @@ class Session:
         self.ceiling: float | None = None
         self.regions: list[Region] = []
         self.pace = Pace()
+        self.checksums: dict[Path, str] = {}
         self._ranges: dict[str, tuple[float, float]] = {}
         self._busy: set[str] = set()
         self._shares_for: tuple[np.ndarray, tuple[Region, ...], float] | None = None
@@ -103,6 +110,7 @@ class Session:
 
     def _load(self) -> None:
         self.place = self._place()
+        self.mode = active_mitsuba().variant()
         self.scene = Scene(load_scene(self.place.scene))
         self.layers = layers.available(self.scene)
         first = next((la for la in self.layers if la.quantity in ("gaze", "kde")), layers.LAYERS["colour"])
@@ -193,7 +201,7 @@ class Session:
 
     def inset(self, name: Hashable, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int) -> None:
         """The same for a small picture that nobody waits for."""
-        self.worker.submit(("inset", name), URGENCY, self._refined(view, deliver, width, 1))
+        self.worker.submit(("inset", name), URGENCY, self._refined(view, deliver, width, 1, False))
 
     def sphere(self, deliver: Callable[[np.ndarray], None], width: int) -> None:
         """All that the observer could turn to, as an equirectangular picture whose middle is ahead of them."""
@@ -266,8 +274,9 @@ class Session:
             self._busy.discard("shares")
 
     def _refined(
-        self, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int
+        self, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int, leads: bool = True
     ) -> Iterator[None]:
+        """``leads``: whether the automatic range is taken from it."""
         with self.lock:
             shade, at = self.shade, self.observer
             ceiling = None if self.ceiling is None else (self.place.up, self.ceiling)
@@ -277,7 +286,7 @@ class Session:
             if found is not None:
                 mask = found.values["opacity"] > 0.5
                 values = found.values.get(layer.quantity)
-                if values is not None and (layer.quantity not in self.baked):
+                if leads and values is not None and layer.quantity not in self.baked:
                     with self.lock:
                         self._learn(layer.quantity, values, mask)
                 deliver(found, layers.colored(layer, found.values["color"], values, mask, self.scale()))
@@ -305,8 +314,10 @@ class Session:
         for layer in self.layers:
             if layer.quantity == quantity:
                 found = layers.automatic(layer, values, mask)
-                if found is not None:
+                if found is not None and found != self._ranges.get(layer.title):
                     self._ranges[layer.title] = found
+                    if layer == self.shade.layer and self.shade.fixed is None:
+                        self.listener.on_range()
 
 
 def _same(one: tuple, other: tuple) -> bool:

@@ -45,7 +45,8 @@ def test02_a_scene_of_what_is_shown(store, tmp_path):
 def test03_a_png(rgb):
     worker = Worker(lambda error: None)
     try:
-        data = png_bytes(SimpleNamespace(worker=worker), np.zeros((4, 6, 3), np.uint8))
+        data = png_bytes(SimpleNamespace(worker=worker), np.zeros((4, 6, 3), np.uint8), {"Comment": "a shelf"})
     finally:
         worker.stop()
     assert data.startswith(b"\x89PNG") and int.from_bytes(data[16:20], "big") == 6
+    assert b"tEXtComment\0a shelf" in data

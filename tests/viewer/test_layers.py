@@ -7,6 +7,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
+from nerg_mi.figures.hatching import LINE, lines
 from nerg_mi.figures.overlay import Heat, overlay
 from nerg_mi.figures.tonemap import to_bytes
 from nerg_mi.viewer import layers
@@ -32,12 +33,13 @@ def test02_heat_is_that_of_pictures():
 def test03_no_data_is_hatched():
     mask = np.ones((24, 24), bool)
     mask[:12] = False
-    shown = layers.colored(LAYERS["depth"], np.zeros((24, 24, 3)), np.full((24, 24), 0.5), mask, Scale(0, 1))
-    assert (
-        len(np.unique(shown[:12].reshape(-1, 3), axis=0)) == 2
-        and len(np.unique(shown[12:].reshape(-1, 3), axis=0)) == 1
-    )
-    assert (np.ptp(shown[:12].astype(int), axis=-1) == 0).all(), "stripes are grey, which no map is"
+    given = LAYERS["depth"], np.zeros((24, 24, 3)), np.full((24, 24), 0.5), mask, Scale(0, 1)
+    shown, plain = layers.colored(*given), layers.colored(*given, hatched=False)
+    assert np.array_equal(shown[12:], plain[12:]) and len(np.unique(shown[12:].reshape(-1, 3), axis=0)) == 1
+    # As pictures are: lines over paled colours.
+    drawn = lines(24, 24)[:12]
+    assert (shown[:12][drawn] == round(255 * LINE)).all()
+    assert (shown[:12][~drawn] > plain[:12][~drawn]).all()
 
 
 def test04_ranges_are_those_of_the_values():

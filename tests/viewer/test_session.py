@@ -20,7 +20,7 @@ class Heard:
     """A listener that counts."""
 
     def __init__(self):
-        self.proxies = self.baked = self.shares = 0
+        self.proxies = self.baked = self.shares = self.ranges = 0
         self.errors = []
 
     def on_proxy(self):
@@ -31,6 +31,9 @@ class Heard:
 
     def on_shares(self):
         self.shares += 1
+
+    def on_range(self):
+        self.ranges += 1
 
     def on_error(self, error):
         self.errors.append(error)
