@@ -33,7 +33,7 @@ TESTS = (
     "training/gaze/test_losses.py",
     "transport/observer/test_surroundings.py",
     "transport/march/test_quadrature.py",
-    "view",
+    "figures",
     "cli/test_demo.py",
     "cli/rays",
     "cli/test_render.py",

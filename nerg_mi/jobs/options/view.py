@@ -16,7 +16,7 @@ class ViewOptions:
     port: int = option(8080, "Port to serve at; 0: any that is free.", min=0, max=65535)
     names: tuple[str, ...] = option((), "Name by which others reach this machine, beside its address.", "--name")
     width: int = option(720, "Width of a refined picture in pixels.", min=16, max=8192)
-    spp: int = option(0, "Samples a pixel of it.  [default: as many as the scene says]", min=0)
+    spp: int = option(0, "Samples a pixel of it; 0: as the scene says.", min=0)
     observer: tuple[float, ...] | None = option(
         None, "Position of the observer's eye, x,y,z.  [default: the scene's]", parse=parse_numbers
     )
