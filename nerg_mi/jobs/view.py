@@ -14,6 +14,7 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.pictures import load_scene
@@ -62,7 +63,7 @@ def place_to_view(
         raise NergError(
             "there is nothing to view; name a scene, a field, a mesh, a gaze field, rays, or a run's folder"
         )
-    kinds = {path: "rays" if path.suffix.lower() == ".rays" else kind_of_file(path) for path in found}
+    kinds = {path: kind_of_file(path) for path in found}
     rays_files = [path for path, kind in kinds.items() if kind == "rays"]
     if len(rays_files) > 1:
         raise NergError(f'"{rays_files[0]}" and "{rays_files[1]}" are both rays; a viewer shows one of them')
@@ -72,7 +73,7 @@ def place_to_view(
     if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays"} and _is_nerg(scenes[0]):
         align = _given_align(options) or Similarity(np.eye(4))
         return PlaceToView(scenes[0], False, rays, align, _up(options, np.array([0.0, 0, 1])), name)
-    given = [path for path in found if path.suffix.lower() != ".rays"]
+    given = [path for path in found if not is_dataset(path)]
     if rays is not None and rays_files[0] not in given:
         copy = folder / "rays.npz"
         rays.save(copy)
@@ -93,7 +94,7 @@ def _expanded(path: Path) -> list[Path]:
     """A file itself; of a folder the files in it that a viewer knows."""
     if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
-    if not path.is_dir() or path.suffix.lower() == ".rays":
+    if not path.is_dir() or is_dataset(path):
         return [path]
     inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES)
     if not inside:

@@ -65,3 +65,15 @@ def test04_two_of_a_kind_are_told(rgb, tmp_path, rays):
         place_to_view([], tmp_path)
     with pytest.raises(NergError, match="up must be a direction"):
         place_to_view([demo.store_scene()], tmp_path, ViewOptions(up=(0, 0, 0)))
+
+
+def test05_a_place_of_a_dataset(rgb, tmp_path):
+    """As everywhere, a dataset is named by its folder, or by that of a place in it."""
+    pytest.importorskip("pyarrow", reason="datasets need the extra parquet")
+    from tests.rays.dataset.making import write_dataset
+
+    _, rays = write_dataset(tmp_path)
+    (tmp_path / "a.obj").write_text(MESH)
+    for name in ("shop.rays", "shop.rays/place=shop"):
+        place = place_to_view([tmp_path / "a.obj", tmp_path / name], tmp_path, ViewOptions(up=(0, 0, 1)))
+        assert place.rays is not None and len(place.rays) == len(rays) and place.made
