@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from nerg_mi.errors import NergError, expected, sentence
+from nerg_mi.files.atomic import write_text
 from nerg_mi.files.video import check_video
 
 from . import layers
@@ -83,8 +84,8 @@ class Flying:
                 falloff=session.falloff,
             )
             scene, frames, video = (Path(folder.name, name) for name in ("view.xml", "view.frames.csv", "flight.mp4"))
-            scene.write_text(copied(session.place.scene, shown), encoding="utf-8")
-            frames.write_text(frames_csv(views), encoding="utf-8", newline="")
+            write_text(scene, copied(session.place.scene, shown))
+            write_text(frames, frames_csv(views))
         except (NergError, ImportError) as error:
             folder.cleanup()
             tell(client, TITLE, sentence(error))
