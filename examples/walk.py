@@ -10,10 +10,12 @@ are those of ``nerg render scene.xml -o walk.png --overlay gaze --frames walk.cs
 from __future__ import annotations
 
 import argparse
+import io
 import tempfile
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.tables import write_csv
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.pictures import render_file
@@ -41,9 +43,10 @@ def render_walk(out: Path, frames: int, width: int, spp: int) -> Path:
         options = PictureOptions(overlay="gaze", frames=walk, defaults=values)
         made = render_file(SCENE, Path(folder) / "walk.png", options)
         pictures = [Image.open(path).convert("RGB") for path in made.files]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    loop = [*pictures, *pictures[-2:0:-1]]
-    loop[0].save(out, save_all=True, append_images=loop[1:], duration=1000 // 12, loop=0, quality=70, method=6)
+    loop, whole = [*pictures, *pictures[-2:0:-1]], io.BytesIO()
+    about = {"save_all": True, "append_images": loop[1:], "duration": 1000 // 12, "loop": 0}
+    loop[0].save(whole, format=out.suffix[1:], quality=70, method=6, **about)
+    write_bytes(out, whole.getvalue())
     return out
 
 
