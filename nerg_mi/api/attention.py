@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,7 @@ def attention(
     """
     import drjit as dr
 
-    from nerg_mi.density.received import arriving, patches
+    from nerg_mi.density.received import patches
 
     active_mitsuba()
     if not scene.has_gaze:
@@ -102,25 +102,53 @@ def attention(
         mesh = _mesh(scene, surface)
         pieces = patches(mesh, _enough_divisions(mesh, eyes) if divisions is None else int(divisions))
         area = np.array(pieces.area, np.float32)
-        i = scene.integrator
         for number, eye in enumerate(eyes):
-            observer = ObserverOf(scene, eye)
-            found = arriving(
-                observer.place,
-                observer.density,
-                observer.center,
-                pieces.p,
-                pieces.n,
-                i.falloff,
-                i.observer_settings,
-                two_sided,
-            )
-            each.append(np.array(found, np.float32))
+            each.append(_density(ObserverOf(scene, eye), pieces, two_sided))
             reporter.progress((number + 1) / len(eyes), f"observer {number + 1} of {len(eyes)}")
         where, normals = (np.ascontiguousarray(np.array(v, np.float32).T) for v in (pieces.p, pieces.n))
     density = np.stack(each)
     share = (density.astype(np.float64) @ area.astype(np.float64)).astype(np.float32)
     return Attention(share, density, where, normals, area, eyes)
+
+
+def shares(
+    scene: Scene, surfaces: Sequence[Any], observer: ArrayLike, *, divisions: int, two_sided: bool = False
+) -> Floats:
+    """The share (N,) of one observer's gaze that each of N ``surfaces`` receives, all of them at once.
+
+    Arguments and errors as of `attention`; ``observer`` (3,).
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    from nerg_mi.density.received import Patches, patches
+
+    active_mitsuba()
+    if not scene.has_gaze:
+        raise NergError("attention needs a gaze field; give make_scene gaze=")
+    if not len(surfaces):
+        return np.zeros(0, np.float32)
+    eye = given_observers(scene, observer)[0]
+    with mitsuba_says(), dr.suspend_grad():
+        each = [patches(_mesh(scene, surface), divisions) for surface in surfaces]
+        area = [np.array(pieces.area, np.float64) for pieces in each]
+        lanes = lambda name: np.concatenate([np.array(getattr(pieces, name), np.float32) for pieces in each], axis=1)
+        pieces = Patches(mi.Point3f(lanes("p")), mi.Vector3f(lanes("n")), mi.Float(np.concatenate(area)))
+        density = _density(ObserverOf(scene, eye), pieces, two_sided)
+    starts = np.cumsum([0, *(len(a) for a in area[:-1])])
+    return np.add.reduceat(density * np.concatenate(area), starts).astype(np.float32)
+
+
+def _density(observer: ObserverOf, pieces: Any, two_sided: bool) -> Floats:
+    """Attention (K,) per area that ``pieces`` receive from ``observer``."""
+    from nerg_mi.density.received import arriving
+
+    i = observer.integrator
+    settings = i.observer_settings
+    found = arriving(
+        observer.place, observer.density, observer.center, pieces.p, pieces.n, i.falloff, settings, two_sided
+    )
+    return np.array(found, np.float32)
 
 
 def _enough_divisions(mesh: Any, eyes: Floats) -> int:

@@ -16,8 +16,7 @@ from nerg_mi.rendering.scene_file import files_of_scene
 from . import layers
 from .copied_scene import Shown, copied
 from .page import Page, Window
-from .session import heading_of
-from .view import View
+from .view import View, heading_of
 
 INSET = 240
 """Width of the observer's own view, in pixels."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,9 +19,7 @@ from .refining import Picture
 from .server import stop_server
 from .session import Session
 from .view import View
-
-REST = 0.12
-"""Seconds without movement after which a picture is refined."""
+from .window import REST, Window
 
 TICK = 0.04
 """Seconds between two looks of the clock."""
@@ -31,23 +28,6 @@ _NEAR = 0.4
 
 _POINT = 1.15
 """Width of a drawn point, in cells of the grid that points lie in."""
-
-
-@dataclass(eq=False)
-class Window:
-    """One browser: its ``client`` and the points in it; when it ``moved`` last and whether that was ``noticed``; the
-    ``version`` of its view, and whether it shows a ``picture``; the ``last`` one, with its colours."""
-
-    client: Any
-    status: Any
-    cloud: Any = None
-    view: View | None = None
-    moved: float = 0.0
-    noticed: bool = False
-    version: int = 0
-    picture: bool = False
-    last: tuple[Picture, np.ndarray] | None = None
-    lines: list[str] = field(default_factory=list)
 
 
 class Page:
@@ -151,20 +131,13 @@ class Page:
         """Make all pictures anew, ``wait`` seconds from now, since what they show has changed."""
         with self._lock:
             for window in self.windows.values():
-                self._moving(window, time.monotonic() - REST + wait)
+                self._moving(window, time.monotonic() - window.rest + wait)
 
     def recolor(self) -> None:
-        """Colour the points anew."""
-        colors = self.session.point_colors()
-        proxy = self.session.proxy
-        if colors is None or proxy is None:
-            return
+        """Colour the points anew, which are other ones where the ceiling is cut off."""
         with self._lock:
             for window in self.windows.values():
-                if window.cloud is None or len(window.cloud.points) != len(colors):
-                    self._add_cloud(window, proxy, colors)
-                else:
-                    window.cloud.colors = colors
+                self._draw_points(window)
 
     def _moving(self, window: Window, when: float) -> None:
         """The view of ``window``, or what it shows, is another one now: its points take the picture's place."""
@@ -204,14 +177,20 @@ class Page:
         text = (window.lines[-1] if window.lines else "points") + end
         window.status.content = text + (f"\n\n**{self.problem}**" if self.problem else "")
 
-    def _add_cloud(self, window: Window, proxy: Any, colors: np.ndarray) -> None:
+    def _draw_points(self, window: Window) -> None:
+        shown = self.session.points(window.level)
+        if shown is None:
+            return
+        if window.cloud is not None and np.array_equal(window.cloud.points, shown.points):
+            window.cloud.colors = shown.colors
+            return
         if window.cloud is not None:
             window.cloud.remove()
         window.cloud = window.client.scene.add_point_cloud(
             "/points",
-            proxy.points,
-            colors,
-            point_size=_POINT * proxy.size,
+            shown.points,
+            shown.colors,
+            point_size=_POINT * shown.size,
             point_shape="square",
             point_shading="flat",
             precision="float32",
@@ -263,10 +242,8 @@ class Page:
             with self._lock:
                 self._look(window)
 
-        colors, proxy = self.session.point_colors(), self.session.proxy
-        if colors is not None and proxy is not None:
-            with self._lock:
-                self._add_cloud(window, proxy, colors)
+        with self._lock:
+            self._draw_points(window)
 
     def _look(self, window: Window) -> None:
         view = View.of_page(window.client.camera)
@@ -275,8 +252,22 @@ class Page:
         names = ("origin", "ahead", "up", "fov", "aspect")
         if old is not None and all(np.allclose(getattr(view, n), getattr(old, n), atol=1e-6) for n in names):
             return
+        now = time.monotonic()
+        if old is not None and not window.noticed:
+            window.learn_pace(now - window.moved)
+            self._keep_pace(window, at_rest=False)
         window.view = view
-        self._moving(window, time.monotonic())
+        self._moving(window, now)
+
+    def _keep_pace(self, window: Window, at_rest: bool) -> None:
+        """Give the browser of ``window`` as many points as it draws quickly."""
+        level = window.level_for_pace(at_rest)
+        if level != window.level:
+            window.frames.clear()
+        del window.frames[:-100]
+        if level != window.level:
+            window.level = level
+            self._draw_points(window)
 
     def _disconnected(self, client: Any) -> None:
         with self._lock:
@@ -293,11 +284,12 @@ class Page:
     def _turn_of_clock(self) -> None:
         now = time.monotonic()
         with self._lock:
-            waiting = [w for w in self.windows.values() if not w.noticed and now - w.moved >= REST]
+            waiting = [w for w in self.windows.values() if not w.noticed and now - w.moved >= w.rest]
             if waiting:
                 self._show_gizmo()
             for window in waiting:
                 window.noticed = True
+                self._keep_pace(window, at_rest=True)
                 self._refine(window)
             if self._follow:
                 self._follow = not self.session.follow_observer()

@@ -8,8 +8,8 @@ import matplotlib
 import numpy as np
 
 from .page import Page
-from .session import heading_of
 from .tracks import ALL, Tracks
+from .view import heading_of
 
 NOBODY = "(nobody)"
 _STEPS = 2000

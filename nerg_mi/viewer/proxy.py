@@ -1,7 +1,8 @@
 """What the browser draws by itself: points on the surfaces of a place, with the gaze that they attract.
 
 Rays in all directions, from places that see different parts of it, end on surfaces; of points that lie in one cell of a
-grid one is kept.
+grid one is kept. They are in such an order that the first of them are spread over the place as evenly as all: a browser
+that draws slowly is given fewer, and a step of their gaze says roughly that of all.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ POINTS = 60_000
 BATCH = 1 << 14
 """Points whose gaze is computed in one step."""
 
+LEVELS = 4
+"""Numbers of points that a browser may be given: at each next one, cells are wider by a factor of √2."""
+
 LIGHT_SEEDS = 4
 """Samples of the light on shapes, which is random."""
 
@@ -34,11 +38,14 @@ LIGHT_SEEDS = 4
 @dataclass(frozen=True, eq=False)
 class Proxy:
     """``points`` (N, 3) in scene units, their linear ``color`` (N, 3), and the ``size`` of the cells that they
-    lie in."""
+    lie in. ``levels``: how many of the first points lie in cells of a size, ``(N, size)`` and fewer. ``near`` (N,): of
+    the first `BATCH` points the one nearest to each."""
 
     points: np.ndarray
     color: np.ndarray
     size: float
+    levels: tuple[tuple[int, float], ...]
+    near: np.ndarray
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -84,33 +91,58 @@ def thin(found: Sequence[tuple[np.ndarray, np.ndarray]], most: int = POINTS) -> 
     """``found`` points (N, 3) with their colours (N, 3): one of those in each cell, ``most`` in all at most."""
     points, color = (np.concatenate([pair[k] for pair in found]) for k in (0, 1))
     if not len(points):
-        return Proxy(points.astype(np.float32), color.astype(np.float32), 1.0)
+        return ordered(points, color, 1.0)
     lower, upper = np.percentile(points, 0.5, axis=0), np.percentile(points, 99.5, axis=0)
     size = max(float(np.linalg.norm(upper - lower)), 1e-6) / 400
     while True:
-        cells = np.floor((points - lower) / size).astype(np.int64)
-        first = np.unique(cells, axis=0, return_index=True)[1]
+        first = _one_in_each_cell(points - lower, size)
         if len(first) <= most:
             break
         size *= max((len(first) / most) ** 0.5, 1.02)
-    first = np.sort(first)
-    return Proxy(points[first].astype(np.float32), color[first].astype(np.float32), size)
+    return ordered(points[first], color[first], size)
 
 
-def bake(scene: Scene, points: np.ndarray, observer: np.ndarray) -> Iterator[dict[str, np.ndarray] | None]:
-    """``gaze`` (1/sr) and ``visibility`` (N,) of ``points`` for the ``observer`` (3,); None between steps. Without a
-    gaze field there is no gaze."""
+def ordered(points: np.ndarray, color: np.ndarray, size: float) -> Proxy:
+    """The proxy of ``points`` (N, 3), of which there is one in each cell of ``size``, with their ``color`` (N, 3)."""
+    from scipy.spatial import KDTree
+
+    rank = np.zeros(len(points), int)
+    widths = [size * 2 ** (k / 2) for k in range(1, LEVELS)]
+    kept = np.arange(len(points))
+    for k, width in enumerate(widths, 1):
+        kept = kept[_one_in_each_cell(points[kept], width)]
+        rank[kept] = k
+    # Of one level in any order but that of the eyes, whose points would otherwise be the first.
+    order = np.lexsort((np.random.default_rng(0).random(len(points)), -rank))
+    points, color = points[order].astype(np.float32), color[order].astype(np.float32)
+    counts = [int((rank >= k).sum()) for k in range(LEVELS)]
+    near = KDTree(points[:BATCH]).query(points)[1] if len(points) else np.zeros(0, int)
+    return Proxy(points, color, size, tuple(zip(counts, [size, *widths])), near)
+
+
+def _one_in_each_cell(points: np.ndarray, size: float) -> np.ndarray:
+    """Indices, in their order, of one of ``points`` (N, 3) in each cell of a grid."""
+    cells = np.floor(points / size).astype(np.int64)
+    return np.sort(np.unique(cells, axis=0, return_index=True)[1])
+
+
+def bake(scene: Scene, proxy: Proxy, observer: np.ndarray) -> Iterator[dict[str, np.ndarray]]:
+    """``gaze`` (1/sr) and ``visibility`` (N,) of the points of ``proxy`` for the ``observer`` (3,), after each step
+    better: of points that are still to come that of the nearest one. Without a gaze field there is no gaze."""
     names = ["gaze", "visibility"] if scene.has_gaze else ["visibility"]
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    points, found = proxy.points, {}
     for a in range(0, len(points), BATCH):
         part = points[a : a + BATCH]
         # Kernels are compiled for a number of points.
         filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
         seen = observe(scene, filled, observers=observer[None], quantities=names)
         for name in names:
-            parts[name].append(seen[name][0, : len(part)])
-        yield None
-    yield {name: np.concatenate(found) for name, found in parts.items()}
+            values = np.asarray(seen[name][0, : len(part)])
+            if a == 0:
+                found[name] = values[proxy.near]
+            else:
+                found[name][a : a + len(part)] = values
+        yield {name: values.copy() for name, values in found.items()}
 
 
 def _farthest(free: Sequence[np.ndarray], visited: Sequence[np.ndarray]) -> np.ndarray | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
@@ -69,6 +70,8 @@ def viewer(
 def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, reporter: Reporter = SILENT) -> None:
     """Serve ``files`` until Ctrl-C, which is the way to end it. Raises as `viewer`."""
     options = options or ViewOptions()
+    if is_loopback(options.host):
+        yield_to_browser()
     with viewer(files, options, reporter) as running:
         if not is_loopback(options.host):
             reporter.warn("whoever has the address sees the place, and moves its observer; it is not encrypted")
@@ -82,6 +85,13 @@ def view_files(files: Sequence[str | Path], options: ViewOptions | None = None, 
             _wait()
         except KeyboardInterrupt:
             reporter.message("the viewer has ended")
+
+
+def yield_to_browser() -> None:
+    """Let the browser, which draws on this machine as well, go before this thread and those that it begins, where the
+    system knows of such a thing: without a graphics card a page would stand still while pictures are refined."""
+    if hasattr(os, "nice"):
+        os.nice(10)
 
 
 def _wait() -> None:

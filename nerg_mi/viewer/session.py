@@ -6,7 +6,6 @@ All of Mitsuba and Dr.Jit is used on the thread of the `Worker`. What is found i
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from nerg_mi.api.attention import attention
+from nerg_mi.api.attention import shares
 from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import Scene
 from nerg_mi.api.variant import active_mitsuba
@@ -30,17 +29,20 @@ from .layers import Layer, Scale
 from .proxy import Proxy, bake, gather
 from .refining import SIZES, Pace, Picture, filled, refine
 from .tracks import Tracks
-from .view import View
+from .view import View, ahead_of, heading_of
 from .worker import Worker
 
 URGENCY = 1
-"""Of all tasks alike, so that they take turns: the first picture is coarse, and nobody waits long for numbers."""
+"""Of tasks that take turns: the first picture is coarse, and nobody waits long for numbers."""
 
-STEP_SECONDS = 0.2
-"""Shares of attention are counted for so long in one step."""
+UNHURRIED = 2
+"""Of small pictures, which nobody waits for."""
 
 DIVISIONS = 8
 """A side of a triangle of an area is cut into so many parts."""
+
+FACES = 1 << 17
+"""Faces of shapes whose shares are counted in one step, but for a shape that has more."""
 
 _MOST_SPP = 256
 _SHAPES = 60
@@ -77,6 +79,15 @@ class Shade:
     layer: Layer
     colors: str = "inferno"
     fixed: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """``points`` (N, 3) in scene units with ``colors`` (N, 3) uint8, each in a cell of ``size``."""
+
+    points: np.ndarray
+    colors: np.ndarray
+    size: float
 
 
 class Session:
@@ -125,7 +136,7 @@ class Session:
         if given is None:
             given = self._ahead_of_home() if own is None else np.asarray(own, float)
         self.observer = np.array(given, float)
-        self.heading = heading_of(self.home.ahead if own is None else _ahead(self.scene), self.place.up)
+        self.heading = heading_of(self.home.ahead if own is None else ahead_of(self.scene), self.place.up)
         self.falloff = float(np.ravel(np.array(self.scene.integrator.falloff))[0])
         self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
         self.regions = read_regions(self.options.regions) if self.options.regions is not None else []
@@ -201,11 +212,11 @@ class Session:
 
     def inset(self, name: Hashable, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int) -> None:
         """The same for a small picture that nobody waits for."""
-        self.worker.submit(("inset", name), URGENCY, self._refined(view, deliver, width, 1, False))
+        self.worker.submit(("inset", name), UNHURRIED, self._refined(view, deliver, width, 1, False))
 
     def sphere(self, deliver: Callable[[np.ndarray], None], width: int) -> None:
         """All that the observer could turn to, as an equirectangular picture whose middle is ahead of them."""
-        self.worker.submit(("inset", "sphere"), URGENCY, self._sphere(deliver, width))
+        self.worker.submit(("inset", "sphere"), UNHURRIED, self._sphere(deliver, width))
 
     def cancel(self, name: Hashable) -> None:
         """Refine the picture ``name`` no further."""
@@ -217,17 +228,27 @@ class Session:
         low, high = shade.fixed or self._ranges.get(shade.layer.title) or (0.0, 1.0)
         return Scale(low, high, shade.colors)
 
-    def point_colors(self) -> np.ndarray | None:
-        """Colours (N, 3) uint8 of the points, as the layer shows them; None where there are no points yet."""
+    def points(self, level: int = 0) -> Points | None:
+        """The points below the ceiling, coloured as the layer shows them, so many as the proxy has at ``level``; None
+        where there are no points yet."""
         with self.lock:
-            proxy, baked, shade = self.proxy, self.baked, self.shade
+            proxy, baked, shade, ceiling = self.proxy, self.baked, self.shade, self.ceiling
         if proxy is None:
             return None
+        count, size = proxy.levels[level]
+        points, color = proxy.points[:count], proxy.color[:count]
         values = baked.get(shade.layer.quantity)
-        mask = np.ones(len(proxy.points), bool)
-        if values is None or len(values) != len(mask):
-            return layers.colored(layers.LAYERS["colour"], proxy.color, None, mask, Scale())
-        return layers.colored(shade.layer, proxy.color, values, mask, self.scale())
+        if values is not None and len(values) == len(proxy.points):
+            layer, values = shade.layer, values[:count]
+        else:
+            layer, values = layers.LAYERS["colour"], None
+        colors = layers.colored(
+            layer, color, values, np.ones(count, bool), self.scale() if values is not None else Scale()
+        )
+        if ceiling is not None:
+            below = points @ self.place.up <= ceiling
+            points, colors = points[below], colors[below]
+        return Points(points, colors, size)
 
     def _gather(self) -> Iterator[None]:
         for proxy in gather(self.scene, [self.observer, self.home.origin]):
@@ -241,16 +262,21 @@ class Session:
         try:
             proxy = self.proxy
             assert proxy is not None
-            for found in bake(self.scene, proxy.points, at):
-                if found is not None:
-                    with self.lock:
-                        if self.proxy is not proxy:
-                            break
-                        self.baked, self.baked_for = found, at
+            for step, found in enumerate(bake(self.scene, proxy, at)):
+                with self.lock:
+                    if self.proxy is not proxy:
+                        return
+                    self.baked, gone = found, not np.array_equal(self.observer, at)
+                    if step == 0:
                         for name, values in found.items():
                             self._learn(name, values, found["visibility"] > 0.5)
-                    self.listener.on_baked()
+                self.listener.on_baked()
+                if gone:
+                    # Roughly is enough while the observer is dragged on.
+                    return
                 yield None
+            with self.lock:
+                self.baked_for = at
         finally:
             self._busy.discard("gaze")
 
@@ -258,20 +284,30 @@ class Session:
         try:
             at, regions, _ = asked
             found: dict[str, float] = {}
-            began = time.monotonic()
-            for name, surface in [*((r.name, r.corners) for r in regions), *((name, name) for name in self.shapes)]:
-                box = not isinstance(surface, str)
-                divisions = DIVISIONS if box else 1
-                seen = attention(self.scene, surface, at[None], divisions=divisions, two_sided=not box)
-                found[name] = float(seen.share[0])
-                if time.monotonic() - began > STEP_SECONDS:
-                    yield None
-                    began = time.monotonic()
+            if regions:
+                boxes = shares(self.scene, [region.corners for region in regions], at, divisions=DIVISIONS)
+                found |= dict(zip([region.name for region in regions], boxes.tolist()))
+                yield None
+            for names in self._shape_groups():
+                found |= dict(zip(names, shares(self.scene, names, at, divisions=1, two_sided=True).tolist()))
+                yield None
             with self.lock:
                 self.shares, self._shares_for = found, asked
             self.listener.on_shares()
         finally:
             self._busy.discard("shares")
+
+    def _shape_groups(self) -> Iterator[list[str]]:
+        """Names of shapes, so many together as one step can count."""
+        faces = {shape.id(): shape.face_count() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()}
+        group: list[str] = []
+        for name in self.shapes:
+            if group and sum(faces[n] for n in [*group, name]) > FACES:
+                yield group
+                group = []
+            group.append(name)
+        if group:
+            yield group
 
     def _refined(
         self, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int, leads: bool = True
@@ -322,19 +358,3 @@ class Session:
 
 def _same(one: tuple, other: tuple) -> bool:
     return np.array_equal(one[0], other[0]) and one[1:] == other[1:]
-
-
-def heading_of(ahead: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) with the columns ahead, left and up, level by ``up``."""
-    level = ahead - up * (ahead @ up)
-    if np.linalg.norm(level) < 1e-6:
-        level = np.eye(3)[np.argmin(np.abs(up))]
-        level = level - up * (level @ up)
-    level = level / np.linalg.norm(level)
-    return np.stack([level, np.cross(up, level), up], axis=1)
-
-
-def _ahead(scene: Scene) -> np.ndarray:
-    """Where the observer of ``scene`` is turned to."""
-    pose = np.array(scene.integrator.observer.world_transform().matrix, float).reshape(4, 4)
-    return pose[:3, 2]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.api.camera import Camera
+from nerg_mi.api.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,3 +86,19 @@ class View:
 def _unit(v: np.ndarray) -> np.ndarray:
     length = float(np.linalg.norm(v))
     return v / length if length > 0 else np.array([1.0, 0.0, 0.0])
+
+
+def heading_of(ahead: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """A rotation (3, 3) with the columns ahead, left and up, level by ``up``."""
+    level = ahead - up * (ahead @ up)
+    if np.linalg.norm(level) < 1e-6:
+        level = np.eye(3)[np.argmin(np.abs(up))]
+        level = level - up * (level @ up)
+    level = level / np.linalg.norm(level)
+    return np.stack([level, np.cross(up, level), up], axis=1)
+
+
+def ahead_of(scene: Scene) -> np.ndarray:
+    """Where the observer of ``scene`` is turned to."""
+    pose = np.array(scene.integrator.observer.world_transform().matrix, float).reshape(4, 4)
+    return pose[:3, 2]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import KDTree
 
 import nerg_mi as nerg
-from nerg_mi.viewer.proxy import Proxy, bake, gather, thin
+from nerg_mi.viewer.proxy import BATCH, LEVELS, bake, gather, ordered, thin
 
 
 def last(steps):
@@ -29,7 +30,8 @@ def test02_one_point_in_a_cell():
     cells = np.floor((proxy.points - np.percentile(points, 0.5, axis=0)) / proxy.size)
     assert 1000 < len(proxy.points) <= 5000 and len(np.unique(cells, axis=0)) >= 0.999 * len(cells)
     assert np.array_equal(proxy.points, proxy.color)
-    assert len(thin([(np.zeros((0, 3)), np.zeros((0, 3)))]).points) == 0
+    nothing = thin([(np.zeros((0, 3)), np.zeros((0, 3)))])
+    assert len(nothing.points) == 0 and [count for count, _ in nothing.levels] == [0] * LEVELS
 
 
 def test03_gaze_on_points_is_that_of_the_integrator(store):
@@ -37,9 +39,10 @@ def test03_gaze_on_points_is_that_of_the_integrator(store):
     eye = np.array([4.4, 2.8, 1.6])
     seen = nerg.render(scene, observers=eye, quantities=["position", "gaze", "opacity"], spp=1)
     points = seen.position[0].reshape(-1, 3)
-    proxy = Proxy(points, np.zeros_like(points), 0.1)
-    baked = last(bake(scene, proxy.points, eye))
-    true, met = seen.gaze[0].ravel(), seen.opacity[0].ravel() > 0.9
+    proxy = ordered(points, np.arange(3 * len(points)).reshape(-1, 3), 0.1)
+    baked = last(bake(scene, proxy, eye))
+    order = proxy.color[:, 0].astype(int) // 3
+    true, met = seen.gaze[0].ravel()[order], seen.opacity[0].ravel()[order] > 0.9
     assert set(baked) == {"gaze", "visibility"} and baked["gaze"].shape == true.shape
     near = np.abs(baked["gaze"] - true) < 0.02 * true.max()
     # Along edges of what the observer sees a point in half a pixel's width of them is either here or there.
@@ -50,5 +53,34 @@ def test03_gaze_on_points_is_that_of_the_integrator(store):
 def test04_what_is_hidden_is_known(room_scene):
     # Behind the box, in front of it, and beside it.
     points = np.array([[2.5, 0, 0.01], [0.5, 0, 0.01], [1.5, 1.5, 0.01]], np.float32)
-    baked = last(bake(room_scene, points, np.array([0, 0, 0.5])))
-    assert np.allclose(baked["visibility"], [0, 1, 1], atol=1e-3) and "gaze" not in baked
+    proxy = ordered(points, points, 0.1)
+    baked = last(bake(room_scene, proxy, np.array([0, 0, 0.5])))
+    hidden = (proxy.points[:, 0] > 2) & (proxy.points[:, 1] == 0)
+    assert np.allclose(baked["visibility"], ~hidden, atol=1e-3) and "gaze" not in baked
+
+
+def test05_the_first_points_are_spread_as_all():
+    points = np.random.default_rng(1).random((200_000, 3)) * [8, 6, 0.01]
+    proxy = thin([(points, points)], most=40_000)
+    counts = [count for count, _ in proxy.levels]
+    assert counts[0] == len(proxy.points) and all(1.4 < a / b < 2.9 for a, b in zip(counts, counts[1:]))
+    for count, size in proxy.levels:
+        # Of a plane, whose cells are squares: no two in one, and none far from the next.
+        cells = np.floor(proxy.points[:count] / size)
+        assert size == proxy.size or len(np.unique(cells, axis=0)) > 0.97 * count
+        away = KDTree(proxy.points[:count]).query(proxy.points)[0]
+        assert away.max() < 3 * size
+    nearest = KDTree(proxy.points[:BATCH]).query(proxy.points)[1]
+    assert np.array_equal(proxy.near, nearest)
+
+
+def test06_each_step_of_the_gaze_is_better(store):
+    scene = nerg.Scene.load(store, width=96, height=64)
+    eye, home = np.array([4.4, 2.8, 1.6]), np.array([6.3, 3.0, 1.6])
+    proxy = last(gather(scene, [eye, home], places=4))
+    assert len(proxy.points) > BATCH
+    steps = list(bake(scene, proxy, eye))
+    assert len(steps) == -(-len(proxy.points) // BATCH)
+    final = steps[-1]["gaze"]
+    off = [np.abs(step["gaze"] - final).mean() / final.mean() for step in steps]
+    assert off[0] < 0.35 and sorted(off, reverse=True) == off and off[-1] == 0

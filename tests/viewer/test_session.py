@@ -13,7 +13,7 @@ from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.view import place_to_view
 from nerg_mi.viewer.layers import LAYERS
-from nerg_mi.viewer.session import Session, heading_of
+from nerg_mi.viewer.session import Session
 
 
 class Heard:
@@ -122,7 +122,13 @@ def test04_shares_are_those_of_the_library(session_of, store):
     for region in session.regions:
         true = nerg.attention(scene, region.corners, observers=[(4.6, 3.0, 1.6)], divisions=8).share[0]
         assert session.shares[region.name] == pytest.approx(float(true), rel=1e-3)
-    assert session.point_colors().shape == session.proxy.points.shape
+    shown = session.points()
+    assert shown.colors.shape == shown.points.shape == session.proxy.points.shape
+    fewer = session.points(2)
+    assert np.array_equal(fewer.colors, shown.colors[: len(fewer.colors)]) and fewer.size > shown.size
+    session.ceiling = 1.0
+    assert 0 < len(session.points().points) < len(shown.points) and session.points().points[:, 2].max() <= 1.0
+    session.ceiling = None
     counted = session.listener.shares
     assert session.follow_shares() and session.listener.shares == counted
     session.regions = session.regions[:1]
@@ -152,10 +158,3 @@ def test06_what_cannot_be_shown_is_told(session_of, room, tmp_path):
         session_of(Path("nowhere.xml"))
     with pytest.raises(NergError, match="three numbers"):
         session_of(room, observer=(1.0, 2.0))
-
-
-def test07_a_heading_is_level():
-    for ahead in ((1, 2, -0.7), (0, 0, -1), (0, 0, 1)):
-        turn = heading_of(np.array(ahead, float) / np.linalg.norm(ahead), np.array([0.0, 0, 1]))
-        assert np.allclose(turn.T @ turn, np.eye(3)) and np.linalg.det(turn) == pytest.approx(1)
-        assert np.allclose(turn[:, 2], [0, 0, 1])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.viewer.view import View
+from nerg_mi.viewer.view import View, heading_of
 
 
 def test01_the_frame_of_a_page():
@@ -48,3 +48,10 @@ def test03_a_sensor_and_back(rgb):
 def test04_straight_down_there_is_an_up_all_the_same(up):
     view = View.of((0, 0, 5), (0, 0, 0), up, 0.9, 1.0)
     assert math.isclose(np.linalg.norm(view.up), 1) and abs(view.up @ view.ahead) < 1e-9
+
+
+def test05_a_heading_is_level():
+    for ahead in ((1, 2, -0.7), (0, 0, -1), (0, 0, 1)):
+        turn = heading_of(np.array(ahead, float) / np.linalg.norm(ahead), np.array([0.0, 0, 1]))
+        assert np.allclose(turn.T @ turn, np.eye(3)) and np.linalg.det(turn) == pytest.approx(1)
+        assert np.allclose(turn[:, 2], [0, 0, 1])
