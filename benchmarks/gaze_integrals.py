@@ -6,16 +6,18 @@ positions.
 
 Positions are uniform in the box of the heads that the field was trained on. The finer integral has twice as many
 directions, others. Prints the largest and the mean difference from one, the share within 1e-3, and what an integral
-costs.
+costs. ``--sweep``: the same of fewer and more directions, of which no finer sum is needed than that of the most.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.files.tables import markdown_table
 
 import numpy as np
 
@@ -30,8 +32,8 @@ def main(argv=None) -> None:
     from nerg_mi.formats.fields import load_gaze
     from nerg_mi.training.geometry.places import place_of_field, place_of_volume
     from nerg_mi.transport.observer.gaze import PlacedGaze
+    from nerg_mi.transport.observer.settings import DIRECTIONS as COUNT
     from nerg_mi.transport.observer.settings import ObserverSettings
-    from nerg_mi.transport.observer.surroundings import COUNT
     from nerg_mi.transport.place import Place
     from nerg_mi.transport.trace import default_settings
 
@@ -40,6 +42,7 @@ def main(argv=None) -> None:
     parser.add_argument("place", type=Path)
     parser.add_argument("--positions", type=int, default=1000)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/gaze_integrals.csv"))
+    parser.add_argument("--sweep", action="store_true")
     args = parser.parse_args(argv)
     ns = namespace("llvm_ad_rgb")
     field, _ = load_gaze(args.gaze, ns)
@@ -48,10 +51,13 @@ def main(argv=None) -> None:
 
     def integral(p: list[float], count: int) -> float:
         p_o = mi.Point3f(*p)
-        return float(gaze.at([p_o], place, settings, count=count).integrals(p_o)[0][0])
+        return float(gaze.at([p_o], place, replace(settings, directions=count)).integrals(p_o)[0][0])
 
     low, high = np.array(field.config.heads)
     rng, rows = np.random.default_rng(0), []
+    if args.sweep:
+        sweep(integral, rng.uniform(low, high, (args.positions, 3)).tolist())
+        return
     for p in rng.uniform(low, high, (args.positions, 3)).tolist():
         started = time.perf_counter()
         ours = integral(p, COUNT)
@@ -66,6 +72,29 @@ def main(argv=None) -> None:
         f"{np.median([r['seconds'] for r in rows]):.3f} s an integral of {COUNT:,} directions (median)"
     )
     write_rows(args.out, rows)
+
+
+def sweep(integral, positions: list[list[float]]) -> None:
+    """Print error and time of an integral by its number of directions."""
+    counts = [1 << k for k in range(9, 19)]
+    found = np.empty((len(counts) + 1, len(positions), 2))
+    for row, count in zip(found, [*counts, (1 << 20) + 13]):
+        integral(positions[0], count)  # compiles its kernels
+        for k, p in enumerate(positions):
+            started = time.perf_counter()
+            row[k] = integral(p, count), time.perf_counter() - started
+    off = np.abs(found[:-1, :, 0] / found[-1, :, 0] - 1)
+    rows = [
+        (
+            f"{count:,}",
+            f"{o.mean():.1e}",
+            f"{np.quantile(o, 0.99):.1e}",
+            f"{o.max():.1e}",
+            f"{1e3 * np.median(t):.0f} ms",
+        )
+        for count, o, t in zip(counts, off, found[:-1, :, 1])
+    ]
+    print(markdown_table(("directions", "mean", "99 %", "most", "time"), rows))
 
 
 if __name__ == "__main__":

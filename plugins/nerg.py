@@ -66,6 +66,11 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - |int|
    - Rows of the ``map``; it has twice as many columns. More of them for fine silhouettes. (Default: 512)
 
+ * - directions
+   - |int|
+   - Directions of the integral over the observer's sphere that a *normalised* gaze field is divided by, once for each
+     place where an observer stands. (Default: 131072)
+
  * - depth
    - |string|
    - {depths} The surface that gaze is evaluated on

@@ -126,6 +126,7 @@ def observer_settings(props, march: MarchSettings) -> ObserverSettings:
         visibility=choice(props, "visibility", defaults.visibility, VISIBILITIES),
         tolerance=number(props, "tolerance", defaults.tolerance, low=0),
         map_height=integer(props, "map_height", defaults.map_height, low=2, high=16384),
+        directions=integer(props, "directions", defaults.directions, low=64, high=1 << 24),
     )
 
 
@@ -147,6 +148,7 @@ def describe(nerg) -> str:
         "falloff": nerg.falloff,
         "tolerance": seen.tolerance or "2 steps",
         "map_height": seen.map_height,
+        "directions": seen.directions,
         "depth": seen.depth,
         "surface_opacity": seen.surface_opacity,
         "radiance": nerg.radiance,

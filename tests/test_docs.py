@@ -16,7 +16,7 @@ from nerg_mi.evaluation.study import settings as study_settings
 from nerg_mi.evaluation.study import subject as study_subject
 from nerg_mi.formats.torch_ngp import unpickling
 from nerg_mi.transport.march.settings import MarchSettings
-from nerg_mi.transport.observer.surroundings import COUNT
+from nerg_mi.transport.observer.settings import DIRECTIONS
 from tests.conftest import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -57,7 +57,7 @@ def test03_defaults_of_the_march_are_the_integrators(rgb):
 
 def test05_numbers_that_are_constants():
     page = lambda name: (ROOT / "docs" / name).read_text()
-    assert f"a sum over {COUNT:,} directions" in page("gaze-evaluation.md")
+    assert f"a sum over {DIRECTIONS:,} directions" in page("gaze-evaluation.md")
     assert f"allow-list of {NUMBERS[len(unpickling._ALLOWED)]} names" in page("interchange.md")
     assert f"{study_subject.FINER} times shorter" in page("error-and-time.md")
     spp = (

@@ -55,7 +55,9 @@ class Onlooker:
         self._place = place.medium if isinstance(place.medium, Place) else Place(place.medium)
         self._known = place.medium is not None
         march = default_settings(self._place)
-        self._settings = ObserverSettings(march=march, depth=kind, surface_opacity=SURFACE_OPACITY)
+        self._settings = ObserverSettings(
+            march=march, depth=kind, surface_opacity=SURFACE_OPACITY, directions=_INTEGRAL
+        )
         self._gaze = PlacedGaze(field)
 
     def meet(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -70,7 +72,7 @@ class Onlooker:
         import mitsuba as mi
 
         center = mi.Point3f(*np.asarray(observer, float).tolist())
-        observed = self._gaze.at([center], self._place, self._settings, count=_INTEGRAL)
+        observed = self._gaze.at([center], self._place, self._settings)
         return np.array(observed.along(center, mi.Vector3f(np.ascontiguousarray(directions.T, np.float32))))
 
     def on_points(self, observer: np.ndarray, points: np.ndarray, spacing: float) -> np.ndarray:

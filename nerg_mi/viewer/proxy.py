@@ -16,6 +16,8 @@ from nerg_mi.api.queries import observe, trace
 from nerg_mi.api.scene import Scene
 from nerg_mi.maths.sphere import fibonacci_directions
 
+from .refining import rough_integrals
+
 RAYS = 1 << 14
 """Rays from each place."""
 
@@ -135,7 +137,8 @@ def bake(scene: Scene, proxy: Proxy, observer: np.ndarray) -> Iterator[dict[str,
         part = points[a : a + BATCH]
         # Kernels are compiled for a number of points.
         filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
-        seen = observe(scene, filled, observers=observer[None], quantities=names)
+        with rough_integrals(scene):
+            seen = observe(scene, filled, observers=observer[None], quantities=names)
         for name in names:
             values = np.asarray(seen[name][0, : len(part)])
             if a == 0:

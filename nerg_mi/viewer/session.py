@@ -27,7 +27,7 @@ from nerg_mi.rendering.pictures import load_scene
 from . import layers
 from .layers import Layer, Scale
 from .proxy import Proxy, bake, gather
-from .refining import SIZES, Pace, Picture, filled, refine
+from .refining import SIZES, Pace, Picture, filled, refine, rough_integrals
 from .tracks import Tracks
 from .view import View, ahead_of, heading_of
 from .worker import Worker
@@ -285,11 +285,14 @@ class Session:
             at, regions, _ = asked
             found: dict[str, float] = {}
             if regions:
-                boxes = shares(self.scene, [region.corners for region in regions], at, divisions=DIVISIONS)
+                with rough_integrals(self.scene):
+                    boxes = shares(self.scene, [region.corners for region in regions], at, divisions=DIVISIONS)
                 found |= dict(zip([region.name for region in regions], boxes.tolist()))
                 yield None
             for names in self._shape_groups():
-                found |= dict(zip(names, shares(self.scene, names, at, divisions=1, two_sided=True).tolist()))
+                with rough_integrals(self.scene):
+                    meshes = shares(self.scene, names, at, divisions=1, two_sided=True)
+                found |= dict(zip(names, meshes.tolist()))
                 yield None
             with self.lock:
                 self.shares, self._shares_for = found, asked

@@ -221,9 +221,9 @@ def test04b_a_normalised_gaze_field(torch, interop, rgb, kind, tmp_path):
     field = normalised(kind)
     shape = {"type": "rectangle", "to_world": rgb.ScalarTransform4f().translate([0, 0, 0.6]).scale(5)}
     place, eye = Place(None, rgb.load_dict({"type": "scene", "s": shape})), rgb.Point3f(0.1, -0.2, 0.3)
-    placed, settings, count = PlacedGaze(field), ObserverSettings(march=MarchSettings(step=1)), 1 << 12
-    around = trace_surroundings(field, placed.to_world, place, eye, settings, count)
-    observed = placed.at([eye], place, settings, count=count)
+    placed, settings = PlacedGaze(field), ObserverSettings(march=MarchSettings(step=1), directions=1 << 12)
+    around = trace_surroundings(field, placed.to_world, place, eye, settings)
+    observed = placed.at([eye], place, settings)
     tensor = lambda v: torch.tensor(np.ascontiguousarray(np.array(v).T, np.float32))
     r_o, escaped = tensor(around.directions), torch.tensor(np.array(around.escaped))
     assert 0.3 < escaped.float().mean() < 0.7

@@ -14,6 +14,7 @@ NAMES = [
     "tolerance",
     "visibility",
     "map_height",
+    "directions",
     "depth",
     "surface_opacity",
     "radiance",
@@ -57,7 +58,7 @@ def test02_a_default_that_is_given_changes_nothing(rgb, name):
     plain = {"type": "nerg", "density": {"type": "constvolume", "value": 1.0}}
     value = manual(rgb)[name]
     integers, numbers = (
-        ("map_height",),
+        ("map_height", "directions"),
         ("falloff", "tolerance", "surface_opacity", "background", "step", "coarse", "dt_gamma", "stop", "color_cutoff"),
     )
     value = (

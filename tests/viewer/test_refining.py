@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.viewer.refining import SIZES, Pace, below, refine
+from nerg_mi.viewer.refining import DIRECTIONS, SIZES, Pace, below, refine, rough_integrals
 from nerg_mi.viewer.view import View
 
 QUANTITIES = ["color", "depth", "opacity", "visibility"]
@@ -78,3 +80,15 @@ def test06_where_a_ray_comes_below_a_plane():
     directions = np.array([[0, 0, -1], [0.6, 0, -0.8], [1, 0, 0], [0, 0, 1.0]])
     assert np.allclose(below(np.array([0, 0, 3.0]), directions, up, 1.0), [2, 2.5, 0, 0])
     assert not below(np.array([0, 0, 0.5]), directions, up, 1.0).any()
+
+
+def test_integrals_are_rough_until_the_last_picture(store):
+    scene = nerg.Scene.load(store)
+    own = scene.integrator.observer_settings
+    with rough_integrals(scene):
+        assert scene.integrator.observer_settings == replace(own, directions=DIRECTIONS)
+    with rough_integrals(scene, False):
+        assert scene.integrator.observer_settings is own
+    with pytest.raises(ZeroDivisionError), rough_integrals(scene):
+        raise ZeroDivisionError
+    assert scene.integrator.observer_settings is own

@@ -19,7 +19,7 @@ from nerg_mi.transport.place import Place
 
 from .cache import Known, ObserverCache, fingerprint_of
 from .settings import ObserverSettings
-from .surroundings import COUNT, Surroundings, distance_along, trace_surroundings
+from .surroundings import Surroundings, distance_along, trace_surroundings
 from .viewpoint import select_nearest
 
 
@@ -34,30 +34,25 @@ class PlacedGaze:
         return list(self.field.parameters().values())
 
     def at(
-        self,
-        observers: list[Point3f],
-        place: Place,
-        settings: ObserverSettings,
-        cache: ObserverCache | None = None,
-        count: int = COUNT,
+        self, observers: list[Point3f], place: Place, settings: ObserverSettings, cache: ObserverCache | None = None
     ) -> ObservedGaze:
         """The field for ``observers`` (scene points, one lane each) in ``place``, traced with ``settings``.
 
-        A normalised field is integrated over the sphere around each observer, in ``count`` directions; the depths carry
-        no derivatives, the integral has those of the field's parameters. A field that is not normalised is the same for
-        all observers. ``cache``: where depths and integrals are kept.
+        A normalised field is integrated over the sphere around each observer, in ``settings.directions``; the depths
+        carry no derivatives, the integral has those of the field's parameters. A field that is not normalised is the
+        same for all observers. ``cache``: where depths and integrals are kept.
         """
         if not self.field.config.normalized:
             return ObservedGaze(self, place, settings, [])
         if not observers:
             raise ValueError("a gaze field that is normalised over the observer's sphere needs to know the observers")
         cache = cache or ObserverCache()
-        made_of = (fingerprint_of(place), settings.surfaces, count)
+        made_of = (fingerprint_of(place), settings.surfaces, settings.directions)
         around = cache.of_each(
             (self, "surroundings"),
             observers,
             made_of,
-            lambda center: trace_surroundings(self.field, self.to_world, place, center, settings, count),
+            lambda center: trace_surroundings(self.field, self.to_world, place, center, settings),
         )
         integrals = [self._integrals(member, around, made_of, cache) for member in self.field.members]
         return ObservedGaze(self, place, settings, integrals)

@@ -8,6 +8,9 @@ from nerg_mi.transport.march.settings import MarchSettings
 
 VISIBILITIES = ("depth", "transmittance", "map")
 
+DIRECTIONS = 1 << 17
+"""Of an integral over an observer's sphere: enough for a thousandth at depths that jump from surface to surface."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObserverSettings:
@@ -25,6 +28,8 @@ class ObserverSettings:
     tolerance: float = 0.0
     # Rows of a map; it has twice as many columns.
     map_height: int = 512
+    # Directions of the integral that a normalised gaze field is divided by.
+    directions: int = DIRECTIONS
 
     @property
     def surfaces(self) -> tuple:

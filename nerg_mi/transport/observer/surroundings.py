@@ -17,9 +17,6 @@ from nerg_mi.transport.place import Place
 
 from .settings import ObserverSettings
 
-COUNT = 1 << 17
-"""Directions of an integral: enough for a thousandth at depths that jump from surface to surface."""
-
 _FILL = 1 << 14
 """Directions whose depths fill those that escape. Always the same: filled from its own directions, an integral of more
 of them would be another one, by up to some per cent where half of them escape."""
@@ -36,16 +33,11 @@ class Surroundings:
 
 
 def trace_surroundings(
-    field: AnyGazeField,
-    to_world: Similarity,
-    place: Place,
-    center: Point3f,
-    settings: ObserverSettings,
-    count: int = COUNT,
+    field: AnyGazeField, to_world: Similarity, place: Place, center: Point3f, settings: ObserverSettings
 ) -> Surroundings:
-    """Those of the observer at ``center`` (one lane) in ``count`` directions, for ``field`` in ``place``."""
+    """Those of the observer at ``center`` (one lane) in ``settings.directions``, for ``field`` in ``place``."""
     with dr.suspend_grad():
-        directions = fibonacci_vectors(count)
+        directions = fibonacci_vectors(settings.directions)
         distance, escaped = distance_along(field, to_world, place, center, directions, settings)
         dr.eval(directions, distance, escaped)
     return Surroundings(directions, distance, escaped)

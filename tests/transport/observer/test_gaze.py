@@ -32,7 +32,7 @@ SETTINGS = ObserverSettings(march=MarchSettings(0.1))
 
 def integral_at(mi, gaze, place, p, settings=SETTINGS, count=1 << 12, **more):
     p_o = mi.Point3f(*map(float, p))
-    return float(gaze.at([p_o], place, settings, count=count, **more).integrals(p_o)[0][0])
+    return float(gaze.at([p_o], place, replace(settings, directions=count), **more).integrals(p_o)[0][0])
 
 
 @pytest.fixture(scope="module")
@@ -113,13 +113,13 @@ def test_what_is_observed_stays_as_it_was(rgb):
     gaze, place, cache = PlacedGaze(normalized()), room(rgb), ObserverCache()
     eyes = [rgb.Point3f(0.1, 0.2, 0.3), rgb.Point3f(-0.4, 0.1, 0)]
     point, d = rgb.Point3f(0.2, 0.9, 0.4), rgb.Vector3f(0, 1, 0)
-    first = gaze.at(eyes[:1], place, SETTINGS, cache, count=1 << 10)
+    first = gaze.at(eyes[:1], place, replace(SETTINGS, directions=1 << 10), cache)
     before = first.evaluate(point, eyes[0], d, True)[0].numpy()
-    second = gaze.at(eyes[1:], place, SETTINGS, cache, count=1 << 10)
+    second = gaze.at(eyes[1:], place, replace(SETTINGS, directions=1 << 10), cache)
     assert first.evaluate(point, eyes[0], d, True)[0].numpy() == before
     assert first.integrals(eyes[0])[0].numpy() != second.integrals(eyes[1])[0].numpy()
     # Of both together each lane has that of its own observer.
-    both = gaze.at(eyes, place, SETTINGS, cache, count=1 << 10)
+    both = gaze.at(eyes, place, replace(SETTINGS, directions=1 << 10), cache)
     lanes = rgb.Point3f([0.1, -0.4], [0.2, 0.1], [0.3, 0.0])
     each = np.concatenate([o.integrals(eye)[0].numpy() for o, eye in zip((first, second), eyes)])
     assert np.array_equal(both.integrals(lanes)[0].numpy(), each)
@@ -160,7 +160,7 @@ def test_derivatives_pass_the_integral_and_are_not_kept(rgb):
         shift = rgb.Float(0)
         dr.enable_grad(shift)
         field.set_parameters({"prior": prior + shift})
-        value = gaze.at([eye], place, SETTINGS, cache, count=1 << 10).integrals(eye)[0]
+        value = gaze.at([eye], place, replace(SETTINGS, directions=1 << 10), cache).integrals(eye)[0]
         dr.forward_from(shift)
         assert dr.grad(value)[0] == pytest.approx(float(value[0]), rel=1e-4)
     assert cache.peek((gaze, "integral", field)) == []

@@ -15,6 +15,7 @@ OTHERS = {
     "visibility": "map",
     "tolerance": 0.1,
     "map_height": 8,
+    "directions": 64,
 }
 
 
@@ -26,4 +27,4 @@ def test_each_setting_is_tried():
 def test_surfaces_are_decided_by_the_ray_and_not_by_what_is_compared(name):
     """What an observer sees all around is kept for other visibilities, and made anew for other surfaces."""
     other = replace(SETTINGS, **{name: OTHERS[name]})
-    assert (other.surfaces == SETTINGS.surfaces) == (name in ("visibility", "tolerance", "map_height"))
+    assert (other.surfaces == SETTINGS.surfaces) == (name in ("visibility", "tolerance", "map_height", "directions"))
