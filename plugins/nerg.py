@@ -68,8 +68,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - directions
    - |int|
-   - Directions of the integral over the observer's sphere that a *normalised* gaze field is divided by, once for each
-     place where an observer stands. (Default: 131072)
+   - Of the integral that a *normalised* gaze field is divided by, for each observer. (Default: 131072)
 
  * - depth
    - |string|
@@ -246,8 +245,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.demands = nerg_aovs.demands_of(self.aovs)
         self.views = nerg_properties.views_of(self.aovs, self._given, self.gaze)
         self.cache = ObserverCache()
-        # The sensors of the render in progress; None when another integrator drives ours.
-        self._sensors = None
+        self._sensors = None  # of the render in progress; None when another integrator drives ours
 
     def aov_names(self):
         return nerg_aovs.channel_names(self.aovs, self.medium) + self.shading.aov_names()

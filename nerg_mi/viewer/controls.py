@@ -22,6 +22,7 @@ INSET = 240
 """Width of the observer's own view, in pixels."""
 
 _ROWS = 12
+_USUAL = "as usual"
 _AGAIN = 0.4
 
 
@@ -58,7 +59,7 @@ class Controls:
         titles = [layer.title for layer in session.layers]
         layer = gui.add_dropdown("Layer", titles, initial_value=session.shade.layer.title)
         self._legend = gui.add_html(layers.legend(session.shade.layer, session.scale()))
-        colors = gui.add_dropdown("Colours", layers.MAPS, initial_value="inferno")
+        colors = gui.add_dropdown("Colours", (_USUAL, *layers.MAPS), initial_value=_USUAL)
         automatic = gui.add_checkbox("Automatic range", True)
         ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
         # As Mitsuba has it, in single precision, it would be written with all its digits.
@@ -66,6 +67,10 @@ class Controls:
 
         def change(event: Any) -> None:
             fixed = None
+            chosen = layers.LAYERS[layer.value]
+            if chosen.quantity != session.shade.layer.quantity and not automatic.value:
+                # A range in 1/sr says nothing of metres.
+                automatic.value = True
             ends.disabled = automatic.value
             if automatic.value:
                 scale = session.scale()
@@ -78,7 +83,7 @@ class Controls:
             if fixed is not None and not fixed[0] < fixed[1]:
                 tell(event, "Range", "The range goes from a number to a larger one.")
                 return
-            session.set_shade(layer=layers.LAYERS[layer.value], colors=colors.value, fixed=fixed)
+            session.set_shade(layer=chosen, colors=None if colors.value == _USUAL else colors.value, fixed=fixed)
             self._shown_anew()
 
         for handle in (layer, colors, automatic, ends):

@@ -63,6 +63,11 @@ def quantities(layer: Layer) -> list[str]:
     return list(dict.fromkeys([COLOR, "depth", "opacity", *([layer.quantity] if layer.quantity else [])]))
 
 
+def usual_colors(layer: Layer) -> str:
+    """The colour map of ``layer`` where nobody chose another."""
+    return "viridis" if layer.kind == "map" else "inferno"
+
+
 @dataclass(frozen=True)
 class Scale:
     """Colours ``colors`` (one of `MAPS`) between ``low`` and ``high``."""
@@ -111,7 +116,7 @@ def colored(
         shown = srgb(color) * (0.25 + 0.75 * seen) + (1 - seen) * np.array([0.02, 0.04, 0.22])
     else:
         share = np.clip((np.nan_to_num(values) - scale.low) / (scale.high - scale.low), 0, 1)
-        shown = matplotlib.colormaps["viridis" if scale.colors == "inferno" else scale.colors](share)[..., :3]
+        shown = matplotlib.colormaps[scale.colors](share)[..., :3]
     if hatched and len(shape) == 2 and layer.kind != "color":
         shown = hatch(shown, ~mask)
     return to_bytes(shown).reshape(*shape, 3)
@@ -125,7 +130,7 @@ def legend(layer: Layer, scale: Scale) -> str:
     if layer.kind in ("color", "shade"):
         words = {"color": "", "shade": "dark blue: hidden from the observer"}[layer.kind]
         return f"<div style='font-size:0.85em;padding:0 1em'>{words}</div>"
-    name = "viridis" if layer.kind == "map" and scale.colors == "inferno" else scale.colors
+    name = scale.colors
     stops = ",".join(to_hex(matplotlib.colormaps[name](k / 8)) for k in range(9))
     ends = f"<span>{scale.low:.3g}</span><span>{layer.unit}</span><span>{scale.high:.3g}</span>"
     return (

@@ -118,7 +118,7 @@ def ordered(points: np.ndarray, color: np.ndarray, size: float) -> Proxy:
     order = np.lexsort((np.random.default_rng(0).random(len(points)), -rank))
     points, color = points[order].astype(np.float32), color[order].astype(np.float32)
     counts = [int((rank >= k).sum()) for k in range(LEVELS)]
-    near = KDTree(points[:BATCH]).query(points)[1] if len(points) else np.zeros(0, int)
+    near = np.asarray(KDTree(points[:BATCH]).query(points)[1] if len(points) else (), int)
     return Proxy(points, color, size, tuple(zip(counts, [size, *widths])), near)
 
 

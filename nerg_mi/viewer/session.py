@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from nerg_mi.rendering.pictures import load_scene
 
 from . import layers
 from .layers import Layer, Scale
+from .listener import Listener
 from .proxy import Proxy, bake, gather
 from .refining import SIZES, Pace, Picture, filled, refine, rough_integrals
 from .tracks import Tracks
@@ -48,36 +49,13 @@ _MOST_SPP = 256
 _SHAPES = 60
 
 
-class Listener(Protocol):
-    """Whoever shows what a session finds."""
-
-    def on_proxy(self) -> None:
-        """There are points, or more of them."""
-        ...
-
-    def on_baked(self) -> None:
-        """The points have the gaze of the observer."""
-        ...
-
-    def on_shares(self) -> None:
-        """The shares of attention are those of the observer."""
-        ...
-
-    def on_range(self) -> None:
-        """The automatic range of the layer that is shown is another one."""
-        ...
-
-    def on_error(self, error: BaseException) -> None:
-        """A task has failed."""
-        ...
-
-
 @dataclass(frozen=True)
 class Shade:
-    """How a layer is coloured: ``layer``, ``colors``, and a range (low, high), or None for an automatic one."""
+    """How a layer is coloured: ``layer``, ``colors`` (None: its usual ones), and a range (low, high) (None: that of what
+    is seen)."""
 
     layer: Layer
-    colors: str = "inferno"
+    colors: str | None = None
     fixed: tuple[float, float] | None = None
 
 
@@ -226,7 +204,7 @@ class Session:
         """The scale of the layer that is shown."""
         shade = self.shade
         low, high = shade.fixed or self._ranges.get(shade.layer.title) or (0.0, 1.0)
-        return Scale(low, high, shade.colors)
+        return Scale(low, high, shade.colors or layers.usual_colors(shade.layer))
 
     def points(self, level: int = 0) -> Points | None:
         """The points below the ceiling, coloured as the layer shows them, so many as the proxy has at ``level``; None

@@ -1,0 +1,173 @@
+"""The panel in a real browser: what is clicked happens, and what is saved is what is shown."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+import nerg_mi as nerg
+from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.viewer.serving import viewer
+from tests.viewer.browser import chromium, require
+from tests.viewer.panel import Panel
+from tests.viewer.test_in_chromium import drag, until
+
+pytestmark = pytest.mark.slow
+
+
+def two_people() -> nerg.Rays:
+    """Ada, of the cohort young, walks along x for four seconds, and Bob stands still."""
+    t = np.tile(np.arange(0, 4, 0.1), 2)
+    person = np.repeat([0, 1], 40)
+    origin = np.stack([np.where(person == 0, 4 + 0.5 * t, 5), np.full(80, 3.0), np.full(80, 1.6)], axis=1)
+    ahead = np.tile([0.0, 1, 0], (80, 1))
+    return nerg.Rays(t, person, ("Ada", "Bob"), origin, ahead, np.ones(80), cohort=person, cohorts=("young", "old"))
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory):
+    from nerg_mi.jobs import demo
+    from nerg_mi.rendering.pictures import activate
+
+    require("viser")
+    activate("llvm_ad_rgb")
+    path = demo.store_scene()
+    if not all((path.parent / name).is_file() for name in demo.CHECKPOINTS.values()):
+        pytest.skip("the store's fields are not here: python -m nerg_mi.scenes.store.make")
+    rays = tmp_path_factory.mktemp("rays") / "rays.npz"
+    two_people().save(rays)
+    with viewer([path, rays], ViewOptions(port=0, width=48, spp=1)) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def panel(running, tmp_path_factory):
+    with chromium(900, 700) as driver:
+        driver.get(running.address)
+        window = until(lambda: next(iter(running.page.windows.values()), None))
+        until(lambda: window.picture)
+        found = Panel(driver, tmp_path_factory.mktemp("saved"))
+        found.close_notes()
+        yield found
+
+
+def window_of(running):
+    return next(iter(running.page.windows.values()))
+
+
+def test01_layers_and_their_scale(running, panel):
+    session, window = running.page.session, window_of(running)
+    panel.choose("Layer", "depth")
+    until(lambda: session.shade.layer.title == "depth")
+    until(lambda: window.picture and "depth" in window.last[0].values and session._ranges.get("depth"))
+    # The scale beside the picture has the range that was taken from it.
+    until(lambda: f"{session.scale().high:.3g}" in panel.texts() and "units" in panel.texts())
+    panel.choose("Layer", "gaze")
+    until(lambda: session.shade.layer.title == "gaze")
+    panel.tick("Automatic range")
+    until(lambda: session.shade.fixed is not None)
+    # A range of 1/sr says nothing of metres.
+    panel.choose("Layer", "depth")
+    until(lambda: session.shade.layer.title == "depth" and session.shade.fixed is None)
+    panel.choose("Colours", "magma")
+    until(lambda: session.scale().colors == "magma")
+    panel.choose("Colours", "as usual")
+    until(lambda: session.scale().colors == "viridis")
+    panel.choose("Layer", "gaze")
+    panel.slide("Fall-off", 0.5)
+    until(lambda: abs(session.falloff - 0.5) < 0.1)
+
+
+def test02_observer_and_camera(running, panel):
+    session, window = running.page.session, window_of(running)
+    panel.press("Observer to the camera")
+    until(lambda: np.allclose(session.observer, window.view.origin))
+    panel.write("At", "5.2")
+    until(lambda: np.isclose(session.observer[0], 5.2))
+    panel.press("Camera to the observer")
+    until(lambda: np.allclose(window.view.origin, session.observer, atol=1e-3))
+
+
+def test03_from_above_and_what_is_saved(running, panel):
+    session, window = running.page.session, window_of(running)
+    panel.open("Flight", "Keep this view")
+    panel.open("Camera", "From above")
+    panel.press("Keep this view")
+    panel.press("From above")
+    until(lambda: window.view.ahead @ session.place.up < -0.95)
+    assert session.ceiling is not None and window.view.origin[2] > session.ceiling
+    panel.press("Keep this view")
+    panel.press("Save the frames (CSV)")
+    rows = list(csv.reader(io.StringIO(panel.saved("view.frames.csv").decode())))
+    assert rows[0] == ["view_camera", "view_target"] and len(rows) == 152
+    assert np.allclose([float(v) for v in rows[-1][0].split(",")], window.view.origin, atol=1e-3)
+    until(lambda: window.picture)
+    panel.press("Save the picture (PNG)")
+    data = panel.saved("view.png")
+    assert data.startswith(b"\x89PNG") and int.from_bytes(data[16:20], "big") in (12, 24, 48)
+    comment = data[data.index(b"tEXtComment\0") + 12 :]
+    about = json.JSONDecoder().raw_decode(comment.decode("latin-1"))[0]
+    assert about["what"] == "nerg view" and about["settings"]["layer"] == "gaze"
+    assert "scene.xml" in about["inputs"] and "shoppers.safetensors" in about["inputs"]
+    panel.press("Copy as a scene (XML)")
+    root = ElementTree.fromstring(panel.saved("view.xml"))
+    eye = next(d for d in root.iter("default") if d.get("name") == "view_observer")
+    assert np.allclose([float(v) for v in eye.get("value").split(",")], session.observer, atol=1e-5)
+    panel.tick("Cut the ceiling off")
+    panel.press("First view")
+    until(lambda: np.allclose(window.view.origin, session.home.origin, atol=1e-3) and session.ceiling is None)
+
+
+def test04_a_flight_becomes_a_video(running, panel):
+    av = pytest.importorskip("av")
+    panel.write("Seconds", "0.1")
+    panel.press("Make a video (MP4)")
+    until(lambda: "Cancel the video" in panel.texts())
+    data = panel.saved("flight.mp4", 60)
+    with av.open(io.BytesIO(data)) as container:
+        frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in container.decode(video=0)]
+    assert len(frames) == 3 and np.abs(frames[0] - frames[-1]).mean() > 3
+    panel.write("Seconds", "60")
+    panel.press("Make a video (MP4)")
+    until(lambda: "Cancel the video" in panel.texts())
+    panel.press("Cancel the video")
+    until(lambda: "The video was cancelled." in panel.texts())
+    until(lambda: "Cancel the video" not in panel.texts())
+
+
+def test05_people_and_their_time(running, panel):
+    session = running.page.session
+    panel.open("People", "Observer follows")
+    panel.choose("Observer follows", "Ada")
+    until(lambda: np.allclose(session.observer, [4, 3, 1.6], atol=0.01))
+    panel.slide("Time (s)", 2.0)
+    until(lambda: np.allclose(session.observer, [5, 3, 1.6], atol=0.2) and session.observer[0] > 4.5)
+    panel.choose("Who", "old")
+    panel.choose("Observer follows", "Bob")
+    until(lambda: np.allclose(session.observer, [5, 3, 1.6], atol=1e-3))
+    panel.choose("Observer follows", "(nobody)")
+
+
+def test06_an_area_is_drawn_named_and_saved(running, panel):
+    session = running.page.session
+    until(lambda: session.proxy is not None)
+    panel.open("Areas of interest", "Draw a box in the view")
+    panel.write("Name", "coolers")
+    panel.press("Draw a box in the view")
+    time.sleep(0.5)
+    drag(panel.driver, (220, 300), (420, 440))
+    region = until(lambda: next(iter(session.regions), None))
+    panel.press("Save (JSON)")
+    saved = json.loads(panel.saved("areas.json"))["regions"]
+    assert [r["name"] for r in saved] == ["coolers"] and np.allclose(saved[0]["min"], region.lower)
+    until(lambda: session.shares.get("coolers") is not None)
+    panel.press("Remove")
+    until(lambda: not session.regions)
+    assert running.page.problem == ""
+    assert not [e for e in panel.driver.get_log("browser") if e["level"] == "SEVERE"]
