@@ -51,8 +51,8 @@ _SHAPES = 60
 
 @dataclass(frozen=True)
 class Shade:
-    """How a layer is coloured: ``layer``, ``colors`` (None: its usual ones), and a range (low, high) (None: that of what
-    is seen)."""
+    """How a layer is coloured: ``layer``, ``colors`` (None: its usual ones), and a range (low, high) (None: that of
+    what is seen)."""
 
     layer: Layer
     colors: str | None = None

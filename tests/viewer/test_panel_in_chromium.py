@@ -148,10 +148,6 @@ def test05_people_and_their_time(running, panel):
     until(lambda: np.allclose(session.observer, [4, 3, 1.6], atol=0.01))
     panel.slide("Time (s)", 2.0)
     until(lambda: np.allclose(session.observer, [5, 3, 1.6], atol=0.2) and session.observer[0] > 4.5)
-    panel.choose("Who", "old")
-    panel.choose("Observer follows", "Bob")
-    until(lambda: np.allclose(session.observer, [5, 3, 1.6], atol=1e-3))
-    panel.choose("Observer follows", "(nobody)")
 
 
 def test06_an_area_is_drawn_named_and_saved(running, panel):
