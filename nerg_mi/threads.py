@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
+VARIABLE = "NERG_THREADS"
+"""Environment variable that tells a worker's process its share of the cores."""
+
 
 def set_thread_count(count: int) -> None:
     """Compute with ``count`` threads from now on.
@@ -13,3 +18,9 @@ def set_thread_count(count: int) -> None:
 
     dr.sync_thread()
     dr.set_thread_count(count)
+
+
+def threads_of_worker() -> int:
+    """The threads that this process was given by whoever started it as a worker; 0 for all."""
+    text = os.environ.get(VARIABLE, "")
+    return int(text) if text.isdigit() else 0

@@ -37,6 +37,8 @@ COMMANDS = {
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
     "export": "Write a radiance field as a mesh, points, grid volumes or a torch-ngp checkpoint.",
     "ablate": "Train every variant of a gaze field alike, and compare them.",
+    "jobs": "Say what is done of a long job, what is left and what is stale.",
+    "worker": "Run parts of long jobs for a cluster (dask).",
     "study": "Measure error against run time: a scene at many settings, compared with what is true.",
 }
 """Name of each sub-command, which is also that of its module, and the line that `nerg --help` says about it."""

@@ -90,16 +90,13 @@ def overlay_pictures(
     until the scale is known, and not at all where it is given. Raises `NergError` where the quantity is 0 everywhere.
     """
     overlay = find_overlay(options.overlay or "")
-    style = Style(options.cmap, options.decades, options.hatching)
+    style = style_of(options)
     limits: list[Limits] = []
     last = Picture((0, 0), 0)
-    waits = len(frames) > 1 and overlay.scaled and (options.top is None or overlay.low is None)
+    waits = shares_a_scale(overlay, len(frames), options)
 
     def finish(layers: Layers, ends: Limits) -> None:
-        if ends is None and overlay.scaled:
-            raise NergError(
-                f'"{overlay.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
-            )
+        check_scale(overlay, ends)
         write(overlay.draw(layers, ends, style))
         stop.check()
 
@@ -107,14 +104,14 @@ def overlay_pictures(
         kept: list[tuple[Path, tuple[int, ...], Any, bool]] = []
 
         def make(loaded: Any, camera: Any, on_strip: OnStrip) -> Picture:
-            _check_memory(path, camera, options)
+            check_memory(path, camera, options)
             layers = layers_of(path, loaded, camera, overlay, options.spp, options.seed, on_strip)
             limits.append(overlay.limits(layers))
             height, width = layers.mask.shape
             if waits:
-                array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
+                array = stacked(layers)
                 file = Path(folder, str(len(kept)))
-                write_bytes(file, np.ascontiguousarray(array, np.float32).data)
+                write_bytes(file, array.data)
                 kept.append((file, array.shape, layers.marker, layers.supported))
             else:
                 finish(layers, shared_limits(limits[-1:], options.top))
@@ -124,17 +121,42 @@ def overlay_pictures(
             last = render(frame, make)
         ends = shared_limits(limits, options.top)
         for file, shape, marker, supported in kept:
-            finish(_read(file, shape, marker, supported), ends)
+            finish(unstacked(np.fromfile(file, np.float32).reshape(shape), marker, supported), ends)
             file.unlink()
     return last, None if ends is None else ends[1]
 
 
-def _read(file: Path, shape: tuple[int, ...], marker: Any, supported: bool) -> Layers:
-    array = np.fromfile(file, np.float32).reshape(shape)
+def style_of(options: PictureOptions) -> Style:
+    """How ``options`` have overlays drawn."""
+    return Style(options.cmap, options.decades, options.hatching)
+
+
+def shares_a_scale(overlay: Overlay, count: int, options: PictureOptions) -> bool:
+    """Whether none of ``count`` pictures can be drawn before all are rendered."""
+    return count > 1 and overlay.scaled and (options.top is None or overlay.low is None)
+
+
+def check_scale(overlay: Overlay, ends: Limits) -> None:
+    """Raise `NergError` where there is nothing to draw a scale by."""
+    if ends is None and overlay.scaled:
+        raise NergError(
+            f'"{overlay.name}" is 0 wherever a surface is seen; move the camera or the observer, or give --top'
+        )
+
+
+def stacked(layers: Layers) -> np.ndarray:
+    """Colour, values and mask of ``layers`` as one array (h, w, 5) of float32."""
+    array = np.concatenate([layers.color, layers.values[..., None], layers.mask[..., None]], axis=-1)
+    return np.ascontiguousarray(array, np.float32)
+
+
+def unstacked(array: np.ndarray, marker: tuple[float, float] | None, supported: bool) -> Layers:
+    """What `stacked` was given, with its ``marker`` and whether it is ``supported``."""
     return Layers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported)
 
 
-def _check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
+def check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
+    """Raise `NergError` where drawing the overlay of a picture takes more than it may."""
     width, height = map(int, camera.film().crop_size())
     needed = BYTES_PER_PIXEL * width * height / 1e9
     if needed > options.memory:

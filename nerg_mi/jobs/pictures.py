@@ -54,6 +54,38 @@ class PictureResult:
     top: float | None = None
 
 
+@dataclass(frozen=True)
+class AskedPictures:
+    """What is to be rendered: values of `<default>`s for each of ``frames``, and the ``files`` to write, or the one
+    ``video``."""
+
+    frames: Sequence[Mapping[str, str]]
+    files: list[Path]
+    video: bool
+
+
+def asked_pictures(scene: Path, output: Path, options: PictureOptions) -> AskedPictures:
+    """What `render_file` would render. Raises `NergError` for options that contradict each other, and for files that
+    cannot be read or written, before any work."""
+    check_writable(output, *dict.fromkeys((*FORMATS, *OVERLAY_FORMATS)))
+    if not options.memory > 0:
+        raise NergError(f"the memory to render in is {options.memory} GB: give it more than 0")
+    if options.spp:
+        check_samples(options.spp, "the picture")
+    if not scene.is_file():
+        raise NergError(f'there is no scene file "{scene}"')
+    check_overlay(output, options)
+    video = _check_video(output, options)
+    frames: Sequence[Mapping[str, str]] = [{}]
+    files = [output]
+    if options.frames is not None:
+        frames = read_frames(options.frames)
+        files = [output] if video else [numbered(output, k + 1, len(frames)) for k in range(len(frames))]
+        for file in files:
+            check_writable(file)
+    return AskedPictures(frames, files, video)
+
+
 def render_file(
     scene: str | Path, output: str | Path, options: PictureOptions | None = None, reporter: Reporter = SILENT
 ) -> PictureResult:
@@ -78,25 +110,10 @@ def render_file(
     """
     options = options or PictureOptions()
     scene, output = Path(scene), Path(output)
-    check_writable(output, *dict.fromkeys((*FORMATS, *OVERLAY_FORMATS)))
-    if not options.memory > 0:
-        raise NergError(f"the memory to render in is {options.memory} GB: give it more than 0")
-    if options.spp:
-        check_samples(options.spp, "the picture")
-    if not scene.is_file():
-        raise NergError(f'there is no scene file "{scene}"')
-    check_overlay(output, options)
-    video = _check_video(output, options)
-    frames: Sequence[Mapping[str, str]] = [{}]
-    files = [output]
-    if options.frames is not None:
-        frames = read_frames(options.frames)
-        files = [output] if video else [numbered(output, k + 1, len(frames)) for k in range(len(frames))]
-        for file in files:
-            check_writable(file)
+    asked = asked_pictures(scene, output, options)
+    frames, files, video = asked.frames, asked.files, asked.video
     reporter.progress(0.0, "reading the scene")
     mode = activate(options.mode)
-
     if options.threads:
         set_thread_count(options.threads)
     start = time.perf_counter()
@@ -114,11 +131,11 @@ def render_file(
             nonlocal done
             loaded = load_scene(scene, {**(options.defaults or {}), **frame})
             stop.check()
-            made = make(loaded, _sensor(scene, loaded, options.sensor), on_strip)
+            made = make(loaded, sensor_of(scene, loaded, options.sensor), on_strip)
             done += 1
             return made
 
-        each = _provenances(scene, frames, options, mode, video)
+        each = provenances(scene, frames, options, mode, video)
         with _writer(files, options, each, video) as write:
             if options.overlay is not None:
                 drawn = lambda figure: write(lambda path, about: save(figure, path, about), lambda: rasterize(figure))
@@ -129,16 +146,23 @@ def render_file(
         # The picture is there, and yet whoever called this does not go on.
         stop.check()
     seconds = time.perf_counter() - start
-    note = f" It was rendered in one piece, beyond {options.memory:g} GB, because of {picture.whole}."
-    width, height = picture.size
-    what = str(output) if len(files) == 1 else f"{len(files)} pictures, {files[0]} to {files[-1]}"
-    what += f", {len(frames)} pictures at {options.fps:g} a second" if video else ""
-    scale = "" if top is None else f", scale to {top:.4g}"
-    reporter.message(
-        f"Wrote {what} ({width} x {height}, {picture.channels} channels, {mode}, {seconds:.1f} s{scale})."
-        f"{note if picture.whole else ''}"
+    result = PictureResult(files[0], picture.size, picture.channels, mode, seconds, picture.whole, tuple(files), top)
+    reporter.message(account(result, asked, options))
+    return result
+
+
+def account(result: PictureResult, asked: AskedPictures, options: PictureOptions) -> str:
+    """The line that says what was written."""
+    files, frames = asked.files, asked.frames
+    note = f" It was rendered in one piece, beyond {options.memory:g} GB, because of {result.whole}."
+    width, height = result.size
+    what = str(files[0]) if len(files) == 1 else f"{len(files)} pictures, {files[0]} to {files[-1]}"
+    what += f", {len(frames)} pictures at {options.fps:g} a second" if asked.video else ""
+    scale = "" if result.top is None else f", scale to {result.top:.4g}"
+    return (
+        f"Wrote {what} ({width} x {height}, {result.channels} channels, {result.mode}, {result.seconds:.1f} s{scale})."
+        f"{note if result.whole else ''}"
     )
-    return PictureResult(files[0], picture.size, picture.channels, mode, seconds, picture.whole, tuple(files), top)
 
 
 Write = Callable[[Callable[[Path, Provenance], None], Callable[[], np.ndarray]], None]
@@ -157,7 +181,7 @@ def _writer(files: Sequence[Path], options: PictureOptions, each: Iterator[Prove
         yield lambda to_file, pixels: add(pixels())
 
 
-def _provenances(
+def provenances(
     scene: Path, frames: Sequence[Mapping[str, str]], options: PictureOptions, mode: str, video: bool
 ) -> Iterator[Provenance]:
     """What each picture was made of, or the one video."""
@@ -218,7 +242,7 @@ def _picture(
     return Picture((width, height), channels, whole)
 
 
-def _sensor(path: Path, scene, index: int):
+def sensor_of(path: Path, scene, index: int):
     """The sensor of ``scene`` with this ``index``."""
     count = len(scene.sensors())
     if not 0 <= index < count:

@@ -1,0 +1,29 @@
+"""Options of jobs that are done in parts, each of which is kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import option
+from .pictures import PictureOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartOptions:
+    """Where finished parts of a job are kept, and who makes them."""
+
+    store: Path | None = option(
+        None,
+        "Keep finished parts in this folder, and go on from those in it.  [default with --scheduler: OUTPUT.tasks]",
+    )
+    scheduler: str | None = option(
+        None,
+        "Who makes the parts: local, local:N for N processes, or a cluster at tcp://HOST:PORT or tls://HOST:PORT.  "
+        "[default with --store: local]",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilmOptions(PictureOptions, PartOptions):
+    """How a scene file is rendered, in one go or in parts."""

@@ -1,0 +1,54 @@
+"""Jobs in parts: from their options to a store and a scheduler, and outputs in their order with progress told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from nerg_mi.tasks.opening import open_scheduler
+from nerg_mi.tasks.plan import Plan
+from nerg_mi.tasks.protocol import Scheduler
+from nerg_mi.tasks.run import Output, Progress, run_plan
+from nerg_mi.tasks.store import Store
+
+from .options.parts import PartOptions
+from .reporter import Reporter
+
+SUFFIX = ".tasks"
+"""Of the store beside an output, where none is named."""
+
+
+def in_parts(options: PartOptions) -> bool:
+    """Whether a job is to be done in parts at all."""
+    return options.store is not None or options.scheduler is not None
+
+
+class Parts:
+    """The store and the scheduler of one job, which writes ``output``. Raises `NergError` for a folder that cannot be
+    written to, and for a scheduler that there is none of."""
+
+    def __init__(self, options: PartOptions, output: Path, reporter: Reporter):
+        self.store = Store(output.with_suffix(SUFFIX) if options.store is None else options.store)
+        self.scheduler: Scheduler = open_scheduler(options.scheduler)
+        self._reporter = reporter
+
+    def run(self, plan: Plan, since: float = 0.0, until: float = 1.0) -> Iterator[Output]:
+        """The outputs of ``plan`` in its order; see `run_plan`. Of the whole job this is from the share ``since`` to
+        the share ``until``. Ctrl-C says where it goes on from."""
+
+        def tell(progress: Progress) -> None:
+            line = progress.line() if until == 1.0 else progress.line().partition(" s left")[0].rpartition(",")[0]
+            self._reporter.progress(since + (until - since) * progress.share, line or progress.line())
+
+        with self._kept():
+            yield from run_plan(plan, self.store, self.scheduler, tell, self._reporter.warn)
+
+    @contextmanager
+    def _kept(self) -> Iterator[None]:
+        try:
+            yield
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"Interrupted; the parts that are done are kept in {self.store.folder}: the same command goes on."
+            ) from None
