@@ -181,7 +181,7 @@ class _Session:
 
     def _hurry(self) -> None:
         """Have idle workers run what takes others too long, when nothing else is left to ask for."""
-        if len(self.open) >= len(self.workers) or not self.took:
+        if len(self.open) > 2 * len(self.workers) or not self.took:
             return
         late = max(self.slow, 4 * statistics.median(self.took))
         behind = [k for k in self.open.values() if len(k.futures) == 1 and time.monotonic() - k.since > late]

@@ -73,6 +73,11 @@ CASES = (
     ),
     Case("render", "{i}/ball.xml -o {o}/a.svg -m llvm_ad_rgb --overlay depth", ("a.svg",)),
     Case("render", "{i}/ball.xml -o {o}/a.mp4 -m llvm_ad_rgb --frames {i}/frames.csv --overlay depth", ("a.mp4",)),
+    Case(
+        "render",
+        "{i}/scene.xml -o {o}/a.png -m llvm_ad_rgb --frames {i}/frames.csv --store {i}/store",
+        ("a_0001.png", "a_0002.png"),
+    ),
     Case("draw floor", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
     Case("draw floor", "{i}/rays.npz -o {o}/a.svg --scene {i}/ball.xml -m llvm_ad_rgb", ("a.svg",)),
     Case("draw sheet", "{i}/a.exr {i}/b.exr -o {o}/a.png --overlay gaze", ("a.png",)),
@@ -160,7 +165,7 @@ CASES = (
 MAKES_A_FOLDER = {"poses": "tests/cli/test_poses.py"}
 """Commands that make a folder as a whole, which must not be there before -> where their output is tried."""
 
-READS_ONLY = {"doctor", "view", "rays guess", "rays show"}
+READS_ONLY = {"doctor", "jobs", "view", "worker", "rays guess", "rays show"}
 """Commands that write no file."""
 INPUTS = {
     "scene": {"files", "photos", "align"},

@@ -1,0 +1,101 @@
+"""Clusters of real processes on this machine, for tests: a scheduler and workers that are killed and started again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tests.conftest import ROOT
+
+DEADLINE = 90.0
+"""Seconds that anything here may take on a busy machine."""
+
+
+def free_port() -> int:
+    """A port of 127.0.0.1 that nobody listens on."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+class ClusterOfProcesses:
+    """A context with a scheduler at ``address`` and workers, all of which end with it. ``folder``: for their logs."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.port = folder, free_port()
+        self.address = f"tcp://127.0.0.1:{self.port}"
+        self.scheduler: subprocess.Popen | None = None
+        self.workers: list[subprocess.Popen] = []
+
+    def __enter__(self) -> ClusterOfProcesses:
+        self.start_scheduler()
+        return self
+
+    def start_scheduler(self) -> None:
+        code = "from distributed.cli.dask_scheduler import main; main()"
+        where = ("--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard")
+        self.scheduler = self._start("scheduler", "-c", code, *where)
+        until = time.monotonic() + DEADLINE
+        while time.monotonic() < until:
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", self.port)) == 0:
+                    return
+            time.sleep(0.1)
+        raise TimeoutError("the scheduler did not start")
+
+    def start_worker(self, before: str = "") -> subprocess.Popen:
+        """Another worker, as the command `nerg worker` is; it need not be there yet when this returns. ``before``: code
+        that its process runs first."""
+        code = f"{before}\nfrom nerg_mi.cli import main; main()"
+        number = len(self.workers)
+        line = ("-c", code, "worker", self.address, "--threads", "1", "--name", f"w{number}")
+        self.workers.append(self._start(f"worker{number}", *line))
+        return self.workers[-1]
+
+    def kill_scheduler(self) -> None:
+        assert self.scheduler is not None
+        self.scheduler.kill()
+        self.scheduler.wait()
+
+    def log(self, name: str) -> str:
+        """What the scheduler or a worker has said."""
+        return (self.folder / f"{name}.log").read_text()
+
+    def _start(self, name: str, *line: str) -> subprocess.Popen:
+        with (self.folder / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                [sys.executable, *line],
+                stdout=log,
+                stderr=log,
+                stdin=subprocess.DEVNULL,
+                cwd=self.folder,
+                env={**os.environ, "PYTHONPATH": str(ROOT)},
+            )
+
+    def __exit__(self, *error) -> None:
+        for process in [*self.workers, self.scheduler]:
+            if process is not None and process.poll() is None:
+                process.send_signal(signal.SIGCONT)
+                process.kill()
+                process.wait()
+
+
+ELSEWHERE = """
+from nerg_mi.tasks import dask_worker, kept_inputs
+dask_worker.shares = lambda folder, probe: False
+kept_inputs.KeptInputs._is_at = lambda self, file: False
+"""
+"""What makes a worker one of another machine, which sees none of the client's files."""
+
+
+def wait_until(condition, what: str) -> None:
+    """Until ``condition()`` holds; fails the test after `DEADLINE`."""
+    until = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < until, what
+        time.sleep(0.05)
