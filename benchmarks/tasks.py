@@ -104,7 +104,9 @@ def main() -> None:
         with ClusterOfProcesses(folder) as cluster:
             cluster.start_worker(), cluster.start_worker()
             for name, scheduler in (("local", None), ("local:2", "local:2"), ("dask", cluster.address)):
-                found = [overhead(scheduler, args.count, folder / f"{name[:5]}{name[-1]}{k}") for k in range(args.rounds)]
+                found = [
+                    overhead(scheduler, args.count, folder / f"{name[:5]}{name[-1]}{k}") for k in range(args.rounds)
+                ]
                 note(f"overhead of a task, {name}", found, 1.0)
             taken: dict[str, list[float]] = {"one go": [], "parts, local": [], "parts, dask": []}
             equal = True

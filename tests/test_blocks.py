@@ -22,6 +22,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").g
 RUN_ELSEWHERE = {
     ("README.md", "python"): "tests/test_readme.py",
     ("README.md", "xml"): "tests/test_readme.py",
+    ("clusters.md", "python"): "tests/tasks/test_page.py",
     ("gradients.md", "python"): "tests/test_gradients_page.py",
     ("python.md", "python"): "tests/api/test_page.py",
     ("rays.md", "python"): "tests/rays/test_manual.py",
@@ -49,6 +50,8 @@ SHELL = {
     "_NERG_COMPLETE=source_fish": "tests/cli/test_completion.py asks for it",
     "pip": "installs packages, which needs the network; its extras are looked up in pyproject.toml",
     "ffmpeg": "a program of others",
+    "dask": "a program of others",
+    "openssl": "a program of others",
 }
 """First words of the lines of shell blocks -> what becomes of them."""
 

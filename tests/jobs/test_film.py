@@ -13,7 +13,10 @@ from nerg_mi.jobs.options.parts import FilmOptions
 from tests.cli.test_render import SCENE
 from tests.jobs.recorder import Recorder
 
-BALL = SCENE.replace('type="aov"><string name="aovs" value="dd:depth"/>', 'type="nerg">').replace('value="8"', 'value="16"')
+AOV = 'type="aov"><string name="aovs" value="dd:depth"/>'
+BALL = SCENE.replace(AOV, 'type="nerg">').replace('value="8"', 'value="16"')
+    'value="8"', 'value="16"'
+)
 
 
 @pytest.fixture

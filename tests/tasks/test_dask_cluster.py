@@ -18,7 +18,7 @@ from tests.tasks.clusters import ELSEWHERE, ClusterOfProcesses, wait_until
 
 pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
 
-from nerg_mi.tasks.dask_cluster import Cluster  # noqa: E402
+from nerg_mi.tasks.dask_cluster import Cluster
 
 
 @pytest.fixture
