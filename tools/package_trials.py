@@ -96,6 +96,7 @@ def try_missing_extras(there: Environment, out: Path) -> str:
         "nerg-mi[parquet]": ("nerg", "rays", "show", out / "rays.parquet"),
         "nerg-mi[poses]": ("nerg", "poses", out, "-o", out / "capture"),
         "nerg-mi[video]": ("nerg", "render", scene, "-o", out / "a.mp4", "--frames", out / "frames.csv"),
+        "nerg-mi[cluster]": ("nerg", "worker", "tcp://127.0.0.1:8786"),
         "nerg-mi[torch]": ("python", "-c", "import nerg_mi.interop.torch"),
     }
     (out / "rays.parquet").write_bytes(b"PAR1")

@@ -5,7 +5,8 @@ from tests.fuzz.checkpoint_readers import CHECKPOINTS
 from tests.fuzz.report_readers import REPORTS
 from tests.fuzz.scene_readers import SCENES
 from tests.fuzz.structure_readers import STRUCTURE
+from tests.fuzz.task_readers import TASKS
 from tests.fuzz.tracking_readers import TRACKING
 
-ALL = [*CHECKPOINTS, *CAPTURES, *STRUCTURE, *SCENES, *REPORTS, *TRACKING]
+ALL = [*CHECKPOINTS, *CAPTURES, *STRUCTURE, *SCENES, *REPORTS, *TASKS, *TRACKING]
 READERS = [r for r in ALL if r.installed]

@@ -15,8 +15,6 @@ from tests.jobs.recorder import Recorder
 
 AOV = 'type="aov"><string name="aovs" value="dd:depth"/>'
 BALL = SCENE.replace(AOV, 'type="nerg">').replace('value="8"', 'value="16"')
-    'value="8"', 'value="16"'
-)
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ def test_answers_are_lines_and_what_tasks_print_is_elsewhere(tmp_path):
     process = subprocess.Popen(
         CHILD, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
     )
-    for task in works.tasks(2):
+    for task in works.tasks(2, prints=True):
         process.stdin.write(json.dumps(request(task, tmp_path)) + "\n")
         process.stdin.flush()
         found = json.loads(process.stdout.readline())

@@ -28,7 +28,8 @@ def hashed(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Pa
         os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(parameters.get("seconds", 0))
     text = "".join(f"{name} {path.read_text()}" for name, path in sorted(inputs.items()))
-    print("what tasks print is in nobody's way")
+    if parameters.get("prints"):
+        print("what tasks print is in nobody's way")
     write_text(output, hashlib.sha256(f"{parameters['number']} {text}".encode()).hexdigest() + "\n")
 
 
