@@ -107,7 +107,7 @@ def main() -> None:
                 found = [
                     overhead(scheduler, args.count, folder / f"{name[:5]}{name[-1]}{k}") for k in range(args.rounds)
                 ]
-                note(f"overhead of a task, {name}", found, 1.0)
+                note(f"overhead of a task, {name}", found, found[0])
             taken: dict[str, list[float]] = {"one go": [], "parts, local": [], "parts, dask": []}
             equal = True
             render(folder, "warm", frames, args.width, "--scheduler", cluster.address)

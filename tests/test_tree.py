@@ -52,6 +52,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/report/sections/stage.py": _SECTIONS,
     "nerg_mi/report/sections/uncertainty.py": _SECTIONS,
     "nerg_mi/report/sections/verdict.py": _SECTIONS,
+    "nerg_mi/tasks/__init__.py": "a docstring only",
     "nerg_mi/tasks/protocol.py": "only fields: tests/tasks/test_run.py fulfils it in three more ways",
     "nerg_mi/viewer/__init__.py": "a docstring only",
     "nerg_mi/viewer/page.py": "what browsers are sent: tests/viewer/test_in_chromium.py looks at it in one",

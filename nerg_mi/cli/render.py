@@ -28,8 +28,9 @@ def command(
 
     An EXR file holds all channels in float32, those of the AOVs among them; a PNG file holds the colour, tonemapped to
     sRGB, or an overlay with its scale, which an SVG file can hold, too. Pictures of a sequence have a number added to
-    their names, or are the frames of an MP4 file. With --store, and with --scheduler, each of them is kept when it is
-    done, and the same command goes on where it ended.
+    their names, or are the frames of an MP4 file.
+
+    With --store or --scheduler each picture is kept when it is done, and the same command goes on where it ended.
     """
     options = replace(options, defaults=parse_defines(define))
     from nerg_mi.jobs import film

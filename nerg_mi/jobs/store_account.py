@@ -22,6 +22,7 @@ def account_for_store(folder: str | Path, remove: bool = False, reporter: Report
     """
     if not Path(folder).is_dir():
         raise NergError(f'there is no folder "{folder}"; name the one that was given as --store')
+    reporter.progress(0.0, "looking at what is there")
     store = Store(folder)
     account = read_account(store)
     rows = [_row(job) for job in account.jobs]

@@ -7,6 +7,7 @@ import re
 from nerg_mi.errors import NergError
 
 from .addresses import is_cluster
+from .dask_cluster import Cluster
 from .local import Local
 from .processes import Processes
 from .protocol import Scheduler
@@ -28,6 +29,4 @@ def open_scheduler(name: str | None) -> Scheduler:
         raise NergError(
             f'there is no scheduler "{name}": give local, local:N for N processes, tcp://HOST:PORT or tls://HOST:PORT'
         )
-    from .dask_cluster import Cluster
-
     return Cluster(name)

@@ -14,13 +14,12 @@ class PartOptions:
     """Where finished parts of a job are kept, and who makes them."""
 
     store: Path | None = option(
-        None,
-        "Keep finished parts in this folder, and go on from those in it.  [default with --scheduler: OUTPUT.tasks]",
+        None, "Keep finished parts in this folder, and go on from them.  [default: OUTPUT.tasks, with --scheduler]"
     )
     scheduler: str | None = option(
         None,
         "Who makes the parts: local, local:N for N processes, or a cluster at tcp://HOST:PORT or tls://HOST:PORT.  "
-        "[default with --store: local]",
+        "[default: local, with --store]",
     )
 
 
