@@ -20,7 +20,8 @@ from nerg_mi.transport.observer.settings import DIRECTIONS
 from tests.conftest import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-FOREIGN = {"--tcnn", "--ff"}  # of torch-ngp
+OF_DASK = {"--dashboard-address", "--no-dashboard", "--protocol", "--tls-ca-file", "--tls-cert", "--tls-key"}
+FOREIGN = {"--tcnn", "--ff"} | OF_DASK  # the former of torch-ngp
 NUMBERS = "zero one two three four five six seven eight nine ten".split()
 
 

@@ -40,6 +40,16 @@ def unprotected(address: str) -> str | None:
     )
 
 
+def own_host(address: str) -> str:
+    """The address of this machine by which the scheduler at ``address`` is reached: where a worker listens, and not
+    wherever else this machine can be reached."""
+    found = _ADDRESS.fullmatch(address)
+    host = found[2].strip("[]") if found is not None else ""
+    if _is_loopback(host):
+        return "127.0.0.1" if host == "localhost" else host
+    return import_distributed().utils.get_ip(host)
+
+
 def _is_loopback(host: str) -> bool:
     if host == "localhost":
         return True

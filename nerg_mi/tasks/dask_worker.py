@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import signal
 import tempfile
 from collections.abc import Mapping
 from functools import cache
@@ -16,7 +17,7 @@ from typing import Any
 
 from nerg_mi.errors import NergError, expected, sentence
 
-from .addresses import check_address, import_distributed, security_for
+from .addresses import check_address, import_distributed, own_host, security_for
 from .children import Child, ChildDied, TaskFailed
 from .kept_inputs import KeptInputs
 from .making import check_code
@@ -111,13 +112,21 @@ def serve_cluster(address: str, patience: float, tell: Warn, name: str | None = 
     came.
     """
     check_address(address)
-    # What dask logs about connections is told in sentences of ours.
+    # What dask logs about connections is told in sentences of ours; importing it sets levels.
+    import_distributed()
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    asyncio.run(_serve(address, patience, tell, name, security_for(address)))
+    try:
+        asyncio.run(_serve(address, patience, tell, name, security_for(address)))
+    except asyncio.CancelledError:
+        # A batch system's SIGTERM ends it as Ctrl-C does, with nothing left behind.
+        raise KeyboardInterrupt from None
 
 
 async def _serve(address: str, patience: float, tell: Warn, name: str | None, security: Any) -> None:
     distributed = import_distributed()
+    serving = asyncio.current_task()
+    assert serving is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, serving.cancel)
 
     class OneTask(distributed.Worker):
         ended_for = ""
@@ -130,6 +139,7 @@ async def _serve(address: str, patience: float, tell: Warn, name: str | None, se
         # Memory is a child's, which the system bounds; a dashboard would be one more open port.
         with tempfile.TemporaryDirectory(prefix="nerg-dask-") as scratch:
             settings = {"nthreads": 1, "memory_limit": 0, "dashboard": False, "local_directory": scratch}
+            settings |= {"host": own_host(address), "dashboard_address": "127.0.0.1:0"}
             worker = OneTask(address, name=name, security=security, **settings)
             try:
                 await asyncio.wait_for(worker, patience)

@@ -74,7 +74,7 @@ class ClusterOfProcesses:
                 stderr=log,
                 stdin=subprocess.DEVNULL,
                 cwd=self.folder,
-                env={**os.environ, "PYTHONPATH": str(ROOT)},
+                env={**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(self.folder)},
             )
 
     def __exit__(self, *error) -> None:

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.tasks.addresses import check_address, import_distributed, is_cluster, security_for, unprotected
+from nerg_mi.tasks.addresses import check_address, import_distributed, is_cluster, own_host, security_for, unprotected
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.9.9.9", "localhost", "[::1]"])
@@ -19,6 +19,11 @@ def test_tls_is_silent_and_all_else_is_told_in_a_sentence():
     for host in ("192.0.2.1", "cluster.example", "[2001:db8::1]", "0.0.0.0"):
         said = unprotected(f"tcp://{host}:8786")
         assert said is not None and said.startswith(f"nothing protects tcp://{host}:8786: whoever reaches that port")
+
+
+def test_workers_listen_where_their_scheduler_reaches_them():
+    assert own_host("tcp://localhost:1") == own_host("tcp://127.0.0.1:1") == "127.0.0.1"
+    assert own_host("tcp://[::1]:1") == "::1"
 
 
 def test_names_of_clusters():

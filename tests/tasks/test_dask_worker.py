@@ -9,6 +9,7 @@ from nerg_mi.tasks.store import Store
 from nerg_mi.tasks.task import Task
 from tests.conftest import ROOT
 from tests.tasks import works
+from tests.tasks.clusters import ClusterOfProcesses, free_port, wait_until
 
 pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
 
@@ -44,7 +45,15 @@ def test_failures_are_answers(child, tmp_path):
 
 
 def test_a_scheduler_that_is_not_there():
-    from tests.tasks.clusters import free_port
-
     with pytest.raises(NergError, match=r"no scheduler has answered at tcp://127.0.0.1:\d+ for 1 s"):
         dask_worker.serve_cluster(f"tcp://127.0.0.1:{free_port()}", 1.0, print)
+
+
+def test_a_batch_systems_end_leaves_nothing_behind(tmp_path):
+    with ClusterOfProcesses(tmp_path) as cluster:
+        worker = cluster.start_worker()
+        wait_until(lambda: "works for" in cluster.log("worker0"), "the worker is there")
+        worker.terminate()
+        assert worker.wait(60) == 130
+        assert cluster.log("worker0").splitlines() == [f"works for {cluster.address}", "Interrupted."]
+    assert not list(tmp_path.glob("nerg-*"))
