@@ -27,6 +27,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/jobs/options/gaze.py": _OPTIONS,
     "nerg_mi/jobs/options/pictures.py": _OPTIONS,
     "nerg_mi/jobs/options/parts.py": _OPTIONS,
+    "nerg_mi/jobs/film_parts.py": "tests/jobs/test_film.py renders by it in every way",
     "nerg_mi/jobs/options/place.py": _OPTIONS,
     "nerg_mi/jobs/options/poses.py": _OPTIONS,
     "nerg_mi/jobs/options/radiance.py": _OPTIONS,

@@ -19,11 +19,6 @@ SUFFIX = ".tasks"
 """Of the store beside an output, where none is named."""
 
 
-def in_parts(options: PartOptions) -> bool:
-    """Whether a job is to be done in parts at all."""
-    return options.store is not None or options.scheduler is not None
-
-
 class Parts:
     """The store and the scheduler of one job, which writes ``output``. Raises `NergError` for a folder that cannot be
     written to, and for a scheduler that there is none of."""

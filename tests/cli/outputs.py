@@ -193,6 +193,7 @@ INPUTS = {
     "export volume": {"field"},
     "export torch-ngp": {"field"},
     "ablate": {"rays", "field", "scene"},
+    "jobs": {"folder"},
     "report": {"files", "objects"},
 }
 """Parameters of commands that name what is read; all others that are paths are written."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 import pytest
 
@@ -11,6 +13,7 @@ from nerg_mi.jobs import film_tasks
 from nerg_mi.jobs.film import render_film
 from nerg_mi.jobs.options.parts import FilmOptions
 from tests.cli.test_render import SCENE
+from tests.conftest import ROOT
 from tests.jobs.recorder import Recorder
 
 AOV = 'type="aov"><string name="aovs" value="dd:depth"/>'
@@ -99,6 +102,17 @@ def test_files_of_the_scene_are_the_same_wherever_it_lies(scene, tmp_path):
     second = render(tmp_path / "again" / "scene.xml", "out", "a.png", told, store=store)
     assert (0.0, "3 of 3 parts") in told.steps or (1.0, "3 of 3 parts") in told.steps
     assert first.files[0].name == second.files[0].name
+
+
+def test_one_picture_needs_nothing_of_it(scene, tmp_path):
+    """Neither the engine nor dask is loaded where no parts are asked for."""
+    code = (
+        "import sys\nfrom nerg_mi.jobs.film import render_film\nfrom nerg_mi.jobs.options.parts import FilmOptions\n"
+        f"render_film({str(scene)!r}, {str(tmp_path / 'a.png')!r}, FilmOptions(mode='llvm_ad_rgb'))\n"
+        "print([m for m in sys.modules if m.startswith(('nerg_mi.tasks', 'distributed', 'dask'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.strip() == "[]", done.stderr
 
 
 def test_options_that_contradict_are_told_before_any_work(scene, tmp_path):

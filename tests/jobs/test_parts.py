@@ -6,7 +6,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.jobs.options.parts import PartOptions
-from nerg_mi.jobs.parts import Parts, in_parts
+from nerg_mi.jobs.parts import Parts
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.processes import Processes
 from tests.jobs.recorder import Recorder
@@ -14,8 +14,8 @@ from tests.tasks import works
 
 
 def test_parts_are_asked_for_by_either_option():
-    assert not in_parts(PartOptions())
-    assert in_parts(PartOptions(store=Path("s"))) and in_parts(PartOptions(scheduler="local"))
+    assert not PartOptions().in_parts
+    assert PartOptions(store=Path("s")).in_parts and PartOptions(scheduler="local").in_parts
 
 
 def test_the_store_is_beside_the_output_unless_it_is_named(tmp_path):

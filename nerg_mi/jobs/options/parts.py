@@ -22,6 +22,11 @@ class PartOptions:
         "[default: local, with --store]",
     )
 
+    @property
+    def in_parts(self) -> bool:
+        """Whether the job is to be done in parts at all."""
+        return self.store is not None or self.scheduler is not None
+
 
 @dataclass(frozen=True, kw_only=True)
 class FilmOptions(PictureOptions, PartOptions):
