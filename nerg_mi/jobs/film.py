@@ -16,7 +16,8 @@ def render_film(
 
     With ``options.store`` or ``options.scheduler`` each picture of a sequence is a part, which is kept and not rendered
     again: whatever ended the job, the same call goes on. A picture depends on the scene, on the files that it names, on
-    its own values and on the options, and on nothing else: those whose inputs have changed are rendered anew.
+    its own values and on the options, and on nothing else: those whose inputs have changed are rendered anew. The
+    reporter hears the progress of either.
     """
     options = options or FilmOptions()
     if not options.in_parts:
