@@ -246,10 +246,17 @@ def around_observer(trace: Trace, frame: Frame, seen: Seen, mean: Trace | None =
 
 
 def of_place(
-    trace: Trace, frame: Frame, lower: np.ndarray, upper: np.ndarray, outside: bool = True, mean: Trace | None = None
+    trace: Trace,
+    frame: Frame,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    outside: bool = True,
+    mean: Trace | None = None,
+    solid: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Shot | None:
     """The camera that shows best what lies between the corners ``lower`` and ``upper`` (3,): from within, where it can
-    stand free, or, with ``outside``, from around. ``mean``: as `Judge` has it. None where nothing is met."""
+    stand free, or, with ``outside``, from around. ``mean``: as `Judge` has it; ``solid``: whether points (N, 3) lie
+    inside of something solid, where no camera stands. None where nothing is met."""
     lower, upper = np.asarray(lower, float), np.asarray(upper, float)
     up = frame.up / np.linalg.norm(frame.up)
     center, size = (lower + upper) / 2, upper - lower
@@ -279,7 +286,12 @@ def of_place(
             targets.append(np.broadcast_to(center, origins[-1].shape))
     if not len(o := np.concatenate(origins)):
         return None
-    return Judge(trace, frame, 0.5 * radius, mean=mean).best(o, np.concatenate(targets))
+    ends = np.concatenate(targets)
+    if solid is not None:
+        places, which = np.unique(o, axis=0, return_inverse=True)
+        outside_of_all = ~solid(places)[which.reshape(-1)]
+        o, ends = o[outside_of_all], ends[outside_of_all]
+    return Judge(trace, frame, 0.5 * radius, mean=mean).best(o, ends) if len(o) else None
 
 
 def _clearance(trace: Trace, points: np.ndarray, far: float) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures.overview import Frame, Judge, Seen, Shot, around_observer, of_place
 from nerg_mi.maths.contraction import box_of
+from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rendering.channels import render_channels
 from nerg_mi.rendering.scene_parts import Eye, ahead_level
 from nerg_mi.transport.panorama import pixel_directions, pixel_solid_angles
@@ -25,6 +26,8 @@ PANORAMA = (96, 48)
 SPHERE = 2
 """Number of the sensor that takes it."""
 
+# Directions in which it is found out whether a point lies inside of a shape.
+_AROUND = 32
 # Where nothing is known of attention: how much more level directions count than those beyond 35 degrees.
 _LEVEL, _STEEP = 1.0, 0.2
 
@@ -52,6 +55,22 @@ class Probe:
         """Mean depth at which light ends, and opacity, along rays (N, 3)."""
         with mitsuba_says():
             return trace_depth(self.place, origins, directions, kind="expected")
+
+    def within(self, points: np.ndarray) -> np.ndarray:
+        """Whether ``points`` (N, 3) lie inside closed shapes: most of what they see are backs of surfaces. (N,) bool;
+        nowhere where a field or volumes are marched, whose surfaces have no backs."""
+        import mitsuba as mi
+
+        if self.place.medium is not None or not len(points):
+            return np.zeros(len(points), bool)
+        around = fibonacci_directions(_AROUND)
+        origins, directions = np.repeat(points, _AROUND, axis=0), np.tile(around, (len(points), 1))
+        o, d = (np.ascontiguousarray(v.T, np.float32) for v in (origins, directions))
+        with mitsuba_says():
+            found = self.scene.ray_intersect(mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)))
+        met, normal = np.array(found.is_valid()), np.array(found.n).T
+        back = (met & ((normal * directions).sum(axis=1) > 0)).reshape(len(points), -1).sum(axis=1)
+        return back > 0.5 * _AROUND
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of what there is; of a field without an end those of its inner cube."""
@@ -102,7 +121,7 @@ def best_camera(probe: Probe, seen: Seen | None, frame: Frame, field_box: dict |
     if seen is not None:
         return around_observer(probe.trace, frame, seen, mean)
     if field_box is None:
-        return of_place(probe.trace, frame, *probe.bounds())
+        return of_place(probe.trace, frame, *probe.bounds(), solid=probe.within)
     box = box_of(field_box)
     lower, upper = np.array(box.core.lower), np.array(box.core.upper)
     return of_place(probe.trace, frame, lower, upper, not box.contracted, mean)

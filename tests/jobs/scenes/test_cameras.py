@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.scenes.cameras import Probe, best_photo, given_point, probe_values, turned_ahead, upright
+from nerg_mi.figures.overview import Frame
+from nerg_mi.jobs.scenes.cameras import Probe, best_camera, best_photo, given_point, probe_values, turned_ahead, upright
 from nerg_mi.jobs.scenes.photos import PhotoCamera
 from nerg_mi.maths.ray_box import box_interval
 from nerg_mi.rendering.pictures import load_scene
@@ -58,3 +59,20 @@ def test_the_best_photo(probe):
     eyes = [Eye(np.array(o, float), np.array(t, float)) for o, t in looks]
     cameras = [PhotoCamera(str(k), eye, Lens(), False) for k, eye in enumerate(eyes)]
     assert best_photo(probe, None, cameras).name == "1"
+
+
+@pytest.mark.parametrize("room", [False, True], ids=["a thing", "a room"])
+def test_a_thing_is_seen_from_outside_and_a_room_from_within(rgb, tmp_path, room):
+    """A cube whose faces look outwards is a thing, one whose faces look inwards a room."""
+    place = Place(beside=(element("shape", element("boolean", name="flip_normals", value=str(room)), type="cube"),))
+    up = np.array([0.0, 0, 1])
+    (tmp_path / "a.xml").write_text(SceneText(place, Attention(), EYE, EYE, up).xml())
+    probe = Probe(load_scene(tmp_path / "a.xml", probe_values()), None, up)
+    assert probe.within(np.array([[0, 0, 0], [0.9, -0.5, 0.3], [3, 0, 0], [0, 0, -1.1]])).tolist() == [
+        not room,
+        not room,
+        False,
+        False,
+    ]
+    shot = best_camera(probe, None, Frame(70, 1.5, up), None)
+    assert (np.abs(shot.origin).max() < 1) == room and shot.opaque > 0.2
