@@ -78,13 +78,17 @@ def evaluate_gaze(
     # What was trained by force is scored, and told.
     check_place(place, scored, option, True, reporter)
     blind, others = standard_baselines(train, account["radius"], options.kappa, options.blind_kappa, seed)
-    density = gaze_field(field, place.medium, place.align, about.get("probes", {}).get("depth", "median"))
+    depth, count = about.get("probes", {}).get("depth", "median"), len(test.centres)
+    # Most of the time goes to the densities of the field.
+    known = lambda number: reporter.progress(0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}")
+    density = gaze_field(field, place.medium, place.align, depth, known)
     methods = {"gaze field": density, **others}
-    reporter.progress(0.1, "scores")
-    rows = evaluation.evaluate_gaze(test, methods, blind, options.resamples, seed)
+    reporter.progress(0.05, "scores")
+    told = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
+    rows = evaluation.evaluate_gaze(test, methods, blind, options.resamples, seed, told)
     half = evaluation.split_half(scored, test.centres, account["radius"], options.kappa, blind, options.min_rays, seed)
     rows += [half] if half else []
-    reporter.progress(0.7, "each person")
+    reporter.progress(0.86, "each person")
     persons = evaluation.person_rows(test, {k: methods[k] for k in _BY_PERSON}, blind, options.min_rays)
     files = []
     if output is not None:
@@ -100,7 +104,7 @@ def evaluate_gaze(
         notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options)
         files = write_report(output, rows, persons, summary, notes)
         if options.pictures:
-            reporter.progress(0.9, "pictures")
+            reporter.progress(0.95, "pictures")
             files.append(output / "positions.png")
             sources = files_among(gaze, rays, options.field, options.scene)
             made = provenance("nerg eval gaze", sources, seed, options)

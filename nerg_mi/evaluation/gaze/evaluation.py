@@ -7,6 +7,7 @@ are drawn whole, with all of their rays (Efron & Tibshirani 1993).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,8 @@ SCORES = MAPS + RAYS
 """KLD in nats and CC, SIM of densities normalised over the sphere; MAE in 1/sr of densities as they are; NSS; AUC-Judd;
 sAUC against rays of other test positions; bits a ray beyond the blind density; mean log density (nats of 1/sr) of a
 ray."""
+# Share of an evaluation's time that goes to the densities of methods that are quick; the rest goes to resamples.
+_ANSWERS = 0.2
 # Rays that are drawn at each test position, and scored one by one.
 _PER_POSITION = 128
 
@@ -141,7 +144,12 @@ def _enough(rays: Rays, centres: np.ndarray, radius: float, min_rays: int) -> np
 
 
 def evaluate_gaze(
-    test: GazeTest, methods: dict[str, Baseline], blind: Baseline, resamples: int = 200, seed: int = 0
+    test: GazeTest,
+    methods: dict[str, Baseline],
+    blind: Baseline,
+    resamples: int = 200,
+    seed: int = 0,
+    on_part: Callable[[float], None] | None = None,
 ) -> list[dict]:
     """One row a method: the scores of ``SCORES``, each with ``.low`` and ``.high`` of its 95 % interval, and the
     integral.
@@ -150,16 +158,19 @@ def evaluate_gaze(
     not its quantiles, since the truth of a resample has fewer persons and narrower peaks, which every map meets worse.
     The resamples are the same for all methods: the last method is the bar, and of the first one the row has ``.less``,
     how much it is above the bar, with ``.less.low`` and ``.less.high``. The row of every other method has ``.gap``, how
-    much the first method is above it, likewise. With fewer than three persons there are no intervals.
+    much the first method is above it, likewise. With fewer than three persons there are no intervals. ``on_part`` is
+    told the share that is done.
     """
     rng, N = np.random.default_rng(seed), len(test.persons)
-    answers = _answers(test, methods, blind)
+    told = on_part or (lambda share: None)
+    answers = _answers(test, methods, blind, lambda share: told(_ANSWERS * share))
     rows = [
         {"method": name, **map_scores(test.truth, maps), **{k: float(v.mean()) for k, v in values.items()}}
         for name, maps, values in answers
     ]
     boot = [[] for _ in answers]
-    for _ in range(resamples if N >= 3 else 0):
+    for number in range(resamples if N >= 3 else 0):
+        told(_ANSWERS + (1 - _ANSWERS) * number / resamples)
         times = rng.multinomial(N, np.full(N, 1 / N))
         share = test.counts * times
         held = share.sum(axis=1) > 0
@@ -195,9 +206,9 @@ def _difference(name: str, value: float, resampled: list[float]) -> dict[str, fl
 
 
 def _answers(
-    test: GazeTest, methods: dict[str, Baseline], blind: Baseline
+    test: GazeTest, methods: dict[str, Baseline], blind: Baseline, on_part: Callable[[float], None] | None = None
 ) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
-    """``(name, maps (P, D), ray scores (P, K) by name)`` of each method."""
+    """``(name, maps (P, D), ray scores (P, K) by name)`` of each method. ``on_part`` is told the share that is done."""
     rays, K = np.concatenate([test.at, test.others], axis=1), test.at.shape[1]
     ask = lambda method: [np.asarray(method(test.centres, v), np.float64) for v in (test.directions, rays)]
     maps, at = ask(blind)
@@ -205,6 +216,8 @@ def _answers(
     for name, method in methods.items():
         maps, at = ask(method)
         out.append((name, maps, ray_scores(maps, at[:, :K], at[:, K:], log_blind)))
+        if on_part is not None:
+            on_part(len(out) / len(methods))
     return out
 
 

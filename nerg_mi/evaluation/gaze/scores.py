@@ -23,7 +23,13 @@ from .baselines import Baseline
 EPS = 1e-6
 
 
-def gaze_field(field: AnyGazeField, medium, align: Similarity | None = None, kind: str = "median") -> Baseline:
+def gaze_field(
+    field: AnyGazeField,
+    medium,
+    align: Similarity | None = None,
+    kind: str = "median",
+    on_position: Callable[[int], None] | None = None,
+) -> Baseline:
     """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the
     positions' units.
 
@@ -34,7 +40,8 @@ def gaze_field(field: AnyGazeField, medium, align: Similarity | None = None, kin
     ``medium``: what the observer's depth is traced in, in the field's frame (a medium or a ``Place``; None for a field
     that knows no geometry); ``align``: similarity from the frame of the positions to the field's; directions (D, 3) for
     all positions or (P, D, 3), unit. The integrals of positions are kept: neither the field nor its place may change.
-    Raises `NergError` for a field that needs surfaces where there is no place.
+    ``on_position`` is told how many positions are known, after each new one. Raises `NergError` for a field that needs
+    surfaces where there is no place.
     """
     if medium is None and field.config.needs_surfaces:
         raise NergError(
@@ -52,10 +59,14 @@ def gaze_field(field: AnyGazeField, medium, align: Similarity | None = None, kin
         import mitsuba as mi
 
         p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
-        if key not in observed:
+        new = key not in observed
+        if new:
             observed[key] = gaze.at([p_o], place, settings)
         r_o = mi.Vector3f(np.ascontiguousarray(directions.T, np.float32))
-        return np.array(observed[key].along(p_o, r_o))
+        density = np.array(observed[key].along(p_o, r_o))
+        if new and on_position is not None:
+            on_position(len(observed))
+        return density
 
     def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
