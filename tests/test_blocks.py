@@ -24,6 +24,7 @@ RUN_ELSEWHERE = {
     ("README.md", "xml"): "tests/test_readme.py",
     ("clusters.md", "python"): "tests/tasks/test_page.py",
     ("gradients.md", "python"): "tests/test_gradients_page.py",
+    ("pictures.md", "py"): "tests/test_pictures_page.py",
     ("python.md", "python"): "tests/api/test_page.py",
     ("rays.md", "python"): "tests/rays/test_manual.py",
 }
@@ -32,7 +33,6 @@ RUN_ELSEWHERE = {
 NOT_RUN = {
     ("applications.md", "text"): "a formula",
     ("plugins.md", "math"): "a formula",
-    ("pictures.md", "py"): "pieces of a session; tests/jobs/drawing and tests/figures call what they name",
     ("python-reference.md", "{eval-rst}"): "what Sphinx is told; tests/tools/site/test_main.py builds the page",
     ("quickstart.md", "text"): "what commands print",
     ("tracking.md", ""): "what commands print, and a list of files",
