@@ -23,13 +23,15 @@ Limits = tuple[float, float] | None
 class Layers:
     """A picture and what lies over it: linear ``color`` (h, w, 3), ``values`` (h, w), ``mask`` (h, w) bool where there
     is a surface; ``marker``: pixel (x, y) of the observer, or None; ``supported``: whether anything was recorded around
-    the observer, so that their gaze is known."""
+    the observer, so that their gaze is known; ``basis``: rays and people that it rests on, in words, "" where that is
+    not known."""
 
     color: np.ndarray
     values: np.ndarray
     mask: np.ndarray
     marker: tuple[float, float] | None = None
     supported: bool = True
+    basis: str = ""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Overlay:
     """``name`` of the AOV; ``summary`` for people; ``limits(layers)``: ends of the scale of one picture, None where it
     shows nothing of it; ``draw(layers, limits, style)``: a figure; ``scaled``: whether it needs a scale; ``low``: the
     lower end of every scale, or None where it depends on the pictures; ``of_gaze``: whether it is known only where rays
-    were recorded."""
+    were recorded; ``rests_on``: "gaze" or "kde", the part of the scene that was made of rays."""
 
     name: str
     summary: str
@@ -61,9 +63,10 @@ class Overlay:
     scaled: bool = True
     low: float | None = 0.0
     of_gaze: bool = False
+    rests_on: str | None = None
 
 
-def _heat(name: str, summary: str, title: str, label: str, of_gaze: bool = False) -> Overlay:
+def _heat(name: str, summary: str, title: str, label: str, of_gaze: bool = False, rests_on: str = "gaze") -> Overlay:
     def limits(of: Layers) -> Limits:
         return (0.0, top_of(of.values, of.mask)) if np.any(of.values[of.mask] > 0) else None
 
@@ -72,9 +75,9 @@ def _heat(name: str, summary: str, title: str, label: str, of_gaze: bool = False
         heat = heat if style.colors is None else replace(heat, colors=style.colors)
         shown = style.title or (title if of.supported or not of_gaze else f"{title}: nobody recorded around here")
         unknown = unknown_of(of, of_gaze) if style.hatched else None
-        return plots.gaze_figure(of.color, of.values, of.mask, heat, shown, label, of.marker, unknown)
+        return plots.gaze_figure(of.color, of.values, of.mask, heat, shown, label, of.marker, unknown, of.basis)
 
-    return Overlay(name, summary, limits, draw, of_gaze=of_gaze)
+    return Overlay(name, summary, limits, draw, of_gaze=of_gaze, rests_on=rests_on)
 
 
 def unknown_of(layers: Layers, of_gaze: bool) -> np.ndarray:
@@ -96,7 +99,7 @@ OVERLAYS = {
     overlay.name: overlay
     for overlay in (
         _heat("gaze", "how much the observer attends to what is seen", "Gaze", plots.GAZE, of_gaze=True),
-        _heat("kde", "where tracked people looked", "Where people looked", "tracked gaze [1/sr]"),
+        _heat("kde", "where tracked people looked", "Where people looked", "tracked gaze [1/sr]", rests_on="kde"),
         _heat("gaze_std", "how sure that is", "Uncertainty of gaze", "standard deviation of gaze [1/sr]", of_gaze=True),
         _heat("emit", "how much surfaces attract", "What surfaces attract", "emitted attention"),
         _heat("capture", "how much the observer gives", "What the observer gives", "captured attention"),

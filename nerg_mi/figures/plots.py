@@ -56,12 +56,12 @@ def depth_figure(
 
 
 def gaze_figure(
-    color, gaze, mask, heat: Heat, title: str = "Gaze", label: str = GAZE, marker=None, unknown=None
+    color, gaze, mask, heat: Heat, title: str = "Gaze", label: str = GAZE, marker=None, unknown=None, note: str = ""
 ) -> Any:
     """``gaze`` (h, w) in 1/sr over the linear picture ``color`` (h, w, 3), with its scale, which ``label`` explains.
     ``marker``: pixel (x, y) at which the observer stands; ``unknown`` (h, w) bool: where it is hatched, since nothing
-    is known there."""
-    sheet = Sheet([overlay(color, gaze, heat, mask, unknown)], [title], scale=True)
+    is known there; ``note``: what it rests on."""
+    sheet = Sheet([overlay(color, gaze, heat, mask, unknown)], [title], scale=True, note=note)
     if marker is not None:
         mark_observer(sheet, 0, marker)
     add_scale(sheet, heat, label, [(gaze, mask)], unknown is not None and bool(np.any(unknown)))
@@ -99,18 +99,19 @@ def difference_figure(
     return sheet.page
 
 
-def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None, hatched: bool = False):
+def occlusion_figure(own, moved_without, moved_with, heat: Heat, marker=None, hatched: bool = False, note: str = ""):
     """The paper's occlusion figure: three pictures with one scale.
 
     ``own``, ``moved_without``, ``moved_with``: tuples (color (h, w, 3) linear, gaze (h, w) in 1/sr, mask (h, w)): what
     the observer sees; another camera, gaze without occlusion; the same with it. ``marker``: pixel (x, y) at which the
-    observer stands in the two pictures of the other camera. ``hatched``: hatch where there is no surface.
+    observer stands in the two pictures of the other camera. ``hatched``: hatch where there is no surface;
+    ``note``: what it rests on.
     """
     parts = (own, moved_without, moved_with)
     void = [~np.asarray(m, bool) if hatched else None for _, _, m in parts]
     pictures = [overlay(c, g, heat, m, u) for (c, g, m), u in zip(parts, void)]
     titles = ["The observer's own view", "Another camera, without occlusion", "The same with occlusion"]
-    sheet = Sheet(pictures, titles, scale=True)
+    sheet = Sheet(pictures, titles, scale=True, note=note)
     if marker is not None:
         for panel in (1, 2):
             mark_observer(sheet, panel, marker)

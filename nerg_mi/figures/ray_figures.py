@@ -16,7 +16,8 @@ _SIDE = 640  # pixels of the plan's longer side
 
 
 def floor_plan(rays, cell: float | None = None, title: str = "Where people stood"):
-    """Density of the rays' origins on the floor, in rays/m², on a logarithmic scale; cells without a ray stay white.
+    """Density of the rays' origins on the floor, in rays/m², on a logarithmic scale; cells without a ray stay white,
+    as the scale says.
 
     ``cell``: edge of a cell in metres (default: a fiftieth of the plan's shorter side, 5 cm at least). Short lines show
     where the people of a coarser cell look on average; the longer, the more they agree.
@@ -37,7 +38,7 @@ def floor_plan(rays, cell: float | None = None, title: str = "Where people stood
     )
     _arrows(axes, rays, low, high)
     bar = figure.colorbar(image, cax=figure.axes[1])
-    bar.set_label(f"rays/m² in cells of {cell:g} m", fontsize=7, color=INK)
+    bar.set_label(f"rays/m² in cells of {cell:g} m; white: no ray", fontsize=7, color=INK)
     bar.ax.tick_params(labelsize=7, colors=INK, length=2)
     return figure
 

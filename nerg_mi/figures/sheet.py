@@ -59,8 +59,9 @@ def _page_type() -> Any:
 class Sheet:
     """Pictures (h, w, 3) of one size in rows of ``columns``, each with one of ``titles``.
 
-    ``scale``: room for a bar on the right; ``axes``: room for ticks and labels of each panel. ``page``: the figure;
-    ``panels``, ``images``: axes of each picture and what they show; ``unit``: by what text is larger than usual.
+    ``scale``: room for a bar on the right; ``axes``: room for ticks and labels of each panel; ``note``: a line below
+    all of it. ``page``: the figure; ``panels``, ``images``: axes of each picture and what they show; ``unit``: by what
+    text is larger than usual.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class Sheet:
         scale: bool = False,
         axes: bool = False,
         columns: int | None = None,
+        note: str = "",
     ):
         h, w = pictures[0].shape[:2]
         times = max(1, math.ceil(_LEAST / max(h, w)))
@@ -85,6 +87,8 @@ class Sheet:
         foot, gap = _EDGE * unit, _GAP * unit
         self._side = _SIDE * unit if scale else 0.0
         self.width = even(left + columns * slot_w + (columns - 1) * (left if axes else gap) + self._side + foot)
+        note = wrap(note, self.width - 2 * left, SMALL * unit) if note else ""
+        foot += SMALL * unit * _PER_POINT * 1.25 * (note.count("\n") + 1) if note else 0.0
         self.height = even(rows * (head + slot_h + below) + foot)
         self.page = new_page(self.width, self.height)
         self.panels: list[Any] = []
@@ -104,6 +108,9 @@ class Sheet:
                 panel.set_yticks([])
             panel.set_title(title, fontsize=TITLE * unit, color=INK, pad=4 * unit)
             self.panels.append(panel)
+        if note:
+            at = left / self.width, 0.6 * _EDGE * unit / self.height
+            self.page.text(*at, note, fontsize=SMALL * unit, color=INK, va="bottom")
         whole = rows * (head + slot_h + below) - head - below
         self._bar_at = (round(left + columns * step - (left if axes else gap) + gap), round(head), round(whole))
 

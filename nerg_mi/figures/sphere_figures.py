@@ -26,12 +26,14 @@ def sphere_figure(
     projection: str = "equirectangular",
     unknown=None,
     label: str = GAZE,
+    note: str = "",
 ) -> Any:
     """Pictures (h, w, ...) of a `panorama` sensor as a map of the observer's sphere, as wide as they are.
 
     ``color`` is linear, ``gaze`` in 1/sr; the heat stays away from where ``mask`` is false, and where ``unknown`` is
     true it is hatched. Azimuth 0 is the sensor's front, positive to the right; elevation 0 the horizon; both in
     degrees. ``projection``: one of `projections.PROJECTIONS`, "mollweide" (equal areas) or "equirectangular".
+    ``note``: what it rests on.
     """
     chosen = find_projection(projection)
     width = int(np.shape(gaze)[1]) // 2 * 2
@@ -39,7 +41,7 @@ def sphere_figure(
     hatched = unknown is not None and bool(np.any(unknown))
     if hatched:
         shown = hatch(shown, resample(unknown, chosen, width)[0])
-    sheet = Sheet([np.where(inside[..., None], shown, 1.0)], [title], scale=True, axes=True)
+    sheet = Sheet([np.where(inside[..., None], shown, 1.0)], [title], scale=True, axes=True, note=note)
     axes = sheet.panels[0]
     sheet.images[0].set_extent((-1, 1, -1, 1))
     axes.set_aspect("auto")

@@ -11,6 +11,7 @@ from typing import Any
 
 from nerg_mi.field.background import Background, BackgroundConfig
 from nerg_mi.field.cascades import CascadeGrid
+from nerg_mi.field.gaze.basis import basis_of
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.field.gaze.registry import build
 from nerg_mi.field.gaze.support import RaySupport
@@ -118,4 +119,5 @@ def load_gaze(path: str | Path, ns: ModuleType) -> tuple[AnyGazeField, dict[str,
         field = build(about, box_of(meta["box"]), arrays)
         if "support" in meta:
             field.support = RaySupport(arrays.array("support.cells", None, 5), meta["support"]["radius"])
+        field.basis = basis_of(meta["provenance"]) if isinstance(meta.get("provenance"), dict) else None
     return field, meta

@@ -221,7 +221,9 @@ class GazeEnsembleModule(torch.nn.Module):
 
     def field(self) -> GazeEnsemble:
         """An ensemble of its own with the weights as they are now."""
-        return GazeEnsemble([member.field() for member in self._densities()], self._field.support)
+        ensemble = GazeEnsemble([member.field() for member in self._densities()], self._field.support)
+        ensemble.basis = self._field.basis
+        return ensemble
 
     def _densities(self) -> list[GazeModule]:
         return cast("list[GazeModule]", list(self.members))

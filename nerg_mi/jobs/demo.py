@@ -24,7 +24,7 @@ from nerg_mi.figures.sphere_figures import sphere_figure
 from nerg_mi.figures.tonemap import srgb, write_png
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.exr import write_bitmap_exr
-from nerg_mi.files.tables import write_json
+from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import activate, load_scene
@@ -34,6 +34,7 @@ from nerg_mi.transport.panorama import pixel_solid_angles
 
 from .options.pictures import DemoOptions
 from .options.report import ReportOptions
+from .overlays import basis_words
 from .report import make_report
 from .reporter import SILENT, Reporter
 from .versions import versions
@@ -109,7 +110,8 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
             f'the gaze is 0 in every picture: move the eye of "{scene}", or train its gaze field for longer'
         )
     heat = Heat(max(tops))
-    files = _write_pictures(out, camera, own, sphere, without, heat, observer_pixel(seen), about)
+    pictures = {"own": own, "without": without, "camera": camera, "sphere": sphere}
+    files = _write_pictures(out, pictures, heat, observer_pixel(seen), basis_words(seen), about)
     for key, value in about.text().items():
         camera.bitmap.metadata()[key] = value
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
@@ -128,7 +130,12 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         title="The demo store and its shoppers" if options.scene is None else None,
     )
     rendered = {"camera": camera, "own": own, "sphere": sphere}
-    files.append(make_report(inputs[1:], out / "report.html", shown, rendered=rendered).path)
+    made = make_report(inputs[1:], out / "report.html", shown, rendered=rendered)
+    files.append(made.path)
+    if made.run.objects:
+        rows = [{"object": o.name, "observer_share": round(o.field.mean, 6)} for o in made.run.objects]
+        write_csv(out / "aoi.csv", rows)
+        files.append(out / "aoi.csv")
     clock.stop()
 
     report = {
@@ -210,32 +217,29 @@ def sphere_integral(sphere: Channels) -> float:
 
 def _write_pictures(
     out: Path,
-    camera: Channels,
-    own: Channels,
-    sphere: Channels,
-    without: Channels,
+    pictures: Mapping[str, Channels],
     heat: Heat,
     marker: tuple[float, float] | None,
+    note: str,
     about: Provenance,
 ) -> list[Path]:
+    """Write the ``pictures`` "own", "without" and "camera" of `figures.occlusion_figure`, and the "sphere"."""
+    camera, sphere = pictures["camera"], pictures["sphere"]
+    parts = [(seen.color, seen.aovs["gaze"], seen.mask) for seen in pictures.values()]
     total = sphere_integral(sphere)
     drawn = {
         "occlusion": lambda: figures.occlusion_figure(
-            (own.color, own.aovs["gaze"], own.mask),
-            (camera.color, without.aovs["gaze"], without.mask),
-            (camera.color, camera.aovs["gaze"], camera.mask),
-            heat,
-            marker,
+            parts[0], (camera.color, *parts[1][1:]), parts[2], heat, marker, True, note
         ),
         "gaze": lambda: figures.gaze_figure(
-            camera.color, camera.aovs["gaze"], camera.mask, heat, "Where the observer looks"
+            *parts[2], heat, "Where the observer looks", marker=marker, unknown=~camera.mask, note=note
         ),
         "gaze_sphere": lambda: sphere_figure(
-            sphere.color,
-            sphere.aovs["gaze"],
-            sphere.mask,
+            *parts[3],
             heat,
             f"The gaze sphere of the observer; its integral is {total:.3f}",
+            unknown=~sphere.mask,
+            note=note,
         ),
         "depth": lambda: figures.depth_figure(camera.aovs["depth"], camera.mask),
         "visibility": lambda: figures.visibility_figure(camera.color, camera.aovs["visibility"], camera.mask),

@@ -104,6 +104,7 @@ class _Film:
             "ends": ends,
             "marker": made.notes["marker"],
             "supported": made.notes["supported"],
+            "basis": made.notes["basis"],
             "options": self.chosen,
             "about": about,
         }

@@ -54,15 +54,16 @@ def make_layers(parameters: Mapping[str, Any], inputs: Mapping[str, Path], outpu
         "limits": overlay.limits(layers),
         "marker": layers.marker,
         "supported": bool(layers.supported),
+        "basis": layers.basis,
     }
 
 
 def draw_layers(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
     """The figure of the layers that `make_layers` made. ``parameters``: ``ends`` of the scale, ``marker``,
-    ``supported``, ``options`` of overlays, and what the header says, ``about``."""
+    ``supported``, ``basis``, ``options`` of overlays, and what the header says, ``about``."""
     (file,) = inputs.values()
     options, marker, ends = PictureOptions(**parameters["options"]), parameters["marker"], parameters["ends"]
-    layers = unstacked(read_npy(file, "layers"), marker and tuple(marker), parameters["supported"])
+    layers = unstacked(read_npy(file, "layers"), marker and tuple(marker), parameters["supported"], parameters["basis"])
     figure = find_overlay(options.overlay or "").draw(layers, ends and tuple(ends), style_of(options))
     save(figure, output, parameters["about"])
 

@@ -101,7 +101,7 @@ def overlay_pictures(
         stop.check()
 
     with tempfile.TemporaryDirectory() as folder:
-        kept: list[tuple[Path, tuple[int, ...], Any, bool]] = []
+        kept: list[tuple[Path, tuple[int, ...], Any, bool, str]] = []
 
         def make(loaded: Any, camera: Any, on_strip: OnStrip) -> Picture:
             check_memory(path, camera, options)
@@ -112,7 +112,7 @@ def overlay_pictures(
                 array = stacked(layers)
                 file = Path(folder, str(len(kept)))
                 write_bytes(file, array.data)
-                kept.append((file, array.shape, layers.marker, layers.supported))
+                kept.append((file, array.shape, layers.marker, layers.supported, layers.basis))
             else:
                 finish(layers, shared_limits(limits[-1:], options.top))
             return Picture((width, height), 3)
@@ -120,8 +120,8 @@ def overlay_pictures(
         for frame in frames:
             last = render(frame, make)
         ends = shared_limits(limits, options.top)
-        for file, shape, marker, supported in kept:
-            finish(unstacked(np.fromfile(file, np.float32).reshape(shape), marker, supported), ends)
+        for file, shape, *about in kept:
+            finish(unstacked(np.fromfile(file, np.float32).reshape(shape), *about), ends)
             file.unlink()
     return last, None if ends is None else ends[1]
 
@@ -150,9 +150,9 @@ def stacked(layers: Layers) -> np.ndarray:
     return np.ascontiguousarray(array, np.float32)
 
 
-def unstacked(array: np.ndarray, marker: tuple[float, float] | None, supported: bool) -> Layers:
-    """What `stacked` was given, with its ``marker`` and whether it is ``supported``."""
-    return Layers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported)
+def unstacked(array: np.ndarray, marker: tuple[float, float] | None, supported: bool, basis: str) -> Layers:
+    """What `stacked` was given, with its ``marker``, whether it is ``supported``, and its ``basis`` in words."""
+    return Layers(array[..., :3], array[..., 3], array[..., 4] > 0.5, marker, supported, basis)
 
 
 def check_memory(path: Path, camera: Any, options: PictureOptions) -> None:
@@ -175,7 +175,17 @@ def layers_of(
         found = render_asked(path, loaded, camera, asked, spp, seed, on_strip)
     marker = observer_pixel(loaded, camera, found.aovs["depth"])
     supported = not overlay.of_gaze or is_supported(loaded, camera)
-    return Layers(found.color, found.aovs[overlay.name], found.mask, marker, supported)
+    basis = basis_words(loaded, overlay.rests_on)
+    return Layers(found.color, found.aovs[overlay.name], found.mask, marker, supported, basis)
+
+
+def basis_words(loaded: Any, part: str | None = "gaze") -> str:
+    """Rays and people that a ``part`` of the scene rests on, "gaze" or "kde", in words; "" where that is not known."""
+    volume = loaded.integrator().children.get(part)
+    if volume is None:
+        return ""
+    basis = volume.kde_view().basis if part == "kde" else volume.field.basis
+    return "" if basis is None else f"made of {basis.words()}"
 
 
 def is_supported(loaded: Any, camera: Any) -> bool:

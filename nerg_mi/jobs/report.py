@@ -13,6 +13,8 @@ import numpy as np
 from nerg_mi.errors import mitsuba_says
 from nerg_mi.evaluation.gaze.results import GazeResults
 from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.figures.provenance import Provenance
+from nerg_mi.figures.provenance import versions as programs
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
@@ -40,9 +42,10 @@ from nerg_mi.transport.place import Place
 from .backend import select_backend
 from .options.report import ReportOptions
 from .options.scene import SceneOptions
+from .overlays import basis_words, is_supported
 from .reporter import SILENT, Reporter
 from .reports.files import ReportFiles, sort_files
-from .reports.pictures import gaze_top, pictures_of_rays, pictures_of_views
+from .reports.pictures import Views, gaze_top, pictures_of_rays, pictures_of_views
 from .reports.results import given_results, made_results
 from .reports.surroundings import company, free_places, panorama_eyes, paths_of
 from .reports.words import observer_words, place_words, setting_words
@@ -133,20 +136,23 @@ class _Work:
         hide = (lambda text: text) if options.names else labels.hide
         with tempfile.TemporaryDirectory() as folder:
             scene = self._scene(Path(folder))
-            views, marker = self._views(scene, rendered)
+            views = self._views(scene, rendered)
             place = self._place(scene)
             onlooker = Onlooker(self.field, place, self._kind())
             eyes = self._eyes(place, scene)
             objects = self._objects(boxes, onlooker, place, eyes)
-            top = gaze_top(views)
+            top = gaze_top(views.seen)
             stage, sizes = self._stage(scene, onlooker, place, eyes, boxes)
         known = given.scene.kind != "none"
-        pictures: dict[str, Picture] = pictures_of_views(views, top, marker, known)
+        inputs = tuple((role, hide(name), digest) for role, name, digest in self._inputs())
+        settings = setting_words(options)
+        about = Provenance("nerg report", {n: d for _, n, d in inputs}, options.seed, settings, programs())
+        pictures: dict[str, Picture] = pictures_of_views(views, top, known, about)
         self._step(0.95, "writing")
         around: tuple[int, ...] = ()
         if rays is not None and self.rays is not None:
             test = given.scene.about.get("test")
-            pictures |= pictures_of_rays(rays, test if isinstance(test, dict) else None)
+            pictures |= pictures_of_rays(rays, test if isinstance(test, dict) else None, about)
             radius = (given.scene.about.get("probes") or {}).get("radius")
             around = company(self.rays, eyes.positions, place, radius if isinstance(radius, (int, float)) else 0.5)
         shown = results if options.names else [results_without_names(r, labels) for r in results]
@@ -168,9 +174,11 @@ class _Work:
             pictures,
             stage,
             *sizes,
-            tuple((role, hide(name), digest) for role, name, digest in self._inputs()),
+            inputs,
             versions(_variant()),
-            setting_words(options),
+            settings,
+            views.basis,
+            about.json(),
         )
 
     def _inputs(self) -> list[tuple[str, str, str]]:
@@ -207,10 +215,8 @@ class _Work:
         named = {default_name(name, scene.taken): str(value) for name, value in values.items()}
         return load_scene(scene.path, named)
 
-    def _views(
-        self, scene: SceneResult, rendered: Mapping[str, Channels] | None
-    ) -> tuple[Mapping[str, Channels], tuple[float, float] | None]:
-        """The pictures of the camera, of the observer's own view and sphere, and where in the first the observer is."""
+    def _views(self, scene: SceneResult, rendered: Mapping[str, Channels] | None) -> Views:
+        """The pictures of the camera, of the observer's own view and sphere, and what is known of the observer."""
         o = self.options
         spread = len(self.field.members) > 1
         aovs = "depth,opacity,gaze" + (",gaze_std" if spread else "")
@@ -230,7 +236,7 @@ class _Work:
             found = pixel_of(camera, center(loaded.sensors()[1]))
             share = width / camera.film().crop_size()[0]
             marker = None if found is None else tuple((v + 0.5) * share - 0.5 for v in found)
-        return views, marker
+        return Views(views, marker, is_supported(loaded, loaded.sensors()[0]), basis_words(loaded))
 
     def _place(self, scene: SceneResult) -> GazePlace:
         """The place as the scene has it, in which depths are traced."""

@@ -33,6 +33,7 @@ def page(run: Run) -> str:
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", name="referrer", content="no-referrer"),
         element("meta", name="generator", content=f"nerg_mi {__version__}"),
+        *([element("meta", name="provenance", content=run.made)] if run.made else []),
         element("title", run.title),
         element("style", Html(style)),
     ]

@@ -63,6 +63,10 @@ class Run:
     versions: Mapping[str, str] = field(default_factory=dict)
     # What the report was made with, by the option's name.
     settings: Mapping[str, str] = field(default_factory=dict)
+    # Rays and people that the gaze rests on, in words, "" where that is not known.
+    basis: str = ""
+    # Where all of this comes from (`figures.provenance`), as JSON.
+    made: str = ""
 
     @property
     def provenance(self) -> Mapping[str, Any]:

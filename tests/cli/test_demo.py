@@ -1,5 +1,6 @@
 """`nerg demo`, the whole way: on random fields always, on the store's own where they are present."""
 
+import csv
 import hashlib
 import json
 
@@ -22,6 +23,7 @@ NAMES = {
     "color.png",
     "scene.exr",
     "report.html",
+    "aoi.csv",
     "run.json",
 }
 TINY = ("--width", 48, "--spp", 1, "-m", "llvm_ad_rgb")
@@ -62,6 +64,14 @@ def test01_writes_and_names_everything(rgb, standins, tmp_path, capsys):
     assert {"nerg_mi", "mitsuba", "drjit", "numpy", "libLLVM"} <= set(report["versions"])
     assert set(report["seconds"]) == set(demo.STAGES)
     assert set(report["inputs"]) == {"scene.xml", "store.safetensors", "shoppers.safetensors"}
+    # Every object of the store, with its share of what this observer looks at.
+    shares = {row["object"]: float(row["observer_share"]) for row in csv.DictReader((out / "aoi.csv").open())}
+    assert len(shares) == 30 and all(share >= 0 for share in shares.values()) and 0 < sum(shares.values()) < 1.01
+    # Inputs and the seed stand in every picture, and rays and people in the page.
+    for name in NAMES - {"report.html", "aoi.csv", "run.json"}:
+        header = (out / name).read_bytes()
+        assert all(digest.encode() in header for digest in report["inputs"].values()) and b'"seed": 0' in header, name
+    assert "made of 4,321 rays of 12 people" in (out / "report.html").read_text("utf-8")
     for name, digest in report["outputs"].items():
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
 

@@ -50,5 +50,5 @@ def write_standins(folder: Path) -> dict[str, str]:
         field.set_parameters({"grid.table": table * float(1 / np.abs(table.numpy()).max())})
     paths = {"field": folder / "store.safetensors", "gaze": folder / "shoppers.safetensors"}
     save_radiance(radiance, paths["field"], {"made": "random"})
-    save_gaze(gaze, paths["gaze"], {"made": "random"})
+    save_gaze(gaze, paths["gaze"], {"made": "random", "rays": 4_321, "people": 12})
     return {name: str(path) for name, path in paths.items()}

@@ -45,6 +45,20 @@ def test02_equal_input_equal_file(tmp_path, name):
     assert a == b and b"seed 1" in a
 
 
+def test02b_a_note_stands_below_and_moves_nothing():
+    """The picture and its scale are where they are without it."""
+    plain, noted = (figures.gaze_figure(COLOR, GAZE, MASK, HEAT, note=n) for n in ("", "made of 300 rays of 3 people"))
+    assert noted.bbox.height > plain.bbox.height and noted.bbox.width == plain.bbox.width
+    for a, b in zip(plain.axes, noted.axes):
+        (x, y, w, h), lower = a.get_window_extent().bounds, noted.bbox.height - plain.bbox.height
+        np.testing.assert_allclose(b.get_window_extent().bounds, (x, y + lower, w, h), atol=0.01)
+    (text,) = noted.texts
+    noted.canvas.draw()
+    box = text.get_window_extent()
+    assert 0 <= box.y0 and box.x1 <= noted.bbox.width
+    assert box.y1 <= min(a.get_window_extent().y0 for a in noted.axes) + 0.5
+
+
 def test03_depth_without_any_surface(tmp_path):
     save(figures.depth_figure(np.zeros((8, 12)), np.zeros((8, 12), bool)), tmp_path / "a.png")
     assert (tmp_path / "a.png").stat().st_size > 0

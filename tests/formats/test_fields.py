@@ -78,6 +78,14 @@ def test02_gaze_round_trip(tmp_path, half):
         assert np.array_equal(arrays(again)[k], v.astype(np.float16).astype(np.float32) if half else v), k
 
 
+def test02b_what_a_gaze_field_rests_on(tmp_path):
+    """Read of what its training says of itself, and of nothing where that says nothing."""
+    for about, words in (({"rays": 300, "people": 7}, "300 rays of 7 people"), ({"rays": -3}, None), ({}, None)):
+        save_gaze(gaze(), tmp_path / "g.safetensors", about)
+        basis = load_gaze(tmp_path / "g.safetensors", ns)[0].basis
+        assert (None if basis is None else basis.words()) == words
+
+
 def test03_without_occupancy_and_step(tmp_path):
     field = RadianceField.random(RadianceConfig(GRID, width=16), BOX, ns)
     save_radiance(field, tmp_path / "f", {})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,11 @@ def test_everything_of_a_folder(run, tmp_path):
     assert 100 < scene["count"] <= 600 and len(scene["observers"]) == 6 and found.company and min(found.company) >= 1
     # Nobody's name, neither of rays nor of evaluations.
     assert not any(name in text for name in NAMES) and "person 1" in text
+    # How many rays of how many people the gaze rests on, and what all of it was made of.
+    assert re.fullmatch(r"made of [\d,]+ rays of [1-4] people", found.basis) and text.count(found.basis) >= 2
+    made = json.loads(found.made)
+    assert made["what"] == "nerg report" and set(made["inputs"].values()) == {digest for *_, digest in found.inputs}
+    assert found.made.encode("latin-1") in found.pictures["own"].png and 'name="provenance"' in text
 
 
 def test_equal_files_make_an_equal_report(run, tmp_path):

@@ -12,6 +12,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.field.gaze.basis import Basis
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 from nerg_mi.rays.rays import Rays
@@ -43,6 +44,7 @@ class KdeView:
             raise NergError("there are no rays to show the density of; give a file that has some")
         self.to_world, self.backend = to_world or Similarity(), backend
         self.count, self.kappa = min(count, len(rays)), kappa
+        self.basis = Basis(len(rays), len(np.unique(rays.person)))
         self._origin, self._direction = rays.origin, rays.direction
 
     def nearest(self, p: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ import drjit as dr
 
 from nerg_mi.maths.contraction import AnyBox
 
+from .basis import Basis
 from .protocol import Arrays, GazeDensity
 from .registry import build, register
 from .support import RaySupport
@@ -31,6 +32,7 @@ class GazeEnsemble:
 
     def __init__(self, members: Sequence[GazeDensity], support: RaySupport | None = None):
         self.members, self.support = list(members), support
+        self.basis: Basis | None = None
         if len(self.members) < 2:
             raise ValueError(f"an ensemble of gaze fields needs at least two members, got {len(self.members)}")
         if any(len(m.members) > 1 for m in self.members):

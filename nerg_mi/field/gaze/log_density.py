@@ -27,6 +27,7 @@ from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
 from nerg_mi.maths.contraction import AnyBox
 
+from .basis import Basis
 from .product import VARIANTS
 from .protocol import Arrays
 from .registry import register
@@ -147,6 +148,8 @@ class LogGazeField:
         self.emit_net, self.capture_net, self.escaped, self.prior = emit_net, capture_net, escaped, prior
         # How many rays it learnt from around a position, where that is known.
         self.support: RaySupport | None = None
+        # How many rays and people it learnt from in all.
+        self.basis: Basis | None = None
         self.pack()
 
     @staticmethod

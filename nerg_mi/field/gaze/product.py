@@ -27,6 +27,7 @@ from nerg_mi.field.radiance import assign, sigmoid
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.elementary import log1p
 
+from .basis import Basis
 from .protocol import Arrays
 from .registry import register
 from .support import RaySupport
@@ -172,6 +173,8 @@ class GazeField:
         self.emit_head, self.capture_head = emit_head, capture_head
         # How many rays it learnt from around a position, where that is known.
         self.support: RaySupport | None = None
+        # How many rays and people it learnt from in all.
+        self.basis: Basis | None = None
         self.pack()
 
     @staticmethod

@@ -22,6 +22,7 @@ from nerg_mi.field.mlp import MLP
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 
+from .basis import Basis
 from .support import RaySupport
 
 
@@ -110,6 +111,8 @@ class AnyGazeField(Protocol):
     kind: ClassVar[str]
     support: RaySupport | None
     """How many rays it learnt from around a position, where that is known."""
+    basis: Basis | None
+    """How many rays and people it learnt from in all, where that is known."""
 
     @property
     def config(self) -> GazeFieldConfig:

@@ -55,7 +55,9 @@ def draw(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> D
     integral = float((seen.values.astype(np.float64) * pixel_solid_angles(width, width // 2)).sum())
     title = f"All that the observer can turn to: integral {integral:.3g}"
     unknown = unknown_of(seen, True) if style.hatched else None
-    figure = sphere_figure(seen.color, seen.values, seen.mask, heat, title, options.projection, unknown)
+    figure = sphere_figure(
+        seen.color, seen.values, seen.mask, heat, title, options.projection, unknown, note=seen.basis
+    )
     return Drawing(figure, [path], options.seed)
 
 

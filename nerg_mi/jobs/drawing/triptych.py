@@ -58,7 +58,8 @@ def draw(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) ->
     assert limits is not None
     heat = Heat(limits[1], style.colors or "inferno", decades=style.decades)
     first, second, third = ((of.color, of.values, of.mask) for of in (own, without, seen))
-    return Drawing(occlusion_figure(first, second, third, heat, marker, style.hatched), [path], options.seed)
+    figure = occlusion_figure(first, second, third, heat, marker, style.hatched, seen.basis)
+    return Drawing(figure, [path], options.seed)
 
 
 def _own_camera(observer: Any, camera: Any) -> Any:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from nerg_mi.figures import plots, ray_figures
 from nerg_mi.figures.overlay import Heat, top_of
+from nerg_mi.figures.overlays import Layers, unknown_of
+from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.saving import encode
 from nerg_mi.figures.sphere_figures import sphere_figure
 from nerg_mi.figures.tonemap import srgb, to_bytes
@@ -18,6 +21,23 @@ from nerg_mi.rendering.channels import Channels
 from nerg_mi.report.run import Picture
 
 
+@dataclass(frozen=True, eq=False)
+class Views:
+    """What was rendered: ``seen`` from the "camera", the observer's "own" view and the "sphere"; ``marker``: pixel of
+    the camera's picture at which the observer is; ``supported``: whether anybody was recorded around there; ``basis``:
+    rays and people that the gaze rests on, in words."""
+
+    seen: Mapping[str, Channels]
+    marker: tuple[float, float] | None = None
+    supported: bool = True
+    basis: str = ""
+
+    def layers(self, name: str, quantity: str = "gaze") -> Layers:
+        """A ``quantity`` over the picture ``name``."""
+        view, marker = self.seen[name], self.marker if name == "camera" else None
+        return Layers(view.color, view.aovs[quantity], view.mask, marker, self.supported, self.basis)
+
+
 def gaze_top(views: Mapping[str, Channels]) -> float | None:
     """One end of the scale (1/sr) for all pictures of gaze, so that a colour means the same in each; None where there
     is no gaze."""
@@ -25,71 +45,79 @@ def gaze_top(views: Mapping[str, Channels]) -> float | None:
     return max(tops) if tops else None
 
 
-def pictures_of_views(
-    views: Mapping[str, Channels], top: float | None, marker: tuple[float, float] | None, place_known: bool
-) -> dict[str, Picture]:
-    """Colour and gaze from the camera, and the observer's own view and sphere. ``views``: "camera", "own", "sphere";
-    ``marker``: pixel of the camera's picture at which the observer is."""
-    out = {}
+def pictures_of_views(views: Views, top: float | None, place_known: bool, about: Provenance) -> dict[str, Picture]:
+    """Colour and gaze from the camera, and the observer's own view and sphere, hatched where nothing is known;
+    ``about``: what the header of each says."""
+    out, text = {}, about.text()
+    camera = views.seen["camera"]
     if place_known:
         out["color"] = Picture(
-            _png(srgb(views["camera"].color)), "The place in colour.", "The place, as the camera sees it."
+            _png(srgb(camera.color), text), "The place in colour.", "The place, as the camera sees it."
         )
     if top is None:
         return out
     heat = Heat(top)
-    draw = lambda name, title, mark=None: encode(
-        plots.gaze_figure(views[name].color, views[name].aovs["gaze"], views[name].mask, heat, title, marker=mark),
-        ".png",
-    )
+    hatched = lambda of: unknown_of(of, True) if place_known or not of.supported else None
+
+    def draw(name: str, title: str) -> bytes:
+        of = views.layers(name)
+        arrays = of.color, of.values, of.mask
+        drawn = plots.gaze_figure(*arrays, heat, title, marker=of.marker, unknown=hatched(of), note=of.basis)
+        return encode(drawn, ".png", text)
+
     if place_known:
         out["gaze"] = Picture(
-            draw("camera", "Where the observer looks", marker),
+            draw("camera", "Where the observer looks"),
             "Gaze of the observer over the colours of the place.",
             "The observer's gaze on the place. What the observer cannot see has none.",
         )
-        spread = views["camera"].aovs.get("gaze_std")
-        if spread is not None and np.any(spread[views["camera"].mask] > 0):
-            out["spread"] = _spread(views["camera"], spread)
+        spread = camera.aovs.get("gaze_std")
+        if spread is not None and np.any(spread[camera.mask] > 0):
+            out["spread"] = _spread(views.layers("camera", "gaze_std"), text)
     out["own"] = Picture(
         draw("own", "The observer's own view"), "Gaze in the observer's own view.", "What the observer sees ahead."
     )
-    sphere = views["sphere"]
-    drawn = sphere_figure(sphere.color, sphere.aovs["gaze"], sphere.mask, heat)
+    sphere = views.layers("sphere")
+    arrays = sphere.color, sphere.values, sphere.mask
+    drawn = sphere_figure(*arrays, heat, unknown=hatched(sphere), note=sphere.basis)
     out["sphere"] = Picture(
-        encode(drawn, ".png"), "Gaze in all directions around the observer.", "All that the observer could turn to."
+        encode(drawn, ".png", text),
+        "Gaze in all directions around the observer.",
+        "All that the observer could turn to.",
     )
     return out
 
 
-def _spread(view: Channels, spread: np.ndarray) -> Picture:
-    heat = Heat(top_of(spread, view.mask), colors="viridis")
+def _spread(of: Layers, text: Mapping[str, str]) -> Picture:
+    heat = Heat(top_of(of.values, of.mask), colors="viridis")
+    label = "standard deviation of the gaze [1/sr]"
+    arrays = of.color, of.values, of.mask
     drawn = plots.gaze_figure(
-        view.color, spread, view.mask, heat, "Where the fields disagree", label="standard deviation of the gaze [1/sr]"
+        *arrays, heat, "Where the fields disagree", label, unknown=unknown_of(of, True), note=of.basis
     )
     return Picture(
-        encode(drawn, ".png"),
+        encode(drawn, ".png", text),
         "Standard deviation of the gaze of the ensemble's members.",
         "How far the members of the ensemble are apart: where this is as large as the gaze itself, nothing is known.",
     )
 
 
-def pictures_of_rays(rays: Rays, test: Mapping[str, Any] | None) -> dict[str, Picture]:
-    """Plans of the floor. ``test``: what was held out of the training."""
-    plan = encode(ray_figures.floor_plan(rays), ".png")
-    about = {}
+def pictures_of_rays(rays: Rays, test: Mapping[str, Any] | None, about: Provenance) -> dict[str, Picture]:
+    """Plans of the floor. ``test``: what was held out of the training; ``about``: what the header of each says."""
+    plan = encode(ray_figures.floor_plan(rays), ".png", about.text())
+    held_out = {}
     words = "Each ray's place."
     if test and test.get("centres"):
-        about = {"centres": np.array(test["centres"], float), "radius": float(test.get("radius", 0.25))}
+        held_out = {"centres": np.array(test["centres"], float), "radius": float(test.get("radius", 0.25))}
         words += " Circles: positions that were held out of the training."
-    layout = encode(ray_figures.layout_figure(rays, title="Rays", **about), ".png")
+    layout = encode(ray_figures.layout_figure(rays, title="Rays", **held_out), ".png", about.text())
     return {
         "plan": Picture(plan, "Plan of how densely the floor is walked.", "How densely the floor is walked."),
         "layout": Picture(layout, "Plan of the places of all rays.", words),
     }
 
 
-def _png(display: np.ndarray) -> bytes:
+def _png(display: np.ndarray, text: Mapping[str, str]) -> bytes:
     import mitsuba as mi
 
-    return encode_png(mi.Bitmap(to_bytes(display)))
+    return encode_png(mi.Bitmap(to_bytes(display)), text)

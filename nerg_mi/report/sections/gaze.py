@@ -13,9 +13,10 @@ def body(run: Run) -> Html:
     shown = lambda names: [
         figure(image(p.png, p.alt), p.caption) for p in (run.pictures.get(n) for n in names) if p is not None
     ]
+    basis = f" The field is {run.basis}." if run.basis else ""
     words = (
-        f"{run.observer} Densities are in 1/sr: what a colour stands for, times the solid angle that it covers for the "
-        "observer, is the probability that they look there."
+        f"{run.observer}{basis} Densities are in 1/sr: what a colour stands for, times the solid angle that "
+        "it covers for the observer, is the probability that they look there."
     )
     return markup([paragraph(words), *shown(["gaze"]), element("div", shown(["own", "sphere"]), class_="side")])
 

@@ -38,6 +38,7 @@ def body(run: Run) -> Html:
         "shift and drag to move, the wheel comes closer; backs of surfaces are left out, so that one looks into "
         "rooms from outside. Blue marks are observers. On paper, and where scripts or WebGL are off, the picture "
         "stands for it."
+        f"{f' The gaze is {run.basis}.' if run.basis else ''}"
     )
     return markup([paragraph(words), element("div", controls, canvas, picture, data, id="stage")])
 

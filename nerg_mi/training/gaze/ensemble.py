@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.field.gaze.basis import basis_of
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.protocol import AnyGazeField, GazeDensity
 from nerg_mi.formats.checkpoint import read_checkpoint
@@ -135,6 +136,7 @@ def train_ensemble(
         fields.append(field)
         each.append(provenance)
     ensemble = GazeEnsemble(fields, supervision.support(plan.probes.radius, place))
+    ensemble.basis = basis_of(supervision.counts())
     provenance = _account(each, plan.settings, rays, kind)
     if write is not None:
         # Every member is in its file by now: there is nothing more to keep if this fails.
@@ -202,7 +204,7 @@ def _account(each: list[dict], settings: GazeSettings, rays: Rays, kind: str) ->
     out = {
         **each[0],
         "settings": settings.to_dict(),
-        "rays": len(rays),
+        **Supervision(rays).counts(),
         "probes_made": round(mean("probes_made")),
         **{k: mean(k) for k in ("escaped_directions", "escaped_gaze")},
         **{k: total(k) for k in ("steps", "seconds", "seconds_preparing")},

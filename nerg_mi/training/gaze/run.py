@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerg_mi.field.gaze.basis import basis_of
 from nerg_mi.field.gaze.protocol import GazeDensity
 from nerg_mi.training.common.run_state import kept_unless
 from nerg_mi.training.geometry.places import GazePlace
@@ -80,6 +81,7 @@ def train_gaze(
     trainer = last.trainer
     field = trainer.field(last.weights)
     field.support = used.support(plan.probes.radius, place)
+    field.basis = basis_of(supervision.counts())
     provenance = _provenance(supervision, place, plan, targets) | {
         "steps": trainer.steps,
         "seconds": round(file.spent, 1),
@@ -132,8 +134,7 @@ def _provenance(supervision: Supervision, place: GazePlace, plan: GazePlan, targ
         "settings": plan.settings.to_dict(),
         "probes": plan.probes.to_dict(),
         "align": alignment(place),
-        "rays": 0 if supervision.rays is None else len(supervision.rays),
-        "salience_views": len(supervision.views),
+        **supervision.counts(),
         "probes_made": len(targets.truth),
         "escaped_directions": round(targets.escape_share, 6),
         "escaped_gaze": round(targets.escaped_gaze, 6),

@@ -31,6 +31,12 @@ class Supervision:
         """SHA-256 of what a training takes from ``rays`` and from ``views`` (JSON); None for what there is none of."""
         return {"rays": None if self.rays is None else digest_rays(self.rays), "views": digest_views(self.views)}
 
+    def counts(self) -> dict[str, int]:
+        """How many ``rays`` of how many ``people``, and how many salience images there are (JSON)."""
+        rays = self.rays
+        people = 0 if rays is None else len(np.unique(rays.person))
+        return {"rays": 0 if rays is None else len(rays), "people": people, "salience_views": len(self.views)}
+
     def support(self, radius: float, place: GazePlace) -> RaySupport | None:
         """How many rays start around a position in the frame of ``place``, for probes of ``radius`` metres; None
         without rays."""

@@ -51,6 +51,10 @@ def test_the_rays_are_the_nearest(rays):
         KdeView(rays.select(np.zeros(300, bool)))
 
 
+def test_it_says_of_how_many_rays_it_is(rays):
+    assert KdeView(rays, COUNT).basis.words() == "300 rays of 1 person"
+
+
 def test_each_lane_has_the_density_of_its_observer(rgb, rays):
     """Two observers, in a scene that is turned, twice the size and elsewhere."""
     turn = np.array([[0, -2.0, 0, 5], [2, 0, 0, 6], [0, 0, 2, 7], [0, 0, 0, 1]])

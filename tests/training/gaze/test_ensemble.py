@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.field.gaze.basis import Basis
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
@@ -93,6 +94,7 @@ def test_members_are_trainings_of_resamples(threads):
     assert about["ensemble"] == {"members": 3, "resampled": "people", "seeds": [0, 100, 200]} and about["steps"] == 12
     # Of all rays, not of a resample.
     assert ensemble.support.cells[:, 3].sum() == len(rays) == about["rays"] and ensemble.support.radius == PROBES.radius
+    assert ensemble.basis == Basis(len(rays), len(rays.persons)) and about["people"] == len(rays.persons)
 
 
 def test_an_interrupted_ensemble_goes_on(threads, tmp_path):
