@@ -23,7 +23,7 @@ def command(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write into; it is made.")] = Path("out/demo"),
     define: Defines = None,
 ) -> None:
-    """Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, EXR, a report, run.json."""
+    """Render the demo store: colour, depth, gaze, visibility, the observer's gaze sphere, occlusion, EXR, a report."""
     options = replace(options, defaults=parse_defines(define))
     from nerg_mi.jobs import demo
 

@@ -3,6 +3,7 @@ directions. Everything is in the coordinates of the place."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from nerg_mi.transport.trace import default_settings, trace_depth
 DIRECTIONS = 4096
 """Directions of equal area around an eye."""
 
+_GOLDEN = (math.sqrt(5) - 1) / 2
 # Directions of the integral of a normalised field: shares are divided by their own sum.
 _INTEGRAL = 2048
 
@@ -103,16 +105,20 @@ class Onlooker:
 
 def eyes_of(rays: Rays, place: GazePlace, most: int) -> Eyes:
     """About ``most`` of the positions of ``rays``, in the place's coordinates, as many of each person: evenly chosen
-    among theirs in the order of time. Of more people than that so many, evenly chosen."""
+    among theirs in the order of time, and begun at another part of it for each person, so that all together are spread
+    over whole visits even where each person has only one. Of more people than that so many, evenly chosen."""
     there = np.unique(rays.person)
     if len(there) > most:
         there = there[np.linspace(0, len(there) - 1, most).astype(int)]
     each, chosen = max(1, most // len(there)), []
-    for person in there:
+    # Multiples of the golden ratio, modulo one, are spread evenly however many there are; the first is one half.
+    starts = (0.5 + np.arange(len(there)) * _GOLDEN) % 1
+    for person, start in zip(there, starts):
         own = np.flatnonzero(rays.person == person)
         own = own[np.argsort(rays.t[own], kind="stable")]
-        # In the middle of as many equal stretches.
-        chosen.append(own[((np.arange(min(each, len(own))) + 0.5) * len(own) / min(each, len(own))).astype(int)])
+        count = min(each, len(own))
+        # At the same share of as many equal stretches.
+        chosen.append(own[((np.arange(count) + start) * len(own) / count).astype(int)])
     rows = np.concatenate(chosen)
     return Eyes(place.points_from_rays(rays.origin[rows]), rays.person[rows])
 

@@ -13,6 +13,7 @@ from nerg_mi.field.gaze.product import GazeConfig, GazeField
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.rays.rays import Rays
 from nerg_mi.report.glances import Eyes, Onlooker, eyes_of, points_of_rays
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.place import Place
@@ -78,6 +79,20 @@ def test_eyes_are_as_many_of_each_person(hall):
     assert (np.diff(times) > 200).all()  # spread over the whole of the time
     few = eyes_of(rays, place, 2)
     assert len(few.positions) == 2 and len(set(few.person)) == 2
+
+
+def test_eyes_are_spread_over_whole_visits(hall):
+    """People walk from one end to the other: one eye of each must not be that in the middle of everybody's way."""
+    _, place = hall
+    people, each = 40, 50
+    walked = np.tile(np.linspace(-5, 5, each), people)
+    origin = np.stack([np.zeros_like(walked), walked, np.full_like(walked, 1.6)], axis=1)
+    person, t = np.repeat(np.arange(people), each), np.tile(np.arange(each, dtype=float), people)
+    names = tuple(f"p{k}" for k in range(people))
+    rays = Rays(t, person, names, origin, np.tile([1.0, 0, 0], (len(t), 1)), np.ones(len(t)))
+    for most in (people, 3 * people):
+        along = np.sort(eyes_of(rays, place, most).positions[:, 1])
+        assert len(along) == most and np.abs(along - np.linspace(-5, 5, most)).max() < 0.5
 
 
 def test_rays_end_at_their_own_points_or_at_the_place(hall):

@@ -28,7 +28,7 @@ class ReportOptions:
     )
     camera_to: tuple[float, ...] | None = option(None, "Point that it looks at, x,y,z.", "--to", parse=parse_numbers)
     fov: float | None = option(None, "Degrees between the left and right border of its picture.  [default: 70]")
-    eyes: int = option(96, "Places of people from which objects are looked for.", min=1, max=10_000)
+    eyes: int = option(200, "Places of people from which objects are looked for.", min=1, max=10_000)
     points: int = option(80_000, "Points of the 3D scene at most.", min=100, max=100_000)
     width: int = option(480, "Width of the pictures in pixels.", min=24, max=1200)
     spp: int = option(2, "Samples a pixel.", min=1)
