@@ -157,7 +157,7 @@ class _Work:
             around = company(self.rays, eyes.positions, place, radius if isinstance(radius, (int, float)) else 0.5)
         shown = results if options.names else [results_without_names(r, labels) for r in results]
         return Run(
-            options.title or hide(f"The gaze field {given.gaze.stem}"),
+            options.title or hide(f"The gaze field “{given.gaze.stem}”"),
             self.about,
             hide(place_words(given)),
             given.scene.kind,

@@ -21,10 +21,12 @@ def _company(run: Run) -> list[str]:
     radius = (run.provenance.get("probes") or {}).get("radius")
     within = f"{radius:g} m" if isinstance(radius, (int, float)) else "half a metre"
     alone, middle = sum(n <= 1 for n in run.company), sorted(run.company)[len(run.company) // 2]
+    words = f"At the {len(run.company)} places that were looked from, the median number of people within {within} is"
+    if not alone:
+        return [f"{words} {middle}, and nowhere fewer than two."]
     return [
-        f"At the {len(run.company)} places that were looked from, the median number of people within {within} is "
-        f"{middle}; at {alone} of them there was only one person. What a field says of a place where one person "
-        "stood is what one person did."
+        f"{words} {middle}; at {alone} of them there was only one person. What a field says of a place where one "
+        "person stood is what one person did."
     ]
 
 

@@ -24,7 +24,7 @@ def body(run: Run) -> Html:
         if half is None
         else (
             f" Of the way in CC from position-blind to what half of these people say of the other half, the field goes "
-            f"{100 * half:.0f} %."
+            f"{100 * half:.0f} %{'' if half <= 1 else ': further, for half of so few people tell little'}."
         )
     )
     return markup([*shown, paragraph(basis, way, kind="note"), *(paragraph(d, kind="note") for d in run.doubts)])
