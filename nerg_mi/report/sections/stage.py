@@ -9,7 +9,8 @@ from .protocol import Section
 
 
 def body(run: Run) -> Html:
-    """The viewer with its data, and the picture that stands for it without scripts, without WebGL and on paper."""
+    """The viewer with its data, and the picture that stands for it without scripts and without WebGL. On paper all of
+    it is left out, for the picture is in the section before."""
     assert run.stage is not None
     still = run.pictures.get("gaze") or run.pictures.get("color")
     picture = None if still is None else image(still.png, still.alt, "still")
@@ -36,11 +37,10 @@ def body(run: Run) -> Html:
     words = (
         f"{run.stage_points:,} points of surfaces as they were seen from where people can stand. Drag to turn, "
         "shift and drag to move, the wheel comes closer; backs of surfaces are left out, so that one looks into "
-        "rooms from outside. Blue marks are observers. On paper, and where scripts or WebGL are off, the picture "
-        "stands for it."
+        "rooms from outside. Blue marks are observers. Where scripts or WebGL are off, a picture stands for it."
         f"{f' The gaze is {run.basis}.' if run.basis else ''}"
     )
-    return markup([paragraph(words), element("div", controls, canvas, picture, data, id="stage")])
+    return markup([paragraph(words), element("div", controls, canvas, picture, data)])
 
 
 def absent(run: Run) -> str | None:
