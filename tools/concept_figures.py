@@ -100,8 +100,8 @@ def _rays(scene: Any) -> Any:
     axes.plot(*EYE[:2], "o", color="#1b6ca8", markersize=9, label="the observer: $p_o$")
     axes.plot(*ASIDE[:2], "s", color="#333333", markersize=8, label="a camera elsewhere")
     axes.set(title=f"{kept.sum()} rays of one observer, from above", xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    axes.set_ylim(-0.4, 7.2)
-    axes.legend(loc="upper center", fontsize=8, ncols=3)
+    axes.set_ylim(-0.4, 6.4)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), fontsize=8, ncols=3, frameon=False)
     return figure
 
 
