@@ -71,7 +71,8 @@ def side_by_side(
     height: int = 48,
     about: Provenance | None = None,
 ) -> None:
-    """Truth and each of ``methods`` at ``count`` test positions, as panoramas (z up) on one scale a row, in 1/sr."""
+    """Truth and each of ``methods`` at ``count`` test positions, as panoramas (z up) on one scale a row, in 1/sr, with
+    how many rays of how many people the truth is made of."""
     d, _ = latlong_grid(2 * height, height, Z_UP)
     which = np.unique(np.linspace(0, len(test.centres) - 1, count).astype(int))
     near = np.argmax(test.directions @ d.T, axis=0)  # the truth is smooth at the scale of its directions
@@ -89,6 +90,8 @@ def side_by_side(
             axis.set(xticks=[], yticks=[])
             if i == 0:
                 axis.set_title(name, fontsize=10)
-        row[0].set_ylabel(", ".join(f"{x:.1f}" for x in test.centres[which[i]]) + " m", fontsize=8)
+        rays = test.counts[which[i]]
+        words = f"{rays.sum():,.0f} rays of {np.count_nonzero(rays)} people"
+        row[0].set_ylabel(", ".join(f"{x:.1f}" for x in test.centres[which[i]]) + f" m\n{words}", fontsize=8)
         figure.colorbar(images[-1], ax=row.tolist(), shrink=0.9).set_label("1/sr", fontsize=8)
     save(figure, path, about)

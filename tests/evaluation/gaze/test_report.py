@@ -64,7 +64,8 @@ def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
     d = fibonacci_directions(500)
     centres = np.arange(15.0).reshape(5, 3)
     truth = np.exp(3 * d @ np.array([1.0, 0, 0])) * np.arange(1, 6)[:, None]
-    test, drawn = SimpleNamespace(centres=centres, directions=d, truth=truth), []
+    counts = np.array([[3, 0, 4], [1, 1, 1], [1, 1, 1], [1, 1, 1], [900, 600, 0]])
+    test, drawn = SimpleNamespace(centres=centres, directions=d, truth=truth, counts=counts), []
     monkeypatch.setattr(gaze_report, "save", lambda figure, path, about: drawn.append(figure))
     asked = []
 
@@ -79,7 +80,8 @@ def test_pictures_are_on_the_scale_of_the_truth(tmp_path, monkeypatch):
     assert [a.get_ylabel() for a in scales] == ["1/sr", "1/sr"]
     assert [tuple(a.get_ylim()) for a in scales] == [images[k].images[0].get_clim() for k in (0, 2)]
     assert np.array_equal(asked[0], centres[[0, 4]]) and [a.get_title() for a in images] == ["truth", "twice", "", ""]
-    assert images[0].get_ylabel() == "0.0, 1.0, 2.0 m" and images[2].get_ylabel() == "12.0, 13.0, 14.0 m"
+    assert images[0].get_ylabel() == "0.0, 1.0, 2.0 m\n7 rays of 2 people"
+    assert images[2].get_ylabel() == "12.0, 13.0, 14.0 m\n1,500 rays of 2 people"
     for a, b in (images[:2], images[2:]):
         # One scale a row.
         assert a.images[0].get_clim() == b.images[0].get_clim() and a.images[0].get_clim()[0] == 0
