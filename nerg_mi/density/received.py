@@ -87,6 +87,36 @@ def _centroids(n: int) -> np.ndarray:
     return np.array(upright + turned, np.float32) / n
 
 
+def attended(
+    place: Place | None,
+    density: Density,
+    p_o: Point3f,
+    p: Point3f,
+    n: Vector3f,
+    falloff: Float = 0.0,
+    settings: ObserverSettings | None = None,
+    two_sided: bool = False,
+) -> Float:
+    """Attention per solid angle, in 1/sr, that the observer ``p_o`` gives ``p`` with normal ``n`` after occlusion.
+
+    Arguments as of ``arriving``, which is this times the Jacobian from solid angle to area.
+    """
+    import mitsuba as mi
+
+    distance, r_o = distance_and_direction(p_o, p)
+    cosine = -dr.dot(n, r_o)
+    n = dr.select(two_sided & (cosine < 0), -n, n)
+    active = ((cosine != 0) if two_sided else (cosine > 0)) & (distance > 0)
+    p_od, seen = p, mi.Float(1)
+    if place is not None:
+        settings = settings or ObserverSettings(march=default_settings(place))
+        # Looked for a tolerance above the surface, as if a camera stood there.
+        found = trace_sight(place, mi.Ray3f(p + n, -n), p, p_o, 0, active, mi.Float(falloff), settings)
+        p_od, seen = found.p_od, found.visibility
+        active &= seen > 0
+    return dr.select(active, density(p_od, p_o, r_o, active) * seen, 0)
+
+
 def arriving(
     place: Place | None,
     density: Density,
@@ -104,23 +134,13 @@ def arriving(
     ``two_sided`` counts both sides of an open one. Lanes are pairs; differentiable in all of them, in the density's
     parameters and in ``falloff``, but not over the edges of ``place``.
     """
-    import mitsuba as mi
-
+    g = attended(place, density, p_o, p, n, falloff, settings, two_sided)
     distance, r_o = distance_and_direction(p_o, p)
     cosine = -dr.dot(n, r_o)
-    n = dr.select(two_sided & (cosine < 0), -n, n)
     cosine = dr.abs(cosine) if two_sided else cosine
-    active = (cosine > 0) & (distance > 0)
-    p_od, seen = p, mi.Float(1)
-    if place is not None:
-        settings = settings or ObserverSettings(march=default_settings(place))
-        # Looked for a tolerance above the surface, as if a camera stood there.
-        found = trace_sight(place, mi.Ray3f(p + n, -n), p, p_o, 0, active, mi.Float(falloff), settings)
-        p_od, seen = found.p_od, found.visibility
-        active &= seen > 0
-    g = dr.select(active, density(p_od, p_o, r_o, active), 0)
-    square = dr.square(dr.select(active, distance, 1))
-    return dr.select(active, g * seen * cosine / square, 0)
+    facing = (cosine > 0) & (distance > 0)
+    square = dr.square(dr.select(facing, distance, 1))
+    return dr.select(facing, g * cosine / square, 0)
 
 
 def contributions(
