@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.maths.color import decode_srgb, encode_srgb
 
+from .gltf import pack_glb
 from .ply import write_columns
 
 
@@ -242,10 +241,4 @@ def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
         "bufferViews": views,
         "accessors": accessors,
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    data += b"\0" * (-len(data) % 4)
-    head = struct.pack("<III", 0x46546C67, 2, 28 + len(text) + len(data))
-    write_bytes(
-        path, head, struct.pack("<II", len(text), 0x4E4F534A), text, struct.pack("<II", len(data), 0x004E4942), data
-    )
+    write_bytes(path, *pack_glb(document, data))

@@ -1,0 +1,168 @@
+"""Binary glTF 2.0 (.glb): the container, and the triangles of a file that somebody else wrote."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import is_count, parse_json, read_bytes, reading
+
+BYTES = 1 << 30
+"""A file may have so many bytes."""
+
+DEPTH = 64
+"""Nodes may be nested so deep."""
+
+INSTANCES = 100_000
+"""So many meshes may stand in a scene."""
+
+TRIANGLES = 20_000_000
+"""So many triangles may be in all of them."""
+
+_MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
+_INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
+_TRIANGLES = 4
+
+
+def pack_glb(document: dict[str, Any], data: bytes) -> tuple[bytes, ...]:
+    """The bytes of a file, in parts, of the ``document`` and of its only buffer ``data``."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    head = struct.pack("<III", _MAGIC, 2, 28 + len(text) + len(data))
+    return head, struct.pack("<II", len(text), _JSON), text, struct.pack("<II", len(data), _BINARY), data
+
+
+def read_glb(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """``(vertices (V, 3), faces (F, 3))`` of all triangles of the file's scene, its nodes applied, in glTF's frame: right
+    -handed, y up. Lines, points, materials, skins and morphs are not looked at.
+
+    Raises `NergError` for what is damaged, compressed or beyond this module's limits, and where there is no triangle.
+    """
+    raw = read_bytes(path, "mesh", BYTES)
+    with reading(path, "mesh", "export it again"):
+        document, data = _parts(raw, path)
+        found = list(_instances(document))
+        vertices: list[np.ndarray] = []
+        faces: list[np.ndarray] = []
+        count = triangles = 0
+        known: dict[tuple[int, int | None], tuple[np.ndarray, np.ndarray]] = {}
+        for primitive, matrix in found:
+            if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
+                raise ValueError("its triangles are compressed (Draco); export it without compression")
+            key = primitive["attributes"]["POSITION"], primitive.get("indices")
+            if key not in known:
+                known[key] = _triangles(document, data, *key)
+            corners, index = known[key]
+            triangles += len(index)
+            if triangles > TRIANGLES:
+                raise ValueError(f"it has more than the {TRIANGLES:,} triangles that are read")
+            vertices.append(corners @ matrix[:3, :3].T + matrix[:3, 3])
+            # A mirrored instance is seen from its other side.
+            faces.append(count + (index if np.linalg.det(matrix[:3, :3]) >= 0 else index[:, ::-1]))
+            count += len(corners)
+        if not triangles:
+            raise ValueError("its scene has no triangles")
+        return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _parts(raw: bytes, path: str | os.PathLike) -> tuple[dict[str, Any], bytes]:
+    magic, version, _ = struct.unpack_from("<III", raw)
+    if magic != _MAGIC or version != 2:
+        raise ValueError("it is no binary glTF of version 2")
+    at, document, data = 12, None, b""
+    while at + 8 <= len(raw):
+        length, kind = struct.unpack_from("<II", raw, at)
+        part = raw[at + 8 : at + 8 + length]
+        if len(part) < length:
+            raise ValueError("it ends within one of its chunks")
+        if kind == _JSON and document is None:
+            document = parse_json(part, path, "mesh")
+        elif kind == _BINARY and not data:
+            data = part
+        at += 8 + length
+    if not isinstance(document, dict):
+        raise ValueError("it has no document")
+    return document, data
+
+
+def _instances(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Primitives of triangles, and where each stands: the matrix (4, 4) of its node in the scene."""
+    nodes = document.get("nodes", [])
+    scenes = document.get("scenes")
+    roots = scenes[_index(document.get("scene", 0))]["nodes"] if scenes else range(len(nodes))
+    waiting = [(_index(k), np.eye(4), 0) for k in roots]
+    seen = 0
+    while waiting:
+        number, above, depth = waiting.pop()
+        seen += 1
+        if depth > DEPTH or seen > INSTANCES:
+            raise ValueError("its nodes are nested too deep, or in a circle")
+        node = nodes[number]
+        here = above @ _matrix(node)
+        waiting += [(_index(k), here, depth + 1) for k in reversed(node.get("children", []))]
+        if "mesh" in node:
+            for primitive in document["meshes"][_index(node["mesh"])]["primitives"]:
+                if primitive.get("mode", _TRIANGLES) == _TRIANGLES:
+                    yield primitive, here
+
+
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        out = np.array(node["matrix"], np.float64).reshape(4, 4).T
+    else:
+        x, y, z, w = (float(v) for v in node.get("rotation", (0, 0, 0, 1)))
+        rotation = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        out = np.eye(4)
+        out[:3, :3] = np.array(rotation) * np.array(node.get("scale", (1, 1, 1)), np.float64).reshape(3)
+        out[:3, 3] = np.array(node.get("translation", (0, 0, 0)), np.float64).reshape(3)
+    if not np.isfinite(out).all():
+        raise ValueError("one of its nodes stands nowhere")
+    return out
+
+
+def _triangles(
+    document: dict[str, Any], data: bytes, position: object, indices: object
+) -> tuple[np.ndarray, np.ndarray]:
+    corners = _values(document, data, position, "VEC3", {5126: "<f4"}).astype(np.float64)
+    if indices is None:
+        index = np.arange(len(corners))
+    else:
+        index = _values(document, data, indices, "SCALAR", _INDICES).reshape(-1).astype(np.int64)
+    if len(index) % 3 or (len(index) and index.max() >= len(corners)):
+        raise ValueError("its triangles have corners that are none of its vertices")
+    return corners, index.reshape(-1, 3)
+
+
+def _values(document: dict[str, Any], data: bytes, number: object, shape: str, kinds: dict[int, str]) -> np.ndarray:
+    """An accessor's values (N, components), as far as the bytes that are there hold them."""
+    accessor = document["accessors"][_index(number)]
+    if accessor["type"] != shape or accessor["componentType"] not in kinds or "sparse" in accessor:
+        raise ValueError("its positions or indices are of a kind that is not read; export it again, without compression")
+    view = document["bufferViews"][_index(accessor["bufferView"])]
+    if _index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0]:
+        raise ValueError("its triangles are in another file; export it as one .glb")
+    dtype, width = np.dtype(kinds[accessor["componentType"]]), {"SCALAR": 1, "VEC3": 3}[shape]
+    count, step = _index(accessor["count"]), _index(view.get("byteStride", 0)) or dtype.itemsize * width
+    start = _index(view.get("byteOffset", 0)) + _index(accessor.get("byteOffset", 0))
+    if step < dtype.itemsize * width or (count and start + (count - 1) * step + dtype.itemsize * width > len(data)):
+        raise ValueError("it ends before the values that it announces")
+    if not count:
+        return np.zeros((0, width), dtype)
+    return np.ndarray((count, width), dtype, data, start, (step, dtype.itemsize)).copy()
+
+
+def _index(value: object) -> int:
+    if not is_count(value):
+        raise NergError("a mesh numbers its parts by what is no whole number; export it again")
+    return int(value)  # pyright: ignore[reportArgumentType] is_count has looked
