@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,69 @@ TRIANGLES = 20_000_000
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
 _TRIANGLES = 4
+
+
+Attribute = tuple[str, np.ndarray, bool]
+"""Name of a vertex attribute, its values (V,) or (V, components), and whether integers stand for 0 to 1."""
+
+_KINDS = {"float32": 5126, "uint16": 5123, "uint32": 5125}
+_SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+
+
+def shown_unlit(
+    attributes: Sequence[Attribute],
+    faces: np.ndarray | None,
+    up: str = "z",
+    extras: Mapping[str, Any] | None = None,
+    image: bytes | None = None,
+) -> tuple[bytes, ...]:
+    """The bytes of a file, in parts, of one mesh (without ``faces`` of points) whose colours are shown as they are.
+
+    ``attributes``: POSITION first; float32 or uint16. ``up``: axis that is up, z or y; glTF's is y, and the node is
+    turned for z. ``extras``: what the file says of itself. ``image``: a PNG, of which TEXCOORD_0 takes the colours.
+    """
+    arrays = [(name, np.ascontiguousarray(values), shared, 34962) for name, values, shared in attributes]
+    if faces is not None:
+        arrays.append(("indices", np.asarray(faces, "<u4").ravel(), False, 34963))
+    views, accessors, data = [], [], b""
+    for _, values, shared, target in arrays:
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes, "target": target})
+        kind, shape = _KINDS[values.dtype.name], _SHAPES[1 if values.ndim == 1 else values.shape[1]]
+        accessors.append({"bufferView": len(views) - 1, "componentType": kind, "count": len(values), "type": shape})
+        if shared:
+            accessors[-1]["normalized"] = True
+        data += values.tobytes()
+        data += b"\0" * (-len(data) % 4)
+    position = arrays[0][1]
+    accessors[0] |= {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
+    named = {name: number for number, (name, *_) in enumerate(arrays) if name != "indices"}
+    primitive: dict[str, Any] = {"attributes": named, "mode": 0 if faces is None else _TRIANGLES, "material": 0}
+    if faces is not None:
+        primitive["indices"] = len(arrays) - 1
+    surface: dict[str, Any] = {"metallicFactor": 0}
+    material: dict[str, Any] = {"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": surface}
+    asset: dict[str, Any] = {"version": "2.0", "generator": "nerg_mi"}
+    document: dict[str, Any] = {
+        "asset": asset | ({"extras": dict(extras)} if extras else {}),
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0} | ({"rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]} if up == "z" else {})],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [material],
+        "extensionsUsed": ["KHR_materials_unlit"],
+    }
+    if image is not None:
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(image)})
+        data += image
+        surface["baseColorTexture"] = {"index": 0}
+        material["doubleSided"] = True
+        document |= {
+            "textures": [{"source": 0, "sampler": 0}],
+            "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+            "images": [{"bufferView": len(views) - 1, "mimeType": "image/png"}],
+        }
+    document |= {"buffers": [{"byteLength": len(data)}], "bufferViews": views, "accessors": accessors}
+    return pack_glb(document, data)
 
 
 def pack_glb(document: dict[str, Any], data: bytes) -> tuple[bytes, ...]:

@@ -7,7 +7,7 @@ shows, gives points an empty list of faces, and knows no attributes of faces tha
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -21,13 +21,15 @@ def write_columns(
     vertices: Mapping[str, np.ndarray],
     faces: np.ndarray | None = None,
     of_faces: Mapping[str, np.ndarray] | None = None,
+    comments: Sequence[str] = (),
 ) -> None:
     """Write ``vertices``, columns (V,) by the names of their properties, and ``faces`` (F, 3), with columns (F,)
     ``of_faces``.
 
-    Columns are float32, or uint8. Of properties ``NAME_0``, ``NAME_1``, ... Mitsuba makes an attribute ``NAME``.
+    Columns are float32, or uint8; ``comments``: lines of the header. Of properties ``NAME_0``, ``NAME_1``, ... Mitsuba makes an attribute ``NAME``.
     """
     table, head = _table(vertices), ["ply", "format binary_little_endian 1.0"]
+    head += [f"comment {line}" for line in comments]
     head += [f"element vertex {len(table)}", *_properties(table)]
     data = table.tobytes()
     if faces is not None:

@@ -13,7 +13,7 @@ from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.maths.color import decode_srgb, encode_srgb
 
-from .gltf import pack_glb
+from .gltf import Attribute, shown_unlit
 from .ply import write_columns
 
 
@@ -211,34 +211,9 @@ def write_glb(surface: Surface, path: str | Path, up: str = "z") -> None:
     linear = decode_srgb(surface.colors)
     rgba = np.full((len(linear), 4), 65535, "<u2")
     rgba[:, :3] = np.rint(linear * 65535)
-    position = surface.vertices.astype("<f4")
-    normal = surface.normals.astype("<f4")
-    arrays = [("POSITION", position, 5126, "VEC3"), ("NORMAL", normal, 5126, "VEC3"), ("COLOR_0", rgba, 5123, "VEC4")]
-    if surface.faces is not None:
-        arrays.append(("indices", surface.faces.astype("<u4").ravel(), 5125, "SCALAR"))
-    views, accessors, data = [], [], b""
-    for name, array, kind, shape in arrays:
-        target = 34963 if name == "indices" else 34962
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes, "target": target})
-        accessors.append({"bufferView": len(views) - 1, "componentType": kind, "count": len(array), "type": shape})
-        data += array.tobytes()
-    accessors[0] |= {"min": position.min(0).tolist(), "max": position.max(0).tolist()}
-    accessors[2]["normalized"] = True
-    mode = 0 if surface.faces is None else 4
-    primitive = {"attributes": {a[0]: i for i, a in enumerate(arrays[:3])}, "mode": mode, "material": 0}
-    if surface.faces is not None:
-        primitive["indices"] = 3
-    node = {"mesh": 0} | ({"rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]} if up == "z" else {})
-    document = {
-        "asset": {"version": "2.0", "generator": "nerg_mi"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [{"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicFactor": 0}}],
-        "extensionsUsed": ["KHR_materials_unlit"],
-        "buffers": [{"byteLength": len(data)}],
-        "bufferViews": views,
-        "accessors": accessors,
-    }
-    write_bytes(path, *pack_glb(document, data))
+    attributes: list[Attribute] = [
+        ("POSITION", surface.vertices.astype("<f4"), False),
+        ("NORMAL", surface.normals.astype("<f4"), False),
+        ("COLOR_0", rgba, True),
+    ]
+    write_bytes(path, *shown_unlit(attributes, surface.faces, up))

@@ -99,16 +99,17 @@ def weld(vertices: np.ndarray, faces: np.ndarray, what: str = "the mesh") -> tup
     if not np.isfinite(vertices).all():
         raise NergError(f"{what} has vertices that are not finite; export it again")
     kept = np.unique(faces)
-    place, number = np.unique(vertices[kept], axis=0, return_inverse=True)
+    one, number = _unique_rows(vertices[kept])
+    place = vertices[kept[one]]
     of = np.zeros(len(vertices), np.int64)
-    of[kept] = number.reshape(-1)
+    of[kept] = number
     joined = of[faces]
     a, b, c = (joined[:, k] for k in range(3))
     whole = (a != b) & (b != c) & (c != a)
     # Products of tiny edges vanish before the edges do.
     extent = float(np.abs(place - place.mean(0)).max(initial=0)) or 1.0
     whole[whole] = triangle_areas(place[joined[whole]] / extent) > 0
-    _, first = np.unique(np.sort(joined[whole], axis=1), axis=0, return_index=True)
+    first, _ = _unique_rows(np.sort(joined[whole], axis=1))
     index = np.flatnonzero(whole)[np.sort(first)]
     if not len(index):
         raise NergError(f"{what} has no face with an area; export it again, as triangles")
@@ -116,3 +117,12 @@ def weld(vertices: np.ndarray, faces: np.ndarray, what: str = "the mesh") -> tup
     mesh = Mesh(place[left], corner.reshape(-1, 3).astype(np.int64))
     flat = int(len(faces) - whole.sum())
     return mesh, index, Repairs(len(kept) - len(place), flat, int(whole.sum() - len(index)))
+
+
+def _unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """``(first, number)`` of rows (N, 3) that are equal: the first of each kind, and the kind (N,) of each."""
+    order = np.lexsort(rows.T[::-1])
+    new = np.r_[True, (rows[order[1:]] != rows[order[:-1]]).any(axis=1)] if len(rows) else np.zeros(0, bool)
+    number = np.empty(len(rows), np.int64)
+    number[order] = np.cumsum(new) - 1
+    return order[new], number

@@ -1,0 +1,273 @@
+"""Gaze on surfaces: how much of it each square metre of a mesh receives, from a gaze field or from tracked rays."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.alignment.record import read_similarity
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation.saliency import cc
+from nerg_mi.figures.colors import find_colors
+from nerg_mi.figures.overlay import Heat
+from nerg_mi.figures.provenance import provenance
+from nerg_mi.files.atomic import check_writable
+from nerg_mi.formats.checkpoint import read_metadata
+from nerg_mi.interruption import Interruption
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.rays import Rays
+from nerg_mi.surfaces.cones import WIDEST
+from nerg_mi.surfaces.gaze_source import GazeSettings
+from nerg_mi.surfaces.mesh import Mesh
+from nerg_mi.surfaces.population import Crowd, ray_seconds
+from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
+from nerg_mi.surfaces.smoothing import Smoother
+from nerg_mi.surfaces.sums import Sums, merge
+
+from .backend import select_backend
+from .baking.chunks import BakeScene, bake_chunk, parts_of
+from .baking.lookers import check_weights, find_crowd, tracked_rays
+from .baking.outputs import SUFFIXES, Baked, check_texture, write_output
+from .baking.receivers import Receivers, cut, read_receivers
+from .gaze_places import align_of_training
+from .options.bake import BakeOptions
+from .reporter import SILENT, Reporter
+
+UNITS = {"share": "share of gaze per square metre [1/m²]", "seconds": "gaze per square metre [s/m²]"}
+SOURCES = ("field", "rays")
+_CONE = 1.5  # degrees: the error of good trackers, and the radius of the fovea
+_ERROR = 5e-3  # of what there was; more is said to be too much
+
+
+@dataclass(frozen=True, eq=False)
+class Bake:
+    """``mesh``: the surface in scene units, cut as finely as gaze was put on it, with ``density`` (V,) of its vertices
+    per square metre, and ``share`` (F,) of gaze on its faces. ``on_surface``, ``elsewhere`` (at other shapes, or in a
+    field), ``escaped`` (at nothing): shares of all gaze, and ``total``, what that is; ``unaccounted``: their difference.
+    ``summary``: all that was found, as the JSON file has it. ``files`` written."""
+
+    mesh: Mesh
+    density: np.ndarray
+    share: np.ndarray
+    on_surface: float
+    elsewhere: float
+    escaped: float
+    total: float
+    summary: dict[str, Any]
+    files: tuple[Path, ...] = ()
+
+    @property
+    def unaccounted(self) -> float:
+        """Gaze that was found nowhere, as a share of all: the error of the bake."""
+        return self.total - self.on_surface - self.elsewhere - self.escaped
+
+
+def bake(
+    surface: str | Path,
+    outputs: Sequence[str | Path] = (),
+    options: BakeOptions | None = None,
+    reporter: Reporter = SILENT,
+    rays: Rays | None = None,
+) -> Bake:
+    """Put the gaze of ``options`` on ``surface``: a mesh (.ply, .obj, .glb), a scene (.xml), or a radiance field.
+
+    ``outputs``: files to write, by their suffixes (.ply, .glb, .csv, .json). ``rays``: in memory, in place of the file
+    in ``options``. Raises `NergError` for what the user can mend.
+    """
+    options, surface, start = options or BakeOptions(), Path(surface), time.perf_counter()
+    paths = [Path(path) for path in outputs]
+    source = _check(surface, paths, options, rays)
+    ns = select_backend(options.mode, options.threads)
+    reporter.progress(0.0, "reading")
+    tracked = rays if rays is not None else None
+    if tracked is None and options.rays is not None:
+        tracked = load_rays(options.rays, options.most, options.seed)
+    if tracked is not None and not len(tracked):
+        raise NergError("there are no rays in what --rays names; give some")
+    align = _alignment(options)
+    receivers = read_receivers(surface, options.shapes, options.resolution, ns, reporter)
+    finest = options.detail
+    refined = cut(receivers, finest, align.scale)
+    mesh = refined.mesh
+    reporter.message(f"{len(receivers.mesh.faces):,} triangles, cut into {len(mesh.faces):,} to hold gaze")
+    cone = math.radians(_CONE if options.cone is None and source == "rays" else options.cone or 0.0)
+    scene = BakeScene(
+        mesh,
+        receivers.others,
+        options.gaze if source == "field" else None,
+        surface.absolute() if surface.suffix.lower() == ".xml" else None,
+        GazeSettings(angle=math.radians(options.angle), cone=cone),
+        RaySettings(cone=cone, bundle=options.bundle, seed=options.seed),
+    )
+    factor = 1.0
+    if source == "rays":
+        assert tracked is not None
+        who: Crowd | TrackedRays = tracked_rays(tracked, align, options.weights)
+        factor = float(ray_seconds(tracked).sum()) if options.unit == "seconds" else 1.0
+    else:
+        who = find_crowd(options, tracked, align, reporter)
+    people = _halves(tracked, options.seed) if options.halves and tracked is not None else None
+    sums, halves = _run(scene, who, people, reporter)
+    reporter.progress(0.9, "smoothing")
+    smoother = Smoother(mesh, options.smooth * align.scale) if options.smooth > 0 else None
+    shares, amounts = _smoothed(mesh, sums, smoother)
+    weight = sums.weight
+    share, amount = shares / weight, amounts / weight
+    density = factor * amount / mesh.vertex_area * align.scale**2
+    summary = _summary(receivers, refined.parent, sums, share, factor, options, source)
+    if halves is not None:
+        summary["halves_cc"] = _agreement(mesh, halves, smoother)
+    heat = Heat(options.top or _top(mesh, density), options.cmap, decades=options.decades)
+    given = (surface, options.gaze, options.rays, options.path, options.align)
+    about = provenance("nerg bake", [p for p in given if p is not None], options.seed, options)
+    summary["provenance"] = {"what": about.what, "inputs": dict(about.inputs), "seed": about.seed}
+    summary["provenance"] |= {"settings": dict(about.settings), "versions": dict(about.versions)}
+    baked = Baked(receivers, refined, density, share, UNITS[options.unit], align.scale, heat, about, summary)
+    _tell(summary, reporter)
+    for path in paths:
+        reporter.progress(0.95, f"writing {path.name}")
+        write_output(baked, path, options.texture)
+        reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB, {time.perf_counter() - start:.1f} s)")
+    parts = (summary[k] for k in ("on_surface", "elsewhere", "escaped", "total"))
+    return Bake(mesh, density, share, *parts, summary, tuple(paths))
+
+
+def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
+    """Whose gaze it is, of `SOURCES`. Raises `NergError` for options that contradict each other."""
+    for path in paths:
+        check_writable(path, *SUFFIXES)
+    check_texture(paths, options.texture)
+    check_weights(options.weights)
+    find_colors(options.cmap)
+    people = rays is not None or options.rays is not None
+    of_scene = surface.suffix.lower() == ".xml"
+    source = options.source or ("field" if options.gaze is not None or (of_scene and not people) else "rays")
+    if source not in SOURCES:
+        raise NergError(f'--from is {" or ".join(SOURCES)}, got "{source}"')
+    if options.unit not in UNITS:
+        raise NergError(f'--unit is {" or ".join(UNITS)}, got "{options.unit}"')
+    if source == "rays" and not people:
+        raise NergError("whose gaze is it? give a gaze field by --gaze, or rays by --rays")
+    if source == "rays" and (options.observer is not None or options.path is not None):
+        raise NergError("--observer and --path look with a gaze field; give --gaze, or leave them out")
+    if source == "field" and (options.unit == "seconds" or options.halves):
+        raise NergError("--unit seconds and --halves are of rays, whose time is known; add --from rays")
+    if options.cone is not None and not 0 <= options.cone <= WIDEST:
+        raise NergError(f"--cone is 0 to {WIDEST:g} degrees, got {options.cone:g}")
+    if not (np.isfinite(options.smooth) and options.smooth >= 0):
+        raise NergError(f"--smooth is a length in metres, got {options.smooth:g}")
+    if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
+        raise NergError(f"--top must be positive, got {options.top}")
+    return source
+
+
+def _alignment(options: BakeOptions) -> Similarity:
+    if options.align is not None:
+        return read_similarity(options.align, "--align", "rays to place")
+    return Similarity() if options.gaze is None else align_of_training(read_metadata(options.gaze).get("provenance", {}))
+
+
+def _halves(rays: Rays, seed: int) -> np.ndarray:
+    """Which rays are of the first half of the people, (N,) bool, drawn by ``seed``."""
+    people = np.unique(rays.person)
+    if len(people) < 2:
+        raise NergError("--halves needs two people at least, and the rays are of one")
+    first = np.random.default_rng(seed).permutation(people)[: len(people) // 2]
+    return np.isin(rays.person, first)
+
+
+def _run(
+    scene: BakeScene, who: Crowd | TrackedRays, first: np.ndarray | None, reporter: Reporter
+) -> tuple[Sums, tuple[Sums, Sums] | None]:
+    """Sums of all parts, and of two halves of the rays, the ``first`` and the others, where they are asked for."""
+    groups = [who]
+    if first is not None and isinstance(who, TrackedRays):
+        order = [np.flatnonzero(first), np.flatnonzero(~first)]
+        starts = [0, len(order[0])]
+        groups = [
+            TrackedRays(who.origins[rows], who.directions[rows], who.weights[rows], start)
+            for rows, start in zip(order, starts)
+        ]
+    parts = [list(parts_of(group)) for group in groups]
+    count, done, found = sum(map(len, parts)), 0, []
+    with Interruption() as stop:
+        for group in parts:
+            sums = Sums.none(len(scene.mesh.faces), len(scene.mesh.vertices))
+            for part in group:
+                stop.check()
+                sums = sums.plus(bake_chunk(scene, part))
+                done += 1
+                reporter.progress(0.05 + 0.85 * done / count, f"part {done} of {count}")
+            found.append(sums)
+    return merge(found), (found[0], found[1]) if len(found) == 2 else None
+
+
+def _smoothed(mesh: Mesh, sums: Sums, smoother: Smoother | None) -> tuple[np.ndarray, np.ndarray]:
+    """Integrals over faces (F,) and over hat functions (V,), after smoothing."""
+    if smoother is None:
+        return sums.face, sums.vertex
+    amount = smoother(sums.vertex)
+    return (amount / mesh.vertex_area)[mesh.faces].mean(axis=1) * mesh.area, amount
+
+
+def _agreement(mesh: Mesh, halves: tuple[Sums, Sums], smoother: Smoother | None) -> float:
+    """Correlation of two halves' densities over the surface."""
+    first, second = (_smoothed(mesh, half, smoother)[0] / mesh.area for half in halves)
+    return float(cc(first, second, mesh.area))
+
+
+def _top(mesh: Mesh, density: np.ndarray) -> float:
+    """The density that 99.5 % of the looked-at area stays below."""
+    seen = np.flatnonzero(density > 0)
+    if not len(seen):
+        return 1.0
+    order = seen[np.argsort(density[seen], kind="stable")]
+    area = np.cumsum(mesh.vertex_area[order])
+    return float(density[order[min(np.searchsorted(area, 0.995 * area[-1]), len(order) - 1)]])
+
+
+def _summary(
+    receivers: Receivers,
+    parent: np.ndarray,
+    sums: Sums,
+    share: np.ndarray,
+    factor: float,
+    options: BakeOptions,
+    source: str,
+) -> dict[str, Any]:
+    w = sums.weight
+    of_shape = np.bincount(receivers.shape[parent], share, len(receivers.names))
+    return {
+        "source": source,
+        "unit": UNITS[options.unit],
+        "factor": factor,
+        "lookers": sums.count,
+        "total": sums.total / w,
+        "on_surface": float(share.sum()),
+        "elsewhere": sums.elsewhere / w,
+        "escaped": sums.escaped / w,
+        "unaccounted": sums.unaccounted / w,
+        "shapes": {name: float(value) for name, value in zip(receivers.names, of_shape)},
+    }
+
+
+def _tell(summary: dict[str, Any], reporter: Reporter) -> None:
+    whom = f"{summary['lookers']:,} {'rays' if summary['source'] == 'rays' else 'observers'}"
+    reporter.message(
+        f"of the gaze of {whom} {summary['on_surface']:.2%} lies on the surface, {summary['elsewhere']:.2%} on what "
+        f"else is there, and {summary['escaped']:.2%} meets no surface; {abs(summary['unaccounted']):.1e} is "
+        "unaccounted for"
+    )
+    if abs(summary["total"] - 1) > _ERROR:
+        reporter.warn(f"the gaze adds up to {summary['total']:.3f} over the sphere, not to one: compare shares by that")
+    if abs(summary["unaccounted"]) > _ERROR * summary["total"]:
+        reporter.warn("more than 0.5 % of the gaze is unaccounted for; a smaller --angle or --detail makes that less")
+    if "halves_cc" in summary:
+        reporter.message(f"two halves of the people agree by CC {summary['halves_cc']:.3f}")

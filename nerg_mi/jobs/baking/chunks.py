@@ -1,0 +1,116 @@
+"""The work of a bake in parts: a scene's description and some of its observers, or rays, give partial sums.
+
+A part is a plain function of what it is given: it may be computed anywhere, any number of times, with the same result.
+Parts are cut by numbers of this module, not by the machine, and their sums are added in the order of the parts.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.backend import namespace
+from nerg_mi.files.checksum import file_sha256
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.surfaces.gaze_source import GazeSettings, MakeLooker, gaze_sums, lookers_of_field
+from nerg_mi.surfaces.mesh import Mesh
+from nerg_mi.surfaces.population import Crowd
+from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays, ray_sums
+from nerg_mi.surfaces.reading import Triangles
+from nerg_mi.surfaces.sums import Sums
+from nerg_mi.surfaces.target import Target
+from nerg_mi.transport.observer.gaze import PlacedGaze
+
+OBSERVERS = 4
+"""Observers of a part."""
+
+RAYS = 1 << 16
+"""Rays of a part."""
+
+
+@dataclass(frozen=True, eq=False)
+class BakeScene:
+    """All that a part needs to know besides who looks; it can be pickled, and refers to ``gaze`` and ``scene`` by file.
+
+    ``mesh`` receives, ``others`` hide it. ``gaze``: the field's checkpoint, None for that of the ``scene`` file, whose
+    field stands around the meshes; None for a place of meshes alone.
+    """
+
+    mesh: Mesh
+    others: tuple[Triangles, ...] = ()
+    gaze: Path | None = None
+    scene: Path | None = None
+    of_gaze: GazeSettings = GazeSettings()
+    of_rays: RaySettings = RaySettings()
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of everything, the files' bytes included."""
+        found = hashlib.sha256()
+        for vertices, faces in ((self.mesh.vertices, self.mesh.faces), *self.others):
+            found.update(np.ascontiguousarray(vertices, "<f8").tobytes() + b"|")
+            found.update(np.ascontiguousarray(faces, "<i8").tobytes() + b"|")
+        sums = [None if path is None else file_sha256(path) for path in (self.gaze, self.scene)]
+        found.update(repr((sums, self.of_gaze, self.of_rays)).encode())
+        return found.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class _Ready:
+    digest: str
+    variant: str
+    target: Target
+    make: MakeLooker | None
+
+
+_last: list[_Ready] = []
+
+
+def bake_chunk(scene: BakeScene, part: Crowd | TrackedRays) -> Sums:
+    """Partial sums of the observers, or of the rays, of ``part``. A variant must be active; what is loaded for a scene
+    is kept for its next part. Raises `NergError`."""
+    ready = _prepared(scene)
+    if isinstance(part, TrackedRays):
+        return ray_sums(ready.target, part, scene.of_rays)
+    if ready.make is None:
+        raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --from rays")
+    return gaze_sums(ready.target, ready.make, part.positions, part.weights, scene.of_gaze)
+
+
+def parts_of(who: Crowd | TrackedRays) -> Iterator[Crowd | TrackedRays]:
+    """``who`` in parts, always the same."""
+    if isinstance(who, TrackedRays):
+        for a in range(0, len(who), RAYS):
+            yield who.part(a, a + RAYS)
+        return
+    for a in range(0, len(who.weights), OBSERVERS):
+        yield Crowd(who.positions[a : a + OBSERVERS], who.weights[a : a + OBSERVERS])
+
+
+def _prepared(scene: BakeScene) -> _Ready:
+    import mitsuba as mi
+
+    variant = str(mi.variant())
+    if _last and (_last[0].digest, _last[0].variant) == (scene.digest, variant):
+        return _last[0]
+    _last.clear()
+    medium, settings, falloff, gaze = None, None, 0.0, None
+    if scene.scene is not None:
+        integrator: Any = load_scene(scene.scene).integrator()
+        if type(integrator).__name__ == "NergIntegrator":
+            medium, gaze = integrator.medium, integrator.gaze
+            settings, falloff = integrator.observer_settings, float(np.ravel(np.array(integrator.falloff))[0])
+    target = Target(scene.mesh, list(scene.others), medium, settings if medium is not None else None, falloff)
+    if scene.gaze is not None:
+        gaze = PlacedGaze(load_gaze(scene.gaze, namespace(mi.Float))[0])
+    make = None if gaze is None else lookers_of_field(gaze, target)
+    _last.append(_Ready(scene.digest, variant, target, make))
+    return _last[0]

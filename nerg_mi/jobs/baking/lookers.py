@@ -1,0 +1,81 @@
+"""Who looks: one observer, a path of them, or the people of tracked rays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.jobs.options.bake import BakeOptions
+from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
+from nerg_mi.surfaces.population import WEIGHTS, Crowd, ray_weights, thin
+from nerg_mi.surfaces.ray_source import TrackedRays
+
+POSITIONS = 1_000_000
+"""A path has so many positions at most."""
+
+
+def read_path(path: Path) -> Crowd:
+    """Observers of a CSV file with columns x, y, z, and weight where they do not all count alike. Raises
+    `NergError`."""
+    names = ("x", "y", "z")
+    columns = table_columns(path)
+    missing = [name for name in names if name not in columns]
+    if missing:
+        raise NergError(f'the path "{path}" has no column "{missing[0]}"; it needs x, y, z and may have weight')
+    weighted = "weight" in columns
+    blocks = [b.numbers for b in iterate_table(path, (*names, "weight") if weighted else names)]
+    rows = np.concatenate(blocks) if blocks else np.zeros((0, 3 + weighted))
+    if not 0 < len(rows) <= POSITIONS:
+        raise NergError(f'the path "{path}" has {len(rows):,} positions; give 1 to {POSITIONS:,}')
+    if not np.isfinite(rows).all():
+        line = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0]) + 1
+        raise NergError(f'the path "{path}" has a position that is no number, the {line:,}th; correct it')
+    weights = rows[:, 3] if weighted else np.ones(len(rows))
+    if (weights < 0).any() or not weights.sum() > 0:
+        raise NergError(f'the path "{path}" has weights that are negative, or all 0; correct them')
+    return Crowd(rows[:, :3], weights / weights.sum())
+
+
+def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, reporter: Reporter) -> Crowd:
+    """The observers of a gaze field, in the place. Raises `NergError` where none, or several kinds, are given."""
+    given = [name for name, value in (("--observer", options.observer), ("--path", options.path)) if value is not None]
+    if len(given) > 1:
+        raise NergError("--observer is one place and --path are many; give one of them")
+    if options.observer is not None:
+        if len(options.observer) != 3 or not np.isfinite(options.observer).all():
+            raise NergError(f"--observer is three numbers x,y,z, got {options.observer}")
+        return Crowd(np.array([options.observer], np.float64), np.ones(1))
+    if options.path is not None:
+        return read_path(options.path)
+    if rays is None:
+        raise NergError("nobody looks: give --observer x,y,z, a --path, or the --rays of people who were there")
+    crowd = thin(placed(rays.origin, align), ray_weights(rays, options.weights), options.observers, options.seed)
+    reporter.message(
+        f"{len(crowd.weights)} observers stand for {len(np.unique(rays.person))} people at {len(rays):,} moments, who "
+        f"were {crowd.mean / align.scale:.2f} m away from them (root mean square; 95 % within "
+        f"{crowd.farthest / align.scale:.2f} m)"
+    )
+    return crowd
+
+
+def tracked_rays(rays: Rays, align: Similarity, by: str) -> TrackedRays:
+    """The rays themselves in the place, with weights ``by`` one of `WEIGHTS` that add up to one."""
+    directions = rays.direction @ (align.matrix[:3, :3] / align.scale).T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return TrackedRays(placed(rays.origin, align), directions, ray_weights(rays, by))
+
+
+def placed(points: np.ndarray, align: Similarity) -> np.ndarray:
+    """Points (N, 3) of the rays' frame in the place's."""
+    return points @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+
+
+def check_weights(name: str) -> None:
+    """Raise `NergError` for a word that is none of `WEIGHTS`."""
+    if name not in WEIGHTS:
+        raise NergError(f'--weights is {", ".join(WEIGHTS)}, got "{name}"')
