@@ -211,7 +211,9 @@ def _values(document: dict[str, Any], data: bytes, number: object, shape: str, k
     """An accessor's values (N, components), as far as the bytes that are there hold them."""
     accessor = document["accessors"][_index(number)]
     if accessor["type"] != shape or accessor["componentType"] not in kinds or "sparse" in accessor:
-        raise ValueError("its positions or indices are of a kind that is not read; export it again, without compression")
+        raise ValueError(
+            "its positions or indices are of a kind that is not read; export it again, without compression"
+        )
     view = document["bufferViews"][_index(accessor["bufferView"])]
     if _index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0]:
         raise ValueError("its triangles are in another file; export it as one .glb")

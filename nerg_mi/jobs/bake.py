@@ -171,7 +171,9 @@ def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | 
 def _alignment(options: BakeOptions) -> Similarity:
     if options.align is not None:
         return read_similarity(options.align, "--align", "rays to place")
-    return Similarity() if options.gaze is None else align_of_training(read_metadata(options.gaze).get("provenance", {}))
+    return (
+        Similarity() if options.gaze is None else align_of_training(read_metadata(options.gaze).get("provenance", {}))
+    )
 
 
 def _halves(rays: Rays, seed: int) -> np.ndarray:

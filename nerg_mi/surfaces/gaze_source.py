@@ -39,7 +39,7 @@ class GazeSettings:
     """``angle``: radian under which an observer sees a piece at most; ``cone``: standard deviation in radian of the
     cone that gaze is seen through, 0 for none; ``directions`` over the sphere."""
 
-    angle: float = 0.05
+    angle: float = 0.026
     cone: float = 0.0
     directions: int = 1 << 16
 

@@ -123,9 +123,7 @@ WRITERS = {".ply": _ply, ".glb": _glb, ".csv": _csv, ".json": _json}
 def vertex_normals(mesh: Mesh) -> np.ndarray:
     """Unit normals (V, 3): means of the faces' around each vertex, by area; of opposite ones any."""
     weighted = mesh.normals * mesh.area[:, None]
-    sums = np.stack(
-        [np.bincount(mesh.faces.ravel(), np.repeat(c, 3), len(mesh.vertices)) for c in weighted.T], axis=1
-    )
+    sums = np.stack([np.bincount(mesh.faces.ravel(), np.repeat(c, 3), len(mesh.vertices)) for c in weighted.T], axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     return np.where(length > 0, sums / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
 

@@ -98,9 +98,7 @@ def _of_scene(path: Path, shapes: tuple[str, ...]) -> tuple[dict[str, Triangles]
     return found, tuple(others)
 
 
-def _joined(
-    path: Path, found: dict[str, Triangles], others: tuple[Triangles, ...], reporter: Reporter
-) -> Receivers:
+def _joined(path: Path, found: dict[str, Triangles], others: tuple[Triangles, ...], reporter: Reporter) -> Receivers:
     """One mesh of all, whose vertices are one where they touch."""
     first = np.cumsum([0, *(len(v) for v, _ in found.values())])
     vertices = np.concatenate([v for v, _ in found.values()])

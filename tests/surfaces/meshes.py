@@ -1,0 +1,44 @@
+"""Meshes and laws that tests put gaze on."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nerg_mi.surfaces.mesh import Mesh, weld
+
+_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
+def box(lower, upper, without: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and triangles of a box; ``without``: the side that is left out, of x, x, y, y, z, z."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    corners = np.asarray(lower) + corners * (np.asarray(upper, float) - lower)
+    quads = [q for k, q in enumerate(_QUADS) if k != without]
+    return corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+
+
+def joined(*parts) -> Mesh:
+    """One mesh of several vertices and faces."""
+    start = np.cumsum([0, *(len(v) for v, _ in parts)])
+    faces = np.concatenate([f + s for (_, f), s in zip(parts, start)])
+    return weld(np.concatenate([v for v, _ in parts]), faces)[0]
+
+
+def plate(n: int, jitter: float = 0.0, side: float = 1.0, z: float = 0.0, seed: int = 0) -> tuple:
+    """A square sheet of n x n vertices around the origin, those within moved by ``jitter`` cells at most."""
+    x = np.linspace(-side / 2, side / 2, n)
+    p = np.stack([*np.meshgrid(x, x, indexing="ij"), np.full((n, n), z)], axis=-1).reshape(-1, 3)
+    inner = (np.abs(p[:, :2]) < side / 2 - 1e-9).all(axis=1)
+    p[inner, :2] += np.random.default_rng(seed).uniform(-jitter, jitter, (inner.sum(), 2)) * side / (n - 1)
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
+    return p, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def vmf(mi, mu, kappa: float):
+    """The density of a von Mises-Fisher law, in 1/sr, of directions of Dr.Jit."""
+    import drjit as dr
+
+    mean = mi.Vector3f(*(np.asarray(mu, float) / np.linalg.norm(mu)).tolist())
+    scale = kappa / (2 * np.pi * -np.expm1(-2 * kappa))
+    return lambda d: scale * dr.exp(kappa * (dr.dot(mean, d) - 1))
