@@ -18,6 +18,7 @@ from .errors import sentence
 EXTRAS = {
     "torch": 'fields as torch modules: pip install "nerg-mi[torch]"',
     "scikit-image": 'meshes of radiance fields: pip install "nerg-mi[mesh]"',
+    "xatlas": 'textures of baked gaze: pip install "nerg-mi[bake]"',
     "pyarrow": 'ray tables in Parquet: pip install "nerg-mi[parquet]"',
     "pycolmap": 'poses of photos: pip install "nerg-mi[poses]"',
 }

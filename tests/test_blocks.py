@@ -26,12 +26,14 @@ RUN_ELSEWHERE = {
     ("gradients.md", "python"): "tests/test_gradients_page.py",
     ("pictures.md", "py"): "tests/test_pictures_page.py",
     ("python.md", "python"): "tests/api/test_page.py",
+    ("sign.md", "python"): "tests/test_sign_page.py",
     ("rays.md", "python"): "tests/rays/test_manual.py",
 }
 """All blocks of a language on a page -> the tests that run them."""
 
 NOT_RUN = {
     ("applications.md", "text"): "a formula",
+    ("bake.md", "text"): "formulas, and what a command prints",
     ("plugins.md", "math"): "a formula",
     ("python-reference.md", "{eval-rst}"): "what Sphinx is told; tests/tools/site/test_main.py builds the page",
     ("quickstart.md", "text"): "what commands print",

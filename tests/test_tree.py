@@ -21,6 +21,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/jobs/options/__init__.py": _OPTIONS,
     "nerg_mi/jobs/options/ablation.py": _OPTIONS,
     "nerg_mi/jobs/options/alignment.py": _OPTIONS,
+    "nerg_mi/jobs/options/bake.py": _OPTIONS,
     "nerg_mi/jobs/options/checkpoints.py": _OPTIONS,
     "nerg_mi/jobs/options/evaluation.py": _OPTIONS,
     "nerg_mi/jobs/options/export.py": _OPTIONS,

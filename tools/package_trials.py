@@ -93,6 +93,10 @@ def try_missing_extras(there: Environment, out: Path) -> str:
     scene = Path(field).with_name("scene.xml")
     asked = {
         "nerg-mi[mesh]": ("nerg", "export", "mesh", field, "-o", out / "field.ply", "--resolution", 8),
+        "nerg-mi[bake]": (
+            *("nerg", "bake", scene.with_name("twin.ply"), "--rays", out / "rays.npz", "-o", out / "a.glb"),
+            *("--texture", 64, "--detail", 3),
+        ),
         "nerg-mi[parquet]": ("nerg", "rays", "show", out / "rays.parquet"),
         "nerg-mi[poses]": ("nerg", "poses", out, "-o", out / "capture"),
         "nerg-mi[video]": ("nerg", "render", scene, "-o", out / "a.mp4", "--frames", out / "frames.csv"),

@@ -103,8 +103,8 @@ def pack_glb(document: dict[str, Any], data: bytes) -> tuple[bytes, ...]:
 
 
 def read_glb(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """``(vertices (V, 3), faces (F, 3))`` of all triangles of the file's scene, its nodes applied, in glTF's frame: right
-    -handed, y up. Lines, points, materials, skins and morphs are not looked at.
+    """``(vertices (V, 3), faces (F, 3))`` of all triangles of the file's scene, its nodes applied, in glTF's frame:
+    right-handed, y up. Lines, points, materials, skins and morphs are not looked at.
 
     Raises `NergError` for what is damaged, compressed or beyond this module's limits, and where there is no triangle.
     """

@@ -26,7 +26,8 @@ def write_columns(
     """Write ``vertices``, columns (V,) by the names of their properties, and ``faces`` (F, 3), with columns (F,)
     ``of_faces``.
 
-    Columns are float32, or uint8; ``comments``: lines of the header. Of properties ``NAME_0``, ``NAME_1``, ... Mitsuba makes an attribute ``NAME``.
+    Columns are float32, or uint8; ``comments``: lines of the header.
+    Of properties ``NAME_0``, ``NAME_1``, ... Mitsuba makes an attribute ``NAME``.
     """
     table, head = _table(vertices), ["ply", "format binary_little_endian 1.0"]
     head += [f"comment {line}" for line in comments]

@@ -50,8 +50,8 @@ _ERROR = 5e-3  # of what there was; more is said to be too much
 class Bake:
     """``mesh``: the surface in scene units, cut as finely as gaze was put on it, with ``density`` (V,) of its vertices
     per square metre, and ``share`` (F,) of gaze on its faces. ``on_surface``, ``elsewhere`` (at other shapes, or in a
-    field), ``escaped`` (at nothing): shares of all gaze, and ``total``, what that is; ``unaccounted``: their difference.
-    ``summary``: all that was found, as the JSON file has it. ``files`` written."""
+    field), ``escaped`` (at nothing): shares of all gaze, and ``total``, what that is. ``summary``: all that was found,
+    as the JSON file has it. ``files`` written."""
 
     mesh: Mesh
     density: np.ndarray
@@ -86,15 +86,14 @@ def bake(
     source = _check(surface, paths, options, rays)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
-    tracked = rays if rays is not None else None
+    tracked = rays
     if tracked is None and options.rays is not None:
         tracked = load_rays(options.rays, options.most, options.seed)
     if tracked is not None and not len(tracked):
         raise NergError("there are no rays in what --rays names; give some")
     align = _alignment(options)
     receivers = read_receivers(surface, options.shapes, options.resolution, ns, reporter)
-    finest = options.detail
-    refined = cut(receivers, finest, align.scale)
+    refined = cut(receivers, options.detail, align.scale)
     mesh = refined.mesh
     reporter.message(f"{len(receivers.mesh.faces):,} triangles, cut into {len(mesh.faces):,} to hold gaze")
     cone = math.radians(_CONE if options.cone is None and source == "rays" else options.cone or 0.0)

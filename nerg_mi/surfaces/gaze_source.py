@@ -5,9 +5,9 @@ An observer at p_o looks into the direction ω with the density g(ω), in 1/sr. 
     ∫_A g(ω) V(y, p_o) dω(y),    dω = |cos θ| dA / |y - p_o|²
 
 (Veach 1997, section 8.2.2.2), summed over pieces that are small as seen from p_o, each of which counts with its exact
-solid angle (`pieces`), and with g and V at its centre (`nerg_mi.density.received.attended`). Over the sphere of the same
-observer directions of equal area tell what g adds up to and how much of it meets something else, or nothing. Both sums
-use other points, and what they lack of each other is the error that is told.
+solid angle (`pieces`), and with g and V at its centre (`nerg_mi.density.received.attended`). Over the sphere of the
+same observer directions of equal area tell what g adds up to and how much of it meets something else, or nothing. Both
+sums use other points, and what they lack of each other is the error that is told.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class GazeSettings:
     """``angle``: radian under which an observer sees a piece at most; ``cone``: standard deviation in radian of the
     cone that gaze is seen through, 0 for none; ``directions`` over the sphere."""
 
-    angle: float = 0.026
+    angle: float = 0.0175
     cone: float = 0.0
     directions: int = 1 << 16
 

@@ -44,7 +44,8 @@ def refine(mesh: Mesh, longest: float) -> Refined:
         cut = middle[of_face]
         if len(faces) + np.count_nonzero(cut >= 0) > MOST_FACES:
             raise NergError(
-                f"edges of at most {longest:.3g} scene units make more than {MOST_FACES:,} faces; give a larger --detail"
+                f"edges of at most {longest:.3g} scene units make more than {MOST_FACES:,} faces; give a "
+                "larger --detail"
             )
         vertices = np.concatenate([vertices, 0.5 * (ends[long, 0] + ends[long, 1])])
         faces, parent, place = _cut(vertices, faces, cut, parent, place)

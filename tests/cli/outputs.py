@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.files.exr import write_exr
+from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.figures.standins import write_standins
@@ -19,6 +20,7 @@ from tests.formats.torch_ngp.test_nerg import save, small_gaze
 from tests.jobs.drawing.scenes import write_scene
 from tests.plugins import fields
 from tests.reference.torch_ngp_numpy import nerf_state
+from tests.surfaces.meshes import box
 
 from .test_render import SCENE
 
@@ -140,6 +142,12 @@ CASES = (
         ("eval",),
         tuple(f"evaluation.gaze.evaluation.{name}" for name in ("evaluate_gaze", "split_half", "person_rows")),
     ),
+    Case(
+        "bake",
+        "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
+        ("a.ply", "a.csv", "a.json"),
+    ),
+    Case("bake", "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.glb", ("a.glb",)),
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
@@ -195,6 +203,7 @@ INPUTS = {
     "ablate": {"rays", "field", "scene"},
     "jobs": {"folder"},
     "report": {"files", "objects"},
+    "bake": {"surface", "gaze", "rays", "path", "align"},
 }
 """Parameters of commands that name what is read; all others that are paths are written."""
 
@@ -222,6 +231,8 @@ def make_inputs(folder: Path) -> Path:
         write_exr(folder / f"{name}.exr", {"gaze.Y": np.full((12, 16), 1.0 + k, np.float32)})
     rays: Rays = crowd(3000)
     rays.save(folder / "rays.npz")
+    vertices, faces = box((-9, -9, -1), (9, 9, 4))
+    write_columns(folder / "room.ply", dict(zip("xyz", vertices.T)), faces)
     fields.radiance(folder / "field.safetensors")
     save(folder / "nerg.pth", small_gaze(), nerf=small_state())
     write_torch(folder / "ngp.pth", {"model": nerf_state(1, np.random.default_rng(1))})

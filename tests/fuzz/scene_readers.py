@@ -106,6 +106,29 @@ def _read_frames(folder: Path) -> object:
     return read_frames(folder / "walk.frames.csv")
 
 
+def _make_glb(folder: Path) -> None:
+    from nerg_mi.formats.gltf import shown_unlit
+
+    corners = [("POSITION", np.array(_CORNERS, "<f4"), False)]
+    (folder / "a.glb").write_bytes(b"".join(shown_unlit(corners, np.array([[0, 1, 2]]))))
+
+
+def _read_glb(folder: Path) -> object:
+    from nerg_mi.formats.gltf import read_glb
+
+    return read_glb(folder / "a.glb")
+
+
+def _make_path(folder: Path) -> None:
+    (folder / "walk.csv").write_text("x,y,z,weight\n1,2,1.6,0.5\n2,2,1.6,1\n")
+
+
+def _read_path(folder: Path) -> object:
+    from nerg_mi.jobs.baking.lookers import read_path
+
+    return read_path(folder / "walk.csv")
+
+
 def _reader(name: str, *kinds: str) -> Reader:
     return Reader(f"scene's {name}", _make, {name: kinds}, _read)
 
@@ -118,5 +141,7 @@ SCENES = [
     _reader("fog.vol"),
     Reader("scene to be nested", _make_nested, {"theirs.xml": ("text",), "more.xml": ("text",)}, _nest),
     Reader("areas of interest", _make_regions, {"areas.json": ("json",)}, _read_regions),
+    Reader("mesh of glTF", _make_glb, {"a.glb": ("json",)}, _read_glb),
+    Reader("path of observers", _make_path, {"walk.csv": ("text",)}, _read_path),
     Reader("frames of a sequence", _make_frames, {"walk.frames.csv": ("text",)}, _read_frames),
 ]

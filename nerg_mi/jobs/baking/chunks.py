@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -48,8 +48,8 @@ class BakeScene:
     others: tuple[Triangles, ...] = ()
     gaze: Path | None = None
     scene: Path | None = None
-    of_gaze: GazeSettings = GazeSettings()
-    of_rays: RaySettings = RaySettings()
+    of_gaze: GazeSettings = field(default_factory=GazeSettings)
+    of_rays: RaySettings = field(default_factory=RaySettings)
 
     @cached_property
     def digest(self) -> str:

@@ -62,8 +62,8 @@ def read_receivers(
 
 
 def cut(receivers: Receivers, longest: float | None, scale: float) -> Refined:
-    """Their mesh with edges of at most ``longest`` metres, or of a length that gives about `FACES` triangles; ``scale``:
-    scene units a metre."""
+    """Their mesh with edges of at most ``longest`` metres, or of a length that gives about `FACES` triangles;
+    ``scale``: scene units a metre."""
     mesh = receivers.mesh
     if longest is not None:
         if not (np.isfinite(longest) and longest > 0):
@@ -75,7 +75,8 @@ def cut(receivers: Receivers, longest: float | None, scale: float) -> Refined:
 
 def _of_scene(path: Path, shapes: tuple[str, ...]) -> tuple[dict[str, Triangles], tuple[Triangles, ...]]:
     loaded = load_scene(path)
-    every = {shape.id(): shape for shape in loaded.shapes()}
+    # Mitsuba keeps them in no order that is always the same.
+    every = dict(sorted(((shape.id(), shape) for shape in loaded.shapes()), key=lambda named: named[0]))
     missing = [name for name in shapes if name not in every]
     if missing:
         known = f"it has {', '.join(every)}" if every else "it has none"
