@@ -11,6 +11,7 @@ from nerg_mi.errors import NergError
 
 from .mesh import Mesh
 from .refinement import Refined
+from .target import mitsuba_mesh
 
 GUTTER = 4
 """Pixels by which colours go on beyond the border of a chart, for filters that look there."""
@@ -29,13 +30,19 @@ class Charts:
     faces: np.ndarray
 
 
-def unroll(mesh: Mesh, pixels: int) -> Charts:
-    """``mesh`` cut into charts that fill a square of ``pixels`` a side without overlaps. Needs xatlas; raises
-    `NergError` for meshes that are too large."""
+def unroller() -> Any:
+    """The package xatlas; `ImportError` with the remedy where it is not installed."""
     try:
         import xatlas
     except ImportError:
         raise ImportError('a texture needs xatlas, which is not installed: pip install "nerg-mi[bake]"') from None
+    return xatlas
+
+
+def unroll(mesh: Mesh, pixels: int) -> Charts:
+    """``mesh`` cut into charts that fill a square of ``pixels`` a side without overlaps. Needs xatlas; raises
+    `NergError` for meshes that are too large."""
+    xatlas = unroller()
     if len(mesh.faces) > MOST_FACES:
         raise NergError(
             f"a mesh of {len(mesh.faces):,} triangles is not unrolled into a texture, but up to {MOST_FACES:,}; leave "
@@ -68,8 +75,6 @@ def texture(charts: Charts, refined: Refined, values: np.ndarray, pixels: int) -
     import drjit as dr
     import mitsuba as mi
     from scipy.ndimage import distance_transform_edt
-
-    from .target import mitsuba_mesh
 
     corners = np.einsum("fij,fjk->fik", refined.place, charts.uv[charts.faces[refined.parent]])
     flat = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2).reshape(-1, 3)

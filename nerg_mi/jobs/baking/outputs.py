@@ -21,7 +21,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.formats.gltf import Attribute, shown_unlit
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.maths.color import decode_srgb
-from nerg_mi.surfaces.charts import texture, unroll
+from nerg_mi.surfaces.charts import texture, unroll, unroller
 from nerg_mi.surfaces.mesh import Mesh
 from nerg_mi.surfaces.refinement import Refined
 
@@ -142,6 +142,9 @@ def _shown(heat: Heat, values: np.ndarray, shade: np.ndarray | float = 1.0) -> n
 
 
 def check_texture(paths: list[Path], pixels: int | None) -> None:
-    """Raise `NergError` where a texture is asked for and no file takes one."""
-    if pixels is not None and not any(path.suffix.lower() == ".glb" for path in paths):
+    """Raise `NergError` where a texture is asked for and no file takes one, `ImportError` where nothing makes it."""
+    if pixels is None:
+        return
+    if not any(path.suffix.lower() == ".glb" for path in paths):
         raise NergError("--texture belongs to glTF; let the name of an output end in .glb")
+    unroller()
