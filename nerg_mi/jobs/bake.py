@@ -134,8 +134,8 @@ def bake(
         reporter.progress(0.95, f"writing {path.name}")
         write_output(baked, path, options.texture)
         reporter.message(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB, {time.perf_counter() - start:.1f} s)")
-    parts = (summary[k] for k in ("on_surface", "elsewhere", "escaped", "total"))
-    return Bake(mesh, density, share, *parts, summary, tuple(paths))
+    on, elsewhere, escaped, total = (summary[k] for k in ("on_surface", "elsewhere", "escaped", "total"))
+    return Bake(mesh, density, share, on, elsewhere, escaped, total, summary, tuple(paths))
 
 
 def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:

@@ -94,6 +94,8 @@ def texture(charts: Charts, refined: Refined, values: np.ndarray, pixels: int) -
     out, hit = out.reshape(pixels, pixels), hit.reshape(pixels, pixels)
     if not hit.any():
         raise NergError(f"no pixel of a texture of {pixels} x {pixels} shows the surface; give a larger --texture")
-    apart, near = distance_transform_edt(~hit, return_indices=True)
+    nearest = distance_transform_edt(~hit, return_indices=True)
+    assert nearest is not None, "both were asked for"
+    apart, near = nearest
     out = out[near[0], near[1]]
     return out, np.asarray(apart) <= GUTTER

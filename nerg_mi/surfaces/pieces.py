@@ -65,10 +65,8 @@ def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float) -> Pieces:
         relative.append(here[small])
         if small.all():
             break
-        left = np.eye(3)[None] if place is None else place[~small]
+        left = np.broadcast_to(np.eye(3), (np.count_nonzero(~small), 3, 3)) if place is None else place[~small]
         place = np.einsum("fij,pjk->pfik", _FOUR, left).reshape(-1, 3, 3)
-        if len(left) == 1 and level == 0:
-            place = np.tile(place, (np.count_nonzero(~small), 1, 1))
         rows = np.repeat(rows[~small], 4)
     found = np.concatenate(relative)
     angles = solid_angles(found)
