@@ -109,7 +109,8 @@ def read_glb(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     Raises `NergError` for what is damaged, compressed or beyond this module's limits, and where there is no triangle.
     """
     raw = read_bytes(path, "mesh", BYTES)
-    with reading(path, "mesh", "export it again"):
+    # Whatever stands where another kind of value belongs is the file's mistake.
+    with reading(path, "mesh", "export it again", also=(TypeError, AttributeError)):
         document, data = _parts(raw, path)
         found = list(_instances(document))
         vertices: list[np.ndarray] = []

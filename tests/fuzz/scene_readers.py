@@ -110,13 +110,20 @@ def _make_glb(folder: Path) -> None:
     from nerg_mi.formats.gltf import shown_unlit
 
     corners = [("POSITION", np.array(_CORNERS, "<f4"), False)]
-    (folder / "a.glb").write_bytes(b"".join(shown_unlit(corners, np.array([[0, 1, 2]]))))
+    whole = b"".join(shown_unlit(corners, np.array([[0, 1, 2]])))
+    (folder / "a.glb").write_bytes(whole)
+    # Its document by itself, of which damage may keep the structure.
+    (folder / "document.json").write_bytes(whole[20 : 20 + struct.unpack_from("<I", whole, 12)[0]])
 
 
 def _read_glb(folder: Path) -> object:
     from nerg_mi.formats.gltf import read_glb
 
-    return read_glb(folder / "a.glb")
+    whole, text = (folder / "a.glb").read_bytes(), (folder / "document.json").read_bytes()
+    data = np.array(_CORNERS, "<f4").tobytes() + np.array([0, 1, 2], "<u4").tobytes()
+    head = struct.pack("<IIIII", 0x46546C67, 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
+    (folder / "b.glb").write_bytes(head + text + struct.pack("<II", len(data), 0x004E4942) + data)
+    return read_glb(folder / "b.glb"), read_glb(folder / "a.glb"), len(whole)
 
 
 def _make_path(folder: Path) -> None:
@@ -141,7 +148,7 @@ SCENES = [
     _reader("fog.vol"),
     Reader("scene to be nested", _make_nested, {"theirs.xml": ("text",), "more.xml": ("text",)}, _nest),
     Reader("areas of interest", _make_regions, {"areas.json": ("json",)}, _read_regions),
-    Reader("mesh of glTF", _make_glb, {"a.glb": ("json",)}, _read_glb),
+    Reader("mesh of glTF", _make_glb, {"a.glb": (), "document.json": ("json",)}, _read_glb),
     Reader("path of observers", _make_path, {"walk.csv": ("text",)}, _read_path),
     Reader("frames of a sequence", _make_frames, {"walk.frames.csv": ("text",)}, _read_frames),
 ]
