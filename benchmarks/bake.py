@@ -56,7 +56,9 @@ def conservation(args) -> list[dict]:
         target = Target(weld(*box((0, 0, 0), (4, 3, 2.5), side))[0], [shelf])
         for where, eye in (("middle", (1, 0.7, 1.5)), ("1 mm from a wall", (0.001, 1.3, 1.2))):
             for kappa in (1, 37, 500):
-                sums = gaze_sums(target, lookers_of_law(law(kappa)), np.array([eye]), [1.0], GazeSettings())
+                sums = gaze_sums(
+                    target, lookers_of_law(law(kappa)), np.array([eye]), [1.0], GazeSettings(directions=1 << 20)
+                )
                 parts = {"surfaces": sums.on_surface, "shelf": sums.elsewhere, "escaped": sums.escaped}
                 rows.append({"room": room, "observer": where, "kappa": kappa, **parts, "unaccounted": sums.unaccounted})
     return rows
