@@ -17,8 +17,10 @@ from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.provenance import versions as programs
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.checksum import file_sha256
+from nerg_mi.formats.areas.kinds import Areas, BoxGroup
+from nerg_mi.formats.areas.reading import read_areas
 from nerg_mi.formats.fields import load_gaze
-from nerg_mi.formats.regions import Region, read_regions
+from nerg_mi.formats.regions import Region
 from nerg_mi.interruption import Interruption
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.rays.dataset.opening import load_rays
@@ -91,14 +93,14 @@ def make_report(
     options, output = options or ReportOptions(), Path(output)
     check_writable(output, ".html", ".htm")
     given = sort_files([Path(file) for file in files])
-    boxes = () if options.objects is None else read_regions(options.objects)
+    areas = Areas(()) if options.objects is None else _objects(options.objects, reporter)
     results, doubts = given_results(given)
     ns = select_backend(options.mode, options.threads)
     if options.evaluate:
         results += made_results(given, options, results, reporter)
     with Interruption() as stop:
         work = _Work(given, ns, options, reporter, stop)
-        run = work.run(boxes, results, doubts, rendered)
+        run = work.run(areas, results, doubts, rendered)
     write_text(output, page(run))
     size = output.stat().st_size / 1e6
     for _, verdict in run.verdicts:
@@ -124,7 +126,7 @@ class _Work:
 
     def run(
         self,
-        boxes: Sequence[Region],
+        areas: Areas,
         results: Sequence[GazeResults],
         doubts: Sequence[str],
         rendered: Mapping[str, Channels] | None,
@@ -140,9 +142,9 @@ class _Work:
             place = self._place(scene)
             onlooker = Onlooker(self.field, place, self._kind())
             eyes = self._eyes(place, scene)
-            objects = self._objects(boxes, onlooker, place, eyes)
+            objects = self._objects(areas.solids, onlooker, place, eyes)
             top = gaze_top(views.seen)
-            stage, sizes = self._stage(scene, onlooker, place, eyes, boxes)
+            stage, sizes = self._stage(scene, onlooker, place, eyes, areas.boxes)
         known = given.scene.kind != "none"
         inputs = tuple((role, hide(name), digest) for role, name, digest in self._inputs())
         settings = setting_words(options)
@@ -254,7 +256,7 @@ class _Work:
         return Eyes(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
     def _objects(
-        self, boxes: Sequence[Region], onlooker: Onlooker, place: GazePlace, eyes: Eyes
+        self, boxes: Sequence[Region | BoxGroup], onlooker: Onlooker, place: GazePlace, eyes: Eyes
     ) -> tuple[ObjectAttention, ...]:
         if not boxes or self.given.scene.kind == "none":
             return ()
@@ -311,6 +313,16 @@ class _Quiet:
 
     def progress(self, share: float, text: str = "") -> None:
         pass
+
+
+def _objects(path: Path, reporter: Reporter) -> Areas:
+    areas = read_areas(path)
+    if len(areas.solids) < len(areas.areas):
+        reporter.warn(
+            f"{len(areas.areas) - len(areas.solids)} of {len(areas.areas)} areas are no boxes and no groups of boxes, "
+            "and a report leaves them out; nerg stats counts them"
+        )
+    return areas
 
 
 def _load(given: ReportFiles, path: Path) -> Rays:

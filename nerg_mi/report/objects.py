@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.evaluation.gaze.verdict import widening
+from nerg_mi.formats.areas.kinds import BoxGroup
 from nerg_mi.formats.regions import Region
 
 from .glances import Glances
@@ -46,10 +47,13 @@ class ObjectAttention:
 
 
 def attention_on(
-    boxes: Sequence[Region], glances: Glances, margin: float, recorded: tuple[np.ndarray, np.ndarray] | None = None
+    boxes: Sequence[Region | BoxGroup],
+    glances: Glances,
+    margin: float,
+    recorded: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[ObjectAttention, ...]:
-    """Attention on each of ``boxes``, which are taken to be larger by ``margin`` (scene units) on all sides, for
-    surfaces are known no better.
+    """Attention on each of ``boxes`` or groups of them, which are taken to be larger by ``margin`` (scene units) on all
+    sides, for surfaces are known no better.
 
     ``recorded``: ``(points (N, 3), person (N,))`` of `glances.points_of_rays`, NaN where a ray ends at nothing; without
     it the eyes are nobody's.

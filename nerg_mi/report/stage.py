@@ -53,9 +53,7 @@ def pack(stage: Stage) -> str:
     proxy, M = stage.proxy, len(stage.observers)
     lower, size = _frame(stage)
     place = lambda points: _bits((np.asarray(points, np.float64).reshape(-1, 3) - lower) / size, 16)
-    corners = [
-        np.where([[a >> k & 1 for k in range(3)]], b.upper, b.lower)[0] for b in stage.boxes for e in _EDGES for a in e
-    ]
+    corners = [b.vertices[a] for b in stage.boxes for e in _EDGES for a in e]
     mean = proxy.gaze.mean(axis=0, keepdims=True) if M > 1 else proxy.gaze[:0]
     gaze = np.concatenate([mean, proxy.gaze, np.zeros((int(M == 0), len(proxy.vertices)))])
     tops = np.array([_top(values) for values in gaze])
@@ -96,8 +94,8 @@ def pack(stage: Stage) -> str:
 
 def _frame(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     """Lower corner and edges of the box that holds everything that is drawn."""
-    every = [stage.proxy.vertices, stage.observers, *stage.paths, *(b.lower for b in stage.boxes)]
-    points = np.concatenate([np.reshape(p, (-1, 3)) for p in [*every, *(b.upper for b in stage.boxes)]])
+    every = [stage.proxy.vertices, stage.observers, *stage.paths, *(b.bounds for b in stage.boxes)]
+    points = np.concatenate([np.reshape(p, (-1, 3)) for p in every])
     lower = points.min(axis=0).astype(np.float64)
     return lower, np.maximum(points.max(axis=0) - lower, 1e-6)
 

@@ -44,7 +44,7 @@ class Areas:
 
         @save.on_click
         def _(event: Any) -> None:
-            text = to_json(self.session.regions).encode()
+            text = to_json(self.session.regions, self.session.other_areas).encode()
             event.client.send_file_download("areas.json", text, save_immediately=True)
 
         self._show_all()
@@ -124,7 +124,8 @@ class Areas:
     def _replace(self, middle: np.ndarray, size: np.ndarray) -> None:
         name = self._chosen.value
         lower, upper = middle - size / 2, middle + size / 2
-        new = Region.of(name, lower, upper)
+        turn = next((r.turn for r in self.session.regions if r.name == name), None)
+        new = Region.of(name, lower, upper, turn)
         self.session.regions = [new if r.name == name else r for r in self.session.regions]
         self._show_all()
         self.page.count()
@@ -138,29 +139,23 @@ class Areas:
             return
         scene = self.page.server.scene
         for k, region in enumerate(self.session.regions):
-            corners, chosen = region.corners, region.name == self._chosen.value
+            chosen = region.name == self._chosen.value
             color = _CHOSEN if chosen else COLOR
             box = scene.add_line_segments(
-                f"/areas/{k}", edges(corners), np.array(color, np.uint8), thickness=2.0, thickness_units="screen"
+                f"/areas/{k}", edges(region), np.array(color, np.uint8), thickness=2.0, thickness_units="screen"
             )
             handles = [box]
             if chosen or len(self.session.regions) <= _FEW:
-                top = (*corners.mean(axis=0)[:2], corners[1, 2])
+                top = (*region.middle[:2], region.bounds[1, 2])
                 handles.append(scene.add_label(f"/areas/{k}_name", region.name, position=top, anchor="bottom-center"))
             self._boxes[region.name] = handles
 
 
-def edges(corners: np.ndarray) -> np.ndarray:
-    """The twelve edges (12, 2, 3) of a box with these ``corners`` (2, 3)."""
-    found = []
-    for axis in range(3):
-        others = [k for k in range(3) if k != axis]
-        for first in (0, 1):
-            for second in (0, 1):
-                ends = np.array(corners, np.float32)
-                ends[:, others[0]], ends[:, others[1]] = corners[first, others[0]], corners[second, others[1]]
-                found.append(ends)
-    return np.array(found)
+def edges(region: Region) -> np.ndarray:
+    """The twelve edges (12, 2, 3) of a box, along one axis after the other."""
+    corners = region.vertices
+    ends = [(k, k | 1 << axis) for axis in range(3) for k in range(8) if not k >> axis & 1]
+    return corners[np.array(ends)].astype(np.float32)
 
 
 def box_around(

@@ -16,9 +16,12 @@ import numpy as np
 from nerg_mi.api.attention import shares
 from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import Scene
+from nerg_mi.api.shapes import box_dict
 from nerg_mi.api.variant import active_mitsuba
 from nerg_mi.errors import NergError, mitsuba_says
-from nerg_mi.formats.regions import Region, read_regions
+from nerg_mi.formats.areas.kinds import Areas
+from nerg_mi.formats.areas.reading import read_areas
+from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.jobs.view import PlaceToView
@@ -82,6 +85,7 @@ class Session:
         self.shares: dict[str, float] = {}
         self.ceiling: float | None = None
         self.regions: list[Region] = []
+        self.other_areas: list[dict[str, Any]] = []
         self.pace = Pace()
         self.checksums: dict[Path, str] = {}
         self._ranges: dict[str, tuple[float, float]] = {}
@@ -117,7 +121,9 @@ class Session:
         self.heading = heading_of(self.home.ahead if own is None else ahead_of(self.scene), self.place.up)
         self.falloff = float(np.ravel(np.array(self.scene.integrator.falloff))[0])
         self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
-        self.regions = read_regions(self.options.regions) if self.options.regions is not None else []
+        areas = read_areas(self.options.regions) if self.options.regions is not None else Areas(())
+        # What is no box is not shown, and is saved again with what is.
+        self.regions, self.other_areas = areas.boxes, list(areas.others)
         shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]
         self.shapes = [name for name in shapes if name and not name.startswith("__")][:_SHAPES]
 
@@ -264,7 +270,7 @@ class Session:
             found: dict[str, float] = {}
             if regions:
                 with rough_integrals(self.scene):
-                    boxes = shares(self.scene, [region.corners for region in regions], at, divisions=DIVISIONS)
+                    boxes = shares(self.scene, [_surface(region) for region in regions], at, divisions=DIVISIONS)
                 found |= dict(zip([region.name for region in regions], boxes.tolist()))
                 yield None
             for names in self._shape_groups():
@@ -339,3 +345,8 @@ class Session:
 
 def _same(one: tuple, other: tuple) -> bool:
     return np.array_equal(one[0], other[0]) and one[1:] == other[1:]
+
+
+def _surface(region: Region) -> Any:
+    """What gaze lands on of an area, as `shares` takes it."""
+    return region.corners if region.turn is None else box_dict(region.corners[0], region.corners[1], region.matrix)

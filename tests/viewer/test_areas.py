@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.formats.regions import Region
 from nerg_mi.viewer.areas import box_around, edges
 from nerg_mi.viewer.view import View
 
@@ -30,7 +31,7 @@ def test02_a_rectangle_to_the_right_and_above():
 
 
 def test03_a_box_has_twelve_edges():
-    found = edges(np.array([[0, 0, 0], [1, 2, 3.0]]))
+    found = edges(Region.of("a", [0, 0, 0], [1, 2, 3]))
     lengths = np.sort(np.abs(found[:, 1] - found[:, 0]).sum(axis=1))
     assert found.shape == (12, 2, 3) and np.allclose(lengths, [1] * 4 + [2] * 4 + [3] * 4)
     assert len(np.unique(found.reshape(12, -1), axis=0)) == 12 and len(np.unique(found.reshape(-1, 3), axis=0)) == 8

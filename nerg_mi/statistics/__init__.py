@@ -1,0 +1,1 @@
+"""Numbers of attention on things: looks, dwell, reach, intervals clustered by person; NumPy alone."""
