@@ -38,6 +38,7 @@ COMMANDS = {
     "export": "Write a radiance field as a mesh, points, grid volumes or a torch-ngp checkpoint.",
     "bake": "Put gaze on surfaces: how much of it each square metre receives, as colours and tables.",
     "ablate": "Train every variant of a gaze field alike, and compare them.",
+    "stats": "Count attention on things, in rays and by a gaze field: numbers with intervals, and what if.",
     "jobs": "Say what is done of a long job, what is left and what is stale.",
     "worker": "Run parts of long jobs for a cluster (dask).",
     "study": "Measure error against run time: a scene at many settings, compared with what is true.",

@@ -11,7 +11,7 @@ import hmac
 import os
 import re
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,6 +43,18 @@ def read_salt(path: str | os.PathLike) -> bytes:
     return salt
 
 
+def pseudonyms(names: Iterable[str], salt: bytes | None = None) -> dict[str, str]:
+    """A pseudonym for each of ``names`` of people: what `pseudonymise` gives them for the same salt."""
+    if salt is not None and len(salt) < SALT_BYTES:
+        raise NergError(f"a salt of {len(salt)} bytes can be guessed; give at least {SALT_BYTES}")
+    key = secrets.token_bytes(32) if salt is None else salt
+    return {name: "p" + _digest(key, "person", name)[:_DIGITS] for name in names}
+
+
+def _digest(key: bytes, kind: str, text: str) -> str:
+    return hmac.new(key, f"{kind}:{text}".encode("utf-8", "surrogatepass"), hashlib.sha256).hexdigest()
+
+
 def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
     """``rays`` with a pseudonym (``p`` and 16 hexadecimal digits) for each person.
 
@@ -55,9 +67,7 @@ def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
     if salt is not None and len(salt) < SALT_BYTES:
         raise NergError(f"a salt of {len(salt)} bytes can be guessed; give at least {SALT_BYTES}")
     key = secrets.token_bytes(32) if salt is None else salt
-    digest = lambda kind, text: hmac.new(
-        key, f"{kind}:{text}".encode("utf-8", "surrogatepass"), hashlib.sha256
-    ).hexdigest()
+    digest = lambda kind, text: _digest(key, kind, text)
     person = lambda name: "p" + digest("person", name)[:_DIGITS]
     names = [person(name) for name in rays.persons]
     order = sorted(range(len(names)), key=lambda i: names[i])

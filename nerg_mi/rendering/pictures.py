@@ -41,8 +41,9 @@ def activate(variant: str | None = None) -> str:
     raise NergError(f'the variant "{wanted[-1]}" does not work here ({reason}); "nerg doctor" says how to mend it')
 
 
-def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
-    """The scene of a file, with ``defaults`` for its `<default>` and `$key`; the variant must be active.
+def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None, merge: bool = True):
+    """The scene of a file, with ``defaults`` for its `<default>` and `$key`; the variant must be active. ``merge``:
+    whether Mitsuba may make one of meshes of the same material, which then lose their names.
 
     Raises NergError for what Mitsuba does not take, and for what would end its process or fill the memory.
     """
@@ -58,7 +59,7 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None):
     check_scene_file(path, defaults)
     with mitsuba_says(), threads_for_mitsuba():
         try:
-            loaded = mi.load_file(str(path), **given)
+            loaded = mi.load_file(str(path), optimize=merge, **given)
         except RuntimeError as error:
             unused = (
                 re.findall(r"^\s*- \$(\w+)=", str(error), re.MULTILINE) if "unused parameters" in str(error) else []

@@ -1,0 +1,104 @@
+"""What a gaze field foretells of people who stand where they stood: the same numbers as those that are counted, as far
+as a field tells them.
+
+A field knows how gaze is shared out at a moment, and nothing of its course: there are no looks, returns or first looks
+in it. The probability that somebody looked at all follows if glances, one every so many seconds, are independent of
+each other: 1 - Π (1 - s_i) over their time, s_i the share at glance i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.statistics.landing import Thing, land, regroup
+from nerg_mi.statistics.measures import People
+from nerg_mi.statistics.sums import Cell
+from nerg_mi.statistics.visibility import Targets, in_view, unhidden
+
+from .surroundings import Surroundings
+from .tracked import Eyes
+
+DIRECTIONS = 8192
+"""Directions of equal area around an eye: some 2.2 degrees apart."""
+
+_RAYS = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Foretold:
+    """Of E eyes and A areas: ``share`` (E, A) of the gaze, ``distance`` (E, A) its mean in metres, times the share,
+    ``visible`` (E, A) bool, ``support`` (E,) rays that the field learnt from there, NaN where it does not say."""
+
+    share: np.ndarray
+    distance: np.ndarray
+    visible: np.ndarray
+    support: np.ndarray
+
+
+def foretell(
+    around: Surroundings,
+    eyes: Eyes,
+    things: Sequence[Thing],
+    members: Sequence[tuple[int, ...]],
+    margin: float,
+    view: float,
+    samples: int,
+    directions: int,
+    reporter: Reporter,
+) -> Foretold:
+    """What the gaze field of ``around`` says of each of the ``eyes``, whose shares over the sphere add up to one."""
+    d = fibonacci_directions(directions)
+    E, A = len(eyes.positions), len(members)
+    share, distance = np.zeros((E, A)), np.zeros((E, A))
+    each = max(1, _RAYS // directions)
+    for a in range(0, E, each):
+        eye = eyes.positions[a : a + each]
+        o, along = np.repeat(eye, directions, axis=0), np.tile(d, (len(eye), 1))
+        depth = None if around.place is None else around.depth(o, along)
+        gaze = np.stack([np.maximum(around.density(p, d), 0) for p in eye])
+        total = gaze.sum(axis=1, keepdims=True)
+        weight = (gaze / np.where(total > 0, total, 1)).ravel()
+        found = regroup(land(things, o, along, depth, margin), members)
+        for k, (rows, far) in enumerate(zip(found.rows, found.distance)):
+            of = rows // directions
+            share[a : a + len(eye), k] = np.bincount(of, weights=weight[rows], minlength=len(eye))
+            far = far / around.scale
+            distance[a : a + len(eye), k] = np.bincount(of, weights=weight[rows] * far, minlength=len(eye))
+        reporter.progress(min(1.0, (a + each) / E), f"the field: place {min(a + each, E)} of {E}")
+    targets = Targets.of(things, samples)
+    seen = in_view(targets, eyes.positions, eyes.ahead, unhidden(targets, eyes.positions, around.depth, margin), view)
+    visible = np.stack([seen[:, list(of)].any(axis=1) for of in members], axis=1)
+    support = np.array([around.support(p) for p in eyes.positions])
+    return Foretold(share, distance, visible, support)
+
+
+def foretold_people(
+    foretold: Foretold, eyes: Eyes, cell: Cell, times: dict[str, float], glance: float
+) -> People | None:
+    """The people of a cell by the field; ``times``: for how long each was there, in seconds; ``glance``: seconds that
+    one takes. None where no eye is of the cell."""
+    rows = [k for k, cells in enumerate(eyes.cells) if cell in cells and eyes.person[k] in times]
+    names = sorted({eyes.person[k] for k in rows})
+    if not names:
+        return None
+    place = {name: k for k, name in enumerate(names)}
+    who = np.array([place[eyes.person[k]] for k in rows])
+    count = np.bincount(who, minlength=len(names)).astype(float)
+
+    def mean(v: np.ndarray) -> np.ndarray:
+        total = np.zeros((len(names), v.shape[1]))
+        np.add.at(total, who, v[rows].astype(float))
+        return total / count[:, None]
+
+    time = np.array([times[name] for name in names])
+    share = mean(foretold.share)
+    missed = mean(-np.log1p(-np.minimum(foretold.share, 1 - 1e-12)))
+    reached = -np.expm1(-missed * (time / glance)[:, None])
+    seconds = time[:, None]
+    distance, visible = mean(foretold.distance) * seconds, mean(foretold.visible) * seconds
+    return People(tuple(names), time, share * seconds, distance, visible, reached)

@@ -1,0 +1,78 @@
+"""Results of statistics as files: a table each, pictures, and the account of how they were made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from nerg_mi.figures.provenance import provenance
+from nerg_mi.figures.saving import save
+from nerg_mi.figures.statistics_figures import map_figure, moves_figure, things_figure
+from nerg_mi.files.atomic import write_text
+from nerg_mi.jobs.options.statistics import StatisticsOptions
+from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.statistics.sums import Sums
+from nerg_mi.statistics.tables import Row
+
+from .writing import has_parquet, plain_columns, thing_columns, write_table
+
+LARGEST_MATRIX = 60
+"""Things of which moves are drawn at most."""
+
+
+class Results(Protocol):
+    """The tables of `nerg_mi.jobs.statistics.StatisticsResult`."""
+
+    things: list[Row]
+    differences: list[Row]
+    moves: list[Row]
+    durations: list[Row]
+    people: list[Row]
+    what_if: list[Row]
+    isovists: list[Row]
+    blanked: int
+
+    @property
+    def sums(self) -> Sums | None: ...
+
+
+def write_results(
+    folder: Path, result: Results, inputs: Sequence[Path], options: StatisticsOptions, reporter: Reporter
+) -> list[Path]:
+    """Write what there is into the ``folder``: each table as CSV, Markdown and Parquet, and its picture."""
+    about = provenance("nerg stats", inputs, options.seed, options)
+    files: list[Path] = []
+    for name in ("things", "differences", "moves", "durations", "people", "what_if", "isovists"):
+        rows: list[Row] = getattr(result, name)
+        if rows:
+            columns = thing_columns(rows) if name == "things" else plain_columns(rows, ())
+            files += write_table(folder, name, rows, *columns)
+    if result.things:
+        first = [r for r in result.things if r["cell"] == result.things[0]["cell"]]
+        save(things_figure(first), folder / "things.png", about)
+        files.append(folder / "things.png")
+    if result.sums is not None and result.moves:
+        told = {(r["from"], r["to"]): r["moves"] for r in result.moves if r["cell"] == "all" and r["moves"] is not None}
+        names = [n for n in result.sums.areas if any(n in pair for pair in told)]
+        if 1 < len(names) <= LARGEST_MATRIX:
+            matrix = np.array([[told.get((a, b), 0) for b in names] for a in names], float)
+            save(moves_figure(names, matrix), folder / "moves.png", about)
+            files.append(folder / "moves.png")
+    if result.isovists:
+        points = np.array([[r["x"], r["y"]] for r in result.isovists])
+        area = np.array([r["area"] for r in result.isovists])
+        figure = map_figure(points, area, options.step, "area that is seen [m²]", "Isovists at eye height")
+        save(figure, folder / "isovists.png", about)
+        files.append(folder / "isovists.png")
+    write_text(folder / "about.json", about.json() + "\n")
+    files.append(folder / "about.json")
+    if not has_parquet():
+        reporter.message("Parquet is left out, since pyarrow is not installed: pip install 'nerg-mi[parquet]'")
+    reporter.message(f"wrote {len(files)} files to {folder}: {', '.join(p.name for p in files if p.suffix == '.md')}")
+    if result.blanked:
+        write_text(folder / "blanked.txt", f"{result.blanked} numbers rest on too few people and are blank\n")
+        files.append(folder / "blanked.txt")
+    return files

@@ -1,0 +1,126 @@
+"""Areas of interest as things that rays meet: boxes in closed form, meshes and shapes by ray casts of Mitsuba."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nerg_mi.errors import NergError, mitsuba_says, plain
+from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
+from nerg_mi.formats.regions import Region
+from nerg_mi.rendering.mesh_file import check_obj, check_ply
+from nerg_mi.statistics.landing import Box, Thing
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+_RAYS = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeThing:
+    """A Mitsuba shape, of the scene or by itself."""
+
+    name: str
+    shape: Any
+    alone: Any
+    open = True
+
+    def interval(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        import mitsuba as mi
+
+        out = np.full(len(o), np.inf)
+        for a in range(0, len(o), _RAYS):
+            origin, along = (np.ascontiguousarray(v[a : a + _RAYS].T, np.float32) for v in (o, d))
+            ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(along))
+            found = np.array(self.alone.ray_intersect_preliminary(ray, coherent=False).t, np.float64)
+            out[a : a + _RAYS] = found
+        return out, out
+
+    def samples(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        import mitsuba as mi
+
+        # The R2 sequence (Roberts 2018): points that are spread evenly, whatever their number.
+        n = np.arange(1, count + 1)
+        u, v = (np.mod(0.5 + n / g, 1.0) for g in (1.32471795724474602596, 1.32471795724474602596**2))
+        found = self.shape.sample_position(0.0, mi.Point2f(u.astype(np.float32), v.astype(np.float32)))
+        points = np.array(found.p, np.float64).T
+        return points, np.zeros_like(points)
+
+
+def things_of(areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[str, Any]) -> list[Thing]:
+    """``areas`` as things, in their order; ``shapes`` of the scene by name; the variant must be active. Raises
+    `NergError` for shapes that there are not, and for meshes that cannot be read."""
+    found: list[Thing] = []
+    for area in areas:
+        if isinstance(area, Region):
+            found.append(Box(area))
+        elif isinstance(area, MeshPart):
+            found.append(thing_of_shape(area.name, load_mesh(area)))
+        else:
+            found.append(thing_of_shape(area.name, shape_named(shapes, area.shape)))
+    return found
+
+
+def thing_of_shape(name: str, shape: Any) -> ShapeThing:
+    """A Mitsuba shape as a thing."""
+    import mitsuba as mi
+
+    with mitsuba_says():
+        return ShapeThing(name, shape, mi.load_dict({"type": "scene", "shape": shape}, optimize=False))
+
+
+def shapes_of(scene: mi.Scene | None) -> dict[str, Any]:
+    """The shapes of a scene by their ids."""
+    return {} if scene is None else {shape.id(): shape for shape in scene.shapes()}
+
+
+def shape_named(shapes: Mapping[str, Any], name: str) -> Any:
+    """The shape of this name. Raises `NergError` where there is none, naming those that there are."""
+    if name not in shapes:
+        known = f"it has {', '.join(list(shapes)[:20])}" if shapes else "give a scene that has shapes"
+        raise NergError(f'there is no shape "{plain(name, 40)}" in the scene; {known}')
+    return shapes[name]
+
+
+def load_mesh(part: MeshPart) -> Any:
+    """The mesh of a part, with its faces alone. Raises `NergError` for a file that is missing or damaged."""
+    import mitsuba as mi
+
+    mesh = mesh_of_file(part.file)
+    if part.faces is None:
+        return mesh
+    params: Any = mi.traverse(mesh)
+    faces = np.array(params["faces"], np.uint32).reshape(-1, 3)
+    chosen = faces[part.chosen(len(faces))]
+    used, index = np.unique(chosen, return_inverse=True)
+    vertices = np.array(params["vertex_positions"], np.float32).reshape(-1, 3)[used]
+    return make_mesh(part.name, vertices, index.reshape(-1, 3))
+
+
+def mesh_of_file(path: Path) -> Any:
+    """The mesh in a file. Raises `NergError`."""
+    import mitsuba as mi
+
+    if not path.is_file():
+        raise NergError(f'there is no mesh file "{path}"; correct its name')
+    kind = path.suffix.lower()[1:]
+    (check_ply if kind == "ply" else check_obj)(path)
+    with mitsuba_says():
+        return mi.load_dict({"type": kind, "filename": str(path)})
+
+
+def make_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    """A Mitsuba mesh of ``vertices`` (V, 3) and ``faces`` (F, 3)."""
+    import mitsuba as mi
+
+    mesh = mi.Mesh(name, len(vertices), len(faces))
+    params: Any = mi.traverse(mesh)
+    params["vertex_positions"] = np.ravel(np.asarray(vertices, np.float32))
+    params["faces"] = np.ravel(np.asarray(faces, np.uint32))
+    params.update()
+    return mesh

@@ -1,0 +1,227 @@
+"""Rays, block by block, as sums: what each lands on, what could be seen, and which cells it is of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.formats.regions import Region
+from nerg_mi.rays.dataset.dataset import RayDataset
+from nerg_mi.rays.dataset.layout import is_dataset
+from nerg_mi.rays.dataset.merging import merge_rays
+from nerg_mi.rays.filters import time_order
+from nerg_mi.rays.rays import Rays
+from nerg_mi.statistics.landing import Landed, Thing, concatenate, cone, land, regroup, unite
+from nerg_mi.statistics.looks import LookRules
+from nerg_mi.statistics.sums import ALL, Cell, Sums, partial_sums
+from nerg_mi.statistics.visibility import CellsInView
+
+from .surroundings import Surroundings
+
+BLOCK = 1 << 17
+"""About so many rays are looked at at once."""
+
+_LAND = 1 << 15
+
+
+@dataclass(frozen=True)
+class Window:
+    """A time from ``start`` (inclusive) to ``end``, on the rays' clock, in seconds."""
+
+    name: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, eq=False)
+class Counting:
+    """How rays are counted. ``names`` of the areas, and of which ``things`` each consists, ``members``; ``movable``:
+    areas between which looks move; ``margin`` in units of the place; ``hits``: whether rays end at their hit points;
+    ``view`` in degrees; ``cells_in_view``: None where it is not asked what could be seen."""
+
+    around: Surroundings
+    things: Sequence[Thing]
+    names: tuple[str, ...]
+    members: Sequence[tuple[int, ...]]
+    movable: Sequence[int]
+    rules: LookRules
+    margin: float
+    tolerance: float = 0.0
+    hits: bool = False
+    view: float = 360.0
+    cells_in_view: CellsInView | None = None
+    windows: Sequence[Window] = ()
+    zones: Sequence[Region] = ()
+    cohorts: dict[str, str] = field(default_factory=dict)
+    cohort_names: tuple[str, ...] = ()
+
+    def cells(self, rays: Rays, places: np.ndarray) -> list[tuple[Cell, np.ndarray | None]]:
+        """The cells with the rays that are of each; ``places`` (N, 3): where they start, in the place."""
+        found: list[tuple[Cell, np.ndarray | None]] = [(ALL, None)]
+        for name in self.cohort_names:
+            found.append((Cell("cohort", name), self._of_cohort(rays, name)))
+        for w in self.windows:
+            found.append((Cell("window", w.name), (rays.t >= w.start) & (rays.t < w.end)))
+        for zone in self.zones:
+            on_floor = np.column_stack([places[:, :2], np.full(len(places), zone.middle[2])])
+            found.append((Cell("zone", zone.name), zone.holds(on_floor)))
+        return found
+
+    def _of_cohort(self, rays: Rays, name: str) -> np.ndarray:
+        if self.cohorts:
+            mine = np.array([self.cohorts.get(person) == name for person in rays.persons], bool)
+            return mine[rays.person]
+        if rays.cohort is None or name not in rays.cohorts:
+            return np.zeros(len(rays), bool)
+        return rays.cohort == rays.cohorts.index(name)
+
+    def land(self, rays: Rays) -> Landed:
+        """What the rays are on, area by area; distances in metres."""
+        parts = [self._land(rays, slice(a, a + _LAND)) for a in range(0, max(len(rays), 1), _LAND)]
+        found = regroup(concatenate(parts), self.members)
+        return Landed(found.count, found.rows, tuple(d / self.around.scale for d in found.distance))
+
+    def _land(self, rays: Rays, part: slice) -> Landed:
+        around = self.around
+        o, d = around.points(rays.origin[part]), around.directions(rays.direction[part])
+        known: np.ndarray | None = None
+        if self.hits and rays.hit is not None:
+            away = np.linalg.norm(rays.hit[part] - rays.origin[part], axis=1) * around.scale
+            known = np.where(np.isfinite(away), away, np.inf)
+        ways = []
+        for direction in cone(d, self.tolerance) if self.tolerance > 0 else [d]:
+            depth = known if around.place is None else around.depth(o, direction)
+            ways.append(land(self.things, o, direction, depth, self.margin))
+        return ways[0] if len(ways) == 1 else unite(ways)
+
+    def visible(self, rays: Rays) -> np.ndarray | None:
+        """Which areas each ray's person could see then (N, A); None where that is not asked."""
+        if self.cells_in_view is None:
+            return None
+        out = np.zeros((len(rays), len(self.names)), bool)
+        for a in range(0, len(rays), _LAND):
+            part = slice(a, a + _LAND)
+            eyes = self.around.points(rays.origin[part])
+            points, cell = self.cells_in_view.seen(eyes)
+            seen = self.cells_in_view.in_view(points[cell], eyes, self.around.directions(ahead(rays)[part]), self.view)
+            for k, of in enumerate(self.members):
+                out[part, k] = seen[:, list(of)].any(axis=1)
+        return out
+
+
+def ahead(rays: Rays) -> np.ndarray:
+    """Where people are turned (N, 3): their heads, or, where these are not known, their rays."""
+    if rays.head is None:
+        return rays.direction
+    return np.where(np.isfinite(rays.head).all(axis=1)[:, None], rays.head, rays.direction)
+
+
+def count_block(rays: Rays, counting: Counting) -> Sums:
+    """The partial sums of a block of rays that holds sittings as a whole: a pure function of its arguments, whose
+    results `nerg_mi.statistics.sums.merge` adds up in the order of the blocks."""
+    landed = counting.land(rays)
+    cells = counting.cells(rays, counting.around.points(rays.origin))
+    return partial_sums(rays, landed, counting.names, cells, counting.rules, counting.visible(rays), counting.movable)
+
+
+def blocks_of(source: Rays | str | Path, rules: LookRules, most: int = BLOCK) -> Iterator[Rays]:
+    """The rays of a file, or of a dataset, in blocks of about ``most`` that hold sittings as a whole; persons sorted by
+    name, and each one's rays by time. The same blocks every time. Raises `NergError` for rays that cannot be read."""
+    if not isinstance(source, Rays) and is_dataset(source):
+        data = RayDataset.open(source).one_place()
+        parts = (
+            ((source.id, part.day, part.bucket), rays)
+            for source, part in data.parts
+            for rays in replace(data, parts=((source, part),)).scan(whole=True)
+        )
+        yield from _whole(parts, rules, most)
+        return
+    rays = source if isinstance(source, Rays) else Rays.load(source)
+    if not len(rays):
+        raise NergError("there are no rays to count; import some, or widen the conditions by which they were chosen")
+    yield from _whole(iter([((), rays)]), rules, most)
+
+
+def _whole(parts: Iterator[tuple[tuple, Rays]], rules: LookRules, most: int) -> Iterator[Rays]:
+    """Parts, each with a key that those have in common which may go on with each other, cut where sittings end; what a
+    part ends with is kept until it is known that the next does not go on with it."""
+    held: Rays | None = None
+    before: tuple = ()
+    for key, part in parts:
+        if held is not None:
+            if key == before and held.persons[held.person[-1]] in part.persons:
+                part = merge_rays([held, part])
+            else:
+                yield held
+        before = key
+        part = _sorted(part)
+        ends = _ends(part, rules)
+        start = 0
+        for a, b in zip(ends[:-1], ends[1:]):
+            if b - start > most and a > start:
+                yield part.select(np.arange(start, a))
+                start = int(a)
+        last = int(ends[-2])
+        if last > start:
+            yield part.select(np.arange(start, last))
+        held = part.select(np.arange(last, len(part)))
+    if held is not None and len(held):
+        yield held
+
+
+def _sorted(rays: Rays) -> Rays:
+    """In the order of persons and times; names are in their order already, or do not matter."""
+    order = time_order(rays)
+    return rays if order is None else rays.select(order)
+
+
+def _ends(rays: Rays, rules: LookRules) -> np.ndarray:
+    """Where sittings begin, with 0 first and the number of rays last."""
+    step = np.diff(rays.t)
+    new = (np.diff(rays.person) != 0) | (step > rules.pause * (1 + 1e-9))
+    return np.r_[0, np.flatnonzero(new) + 1, len(rays)]
+
+
+@dataclass(frozen=True, eq=False)
+class Eyes:
+    """Where people stood, in the place: ``positions``, ``ahead`` (E, 3), whose they are, ``person`` (E,) names, and of
+    which ``cells`` each is."""
+
+    positions: np.ndarray
+    ahead: np.ndarray
+    person: tuple[str, ...]
+    cells: tuple[frozenset[Cell], ...]
+
+
+class EyePicker:
+    """Takes every so manieth ray of a stream, and one of each block whose people would have none."""
+
+    def __init__(self, every: int):
+        self._every, self._passed = max(1, every), 0
+        self._found: list[tuple[np.ndarray, np.ndarray, str, frozenset[Cell]]] = []
+
+    def take(self, rays: Rays, counting: Counting) -> None:
+        """The chosen of a block."""
+        number = self._passed + np.arange(len(rays))
+        chosen = number % self._every == self._every // 2
+        for code in np.unique(rays.person):
+            own = np.flatnonzero(rays.person == code)
+            if not chosen[own].any():
+                chosen[own[len(own) // 2]] = True
+        self._passed += len(rays)
+        rows = np.flatnonzero(chosen)
+        some = rays.select(rows)
+        at, turned = counting.around.points(some.origin), counting.around.directions(ahead(some))
+        cells = counting.cells(some, at)
+        for k in range(len(rows)):
+            mine = frozenset(cell for cell, mask in cells if mask is None or mask[k])
+            self._found.append((at[k], turned[k], some.persons[some.person[k]], mine))
+
+    def eyes(self) -> Eyes:
+        """All that were taken."""
+        position, turned, person, cells = zip(*self._found)
+        return Eyes(np.array(position), np.array(turned), tuple(person), tuple(cells))

@@ -1,0 +1,89 @@
+"""The table of what a change would do, by the field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.formats.areas.kinds import Areas
+from nerg_mi.statistics.intervals import adjusted, ratio_differences
+from nerg_mi.statistics.landing import Thing
+from nerg_mi.statistics.tables import FIELD, Floor, Row
+
+from .changes import changed_areas, changed_scene, read_changes
+from .foretold import Foretold
+from .places import places_of
+from .surroundings import Surroundings
+from .things import shapes_of, things_of
+from .tracked import Eyes
+
+Foretell = Callable[[Surroundings, Eyes, Areas, "list[Thing]"], Foretold]
+
+
+def what_if_rows(
+    path: Path,
+    around: Surroundings,
+    areas: Areas,
+    eyes: Eyes,
+    before: Foretold,
+    foretell: Foretell,
+    floor: Floor,
+    resamples: int,
+    seed: int,
+) -> list[Row]:
+    """Of each area and measure (``share`` of gaze, ``visible`` share of people's time) what the field says ``before``
+    and ``after`` the changes in the file ``path``, the ``difference`` with its interval over people, and the
+    ``support``: rays that the field learnt from around an eye, at the median after the changes. Raises `NergError`."""
+    changes = read_changes(path)
+    after_areas = changed_areas(areas, changes)
+    scene, shapes = around.scene, shapes_of(around.scene)
+    there = around
+    if changes.of_shapes:
+        scene, shapes = changed_scene(around.scene, changes)
+        there = around.within(scene)
+    others = eyes
+    if changes.observers is not None:
+        others = places_of(changes.observers)
+    if changes.shift is not None:
+        others = replace(others, positions=others.positions + changes.shift)
+    after = foretell(there, others, after_areas, things_of(after_areas.things, shapes))
+    # People who are the same before and after are compared with themselves.
+    names = sorted({*eyes.person, *others.person})
+    support = float(np.nanmedian(after.support)) if np.isfinite(after.support).any() else None
+    rows: list[Row] = []
+    for name in dict.fromkeys((*areas.names, *after_areas.names)):
+        for measure in ("share", "visible"):
+            old = _of(eyes, names, getattr(before, measure), areas, name)
+            new = _of(others, names, getattr(after, measure), after_areas, name)
+            rows.append(_row(name, measure, old, new, floor, resamples, seed) | {"support": support, "source": FIELD})
+    corrected = adjusted(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
+    for row, p in zip(rows, corrected):
+        row["p_adjusted"] = float(p) if np.isfinite(p) else None
+    return rows
+
+
+def _of(eyes: Eyes, names: list[str], values: np.ndarray, areas: Areas, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of an area's ``values`` (E, A) over the eyes of each person, and who has any, (P, 1) each."""
+    total, count = np.zeros((len(names), 1)), np.zeros((len(names), 1))
+    if name in areas.names:
+        place = {n: k for k, n in enumerate(names)}
+        who = np.array([place[p] for p in eyes.person])
+        np.add.at(total[:, 0], who, values[:, areas.names.index(name)].astype(float))
+        np.add.at(count[:, 0], who, 1.0)
+    return total / np.maximum(count, 1), (count > 0).astype(float)
+
+
+def _row(name: str, measure: str, old, new, floor: Floor, resamples: int, seed: int) -> Row:
+    mean = lambda pair: float(pair[0].sum() / pair[1].sum()) if pair[1].sum() else None
+    people = int(min(old[1].sum() or new[1].sum(), new[1].sum() or old[1].sum()))
+    told = floor.passes(people)
+    row: Row = {"thing": name, "measure": measure, "people": people if told else None}
+    row |= {"before": mean(old) if told else None, "after": mean(new) if told else None}
+    both = bool(old[1].sum() and new[1].sum())
+    found = ratio_differences(old, new, resamples=resamples, seed=seed) if both and told else None
+    number = lambda v: float(v[0]) if np.isfinite(v[0]) else None
+    keys = {"difference": "value", "low": "low", "high": "high", "p": "p"}
+    return row | {k: None if found is None else number(getattr(found, v)) for k, v in keys.items()}

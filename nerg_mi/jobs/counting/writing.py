@@ -1,0 +1,65 @@
+"""Tables of statistics as files: CSV, Markdown and, with pyarrow, Parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from nerg_mi.files.atomic import replacing, write_text
+from nerg_mi.files.tables import markdown_table, write_csv
+from nerg_mi.rays.io import pyarrow_modules
+from nerg_mi.statistics.measures import MEASURES
+from nerg_mi.statistics.tables import Row, shown
+
+Cells = Callable[[Row], Sequence[Any]]
+
+
+def has_parquet() -> bool:
+    """Whether Parquet can be written here."""
+    return find_spec("pyarrow") is not None
+
+
+def write_table(folder: Path, name: str, rows: Sequence[Row], head: Sequence[str], cells: Cells) -> list[Path]:
+    """``rows`` as ``name``.csv, .md and, where that can be, .parquet in a ``folder``; ``head`` and ``cells``: the
+    columns of the Markdown. Of no rows there is a table of names alone."""
+    columns = list(dict.fromkeys(key for row in rows for key in row)) or list(head)
+    written = [folder / f"{name}.csv", folder / f"{name}.md"]
+    write_csv(written[0], [{k: "" if v is None else v for k, v in row.items()} for row in rows], columns)
+    right = [title for title in head if title not in ("cell", "thing", "source", "person", "from", "to", "measure")]
+    write_text(written[1], markdown_table(head, [cells(row) for row in rows], right) + "\n")
+    if has_parquet():
+        pa, pq = pyarrow_modules()
+        table = pa.table({k: [row.get(k) for row in rows] for k in columns})
+        written.append(folder / f"{name}.parquet")
+        with replacing(written[-1]) as temporary:
+            pq.write_table(table, temporary)
+    return written
+
+
+def cell_name(row: Row) -> str:
+    """What a row is of, in words."""
+    return "all" if row["cell"] == "all" else f"{row['cell']} {row['value']}"
+
+
+def thing_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
+    """Head and cells of the table of things, with the measures that any row has."""
+    used = [m for m in MEASURES if any(row.get(m.name) is not None for row in rows)]
+    head = ["cell", "thing", "source", "people", *(m.title for m in used)]
+
+    def cells(row: Row) -> list[Any]:
+        people = "" if row["people"] is None else row["people"]
+        return [cell_name(row), row["thing"], row["source"], people, *(shown(row, m) for m in used)]
+
+    return head, cells
+
+
+def plain_columns(rows: Sequence[Row], names: Sequence[str]) -> tuple[list[str], Cells]:
+    """Head and cells of a table whose columns are told as they are."""
+    head = list(dict.fromkeys(key for row in rows for key in row)) or list(names)
+
+    def cells(row: Row) -> list[Any]:
+        return ["" if row.get(k) is None else f"{row[k]:.4g}" if isinstance(row[k], float) else row[k] for k in head]
+
+    return head, cells

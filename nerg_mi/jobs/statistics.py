@@ -1,0 +1,352 @@
+"""Attention on things as numbers: counted in rays, foretold by a field, by cohort, time and zone; and what if."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from nerg_mi.alignment.record import read_similarity
+from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import check_folder, make_folder
+from nerg_mi.formats.areas.kinds import Areas, Group
+from nerg_mi.formats.areas.reading import read_areas
+from nerg_mi.formats.regions import read_regions
+from nerg_mi.interruption import Interruption
+from nerg_mi.rays.dataset.dataset import RayDataset
+from nerg_mi.rays.dataset.layout import is_dataset
+from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
+from nerg_mi.rays.rays import Rays
+from nerg_mi.statistics.intervals import LEAST_PEOPLE
+from nerg_mi.statistics.landing import Thing
+from nerg_mi.statistics.looks import LookRules
+from nerg_mi.statistics.measures import People
+from nerg_mi.statistics.sums import ALL, Cell, Sums, Total
+from nerg_mi.statistics.tables import (
+    FIELD,
+    TRACKED,
+    Floor,
+    Row,
+    difference_rows,
+    duration_rows,
+    move_rows,
+    person_rows,
+    thing_rows,
+)
+from nerg_mi.statistics.visibility import CellsInView, Isovists, Targets
+
+from .backend import select_backend
+from .counting.cohorts import read_cohorts
+from .counting.foretold import Foretold, foretell, foretold_people
+from .counting.places import isovist_rows, look_around, places_of
+from .counting.results import write_results
+from .counting.surroundings import Surroundings, surroundings_of_files
+from .counting.things import shapes_of, things_of
+from .counting.tracked import Counting, EyePicker, Eyes, Window, blocks_of, count_block
+from .counting.what_if import what_if_rows
+from .options import parse_numbers
+from .options.statistics import StatisticsOptions, parse_window
+from .reporter import SILENT, Reporter
+from .scenes.files import kind_of_file
+
+
+@dataclass(frozen=True, eq=False)
+class StatisticsResult:
+    """Rows of tables, each a dict: ``things`` (by cell, thing and source), ``differences``, ``moves``, ``durations``,
+    ``people``, ``what_if``, ``isovists``; ``sums``: what they were made of; ``blanked``: numbers on too few people;
+    ``files`` that were written."""
+
+    things: list[Row] = field(default_factory=list)
+    differences: list[Row] = field(default_factory=list)
+    moves: list[Row] = field(default_factory=list)
+    durations: list[Row] = field(default_factory=list)
+    people: list[Row] = field(default_factory=list)
+    what_if: list[Row] = field(default_factory=list)
+    isovists: list[Row] = field(default_factory=list)
+    sums: Sums | None = None
+    blanked: int = 0
+    files: list[Path] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """The files, by what they are."""
+
+    scene: Path | None = None
+    field: Path | None = None
+    gaze: Path | None = None
+    rays: Path | Rays | None = None
+
+
+def statistics(
+    files: Sequence[str | Path | Rays],
+    output: str | Path | None = None,
+    options: StatisticsOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> StatisticsResult:
+    """Numbers of attention on the areas of ``options``.
+
+    ``files``, in any order: rays or a dataset of them, a scene, a gaze field, a radiance field; a gaze field's place is
+    found beside it. ``output``: folder for the tables; None: nothing is written. Raises `NergError`.
+    """
+    options = options or StatisticsOptions()
+    if output is not None:
+        check_folder(output)
+    given = _sort(files)
+    reporter.progress(0.0, "reading")
+    areas = _areas(options)
+    ns = select_backend(options.mode, options.threads)
+    with Interruption() as stop:
+        work = _Work(given, areas, options, ns, reporter, stop)
+        result = work.run()
+    if output is not None:
+        inputs = [p for p in (given.scene, given.field, given.gaze, given.rays) if isinstance(p, Path)]
+        inputs += [p for p in (options.areas, options.what_if) if p is not None and p.is_file()]
+        result.files.extend(write_results(make_folder(output), result, inputs, options, reporter))
+    return result
+
+
+def _sort(files: Sequence[str | Path | Rays]) -> _Given:
+    found: dict[str, Path | Rays] = {}
+    for given in files:
+        path = given if isinstance(given, Rays) else Path(given)
+        kind = "rays" if isinstance(path, Rays) else kind_of_file(path)
+        if kind not in ("scene", "field", "gaze", "rays"):
+            raise NergError(f'"{path}" is a {kind}; statistics take rays, a scene (.xml), a gaze and a radiance field')
+        if kind in found:
+            raise NergError(f'"{found[kind]}" and "{path}" are both a {kind}; give one')
+        found[kind] = path
+    if not found:
+        raise NergError("give rays, a scene, or a gaze field to tell of")
+    return _Given(**found)  # pyright: ignore[reportArgumentType]
+
+
+def _areas(options: StatisticsOptions) -> Areas:
+    if options.areas is None:
+        if options.visibility:
+            return Areas(())
+        raise NergError("say which things are asked about: --areas FILE")
+    return read_areas(options.areas)
+
+
+class _Work:
+    """What is computed, with what its parts have in common."""
+
+    def __init__(
+        self,
+        given: _Given,
+        areas: Areas,
+        options: StatisticsOptions,
+        ns: ModuleType,
+        reporter: Reporter,
+        stop: Interruption,
+    ):
+        self.given, self.areas, self.options, self.reporter, self.stop = given, areas, options, reporter, stop
+        align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
+        self.around: Surroundings = surroundings_of_files(given.scene, given.field, given.gaze, align, ns)
+        self.things = things_of(areas.things, shapes_of(self.around.scene))
+        self.members = list(areas.members().values())
+        self.margin = options.margin * self.around.scale
+        self.rules = LookRules(options.gap, options.pause, options.merge, options.least)
+
+    def run(self) -> StatisticsResult:
+        """All that is asked for."""
+        o, floor = self.options, Floor(self.options.min_people)
+        if o.visibility:
+            return StatisticsResult(isovists=isovist_rows(self._isovists(), self.areas.names, self.members))
+        counting = None if self.given.rays is None else self._counting(self.given.rays)
+        sums, eyes = (None, self._standing()) if counting is None else self._count(counting)
+        if counting is None and self.around.gaze is None:
+            raise NergError("there is nobody to tell of: give rays, or a gaze field (or --visibility for isovists)")
+        cells = [ALL] if counting is None else list(sums.cells) if sums is not None else []
+        seen = counting is not None and counting.cells_in_view is not None
+        people: dict[Cell, dict[str, People]] = {cell: {} for cell in cells}
+        times: dict[Cell, dict[str, float]] = {cell: {} for cell in cells}
+        for cell in cells:
+            if sums is not None:
+                people[cell][TRACKED] = tracked = People.of(sums, cell, seen)
+                times[cell] = dict(zip(tracked.names, tracked.time.tolist()))
+            else:
+                times[cell] = dict.fromkeys(eyes.person, 1.0)
+        foretold = None
+        if self.around.gaze is not None:
+            foretold = self._foretell(self.around, eyes)
+            for cell in cells:
+                found = foretold_people(foretold, eyes, cell, times[cell], o.glance)
+                if found is not None:
+                    people[cell][FIELD] = found
+        self._tell(people)
+        names = self.areas.names
+        how = {"resamples": o.resamples, "seed": o.seed}
+        self.reporter.progress(0.9, "intervals")
+        things = thing_rows(names, people, floor, **how)
+        result = StatisticsResult(
+            things,
+            difference_rows(names, people, floor, source=TRACKED if sums is not None else FIELD, **how),
+            [] if sums is None else move_rows(sums, floor),
+            [] if sums is None else duration_rows(sums, floor),
+            self._people(sums, seen),
+            [] if o.what_if is None else self._what_if(eyes, foretold, times[ALL], floor),
+            [],
+            sums,
+            floor.blanked,
+        )
+        if floor.blanked:
+            self.reporter.message(f"{floor.blanked:,} numbers rest on fewer than {floor.least} people and are blank")
+        return result
+
+    def _counting(self, rays: Path | Rays) -> Counting:
+        o = self.options
+        first = next(blocks_of(rays, self.rules))
+        hits = self.around.place is None and first.hit is not None and bool(np.isfinite(first.hit).any())
+        if self.around.place is None:
+            self.reporter.message(
+                "no place is given: rays end at their hit points"
+                if hits
+                else "no place is given: things hide each other, and nothing else hides them"
+            )
+        in_view = None
+        if o.seen:
+            targets = Targets.of(self.things, o.samples)
+            in_view = CellsInView(targets, self._depth_or_things, o.cell * self.around.scale, self.margin)
+        leaves = [k for k, area in enumerate(self.areas.areas) if not isinstance(area, Group)]
+        cohorts = {} if o.cohorts is None else read_cohorts(o.cohorts)
+        return Counting(
+            self.around,
+            self.things,
+            self.areas.names,
+            self.members,
+            leaves,
+            self.rules,
+            self.margin,
+            o.tolerance,
+            hits,
+            o.view,
+            in_view,
+            [Window(*parse_window(text)) for text in o.windows],
+            [] if o.zones is None else read_regions(o.zones),
+            cohorts,
+            tuple(sorted(set(cohorts.values()))) if cohorts else _cohort_names(rays, first),
+        )
+
+    def _depth_or_things(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """How far is seen: to the surfaces of the place, or, where none is known, to the nearest thing."""
+        if self.around.place is not None:
+            return self.around.depth(o, d)
+        reach = np.full(len(o), np.inf)
+        for thing in self.things:
+            near, far = thing.interval(o, d)
+            met = (near >= 0) & (np.isfinite(near) if thing.open else near < far)
+            reach = np.where(met, np.minimum(reach, near), reach)
+        return reach
+
+    def _count(self, counting: Counting) -> tuple[Sums, Eyes]:
+        assert self.given.rays is not None
+        count = _ray_count(self.given.rays)
+        picker = EyePicker(max(1, count // self.options.eyes))
+        total: Total | None = None
+        done = 0
+        for block in blocks_of(self.given.rays, self.rules):
+            self.stop.check()
+            part = count_block(block, counting)
+            total = total or Total(part.areas, part.cells)
+            total.add(part)
+            if self.around.gaze is not None:
+                picker.take(block, counting)
+            done += len(block)
+            self.reporter.progress(0.8 * done / max(count, done), f"{done:,} of {count:,} rays")
+        if total is None:
+            raise NergError("there are no rays to count; import some")
+        sums = total.sums()
+        self.reporter.message(f"{done:,} rays of {len(sums.persons_of(ALL)[0]):,} people")
+        nobody = Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
+        return sums, picker.eyes() if self.around.gaze is not None else nobody
+
+    def _standing(self) -> Eyes:
+        """Observers who were not tracked."""
+        o = self.options
+        if o.observers:
+            given = [parse_numbers(text, "--observer") for text in o.observers]
+            if any(len(p) != 3 for p in given):
+                raise NergError("--observer is three numbers, x,y,z")
+            return places_of(np.array(given, float))
+        if self.around.observer is not None:
+            return places_of(self.around.observer[None])
+        found = look_around(self.around, o.height, o.step, o.floor)
+        every = max(1, len(found) // o.eyes)
+        self.reporter.message(f"nobody was tracked: {len(found[::every])} places on the floor, each somebody's")
+        return places_of(found[::every])
+
+    def _foretell(
+        self, around: Surroundings, eyes: Eyes, areas: Areas | None = None, things: Sequence[Thing] | None = None
+    ) -> Foretold:
+        o = self.options
+        areas = self.areas if areas is None else areas
+        things = self.things if things is None else things
+        members = list(areas.members().values())
+        # Without rays nobody knows where somebody is turned.
+        view = o.view if self.given.rays is not None else 360.0
+        return foretell(around, eyes, things, members, self.margin, view, o.samples, o.directions, self.reporter)
+
+    def _isovists(self) -> Isovists:
+        from nerg_mi.statistics.visibility import isovists
+
+        o = self.options
+        points = look_around(self.around, o.height, o.step, o.floor)
+        box = self.around.bounds()
+        self.reporter.message(f"{len(points):,} places on the floor")
+        reach = float(np.linalg.norm(box[1] - box[0]))
+        return isovists(points, self.around.depth, Targets.of(self.things, o.samples), self.margin, reach)
+
+    def _what_if(self, eyes: Eyes, before: Foretold | None, times: Mapping[str, float], floor: Floor) -> list[Row]:
+        if before is None:
+            raise NergError("--what-if is what a gaze field foretells: give one, or a scene that has one")
+        assert self.options.what_if is not None
+        return what_if_rows(
+            self.options.what_if,
+            self.around,
+            self.areas,
+            eyes,
+            before,
+            self._foretell,
+            floor,
+            self.options.resamples,
+            self.options.seed,
+        )
+
+    def _people(self, sums: Sums | None, seen: bool) -> list[Row]:
+        o = self.options
+        if sums is None:
+            return []
+        if o.min_people > 1:
+            self.reporter.message("no table of single people is made, since each number in it would be of one person")
+            return []
+        persons = sums.persons_of(ALL)[1]
+        named = {p: p for p in persons}
+        if not o.names:
+            named = pseudonyms(persons, None if o.salt is None else read_salt(o.salt))
+        return person_rows(sums, named, seen)
+
+    def _tell(self, people: Mapping[Cell, Mapping[str, People]]) -> None:
+        few = [cell for cell, found in people.items() for p in found.values() if 0 < p.there.sum() < LEAST_PEOPLE]
+        if few:
+            which = "all of it" if few[0] == ALL else f"{few[0].dimension} {few[0].value}"
+            self.reporter.message(
+                f"there are no intervals where there are fewer than {LEAST_PEOPLE} people ({which}"
+                + (f" and {len(set(few)) - 1} more)" if len(set(few)) > 1 else ")")
+            )
+
+
+def _cohort_names(rays: Path | Rays, first: Rays) -> tuple[str, ...]:
+    if not isinstance(rays, Rays) and is_dataset(rays):
+        return tuple(sorted(RayDataset.open(rays).cohorts))
+    return tuple(sorted(first.cohorts))
+
+
+def _ray_count(rays: Path | Rays) -> int:
+    if isinstance(rays, Rays):
+        return len(rays)
+    return len(RayDataset.open(rays)) if is_dataset(rays) else len(Rays.load(rays))

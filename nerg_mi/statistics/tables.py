@@ -1,0 +1,185 @@
+"""Tables of numbers: things by cell and source, differences, moves, durations; with a floor on people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from .intervals import adjusted, proportion_differences, ratio_differences
+from .measures import MEASURES, Measure, People
+from .sums import BINS, Cell, Sums
+
+TRACKED, FIELD = "tracked", "field"
+"""Sources of numbers: rays that were recorded, and what the gaze field foretells."""
+
+COMPARED = ("share", "dwell", "reach", "looks", "given_visible")
+"""Measures of which differences are told."""
+
+MOST_VALUES = 12
+"""So many values of a dimension are compared with each other."""
+
+Row = dict[str, Any]
+
+
+@dataclass
+class Floor:
+    """Blanks numbers that rest on fewer than ``least`` people, and counts those that were."""
+
+    least: int = 1
+    blanked: int = field(default=0)
+
+    def passes(self, people: int) -> bool:
+        """Whether a number of so many people may be told; one of nobody is nobody's secret."""
+        if 0 < people < self.least:
+            self.blanked += 1
+            return False
+        return True
+
+
+def thing_rows(
+    areas: Sequence[str], cells: Mapping[Cell, Mapping[str, People]], floor: Floor, *, resamples: int, seed: int
+) -> list[Row]:
+    """A row for each cell, area and source: ``people`` in the cell, and of each measure its value, ``_low``, ``_high``
+    and ``_people``, None where it is not known or blanked."""
+    rows: list[Row] = []
+    for cell, sources in cells.items():
+        found: dict[str, list[Row]] = {}
+        for source, people in sources.items():
+            estimates = {m.name: m.estimate(people, resamples, seed) for m in MEASURES}
+            count = int(people.there.sum())
+            found[source] = []
+            for a, area in enumerate(areas):
+                row: Row = {"cell": cell.dimension, "value": cell.value, "thing": area, "source": source}
+                row["people"] = count if floor.passes(count) else None
+                for name, e in estimates.items():
+                    told = e is not None and floor.passes(int(e.people[a]))
+                    for key in ("", "_low", "_high"):
+                        row[name + key] = _number(getattr(e, key[1:] or "value")[a]) if told else None
+                    row[name + "_people"] = int(e.people[a]) if e is not None and told else None
+                found[source].append(row)
+        rows += [found[source][a] for a in range(len(areas)) for source in sources]
+    return rows
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def difference_rows(
+    areas: Sequence[str],
+    cells: Mapping[Cell, Mapping[str, People]],
+    floor: Floor,
+    *,
+    source: str = TRACKED,
+    resamples: int,
+    seed: int,
+    compared: Sequence[str] = COMPARED,
+) -> list[Row]:
+    """Differences between every two values of a dimension, of each area and measure, with p-values that are adjusted
+    over all rows (``p_adjusted``), and ``found``: whether that is at most 0.05."""
+    rows: list[Row] = []
+    dimensions = dict.fromkeys(cell.dimension for cell in cells)
+    for dimension in dimensions:
+        values = [cell for cell in cells if cell.dimension == dimension and source in cells[cell]][:MOST_VALUES]
+        for first, second in combinations(values, 2):
+            a, b = cells[first][source], cells[second][source]
+            names = sorted({*a.names, *b.names})
+            pair = a.aligned(names), b.aligned(names)
+            for measure in (m for m in MEASURES if m.name in compared):
+                rows += _differences(
+                    areas, dimension, (first.value, second.value), measure, pair, floor, resamples, seed
+                )
+    corrected = adjusted(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
+    for row, p in zip(rows, corrected):
+        row["p_adjusted"] = _number(p)
+        row["found"] = bool(p <= 0.05)
+    return rows
+
+
+def _differences(
+    areas: Sequence[str],
+    dimension: str,
+    values: tuple[str, str],
+    measure: Measure,
+    people: tuple[People, People],
+    floor: Floor,
+    resamples: int,
+    seed: int,
+) -> list[Row]:
+    first, second = (measure.pair(p) for p in people)
+    if first is None or second is None:
+        return []
+    if measure.counts:
+        found = proportion_differences(first, second)
+    else:
+        found = ratio_differences(first, second, resamples=resamples, seed=seed)
+    least = np.minimum((first[1] > 0).sum(axis=0), (second[1] > 0).sum(axis=0))
+    rows = []
+    for a, area in enumerate(areas):
+        told = floor.passes(int(least[a]))
+        row: Row = {"cell": dimension, "first": values[0], "second": values[1], "thing": area, "measure": measure.name}
+        for key in ("value", "low", "high", "p"):
+            row["difference" if key == "value" else key] = _number(getattr(found, key)[a]) if told else None
+        rows.append(row)
+    return rows
+
+
+def move_rows(sums: Sums, floor: Floor) -> list[Row]:
+    """Moves between things of each cell: ``from``, ``to``, how many ``moves``, and their ``share`` of those from
+    there."""
+    rows = []
+    for c, cell in enumerate(sums.cells):
+        people = len(sums.persons_of(cell)[0])
+        total = sums.moves[c].sum(axis=1)
+        for i, j in np.argwhere(sums.moves[c] > 0):
+            told = floor.passes(people)
+            n = float(sums.moves[c, i, j])
+            row: Row = {"cell": cell.dimension, "value": cell.value, "from": sums.areas[i], "to": sums.areas[j]}
+            rows.append(row | {"moves": int(n) if told else None, "share": n / float(total[i]) if told else None})
+    return rows
+
+
+def duration_rows(sums: Sums, floor: Floor) -> list[Row]:
+    """How many looks at each area last how long, of each cell; `BINS` in seconds."""
+    rows = []
+    names = [f"{a:g} to {b:g} s" if np.isfinite(b) else f"{a:g} s or more" for a, b in zip(BINS[:-1], BINS[1:])]
+    for c, cell in enumerate(sums.cells):
+        people = len(sums.persons_of(cell)[0])
+        for a, area in enumerate(sums.areas):
+            told = floor.passes(people)
+            counts = {n: int(v) if told else None for n, v in zip(names, sums.lasted[c, a])}
+            rows.append({"cell": cell.dimension, "value": cell.value, "thing": area, **counts})
+    return rows
+
+
+def person_rows(sums: Sums, names: Mapping[str, str], seen: bool) -> list[Row]:
+    """Each person's own sums of each area, over all that was recorded; ``names``: what each is called."""
+    rows = []
+    of_all, persons = sums.persons_of(Cell("all", ""))
+    shown = sorted(zip(persons, of_all), key=lambda found: names[found[0]])
+    for person, r in shown:
+        for a, area in enumerate(sums.areas):
+            looked = sums.looks[r, a] > 0
+            first = sums.first_sum[r, a] / sums.first_count[r, a] if looked else None
+            row: Row = {"person": names[person], "thing": area, "time": float(sums.time[r]), "rays": int(sums.rays[r])}
+            row |= {"dwell": float(sums.on_time[r, a]), "looks": int(sums.looks[r, a])}
+            row |= {"first_look": first if first is None else float(first)}
+            rows.append(row | {"visible": float(sums.visible[r, a]) if seen else None})
+    return rows
+
+
+def shown(row: Row, measure: Measure) -> str:
+    """A value with its interval as Markdown has it: shares in percent."""
+    value = row.get(measure.name)
+    if value is None:
+        return ""
+    scale, digits = (100.0, 1) if measure.most == 1.0 else (1.0, 2)
+    text = f"{scale * value:.{digits}f}" + (" %" if scale > 1 else "")
+    low, high = row.get(measure.name + "_low"), row.get(measure.name + "_high")
+    if low is None or high is None:
+        return text
+    return text + f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
