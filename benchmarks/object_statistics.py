@@ -1,0 +1,382 @@
+"""Numbers of attention on things against what is true: errors, coverage of intervals, halves of people, time.
+
+    python benchmarks/object_statistics.py errors      # the store's law and brute-force ray casts
+    python benchmarks/object_statistics.py coverage    # 200 data sets of shoppers: how often intervals hold the truth
+    NERG_DATA=DIR python benchmarks/object_statistics.py halves   # the VR supermarket, boxes over its shelves
+    python benchmarks/object_statistics.py time        # rays against seconds and memory
+
+The shoppers' walks are those of the demo store (`nerg_mi.scenes.store.shoppers`), each tracked once in 0.8 s; where
+they look is drawn anew from its law for every data set. The truth of the coverage is that of the pool of walks, from 60
+draws of all of them; a data set is so many shoppers of the pool, drawn with replacement.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from pathlib import Path
+
+import nerg_mi  # chooses the libLLVM, so it comes before drjit and mitsuba
+
+import numpy as np
+
+SENSORS = 4  # every so manieth sample of a walk
+TRUTHS, POOL = 60, 60
+STEP = 0.8
+
+
+def made_store():
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.formats.areas.reading import read_areas
+    from nerg_mi.jobs.counting.surroundings import surroundings_of_scene
+    from nerg_mi.jobs.counting.things import shapes_of, things_of
+    from nerg_mi.jobs.demo import store_scene
+
+    folder = store_scene().parent
+    around = surroundings_of_scene(folder / "shapes.xml", None, None, None)
+    areas = read_areas(folder / "regions.json")
+    return around, areas, things_of(areas.things, shapes_of(around.scene))
+
+
+def counting_of(around, areas, things, seen: bool = True):
+    from nerg_mi.jobs.counting.tracked import Counting
+    from nerg_mi.statistics.looks import LookRules
+    from nerg_mi.statistics.visibility import CellsInView, Targets
+
+    in_view = CellsInView(Targets.of(things, 48), around.depth, 0.1, 0.03) if seen else None
+    members = list(areas.members().values())
+    rules = LookRules(gap=2.0, pause=60.0, merge=0.15, least=0.1)
+    return Counting(
+        around, things, areas.names, members, range(len(members)), rules, 0.03, view=120.0, cells_in_view=in_view
+    )
+
+
+class Walks:
+    """A pool of walks with the law's mixture at each position, from which directions are drawn."""
+
+    def __init__(self, count: int, seed: int = 11):
+        from nerg_mi.scenes.store import layout, shoppers
+        from nerg_mi.scenes.store.attention_law import AttentionLaw
+
+        plan = layout.build()
+        self.law = AttentionLaw()
+        store, rng = shoppers.Store(plan), np.random.default_rng([seed, 1])
+        weights = 0.5 + self.law.attractiveness
+        self.heads, self.times = [], []
+        for _ in range(count):
+            visit = shoppers.walk(store, rng, int(rng.integers(8, 21)), weights)
+            self.heads.append(visit.head[::SENSORS])
+            self.times.append(visit.time[::SENSORS])
+        self.lengths = np.array([len(h) for h in self.heads])
+        self.start = np.r_[0, np.cumsum(self.lengths)]
+        self.origin = np.concatenate(self.heads)
+        self.time = np.concatenate(self.times)
+        self.lobes = self.law.lobes(self.origin)
+
+    def draw(self, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Directions at the positions ``rows``: the law's own sampling, of a mixture that is known already."""
+        from nerg_mi.scenes.store.attention_law import Lobes
+
+        lobes = self.lobes
+        some = Lobes(lobes.weights[rows], lobes.mu[rows], lobes.kappa[rows], lobes.visible[rows])
+        self.law.lobes = lambda positions: some
+        try:
+            return self.law.sample(self.origin[rows], rng)
+        finally:
+            del self.law.lobes
+
+    def rays(self, who: np.ndarray, rng: np.random.Generator):
+        """Rays of these walks, each somebody's."""
+        from nerg_mi.rays.rays import Rays
+
+        rows = np.concatenate([np.arange(self.start[w], self.start[w + 1]) for w in who])
+        person = np.repeat(np.arange(len(who)), self.lengths[who])
+        names = tuple(f"{k:04d}" for k in range(len(who)))
+        ones = np.ones(len(rows))
+        return Rays(self.time[rows], person, names, self.origin[rows], self.draw(rows, rng), ones)
+
+
+def coverage(sets: int, people: tuple[int, ...]) -> None:
+    from nerg_mi.jobs.counting.tracked import count_block
+    from nerg_mi.statistics.measures import MEASURES, People
+    from nerg_mi.statistics.sums import ALL
+
+    around, areas, things = made_store()
+    counting = counting_of(around, areas, things)
+    walks = Walks(POOL)
+    rng = np.random.default_rng(3)
+    x = {m.name: 0.0 for m in MEASURES}
+    y = {m.name: 0.0 for m in MEASURES}
+    for _ in range(TRUTHS):
+        found = People.of(count_block(walks.rays(np.arange(POOL), rng), counting), ALL, True)
+        for m in MEASURES:
+            a, b = m.pair(found)
+            x[m.name], y[m.name] = x[m.name] + a.sum(axis=0), y[m.name] + b.sum(axis=0)
+    truth = {name: x[name] / y[name] for name in x}
+    print(f"{len(areas.names)} things, {sets} data sets; truth of {TRUTHS} x {POOL} walks\n")
+    print(
+        "| people | measure | held | least of a thing | width | without |\n| ---: | --- | ---: | ---: | ---: | ---: |"
+    )
+    for n in people:
+        held = {m.name: [] for m in MEASURES}
+        for _ in range(sets):
+            who = rng.integers(0, POOL, n)
+            found = People.of(count_block(walks.rays(who, rng), counting), ALL, True)
+            for m in MEASURES:
+                e = m.estimate(found, 499, int(rng.integers(1 << 30)))
+                inside = (e.low <= truth[m.name] + 1e-12) & (truth[m.name] <= e.high + 1e-12)
+                held[m.name].append(np.stack([inside, np.isnan(e.low), (e.high - e.low) / truth[m.name]]))
+        for m in MEASURES:
+            inside, without, width = np.moveaxis(np.array(held[m.name], float), 1, 0)
+            known = without == 0
+            each = np.where(known, inside, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+            print(
+                f"| {n} | {m.name} | {100 * inside[known].mean():.1f} % | {100 * each[known.sum(axis=0) > 50].min():.1f} % | "
+                f"{100 * np.nanmedian(width[known]):.0f} % | {100 * without.mean():.1f} % |",
+                flush=True,
+            )
+
+
+def errors() -> None:
+    from nerg_mi.jobs.counting.foretold import foretell
+    from nerg_mi.jobs.counting.tracked import Eyes, count_block
+    from nerg_mi.jobs.reporter import SILENT
+    from nerg_mi.maths.sphere import fibonacci_directions
+    from nerg_mi.scenes.store import twin
+    from nerg_mi.statistics.landing import land
+    from nerg_mi.statistics.measures import People
+    from nerg_mi.statistics.sums import ALL
+
+    around, areas, things = made_store()
+    walks = Walks(12, seed=5)
+    counting = counting_of(around, areas, things)
+    rng = np.random.default_rng(1)
+    rays = walks.rays(np.arange(12), rng)
+    people = People.of(count_block(rays, counting), ALL, True)
+    # Brute force: a ray at a time to the twin, every box by its six planes, sums by plain loops.
+    depth = twin.cast(rays.origin, rays.direction)
+    dwell = np.zeros((12, len(areas.names)))
+    reached = np.zeros_like(dwell)
+    for i in range(len(rays)):
+        last = i + 1 == len(rays) or rays.person[i + 1] != rays.person[i]
+        weight = STEP if last else rays.t[i + 1] - rays.t[i]
+        for k, box in enumerate(areas.boxes):
+            near, far = -np.inf, np.inf
+            for axis in range(3):
+                d, o = rays.direction[i, axis], rays.origin[i, axis]
+                one, two = sorted(((box.lower[axis] - o) / d, (box.upper[axis] - o) / d))
+                near, far = max(near, one), min(far, two)
+            if near < far and far > 0 and 0 <= near <= depth[i] + 0.03:
+                dwell[rays.person[i], k] += weight
+                reached[rays.person[i], k] = 1
+    print("| number | against | largest error |\n| --- | --- | ---: |")
+    print(
+        f"| dwell [s], each person and thing | plain loops, ray casts to the twin | {np.abs(people.on_time - dwell).max():.2g} |"
+    )
+    print(f"| reach, each person and thing | the same | {np.abs(people.reached - reached).max():.2g} |")
+    # The law's own share, by quadrature over the sphere at some positions, beside the field's and a large draw.
+    rows = np.linspace(0, len(walks.origin) - 1, 160).round().astype(int)
+    d = fibonacci_directions(8192)
+    eyes = walks.origin[rows]
+    density = walks.law.density(eyes, d)
+    o, along = np.repeat(eyes, len(d), axis=0), np.tile(d, (len(eyes), 1))
+    law = np.zeros((len(rows), len(areas.names)))
+    far = np.zeros_like(law)
+    for a in range(0, len(eyes), 40):
+        part = slice(a * len(d), (a + 40) * len(d))
+        found = land(things, o[part], along[part], twin.cast(o[part], along[part]), 0.03)
+        weight = density[a : a + 40].ravel() * (4 * np.pi / len(d))
+        for k, (at, distance) in enumerate(zip(found.rows, found.distance)):
+            law[a : a + 40, k] = np.bincount(at // len(d), weights=weight[at], minlength=40)
+            far[a : a + 40, k] = np.bincount(at // len(d), weights=weight[at] * distance, minlength=40)
+    # Many draws at the same positions, through the very counting of rays.
+    draws = 400
+    many = np.tile(rows, draws)
+    directions = walks.draw(many, rng)
+    from nerg_mi.rays.rays import Rays
+
+    sampled = Rays(
+        np.repeat(np.arange(draws), len(rows)) * 1.0,
+        np.tile(np.arange(len(rows)), draws),
+        tuple(f"{k:04d}" for k in range(len(rows))),
+        walks.origin[many],
+        directions,
+        np.ones(len(many)),
+    )
+    landed = counting.land(sampled)
+    counted = np.array([len(at) for at in landed.rows]) / len(many)
+    shares = law.mean(axis=0)
+    sigma = np.sqrt(shares * (1 - shares) / len(many))
+    worst = np.abs(counted - shares) / sigma
+    print(
+        f"| share of {draws * len(rows):,} rays | the law by quadrature | {np.abs(counted - shares).max():.2g} of {shares.max():.2g}, "
+        f"{worst.max():.1f} standard errors (median {np.median(worst):.1f}) |"
+    )
+    mean = far.sum(axis=0) / law.sum(axis=0)
+    near = np.array([v.mean() for v in landed.distance])
+    print(
+        f"| mean distance [m] of these | the same | {np.abs(near - mean).max():.2g} (median {np.median(np.abs(near - mean)):.2g}) |"
+    )
+    at = Eyes(
+        eyes, np.tile([1.0, 0, 0], (len(eyes), 1)), tuple(map(str, range(len(eyes)))), (frozenset([ALL]),) * len(eyes)
+    )
+    told = foretell(around, at, things, counting.members, 0.03, 360.0, 48, 8192, SILENT)
+    error = np.abs(told.share.mean(axis=0) - shares)
+    correlation = np.corrcoef(told.share.mean(axis=0), shares)[0, 1]
+    print(
+        f"| share by the field | the same | {error.max():.2g} (median {np.median(error):.2g} of {np.median(shares):.2g}; r {correlation:.3f}) |"
+    )
+    metres = told.distance.sum(axis=0) / told.share.sum(axis=0)
+    print(
+        f"| mean distance [m] by the field | the same | {np.abs(metres - mean).max():.2g} (median {np.median(np.abs(metres - mean)):.2g}) |"
+    )
+    # What could be seen: exact ray casts from where people stood, against cells of 10 cm.
+    some = np.linspace(0, len(rays) - 1, 1500).round().astype(int)
+    chosen = rays.select(some)
+    seen = counting.visible(chosen)
+    targets = counting.cells_in_view._targets
+    exact = np.zeros_like(seen)
+    for n in range(len(chosen)):
+        away = targets.points - chosen.origin[n]
+        length = np.linalg.norm(away, axis=1)
+        front = (away * targets.normals).sum(axis=1) < 0
+        within = away @ chosen.direction[n] >= np.cos(np.radians(60)) * length
+        free = np.zeros(len(length), bool)
+        ask = np.flatnonzero(front & within)
+        if len(ask):
+            free[ask] = twin.visible(chosen.origin[n], targets.points[ask], tolerance=0.03)
+        exact[n] = np.bincount(targets.thing, weights=free, minlength=exact.shape[1]) > 0
+    agree = (seen == exact).mean()
+    print(
+        f"| visible or not, {seen.size:,} pairs | ray casts from where they stood | {100 * (1 - agree):.2f} % differ |"
+    )
+    print(f"| visible share, each thing | the same | {np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max():.2g} |")
+
+
+def halves(splits: int) -> None:
+    import os
+
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.formats.areas.kinds import Areas
+    from nerg_mi.formats.regions import Region
+    from nerg_mi.jobs.counting.surroundings import Surroundings
+    from nerg_mi.jobs.counting.things import things_of
+    from nerg_mi.jobs.counting.tracked import count_block
+    from nerg_mi.maths.similarity import Similarity
+    from nerg_mi.statistics.measures import MEASURES, People
+    from nerg_mi.statistics.sums import ALL
+
+    folder = Path(os.environ.get("NERG_DATA", "../shared/data")) / "vr_supermarket"
+    rays = nerg_mi.import_rays(sorted(folder.glob("*.csv.gz")), "vr_supermarket")
+    hit = rays.hit[np.isfinite(rays.hit).all(axis=1)]
+    boxes = proxy_boxes(hit)
+    areas = Areas(tuple(Region.of(f"shelf {k + 1}", *b) for k, b in enumerate(boxes)))
+    around = Surroundings(None, None, Similarity())
+    counting = counting_of(around, areas, things_of(areas.things, {}), seen=False)
+    from dataclasses import replace
+
+    counting = replace(counting, hits=True)
+    sums = count_block(rays, counting)
+    people = People.of(sums, ALL, False)
+    print(f"{len(rays):,} rays of {len(people.names)} people, {len(boxes)} boxes\n")
+    rng = np.random.default_rng(0)
+    print("| measure | r of halves | median difference | intervals of halves overlap |\n| --- | ---: | ---: | ---: |")
+    for m in MEASURES:
+        pair = m.pair(people)
+        if pair is None:
+            continue
+        r, gap, both = [], [], []
+        for _ in range(splits):
+            order = rng.permutation(len(people.names))
+            first, second = np.sort(order[: len(order) // 2]), np.sort(order[len(order) // 2 :])
+            e = [m.estimate(part(people, who), 499, 0) for who in (first, second)]
+            known = np.isfinite(e[0].value) & np.isfinite(e[1].value)
+            if known.sum() > 2 and np.ptp(e[0].value[known]) > 0 and np.ptp(e[1].value[known]) > 0:
+                r.append(np.corrcoef(e[0].value[known], e[1].value[known])[0, 1])
+            middle = (e[0].value + e[1].value)[known] / 2
+            gap.append(np.median(np.abs(e[0].value - e[1].value)[known] / np.maximum(middle, 1e-12)))
+            some = np.isfinite(e[0].low) & np.isfinite(e[1].low)
+            both.append(((e[0].low <= e[1].high) & (e[1].low <= e[0].high))[some].mean())
+        print(f"| {m.name} | {np.mean(r):.2f} | {100 * np.mean(gap):.0f} % | {100 * np.mean(both):.0f} % |")
+
+
+def part(people, who):
+    from dataclasses import fields, replace
+
+    made = {f.name: v[who] for f in fields(people) if isinstance(v := getattr(people, f.name), np.ndarray)}
+    return replace(people, names=tuple(people.names[k] for k in who), **made)
+
+
+def proxy_boxes(hit: np.ndarray, most: int = 24) -> list:
+    """Boxes of 2 m over the floor's cells that most hit points between 0.3 and 2.2 m lie in, fitted to these."""
+    some = hit[(hit[:, 2] > 0.3) & (hit[:, 2] < 2.2)]
+    cell = np.floor(some[:, :2] / 2.0).astype(int)
+    cells, of, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    found = []
+    for k in np.argsort(-count)[:most]:
+        mine = some[of.ravel() == k]
+        low, high = np.percentile(mine, 2, axis=0), np.percentile(mine, 98, axis=0)
+        found.append((low - 0.02, np.maximum(high, low + 0.05) + 0.02))
+    return found
+
+
+def timing(counts: tuple[int, ...]) -> None:
+    from nerg_mi.jobs.counting.tracked import blocks_of, count_block
+    from nerg_mi.rays.rays import Rays
+    from nerg_mi.statistics.sums import Total
+
+    around, areas, things = made_store()
+    walks = Walks(20, seed=7)
+    rng = np.random.default_rng(0)
+    base = walks.rays(np.arange(20), rng)
+    print("| rays | what could be seen | seconds | rays a second | memory of sums [MB] | memory of it all [MB] |")
+    print("| ---: | --- | ---: | ---: | ---: | ---: |")
+    for n in counts:
+        for seen in (False, True) if n <= 1_000_000 else (False,):
+            counting = counting_of(around, areas, things, seen)
+            count_block(base, counting)
+            copies, done, total = -(-n // len(base)), 0, None
+            began = time.perf_counter()
+            # People and days are new in every copy, as a dataset's parts would give them.
+            for c in range(copies):
+                names = tuple(f"{c % 50:03d}-{p}" for p in base.persons)
+                rays = Rays(base.t + 1e5 * c, base.person, names, base.origin, base.direction, base.confidence)
+                for block in blocks_of(rays, counting.rules):
+                    found = count_block(block, counting)
+                    total = total or Total(found.areas, found.cells)
+                    total.add(found)
+                    done += len(block)
+            seconds = time.perf_counter() - began
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            print(
+                f"| {done:,} | {'yes' if seen else 'no'} | {seconds:.1f} | {done / seconds:,.0f} | "
+                f"{total.sums().nbytes / 1e6:.1f} | {peak:.0f} |",
+                flush=True,
+            )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("errors", "coverage", "halves", "time"))
+    parser.add_argument("--sets", type=int, default=200, help="data sets of the coverage (200)")
+    parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 30], help="people of each (8 16 30)")
+    parser.add_argument("--splits", type=int, default=50, help="ways to halve people (50)")
+    parser.add_argument("--rays", type=int, nargs="+", default=[100_000, 1_000_000, 10_000_000])
+    given = parser.parse_args()
+    if given.what == "errors":
+        errors()
+    elif given.what == "coverage":
+        coverage(given.sets, tuple(given.people))
+    elif given.what == "halves":
+        halves(given.splits)
+    else:
+        timing(tuple(given.rays))
+
+
+if __name__ == "__main__":
+    main()
