@@ -1,8 +1,7 @@
-"""Numbers of attention on things against what is true: errors, coverage of intervals, halves of people, time.
+"""Numbers of attention on things against what is true: errors, coverage of intervals, time.
 
     python benchmarks/object_statistics.py errors      # the store's law and brute-force ray casts
     python benchmarks/object_statistics.py coverage    # 200 data sets of shoppers: how often intervals hold the truth
-    NERG_DATA=DIR python benchmarks/object_statistics.py halves   # the VR supermarket, boxes over its shelves
     python benchmarks/object_statistics.py time        # rays against seconds and memory
 
 The shoppers' walks are those of the demo store (`nerg_mi.scenes.store.shoppers`), each tracked once in 0.8 s; where
@@ -15,7 +14,6 @@ from __future__ import annotations
 import argparse
 import resource
 import time
-from pathlib import Path
 
 import nerg_mi  # chooses the libLLVM, so it comes before drjit and mitsuba
 
@@ -133,8 +131,9 @@ def coverage(sets: int, people: tuple[int, ...]) -> None:
             inside, without, width = np.moveaxis(np.array(held[m.name], float), 1, 0)
             known = without == 0
             each = np.where(known, inside, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+            worst = each[known.sum(axis=0) > 50].min()
             print(
-                f"| {n} | {m.name} | {100 * inside[known].mean():.1f} % | {100 * each[known.sum(axis=0) > 50].min():.1f} % | "
+                f"| {n} | {m.name} | {100 * inside[known].mean():.1f} % | {100 * worst:.1f} % | "
                 f"{100 * np.nanmedian(width[known]):.0f} % | {100 * without.mean():.1f} % |",
                 flush=True,
             )
@@ -149,6 +148,7 @@ def errors() -> None:
     from nerg_mi.statistics.landing import land
     from nerg_mi.statistics.measures import People
     from nerg_mi.statistics.sums import ALL
+    from nerg_mi.statistics.visibility import Targets
 
     around, areas, things = made_store()
     walks = Walks(12, seed=5)
@@ -173,9 +173,8 @@ def errors() -> None:
                 dwell[rays.person[i], k] += weight
                 reached[rays.person[i], k] = 1
     print("| number | against | largest error |\n| --- | --- | ---: |")
-    print(
-        f"| dwell [s], each person and thing | plain loops, ray casts to the twin | {np.abs(people.on_time - dwell).max():.2g} |"
-    )
+    largest = np.abs(people.on_time - dwell).max()
+    print(f"| dwell [s], each person and thing | plain loops, ray casts to the twin | {largest:.2g} |")
     print(f"| reach, each person and thing | the same | {np.abs(people.reached - reached).max():.2g} |")
     # The law's own share, by quadrature over the sphere at some positions, beside the field's and a large draw.
     rows = np.linspace(0, len(walks.origin) - 1, 160).round().astype(int)
@@ -212,32 +211,30 @@ def errors() -> None:
     sigma = np.sqrt(shares * (1 - shares) / len(many))
     worst = np.abs(counted - shares) / sigma
     print(
-        f"| share of {draws * len(rows):,} rays | the law by quadrature | {np.abs(counted - shares).max():.2g} of {shares.max():.2g}, "
-        f"{worst.max():.1f} standard errors (median {np.median(worst):.1f}) |"
+        f"| share of {draws * len(rows):,} rays | the law by quadrature | {np.abs(counted - shares).max():.2g} of "
+        f"{shares.max():.2g}, {worst.max():.1f} standard errors (median {np.median(worst):.1f}) |"
     )
     mean = far.sum(axis=0) / law.sum(axis=0)
     near = np.array([v.mean() for v in landed.distance])
-    print(
-        f"| mean distance [m] of these | the same | {np.abs(near - mean).max():.2g} (median {np.median(np.abs(near - mean)):.2g}) |"
-    )
+    off = np.abs(near - mean)
+    print(f"| mean distance [m] of these | the same | {off.max():.2g} (median {np.median(off):.2g}) |")
     at = Eyes(
         eyes, np.tile([1.0, 0, 0], (len(eyes), 1)), tuple(map(str, range(len(eyes)))), (frozenset([ALL]),) * len(eyes)
     )
     told = foretell(around, at, things, counting.members, 0.03, 360.0, 48, 8192, SILENT)
     error = np.abs(told.share.mean(axis=0) - shares)
-    correlation = np.corrcoef(told.share.mean(axis=0), shares)[0, 1]
+    r = np.corrcoef(told.share.mean(axis=0), shares)[0, 1]
     print(
-        f"| share by the field | the same | {error.max():.2g} (median {np.median(error):.2g} of {np.median(shares):.2g}; r {correlation:.3f}) |"
+        f"| share by the field | the same | {error.max():.2g} (median {np.median(error):.2g} of "
+        f"{np.median(shares):.2g}; r {r:.3f}) |"
     )
-    metres = told.distance.sum(axis=0) / told.share.sum(axis=0)
-    print(
-        f"| mean distance [m] by the field | the same | {np.abs(metres - mean).max():.2g} (median {np.median(np.abs(metres - mean)):.2g}) |"
-    )
+    off = np.abs(told.distance.sum(axis=0) / told.share.sum(axis=0) - mean)
+    print(f"| mean distance [m] by the field | the same | {off.max():.2g} (median {np.median(off):.2g}) |")
     # What could be seen: exact ray casts from where people stood, against cells of 10 cm.
     some = np.linspace(0, len(rays) - 1, 1500).round().astype(int)
     chosen = rays.select(some)
     seen = counting.visible(chosen)
-    targets = counting.cells_in_view._targets
+    targets = Targets.of(things, 48)
     exact = np.zeros_like(seen)
     for n in range(len(chosen)):
         away = targets.points - chosen.origin[n]
@@ -254,75 +251,6 @@ def errors() -> None:
         f"| visible or not, {seen.size:,} pairs | ray casts from where they stood | {100 * (1 - agree):.2f} % differ |"
     )
     print(f"| visible share, each thing | the same | {np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max():.2g} |")
-
-
-def halves(splits: int) -> None:
-    import os
-
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    from nerg_mi.formats.areas.kinds import Areas
-    from nerg_mi.formats.regions import Region
-    from nerg_mi.jobs.counting.surroundings import Surroundings
-    from nerg_mi.jobs.counting.things import things_of
-    from nerg_mi.jobs.counting.tracked import count_block
-    from nerg_mi.maths.similarity import Similarity
-    from nerg_mi.statistics.measures import MEASURES, People
-    from nerg_mi.statistics.sums import ALL
-
-    folder = Path(os.environ.get("NERG_DATA", "../shared/data")) / "vr_supermarket"
-    rays = nerg_mi.import_rays(sorted(folder.glob("*.csv.gz")), "vr_supermarket")
-    hit = rays.hit[np.isfinite(rays.hit).all(axis=1)]
-    boxes = proxy_boxes(hit)
-    areas = Areas(tuple(Region.of(f"shelf {k + 1}", *b) for k, b in enumerate(boxes)))
-    around = Surroundings(None, None, Similarity())
-    counting = counting_of(around, areas, things_of(areas.things, {}), seen=False)
-    from dataclasses import replace
-
-    counting = replace(counting, hits=True)
-    sums = count_block(rays, counting)
-    people = People.of(sums, ALL, False)
-    print(f"{len(rays):,} rays of {len(people.names)} people, {len(boxes)} boxes\n")
-    rng = np.random.default_rng(0)
-    print("| measure | r of halves | median difference | intervals of halves overlap |\n| --- | ---: | ---: | ---: |")
-    for m in MEASURES:
-        pair = m.pair(people)
-        if pair is None:
-            continue
-        r, gap, both = [], [], []
-        for _ in range(splits):
-            order = rng.permutation(len(people.names))
-            first, second = np.sort(order[: len(order) // 2]), np.sort(order[len(order) // 2 :])
-            e = [m.estimate(part(people, who), 499, 0) for who in (first, second)]
-            known = np.isfinite(e[0].value) & np.isfinite(e[1].value)
-            if known.sum() > 2 and np.ptp(e[0].value[known]) > 0 and np.ptp(e[1].value[known]) > 0:
-                r.append(np.corrcoef(e[0].value[known], e[1].value[known])[0, 1])
-            middle = (e[0].value + e[1].value)[known] / 2
-            gap.append(np.median(np.abs(e[0].value - e[1].value)[known] / np.maximum(middle, 1e-12)))
-            some = np.isfinite(e[0].low) & np.isfinite(e[1].low)
-            both.append(((e[0].low <= e[1].high) & (e[1].low <= e[0].high))[some].mean())
-        print(f"| {m.name} | {np.mean(r):.2f} | {100 * np.mean(gap):.0f} % | {100 * np.mean(both):.0f} % |")
-
-
-def part(people, who):
-    from dataclasses import fields, replace
-
-    made = {f.name: v[who] for f in fields(people) if isinstance(v := getattr(people, f.name), np.ndarray)}
-    return replace(people, names=tuple(people.names[k] for k in who), **made)
-
-
-def proxy_boxes(hit: np.ndarray, most: int = 24) -> list:
-    """Boxes of 2 m over the floor's cells that most hit points between 0.3 and 2.2 m lie in, fitted to these."""
-    some = hit[(hit[:, 2] > 0.3) & (hit[:, 2] < 2.2)]
-    cell = np.floor(some[:, :2] / 2.0).astype(int)
-    cells, of, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    found = []
-    for k in np.argsort(-count)[:most]:
-        mine = some[of.ravel() == k]
-        low, high = np.percentile(mine, 2, axis=0), np.percentile(mine, 98, axis=0)
-        found.append((low - 0.02, np.maximum(high, low + 0.05) + 0.02))
-    return found
 
 
 def timing(counts: tuple[int, ...]) -> None:
@@ -362,18 +290,15 @@ def timing(counts: tuple[int, ...]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("errors", "coverage", "halves", "time"))
+    parser.add_argument("what", choices=("errors", "coverage", "time"))
     parser.add_argument("--sets", type=int, default=200, help="data sets of the coverage (200)")
     parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 30], help="people of each (8 16 30)")
-    parser.add_argument("--splits", type=int, default=50, help="ways to halve people (50)")
     parser.add_argument("--rays", type=int, nargs="+", default=[100_000, 1_000_000, 10_000_000])
     given = parser.parse_args()
     if given.what == "errors":
         errors()
     elif given.what == "coverage":
         coverage(given.sets, tuple(given.people))
-    elif given.what == "halves":
-        halves(given.splits)
     else:
         timing(tuple(given.rays))
 

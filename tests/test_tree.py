@@ -34,6 +34,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/jobs/options/radiance.py": _OPTIONS,
     "nerg_mi/jobs/options/report.py": _OPTIONS,
     "nerg_mi/jobs/options/scene.py": _OPTIONS,
+    "nerg_mi/jobs/options/statistics.py": _OPTIONS,
     "nerg_mi/jobs/options/study.py": _OPTIONS,
     "nerg_mi/jobs/options/view.py": _OPTIONS,
     "nerg_mi/rays/checks/protocol.py": "only fields: tests/rays/checks/test_registry.py looks at every check",

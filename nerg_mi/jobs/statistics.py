@@ -16,8 +16,6 @@ from nerg_mi.formats.areas.kinds import Areas, Group
 from nerg_mi.formats.areas.reading import read_areas
 from nerg_mi.formats.regions import read_regions
 from nerg_mi.interruption import Interruption
-from nerg_mi.rays.dataset.dataset import RayDataset
-from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.intervals import LEAST_PEOPLE
@@ -45,7 +43,7 @@ from .counting.places import isovist_rows, look_around, places_of
 from .counting.results import write_results
 from .counting.surroundings import Surroundings, surroundings_of_files
 from .counting.things import shapes_of, things_of
-from .counting.tracked import Counting, EyePicker, Eyes, Window, blocks_of, count_block
+from .counting.tracked import Counting, EyePicker, Eyes, Window, blocks_of, cohort_names, count_block, ray_count
 from .counting.what_if import what_if_rows
 from .options import parse_numbers
 from .options.statistics import StatisticsOptions, parse_window
@@ -145,12 +143,14 @@ class _Work:
         stop: Interruption,
     ):
         self.given, self.areas, self.options, self.reporter, self.stop = given, areas, options, reporter, stop
+        # What is plainly wrong is told before anything is loaded.
+        self.rules = LookRules(options.gap, options.pause, options.merge, options.least)
+        self.windows = [Window(*parse_window(text)) for text in options.windows]
         align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
         self.around: Surroundings = surroundings_of_files(given.scene, given.field, given.gaze, align, ns)
         self.things = things_of(areas.things, shapes_of(self.around.scene))
         self.members = list(areas.members().values())
         self.margin = options.margin * self.around.scale
-        self.rules = LookRules(options.gap, options.pause, options.merge, options.least)
 
     def run(self) -> StatisticsResult:
         """All that is asked for."""
@@ -226,10 +226,10 @@ class _Work:
             hits,
             o.view,
             in_view,
-            [Window(*parse_window(text)) for text in o.windows],
+            self.windows,
             [] if o.zones is None else read_regions(o.zones),
             cohorts,
-            tuple(sorted(set(cohorts.values()))) if cohorts else _cohort_names(rays, first),
+            tuple(sorted(set(cohorts.values()))) if cohorts else cohort_names(rays, first),
         )
 
     def _depth_or_things(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -245,7 +245,7 @@ class _Work:
 
     def _count(self, counting: Counting) -> tuple[Sums, Eyes]:
         assert self.given.rays is not None
-        count = _ray_count(self.given.rays)
+        count = ray_count(self.given.rays)
         picker = EyePicker(max(1, count // self.options.eyes))
         total: Total | None = None
         done = 0
@@ -338,15 +338,3 @@ class _Work:
                 f"there are no intervals where there are fewer than {LEAST_PEOPLE} people ({which}"
                 + (f" and {len(set(few)) - 1} more)" if len(set(few)) > 1 else ")")
             )
-
-
-def _cohort_names(rays: Path | Rays, first: Rays) -> tuple[str, ...]:
-    if not isinstance(rays, Rays) and is_dataset(rays):
-        return tuple(sorted(RayDataset.open(rays).cohorts))
-    return tuple(sorted(first.cohorts))
-
-
-def _ray_count(rays: Path | Rays) -> int:
-    if isinstance(rays, Rays):
-        return len(rays)
-    return len(RayDataset.open(rays)) if is_dataset(rays) else len(Rays.load(rays))

@@ -31,6 +31,8 @@ ABLATION = (
     "default_emit_capture_0.safetensors default_emit_capture_0.json"
 )
 EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.png"
+STATS = "things.csv things.md things.parquet moves.csv moves.md moves.parquet durations.csv durations.md "
+STATS += "durations.parquet people.csv people.md people.parquet things.png moves.png about.json"
 GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8 --seed 1"
 
 
@@ -108,6 +110,12 @@ CASES = (
     Case("rays filter", "{i}/rays.npz -o {o}/a.parquet --person a", ("a.parquet",)),
     Case("rays split", "{i}/rays.npz -o {o}/a.npz --people 0.5", ("a-train.npz", "a-test.npz")),
     Case("rays plot", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
+    Case(
+        "stats",
+        "{i}/rays.npz -o {o}/numbers --areas {i}/areas.json --resamples 199 -m llvm_ad_rgb",
+        _below("numbers", STATS),
+        ("numbers",),
+    ),
     Case("align", "-o {o}/a.json --pairs {i}/pairs.csv", ("a.json", "a.png")),
     Case("rays plot", "{i}/rays.npz -o {o}/a.png --kind layout", ("a.png",)),
     Case(
@@ -179,6 +187,7 @@ INPUTS = {
     "scene": {"files", "photos", "align"},
     "view": {"files", "regions", "align"},
     "render": {"scene", "frames"},
+    "stats": {"files", "areas", "align", "zones", "cohorts", "what_if", "salt"},
     "draw sphere": {"files"},
     "draw triptych": {"files"},
     "draw floor": {"files", "scene"},
@@ -224,6 +233,8 @@ def make_inputs(folder: Path) -> Path:
     (folder / "demo.json").write_text(json.dumps(write_standins(folder / "demo")))
     rows = [f"{t},a,{0.1 * t},0,1.6,0,1,0" for t in range(2000)]
     (folder / "day.csv").write_text("\n".join(["t,p,x,y,z,a,b,c", *rows]))
+    areas = {"low": [[1.4, -2, 0], [1.6, 2, 1.2]], "high": [[1.4, -2, 1.2], [1.6, 2, 3]]}
+    (folder / "areas.json").write_text(json.dumps(areas))
     pairs = "x,y,z,place_x,place_y,place_z\n0,0,0,1,0,0\n1,0,0,2,0,0\n0,1,0,1,1,0\n0,0,1,1,0,1\n"
     (folder / "pairs.csv").write_text(pairs)
     write_scene(folder / "watched", "gaze.xml")

@@ -117,6 +117,8 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     options = StatisticsOptions(areas=folder / "areas.json", what_if=folder / "changes.json", **FAST)
     recorder = Recorder()
     found = statistics([folder / "scene.xml", folder / "rays.npz"], tmp_path / "out", options, recorder)
+    # A shape as a thing is still the scene's, by its name.
+    assert found.what_if
     field = table(found.things, cell="all", source="field")
     assert len(field) == 3 and all(0 < r["share"] < 1 and r["looks"] is None for r in field)
     assert field[2]["share"] == pytest.approx(field[0]["share"] + field[1]["share"], rel=0.02)

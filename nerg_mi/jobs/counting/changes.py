@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError, mitsuba_says, plain
+from nerg_mi.errors import NergError, plain
 from nerg_mi.files.bounded import read_json
 from nerg_mi.formats.areas.kinds import Area, Areas, Group, SceneShape
 from nerg_mi.formats.regions import Entry, Region, check_name, is_number, parse_box
 
-from .things import make_mesh, mesh_of_file, shape_named, shapes_of
+from .things import make_mesh, mesh_of_file, scene_of, shape_named, shapes_of
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -185,8 +185,6 @@ def _moved(box: Region, move: Move) -> Region:
 def changed_scene(scene: mi.Scene | None, changes: Changes) -> tuple[mi.Scene, dict[str, Any]]:
     """Another scene with the changed shapes, which has those that stay in common with ``scene``, and all of its shapes
     by name. Raises `NergError` for shapes that there are not, or cannot be moved."""
-    import mitsuba as mi
-
     if scene is None:
         raise NergError("shapes are changed in a scene; give one (.xml), since a trained field cannot be taken apart")
     kept = shapes_of(scene)
@@ -206,9 +204,7 @@ def changed_scene(scene: mi.Scene | None, changes: Changes) -> tuple[mi.Scene, d
         kept[put.name] = _made(put)
     if not kept:
         raise NergError("no shape is left; leave one at least")
-    with mitsuba_says():
-        made = {"type": "scene", **{f"shape_{k}": shape for k, shape in enumerate(kept.values())}}
-        return mi.load_dict(made, optimize=False), kept
+    return scene_of(kept), kept
 
 
 def _moved_shape(shape: Any, move: Move) -> Any:

@@ -68,10 +68,20 @@ def things_of(areas: Sequence[Region | MeshPart | SceneShape], shapes: Mapping[s
 
 def thing_of_shape(name: str, shape: Any) -> ShapeThing:
     """A Mitsuba shape as a thing."""
+    return ShapeThing(name, shape, scene_of({name: shape}))
+
+
+def scene_of(shapes: Mapping[str, Any]) -> mi.Scene:
+    """A scene of nothing but ``shapes``, which keep the names that they have: Mitsuba gives them others."""
     import mitsuba as mi
 
+    names = [shape.id() for shape in shapes.values()]
     with mitsuba_says():
-        return ShapeThing(name, shape, mi.load_dict({"type": "scene", "shape": shape}, optimize=False))
+        made = {f"shape_{k}": shape for k, shape in enumerate(shapes.values())}
+        scene = mi.load_dict({"type": "scene", **made}, optimize=False)
+    for shape, name in zip(shapes.values(), names):
+        shape.set_id(name)
+    return scene
 
 
 def shapes_of(scene: mi.Scene | None) -> dict[str, Any]:

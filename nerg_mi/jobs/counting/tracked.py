@@ -146,6 +146,20 @@ def blocks_of(source: Rays | str | Path, rules: LookRules, most: int = BLOCK) ->
     yield from _whole(iter([((), rays)]), rules, most)
 
 
+def cohort_names(source: Rays | str | Path, first: Rays) -> tuple[str, ...]:
+    """The cohorts that rays have, of which ``first`` is a block."""
+    if not isinstance(source, Rays) and is_dataset(source):
+        return tuple(sorted(RayDataset.open(source).cohorts))
+    return tuple(sorted(first.cohorts))
+
+
+def ray_count(source: Rays | str | Path) -> int:
+    """How many rays there are."""
+    if isinstance(source, Rays):
+        return len(source)
+    return len(RayDataset.open(source)) if is_dataset(source) else len(Rays.load(source))
+
+
 def _whole(parts: Iterator[tuple[tuple, Rays]], rules: LookRules, most: int) -> Iterator[Rays]:
     """Parts, each with a key that those have in common which may go on with each other, cut where sittings end; what a
     part ends with is kept until it is known that the next does not go on with it."""

@@ -1,0 +1,22 @@
+"""Cohorts of people from a table."""
+
+from __future__ import annotations
+
+import pytest
+
+from nerg_mi.errors import NergError
+from nerg_mi.jobs.counting.cohorts import read_cohorts
+
+
+def test01_read(tmp_path):
+    (tmp_path / "c.csv").write_text("cohort;person\nold;Ada\nyoung;Bo\nold;Ada\n")
+    assert read_cohorts(tmp_path / "c.csv") == {"Ada": "old", "Bo": "young"}
+
+
+@pytest.mark.parametrize(
+    "text", ["person,cohort\n", "person,group\nAda,old\n", "person,cohort\nAda,old\nAda,young\n", ""]
+)
+def test02_refused(tmp_path, text):
+    (tmp_path / "c.csv").write_text(text)
+    with pytest.raises(NergError, match=r"c\.csv"):
+        read_cohorts(tmp_path / "c.csv")

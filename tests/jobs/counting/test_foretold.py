@@ -1,0 +1,62 @@
+"""What a field foretells, against sums over directions that are written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nerg_mi.formats.regions import Region
+from nerg_mi.jobs.counting.foretold import foretell, foretold_people
+from nerg_mi.jobs.counting.surroundings import Surroundings
+from nerg_mi.jobs.counting.tracked import Eyes
+from nerg_mi.jobs.reporter import SILENT
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.statistics.landing import Box
+from nerg_mi.statistics.sums import ALL, Cell
+
+
+class Law(Surroundings):
+    """A gaze that is known: twice as dense ahead (x > 0) as behind, and seven units of support."""
+
+    def density(self, eye, d):
+        return np.where(d[:, 0] > 0, 2.0, 1.0)
+
+    def support(self, eye):
+        return 7.0
+
+
+AROUND = Law(None, None, Similarity())
+EYES = Eyes(
+    np.array([[0.0, 0, 0], [0, 0, 0.2], [0, 0, 0]]),
+    np.tile([1.0, 0, 0], (3, 1)),
+    ("Ada", "Ada", "Bo"),
+    (frozenset([ALL]), frozenset([ALL]), frozenset([ALL, Cell("zone", "z")])),
+)
+
+
+def test01_shares_are_integrals():
+    # A cube of which the eye sees a face of 2 x 2 at x = 1: a sixth of the sphere; of the hemisphere's gaze 2/3.
+    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1])), Box(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
+    found = foretell(AROUND, EYES, things, [(0,), (1,), (0, 1)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    assert np.allclose(found.share[0], [2 / 9, 1 / 9, 3 / 9], rtol=2e-3)
+    # The mean distance to a square face, over its solid angle, by quadrature in its plane.
+    u = (np.arange(400) + 0.5) / 200 - 1
+    y, z = np.meshgrid(u, u)
+    r2 = 1 + y**2 + z**2
+    mean = (r2**-1.5 * np.sqrt(r2)).sum() / (r2**-1.5).sum()
+    assert found.distance[0, 0] / found.share[0, 0] == pytest.approx(mean, rel=2e-3)
+    assert found.visible.tolist() == [[True, False, True]] * 3 and found.support.tolist() == [7, 7, 7]
+
+
+def test02_people():
+    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1]))]
+    found = foretell(AROUND, EYES, things, [(0,)], 0.0, 120.0, 24, 4096, SILENT)
+    people = foretold_people(found, EYES, ALL, {"Ada": 3.0, "Bo": 6.0}, 0.3)
+    assert people.names == ("Ada", "Bo")
+    share = found.share[:2].mean(axis=0)
+    assert people.on_time[0] == pytest.approx(3 * share)
+    # Ten glances, five from each place.
+    missed = np.prod([(1 - s) ** 5 for s in found.share[:2, 0]])
+    assert people.reached[0, 0] == pytest.approx(1 - missed)
+    (bo,) = foretold_people(found, EYES, Cell("zone", "z"), {"Bo": 6.0}, 0.3).names
+    assert bo == "Bo" and foretold_people(found, EYES, Cell("zone", "other"), {"Bo": 6.0}, 0.3) is None

@@ -1,0 +1,63 @@
+"""The table of a change, from foretold numbers that are known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from nerg_mi.formats.areas.kinds import Areas
+from nerg_mi.formats.regions import Region
+from nerg_mi.jobs.counting.foretold import Foretold
+from nerg_mi.jobs.counting.places import places_of
+from nerg_mi.jobs.counting.surroundings import Surroundings
+from nerg_mi.jobs.counting.what_if import what_if_rows
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.statistics.tables import Floor
+
+AREAS = Areas((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
+EYES = places_of(np.arange(15.0).reshape(5, 3))
+
+
+def told(share, support=5.0):
+    share = np.asarray(share, float)
+    return Foretold(share, share, share > 0, np.full(len(share), support))
+
+
+def rows(tmp_path, changes, after, floor=None):
+    (tmp_path / "c.json").write_text(json.dumps(changes))
+    asked = []
+
+    def foretell(around, eyes, areas, things):
+        asked.append((eyes, areas, things))
+        return after
+
+    before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]])
+    around = Surroundings(None, None, Similarity())
+    found = what_if_rows(tmp_path / "c.json", around, AREAS, EYES, before, foretell, floor or Floor(), 199, 0)
+    return {(r["thing"], r["measure"]): r for r in found}, asked[0]
+
+
+def test01_the_same_people_are_compared_with_themselves(tmp_path):
+    after = told([[0.2, 0.1], [0.3, 0.1], [0.21, 0.1], [0.29, 0.1], [0.25, 0.1]])
+    found, (eyes, areas, things) = rows(tmp_path, {"move": [{"area": "a", "by": [5, 0, 0]}]}, after)
+    share = found["a", "share"]
+    assert share["before"] == pytest.approx(0.15) and share["after"] == pytest.approx(0.25)
+    assert share["difference"] == pytest.approx(0.1) and 0.08 < share["low"] < 0.1 < share["high"] < 0.12
+    assert share["support"] == 5 and share["source"] == "field" and share["people"] == 5
+    assert found["b", "visible"]["after"] == 1 and found["b", "visible"]["before"] == 0
+    assert areas.boxes[0].lower[0] == 5 and eyes is EYES and len(things) == 2
+
+
+def test02_other_observers_are_other_people(tmp_path):
+    after = told([[0.5, 0.5]] * 2)
+    found, (eyes, *_) = rows(tmp_path, {"observers": [[9, 9, 9], [8, 8, 8]], "shift": [0, 0, 1]}, after)
+    assert eyes.positions.tolist() == [[9, 9, 10], [8, 8, 9]]
+    assert found["a", "share"]["after"] == 0.5 and found["a", "share"]["before"] == pytest.approx(0.15)
+
+
+def test03_a_floor_on_people(tmp_path):
+    floor = Floor(9)
+    found, _ = rows(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5), floor)
+    assert all(r["before"] is None and r["difference"] is None for r in found.values()) and floor.blanked == 4
