@@ -15,9 +15,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import nerg_mi  # chooses the libLLVM, so it comes before drjit and mitsuba
+from object_statistics import counting_of
 
 import numpy as np
-from object_statistics import counting_of
 
 
 def halves(splits: int) -> None:

@@ -28,6 +28,9 @@ RUN_ELSEWHERE = {
     ("python.md", "python"): "tests/api/test_page.py",
     ("sign.md", "python"): "tests/test_sign_page.py",
     ("rays.md", "python"): "tests/rays/test_manual.py",
+    ("shop.md", "json"): "tests/test_shop_page.py",
+    ("shop.md", "python"): "tests/test_shop_page.py",
+    ("statistics.md", "json"): "tests/test_shop_page.py",
 }
 """All blocks of a language on a page -> the tests that run them."""
 
