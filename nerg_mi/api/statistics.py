@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerg_mi.jobs.reporter import SILENT, Reporter
@@ -46,4 +47,5 @@ def stats(
     if areas is not None:
         options["areas"] = os.fspath(areas)
     paths = [f if isinstance(f, Rays) else os.fspath(f) for f in given]
-    return statistics(paths, output, options_of(StatisticsOptions, "stats", None, options), reporter)
+    out = None if output is None else Path(output)
+    return statistics(paths, out, options_of(StatisticsOptions, "stats", None, options), reporter)

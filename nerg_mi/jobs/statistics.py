@@ -180,12 +180,13 @@ class _Work:
                     people[cell][FIELD] = found
         self._tell(people)
         names = self.areas.names
-        how = {"resamples": o.resamples, "seed": o.seed}
         self.reporter.progress(0.9, "intervals")
-        things = thing_rows(names, people, floor, **how)
+        things = thing_rows(names, people, floor, resamples=o.resamples, seed=o.seed)
         result = StatisticsResult(
             things,
-            difference_rows(names, people, floor, source=TRACKED if sums is not None else FIELD, **how),
+            difference_rows(
+                names, people, floor, source=TRACKED if sums is not None else FIELD, resamples=o.resamples, seed=o.seed
+            ),
             [] if sums is None else move_rows(sums, floor),
             [] if sums is None else duration_rows(sums, floor),
             self._people(sums, seen),

@@ -105,7 +105,7 @@ def _ranges(given: object) -> tuple[tuple[int, int], ...]:
     listed = given if isinstance(given, list) else [None]
     found = []
     for one in listed if 0 < len(listed) <= PARTS else [None]:
-        ends = one if isinstance(one, list) else [one, one]
+        ends: list[Any] = one if isinstance(one, list) else [one, one]
         if len(ends) != 2 or not all(is_count(v) for v in ends) or ends[0] > ends[1]:
             raise NergError('"faces" are numbers from 0 on, or pairs of a first and a last one, as in [0, [4, 9]]')
         found.append((int(ends[0]), int(ends[1])))

@@ -26,14 +26,29 @@ LARGEST_MATRIX = 60
 class Results(Protocol):
     """The tables of `nerg_mi.jobs.statistics.StatisticsResult`."""
 
-    things: list[Row]
-    differences: list[Row]
-    moves: list[Row]
-    durations: list[Row]
-    people: list[Row]
-    what_if: list[Row]
-    isovists: list[Row]
-    blanked: int
+    @property
+    def things(self) -> list[Row]: ...
+
+    @property
+    def differences(self) -> list[Row]: ...
+
+    @property
+    def moves(self) -> list[Row]: ...
+
+    @property
+    def durations(self) -> list[Row]: ...
+
+    @property
+    def people(self) -> list[Row]: ...
+
+    @property
+    def what_if(self) -> list[Row]: ...
+
+    @property
+    def isovists(self) -> list[Row]: ...
+
+    @property
+    def blanked(self) -> int: ...
 
     @property
     def sums(self) -> Sums | None: ...

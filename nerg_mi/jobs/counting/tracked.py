@@ -117,7 +117,8 @@ def ahead(rays: Rays) -> np.ndarray:
     """Where people are turned (N, 3): their heads, or, where these are not known, their rays."""
     if rays.head is None:
         return rays.direction
-    return np.where(np.isfinite(rays.head).all(axis=1)[:, None], rays.head, rays.direction)
+    known = np.isfinite(rays.head).all(axis=1, keepdims=True)
+    return np.where(known, rays.head, rays.direction)
 
 
 def count_block(rays: Rays, counting: Counting) -> Sums:
