@@ -270,7 +270,8 @@ class Session:
             found: dict[str, float] = {}
             if regions:
                 with rough_integrals(self.scene):
-                    boxes = shares(self.scene, [_surface(region) for region in regions], at, divisions=DIVISIONS)
+                    surfaces = [box_dict(r.corners[0], r.corners[1], r.matrix) for r in regions]
+                    boxes = shares(self.scene, surfaces, at, divisions=DIVISIONS)
                 found |= dict(zip([region.name for region in regions], boxes.tolist()))
                 yield None
             for names in self._shape_groups():
@@ -345,8 +346,3 @@ class Session:
 
 def _same(one: tuple, other: tuple) -> bool:
     return np.array_equal(one[0], other[0]) and one[1:] == other[1:]
-
-
-def _surface(region: Region) -> Any:
-    """What gaze lands on of an area, as `shares` takes it."""
-    return region.corners if region.turn is None else box_dict(region.corners[0], region.corners[1], region.matrix)
