@@ -35,8 +35,11 @@ def test01_a_row_for_each_cell_thing_and_source():
     cells = {ALL: {TRACKED: people(12, 0.2, 0)}, A: {TRACKED: people(2, 0.2, 1)}}
     rows = thing_rows(("x", "y"), cells, Floor(), **HOW)
     assert [(r["cell"], r["value"], r["thing"]) for r in rows] == [
-        ("all", "", "x"), ("all", "", "y"), ("cohort", "a", "x"), ("cohort", "a", "y")
-    ]  # fmt: skip
+        ("all", "", "x"),
+        ("all", "", "y"),
+        ("cohort", "a", "x"),
+        ("cohort", "a", "y"),
+    ]
     mean = (cells[ALL][TRACKED].on_time[:, 0] / 100).mean()
     assert rows[0]["share"] == pytest.approx(mean) and rows[0]["share_low"] < mean < rows[0]["share_high"]
     assert rows[0]["visible"] is None and rows[0]["people"] == 12
