@@ -69,10 +69,10 @@ class Surroundings:
         assert self.gaze is not None
         place = self.place if self.place is not None else Place(None)
         settings = self.settings or ObserverSettings(
-            march=default_settings(place), depth=self.kind, surface_opacity=SURFACE_OPACITY
+            march=default_settings(place), depth=self.kind, surface_opacity=SURFACE_OPACITY, directions=_INTEGRAL
         )
         center = mi.Point3f(*np.asarray(eye, float).tolist())
-        observed = self.gaze.at([center], place, settings, count=_INTEGRAL)
+        observed = self.gaze.at([center], place, settings)
         found = np.array(observed.along(center, mi.Vector3f(np.ascontiguousarray(d.T, np.float32))), np.float64)
         return np.broadcast_to(found, (len(d),))
 
