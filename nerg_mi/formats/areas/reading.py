@@ -68,11 +68,13 @@ def _other(entry: Entry, path: Path) -> list[Area]:
     if "mesh" in given:
         file = _inside(given["mesh"], path)
         if file.suffix.lower() not in MESHES:
-            raise NergError(f'the mesh "{plain(file.name, 60)}" ends in none of {", ".join(MESHES)}')
+            raise NergError(
+                f'the mesh "{plain(file.name, 60)}" is no .ply or .obj; convert it to one of {", ".join(MESHES)}'
+            )
         return [MeshPart(name, file, None if given.get("faces") is None else _ranges(given["faces"]))]
     if "shape" in given:
         if not isinstance(given["shape"], str) or not given["shape"]:
-            raise NergError('"shape" is the id of a shape of the scene')
+            raise NergError('"shape" must be the id of a shape of the scene')
         return [SceneShape(name, given["shape"])]
     return [Group(name, _words(given["parts"], "parts"))]
 
@@ -84,7 +86,7 @@ def _objects(entry: Entry, path: Path) -> list[Area]:
     if entry.name is None or entry.name == "":
         return objects
     if not isinstance(entry.name, str):
-        raise NergError("a name is a text")
+        raise NergError("a name must be a text")
     check_name(entry.name)
     return [*objects, Group(entry.name, tuple(a.name for a in objects))]
 
@@ -114,5 +116,5 @@ def _ranges(given: object) -> tuple[tuple[int, int], ...]:
 
 def _words(given: object, what: str) -> tuple[str, ...]:
     if not isinstance(given, list) or not 0 < len(given) <= PARTS or not all(isinstance(w, str) for w in given):
-        raise NergError(f'"{what}" are 1 to {PARTS} names')
+        raise NergError(f'"{what}" must be 1 to {PARTS} names')
     return tuple(dict.fromkeys(given))

@@ -53,7 +53,7 @@ def read_twin_objects(folder: Path, categories: Collection[str] | None = None) -
         if uid in places and (categories is None or category in categories):
             found.append((name, uid))
     if not found:
-        raise NergError(f'"{folder}" has no object that stands still with a box and a place')
+        raise NergError(f'"{folder}" has no object that stands still with a box and a place; name other areas')
     if len(found) > MOST:
         raise NergError(
             f'"{folder}" has {len(found):,} objects, and {MOST} areas are read; choose some by "categories"'

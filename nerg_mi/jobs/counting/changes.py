@@ -112,7 +112,7 @@ def _move(given: Any) -> Move:
         raise NergError(f'a "move" names a "shape" or an "area", "by" what, and a "turn" in degrees, as in {_EXAMPLE}')
     turn = given.get("turn", 0)
     if not is_number(turn) or not abs(turn) <= 1e6:
-        raise NergError('a "turn" is in degrees')
+        raise NergError('a "turn" must be in degrees')
     by = _three(given.get("by", [0, 0, 0]), "by")
     return Move(_word(given[keys[0]], keys[0]), keys[0] == "shape", by, float(turn))
 
@@ -129,7 +129,7 @@ def _put(given: Any, key: str, path: Path) -> Put:
     if os.path.isabs(mesh) or os.path.commonpath([folder, os.path.realpath(os.path.join(folder, mesh))]) != folder:
         raise NergError(f'"{plain(mesh, 80)}" lies outside of the folder of the changes; put it, or a copy, there')
     if Path(mesh).suffix.lower() not in (".ply", ".obj"):
-        raise NergError(f'the mesh "{plain(mesh, 80)}" ends in neither .ply nor .obj')
+        raise NergError(f'the mesh "{plain(mesh, 80)}" is no .ply or .obj; convert it')
     return Put(name, path.parent / mesh)
 
 

@@ -20,7 +20,7 @@ def read_cohorts(path: Path) -> dict[str, str]:
             if found.setdefault(person, cohort) != cohort:
                 raise NergError(f'"{path}" has "{plain(person, 40)}" in two cohorts; leave one')
         if len(found) > MOST:
-            raise NergError(f'"{path}" names more than {MOST:,} people')
+            raise NergError(f'"{path}" names more than {MOST:,} people; give fewer')
     if not found:
         raise NergError(f'"{path}" names nobody; write a line person,cohort and one for each')
     return found
