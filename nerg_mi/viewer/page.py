@@ -253,9 +253,11 @@ class Page:
         if old is not None and all(np.allclose(getattr(view, n), getattr(old, n), atol=1e-6) for n in names):
             return
         now = time.monotonic()
-        if old is not None and not window.noticed:
-            window.learn_pace(now - window.moved)
+        if old is not None:
+            # Also after what seemed to be a rest: of a browser that is slow, each frame does.
+            window.learn_pace(now - window.looked)
             self._keep_pace(window, at_rest=False)
+        window.looked = now
         window.view = view
         self._moving(window, now)
 

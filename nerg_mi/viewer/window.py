@@ -25,15 +25,17 @@ _LONGEST_REST = 0.8
 
 @dataclass(eq=False)
 class Window:
-    """One browser: its ``client`` and the points in it; when it ``moved`` last and whether that was ``noticed``; the
-    ``version`` of its view, and whether it shows a ``picture``; the ``last`` one, with its colours. ``level``: which
-    of the proxy's numbers of points it is given; ``frames``: seconds between the last views of a movement."""
+    """One browser: its ``client`` and the points in it; when it or what it shows ``moved`` last and whether that was
+    ``noticed``, and when it ``looked`` elsewhere last; the ``version`` of its view, and whether it shows a ``picture``;
+    the ``last`` one, with its colours. ``level``: which of the proxy's numbers of points it is given; ``frames``:
+    seconds between the last views of a movement."""
 
     client: Any
     status: Any
     cloud: Any = None
     view: View | None = None
     moved: float = 0.0
+    looked: float = 0.0
     noticed: bool = False
     version: int = 0
     picture: bool = False
