@@ -120,8 +120,8 @@ def overlay_pictures(
         for frame in frames:
             last = render(frame, make)
         ends = shared_limits(limits, options.top)
-        for file, shape, *about in kept:
-            finish(unstacked(np.fromfile(file, np.float32).reshape(shape), *about), ends)
+        for file, shape, marker, supported, basis in kept:
+            finish(unstacked(np.fromfile(file, np.float32).reshape(shape), marker, supported, basis), ends)
             file.unlink()
     return last, None if ends is None else ends[1]
 

@@ -65,7 +65,7 @@ def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float) -> Pieces:
         relative.append(here[small])
         if small.all():
             break
-        left = np.broadcast_to(np.eye(3), (np.count_nonzero(~small), 3, 3)) if place is None else place[~small]
+        left = np.broadcast_to(np.eye(3), (int(np.count_nonzero(~small)), 3, 3)) if place is None else place[~small]
         place = np.einsum("fij,pjk->pfik", _FOUR, left).reshape(-1, 3, 3)
         rows = np.repeat(rows[~small], 4)
     found = np.concatenate(relative)
