@@ -32,6 +32,8 @@ from nerg_mi.rendering.projection import pixel_of
 from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.panorama import pixel_solid_angles
 
+from .bake import bake
+from .options.bake import BakeOptions
 from .options.pictures import DemoOptions
 from .options.report import ReportOptions
 from .overlays import basis_words
@@ -47,9 +49,9 @@ MAKE = "python -m nerg_mi.scenes.store.make"
 REPORT_POINTS = 60_000
 """Points of the report's 3D scene."""
 
-STAGES = ("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures", "report")
-OBJECTS = "regions.json"
-"""The file of named objects, where it stands beside the scene."""
+STAGES = ("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures", "surfaces", "report")
+OBJECTS, TWIN = "regions.json", "twin.ply"
+"""Files of named objects and of the place as a mesh, where they stand beside the scene."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +118,16 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         camera.bitmap.metadata()[key] = value
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")
+    clock.start("surfaces")
+    eye = tuple(float(v) for v in np.ravel(center(seen.sensors()[OWN])))
+    if (scene.parent / TWIN).is_file():
+        files.append(_bake(scene.parent / TWIN, inputs[2], eye, out / "heatmap.glb", mode, seed))
     clock.start("report")
     # Named by the scene, or that beside it of which the demo is made.
     objects = scene.parent / OBJECTS
     shown = ReportOptions(
         objects=objects if objects.is_file() else None,
-        observer=tuple(float(v) for v in np.ravel(center(seen.sensors()[OWN]))),
+        observer=eye,
         **_camera_of(seen.sensors()[CAMERA]),
         width=min(max(width, 24), 1200),
         points=REPORT_POINTS,
@@ -186,6 +192,13 @@ def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
             raise NergError(f'the {name} checkpoint "{path}" is missing: make it with "{MAKE}" (about 20 minutes)')
         paths.append(path)
     return paths
+
+
+def _bake(twin: Path, gaze: Path, eye: tuple[float, ...], output: Path, mode: str, seed: int) -> Path:
+    """Write the gaze of the observer at ``eye`` on the mesh ``twin`` as ``output``, as fine as a glance at it needs."""
+    options = BakeOptions(gaze=gaze, observer=eye, angle=5.0, detail=0.2, mode=mode, seed=seed)
+    bake(twin, [output], options)
+    return output
 
 
 def _camera_of(sensor) -> dict:

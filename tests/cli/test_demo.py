@@ -22,6 +22,7 @@ NAMES = {
     "visibility.png",
     "color.png",
     "scene.exr",
+    "heatmap.glb",
     "report.html",
     "aoi.csv",
     "run.json",
@@ -68,7 +69,9 @@ def test01_writes_and_names_everything(rgb, standins, tmp_path, capsys):
     shares = {row["object"]: float(row["observer_share"]) for row in csv.DictReader((out / "aoi.csv").open())}
     assert len(shares) == 30 and all(share >= 0 for share in shares.values()) and 0 < sum(shares.values()) < 1.01
     # Inputs and the seed stand in every picture, and rays and people in the page.
-    for name in NAMES - {"report.html", "aoi.csv", "run.json"}:
+    header = (out / "heatmap.glb").read_bytes()
+    assert header[:4] == b"glTF" and all(report["inputs"][n].encode() in header for n in ["shoppers.safetensors"])
+    for name in NAMES - {"heatmap.glb", "report.html", "aoi.csv", "run.json"}:
         header = (out / name).read_bytes()
         assert all(digest.encode() in header for digest in report["inputs"].values()) and b'"seed": 0' in header, name
     assert "made of 4,321 rays of 12 people" in (out / "report.html").read_text("utf-8")
