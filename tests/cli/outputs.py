@@ -24,7 +24,8 @@ from tests.surfaces.meshes import box
 
 from .test_render import SCENE
 
-DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr heatmap.glb report.html run.json"
+DEMO = "occlusion.png gaze.png gaze_sphere.png depth.png visibility.png color.png scene.exr report.html run.json"
+DEMO += " heatmap.glb aoi.csv"
 STUDY = "study.csv study.md scaling.csv study.json errors.png scaling.png"
 ABLATION = (
     "ablation.md ablation.csv ablation.json ablation.png place.vol "
