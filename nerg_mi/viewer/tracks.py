@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nerg_mi.density.probes import place_probes
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 
@@ -14,6 +15,12 @@ VERTICES = 20_000
 
 GAP = 1.0
 """Seconds without a ray that end a path, and that a person is still shown after the last one."""
+
+RAYS = 1 << 11
+"""Rays that are drawn at most."""
+
+PROBES = 512
+"""Probes that are drawn at most."""
 
 ALL = "everybody"
 
@@ -33,7 +40,7 @@ class Tracks:
     def __init__(self, rays: Rays, align: Similarity):
         order = np.lexsort((rays.t, rays.person))
         self._rays = rays.select(order)
-        matrix = np.asarray(align.matrix, float)
+        matrix = self._matrix = np.asarray(align.matrix, float)
         turn = matrix[:3, :3] / align.scale
         self.at = self._rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
         self.ahead = self._rays.direction @ turn.T
@@ -74,6 +81,21 @@ class Tracks:
             k = own[np.argmin(np.abs(self._rays.t[own] - time))]
             found.append(Pose(self._rays.persons[person], self.at[k], self.ahead[k]))
         return found
+
+    def sample(self, group: str = ALL, most: int = RAYS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Eyes (K, 3) and unit directions (K, 3) of ``most`` rays of a cohort at most, evenly through each person's
+        time, and the person's number (K,)."""
+        rows = np.flatnonzero(self._of(group))
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)] if len(rows) else rows
+        return self.at[rows], self.ahead[rows], self._rays.person[rows]
+
+    def probes(self, group: str = ALL) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (P, 3) in the place of the probes that a density of a cohort's rays would have by default, and how
+        many rays each holds (P,). Raises `NergError` where nobody stayed long enough for one."""
+        rows = np.flatnonzero(self._of(group))
+        found = place_probes(self._rays.select(rows), count=PROBES)
+        turn, shift = self._matrix[:3, :3], self._matrix[:3, 3]
+        return found.positions @ turn.T + shift, found.counts
 
     def _of(self, group: str) -> np.ndarray:
         if group == ALL or self._rays.cohort is None:
