@@ -59,6 +59,8 @@ class Controls:
         titles = [layer.title for layer in session.layers]
         layer = gui.add_dropdown("Layer", titles, initial_value=session.shade.layer.title)
         self._legend = gui.add_html(layers.legend(session.shade.layer, session.scale()))
+        if session.basis:
+            gui.add_html(layers.note(f"gaze {session.basis}"))
         colors = gui.add_dropdown("Colours", (_USUAL, *layers.MAPS), initial_value=_USUAL)
         automatic = gui.add_checkbox("Automatic range", True)
         ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)

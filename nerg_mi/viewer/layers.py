@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 
@@ -122,6 +123,11 @@ def colored(
     return to_bytes(shown).reshape(*shape, 3)
 
 
+def note(text: str) -> str:
+    """``text`` in small letters, as HTML."""
+    return f"<div style='font-size:0.85em;padding:0 1em'>{escape(text)}</div>"
+
+
 def legend(layer: Layer, scale: Scale) -> str:
     """The scale as HTML; empty where there is none."""
     import matplotlib
@@ -129,7 +135,7 @@ def legend(layer: Layer, scale: Scale) -> str:
 
     if layer.kind in ("color", "shade"):
         words = {"color": "", "shade": "dark blue: hidden from the observer"}[layer.kind]
-        return f"<div style='font-size:0.85em;padding:0 1em'>{words}</div>"
+        return note(words)
     name = scale.colors
     stops = ",".join(to_hex(matplotlib.colormaps[name](k / 8)) for k in range(9))
     ends = f"<span>{scale.low:.3g}</span><span>{layer.unit}</span><span>{scale.high:.3g}</span>"

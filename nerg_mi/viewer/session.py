@@ -23,6 +23,7 @@ from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.formats.areas.reading import read_areas
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.jobs.overlays import basis_words
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.jobs.view import PlaceToView
 from nerg_mi.rendering.pictures import load_scene
@@ -120,6 +121,7 @@ class Session:
         self.observer = np.array(given, float)
         self.heading = heading_of(self.home.ahead if own is None else ahead_of(self.scene), self.place.up)
         self.falloff = float(np.ravel(np.array(self.scene.integrator.falloff))[0])
+        self.basis = basis_words(self.scene.mitsuba)
         self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
         areas = read_areas(self.options.regions) if self.options.regions is not None else Areas(())
         # What is no box is not shown, and is saved again with what is.
