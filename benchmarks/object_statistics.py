@@ -15,6 +15,8 @@ import argparse
 import resource
 import time
 
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
 import numpy as np
 
 SENSORS = 4  # every so manieth sample of a walk

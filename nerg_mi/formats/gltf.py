@@ -108,7 +108,11 @@ def read_glb(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
     Raises `NergError` for what is damaged, compressed or beyond this module's limits, and where there is no triangle.
     """
-    raw = read_bytes(path, "mesh", BYTES)
+    return parse_glb(read_bytes(path, "mesh", BYTES), path)
+
+
+def parse_glb(raw: bytes, path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """The same of the bytes ``raw`` of the file ``path``."""
     # Whatever stands where another kind of value belongs is the file's mistake.
     with reading(path, "mesh", "export it again", also=(TypeError, AttributeError)):
         document, data = _parts(raw, path)

@@ -45,10 +45,14 @@ def read_salt(path: str | os.PathLike) -> bytes:
 
 def pseudonyms(names: Iterable[str], salt: bytes | None = None) -> dict[str, str]:
     """A pseudonym for each of ``names`` of people: what `pseudonymise` gives them for the same salt."""
+    key = _key(salt)
+    return {name: "p" + _digest(key, "person", name)[:_DIGITS] for name in names}
+
+
+def _key(salt: bytes | None) -> bytes:
     if salt is not None and len(salt) < SALT_BYTES:
         raise NergError(f"a salt of {len(salt)} bytes can be guessed; give at least {SALT_BYTES}")
-    key = secrets.token_bytes(32) if salt is None else salt
-    return {name: "p" + _digest(key, "person", name)[:_DIGITS] for name in names}
+    return secrets.token_bytes(32) if salt is None else salt
 
 
 def _digest(key: bytes, kind: str, text: str) -> str:
@@ -64,9 +68,7 @@ def pseudonymise(rays: Rays, salt: bytes | None = None) -> Rays:
     place of their checksums, and names of people are replaced wherever they stand, also as parts of other words.
     Cohorts, times, origins, directions and hit points are left as they are.
     """
-    if salt is not None and len(salt) < SALT_BYTES:
-        raise NergError(f"a salt of {len(salt)} bytes can be guessed; give at least {SALT_BYTES}")
-    key = secrets.token_bytes(32) if salt is None else salt
+    key = _key(salt)
     digest = lambda kind, text: _digest(key, kind, text)
     person = lambda name: "p" + digest("person", name)[:_DIGITS]
     names = [person(name) for name in rays.persons]

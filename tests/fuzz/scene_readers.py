@@ -117,13 +117,13 @@ def _make_glb(folder: Path) -> None:
 
 
 def _read_glb(folder: Path) -> object:
-    from nerg_mi.formats.gltf import read_glb
+    from nerg_mi.formats.gltf import parse_glb, read_glb
 
     whole, text = (folder / "a.glb").read_bytes(), (folder / "document.json").read_bytes()
     data = np.array(_CORNERS, "<f4").tobytes() + np.array([0, 1, 2], "<u4").tobytes()
     head = struct.pack("<IIIII", 0x46546C67, 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
-    (folder / "b.glb").write_bytes(head + text + struct.pack("<II", len(data), 0x004E4942) + data)
-    return read_glb(folder / "b.glb"), read_glb(folder / "a.glb"), len(whole)
+    made = head + text + struct.pack("<II", len(data), 0x004E4942) + data
+    return parse_glb(made, folder / "b.glb"), read_glb(folder / "a.glb"), len(whole)
 
 
 def _make_path(folder: Path) -> None:

@@ -41,7 +41,7 @@ def test_layers_are_drawn_as_they_would_be_at_once(scene, tmp_path):
     assert values.shape == (16, 16, 5) and notes["size"] == (16, 16) and notes["supported"] is True
     met = values[values[..., 4] > 0.5, 3]
     assert 3.6 < np.median(met) < 3.9 and find_overlay("depth").scaled
-    drawn = {"ends": notes["limits"], "marker": notes["marker"], "supported": True, "about": {}}
+    drawn = {"ends": notes["limits"], "marker": notes["marker"], "supported": True, "about": {}, "basis": ""}
     draw_layers({**drawn, "options": chosen(options)}, {"layers.npy": tmp_path / "layers.npy"}, tmp_path / "a.png")
     render_file(scene, tmp_path / "b.png", options)
     import mitsuba as mi

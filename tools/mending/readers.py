@@ -71,7 +71,7 @@ MENDINGS = (
         undo(
             "the salt is left out",
             ["tests/rays/test_pseudonyms.py::test_the_salt_decides"],
-            (_PSEUDONYMS, "    key = secrets.token_bytes(32) if salt is None else salt\n", "    key = bytes(32)\n"),
+            (_PSEUDONYMS, "    return secrets.token_bytes(32) if salt is None else salt\n", "    return bytes(32)\n"),
         ),
         undo(
             "rays stay in the order of the names",

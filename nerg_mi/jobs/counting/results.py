@@ -17,7 +17,7 @@ from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.statistics.sums import Sums
 from nerg_mi.statistics.tables import Row
 
-from .writing import has_parquet, plain_columns, thing_columns, write_table
+from .writing import has_parquet, plain_columns, thing_columns, write_rows
 
 LARGEST_MATRIX = 60
 """Things of which moves are drawn at most."""
@@ -64,7 +64,7 @@ def write_results(
         rows: list[Row] = getattr(result, name)
         if rows:
             columns = thing_columns(rows) if name == "things" else plain_columns(rows, ())
-            files += write_table(folder, name, rows, *columns)
+            files += write_rows(folder, name, rows, *columns)
     if result.things:
         first = [r for r in result.things if r["cell"] == result.things[0]["cell"]]
         save(things_figure(first), folder / "things.png", about)

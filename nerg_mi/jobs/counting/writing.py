@@ -21,7 +21,7 @@ def has_parquet() -> bool:
     return find_spec("pyarrow") is not None
 
 
-def write_table(folder: Path, name: str, rows: Sequence[Row], head: Sequence[str], cells: Cells) -> list[Path]:
+def write_rows(folder: Path, name: str, rows: Sequence[Row], head: Sequence[str], cells: Cells) -> list[Path]:
     """``rows`` as ``name``.csv, .md and, where that can be, .parquet in a ``folder``; ``head`` and ``cells``: the
     columns of the Markdown. Of no rows there is a table of names alone."""
     columns = list(dict.fromkeys(key for row in rows for key in row)) or list(head)

@@ -15,7 +15,7 @@ ROWS = [
 
 
 def test01_all_kinds(tmp_path):
-    files = writing.write_table(tmp_path, "t", ROWS, *writing.plain_columns(ROWS, ()))
+    files = writing.write_rows(tmp_path, "t", ROWS, *writing.plain_columns(ROWS, ()))
     with files[0].open() as file:
         rows = list(csv.DictReader(file))
     assert rows[0]["x"] == "0.125" and rows[1]["n"] == "" and rows[0]["thing"] == "a|b"
@@ -26,7 +26,7 @@ def test01_all_kinds(tmp_path):
 
 def test02_without_pyarrow(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "find_spec", lambda name: None)
-    files = writing.write_table(tmp_path, "t", ROWS, *writing.plain_columns(ROWS, ()))
+    files = writing.write_rows(tmp_path, "t", ROWS, *writing.plain_columns(ROWS, ()))
     assert [f.suffix for f in files] == [".csv", ".md"]
 
 
