@@ -123,6 +123,8 @@ class _Session:
         for kept in self.open.values():
             self._ask(kept)
         while True:
+            # Also while tasks end one after the other: workers may have joined.
+            self._look()
             self._fill()
             if not self.open:
                 return

@@ -8,6 +8,7 @@ import threading
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.tasks.addresses import import_distributed
 from nerg_mi.tasks.local import Local
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.run import carry_out, run_plan
@@ -46,6 +47,8 @@ def test_a_worker_that_is_killed_and_one_that_comes_late(cluster, tmp_path, runs
     tasks = works.tasks(12, runs=str(runs), seconds=0.3)
     store = Store(tmp_path / "store")
     cluster.start_worker(), cluster.start_worker()
+    with import_distributed().Client(cluster.address) as client:
+        client.wait_for_workers(2, timeout=90)
     told, outputs = [], []
     for made in run_plan(Plan("p", tasks), store, Cluster(cluster.address), warn=told.append):
         outputs.append(made)
