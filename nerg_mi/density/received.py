@@ -103,8 +103,7 @@ def attended(
     """
     import mitsuba as mi
 
-    distance, r_o = distance_and_direction(p_o, p)
-    cosine = -dr.dot(n, r_o)
+    distance, r_o, cosine = _faced(p_o, p, n)
     n = dr.select(two_sided & (cosine < 0), -n, n)
     active = ((cosine != 0) if two_sided else (cosine > 0)) & (distance > 0)
     p_od, seen = p, mi.Float(1)
@@ -115,6 +114,12 @@ def attended(
         p_od, seen = found.p_od, found.visibility
         active &= seen > 0
     return dr.select(active, density(p_od, p_o, r_o, active) * seen, 0)
+
+
+def _faced(p_o: Point3f, p: Point3f, n: Vector3f) -> tuple[Float, Vector3f, Float]:
+    """Distance and direction from ``p_o`` to ``p``, and the cosine under which its normal ``n`` faces ``p_o``."""
+    distance, r_o = distance_and_direction(p_o, p)
+    return distance, r_o, -dr.dot(n, r_o)
 
 
 def arriving(
@@ -135,8 +140,7 @@ def arriving(
     parameters and in ``falloff``, but not over the edges of ``place``.
     """
     g = attended(place, density, p_o, p, n, falloff, settings, two_sided)
-    distance, r_o = distance_and_direction(p_o, p)
-    cosine = -dr.dot(n, r_o)
+    distance, _, cosine = _faced(p_o, p, n)
     cosine = dr.abs(cosine) if two_sided else cosine
     facing = (cosine > 0) & (distance > 0)
     square = dr.square(dr.select(facing, distance, 1))
