@@ -85,7 +85,9 @@ def provide_llvm() -> None:
         )
     print(f"Installing {package} ...", flush=True)
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    install = [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", package]
+    # A machine that has just started often updates itself in the background and holds the package database meanwhile.
+    waiting = ["-o", "DPkg::Lock::Timeout=600"]
+    install = [*root, "apt-get", "install", "-y", "-qq", "--no-install-recommends", *waiting, package]
     if subprocess.run(install, env=environment).returncode != 0:
         # Lists of packages that are there, but older than the packages.
         subprocess.run([*root, "apt-get", "update", "-qq"], check=True)

@@ -77,6 +77,7 @@ def test03_installs_where_it_is(setup, commands, monkeypatch):
     setup.provide_llvm()
     assert [command[:2] for command in commands] == [["apt-get", "update"], ["apt-get", "install"]]
     assert commands[-1][-1] == "libllvm22"
+    assert "DPkg::Lock::Timeout=600" in commands[-1], "waits where the machine updates itself in the background"
 
 
 def test04_named_by_the_user_is_not_replaced(setup, commands, monkeypatch):
