@@ -155,10 +155,10 @@ def _enough_divisions(mesh: Any, eyes: Floats) -> int:
     """A power of two, so that meshes of different sizes have kernels in common."""
     import mitsuba as mi
 
-    params: Any = mi.traverse(mesh)
-    if "vertex_positions" not in params or "faces" not in params:
+    if not isinstance(mesh, mi.Mesh):
         return 1  # no mesh, as will be said
-    corners = np.reshape(params["vertex_positions"], (-1, 3))[np.reshape(params["faces"], (-1, 3))]
+    positions, faces = (np.reshape(np.array(v), (-1, 3)) for v in (mesh.vertex_positions_buffer(), mesh.faces_buffer()))
+    corners = positions[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
     beside = np.maximum(np.maximum(corners.min((0, 1)) - eyes, eyes - corners.max((0, 1))), 0)
     nearest = np.linalg.norm(beside, axis=1).min()

@@ -53,17 +53,17 @@ def patches(mesh: mi.Mesh, divisions: int = 4) -> Patches:
     """A Mitsuba mesh, each triangle cut into ``divisions``² congruent ones: the centroid rule, of second order.
 
     Normals are the faces' own, to the side that sees the vertices counter-clockwise. Attached to the
-    ``vertex_positions`` of the mesh. Raises
-    `NergError` for what is not a mesh, ``ValueError`` for no divisions.
+    ``vertex_positions`` of the mesh, or the ``to_world`` of a rectangle. Raises `NergError` for what is not a mesh,
+    ``ValueError`` for no divisions.
     """
     import mitsuba as mi
 
-    params = mi.traverse(mesh)
-    if "vertex_positions" not in params or "faces" not in params:
+    if not isinstance(mesh, mi.Mesh):
         raise NergError(f'"{mesh.id()}" is not a mesh; attention is received by meshes (cube, rectangle, ply, obj)')
     if divisions < 1:
         raise ValueError(f"a triangle is cut into at least 1 piece a side, got divisions={divisions}")
-    positions, faces = params["vertex_positions"], mi.UInt32(params["faces"])
+    # Not its parameters: a rectangle is a mesh that has no others than its transform.
+    positions, faces = mesh.vertex_positions_buffer(), mi.UInt32(mesh.faces_buffer())
     centre = _centroids(divisions)
     count = len(faces) // 3
     index = dr.arange(mi.UInt32, count * len(centre))

@@ -31,17 +31,10 @@ def read_mesh(path: str | Path) -> Triangles:
 
 def shape_triangles(shape: Any) -> Triangles | None:
     """Those of a shape of a Mitsuba scene, in the scene; None of a shape that has none."""
-    import mitsuba as mi
-
-    params: Any = mi.traverse(shape)
-    if "vertex_positions" in params and "faces" in params:
-        vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
-        return vertices, np.array(params["faces"], np.int64).reshape(-1, 3)
-    if shape.class_name() == "Rectangle":
-        matrix = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)
-        flat = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float64)
-        return flat @ matrix[:3, :3].T + matrix[:3, 3], np.array([[0, 1, 2], [0, 2, 3]])
-    return None
+    if not shape.is_mesh():
+        return None
+    vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
+    return vertices, np.array(shape.faces_buffer(), np.int64).reshape(-1, 3)
 
 
 def _by_mitsuba(kind: str, check: Callable[[Path], None]) -> Callable[[Path], Triangles]:

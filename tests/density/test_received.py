@@ -66,6 +66,21 @@ def test13_one_piece_is_the_triangle_itself(rgb):
     assert np.allclose(np.array(whole.n).T, [across / np.linalg.norm(across)], atol=1e-6)
 
 
+def test15_a_rectangle_is_a_mesh_that_follows_its_transform(rgb):
+    flat = rgb.load_dict({"type": "rectangle"})
+    params, x = rgb.traverse(flat), rgb.Float(0.5)
+    dr.enable_grad(x)
+    params["to_world"] = rgb.Transform4f().translate(rgb.Point3f(x, 0, -1)).scale(rgb.Point3f(0.6, 0.4, 1))
+    params.update()
+    pieces = patches(flat, 24)
+    assert np.isclose(dr.sum(pieces.area)[0], 4 * 0.6 * 0.4) and np.allclose(np.array(pieces.n), [[0], [0], [1]])
+    share = received(None, uniform, rgb.Point3f(0, 0, 1), pieces)
+    wanted = lambda x: solid_angle(0.6, 0.4, (-x, 0, 2)) / (4 * np.pi)
+    assert np.isclose(share[0], wanted(0.5), rtol=1e-3)
+    dr.backward(share)
+    assert np.isclose(dr.grad(x)[0], (wanted(0.5001) - wanted(0.4999)) / 2e-4, rtol=2e-3)
+
+
 @pytest.mark.parametrize("bad", ["sphere", "divisions"])
 def test02_what_cannot_be_cut(rgb, bad):
     shape = rgb.load_dict({"type": "sphere" if bad == "sphere" else "cube"})
