@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from nerg_mi.alignment.record import read_similarity
 from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.maths.similarity import Similarity
@@ -18,6 +19,7 @@ from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene_gaze import gaze_of_scene, with_gaze
 
 from .backend import select_backend
 from .options.scene import SceneOptions
@@ -25,7 +27,7 @@ from .options.view import ViewOptions
 from .reporter import SILENT, Reporter
 from .scene import write_scene
 from .scenes.cameras import given_point
-from .scenes.files import KINDS, kind_of_file
+from .scenes.files import KINDS, kind_of_file, training_place
 
 RAYS = 2_000_000
 """Of larger datasets so many rays are shown, drawn at random."""
@@ -38,7 +40,8 @@ _NERG = "NergIntegrator"
 class PlaceToView:
     """``scene``: a scene file with the integrator `nerg`; ``made``: whether it was written for the viewer, and ends
     with it; ``rays`` in their own frame, or None, and ``align`` from there to the place; ``up`` (3,), a unit vector;
-    ``name`` for people."""
+    ``name`` for people; ``variants``: scene files that differ in their gaze field alone, by its name, of which
+    ``scene`` is the first; none where there is nothing to choose."""
 
     scene: Path
     made: bool
@@ -46,6 +49,7 @@ class PlaceToView:
     align: Similarity
     up: np.ndarray
     name: str
+    variants: dict[str, Path] = field(default_factory=dict)
 
 
 def place_to_view(
@@ -54,7 +58,8 @@ def place_to_view(
     """The scene of ``files``: a scene file with `nerg`, or whatever `write_scene` makes one of, in ``folder``.
 
     A folder stands for the files in it, of which there must be one of a kind, or is a dataset of rays (.rays). Rays
-    beside a scene are shown in it. Raises `NergError` for what the user can mend.
+    beside a scene are shown in it. Several gaze fields, as `nerg ablate` trains them, are variants to choose among; a
+    scene's own is the first of them. Raises `NergError` for what the user can mend.
     """
     options = options or ViewOptions()
     select_backend(options.mode)
@@ -70,10 +75,14 @@ def place_to_view(
     rays = load_rays(rays_files[0], RAYS) if rays_files else None
     name = " + ".join(path.name for path in found)
     scenes = [path for path, kind in kinds.items() if kind == "scene"]
-    if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays"} and _is_nerg(scenes[0]):
+    gaze = [path for path, kind in kinds.items() if kind == "gaze"]
+    if len(scenes) == 1 and set(kinds.values()) <= {"scene", "rays", "gaze"} and _is_nerg(scenes[0]):
         align = _given_align(options) or Similarity(np.eye(4))
-        return PlaceToView(scenes[0], False, rays, align, _up(options, np.array([0.0, 0, 1])), name)
-    given = [path for path in found if not is_dataset(path)]
+        own = gaze_of_scene(scenes[0]) if gaze else None
+        variants = write_variants(scenes[0], [*([own] if own else []), *gaze], folder, reporter) if gaze else {}
+        scene = next(iter(variants.values()), scenes[0])
+        return PlaceToView(scene, bool(gaze), rays, align, _up(options, np.array([0.0, 0, 1])), name, variants)
+    given = [path for path in found if not is_dataset(path) and path not in gaze[1:]]
     if rays is not None and rays_files[0] not in given:
         copy = folder / "rays.npz"
         rays.save(copy)
@@ -83,11 +92,38 @@ def place_to_view(
         observer=options.observer, up=options.up, align=options.align, geometry=options.geometry, mode=options.mode
     )
     write_scene(given, output, chosen, reporter)
-    gaze = [path for path, kind in kinds.items() if kind == "gaze"]
     align = _given_align(options)
     if align is None:
         align = align_of_training(read_metadata(gaze[0]).get("provenance", {}) if gaze else {})
-    return PlaceToView(output, True, rays, align, _up(options, _up_of(output)), name)
+    variants = write_variants(output, gaze, folder, reporter) if len(gaze) > 1 else {}
+    return PlaceToView(output, True, rays, align, _up(options, _up_of(output)), name, variants)
+
+
+def write_variants(scene: Path, gaze: Sequence[Path], folder: Path, reporter: Reporter = SILENT) -> dict[str, Path]:
+    """Copies of the file ``scene``, with each of the files ``gaze`` as its gaze field, into ``folder``: by the names of
+    these, which are their paths' last parts as far as they differ.
+
+    Warns of fields that were trained in other places than the first. Raises `NergError` for a scene that takes none.
+    """
+    first = read_metadata(gaze[0]).get("provenance", {})
+    found: dict[str, Path] = {}
+    for number, path in enumerate(gaze):
+        if training_place(read_metadata(path).get("provenance", {})) != training_place(first):
+            reporter.warn(
+                f'"{path}" was trained in another place than "{gaze[0]}"; its gaze is right only where surfaces and '
+                "coordinates are the same"
+            )
+        name = next(n for n in _names(path, number) if n not in found)
+        found[name] = folder / f"variant{number}.xml"
+        write_text(found[name], with_gaze(scene, path))
+    return found
+
+
+def _names(path: Path, number: int) -> Iterator[str]:
+    """Names for the gaze field of a file, the shortest first."""
+    yield path.stem
+    yield f"{path.parent.name}/{path.stem}"
+    yield f"{path.stem} ({number})"
 
 
 def _expanded(path: Path) -> list[Path]:

@@ -33,9 +33,7 @@ def nested_place(path: Path, folder: Path) -> Place:
     """
     version, children = scene_elements(path)
     defaults = [child for child in children if child.tag == "default"]
-    values: dict[str, str] = {}
-    for default in defaults:
-        values.setdefault(default.get("name", ""), _filled(default.get("value", ""), values))
+    values = filled_values(children)
     integrators = [child for child in children if child.tag == "integrator"]
     _check_integrators(path, integrators, values)
     ids = {found.get("id", "") for child in children for found in child.iter()}
@@ -59,6 +57,29 @@ def scene_elements(path: Path) -> tuple[str, list[ElementTree.Element]]:
     check_scene_file(path)
     root = _root(path)
     return root.get("version", "3.0.0"), list(_inlined(root, path, [path.parent]))
+
+
+def filled_values(children: list[ElementTree.Element]) -> dict[str, str]:
+    """The values of the `<default>`s among a scene's elements, where they name each other filled in."""
+    values: dict[str, str] = {}
+    for default in children:
+        if default.tag == "default":
+            values.setdefault(default.get("name", ""), fill(default.get("value", ""), values))
+    return values
+
+
+def name_files(elements: list[ElementTree.Element], path: Path, children: list[ElementTree.Element]) -> None:
+    """Make names of files that are there absolute, in ``elements`` and below, and in the values of `<default>`s; they
+    are of the scene file ``path``, whose ``children`` say in which folders to look."""
+    folders = [path.parent, *(path.parent / c.get("value", "") for c in children if c.tag == "path")]
+    for one in (found for given in elements for found in given.iter()):
+        named = one.tag == "default" or (one.tag == "string" and one.get("name") == "filename")
+        value = one.get("value", "")
+        if not named or not value or value.startswith("$"):
+            continue
+        there = next((f / value for f in folders if (f / value).is_file()), None)
+        if there is not None:
+            one.set("value", value_of(str(there.resolve())))
 
 
 def verbatim(found: ElementTree.Element) -> Verbatim:
@@ -97,7 +118,7 @@ def _inlined(root: ElementTree.Element, path: Path, folders: list[Path]) -> Iter
 def _check_integrators(path: Path, integrators: list[ElementTree.Element], values: dict[str, str]) -> None:
     if len(integrators) > 1:
         raise NergError(f'the scene file "{path}" has {len(integrators)} integrators; leave one of them')
-    kinds = {_filled(found.get("type", ""), values) for i in integrators for found in i.iter("integrator")}
+    kinds = {fill(found.get("type", ""), values) for i in integrators for found in i.iter("integrator")}
     if "nerg" in kinds:
         raise NergError(
             f'the integrator of "{path}" is "nerg" already; put the gaze field into it by hand, as a <volume '
@@ -105,7 +126,8 @@ def _check_integrators(path: Path, integrators: list[ElementTree.Element], value
         )
 
 
-def _filled(text: str, values: dict[str, str]) -> str:
+def fill(text: str, values: dict[str, str]) -> str:
+    """``text`` with ``values`` in place of their `$key`s."""
     # The longest name first, as Mitsuba does.
     for key in sorted(values, key=len, reverse=True):
         text = text.replace(f"${key}", values[key])

@@ -56,11 +56,12 @@ class Controls:
 
     def _show(self) -> None:
         session, gui = self.session, self.gui
+        names = list(session.place.variants)
+        variant = gui.add_dropdown("Gaze field", names, initial_value=session.gaze_name) if len(names) > 1 else None
         titles = [layer.title for layer in session.layers]
         layer = gui.add_dropdown("Layer", titles, initial_value=session.shade.layer.title)
         self._legend = gui.add_html(layers.legend(session.shade.layer, session.scale()))
-        if session.basis:
-            gui.add_html(layers.note(f"gaze {session.basis}"))
+        basis = gui.add_html(basis_note(session))
         colors = gui.add_dropdown("Colours", (_USUAL, *layers.MAPS), initial_value=_USUAL)
         automatic = gui.add_checkbox("Automatic range", True)
         ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
@@ -68,6 +69,9 @@ class Controls:
         falloff = gui.add_slider("Fall-off", 0.0, 1.0, 0.01, round(min(session.falloff, 1.0), 4))
 
         def change(event: Any) -> None:
+            if event.client is None:
+                # Written by the program, which has set all else.
+                return
             fixed = None
             chosen = layers.LAYERS[layer.value]
             if chosen.quantity != session.shade.layer.quantity and not automatic.value:
@@ -90,6 +94,24 @@ class Controls:
 
         for handle in (layer, colors, automatic, ends):
             handle.on_update(change)
+
+        def change_gaze(event: Any) -> None:
+            if event.client is None:
+                return
+            try:
+                session.set_gaze(event.target.value)
+            except NergError as error:
+                tell(event, "Gaze field", sentence(error))
+                event.target.value = session.gaze_name
+                return
+            layer.options = tuple(la.title for la in session.layers)
+            layer.value = session.shade.layer.title
+            basis.content = basis_note(session)
+            self.page.follow()
+            self._shown_anew()
+
+        if variant is not None:
+            variant.on_update(change_gaze)
 
         @falloff.on_update
         def _(event: Any) -> None:
@@ -246,6 +268,11 @@ class Controls:
         return float(np.percentile(along, 0.5)), float(np.percentile(along, 99.5))
 
 
+def basis_note(session: Any) -> str:
+    """How many rays of how many people the gaze is made of, as HTML; "" where that is not known."""
+    return layers.note(f"gaze {session.basis}") if session.basis else ""
+
+
 def look(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
     """Turn one page's camera."""
     if client is None:
@@ -293,7 +320,7 @@ def about_picture(session: Any, window: Window) -> Provenance:
         "samples": window.last[0].samples,
         "ceiling": session.ceiling,
     }
-    return provenance("nerg view", files_of_scene(session.place.scene), 0, settings, session.checksums)
+    return provenance("nerg view", files_of_scene(session.scene_file), 0, settings, session.checksums)
 
 
 def png_bytes(session: Any, colors: np.ndarray, text: dict[str, str] | None = None) -> bytes:
@@ -314,10 +341,10 @@ def copied_view(session: Any, view: View) -> str:
     asked = tuple(name for name in layers.quantities(session.shade.layer) if name != "color")
     falloff = session.falloff
     shown = Shown(view, session.observer, asked, session.options.width, session.spp, falloff)
-    return copied(session.place.scene, shown)
+    return copied(session.scene_file, shown)
 
 
 def check_copied(session: Any) -> None:
     """Raise `NergError` for a place that ends with the viewer, so that no copy of it could be rendered."""
-    if session.place.made and session.place.scene.with_suffix(".vol").exists():
+    if session.place.made and session.scene_file.with_suffix(".vol").exists():
         raise NergError('the place was made of rays for this viewer; "nerg scene" writes it as a scene of its own')

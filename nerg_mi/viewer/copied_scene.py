@@ -11,15 +11,13 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.nested_scene import scene_elements, verbatim
-from nerg_mi.rendering.scene_writer import Comment, document, element, numbers, prop, value_of
+from nerg_mi.rendering.nested_scene import name_files, scene_elements, verbatim
+from nerg_mi.rendering.scene_writer import Comment, document, element, numbers, prop
 
 from .view import View
 
 CAMERA, TARGET, OBSERVER = "view_camera", "view_target", "view_observer"
 """`<default>`s of a copied scene."""
-
-_FILES = ("filename",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +40,11 @@ def copied(path: Path, shown: Shown) -> str:
     Raises `NergError` for a scene whose integrator is not written in the file.
     """
     version, children = scene_elements(path)
-    folders = [path.parent, *(path.parent / c.get("value", "") for c in children if c.tag == "path")]
     own = [deepcopy(child) for child in children if child.tag != "path"]
     integrators = [child for child in own if child.tag == "integrator"]
     if len(integrators) != 1:
         raise NergError(f'"{path}" has {len(integrators)} integrators, and a copy needs one; leave one of them')
-    for child in own:
-        _name_files(child, folders)
+    name_files(own, path, children)
     _observe(integrators[0], shown)
     eye = [] if shown.observer is None else [element("default", name=OBSERVER, value=numbers(shown.observer))]
     target = shown.view.origin + shown.view.ahead
@@ -100,15 +96,3 @@ def _sensor(shown: Shown):
         type="perspective",
         id="view",
     )
-
-
-def _name_files(found: Element, folders: list[Path]) -> None:
-    """Make names of files that are there absolute, in ``found`` and below, and in the values of `<default>`s."""
-    for one in found.iter():
-        named = one.tag == "default" or (one.tag == "string" and one.get("name") in _FILES)
-        value = one.get("value", "")
-        if not named or not value or value.startswith("$"):
-            continue
-        there = next((f / value for f in folders if (f / value).is_file()), None)
-        if there is not None:
-            one.set("value", value_of(str(there.resolve())))

@@ -84,7 +84,7 @@ class Flying:
                 falloff=session.falloff,
             )
             scene, frames, video = (Path(folder.name, name) for name in ("view.xml", "view.frames.csv", "flight.mp4"))
-            write_text(scene, copied(session.place.scene, shown))
+            write_text(scene, copied(session.scene_file, shown))
             write_text(frames, frames_csv(views))
         except (NergError, ImportError) as error:
             folder.cleanup()

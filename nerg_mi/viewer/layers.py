@@ -28,6 +28,16 @@ class Layer:
     of_observer: bool = True
 
 
+@dataclass(frozen=True)
+class Shade:
+    """How a layer is coloured: ``layer``, ``colors`` (None: its usual ones), and a range (low, high) (None: that of
+    what is seen)."""
+
+    layer: Layer
+    colors: str | None = None
+    fixed: tuple[float, float] | None = None
+
+
 LAYERS = {
     layer.title: layer
     for layer in (
@@ -46,9 +56,11 @@ LAYERS = {
 
 
 def available(scene: Scene) -> list[Layer]:
-    """The layers that ``scene`` can show."""
-    found = []
+    """The layers that ``scene`` can show, without a factor that its gaze field lacks."""
+    found, lacking = [], _lacking(scene)
     for layer in LAYERS.values():
+        if layer.quantity and layer.quantity == lacking:
+            continue
         try:
             if layer.quantity:
                 scene.integrator.asked([layer.quantity], False)
@@ -57,6 +69,13 @@ def available(scene: Scene) -> list[Layer]:
             continue
         found.append(layer)
     return found
+
+
+def _lacking(scene: Scene) -> str:
+    """The factor that the gaze field of ``scene`` has not, which the integrator takes as 1; "" where it has both."""
+    gaze = scene.integrator.gaze
+    variant = "" if gaze is None else gaze.field.config.variant
+    return {"emit": "capture", "capture": "emit"}.get(variant, "")
 
 
 def quantities(layer: Layer) -> list[str]:

@@ -38,6 +38,15 @@ LIGHT_SEEDS = 4
 
 
 @dataclass(frozen=True, eq=False)
+class Points:
+    """``points`` (N, 3) in scene units with ``colors`` (N, 3) uint8, each in a cell of ``size``."""
+
+    points: np.ndarray
+    colors: np.ndarray
+    size: float
+
+
+@dataclass(frozen=True, eq=False)
 class Proxy:
     """``points`` (N, 3) in scene units, their linear ``color`` (N, 3), and the ``size`` of the cells that they
     lie in. ``levels``: how many of the first points lie in cells of a size, ``(N, size)`` and fewer. ``near`` (N,): of

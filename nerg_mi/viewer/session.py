@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Hashable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nerg_mi.api.attention import shares
 from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import Scene
-from nerg_mi.api.shapes import box_dict
 from nerg_mi.api.variant import active_mitsuba
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.formats.areas.kinds import Areas
@@ -29,10 +27,11 @@ from nerg_mi.jobs.view import PlaceToView
 from nerg_mi.rendering.pictures import load_scene
 
 from . import layers
-from .layers import Layer, Scale
+from .layers import Layer, Scale, Shade
 from .listener import Listener
-from .proxy import Proxy, bake, gather
-from .refining import SIZES, Pace, Picture, filled, refine, rough_integrals
+from .proxy import Points, Proxy, bake, gather
+from .refining import SIZES, Pace, Picture, filled, refine
+from .sharing import shares_in_steps
 from .tracks import Tracks
 from .view import View, ahead_of, heading_of
 from .worker import Worker
@@ -43,33 +42,8 @@ URGENCY = 1
 UNHURRIED = 2
 """Of small pictures, which nobody waits for."""
 
-DIVISIONS = 8
-"""A side of a triangle of an area is cut into so many parts."""
-
-FACES = 1 << 17
-"""Faces of shapes whose shares are counted in one step, but for a shape that has more."""
-
 _MOST_SPP = 256
 _SHAPES = 60
-
-
-@dataclass(frozen=True)
-class Shade:
-    """How a layer is coloured: ``layer``, ``colors`` (None: its usual ones), and a range (low, high) (None: that of
-    what is seen)."""
-
-    layer: Layer
-    colors: str | None = None
-    fixed: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Points:
-    """``points`` (N, 3) in scene units with ``colors`` (N, 3) uint8, each in a cell of ``size``."""
-
-    points: np.ndarray
-    colors: np.ndarray
-    size: float
 
 
 class Session:
@@ -91,7 +65,9 @@ class Session:
         self.checksums: dict[Path, str] = {}
         self._ranges: dict[str, tuple[float, float]] = {}
         self._busy: set[str] = set()
-        self._shares_for: tuple[np.ndarray, tuple[Region, ...], float] | None = None
+        self._shares_for: tuple[np.ndarray, tuple[Region, ...], int] | None = None
+        # Of the gaze field and its settings: what was begun with others is not kept.
+        self._version = 0
 
     def start(self) -> None:
         """Load the place, and begin to gather its points. Raises `NergError` for what cannot be shown."""
@@ -105,10 +81,9 @@ class Session:
     def _load(self) -> None:
         self.place = self._place()
         self.mode = active_mitsuba().variant()
-        self.scene = Scene(load_scene(self.place.scene))
-        self.layers = layers.available(self.scene)
-        first = next((la for la in self.layers if la.quantity in ("gaze", "kde")), layers.LAYERS["colour"])
-        self.shade = Shade(first)
+        self.gaze_name = next(iter(self.place.variants), "")
+        self._use(self.place.scene)
+        self.shade = Shade(self._first_layer())
         sensors = self.scene.mitsuba.sensors()
         if not sensors:
             raise NergError(f'"{self.place.scene}" has no sensor to begin with; give it one')
@@ -121,13 +96,21 @@ class Session:
         self.observer = np.array(given, float)
         self.heading = heading_of(self.home.ahead if own is None else ahead_of(self.scene), self.place.up)
         self.falloff = float(np.ravel(np.array(self.scene.integrator.falloff))[0])
-        self.basis = basis_words(self.scene.mitsuba)
         self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
         areas = read_areas(self.options.regions) if self.options.regions is not None else Areas(())
         # What is no box is not shown, and is saved again with what is.
         self.regions, self.other_areas = areas.boxes, list(areas.others)
         shapes = [shape.id() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()]
         self.shapes = [name for name in shapes if name and not name.startswith("__")][:_SHAPES]
+
+    def _use(self, scene_file: Path) -> None:
+        """Show the scene of that file from now on."""
+        self.scene_file, self.scene = scene_file, Scene(load_scene(scene_file))
+        self.layers = layers.available(self.scene)
+        self.basis = basis_words(self.scene.mitsuba)
+
+    def _first_layer(self) -> Layer:
+        return next((la for la in self.layers if la.quantity in ("gaze", "kde")), layers.LAYERS["colour"])
 
     def _ahead_of_home(self) -> np.ndarray:
         """Where the observer stands of a scene whose camera it is: half way to what that looks at, so as to be seen."""
@@ -148,16 +131,41 @@ class Session:
         """How far behind a surface is still seen a little, in scene units."""
 
         def change() -> None:
-            import mitsuba as mi
-
-            with mitsuba_says():
-                params: Any = mi.traverse(self.scene.integrator)
-                params["falloff"] = float(value)
-                params.update()
             self.falloff = float(value)
-            self.baked_for = None
+            self._set_falloff()
+            self._forget()
 
         self.worker.call(change).result()
+
+    def _set_falloff(self) -> None:
+        import mitsuba as mi
+
+        with mitsuba_says():
+            params: Any = mi.traverse(self.scene.integrator)
+            params["falloff"] = self.falloff
+            params.update()
+
+    def set_gaze(self, name: str) -> None:
+        """Show the gaze field ``name`` of the place's variants; where it lacks the layer that is shown, its gaze.
+        Raises `NergError` for a file that is no longer there."""
+
+        def change() -> None:
+            self._use(self.place.variants[name])
+            self.gaze_name = name
+            self._set_falloff()
+            self._forget()
+            with self.lock:
+                self.baked, self._ranges = {}, {}
+                if self.shade.layer not in self.layers:
+                    self.shade = Shade(self._first_layer())
+
+        self.worker.call(change).result()
+
+    def _forget(self) -> None:
+        """Have the gaze on the points, and the shares, computed anew."""
+        with self.lock:
+            self._version += 1
+            self.baked_for = self._shares_for = None
 
     def set_shade(self, **changes: Any) -> None:
         """Another layer, other colours, or another range."""
@@ -182,7 +190,7 @@ class Session:
         with self.lock:
             if not self.scene.has_gaze:
                 return True
-            asked = self.observer, tuple(self.regions), self.falloff
+            asked = self.observer, tuple(self.regions), self._version
             fresh = self._shares_for is not None and _same(self._shares_for, asked)
             if not fresh and "shares" not in self._busy:
                 self._busy.add("shares")
@@ -246,11 +254,11 @@ class Session:
 
     def _bake(self, at: np.ndarray) -> Iterator[None]:
         try:
-            proxy = self.proxy
+            proxy, version = self.proxy, self._version
             assert proxy is not None
             for step, found in enumerate(bake(self.scene, proxy, at)):
                 with self.lock:
-                    if self.proxy is not proxy:
+                    if self.proxy is not proxy or self._version != version:
                         return
                     self.baked, gone = found, not np.array_equal(self.observer, at)
                     if step == 0:
@@ -262,42 +270,32 @@ class Session:
                     return
                 yield None
             with self.lock:
-                self.baked_for = at
+                if self._version == version:
+                    self.baked_for = at
+        except NergError:
+            self.baked_for = at
+            raise
         finally:
             self._busy.discard("gaze")
 
-    def _shares(self, asked: tuple[np.ndarray, tuple[Region, ...], float]) -> Iterator[None]:
+    def _shares(self, asked: tuple[np.ndarray, tuple[Region, ...], int]) -> Iterator[None]:
         try:
-            at, regions, _ = asked
+            at, regions, version = asked
             found: dict[str, float] = {}
-            if regions:
-                with rough_integrals(self.scene):
-                    surfaces = [box_dict(r.corners[0], r.corners[1], r.matrix) for r in regions]
-                    boxes = shares(self.scene, surfaces, at, divisions=DIVISIONS)
-                found |= dict(zip([region.name for region in regions], boxes.tolist()))
+            for more in shares_in_steps(self.scene, at, regions, self.shapes):
+                found |= more
                 yield None
-            for names in self._shape_groups():
-                with rough_integrals(self.scene):
-                    meshes = shares(self.scene, names, at, divisions=1, two_sided=True)
-                found |= dict(zip(names, meshes.tolist()))
-                yield None
+                if version != self._version:
+                    return
             with self.lock:
                 self.shares, self._shares_for = found, asked
             self.listener.on_shares()
+        except NergError:
+            # What cannot be counted is told once, not at each tick of a clock.
+            self._shares_for = asked
+            raise
         finally:
             self._busy.discard("shares")
-
-    def _shape_groups(self) -> Iterator[list[str]]:
-        """Names of shapes, so many together as one step can count."""
-        faces = {shape.id(): shape.face_count() for shape in self.scene.mitsuba.shapes() if shape.is_mesh()}
-        group: list[str] = []
-        for name in self.shapes:
-            if group and sum(faces[n] for n in [*group, name]) > FACES:
-                yield group
-                group = []
-            group.append(name)
-        if group:
-            yield group
 
     def _refined(
         self, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int, leads: bool = True

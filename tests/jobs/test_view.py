@@ -9,9 +9,11 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
+from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.jobs import demo
 from nerg_mi.jobs.options.view import ViewOptions
-from nerg_mi.jobs.view import place_to_view
+from nerg_mi.jobs.view import place_to_view, write_variants
+from nerg_mi.rendering.scene_gaze import gaze_of_scene
 from tests.jobs.recorder import Recorder
 
 MESH = "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n"
@@ -77,3 +79,26 @@ def test05_a_place_of_a_dataset(rgb, tmp_path):
     for name in ("shop.rays", "shop.rays/place=shop"):
         place = place_to_view([tmp_path / "a.obj", tmp_path / name], tmp_path, ViewOptions(up=(0, 0, 1)))
         assert place.rays is not None and len(place.rays) == len(rays) and place.made
+
+
+def test06_several_gaze_fields_are_variants(rgb, tmp_path):
+    store = demo.store_scene()
+    run, told = tmp_path / "run", Recorder()
+    run.mkdir()
+    for name in ("a", "b"):
+        shutil.copy(store.parent / "shoppers.safetensors", run / f"{name}.safetensors")
+    place = place_to_view([store, run], tmp_path, reporter=told)
+    assert list(place.variants) == ["shoppers", "a", "b"] and place.scene == place.variants["shoppers"]
+    assert gaze_of_scene(place.variants["b"]) == (run / "b.safetensors").resolve() and place.made and not told.warnings
+    # Where a name is taken, the folder's is put before it; a field of another place is told.
+    shutil.copy(run / "a.safetensors", tmp_path / "a.safetensors")
+    metadata = {"provenance": {"field_file": {"file": "x", "sha256": "y"}}}
+    write_checkpoint(tmp_path / "c.safetensors", "gaze", {"a": np.zeros(1, np.float32)}, metadata)
+    files = [run / "a.safetensors", tmp_path / "a.safetensors", tmp_path / "c.safetensors"]
+    found = write_variants(store, files, tmp_path, told)
+    assert list(found) == ["a", f"{tmp_path.name}/a", "c"]
+    assert len(told.warnings) == 1 and "another place" in told.warnings[0]
+    # Of fields alone a scene is made, in the place of their training.
+    shutil.copy(store.parent / "store.safetensors", run / "store.safetensors")
+    place = place_to_view([run], tmp_path)
+    assert place.made and list(place.variants) == ["a", "b"]

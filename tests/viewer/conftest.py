@@ -6,32 +6,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.jobs import demo
-
-ROOM = """<scene version="3.0.0">
-    <integrator type="nerg" id="integrator">
-        <integrator type="direct"/>
-        <sensor name="observer" type="perspective">
-            <transform name="to_world"><lookat origin="0, 0, 0.5" target="1, 0, 0.5" up="0, 0, 1"/></transform>
-        </sensor>
-        <string name="aovs" value="depth"/>
-    </integrator>
-    <sensor type="perspective">
-        <float name="fov" value="60"/>
-        <transform name="to_world"><lookat origin="-2, 0, 1" target="2, 0, 0" up="0, 0, 1"/></transform>
-        <sampler type="independent"><integer name="sample_count" value="2"/></sampler>
-        <film type="hdrfilm">
-            <integer name="width" value="48"/><integer name="height" value="32"/><rfilter type="box"/>
-        </film>
-    </sensor>
-    <shape type="rectangle" id="floor">
-        <transform name="to_world"><scale value="3"/></transform>
-    </shape>
-    <shape type="cube" id="box">
-        <transform name="to_world"><scale value="0.5"/><translate x="1.5" z="0.5"/></transform>
-    </shape>
-    <emitter type="constant"/>
-</scene>
-"""
+from tests.viewer.room import ROOM, write_gaze_fields
 
 
 @pytest.fixture
@@ -45,6 +20,12 @@ def room(rgb, tmp_path):
 @pytest.fixture
 def room_scene(room):
     return nerg.Scene.load(room)
+
+
+@pytest.fixture
+def gaze_fields(rgb, tmp_path):
+    """Files of two untrained gaze fields in the room, one of both factors and one of emit alone."""
+    return write_gaze_fields(tmp_path)
 
 
 @pytest.fixture

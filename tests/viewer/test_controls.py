@@ -10,8 +10,7 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.viewer.controls import copied_view, png_bytes, table
-from nerg_mi.viewer.layers import LAYERS
-from nerg_mi.viewer.session import Shade
+from nerg_mi.viewer.layers import LAYERS, Shade
 from nerg_mi.viewer.view import View
 from nerg_mi.viewer.worker import Worker
 
@@ -25,18 +24,24 @@ def test01_the_largest_share_first():
 
 
 def test02_a_scene_of_what_is_shown(store, tmp_path):
-    place = SimpleNamespace(scene=store, made=False)
+    place = SimpleNamespace(made=False)
     options = SimpleNamespace(width=48)
     view = View.of((7, 3, 2), (5, 4, 1), (0, 0, 1), 0.9, 1.5)
     shown = SimpleNamespace(
-        place=place, shade=Shade(LAYERS["gaze"]), observer=np.array([5, 3, 1.6]), options=options, spp=1, falloff=0.1
+        place=place,
+        scene_file=store,
+        shade=Shade(LAYERS["gaze"]),
+        observer=np.array([5, 3, 1.6]),
+        options=options,
+        spp=1,
+        falloff=0.1,
     )
     (tmp_path / "view.xml").write_text(copied_view(shown, view))
     scene = nerg.Scene.load(tmp_path / "view.xml")
     assert scene.integrator.aov_names() == ["depth.T", "opacity.Y", "gaze.Y"] and np.allclose(
         scene.observer, [5, 3, 1.6]
     )
-    shown.place = SimpleNamespace(scene=tmp_path / "scene.xml", made=True)
+    shown.place, shown.scene_file = SimpleNamespace(made=True), tmp_path / "scene.xml"
     (tmp_path / "scene.vol").touch()
     with pytest.raises(NergError, match="nerg scene"):
         copied_view(shown, view)

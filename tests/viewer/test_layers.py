@@ -10,6 +10,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.hatching import LINE, lines
 from nerg_mi.figures.overlay import Heat, overlay
 from nerg_mi.figures.tonemap import to_bytes
+from nerg_mi.rendering.scene_gaze import with_gaze
 from nerg_mi.viewer import layers
 from nerg_mi.viewer.layers import LAYERS, Scale
 
@@ -18,6 +19,15 @@ def test01_only_what_the_scene_has(store, room_scene):
     assert [la.title for la in layers.available(room_scene)] == ["colour", "depth", "visibility"]
     found = [la.title for la in layers.available(nerg.Scene.load(store))]
     assert found[:4] == ["gaze", "colour", "depth", "visibility"] and "spread of gaze" not in found
+
+
+def test01_a_factor_that_a_variant_lacks_is_no_layer(room, gaze_fields, tmp_path):
+    factors = {"what surfaces attract", "what the observer gives"}
+    for path, expected in zip(gaze_fields, (factors, {"what surfaces attract"})):
+        scene = tmp_path / "with.xml"
+        scene.write_text(with_gaze(room, path))
+        titles = {la.title for la in layers.available(nerg.Scene.load(scene))}
+        assert "gaze" in titles and titles & factors == expected
 
 
 def test02_heat_is_that_of_pictures():

@@ -16,6 +16,7 @@ from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.viewer.serving import viewer
 from tests.viewer.browser import chromium, require
 from tests.viewer.panel import Panel
+from tests.viewer.room import ROOM, write_gaze_fields
 from tests.viewer.test_in_chromium import drag, until
 
 pytestmark = pytest.mark.slow
@@ -167,3 +168,26 @@ def test06_an_area_is_drawn_named_and_saved(running, panel):
     until(lambda: not session.regions)
     assert running.page.problem == ""
     assert not [e for e in panel.driver.get_log("browser") if e["level"] == "SEVERE"]
+
+
+def test07_gaze_fields_to_choose_among(running, tmp_path):
+    """Two of them, of which one lacks a factor: other layers, and the pictures are made anew."""
+    (tmp_path / "room.xml").write_text(ROOM)
+    with viewer([tmp_path / "room.xml", *write_gaze_fields(tmp_path)], ViewOptions(port=0, width=48, spp=1)) as found:
+        session = found.page.session
+        with chromium(900, 700) as driver:
+            driver.get(found.address)
+            window = until(lambda: next(iter(found.page.windows.values()), None))
+            until(lambda: window.picture)
+            panel = Panel(driver, tmp_path)
+            panel.close_notes()
+            panel.choose("Layer", "what the observer gives")
+            until(lambda: session.shade.layer.title == "what the observer gives")
+            panel.choose("Gaze field", "emit")
+            until(lambda: session.gaze_name == "emit" and session.shade.layer.title == "gaze")
+            until(lambda: window.picture and "gaze" in window.last[0].values)
+            until(lambda: panel.input("Layer").get_attribute("value") == "gaze")
+            one = window.last[1]
+            panel.choose("Gaze field", "emit_capture")
+            until(lambda: session.gaze_name == "emit_capture" and window.picture and window.last[0].whole)
+            assert not np.array_equal(window.last[1], one)

@@ -12,6 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.view import place_to_view
+from nerg_mi.viewer import session as session_module
 from nerg_mi.viewer.layers import LAYERS
 from nerg_mi.viewer.session import Session
 
@@ -43,9 +44,9 @@ class Heard:
 def session_of(tmp_path):
     made = []
 
-    def make(path, **options) -> Session:
+    def make(path, *others, **options) -> Session:
         chosen = ViewOptions(**options)
-        session = Session(lambda: place_to_view([path], tmp_path, chosen), chosen, Heard())
+        session = Session(lambda: place_to_view([path, *others], tmp_path, chosen), chosen, Heard())
         made.append(session)
         session.start()
         return session
@@ -59,6 +60,7 @@ def settle(session):
     assert session.worker.wait_idle(120)
     while not (session.follow_observer() and session.follow_shares()):
         assert session.worker.wait_idle(120)
+        assert not session.listener.errors
     assert not session.listener.errors
 
 
@@ -159,3 +161,41 @@ def test06_what_cannot_be_shown_is_told(session_of, room, tmp_path):
         session_of(Path("nowhere.xml"))
     with pytest.raises(NergError, match="three numbers"):
         session_of(room, observer=(1.0, 2.0))
+
+
+def test07_variants_are_shown_in_turn(session_of, room, gaze_fields):
+    session = session_of(room, *gaze_fields, observer=(0.5, 0.0, 1.0))
+    assert session.gaze_name == "emit_capture" and session.shade.layer.title == "gaze"
+    settle(session)
+    first, points, shared, falloff = session.baked["gaze"], session.proxy.points, dict(session.shares), session.falloff
+    assert first.max() > 0 and shared
+    session.set_falloff(0.25)
+    session.set_shade(layer=LAYERS["what the observer gives"])
+    # Even while the gaze of the other is being computed.
+    session.follow_observer()
+    session.set_gaze("emit")
+    assert session.shade.layer.title == "gaze", "a layer that this one has not"
+    assert float(np.ravel(np.array(session.scene.integrator.falloff))[0]) == pytest.approx(0.25)
+    settle(session)
+    assert session.proxy.points is points and not np.allclose(session.baked["gaze"], first, rtol=0.1)
+    assert session.shares != shared
+    # It is that of the file by itself.
+    session.set_gaze("emit_capture")
+    session.set_falloff(falloff)
+    settle(session)
+    assert np.allclose(session.baked["gaze"], first, rtol=1e-4, atol=1e-6)
+
+
+def test08_what_cannot_be_counted_is_told_once(session_of, room, gaze_fields, monkeypatch):
+    def refuse(*_):
+        raise NergError("no")
+        yield
+
+    monkeypatch.setattr(session_module, "shares_in_steps", refuse)
+    session = session_of(room, gaze_fields[0])
+    assert session.worker.wait_idle(120)
+    while not session.follow_shares():
+        assert session.worker.wait_idle(120)
+    assert [str(e) for e in session.listener.errors] == ["no"]
+    session.place_observer(np.array([0.0, 1, 1]))
+    assert not session.follow_shares()

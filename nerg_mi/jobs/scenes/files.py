@@ -117,7 +117,7 @@ def _trained_in(gaze: Path, about: dict) -> tuple[str, Path | None]:
 
 def _compare(place: Path, gaze: Path, about: dict, reporter: Reporter) -> None:
     """Warn where a gaze field is to be shown in another place than that of its training."""
-    known = next((about[k] for k in ("field_file", "scene_file", "geometry_file") if k in about), None)
+    known = _place_file(about)
     if known is None:
         if about.get("geometry") == "none":
             reporter.warn(f'"{gaze}" was trained without a place; surfaces of "{place}" are not where it takes them')
@@ -127,6 +127,17 @@ def _compare(place: Path, gaze: Path, about: dict, reporter: Reporter) -> None:
             f'"{gaze}" was trained in another file than "{place}", {plain(known.get("file"), 80)}; gaze is right only '
             "where surfaces and coordinates are the same"
         )
+
+
+def training_place(about: dict) -> str | None:
+    """The checksum of the file of the place that a gaze field was trained in, by its provenance ``about``; None where
+    there was none."""
+    known = _place_file(about)
+    return None if known is None else known.get("sha256")
+
+
+def _place_file(about: dict) -> dict | None:
+    return next((about[k] for k in ("field_file", "scene_file", "geometry_file") if k in about), None)
 
 
 def _have_hits(rays: Path | None) -> bool:
