@@ -21,18 +21,21 @@ def contact_sheet(
     label: str = "",
     values: Sequence[tuple[Any, Any]] = (),
     unknown: bool = False,
+    note: str = "",
 ) -> Any:
     """``pictures`` (h, w, 3), display values, each under its title, in rows of ``columns`` (default: about as many as
     rows); smaller ones lie in the middle of their place.
 
     ``heat``: the one scale of all, with its ``label``; ``values``: pairs (values, mask) that it explains; ``unknown``:
-    whether some are hatched.
+    whether some are hatched; ``note``: what they rest on.
     """
     if not pictures:
         raise ValueError("a contact sheet needs at least one picture")
     columns = columns or math.ceil(math.sqrt(len(pictures)))
     height, width = (max(p.shape[axis] for p in pictures) for axis in (0, 1))
-    sheet = Sheet([_padded(p, height, width) for p in pictures], titles, scale=heat is not None, columns=columns)
+    sheet = Sheet(
+        [_padded(p, height, width) for p in pictures], titles, scale=heat is not None, columns=columns, note=note
+    )
     if heat is not None:
         add_scale(sheet, heat, label, values, unknown)
     return sheet.page

@@ -82,17 +82,24 @@ def visibility_figure(color, visibility, mask, title: str = "Visible to the obse
 
 
 def difference_figure(
-    first, second, mask=None, title: str = "Difference", label: str = "difference", limit=None, colors: str = "RdBu_r"
+    first,
+    second,
+    mask=None,
+    title: str = "Difference",
+    label: str = "difference",
+    limit=None,
+    colors: str = "RdBu_r",
+    note: str = "",
 ):
     """``first`` less ``second``, (h, w) each, in the colours of a diverging map whose middle is 0; hatched where
     ``mask`` (h, w) is false, or one of both is no number. ``limit``: both ends of the scale, by default that which 99.5
-    percent of the pixels stay within."""
+    percent of the pixels stay within; ``note``: what they rest on."""
     less = np.asarray(first, np.float64) - np.asarray(second, np.float64)
     some = np.isfinite(less) if mask is None else np.isfinite(less) & np.asarray(mask, bool)
     size = np.abs(less[some])
     limit = float(limit or (np.percentile(size, 99.5) if size.size else 0.0) or (size.max() if size.size else 0.0) or 1)
     shown = color_values(colors, np.where(some, 0.5 + 0.5 * less / limit, 0.5), diverging=True)
-    sheet = Sheet([_hatched(shown, ~some)], [title], scale=True)
+    sheet = Sheet([_hatched(shown, ~some)], [title], scale=True, note=note)
     strip = color_values(colors, np.linspace(0, 1, _STEPS), diverging=True)
     over = dict(above=bool(np.any(less[some] > limit)), below=bool(np.any(less[some] < -limit)))
     sheet.bar(strip, -limit, limit, label, unknown=not some.all(), **over)

@@ -121,6 +121,16 @@ def read_exr(path: str | os.PathLike, what: str = "image") -> dict[str, np.ndarr
     return {name: channels[name] for name in sorted(channels, key=_channel_order)}
 
 
+def read_exr_text(path: str | os.PathLike, what: str = "image") -> dict[str, str]:
+    """The texts in the header of an EXR file by their names: the ``attributes`` of `exr_rows` and of other programs.
+    Raises `NergError` for what is damaged."""
+    import OpenEXR
+
+    check_image(path, what)
+    with reading(path, what, also=(RuntimeError, TypeError)), OpenEXR.File(str(path), header_only=True) as file:
+        return {name: value for name, value in file.header().items() if isinstance(value, str)}
+
+
 def _channel_order(name: str) -> str:
     """What names are sorted by, so that the colours of a layer come in the order that Mitsuba gives them."""
     layer, dot, last = name.rpartition(".")

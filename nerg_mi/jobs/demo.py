@@ -36,7 +36,7 @@ from .bake import bake
 from .options.bake import BakeOptions
 from .options.pictures import DemoOptions
 from .options.report import ReportOptions
-from .overlays import basis_words
+from .overlays import basis_texts, basis_words
 from .report import make_report
 from .reporter import SILENT, Reporter
 from .versions import versions
@@ -114,7 +114,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     heat = Heat(max(tops))
     pictures = {"own": own, "without": without, "camera": camera, "sphere": sphere}
     files = _write_pictures(out, pictures, heat, observer_pixel(seen), basis_words(seen), about)
-    for key, value in about.text().items():
+    for key, value in (about.text() | basis_texts(seen)).items():
         camera.bitmap.metadata()[key] = value
     write_bitmap_exr(out / "scene.exr", camera.bitmap)
     files.append(out / "scene.exr")

@@ -181,11 +181,18 @@ def layers_of(
 
 def basis_words(loaded: Any, part: str | None = "gaze") -> str:
     """Rays and people that a ``part`` of the scene rests on, "gaze" or "kde", in words; "" where that is not known."""
-    volume = loaded.integrator().children.get(part)
+    volume = getattr(loaded.integrator(), "children", {}).get(part)
     if volume is None:
         return ""
     basis = volume.kde_view().basis if part == "kde" else volume.field.basis
     return "" if basis is None else f"made of {basis.words()}"
+
+
+def basis_texts(loaded: Any) -> dict[str, str]:
+    """The same for the header of a picture, by the names under which `jobs.drawing` finds it: "gaze.basis" and
+    "kde.basis", as far as they are known."""
+    words = {f"{part}.basis": basis_words(loaded, part) for part in ("gaze", "kde")}
+    return {name: text for name, text in words.items() if text}
 
 
 def is_supported(loaded: Any, camera: Any) -> bool:

@@ -27,7 +27,7 @@ from nerg_mi.rendering.scene_file import check_samples, files_of_scene
 from nerg_mi.threads import set_thread_count
 
 from .options.pictures import PictureOptions
-from .overlays import OVERLAY_FORMATS, Make, OnStrip, Picture, check_overlay, overlay_pictures
+from .overlays import OVERLAY_FORMATS, Make, OnStrip, Picture, basis_texts, check_overlay, overlay_pictures
 from .reporter import SILENT, Reporter
 
 VIDEO = ".mp4"
@@ -229,7 +229,7 @@ def _picture(
             stop.check()
 
     def to_file(path: Path, about: Provenance) -> None:
-        with picture_rows(path, width, height, about.text()) as add:
+        with picture_rows(path, width, height, about.text() | basis_texts(loaded)) as add:
             fill(add)
 
     def pixels() -> np.ndarray:

@@ -3,6 +3,8 @@
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.exr import read_exr_text
+from nerg_mi.jobs.demo import store_scene
 from nerg_mi.jobs.pictures import PictureOptions, render_file
 from tests.cli.test_render import SCENE
 from tests.jobs.recorder import Recorder
@@ -40,3 +42,12 @@ def test_a_reporter_may_end_it(scene, tmp_path):
 def test_a_sensor_that_is_not_there(scene, tmp_path):
     with pytest.raises(NergError, match="has 2 sensor"):
         render_file(scene, tmp_path / "a.exr", PictureOptions(sensor=2, mode="llvm_ad_rgb"))
+
+
+@pytest.mark.slow
+def test_the_header_says_what_the_gaze_rests_on(tmp_path):
+    small = {"width": "12", "height": "8"}
+    options = PictureOptions(defaults=small, spp=1, mode="llvm_ad_rgb")
+    text = read_exr_text(render_file(store_scene(), tmp_path / "a.exr", options).path)
+    assert text["gaze.basis"].startswith("made of ") and text["gaze.basis"].endswith(" people")
+    assert "nerg render" in text["Comment"] and "kde.basis" not in text

@@ -14,7 +14,7 @@ from nerg_mi.figures.plots import difference_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 
-from .files import read_stored
+from .files import read_stored, shared_note
 from .kind import Drawing, Kind
 
 
@@ -42,7 +42,8 @@ def draw(files: Sequence[Path], options: DifferenceOptions, reporter: Reporter) 
     title = f"{files[0].stem} less {files[1].stem}"
     unit = " [1/sr]" if name in ("gaze", "kde", "gaze_std") else ""
     label = f"difference of {name}{unit}"
-    figure = difference_figure(first.values, second.values, mask, title, label, options.top, options.cmap)
+    note = shared_note([path.stem for path in files], [first.basis, second.basis])
+    figure = difference_figure(first.values, second.values, mask, title, label, options.top, options.cmap, note)
     return Drawing(figure, list(files))
 
 

@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.exr import read_exr
+from nerg_mi.files.exr import read_exr, read_exr_text
 from nerg_mi.rendering.channels import SURFACE
 
 EXR = ".exr"
+
+_RESTS_ON = {"gaze": "gaze", "gaze_std": "gaze", "emit": "gaze", "capture": "gaze", "kde": "kde"}
 
 
 @dataclass(frozen=True, eq=False)
 class Stored:
     """Linear ``color`` (h, w, 3), the ``values`` (h, w) of a quantity, and where there is a surface, ``mask`` (h, w)
-    bool: everywhere, for a file without opacity."""
+    bool: everywhere, for a file without opacity. ``basis``: of how many rays of how many people gaze is made, in words,
+    or "" where the file does not say."""
 
     color: np.ndarray
     values: np.ndarray
     mask: np.ndarray
+    basis: str = ""
+
+
+def shared_note(names: Sequence[str], basis: Sequence[str]) -> str:
+    """A line on what several pictures rest on: once where it is the same, otherwise by their names."""
+    if len(set(basis)) == 1:
+        return basis[0]
+    return "; ".join(f"{name}: {words or 'not known'}" for name, words in zip(names, basis))
 
 
 def read_stored(path: Path, channel: str) -> Stored:
@@ -37,4 +49,6 @@ def read_stored(path: Path, channel: str) -> Stored:
     opacity = found.get("opacity.Y")
     mask = np.ones(values.shape, bool) if opacity is None else opacity >= SURFACE
     as_floats = lambda array: np.nan_to_num(np.asarray(array, np.float32))
-    return Stored(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask)
+    part = _RESTS_ON.get(channel.partition(".")[0])
+    basis = "" if part is None else read_exr_text(path, "picture").get(f"{part}.basis", "")
+    return Stored(as_floats(np.stack(color, axis=-1)), np.asarray(values, np.float32), mask, basis)

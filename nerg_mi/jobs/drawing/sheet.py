@@ -13,7 +13,7 @@ from nerg_mi.figures.overlay import Heat, overlay, top_of
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
 
-from .files import EXR, read_stored
+from .files import EXR, read_stored, shared_note
 from .kind import Drawing, Kind, ScaleOptions
 
 _UNITS = {"gaze": "gaze density [1/sr]", "kde": "tracked gaze [1/sr]", "gaze_std": "standard deviation of gaze [1/sr]"}
@@ -39,9 +39,10 @@ def draw(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Dr
             reporter.progress(k / len(files), path.name)
             pictures.append(shrink(_display(path), options.width))
         return Drawing(contact_sheet(pictures, names, options.columns), list(files))
-    tops = []
+    tops, notes = [], []
     for path in files:
         stored = read_stored(path, options.overlay)
+        notes.append(stored.basis)
         if np.any(stored.values[stored.mask] > 0):
             tops.append(top_of(np.nan_to_num(stored.values), stored.mask))
     top = options.top or max(tops, default=0.0)
@@ -57,7 +58,8 @@ def draw(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Dr
         highest = np.max(stored.values, where=stored.mask & np.isfinite(stored.values), initial=0.0)
         values.append((np.array([highest]), np.ones(1, bool)))
     label = _UNITS.get(options.overlay.partition(".")[0], options.overlay)
-    return Drawing(contact_sheet(pictures, names, options.columns, heat, label, values, hatched), list(files))
+    note = shared_note(names, notes)
+    return Drawing(contact_sheet(pictures, names, options.columns, heat, label, values, hatched, note), list(files))
 
 
 def _display(path: Path) -> np.ndarray:

@@ -5,15 +5,15 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.exr import write_exr
-from nerg_mi.jobs.drawing.files import read_stored
+from nerg_mi.jobs.drawing.files import read_stored, shared_note
 
 RNG = np.random.default_rng(0)
 COLOR, GAZE = RNG.random((6, 8, 3)).astype(np.float32), RNG.random((6, 8)).astype(np.float32)
 OPACITY = np.where(np.arange(8) < 3, 0.2, 0.9).astype(np.float32) * np.ones((6, 1), np.float32)
 
 
-def write(path, **more):
-    write_exr(path, {name: COLOR[..., k] for k, name in enumerate("RGB")} | {"gaze.Y": GAZE} | more)
+def write(path, text=None, **more):
+    write_exr(path, {name: COLOR[..., k] for k, name in enumerate("RGB")} | {"gaze.Y": GAZE} | more, text)
     return path
 
 
@@ -23,6 +23,15 @@ def test_colour_values_and_mask(tmp_path):
     np.testing.assert_array_equal(found.values, GAZE)
     np.testing.assert_array_equal(found.mask, np.tile(np.arange(8) >= 3, (6, 1)))
     assert read_stored(write(tmp_path / "b.exr"), "gaze.Y").mask.all()
+
+
+def test_what_gaze_rests_on(tmp_path):
+    text = {"gaze.basis": "made of 5 rays of 2 people", "kde.basis": "made of 3 rays of 1 person"}
+    path = write(tmp_path / "a.exr", text, **{"kde.Y": GAZE, "depth.T": GAZE})
+    bases = [read_stored(path, channel).basis for channel in ("gaze", "kde.Y", "depth")]
+    assert bases == [*text.values(), ""] and read_stored(write(tmp_path / "b.exr"), "gaze").basis == ""
+    assert shared_note("ab", bases[:1] * 2) == bases[0]
+    assert shared_note("ab", ["x", ""]) == "a: x; b: not known"
 
 
 def test_what_is_refused(tmp_path):

@@ -44,3 +44,13 @@ def test_nothing_to_take_a_scale_from(tmp_path):
     with pytest.raises(NergError, match="no gaze in this picture"):
         draw("sheet", dark, overlay="gaze")
     assert draw("sheet", dark, overlay="gaze", top=1.0).axes
+
+
+def test_what_the_pictures_rest_on_is_said_below(tmp_path):
+    texts = [{"gaze.basis": f"made of {n} rays of 2 people"} for n in (5, 6)]
+    a, b = (write(tmp_path / f"{name}.exr", text) for name, text in zip("ab", texts))
+    said = lambda *files: {t.get_text().replace("\n", " ") for t in draw("sheet", list(files), overlay="gaze").texts}
+    assert said(a, a) == {texts[0]["gaze.basis"]}
+    assert said(a, b) == {f"a: {texts[0]['gaze.basis']}; b: {texts[1]['gaze.basis']}"}
+    figure = draw("difference", [a, a])
+    assert figure.texts[0].get_text().replace("\n", " ") == texts[0]["gaze.basis"]
