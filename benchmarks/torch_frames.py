@@ -1,0 +1,305 @@
+"""A frame of the demo store beside a plain PyTorch renderer of the same checkpoints, steps and camera.
+
+    python benchmarks/torch_frames.py [--sizes 320x180,1280x720] [--runs 3] [--compile] [--csv FILE]
+
+Colour, depth and gaze of an observer who is not the camera, after occlusion. The peer is eager PyTorch as radiance
+fields are commonly rendered with it: steps of the field's own length in slabs, cells that its occupancy grid says are
+empty left out, samples and rays compacted, the density net first and the colour net where the weight exceeds 1e-3, rays
+ended at T < 1e-4; then the observer's rays to the surfaces, which end where they are opaque or have arrived; then both
+factors of the gaze. Its grid is evaluated as torch-ngp's fallback does, eight gathers a level, and in a second row with
+less traffic in memory; `--compile` adds one with the encoding and the networks through torch.compile. Before anything
+is timed they render the same rays, and the program stops where colours are less alike than 35 dB or the means of gaze
+differ by more than 2 %. Runs are taken in turns; the figures are medians of wall-clock seconds, with the quickest and
+the slowest, and processor seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import statistics
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import nerg_mi as nerg
+from nerg_mi.figures.tonemap import srgb
+from nerg_mi.formats.fields import load_gaze, load_radiance
+from nerg_mi.jobs.demo import store_scene
+from output import print_table, write_rows
+from torch_radiance import _PRIMES, TorchModel, harmonics
+
+import numpy as np
+
+SLAB = 16
+"""Steps of a ray that are looked at together."""
+
+RAYS = 1 << 15
+"""Rays that are rendered together."""
+
+WEIGHT, STOP = 1e-3, 1e-4
+
+
+class QuickModel(TorchModel):
+    """The same grid with less traffic in memory, which nothing is differentiated for: corners one after the other, and
+    indices of 32 bits, whose products overflow as the hash wants them to."""
+
+    def encode(self, p):
+        torch, out = self.torch, []
+        u = ((p - self.center) / self.box.side + 0.5).clamp(0, 1)
+        table = self.weights["grid.table"].detach().view(-1, self.config.grid.features)
+        for scale, rows, offset, hashed in zip(self.scales, self.rows, self.offsets, self.hashed):
+            x = u * float(scale) + 0.5
+            cell = x.floor()
+            w = x - cell
+            stride = int(np.ceil(scale)) + 2
+            steps = [np.uint32(k).astype(np.int32).item() for k in (_PRIMES if hashed else (1, stride, stride**2))]
+            low = [cell[:, k].int() * steps[k] for k in range(3)]
+            ends = [((1 - w[:, k], low[k]), (w[:, k], low[k] + steps[k])) for k in range(3)]
+            total = None
+            for (wx, x), (wy, y), (wz, z) in itertools.product(*ends):
+                row = ((x ^ y ^ z) & (rows - 1)) if hashed else x + y + z
+                value = table[offset : offset + rows].index_select(0, row) * (wx * wy * wz)[:, None]
+                total = value if total is None else total.add_(value)
+            out.append(total)
+        return torch.cat(out, 1)
+
+
+class Attention:
+    """The paper's product of emit and capture, of the weights of a ``model`` (`TorchModel`)."""
+
+    def __init__(self, model):
+        self.model = model
+
+    def factor(self, p, d, head):
+        """What a head gives before its activation."""
+        import torch
+
+        geometry = self.model._net("position_net", self.model.encode(p))
+        hidden = self.model._net("direction_net", torch.cat([harmonics(d), geometry], 1))
+        return self.model._net(f"{head}_head", hidden.relu())[:, 0]
+
+    def gaze(self, p_od, p_o, r_o):
+        """Gaze in 1/sr."""
+        import torch
+
+        emit = torch.nn.functional.softplus(self.factor(p_od, -r_o, "emit")) * self.model.config.emit_scale
+        return emit * self.factor(p_o, r_o, "capture").sigmoid()
+
+
+class TorchRenderer:
+    """Frames of a radiance field and a gaze field, in torch."""
+
+    def __init__(self, field, gaze, falloff: float, model: type[TorchModel] = QuickModel, compiled: bool = False):
+        import torch
+
+        self.torch, self.falloff = torch, falloff
+        self.model, self.attention = model(field), Attention(model(gaze))
+        self.bits = torch.from_numpy(field.occupancy.bits.ravel().copy())
+        self.cells, self.dt = field.occupancy.resolution, float(field.march_step)
+        self.side = float(field.box.side)
+        self.lower = self.model.center - self.side / 2
+        self.low, self.high = (torch.tensor(v, dtype=torch.float32) for v in (field.box.lower, field.box.upper))
+        self.density, self.color, self.gaze = self._density, self._color, self.attention.gaze
+        if compiled:
+            self.density, self.color, self.gaze = (
+                torch.compile(f, dynamic=True) for f in (self._density, self._color, self.attention.gaze)
+            )
+
+    def _density(self, p):
+        h = self.model._net("density_net", self.model.encode(p))
+        return self.model.config.density_scale * h[:, 0].clamp(max=30).exp(), h[:, 1:]
+
+    def _color(self, features, d):
+        return self.model._net("color_net", self.torch.cat([harmonics(d), features], 1)).sigmoid()
+
+    def occupied(self, p):
+        """Whether the cells of ``p`` (..., 3) may hold matter."""
+        c = ((p - self.lower) * (self.cells / self.side)).long().clamp_(0, self.cells - 1)
+        return self.bits[c[..., 0] + self.cells * (c[..., 1] + self.cells * c[..., 2])]
+
+    def march(self, o, d, end=None, colored=True):
+        """Colour (N, 3), opacity and median depth (N,) of rays, which end at ``end`` (N,) or leave the box."""
+        torch, dt = self.torch, self.dt
+        n = len(o)
+        ends = torch.stack([(self.low - o) / d, (self.high - o) / d])
+        t0, t1 = ends.amin(0).amax(1).clamp(min=0), ends.amax(0).amin(1)
+        t1 = t1 if end is None else torch.minimum(t1, end)
+        color, through = torch.zeros(n, 3), torch.ones(n)
+        depth = torch.full((n,), torch.inf)
+        alive = (t1 > t0).nonzero()[:, 0]
+        steps = torch.arange(SLAB) * dt
+        start = t0.clone()
+        while len(alive):
+            t = start[alive, None] + steps
+            p = o[alive, None] + d[alive, None] * (t + 0.5 * dt)[..., None]
+            row, column = (self.occupied(p) & (t < t1[alive, None])).nonzero(as_tuple=True)
+            tau = torch.zeros(len(alive), SLAB)
+            if len(row):
+                sigma, features = self.density(p[row, column])
+                tau[row, column] = sigma * dt
+                before = tau.cumsum(1) - tau
+                first = through[alive, None] * (-before).exp()
+                weight = first * -torch.expm1(-tau)
+                after = first * (-tau).exp()
+                crossed = (first > 0.5) & (after <= 0.5)
+                at = crossed.any(1).nonzero()[:, 0]
+                k = crossed[at].to(torch.uint8).argmax(1)
+                depth[alive[at]] = t[at, k] + dt * (first[at, k] / 0.5).log() / tau[at, k]
+                if colored:
+                    w = weight[row, column]
+                    kept = w > WEIGHT
+                    ray = alive[row[kept]]
+                    color.index_add_(0, ray, w[kept, None] * self.color(features[kept], d[ray]))
+                through[alive] = after[:, -1]
+            start[alive] = t[:, -1] + dt
+            going = start[alive] < t1[alive]
+            going &= (through[alive] > STOP) if colored else (through[alive] > 0.5)
+            alive = alive[going]
+        return color, 1 - through, depth
+
+    def frame(self, o, d, observer):
+        """Linear colour (N, 3), depth and gaze (N,) as arrays of rays from ``o`` along unit ``d`` (N, 3)."""
+        torch = self.torch
+        rays, found = [torch.from_numpy(np.ascontiguousarray(v, np.float32)) for v in (o, d)], []
+        p_o = torch.tensor(observer, dtype=torch.float32)
+        with torch.no_grad():
+            for a in range(0, len(o), RAYS):
+                found.append(self._part(*(v[a : a + RAYS] for v in rays), p_o))
+        color, depth, gaze = (np.concatenate(v) for v in zip(*found))
+        return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4), depth, gaze
+
+    def _part(self, o, d, p_o):
+        torch = self.torch
+        color, _, depth = self.march(o, d)
+        gaze = torch.zeros(len(o))
+        met = depth.isfinite().nonzero()[:, 0]
+        p_d = o[met] + depth[met, None] * d[met]
+        tolerance = 2 * self.dt
+        away = p_d - d[met] * tolerance - p_o
+        distance = away.norm(dim=1)
+        r_o = away / distance[:, None]
+        _, _, d_o = self.march(p_o.expand(len(met), 3), r_o, distance, colored=False)
+        seen = torch.where(d_o.isfinite(), (1 - (distance - d_o - tolerance) / self.falloff).clamp(0, 1), 1.0)
+        lit = (seen > 0).nonzero()[:, 0]
+        blocked = d_o[lit] < distance[lit] - tolerance
+        p_od = torch.where(blocked[:, None], p_o + r_o[lit] * d_o[lit, None].nan_to_num(posinf=0.0), p_d[lit])
+        gaze[met[lit]] = seen[lit] * self.gaze(p_od, p_o.expand(len(lit), 3), r_o[lit])
+        return color.numpy(), depth.numpy(), gaze.numpy()
+
+
+def camera_rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions (width * height, 3) of the pixels' middles, seen by the scene's first sensor."""
+    import mitsuba as mi
+
+    sensor = nerg.Scene.load(store_scene(), width=width, height=height).mitsuba.sensors()[0]
+    x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    at = mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32))
+    ray, _ = sensor.sample_ray(0, 0.5, at, mi.Point2f(0.5), True)
+    return np.array(ray.o).T, np.array(ray.d).T
+
+
+def agreement(scene, peer: TorchRenderer, width: int = 160, height: int = 90) -> dict[str, float]:
+    """How alike both are on the same rays."""
+    o, d = camera_rays(width, height)
+    observer = np.asarray(scene.observer, float)
+    ours = nerg.trace(scene, o, d, ["color", "depth", "gaze"], observers=observer[None])
+    color, depth, gaze = peer.frame(o, d, observer)
+    mse = np.mean((srgb(np.reshape(ours["color"], (-1, 3))) - srgb(color)) ** 2)
+    truth = np.ravel(ours["depth"])
+    both = np.isfinite(depth) & np.isfinite(truth)
+    apart = np.abs(depth - truth)[both]
+    mean = float(np.mean(ours["gaze"]))
+    return {
+        "color_db": float(-10 * np.log10(mse)),
+        "depth_mm": float(1e3 * np.median(apart)),
+        "depth_mae_mm": float(1e3 * np.mean(apart)),
+        "gaze_mean": float(np.mean(gaze)) / mean - 1,
+    }
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sizes", default="320x180,1280x720")
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--compile", action="store_true")
+    parser.add_argument("--csv", type=Path, default=Path("out/benchmarks/torch_frames.csv"))
+    args = parser.parse_args(argv)
+
+    import drjit as dr
+    import mitsuba as mi
+    import torch
+
+    mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.field.backend import namespace
+
+    dr.set_thread_count(args.threads)
+    torch.set_num_threads(args.threads)
+    folder, ns = store_scene().parent, namespace("llvm_ad_rgb")
+    field, gaze = load_radiance(folder / "store.safetensors", ns)[0], load_gaze(folder / "shoppers.safetensors", ns)[0]
+    scene = nerg.Scene.load(store_scene())
+    falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
+    peers = {
+        "PyTorch, eager": TorchRenderer(field, gaze, falloff, TorchModel),
+        "PyTorch, eager, corner by corner": TorchRenderer(field, gaze, falloff),
+    }
+    if args.compile:
+        peers["PyTorch, compiled"] = TorchRenderer(field, gaze, falloff, TorchModel, compiled=True)
+    for name, peer in peers.items():
+        found = agreement(scene, peer)
+        print(name, ", ".join(f"{k} {v:.4g}" for k, v in found.items()), flush=True)
+        if found["color_db"] < 35 or abs(found["gaze_mean"]) > 0.02:
+            raise SystemExit("the two do not render the same picture")
+    rows = []
+    for size in args.sizes.split(","):
+        width, height = map(int, size.split("x"))
+        o, d = camera_rays(width, height)
+        still = {"width": width, "height": height, "spp": 1, "aovs": "depth,gaze"}
+        frames = {"nerg": _ours(still, "depth"), "nerg, same observer again": _ours(still, "map")}
+        frames |= {name: partial(peer.frame, o, d, scene.observer) for name, peer in peers.items()}
+        rows += measure(frames, size, args.runs)
+    write_rows(args.csv, rows)
+    head = "frame|renderer|s|quickest, slowest|CPU s|times nerg".split("|")
+    print_table("A frame beside PyTorch", head, [[r[k] for k in head] for r in rows])
+
+
+def _ours(values: dict, visibility: str):
+    import mitsuba as mi
+
+    scene = nerg.Scene.load(store_scene(), **values, visibility=visibility).mitsuba
+    return lambda: np.array(mi.render(scene, sensor=0, spp=1))
+
+
+def measure(frames: dict, size: str, runs: int) -> list[dict]:
+    """A row for each of ``frames``, functions by their names, called in turns."""
+    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in frames}
+    for turn in range(runs + 1):
+        for name, frame in frames.items():
+            wall, cpu = time.perf_counter(), time.process_time()
+            frame()
+            # The first compiles, and fills what is kept of the observer.
+            if turn:
+                seconds[name].append((time.perf_counter() - wall, time.process_time() - cpu))
+    medians = {name: statistics.median(wall for wall, _ in taken) for name, taken in seconds.items()}
+    ours = medians[next(iter(frames))]
+    return [
+        {
+            "frame": size,
+            "renderer": name,
+            "s": f"{medians[name]:.3g}",
+            "quickest, slowest": f"{min(taken)[0]:.3g}, {max(taken)[0]:.3g}",
+            "CPU s": f"{statistics.median(cpu for _, cpu in taken):.3g}",
+            "times nerg": f"{medians[name] / ours:.2g}",
+        }
+        for name, taken in seconds.items()
+    ]
+
+
+if __name__ == "__main__":
+    main()
