@@ -5,14 +5,16 @@ An observer at p_o looks into the direction ω with the density g(ω), in 1/sr. 
     ∫_A g(ω) V(y, p_o) dω(y),    dω = |cos θ| dA / |y - p_o|²
 
 (Veach 1997, section 8.2.2.2), summed over pieces that are small as seen from p_o, each of which counts with its exact
-solid angle (`pieces`), and with g and V at its centre (`nerg_mi.density.received.attended`). Over the sphere of the
-same observer directions of equal area tell what g adds up to and how much of it meets something else, or nothing. Both
-sums use other points, and what they lack of each other is the error that is told.
+solid angle (`pieces`), with g at its centre, and with the share of it that is seen, for which it is cut where outlines
+pass (`outlines`). In a medium, or with a fall-off behind outlines, V is that of `nerg_mi.density.received.attended` at
+the centre. Over the sphere of the same observer directions (`sphere_rule`) tell what g adds up to and how much of it
+meets something else, or nothing. Both sums use other points, and what they lack of each other is the error that is
+told.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,26 +22,30 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.density.received import Density, attended
-from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.maths.types import Point3f, Vector3f
 from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.observer.gaze import PlacedGaze
 
 from .cones import blurred
+from .outlines import visible_pieces
 from .pieces import Pieces, pieces_of
+from .sphere_rule import sphere_rule
 from .sums import Sums, deposit, merge
 from .target import Target
 
-BATCH = 1 << 20
+BATCH = 1 << 18
 """Pieces in one launch."""
+
+FACES = 1 << 16
+"""Faces that are cut into pieces together."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GazeSettings:
     """``angle``: radian under which an observer sees a piece at most; ``cone``: standard deviation in radian of the
-    cone that gaze is seen through, 0 for none; ``directions`` over the sphere."""
+    cone that gaze is seen through, 0 for none; ``directions`` over the sphere, about."""
 
-    angle: float = 0.0175
+    angle: float = 0.035
     cone: float = 0.0
     directions: int = 1 << 16
 
@@ -94,45 +100,59 @@ def gaze_sums(
 
 
 def _of_one(target: Target, looker: Looker, weight: float, eye: np.ndarray, settings: GazeSettings) -> Sums:
-    mesh = target.mesh
-    pieces = pieces_of(mesh, eye, settings.angle)
-    received = weight * pieces.solid_angle * _attended(target, looker, pieces, settings.cone)
-    on_faces, on_vertices = deposit(mesh.faces, len(mesh.vertices), pieces.face, pieces.place, received)
-    directions = fibonacci_directions(settings.directions)
+    mesh, eye = target.mesh, np.asarray(eye, np.float64)
+    along = _along(looker, settings.cone)
+    everywhere = lambda d: np.broadcast_to(np.array(along(_vectors(d)), np.float64), (len(d),))
+    directions, angles = sphere_rule(everywhere, settings.directions)
+    share = weight * angles * everywhere(directions)
     ends = target.ends(np.broadcast_to(eye, directions.shape), directions)
-    along = _along(looker, settings.cone)(_vectors(directions))
-    share = weight * 4 * np.pi / len(directions) * np.broadcast_to(np.array(along, np.float64), (len(directions),))
-    escaped = share[(ends.face < 0) & ~ends.elsewhere].sum()
-    return Sums(
-        on_faces, on_vertices, float(share[ends.elsewhere].sum()), float(escaped), float(share.sum()), weight, 1
-    )
+    total, escaped = float(share.sum()), float(share[(ends.face < 0) & ~ends.elsewhere].sum())
+    on_faces, on_vertices = np.zeros(len(mesh.faces)), np.zeros(len(mesh.vertices))
+    for a in range(0, len(mesh.faces), FACES):
+        pieces = pieces_of(mesh, eye, settings.angle, slice(a, a + FACES))
+        for some, received in _received(target, looker, pieces, total / weight if weight else 0.0, settings.cone):
+            found = deposit(mesh.faces, len(mesh.vertices), some.face, some.place, weight * received)
+            on_faces, on_vertices = on_faces + found[0], on_vertices + found[1]
+    return Sums(on_faces, on_vertices, float(share[ends.elsewhere].sum()), escaped, total, weight, 1)
 
 
-def _attended(target: Target, looker: Looker, pieces: Pieces, cone: float) -> np.ndarray:
-    """Gaze after occlusion, in 1/sr, that reaches the centres of pieces, (P,) float64."""
-    out = np.zeros(len(pieces.face))
-    normals = target.mesh.normals[pieces.face]
+def _received(
+    target: Target, looker: Looker, pieces: Pieces, total: float, cone: float
+) -> Iterator[tuple[Pieces, np.ndarray]]:
+    """Pieces, some of which may be cut again, and the gaze (P,) that each receives."""
     density = looker.density
     if cone > 0:
         density = lambda p_od, p_o, r_o, active: blurred(looker.along, r_o, cone)
-    for a in range(0, len(out), BATCH):
-        rows = np.arange(a, min(a + BATCH, len(out)))
+    if target.sharp:
+        yield from visible_pieces(target, pieces, lambda some: _unhidden(looker, density, some), total, BATCH)
+        return
+    for a in range(0, len(pieces), BATCH):
         # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
-        seen = _launch(target, looker.center, _uniform, pieces.center[rows], normals[rows])
-        rows = rows[seen > 0]
-        if len(rows):
-            out[rows] = _launch(target, looker.center, density, pieces.center[rows], normals[rows])
-    return out
+        some = pieces.part(slice(a, a + BATCH))
+        some = some.part(_launch(target, looker.center, _uniform, some) > 0)
+        if len(some):
+            yield some, some.solid_angle * _launch(target, looker.center, density, some)
 
 
-def _launch(target: Target, center: Point3f, density: Density, p: np.ndarray, n: np.ndarray) -> np.ndarray:
+def _unhidden(looker: Looker, density: Density, pieces: Pieces) -> np.ndarray:
+    """``density`` (P,) at the centroids of ``pieces``, in 1/sr, whatever may stand between."""
     import mitsuba as mi
 
-    p_o = center + dr.zeros(mi.Point3f, len(p))
-    found = attended(
-        target.place, density, p_o, mi.Point3f(_vectors(p)), _vectors(n), target.falloff, target.settings, True
-    )
-    return np.broadcast_to(np.array(found, np.float64), (len(p),))
+    middle = pieces.relative.mean(axis=1)
+    r_o = _vectors(middle / np.linalg.norm(middle, axis=1, keepdims=True))
+    p_od, p_o = mi.Point3f(_vectors(pieces.center)), looker.center + dr.zeros(mi.Point3f, len(pieces))
+    found = density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(pieces)))
+    return np.broadcast_to(np.array(found, np.float64), (len(pieces),))
+
+
+def _launch(target: Target, center: Point3f, density: Density, pieces: Pieces) -> np.ndarray:
+    """``density`` (P,) after occlusion by what may be a medium, at the centroids of ``pieces``, in 1/sr."""
+    import mitsuba as mi
+
+    p_o, p = center + dr.zeros(mi.Point3f, len(pieces)), mi.Point3f(_vectors(pieces.center))
+    normals = _vectors(target.mesh.normals[pieces.face])
+    found = attended(target.place, density, p_o, p, normals, target.falloff, target.settings, True)
+    return np.broadcast_to(np.array(found, np.float64), (len(pieces),))
 
 
 def _uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:

@@ -9,6 +9,7 @@ a Plane Triangle" (1983); no Jacobian has to be evaluated where it is steep.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,60 +18,83 @@ from .mesh import Mesh
 LEVELS = 40
 """A face is cut in four so many times at most: to 10^-12 of its size."""
 
-_FOUR = np.array(
-    [
-        [[1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5]],
-        [[0.5, 0.5, 0], [0, 1, 0], [0, 0.5, 0.5]],
-        [[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1]],
-        [[0.5, 0.5, 0], [0, 0.5, 0.5], [0.5, 0, 0.5]],
-    ]
-)
-
-
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """``face`` (P,) that each lies in; ``place`` (P, 3), barycentric coordinates of its centroid there; ``center`` (P,
-    3) of it in the scene; ``solid_angle`` (P,) under which the observer sees it, in steradian."""
+    """Parts of faces as ``eye`` (3,) sees them: ``face`` (P,) that each lies in; ``cut`` (P, 3, 3), of each of its
+    corners the barycentric coordinates there; ``relative`` (P, 3, 3), its corners from the eye in scene units."""
 
+    eye: np.ndarray
     face: np.ndarray
-    place: np.ndarray
-    center: np.ndarray
-    solid_angle: np.ndarray
+    cut: np.ndarray
+    relative: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.face)
+
+    @property
+    def place(self) -> np.ndarray:
+        """Barycentric coordinates (P, 3) of the centroids."""
+        return self.cut.mean(axis=1)
+
+    @property
+    def center(self) -> np.ndarray:
+        """Centroids (P, 3) in the scene."""
+        return self.relative.mean(axis=1) + self.eye
+
+    @cached_property
+    def solid_angle(self) -> np.ndarray:
+        """Solid angles (P,) under which the eye sees them, in steradian."""
+        return solid_angles(self.relative)
+
+    def part(self, rows: np.ndarray | slice) -> Pieces:
+        """Those numbered, or marked, by ``rows``."""
+        return Pieces(self.eye, self.face[rows], self.cut[rows], self.relative[rows])
+
+    def quartered(self) -> Pieces:
+        """Each cut into four congruent ones, one after the other."""
+        return Pieces(self.eye, np.repeat(self.face, 4), _quarters(self.cut), _quarters(self.relative))
 
 
-def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float) -> Pieces:
-    """The faces of ``mesh``, cut into pieces none of whose edges is seen from ``eye`` (3,) under more than about
+def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float, faces: slice = slice(None)) -> Pieces:
+    """The ``faces`` of ``mesh``, cut into pieces none of whose edges is seen from ``eye`` (3,) under more than about
     ``angle`` (radian).
 
     An edge counts as seen from the nearest point of the ball around its piece; a piece that holds the eye itself is cut
     `LEVELS` times.
     """
-    corners = mesh.corners - eye
-    rows, place = np.arange(len(corners)), None
-    faces, places, relative = [], [], []
+    relative = mesh.corners[faces] - eye
+    number = np.arange(len(mesh.faces))[faces]
+    left = Pieces(eye, number, np.broadcast_to(np.eye(3), (len(number), 3, 3)), relative)
+    found: list[Pieces] = []
     for level in range(LEVELS + 1):
-        if place is None:
-            here = corners
-        else:
-            here = np.einsum("pij,pjk->pik", place, corners[rows])
+        here = left.relative
         middle = here.mean(axis=1)
-        radius = np.linalg.norm(here - middle[:, None], axis=2).max(axis=1)
-        edge = np.linalg.norm(here - np.roll(here, 1, axis=1), axis=2).max(axis=1)
-        small = edge <= angle * np.maximum(np.linalg.norm(middle, axis=1) - radius, 0)
+        radius = np.sqrt(_square(here - middle[:, None]).max(axis=1))
+        edge = np.sqrt(_square(here - here[:, [2, 0, 1]]).max(axis=1))
+        small = edge <= angle * np.maximum(np.sqrt(_square(middle)) - radius, 0)
         if level == LEVELS:
             small[:] = True
-        faces.append(rows[small])
-        done = np.full((np.count_nonzero(small), 3), 1 / 3) if place is None else place[small].mean(axis=1)
-        places.append(done)
-        relative.append(here[small])
+        found.append(left.part(small))
         if small.all():
             break
-        left = np.broadcast_to(np.eye(3), (int(np.count_nonzero(~small)), 3, 3)) if place is None else place[~small]
-        place = np.einsum("fij,pjk->pfik", _FOUR, left).reshape(-1, 3, 3)
-        rows = np.repeat(rows[~small], 4)
-    found = np.concatenate(relative)
-    angles = solid_angles(found)
-    return Pieces(np.concatenate(faces), np.concatenate(places), found.mean(axis=1) + eye, angles)
+        left = left.part(~small).quartered()
+    joined = (np.concatenate([getattr(part, name) for part in found]) for name in ("face", "cut", "relative"))
+    return Pieces(eye, *joined)
+
+
+def _square(v: np.ndarray) -> np.ndarray:
+    return np.einsum("...i,...i->...", v, v)
+
+
+def _quarters(corners: np.ndarray) -> np.ndarray:
+    """Corners (4 P, 3, 3) of the quarters of triangles (P, 3, 3)."""
+    middle = 0.5 * (corners + corners[:, [1, 2, 0]])
+    (a, b, c), (ab, bc, ca) = (np.moveaxis(v, 1, 0) for v in (corners, middle))
+    out = np.empty((len(corners), 4, 3, 3))
+    for k, three in enumerate(((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))):
+        for n, corner in enumerate(three):
+            out[:, k, n] = corner
+    return out.reshape(-1, 3, 3)
 
 
 def solid_angles(corners: np.ndarray) -> np.ndarray:

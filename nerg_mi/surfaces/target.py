@@ -18,6 +18,9 @@ from .mesh import Mesh
 SURFACE_OPACITY = 0.5
 """Opacity of a medium from which on a ray ends in it."""
 
+NEAR = 1e-5
+"""What a ray meets so near before a point, as a share of the distance, does not hide it: its own face, a neighbour."""
+
 
 @dataclass(frozen=True, eq=False)
 class Ends:
@@ -57,6 +60,32 @@ class Target:
         self.settings = settings or ObserverSettings(
             march=default_settings(self.place), surface_opacity=SURFACE_OPACITY
         )
+
+    @property
+    def sharp(self) -> bool:
+        """Whether what is met hides all that is behind it: shapes alone, without a medium, and without a fall-off."""
+        return self.place.medium is None and self.falloff == 0
+
+    def sees(self, eye: np.ndarray, points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Whether ``eye`` (3,) sees ``points`` (N, 3) of the surface, which lie in its ``faces`` (N,); of `sharp`
+        targets. A point is seen where the ray at it ends at its own face, however obliquely, or not before it."""
+        import mitsuba as mi
+
+        to = points - eye
+        distance = np.linalg.norm(to, axis=1)
+        d = mi.Vector3f(np.ascontiguousarray((to / np.where(distance > 0, distance, 1)[:, None]).T, np.float32))
+        o = mi.Point3f(np.asarray(eye, np.float64).tolist())
+        # A position that is a constant of the kernel would be compiled anew for every observer.
+        dr.make_opaque(o)
+        count = len(points)
+        with dr.suspend_grad():
+            view = self.place.trace(mi.Ray3f(o, d), dr.full(mi.Bool, True, count), self.settings.march)
+            assert view.cast is not None, "a target has shapes"
+            own = (view.cast.shape == mi.ShapePtr(self._shape)) & (
+                view.cast.prim_index == mi.UInt32(faces.astype(np.uint32))
+            )
+            seen = ~view.hit | own | (view.distance >= mi.Float((distance * (1 - NEAR)).astype(np.float32)))
+        return np.broadcast_to(np.array(seen).astype(bool), (count,)) & (distance > 0)
 
     def ends(self, origins: np.ndarray, directions: np.ndarray) -> Ends:
         """Where rays with ``origins`` (N, 3) and unit ``directions`` (N, 3) end."""

@@ -44,7 +44,7 @@ class BakeOptions:
         None, "Longest edge of a triangle in metres; longer ones are cut.  [default: about 100,000 triangles]"
     )
     angle: float = option(
-        1.0, "Degrees under which an observer sees a piece of a surface at most: less is exacter.", min=0.2, max=30
+        2.0, "Degrees under which an observer sees a piece of a surface at most: less is exacter.", min=0.2, max=30
     )
     unit: str = option("share", "Values are: share (of gaze, 1/m²), or seconds (of the rays, s/m²).")
     halves: bool = option(False, "Say how well two halves of the people agree (of rays).")
