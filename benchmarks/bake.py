@@ -1,6 +1,6 @@
 """Gaze on surfaces: what is lost, what it costs, and how well two halves of the people agree.
 
-    python benchmarks/bake.py [--tables conservation,error,detail,observers,smoothing,halves] [--rays FILE]
+    python benchmarks/bake.py [--tables conservation,error,detail,observers,smoothing,halves,supermarket] [--rays FILE]
         [--shoppers 40] [--out out/benchmarks/bake.csv]
 
 `conservation`: rooms with and without a window, von Mises-Fisher laws of four widths, observers in the middle and a
@@ -10,12 +10,13 @@ pieces, the differences from the finest and the time. `detail`: heat on a plane 
 a point at several edges, against the Gaussian. `smoothing`: the same at several numbers of steps. `observers`: how far
 the shoppers are from those that stand for them. `halves`: CC over the twin's faces between two halves of the
 shoppers, by lines and by cones of 1.5 degrees, smoothed along the surface. Shoppers are simulated; `--rays` takes
-others.
+others. `supermarket`: the same of the people tracked in a VR supermarket, on voxels of what their rays hit.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from pathlib import Path
 
@@ -24,7 +25,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 import numpy as np
 
 EYE = (4.4, 2.8, 1.6)
-TABLES = ("conservation", "error", "detail", "smoothing", "observers", "halves")
+TABLES = ("conservation", "error", "detail", "smoothing", "observers", "halves", "supermarket")
 
 
 def law(kappa: float):
@@ -176,6 +177,44 @@ def observers(args) -> list[dict]:
 
 
 def halves(args) -> list[dict]:
+    rays = shoppers(args)
+    return [row for some in (8, len(rays.persons)) for row in agreement(rays, twin_surface(0.15).mesh, some)]
+
+
+def supermarket(args) -> list[dict]:
+    """The tracked people of the VR supermarket, on the shell of what their rays hit."""
+    from nerg_mi.rays.readers.registry import read_rays
+
+    files = sorted(args.supermarket.glob("*.csv.gz"))
+    if not files:
+        raise SystemExit(
+            f'no recordings in "{args.supermarket}"; set NERG_DATA to the folder that holds vr_supermarket'
+        )
+    rays = read_rays("vr_supermarket", files)
+    return agreement(rays, shell(rays.hit, 0.15), len(rays.persons))
+
+
+def shell(points, edge: float, least: int = 5):
+    """Outer sides of voxels with the ``edge`` that hold ``least`` of ``points`` or more, as a mesh."""
+    from nerg_mi.surfaces.mesh import weld
+
+    points = points[np.isfinite(points).all(axis=1)]
+    cells, count = np.unique(np.floor(points / edge).astype(int), axis=0, return_counts=True)
+    cells = cells[count >= least]
+    full, (corners, triangles) = set(map(tuple, cells)), box((0, 0, 0), (1, 1, 1))
+    vertices, faces = [], []
+    for side in range(6):
+        step = np.zeros(3, int)
+        step[side // 2] = 2 * (side % 2) - 1
+        bare = cells[[tuple(c) not in full for c in cells + step]]
+        for two in triangles[2 * side : 2 * side + 2]:
+            faces.append(sum(map(len, vertices)) + np.arange(3 * len(bare)).reshape(-1, 3))
+            vertices.append((bare[:, None] + corners[two]).reshape(-1, 3) * edge)
+    return weld(np.concatenate(vertices), np.concatenate(faces))[0]
+
+
+def agreement(rays, mesh, some: int) -> list[dict]:
+    """CC over the faces of ``mesh`` between halves of ``some`` people, by lines and by cones."""
     from nerg_mi.evaluation.saliency import cc
     from nerg_mi.jobs.baking.lookers import tracked_rays
     from nerg_mi.maths.similarity import Similarity
@@ -183,27 +222,25 @@ def halves(args) -> list[dict]:
     from nerg_mi.surfaces.smoothing import Smoother
     from nerg_mi.surfaces.target import Target
 
-    rays, mesh, rows = shoppers(args), twin_surface(0.15).mesh, []
-    who = tracked_rays(rays, Similarity(), "time")
+    rows, who = [], tracked_rays(rays, Similarity(), "time")
     target, smoothers = Target(mesh), {s: Smoother(mesh, s) for s in (0.02, 0.05, 0.1)}
-    for some in (8, len(rays.persons)):
-        people = np.random.default_rng(0).permutation(len(rays.persons))[:some]
-        parts = [np.isin(rays.person, people[: some // 2]), np.isin(rays.person, people[some // 2 :])]
-        for cone in (0.0, 1.5):
-            settings = RaySettings(cone=np.radians(cone))
-            both = [
-                ray_sums(target, TrackedRays(who.origins[p], who.directions[p], who.weights[p]), settings)
-                for p in parts
-            ]
-            row = {
-                "people": some,
-                "cone": cone,
-                "not smoothed": float(cc(*(b.face / mesh.area for b in both), mesh.area)),
-            }
-            for s, smoother in smoothers.items():
-                maps = [(smoother(b.vertex) / mesh.vertex_area)[mesh.faces].mean(axis=1) for b in both]
-                row[f"{100 * s:.0f} cm"] = float(cc(*maps, mesh.area))
-            rows.append(row)
+    people = np.random.default_rng(0).permutation(len(rays.persons))[:some]
+    parts = [np.isin(rays.person, people[: some // 2]), np.isin(rays.person, people[some // 2 :])]
+    for cone in (0.0, 1.5):
+        settings = RaySettings(cone=np.radians(cone))
+        both = [
+            ray_sums(target, TrackedRays(who.origins[p], who.directions[p], who.weights[p]), settings) for p in parts
+        ]
+        row = {
+            "people": some,
+            "cone": cone,
+            "on the surface": sum(b.on_surface for b in both) / sum(b.weight for b in both),
+            "not smoothed": float(cc(*(b.face / mesh.area for b in both), mesh.area)),
+        }
+        for s, smoother in smoothers.items():
+            maps = [(smoother(b.vertex) / mesh.vertex_area)[mesh.faces].mean(axis=1) for b in both]
+            row[f"{100 * s:.0f} cm"] = float(cc(*maps, mesh.area))
+        rows.append(row)
     return rows
 
 
@@ -218,6 +255,8 @@ def main(argv=None) -> None:
     parser.add_argument("--tables", default=",".join(TABLES))
     parser.add_argument("--rays", type=Path, default=None)
     parser.add_argument("--shoppers", type=int, default=40)
+    data = Path(os.environ.get("NERG_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    parser.add_argument("--supermarket", type=Path, default=data / "vr_supermarket")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/bake.csv"))
     args = parser.parse_args(argv)
     every = []

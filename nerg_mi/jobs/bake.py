@@ -43,7 +43,8 @@ from .reporter import SILENT, Reporter
 UNITS = {"share": "share of gaze per square metre [1/m²]", "seconds": "gaze per square metre [s/m²]"}
 SOURCES = ("field", "rays")
 _CONE = 1.5  # degrees: the error of good trackers, and the radius of the fovea
-_ERROR = 5e-3  # of what there was; more is said to be too much
+_ERROR = 2e-3  # of what there was; more is said to be too much
+_LARGEST = 1000.0  # metres; no place that people were tracked in measures more
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +94,12 @@ def bake(
         raise NergError("there are no rays in what --rays names; give some")
     align = _alignment(options)
     receivers = read_receivers(surface, options.shapes, options.resolution, ns, reporter)
+    across = receivers.mesh.diagonal / align.scale
+    if across > _LARGEST:
+        reporter.warn(
+            f"the surface measures {across:,.0f} m across; if its unit is not the metre, give --align with the scale "
+            "from metres to it"
+        )
     refined = cut(receivers, options.detail, align.scale)
     mesh = refined.mesh
     reporter.message(f"{len(receivers.mesh.faces):,} triangles, cut into {len(mesh.faces):,} to hold gaze")
@@ -267,8 +274,11 @@ def _tell(summary: dict[str, Any], reporter: Reporter) -> None:
         "unaccounted for"
     )
     if abs(summary["total"] - 1) > _ERROR:
-        reporter.warn(f"the gaze adds up to {summary['total']:.3f} over the sphere, not to one: compare shares by that")
+        reporter.warn(
+            f"the gaze adds up to {summary['total']:.3f} over the sphere, for the field is not normalised: divide "
+            "shares by that to compare them"
+        )
     if abs(summary["unaccounted"]) > _ERROR * summary["total"]:
-        reporter.warn("more than 0.5 % of the gaze is unaccounted for; a smaller --angle or --detail makes that less")
+        reporter.warn("more than 0.2 % of the gaze is unaccounted for; a smaller --angle or --detail makes that less")
     if "halves_cc" in summary:
         reporter.message(f"two halves of the people agree by CC {summary['halves_cc']:.3f}")

@@ -18,6 +18,7 @@ from .mesh import Mesh
 LEVELS = 40
 """A face is cut in four so many times at most: to 10^-12 of its size."""
 
+
 @dataclass(frozen=True, eq=False)
 class Pieces:
     """Parts of faces as ``eye`` (3,) sees them: ``face`` (P,) that each lies in; ``cut`` (P, 3, 3), of each of its

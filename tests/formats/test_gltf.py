@@ -92,3 +92,47 @@ def test05_what_ends_early(tmp_path, cut):
     (tmp_path / "b.glb").write_bytes(whole[: min(cut, len(whole) - 5)])
     with pytest.raises(NergError, match="cannot be read"):
         read_glb(tmp_path / "b.glb")
+
+
+_SIZES = {5121: 1, 5123: 2, 5125: 4, 5126: 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+@pytest.mark.parametrize("image", [None, b"\x89PNG\r\n\x1a\n odd"])
+@pytest.mark.parametrize("faces", [F, None])
+def test06_what_is_written_keeps_the_rules_of_the_format(image, faces):
+    """Of glTF 2.0, sections 3.6 and 4.4: lengths, alignment, bounds and kinds."""
+    parts = [("POSITION", V.astype("<f4"), False), ("NORMAL", V.astype("<f4"), False)]
+    parts += [("TEXCOORD_0", V[:, :2].astype("<f4"), False), ("COLOR_0", np.full((8, 4), 9, "<u2"), True)]
+    raw = b"".join(shown_unlit([*parts, ("_VALUE", V[:, 0].astype("<f4"), False)], faces, image=image))
+    assert struct.unpack_from("<III", raw) == (0x46546C67, 2, len(raw))
+    length, kind = struct.unpack_from("<II", raw, 12)
+    rest, binary = struct.unpack_from("<II", raw, 20 + length)
+    assert (kind, binary) == (0x4E4F534A, 0x004E4942) and length % 4 == rest % 4 == 0
+    assert len(raw) == 28 + length + rest
+    document, data = document_of(raw)
+    # The chunk is as long as the buffer, but for what fills it up to four bytes.
+    assert 0 <= len(data) - document["buffers"][0]["byteLength"] < 4
+    end = 0
+    for view in document["bufferViews"]:
+        assert end <= view["byteOffset"] and view["byteLength"] > 0
+        end = view["byteOffset"] + view["byteLength"]
+    assert end <= document["buffers"][0]["byteLength"]
+    primitive = document["meshes"][0]["primitives"][0]
+    for name, number in {**primitive["attributes"], "indices": primitive.get("indices")}.items():
+        if number is None:
+            continue
+        accessor = document["accessors"][number]
+        view = document["bufferViews"][accessor["bufferView"]]
+        step = _SIZES[accessor["componentType"]] * _WIDTHS[accessor["type"]]
+        assert accessor["count"] * step == view["byteLength"] and view["byteOffset"] % 4 == 0
+        assert view["target"] == (34963 if name == "indices" else 34962)
+        # Elements of vertices begin at multiples of four bytes; colours of integers are parts of the whole.
+        assert name == "indices" or step % 4 == 0
+        assert accessor.get("normalized", False) == (name == "COLOR_0")
+        if name == "POSITION":
+            assert np.array_equal(accessor["min"], V.min(0)) and np.array_equal(accessor["max"], V.max(0))
+    assert primitive["mode"] == (0 if faces is None else 4)
+    used = {name for m in document["materials"] for name in m.get("extensions", {})}
+    assert used == set(document["extensionsUsed"]) and document["asset"]["version"] == "2.0"
+    assert all(document["images"][t["source"]]["mimeType"] == "image/png" for t in document.get("textures", []))

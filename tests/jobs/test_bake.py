@@ -100,3 +100,16 @@ def test06_what_is_not_asked_for_is_not_made(rgb, room, monkeypatch):
     bake(room, [room.with_name("a.glb")], BakeOptions(detail=3.0, mode="llvm_ad_rgb"), rays=rays())
     with pytest.raises(AssertionError):
         bake(room, (), BakeOptions(detail=3.0, smooth=0.1, mode="llvm_ad_rgb"), rays=rays())
+
+
+def test07_a_mesh_in_millimetres_is_told(rgb, tmp_path):
+    v, f = box((0, 0, 0), (8000, 6000, 3000))
+    write_columns(tmp_path / "mm.ply", dict(zip("xyz", v.T)), f)
+    (tmp_path / "align.json").write_text("[[1e3,0,0,0],[0,1e3,0,0],[0,0,1e3,0],[0,0,0,1]]")
+    told, mended = Recorder(), Recorder()
+    options = {"detail": 5e3, "cone": 0.0, "mode": "llvm_ad_rgb"}
+    bake(tmp_path / "mm.ply", (), BakeOptions(**options), told, rays=rays(4))
+    assert any("10,440 m across" in said and "--align" in said for said in told.warnings)
+    options["detail"] = 5.0
+    bake(tmp_path / "mm.ply", (), BakeOptions(**options, align=tmp_path / "align.json"), mended, rays=rays(4))
+    assert not mended.warnings

@@ -28,7 +28,7 @@ def test01_a_closed_room_receives_all(rgb, kappa, eye):
     assert np.isclose(sums.vertex.sum(), sums.face.sum(), rtol=1e-12)
 
 
-@pytest.mark.parametrize(("y", "kappa"), [(0.7, 500.0), (0.69, 500.0), (0.7, 37.0), (0.69, 5000.0)])
+@pytest.mark.parametrize(("y", "kappa"), [(0.7, 500.0), (0.69, 5000.0)])
 def test02_surfaces_what_hides_them_and_what_escapes_are_what_they_are(rgb, y, kappa):
     """Against a sum in double precision that shares no line with it, narrow laws on an outline that runs along the
     cuts of a wall included."""
@@ -47,7 +47,11 @@ def _shares(kappa: float, eye: np.ndarray, window: bool, count: int = 1 << 17) -
     i, side = np.arange(count), np.cross(MEAN, [0, 0, 1]) / np.linalg.norm(np.cross(MEAN, [0, 0, 1]))
     cos = 1 + np.log1p((i + 0.5) / count * np.expm1(-2 * kappa)) / kappa
     turn, sin = 2 * np.pi * (i * (np.sqrt(5) - 1) / 2 % 1), np.sqrt(1 - cos**2)
-    d = cos[:, None] * MEAN + (sin * np.cos(turn))[:, None] * side + (sin * np.sin(turn))[:, None] * np.cross(MEAN, side)
+    d = (
+        cos[:, None] * MEAN
+        + (sin * np.cos(turn))[:, None] * side
+        + (sin * np.sin(turn))[:, None] * np.cross(MEAN, side)
+    )
     ends = (np.array([(1.5, 2, 0), (3, 2.4, 1.8)])[:, None] - eye) / d
     shelf = (ends.min(axis=0).max(axis=1) < ends.max(axis=0).min(axis=1)) & (ends.min(axis=0).max(axis=1) > 0)
     wall = ((np.array([(0, 0, 0), (4, 3, 2.5)])[:, None] - eye) / d).max(axis=0).argmin(axis=1)
@@ -102,8 +106,8 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
 
 
 def test06_parts_add_up_to_the_whole_bit_by_bit(rgb):
-    target, law = Target(joined(ROOM)), lookers_of_law(vmf(rgb, (0, 1, 0), 5.0))
+    target, law, coarse = Target(joined(ROOM)), lookers_of_law(vmf(rgb, (0, 1, 0), 5.0)), GazeSettings(angle=0.2)
     eyes, weights = np.random.default_rng(0).uniform(0.5, 2, (3, 3)), np.array([0.2, 0.3, 0.5])
-    each = [gaze_sums(target, law, eyes[k : k + 1], weights[k : k + 1], SETTINGS) for k in range(3)]
-    whole = gaze_sums(target, law, eyes, weights, SETTINGS)
+    each = [gaze_sums(target, law, eyes[k : k + 1], weights[k : k + 1], coarse) for k in range(3)]
+    whole = gaze_sums(target, law, eyes, weights, coarse)
     assert np.array_equal(merge(each).vertex, whole.vertex) and whole.count == 3
