@@ -147,6 +147,7 @@ AOVS: dict[str, Aov] = {
             summary=":math:`d_o`; the distance to the surface where no occlusion is computed",
             compute=lambda p: [dr.select(p.surface, p.sight.depth, 0)],
             of_observer=True,
+            demands=frozenset({"observer_depth"}),
         ),
         Aov(
             name="features",

@@ -44,6 +44,7 @@ class Pixel:
 
     - ``counts``: evaluations of density and colour are counted;
     - ``features``: geometry features are accumulated along the ray;
+    - ``observer_depth``: the depth that the observer meets is found also where visibility does not need it;
     - ``gaze``: the gaze field is evaluated; ``factors``: on every surface, also where the observer does not see it;
       ``spread``: with the standard deviation over its members.
     """
@@ -147,6 +148,7 @@ class Pixel:
             count=self.counting,
             gaze=self.gaze if self._may_look_gaze_up else None,
             cache=self.cache,
+            whole=bool(nerg.demands & {"factors", "observer_depth"}),
         )
         if sight.density_evals is not None:
             self._evaluations.append(sight.density_evals)

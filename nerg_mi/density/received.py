@@ -110,7 +110,8 @@ def attended(
     if place is not None:
         settings = settings or ObserverSettings(march=default_settings(place))
         # Looked for a tolerance above the surface, as if a camera stood there.
-        found = trace_sight(place, mi.Ray3f(p + n, -n), p, p_o, 0, active, mi.Float(falloff), settings)
+        ray = mi.Ray3f(p + n, -n)
+        found = trace_sight(place, ray, p, p_o, 0, active, mi.Float(falloff), settings, whole=False)
         p_od, seen = found.p_od, found.visibility
         active &= seen > 0
     return dr.select(active, density(p_od, p_o, r_o, active) * seen, 0)

@@ -62,6 +62,11 @@ class Depth(Protocol):
         """How deep in thick matter of constant density the surface lies, in mean free paths."""
         ...
 
+    @property
+    def at_half(self) -> bool:
+        """Whether it lies in the step in which half of the ray's own opacity is reached."""
+        ...
+
     def inside(self, marched: Marched) -> Float:
         """Distance of the surface in the medium, in scene units; 0 where nothing absorbs, and on rays that are
         ``backed`` where what is behind is reached first.
@@ -89,6 +94,7 @@ class Expected:
     name = "expected"
     summary = "mean distance of absorption"
     mean_free_paths = 1.0
+    at_half = False
 
     def inside(self, marched: Marched) -> Float:
         return marched.result.expected_depth
@@ -104,6 +110,7 @@ class Median:
     name = "median"
     summary = "where half of the ray's own opacity is reached"
     mean_free_paths = LOG2
+    at_half = True
 
     def inside(self, marched: Marched) -> Float:
         return _Half(marched).depth

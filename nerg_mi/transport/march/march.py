@@ -17,6 +17,7 @@ from nerg_mi.transport.media.painting import Painter
 from nerg_mi.transport.media.protocol import Medium
 
 from .adjoint import attached, differentiable_march
+from .occlusion import Occlusion
 from .primal import march_primal
 from .settings import MarchResult, MarchSettings
 
@@ -37,13 +38,15 @@ def march(
     count: bool = False,
     until: Float | None = None,
     fine_from: Float | None = None,
+    occlusion: Occlusion | None = None,
 ) -> MarchResult:
     """March ``ray`` from the distance ``t0`` to ``t1``, both in scene units and finite where there is matter.
 
     ``offset`` in [0, 1]: length of the first step as a share of a full one (jitter; None: a full step). ``color``: what
     samples contribute to the result's ``color``; None for a density-only pass. ``until``: optical depth at which to
     end, for a march that only looks for that crossing. ``count``: count evaluations. ``fine_from``: distance up to
-    which steps are coarse. Differentiable, in forward and in reverse mode, in the ray, ``t0``, ``t1``, ``until`` and
+    which steps are coarse. ``occlusion``: end as soon as its answer is known, unless derivatives are tracked, and say
+    so in ``known``. Differentiable, in forward and in reverse mode, in the ray, ``t0``, ``t1``, ``until`` and
     the medium's parameters. Raises ``NergError`` for a quadrature rule that is not known, or that the medium does not
     suit.
     """
@@ -53,7 +56,7 @@ def march(
     if attached(medium, ray, t0, t1):
         result = differentiable_march(medium, ray, *arguments)
     else:
-        result = march_primal(medium, ray, *arguments)
+        result = march_primal(medium, ray, *arguments, occlusion)
     result.origin = arguments[0]
     if until is not None and dr.grad_enabled(until):
         crossed = dr.isfinite(result.half)

@@ -15,6 +15,7 @@ from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import Painter
 from nerg_mi.transport.media.protocol import Medium
 
+from .occlusion import Occlusion
 from .quadrature import absorbed_share
 from .rules import RULES, boundaries
 from .settings import MarchResult, MarchSettings
@@ -35,6 +36,7 @@ def march_primal(
     count: bool,
     until: Float | None,
     fine_from: Float | None,
+    occlusion: Occlusion | None = None,
 ) -> MarchResult:
     """March ``ray`` from ``t0`` to ``t1``; the arguments are those of ``march.march``."""
     Float = type(t0)
@@ -45,8 +47,11 @@ def march_primal(
     quadrature = RULES.find(settings.quadrature)
     cells = boundaries(quadrature, medium)
 
-    def body(active, t, share, carry, lost, tau, moment, half, slope, enter, enter_tau, total, pending, n, m):
+    def body(active, t, share, carry, lost, tau, moment, half, slope, enter, enter_tau, total, pending, n, m, known):
         active, t, delta, t_next = advance(medium, ray, t, t1, share, settings, active, cells, fine_from)
+        if occlusion is not None:
+            clear = active & occlusion.clear(t, tau)
+            known, active = known | clear, active & ~clear
         step = quadrature.step(medium, ray, t, delta, t_next, carry, active, color is not None)
         weight = dr.exp(-tau) * absorbed_share(step.dtau)
         moment, lost_moment = add(moment, lost[1], weight * dr.fma(delta, step.share, t - t0))
@@ -72,6 +77,9 @@ def march_primal(
             n = n + step.evals
 
         tau = after
+        if occlusion is not None:
+            hidden = active & occlusion.hidden(t_next, tau)
+            known, active = known | hidden, active & ~hidden
         active = active & (t_next < t1) & (tau < end)
         return (
             active,
@@ -89,6 +97,7 @@ def march_primal(
             pending,
             n,
             m,
+            known,
         )
 
     start = (
@@ -107,14 +116,15 @@ def march_primal(
         None if color is None else Float(0),
         Float(0) if count else None,
         Float(0) if count and color is not None else None,
+        None if occlusion is None else dr.mask_t(Float)(False),
     )
     state = dr.while_loop(start, lambda active, *_: active, body, label="march")
-    tau, moment, half, slope, enter, enter_tau, total, pending, n, m = state[5:]
+    tau, moment, half, slope, enter, enter_tau, total, pending, n, m, known = state[5:]
     if color is not None:
         # What never gathered enough weight for a colour of its own takes that of the rest.
         painted = absorbed_share(tau) - pending
         total *= dr.select(painted > 0, 1 + pending / dr.select(painted > 0, painted, 1), 0)
-    return MarchResult(tau, moment, half, slope, enter, enter_tau, total, n, m)
+    return MarchResult(tau, moment, half, slope, enter, enter_tau, total, n, m, known)
 
 
 def add(total: Float, lost: Float, term: Float) -> tuple[Float, Float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 
 from nerg_mi.maths.elementary import quotient
-from nerg_mi.maths.types import Color, Float
+from nerg_mi.maths.types import Bool, Color, Float
 from nerg_mi.transport.media.protocol import Medium
 
 from .quadrature import absorbed_share
@@ -74,6 +74,8 @@ class MarchResult:
     # Evaluations made; None unless counted.
     density_evals: Float | None = None
     color_evals: Float | None = None
+    # Where the march ended early, because what was asked of it (``occlusion``) is known; None: nowhere.
+    known: Bool | None = None
     # Distance at which the march began.
     origin: Float = 0
 

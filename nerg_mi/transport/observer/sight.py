@@ -12,6 +12,8 @@ import drjit as dr
 
 from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f
 from nerg_mi.transport.fingerprint import Fingerprint
+from nerg_mi.transport.march.depth import DEPTHS
+from nerg_mi.transport.march.occlusion import Occlusion
 from nerg_mi.transport.place import Place, View
 
 from .cache import ObserverCache, fingerprint_of
@@ -60,6 +62,7 @@ def trace_sight(
     count: bool = False,
     gaze: ObservedGaze | None = None,
     cache: ObserverCache | None = None,
+    whole: bool = True,
 ) -> Sight:
     """What the observer at ``p_o`` meets towards the surface ``p_d`` that the camera sees on ``ray``.
 
@@ -69,7 +72,9 @@ def trace_sight(
     bound.
 
     ``falloff``: d_f. ``count``: count evaluations. ``gaze``: what a map keeps the density of as well, where no
-    derivative needs the field itself. ``cache``: keeps the map.
+    derivative needs the field itself. ``cache``: keeps the map. ``whole``: whether the depth, and the surface that is
+    met, are needed where the visibility is 0 or 1 without them; otherwise rays may end there, and what they return is
+    on the right side of the point, and nothing more.
     """
     import mitsuba as mi
 
@@ -98,13 +103,29 @@ def trace_sight(
             between = place.trace(to_point, active, settings.march, count=count)
             seen = dr.select(between.hit, 0, 1 if between.march is None else dr.exp(-between.march.tau))
             return Sight(p_d, distance, seen, _evaluations(between))
-        view = place.trace(to_point, active, settings.march, count=count)
-        met = dr.select(active & view.meets(settings.surface_opacity), view.depth(settings.depth, active), dr.inf)
+        occlusion = None
+        if not whole and DEPTHS.find(settings.depth).at_half:
+            before = distance - tolerance
+            occlusion = Occlusion(before, before - falloff, settings.surface_opacity)
+        view = place.trace(to_point, active, settings.march, count=count, occlusion=occlusion)
+        met = _met(view, settings, active)
         seen, evals = visibility(distance, met, falloff, tolerance), _evaluations(view)
     # An observer who meets nothing before the point sees the point itself.
     blocked = met < distance - tolerance
     d_o = dr.select(dr.isfinite(met), met, distance)
     return Sight(dr.select(blocked, p_o + r_o * d_o, p_d), d_o, seen, evals, attended)
+
+
+def _met(view: View, settings: ObserverSettings, active: Bool) -> Float:
+    """Depth of the surface on the observer's rays; infinite where there is none, or where it is known to lie behind the
+    point."""
+    known = None if view.march is None else view.march.known
+    if known is None:
+        return dr.select(active & view.meets(settings.surface_opacity), view.depth(settings.depth, active), dr.inf)
+    rest = active & ~known
+    met = dr.select(rest & view.meets(settings.surface_opacity), view.depth(settings.depth, rest), dr.inf)
+    # Infinite where the way is clear: transmittance 1/2 has not been reached there.
+    return dr.select(active & known, view.march.half, met)
 
 
 def _tolerance(place: Place, ray: Ray3f, p_d: Point3f, p_o: Point3f, settings: ObserverSettings) -> Float:
