@@ -121,6 +121,11 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - |float|
    - Samples that contribute less than this weight get no colour. (Default: 1e-3)
 
+ * - refined
+   - |bool|
+   - Skip the parts of a field's occupied cells in which nothing was found when it was trained or refined (``nerg
+     refine``); false: only its empty cells. (Default: true)
+
  * - jitter
    - |bool|
    - Shift the steps of each sample by a random share of a step, for noise in place of bands. (Default: false)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.properties import choice, color, integer, number
+from nerg_mi.properties import boolean, choice, color, integer, number
 from nerg_mi.transport.march.depth import DEPTHS
 from nerg_mi.transport.march.rules import RULES, boundaries
 from nerg_mi.transport.march.settings import MarchSettings, default_growth, default_step
@@ -109,6 +109,7 @@ def march_settings(props, medium: Medium | None) -> MarchSettings:
         color_cutoff=number(props, "color_cutoff", MarchSettings.color_cutoff, low=0, high=1),
         quadrature=choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),
         coarse=number(props, "coarse", MarchSettings.coarse, low=1),
+        refined=boolean(props, "refined", MarchSettings.refined),
         cell_step=step or math.inf,
     )
     if medium is not None:
@@ -159,6 +160,7 @@ def describe(nerg) -> str:
         "dt_gamma": march.dt_gamma,
         "stop": march.stop,
         "color_cutoff": march.color_cutoff,
+        "refined": march.refined,
         "jitter": nerg.jitter,
     }
     return "NergIntegrator[\n" + "".join(f"  {k} = {v},\n" for k, v in body.items()) + "]"

@@ -36,6 +36,7 @@ COMMANDS = {
     "report": "Write a report on a gaze field: one HTML file with a verdict, pictures, scores and the place in 3D.",
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
     "export": "Write a radiance field as a mesh, points, grid volumes or a torch-ngp checkpoint.",
+    "refine": "Find more closely where a radiance field holds matter, so that it renders faster.",
     "bake": "Put gaze on surfaces: how much of it each square metre receives, as colours and tables.",
     "ablate": "Train every variant of a gaze field alike, and compare them.",
     "stats": "Count attention on things, in rays and by a gaze field: numbers with intervals, and what if.",

@@ -50,6 +50,11 @@ class CascadeGrid:
         self.distance = ns.UInt8(np.stack(self._distances()).ravel())
 
     @property
+    def coarse(self) -> CascadeGrid:
+        """Itself: it refines no other grid (``refined.RefinedGrid.coarse``)."""
+        return self
+
+    @property
     def resolution(self) -> int:
         """Cells along an edge of each level."""
         return self.bits.shape[1]

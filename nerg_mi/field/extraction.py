@@ -59,7 +59,7 @@ class Sampler:
     def _density(self, p, masked: bool = True):
         active = self.ns.Bool(True)
         if masked and self.field.occupancy is not None:
-            active = self.field.occupancy.empty_cells(self.field.box.to_cube(p)) == 0
+            active = self.field.occupancy.coarse.empty_cells(self.field.box.to_cube(p)) == 0
         return dr.select(active, self.field.density(p, active), 0)
 
     def density(self, p: np.ndarray, masked: bool = True) -> np.ndarray:

@@ -35,6 +35,11 @@ class OccupancyGrid:
         self.distance = ns.UInt8(chessboard(bits).ravel())
 
     @property
+    def coarse(self) -> OccupancyGrid:
+        """Itself: it refines no other grid (``refined.RefinedGrid.coarse``)."""
+        return self
+
+    @property
     def resolution(self) -> int:
         """Cells along an edge of a cubic grid."""
         if len(set(self.cells)) != 1:
@@ -64,12 +69,17 @@ class OccupancyGrid:
     def from_packed(data: np.ndarray, resolution: int, ns: ModuleType, threshold: float) -> OccupancyGrid:
         """The cubic grid of ``resolution`` cells an edge whose ``packed`` bits are ``data`` (uint8); ``ValueError`` if
         they are too few."""
-        if data.size * 8 < resolution**3:
-            raise ValueError(
-                f"an occupancy grid of resolution {resolution} needs {resolution**3 // 8} bytes, got {data.size}"
-            )
-        bits = np.unpackbits(data, bitorder="little")[: resolution**3].reshape((resolution,) * 3)
-        return OccupancyGrid(bits.astype(bool), ns, threshold)
+        return OccupancyGrid(unpacked(data, resolution), ns, threshold)
+
+
+def unpacked(data: np.ndarray, resolution: int) -> np.ndarray:
+    """The bits (R, R, R) of a cubic grid of ``resolution`` R whose ``packed`` form is ``data`` (uint8); ``ValueError``
+    if they are too few."""
+    if data.size * 8 < resolution**3:
+        raise ValueError(
+            f"an occupancy grid of resolution {resolution} needs {resolution**3 // 8} bytes, got {data.size}"
+        )
+    return np.unpackbits(data, bitorder="little")[: resolution**3].reshape((resolution,) * 3).astype(bool)
 
 
 def chessboard(bits: np.ndarray) -> np.ndarray:

@@ -26,6 +26,7 @@ from .encoding.protocol import Encoding, EncodingConfig
 from .encoding.registry import encoding_config, random_encoding
 from .mlp import MLP
 from .occupancy import OccupancyGrid
+from .refined import RefinedGrid
 
 # exp(30) is 1e13 per unit: opaque at any scale, and far from the overflow of fp32 (exp(88)).
 _MAX_LOG_DENSITY = 30.0
@@ -126,7 +127,7 @@ class RadianceField:
         grid: Encoding,
         density_net: MLP,
         color_net: MLP,
-        occupancy: OccupancyGrid | CascadeGrid | None = None,
+        occupancy: OccupancyGrid | RefinedGrid | CascadeGrid | None = None,
         color_space: str = "srgb",
         march_step: float | None = None,
         background: Background | None = None,
@@ -139,9 +140,11 @@ class RadianceField:
         color_net.require(config.color_sizes, "color_net")
         self.config, self.box, self.color_space = config, box, color_space
         self.grid, self.density_net, self.color_net = grid, density_net, color_net
-        self.occupancy, self.march_step, self.background = occupancy, march_step, background
+        self.march_step, self.background = march_step, background
         self.march_growth = march_growth
+        self.occupancy: OccupancyGrid | RefinedGrid | CascadeGrid | None = None
         self.pack()
+        self.occupancy = occupancy
 
     @staticmethod
     def random(config: RadianceConfig, box: AnyBox, ns: ModuleType, seed: int = 0, **kwargs) -> RadianceField:
@@ -184,7 +187,11 @@ class RadianceField:
         self.pack()
 
     def pack(self) -> None:
-        """Refresh what the kernels read; call after any change of the weights."""
+        """Refresh what the kernels read; call after any change of the weights.
+
+        A refined occupancy becomes the one that it refines: it holds for the weights that it was made of."""
+        if self.occupancy is not None:
+            self.occupancy = self.occupancy.coarse
         for part in (self.grid, self.density_net, self.color_net):
             part.pack()
         # Depth passes need one output of the last layer, not 1 + geometry of them.

@@ -9,27 +9,49 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from nerg_mi.field.background import Background, BackgroundConfig
 from nerg_mi.field.cascades import CascadeGrid
 from nerg_mi.field.gaze.basis import basis_of
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.field.gaze.registry import build
 from nerg_mi.field.gaze.support import RaySupport
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.field.occupancy import OccupancyGrid, unpacked
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.field.refined import RefinedGrid
+from nerg_mi.files.checksum import file_sha256
 from nerg_mi.maths.contraction import box_of
 
 from .architecture import MEMBERS, building, check_occupancy, check_sizes, number
 from .arrays import StoredArrays, stored
-from .checkpoint import read_checkpoint, write_checkpoint
+from .checkpoint import read_checkpoint, read_metadata, write_checkpoint
 
 
-def _occupancy(arrays: StoredArrays, about: dict) -> OccupancyGrid | CascadeGrid:
+def _occupancy(arrays: StoredArrays, about: dict) -> OccupancyGrid | RefinedGrid | CascadeGrid:
     check_occupancy(about)
     bits, resolution, threshold = arrays.raw("occupancy.bits"), about["resolution"], about["threshold"]
     if "bound" in about:
         return CascadeGrid.from_packed(bits, resolution, about["bound"], arrays.ns, threshold)
-    return OccupancyGrid.from_packed(bits, resolution, arrays.ns, threshold)
+    if "refined" not in about:
+        return OccupancyGrid.from_packed(bits, resolution, arrays.ns, threshold)
+    limit, missed = (number(about["refined"], name, "refined occupancy") for name in ("threshold", "missed"))
+    cells = unpacked(bits, resolution)
+    return RefinedGrid(cells, arrays.raw("occupancy.parts"), arrays.ns, limit, threshold, missed)
+
+
+def occupancy_arrays(grid: OccupancyGrid | RefinedGrid | CascadeGrid) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """``grid`` as arrays of a checkpoint, by name, and what its metadata say. Of a refined one the cells that it
+    refines stand there too, as readers that know no parts expect them."""
+    cells = grid.coarse
+    tensors = {"occupancy.bits": cells.packed()}
+    about: dict[str, Any] = {"resolution": cells.resolution, "threshold": cells.threshold}
+    if isinstance(cells, CascadeGrid):
+        about["bound"] = cells.bound
+    if isinstance(grid, RefinedGrid):
+        tensors["occupancy.parts"] = grid.masks
+        about["refined"] = {"threshold": grid.threshold, "missed": grid.missed}
+    return tensors, about
 
 
 def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half: bool = False) -> None:
@@ -45,10 +67,8 @@ def save_radiance(field: RadianceField, path: str | Path, provenance: dict, half
         "provenance": provenance,
     }
     if field.occupancy is not None:
-        tensors["occupancy.bits"] = field.occupancy.packed()
-        metadata["occupancy"] = {"resolution": field.occupancy.resolution, "threshold": field.occupancy.threshold}
-        if isinstance(field.occupancy, CascadeGrid):
-            metadata["occupancy"]["bound"] = field.occupancy.bound
+        arrays, metadata["occupancy"] = occupancy_arrays(field.occupancy)
+        tensors |= arrays
     if field.background is not None:
         metadata["background"] = field.background.config.to_dict()
     write_checkpoint(path, "radiance", tensors, metadata)
@@ -87,6 +107,15 @@ def load_radiance(path: str | Path, ns: ModuleType) -> tuple[RadianceField, dict
             growth,
         )
     return field, meta
+
+
+def is_field(path: str | Path, sha256: object) -> bool:
+    """Whether ``path`` is the file of this checksum, or a radiance field that was made of it by refining its bound."""
+    if file_sha256(path) == sha256:
+        return True
+    return (
+        Path(path).suffix == ".safetensors" and sha256 is not None and read_metadata(path).get("refined_from") == sha256
+    )
 
 
 def save_gaze(field: AnyGazeField, path: str | Path, provenance: dict, half: bool = False) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.product import GazeField
 from nerg_mi.field.radiance import RadianceField
+from nerg_mi.field.refinement import refine
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import save_gaze, save_radiance
 from nerg_mi.formats.torch_ngp.fields import Given, read_torch_ngp
@@ -56,6 +57,8 @@ def import_checkpoint(
         if gaze is not None:
             raise NergError(f'"{file}" holds no gaze field: leave out --gaze')
         (field, origin), attention = read_torch_ngp(file, ns, options.ema, given), None
+    if field is not None:
+        field.occupancy = refine(field) or field.occupancy
     if output is not None:
         if field is None:
             raise NergError(f'"{file}" holds a gaze field without its NeRF: import that from its own file')

@@ -12,7 +12,7 @@ import numpy as np
 from nerg_mi.alignment.check import check_alignment
 from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
-from nerg_mi.files.checksum import file_sha256
+from nerg_mi.formats.fields import is_field
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
@@ -120,7 +120,7 @@ def file_of_training(gaze: Path, provenance: dict, given: Path | None, where: st
     path = gaze.parent / about["file"] if given is None else Path(given)
     if not path.is_file():
         raise NergError(f'"{path}", which the field was trained in, does not exist; {where}')
-    if file_sha256(path) != about["sha256"]:
+    if not is_field(path, about["sha256"]):
         raise NergError(f'"{path}" is not the file that "{gaze}" was trained in; {other}')
     return path
 

@@ -39,6 +39,7 @@ COLUMNS = (
     "dt_gamma",
     "stop",
     "color_cutoff",
+    "refined",
     "depth",
     "visibility",
     "map_height",
@@ -49,7 +50,7 @@ COLUMNS = (
     "resolution",
     "precision",
 )
-MARCHING = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "depth", "jitter")
+MARCHING = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "refined", "depth", "jitter")
 """The parameters that mean nothing where nothing is marched."""
 COUNTS = ("density_evals", "color_evals", "gaze_evals")
 SEED = 1

@@ -69,6 +69,7 @@ def settings(subject, quick: bool = False) -> list[Setting]:
         rows.append(Setting(f"depth {k}", "depth", {"depth": k}))
         for n in () if quick else (128, 256, 512, 1024):
             rows.append(Setting(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
+    rows.append(Setting("unrefined", "refined", {"refined": False}))
     rows.append(Setting("jitter", "jitter", {"jitter": True}))
     rows += _visibility(quick) + _left_out(subject) + _samples(quick)
     if subject.resampled:

@@ -337,7 +337,7 @@ def load_subject(
 def parameters(integrator) -> dict:
     """The parameters of an integrator of type ``nerg``, read back by the names of its manual page."""
     names = ("occlusion", "radiance", "jitter")
-    march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse")
+    march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse", "refined")
     out = {n: getattr(integrator, n) for n in names} | {n: getattr(integrator.settings, n) for n in march}
     observer = integrator.observer_settings
     return out | {

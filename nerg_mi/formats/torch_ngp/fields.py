@@ -169,7 +169,7 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
     state = {
         "aabb_train": cube,
         "aabb_infer": np.array([*box.lower, *box.upper], np.float32),
-        "density_bitfield": bitfield(field.occupancy, bound),
+        "density_bitfield": bitfield(field.occupancy and field.occupancy.coarse, bound),
         "step_counter": np.zeros((16, 2), np.int32),
     }
     _put_grid(state, "encoder", field.grid)
@@ -193,7 +193,7 @@ def _put_layers(state: dict, name: str, net: MLP) -> None:
 def write_torch_ngp(field: RadianceField, path: str | Path) -> None:
     """Write ``field`` as a torch-ngp checkpoint, of the form of its ``ngp.pth``: no density grid, no optimiser."""
     stats = {"loss": [], "valid_loss": [], "results": [], "checkpoints": [], "best_result": None}
-    threshold = 0.0 if field.occupancy is None else field.occupancy.threshold
+    threshold = 0.0 if field.occupancy is None else field.occupancy.coarse.threshold
     write_torch(
         path,
         {

@@ -1,4 +1,4 @@
-"""Options of the import of checkpoints of other programs."""
+"""Options of the import of checkpoints of other programs, and of their refinement."""
 
 from __future__ import annotations
 
@@ -20,4 +20,11 @@ class ImportOptions:
     )
     finest: int | None = option(None, "Finest resolution of the hash grid.  [default: 2048 x bound]")
     half: bool = option(False, "Store the weights in fp16.")
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineOptions:
+    """On what a bound is refined."""
+
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import MissingFile, NergError, plain
-from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.checkpoint import read_metadata
+from nerg_mi.formats.fields import is_field
 from nerg_mi.jobs.gaze_places import align_of_training, file_of_training, place_key
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.maths.similarity import Similarity
@@ -122,7 +122,7 @@ def _compare(place: Path, gaze: Path, about: dict, reporter: Reporter) -> None:
         if about.get("geometry") == "none":
             reporter.warn(f'"{gaze}" was trained without a place; surfaces of "{place}" are not where it takes them')
         return
-    if known.get("sha256") != file_sha256(place):
+    if not is_field(place, known.get("sha256")):
         reporter.warn(
             f'"{gaze}" was trained in another file than "{place}", {plain(known.get("file"), 80)}; gaze is right only '
             "where surfaces and coordinates are the same"

@@ -19,6 +19,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
+from nerg_mi.field.refinement import refine
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.types import Float, UInt32
 from nerg_mi.training.common.step_clock import StepClock
@@ -341,4 +342,5 @@ class RadianceTrainer:
         if bound:
             with dr.suspend_grad():
                 out.occupancy = self.grid.bound(out.density, np.random.default_rng(self.settings.seed), self._lit)
+            out.occupancy = refine(out) or out.occupancy
         return out

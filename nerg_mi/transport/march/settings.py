@@ -30,6 +30,8 @@ class MarchSettings:
     quadrature: str = "constant"
     # Steps in front of all matter are this many times longer; 1: one step length everywhere.
     coarse: float = 1.0
+    # Whether the occupancy's finer form is made use of, where it has one.
+    refined: bool = True
     # Longest step of a rule whose steps end at voxel boundaries, to which `step`, `dt_gamma`, `coarse` and the length
     # of the first step do not apply.
     cell_step: float = math.inf

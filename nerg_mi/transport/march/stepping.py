@@ -40,6 +40,7 @@ def advance(
         settings, fine_from = replace(settings, step=stride, dt_gamma=0.0), None
     grid = medium.occupancy
     if grid is not None:
+        grid = grid if settings.refined else grid.coarse
         t, share = leap(medium, grid, ray, t, t1, share, settings, active, fine_from)
         active = active & (t < t1)
     if cells is None:

@@ -30,7 +30,11 @@ class FieldMedium:
         # A field scaled by s is s times longer, so its density per scene unit is s times lower.
         self._per_unit = 1 / self.to_world.scale
         self.color_space = field.color_space
-        self.occupancy: Occupancy | None = field.occupancy
+
+    @property
+    def occupancy(self) -> Occupancy | None:
+        """The field's own, which changes with its weights."""
+        return self.field.occupancy
 
     @property
     def feature_count(self) -> int:
