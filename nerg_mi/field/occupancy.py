@@ -90,3 +90,15 @@ def chessboard(bits: np.ndarray) -> np.ndarray:
 
     distance: Any = distance_transform_cdt(~bits, metric="chessboard")
     return np.minimum(distance, _FAR).astype(np.uint8)
+
+
+def grown(cells: np.ndarray) -> np.ndarray:
+    """``cells`` (bool, three axes) and all that touch one of them, by a face, an edge or a corner."""
+    # An axis at a time: a tenth of the work of a dilation by the whole cube.
+    for axis in range(3):
+        before, grown = np.moveaxis(cells, axis, 0), cells.copy()
+        moved = np.moveaxis(grown, axis, 0)
+        moved[1:] |= before[:-1]
+        moved[:-1] |= before[1:]
+        cells = grown
+    return cells

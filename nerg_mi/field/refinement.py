@@ -3,12 +3,12 @@
 Every part is looked at in the same points of an additive recurrence (Roberts 2018, "The unreasonable effectiveness of
 quasirandom sequences", in three dimensions), so that a field always has the same bound. Trained densities are nearly
 all either far above or far below any threshold: after a few points the rest are asked for only where one of them came
-near it.
+near it, or where a part beside holds something.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from nerg_mi.maths.types import Array3f, Float, UInt32
 
 from .backend import aligned
-from .occupancy import OccupancyGrid
+from .occupancy import OccupancyGrid, grown
 from .refined import PARTS, RefinedGrid
 
 if TYPE_CHECKING:
@@ -50,8 +50,7 @@ def refine(field: RadianceField, points: int = POINTS) -> RefinedGrid | None:
     ns = field.ns
     with dr.suspend_grad():
         cells = ns.UInt32(aligned(np.flatnonzero(grid.bits), np.uint32))
-        found = _occupied(field, cells, grid.resolution, threshold, points)
-        masks = np.packbits(found, axis=1, bitorder="little").ravel()
+        masks = _masks(field, grid.bits, cells, threshold, points)
         missed = _missed(field, cells, ns.UInt32(aligned(masks, np.uint32)), grid.resolution, step)
     return RefinedGrid(grid.bits, masks, ns, threshold, grid.threshold, missed)
 
@@ -63,11 +62,16 @@ def _corner(index: UInt32, resolution: int, ns) -> Array3f:
     return ns.Array3f(index - (z * resolution + y) * resolution, y, z)
 
 
-def _occupied(field: RadianceField, cells: UInt32, resolution: int, threshold: float, points: int) -> np.ndarray:
-    """Which parts (N, 8) of the N ``cells`` hold a density above the ``threshold`` at one of the ``points``."""
-    ns, count = field.ns, PARTS**3
+def _masks(field: RadianceField, bits: np.ndarray, cells: UInt32, threshold: float, points: int) -> np.ndarray:
+    """Masks of the parts of ``bits`` (R, R, R), whose occupied cells are ``cells`` (N), that hold a density above the
+    ``threshold`` at one of the ``points``: uint8 (N,)."""
+    ns, count, resolution = field.ns, PARTS**3, len(bits)
+    if dr.width(cells) == 0:
+        return np.zeros(0, np.uint8)
     found, near = (dr.zeros(ns.UInt8, count * dr.width(cells)) for _ in range(2))
     for k in range(points):
+        if k == _FIRST:
+            near |= ns.UInt8(_touching(bits, _packed(found)))
         rest: UInt32 = dr.compress((found == 0) & (near > 0) if k >= _FIRST else found == 0)
         if dr.width(rest) == 0:
             break
@@ -80,7 +84,22 @@ def _occupied(field: RadianceField, cells: UInt32, resolution: int, threshold: f
         dr.scatter(found, ns.UInt8(1), rest, sigma > threshold)
         dr.scatter(near, ns.UInt8(1), rest, sigma > _PLAIN * threshold)
         dr.eval(found, near)
-    return found.numpy().reshape(-1, count) > 0
+    return _packed(found)
+
+
+def _packed(found: Any) -> np.ndarray:
+    """Masks of cells of the parts that were ``found`` (UInt8 a part)."""
+    return np.packbits(found.numpy().reshape(-1, PARTS**3) > 0, axis=1, bitorder="little").ravel()
+
+
+def _touching(bits: np.ndarray, masks: np.ndarray) -> np.ndarray:
+    """Of each part of the occupied cells of ``bits``, whether it is one of ``masks`` or touches one: uint8, ravelled.
+    A surface that passes one part may cut a corner off the next."""
+    at = np.argwhere(bits)[:, None] * PARTS + np.array(list(np.ndindex(PARTS, PARTS, PARTS)))
+    z, y, x = at.reshape(-1, 3).T
+    whole = np.zeros([PARTS * n for n in bits.shape], bool)
+    whole[z, y, x] = np.unpackbits(masks, bitorder="little")
+    return grown(whole)[z, y, x].astype(np.uint8)
 
 
 def _missed(field: RadianceField, cells: UInt32, masks: UInt32, resolution: int, step: float) -> float:

@@ -13,7 +13,7 @@ from nerg_mi.capture.cameras import Camera, view_tangents
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import aligned
 from nerg_mi.field.cascades import CascadeGrid, contracted_cascades
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.field.occupancy import OccupancyGrid, grown
 from nerg_mi.maths.contraction import AnyBox
 from nerg_mi.maths.types import Array3f, UInt32
 
@@ -118,7 +118,7 @@ class DensityGrid:
         """
         found = self._holding(points)
         self.always = self.seen & self.ns.Bool(found.ravel())
-        self._allow(self.seen & self.ns.Bool(_grown(found).ravel()))
+        self._allow(self.seen & self.ns.Bool(grown(found).ravel()))
 
     def _holding(self, points) -> np.ndarray:
         """Cells (R, R, R) that hold one of the points (Array3f, world) of an iterable."""
@@ -217,7 +217,7 @@ class DensityGrid:
         dense = self.grown(found)
         bits = self.ns.UInt8(dense.ravel())
         shown = self._holding(lit(density, lambda p, active: self.within(bits, p, active)))
-        bits = dense & _grown(shown)
+        bits = dense & grown(shown)
         if self.box.reach is not None:
             return contracted_cascades(bits, self.box.reach, self.ns, self.limit)
         return OccupancyGrid(bits, self.ns, self.limit)
@@ -242,7 +242,7 @@ class DensityGrid:
     def grown(self, found) -> np.ndarray:
         """Cells (R, R, R) of ``found`` (UInt8 a cell) and all that touch one of them, as far as they may be sampled."""
         shape = (self.resolution,) * 3
-        return _grown(found.numpy().reshape(shape) > 0) & self.seen.numpy().reshape(shape)
+        return grown(found.numpy().reshape(shape) > 0) & self.seen.numpy().reshape(shape)
 
     def keep(self, cells: np.ndarray) -> None:
         """From now on sample ``cells`` (R, R, R) whatever is found in them."""
@@ -254,15 +254,3 @@ class DensityGrid:
         index = dr.arange(self.ns.UInt32, self.resolution**3 // parts) * parts + dr.opaque(self.ns.UInt32, turn % parts)
         seen: UInt32 = dr.compress(dr.gather(self.ns.Bool, self.seen, index))
         return dr.gather(self.ns.UInt32, index, seen)
-
-
-def _grown(cells: np.ndarray) -> np.ndarray:
-    """``cells`` and all that touch one of them, by a face, an edge or a corner."""
-    # An axis at a time: a tenth of the work of a dilation by the whole cube.
-    for axis in range(3):
-        before, grown = np.moveaxis(cells, axis, 0), cells.copy()
-        moved = np.moveaxis(grown, axis, 0)
-        moved[1:] |= before[:-1]
-        moved[:-1] |= before[1:]
-        cells = grown
-    return cells

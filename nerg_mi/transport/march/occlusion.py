@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import drjit as dr
-
 from nerg_mi.maths.types import Bool, Float
 
 _HALF = math.log(2)

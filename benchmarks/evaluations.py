@@ -1,0 +1,111 @@
+"""How many evaluations of density a frame takes, and what each way of saving them costs in time and in error.
+
+    python benchmarks/evaluations.py SCENE.xml [-D KEY=VALUE] [--width 640] [--height 360] [--repeats 7]
+    [--out out/benchmarks/evaluations.csv] [--page docs/error-and-time.md]
+
+Each row is the scene with some parameters, against the first row: all occupied cells are marched, and each observer's
+ray to its end. Times are processor time of both passes, colour and gaze, medians of rounds over all rows in turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from pathlib import Path
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
+
+AOVS = "depth,opacity,gaze,visibility"
+WHOLE = AOVS + ",observer_depth"
+ROWS = (
+    # Name, AOVs, parameters of the integrator.
+    ("cells, whole rays", WHOLE, {"refined": False}),
+    ("cells", AOVS, {"refined": False}),
+    ("parts, whole rays", WHOLE, {}),
+    ("parts (default)", AOVS, {}),
+    ("parts, stop 1e-4", AOVS, {"stop": 1e-4}),
+    ("parts, stop 1e-3", AOVS, {"stop": 1e-3}),
+    ("parts, color_cutoff 1e-2", AOVS, {"color_cutoff": 1e-2}),
+    ("parts, stop 1e-3, color_cutoff 1e-2", AOVS, {"stop": 1e-3, "color_cutoff": 1e-2}),
+    ("parts, dt_gamma 1/256", AOVS, {"dt_gamma": 1 / 256}),
+    ("parts, map of the observer", AOVS, {"visibility": "map"}),
+)
+HEAD = ("setting", "density", "colour", "us CPU", "times", "dB", "depth MAE mm", "depth 99.9 % mm", "gaze MAE")
+
+
+def main(argv=None) -> None:
+    from output import print_table, write_rows
+
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.evaluation.study.subject import load_subject
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("-D", "--define", action="append", default=[])
+    parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--height", type=int, default=360)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/evaluations.csv"))
+    parser.add_argument("--page", type=Path)
+    args = parser.parse_args(argv)
+    defaults = dict(word.split("=", 1) for word in args.define)
+    subject = load_subject(args.scene, args.width, args.height, defaults)
+    pixels = args.width * args.height
+
+    def aovs(names: str) -> str:
+        return names if subject.has_gaze else names.replace(",gaze", "")
+
+    made, rows, first = [], [], None
+    for name, wanted, params in ROWS:
+        counts = f"{aovs(wanted)},density_evals,color_evals"
+        seen = subject.channels(subject.integrator({**params, "aovs": counts}), 1, 1)
+        integrator = subject.integrator({**params, "aovs": aovs(wanted)})
+        subject.render(integrator, 1, 1)
+        made.append(integrator)
+        first = first or seen
+        off = np.abs(seen["depth"] - first["depth"])
+        square = np.mean((seen["color"] - first["color"]) ** 2)
+        rows.append(
+            {
+                "setting": name,
+                "density": float(seen["density_evals"].mean()),
+                "colour": float(seen["color_evals"].mean()),
+                "db": float(-10 * np.log10(square)) if square > 0 else float("inf"),
+                "depth_mae": float(off.mean()),
+                "depth_999": float(np.quantile(off, 0.999)),
+                "gaze_mae": float(np.abs(seen["gaze"] - first["gaze"]).mean()) if subject.has_gaze else 0.0,
+            }
+        )
+    taken = [[] for _ in made]
+    for _ in range(args.repeats):
+        for integrator, times in zip(made, taken):
+            started = time.process_time()
+            subject.render(integrator, 1, 1)
+            times.append(time.process_time() - started)
+    for row, times in zip(rows, taken):
+        row["us"] = 1e6 * statistics.median(times) / pixels
+    write_rows(args.out, rows)
+    shown = [
+        [
+            r["setting"],
+            f"{r['density']:.2f}",
+            f"{r['colour']:.2f}",
+            f"{r['us']:.2f}",
+            f"{rows[0]['us'] / r['us']:.2f}",
+            f"{r['db']:.1f}",
+            f"{1e3 * r['depth_mae']:.4f}",
+            f"{1e3 * r['depth_999']:.3f}",
+            f"{r['gaze_mae']:.1e}",
+        ]
+        for r in rows
+    ]
+    print_table(f"Evaluations, {subject.name}", HEAD, shown, args.page)
+
+
+if __name__ == "__main__":
+    main()
