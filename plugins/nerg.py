@@ -72,8 +72,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - depth
    - |string|
-   - {depths} The surface that gaze is evaluated on
-     lies at this depth. (Default: ``median``)
+   - {depths} The surface that gaze is evaluated on lies there. (Default: ``median``)
 
  * - surface_opacity
    - |float|
@@ -89,8 +88,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - aovs
    - |string|
-   - Comma-separated list, in the order wanted; see below. What is not asked for is not computed.
-     (Default: ``depth,opacity``)
+   - What to compute, in the order wanted, with commas between; see below. (Default: ``depth,opacity``)
 
  * - step
    - |float|
@@ -109,13 +107,11 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - dt_gamma
    - |float|
-   - Steps are at least this share of the distance travelled: for wide views, whose far parts need no short steps.
-     (Default: 0, i.e. uniform steps; for a field without an end that which it was trained with)
+   - {dt_gamma}
 
  * - stop
    - |float|
-   - Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times that, in
-     mean free paths. (Default: 1e-7)
+   - {stop} (Default: 1e-7)
 
  * - color_cutoff
    - |float|
@@ -123,8 +119,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - refined
    - |bool|
-   - Skip the parts of a field's occupied cells in which nothing was found when it was trained or refined (``nerg
-     refine``); false: only its empty cells. (Default: true)
+   - {refined} (Default: true)
 
  * - jitter
    - |bool|

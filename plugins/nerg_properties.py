@@ -20,9 +20,22 @@ from nerg_mi.transport.observer.settings import VISIBILITIES, ObserverSettings
 from nerg_mi.transport.observer.views import ObserverView, SupportView
 
 
+_MARCH_MANUAL = {
+    "dt_gamma": "Steps are at least this share of the distance travelled: for wide views, whose far parts need no short "
+    "steps. (Default: 0, i.e. uniform steps; for a field without an end that which it was trained with)",
+    "stop": "Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times "
+    "that, in mean free paths.",
+    "refined": "Skip the parts of a field's occupied cells in which nothing was found when it was trained or refined "
+    "(``nerg refine``); false: only its empty cells.",
+}
+
+
 def complete(manual: str) -> str:
-    """The ``manual`` with the kinds of depth and of quadrature that are registered."""
-    return manual.replace("{quadratures}", RULES.manual()).replace("{depths}", DEPTHS.manual())
+    """The ``manual`` with the kinds of depth and of quadrature that are registered, and what is said of a march."""
+    texts = {"quadratures": RULES.manual(), "depths": DEPTHS.manual(), **_MARCH_MANUAL}
+    for name, text in texts.items():
+        manual = manual.replace(f"{{{name}}}", text)
+    return manual
 
 
 def read_children(props) -> dict:

@@ -7,7 +7,6 @@ up in occupied cells only: two tables of a byte a cell, where a grid of parts wo
 
 from __future__ import annotations
 
-from functools import cached_property
 from types import ModuleType
 from typing import Any, ClassVar
 
@@ -46,6 +45,7 @@ class RefinedGrid:
                 f"{int(bits.sum())} of {bits.shape}"
             )
         self._ns, self.coarse_bits, self.masks = ns, bits, masks
+        self._coarse: OccupancyGrid | None = None
         self.threshold, self.coarse_threshold, self.missed = float(threshold), float(coarse_threshold), float(missed)
         self.cells = tuple(PARTS * n for n in bits.shape[::-1])
         whole = np.zeros(bits.shape, np.uint8)
@@ -53,11 +53,13 @@ class RefinedGrid:
         # Cells of which nothing is left are empty as any other.
         self.distance, self.parts = ns.UInt8(chessboard(whole > 0).ravel()), ns.UInt8(whole.ravel())
 
-    @cached_property
+    @property
     def coarse(self) -> OccupancyGrid:
         """The grid that was refined, which holds all that this one holds: for weights that are no longer those that
         were looked at, and for formats that know no parts."""
-        return OccupancyGrid(self.coarse_bits, self._ns, self.coarse_threshold)
+        if self._coarse is None:
+            self._coarse = OccupancyGrid(self.coarse_bits, self._ns, self.coarse_threshold)
+        return self._coarse
 
     @property
     def bits(self) -> np.ndarray:

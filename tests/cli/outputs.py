@@ -158,7 +158,7 @@ CASES = (
     ),
     Case("bake", "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.glb", ("a.glb",)),
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
-    Case("refine", "{i}/field.safetensors -o {o}/a.safetensors", ("a.safetensors",)),
+    Case("refine", "{i}/ngp.safetensors -o {o}/a.safetensors", ("a.safetensors",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
     Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),

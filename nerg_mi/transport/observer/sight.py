@@ -119,13 +119,13 @@ def trace_sight(
 def _met(view: View, settings: ObserverSettings, active: Bool) -> Float:
     """Depth of the surface on the observer's rays; infinite where there is none, or where it is known to lie behind the
     point."""
-    known = None if view.march is None else view.march.known
-    if known is None:
+    march = view.march
+    if march is None or march.known is None:
         return dr.select(active & view.meets(settings.surface_opacity), view.depth(settings.depth, active), dr.inf)
-    rest = active & ~known
+    rest = active & ~march.known
     met = dr.select(rest & view.meets(settings.surface_opacity), view.depth(settings.depth, rest), dr.inf)
     # Infinite where the way is clear: transmittance 1/2 has not been reached there.
-    return dr.select(active & known, view.march.half, met)
+    return dr.select(active & march.known, march.half, met)
 
 
 def _tolerance(place: Place, ray: Ray3f, p_d: Point3f, p_o: Point3f, settings: ObserverSettings) -> Float:
