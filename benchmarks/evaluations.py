@@ -33,7 +33,7 @@ ROWS = (
     ("parts, dt_gamma 1/256", AOVS, {"dt_gamma": 1 / 256}),
     ("parts, map of the observer", AOVS, {"visibility": "map"}),
 )
-HEAD = ("setting", "density", "colour", "us CPU", "times", "dB", "depth MAE mm", "depth 99.9 % mm", "gaze MAE")
+HEAD = ("variant", "density", "colour", "us CPU", "times", "dB", "depth MAE mm", "depth 99.9 % mm", "gaze MAE")
 
 
 def main(argv=None) -> None:

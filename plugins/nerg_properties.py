@@ -19,10 +19,9 @@ from nerg_mi.transport.observer.gaze import PlacedGaze
 from nerg_mi.transport.observer.settings import VISIBILITIES, ObserverSettings
 from nerg_mi.transport.observer.views import ObserverView, SupportView
 
-
 _MARCH_MANUAL = {
-    "dt_gamma": "Steps are at least this share of the distance travelled: for wide views, whose far parts need no short "
-    "steps. (Default: 0, i.e. uniform steps; for a field without an end that which it was trained with)",
+    "dt_gamma": "Steps are at least this share of the distance travelled: for wide views, whose far parts need no "
+    "short steps. (Default: 0, i.e. uniform steps; for a field without an end that which it was trained with)",
     "stop": "Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times "
     "that, in mean free paths.",
     "refined": "Skip the parts of a field's occupied cells in which nothing was found when it was trained or refined "

@@ -26,6 +26,7 @@ NAMES = [
     "dt_gamma",
     "stop",
     "color_cutoff",
+    "refined",
     "jitter",
 ]
 
