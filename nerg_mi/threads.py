@@ -24,3 +24,15 @@ def threads_of_worker() -> int:
     """The threads that this process was given by whoever started it as a worker; 0 for all."""
     text = os.environ.get(VARIABLE, "")
     return int(text) if text.isdigit() else 0
+
+
+def use_share() -> None:
+    """Compute with the threads that this worker was given from now on; in a process that is none, nothing changes."""
+    if threads := threads_of_worker():
+        set_thread_count(threads)
+
+
+def share(own: int, asked: int) -> int:
+    """Threads of a worker for a job that has ``asked`` for so many, of which it may use its ``own``; 0 for all."""
+    wanted = [count for count in (own, asked) if count]
+    return min(wanted) if wanted else os.cpu_count() or 1

@@ -21,6 +21,9 @@ from nerg_mi.rays.dataset.opening import rays_digest
 
 _PROGRAMS = ("mitsuba", "drjit")
 
+_OF_THE_RUN = ("seed", "store", "scheduler")
+"""Options that are said elsewhere, or on which nothing that is made depends."""
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -65,8 +68,7 @@ def provenance(
         if path not in known:
             known[path] = rays_digest(path) if path.is_dir() else file_sha256(path)
         sums[name] = known[path]
-    given = _given(settings)
-    given.pop("seed", None)
+    given = {name: value for name, value in _given(settings).items() if name not in _OF_THE_RUN}
     return Provenance(what, sums, seed, {k: _plain(v) for k, v in given.items()}, versions())
 
 

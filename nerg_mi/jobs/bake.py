@@ -19,7 +19,6 @@ from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.checkpoint import read_metadata
-from nerg_mi.interruption import Interruption
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
@@ -32,12 +31,14 @@ from nerg_mi.surfaces.smoothing import Smoother
 from nerg_mi.surfaces.sums import Sums, merge
 
 from .backend import select_backend
-from .baking.chunks import BakeScene, bake_chunk, parts_of
+from .baking.chunks import BakeScene
 from .baking.lookers import check_weights, find_crowd, tracked_rays
 from .baking.outputs import SUFFIXES, Baked, check_texture, write_output
 from .baking.receivers import Receivers, cut, read_receivers
+from .baking.summing import halves_of, sums_in_one_go, sums_in_parts
 from .gaze_places import align_of_training
 from .options.bake import BakeOptions
+from .parts import Parts
 from .reporter import SILENT, Reporter
 
 UNITS = {"share": "share of gaze per square metre [1/m²]", "seconds": "gaze per square metre [s/m²]"}
@@ -80,7 +81,8 @@ def bake(
     """Put the gaze of ``options`` on ``surface``: a mesh (.ply, .obj, .glb), a scene (.xml), or a radiance field.
 
     ``outputs``: files to write, by their suffixes (.ply, .glb, .csv, .json). ``rays``: in memory, in place of the file
-    in ``options``. Raises `NergError` for what the user can mend.
+    in ``options``. With ``options.store`` or ``options.scheduler`` some observers, or rays, at a time are a part, which
+    is kept and may be made by others; the sums are the same to the bit. Raises `NergError` for what the user can mend.
     """
     options, surface, start = options or BakeOptions(), Path(surface), time.perf_counter()
     paths = [Path(path) for path in outputs]
@@ -119,8 +121,16 @@ def bake(
         factor = float(ray_seconds(tracked).sum()) if options.unit == "seconds" else 1.0
     else:
         who = find_crowd(options, tracked, align, reporter)
-    people = _halves(tracked, options.seed) if options.halves and tracked is not None else None
-    sums, halves = _run(scene, who, people, reporter)
+    groups = [who]
+    if options.halves and tracked is not None and isinstance(who, TrackedRays):
+        groups = halves_of(who, tracked, options.seed)
+    name = paths[0] if paths else surface
+    found = (
+        sums_in_parts(scene, groups, Parts(options, name, reporter, options.threads), f"nerg bake {name.absolute()}")
+        if options.in_parts
+        else sums_in_one_go(scene, groups, reporter)
+    )
+    sums = merge(found)
     reporter.progress(0.9, "smoothing")
     smoother = Smoother(mesh, options.smooth * align.scale) if options.smooth > 0 else None
     shares, amounts = _smoothed(mesh, sums, smoother)
@@ -128,8 +138,8 @@ def bake(
     share, amount = shares / weight, amounts / weight
     density = factor * amount / mesh.vertex_area * align.scale**2
     summary = _summary(receivers, refined.parent, sums, share, factor, options, source)
-    if halves is not None:
-        summary["halves_cc"] = _agreement(mesh, halves, smoother)
+    if len(found) == 2:
+        summary["halves_cc"] = _agreement(mesh, found, smoother)
     heat = Heat(options.top or _top(mesh, density), options.cmap, decades=options.decades)
     given = (surface, options.gaze, options.rays, options.path, options.align)
     about = provenance("nerg bake", [p for p in given if p is not None], options.seed, options)
@@ -182,41 +192,6 @@ def _alignment(options: BakeOptions) -> Similarity:
     )
 
 
-def _halves(rays: Rays, seed: int) -> np.ndarray:
-    """Which rays are of the first half of the people, (N,) bool, drawn by ``seed``."""
-    people = np.unique(rays.person)
-    if len(people) < 2:
-        raise NergError("--halves needs two people at least, and the rays are of one")
-    first = np.random.default_rng(seed).permutation(people)[: len(people) // 2]
-    return np.isin(rays.person, first)
-
-
-def _run(
-    scene: BakeScene, who: Crowd | TrackedRays, first: np.ndarray | None, reporter: Reporter
-) -> tuple[Sums, tuple[Sums, Sums] | None]:
-    """Sums of all parts, and of two halves of the rays, the ``first`` and the others, where they are asked for."""
-    groups = [who]
-    if first is not None and isinstance(who, TrackedRays):
-        order = [np.flatnonzero(first), np.flatnonzero(~first)]
-        starts = [0, len(order[0])]
-        groups = [
-            TrackedRays(who.origins[rows], who.directions[rows], who.weights[rows], start)
-            for rows, start in zip(order, starts)
-        ]
-    parts = [list(parts_of(group)) for group in groups]
-    count, done, found = sum(map(len, parts)), 0, []
-    with Interruption() as stop:
-        for group in parts:
-            sums = Sums.none(len(scene.mesh.faces), len(scene.mesh.vertices))
-            for part in group:
-                stop.check()
-                sums = sums.plus(bake_chunk(scene, part))
-                done += 1
-                reporter.progress(0.05 + 0.85 * done / count, f"part {done} of {count}")
-            found.append(sums)
-    return merge(found), (found[0], found[1]) if len(found) == 2 else None
-
-
 def _smoothed(mesh: Mesh, sums: Sums, smoother: Smoother | None) -> tuple[np.ndarray, np.ndarray]:
     """Integrals over faces (F,) and over hat functions (V,), after smoothing."""
     if smoother is None:
@@ -225,7 +200,7 @@ def _smoothed(mesh: Mesh, sums: Sums, smoother: Smoother | None) -> tuple[np.nda
     return (amount / mesh.vertex_area)[mesh.faces].mean(axis=1) * mesh.area, amount
 
 
-def _agreement(mesh: Mesh, halves: tuple[Sums, Sums], smoother: Smoother | None) -> float:
+def _agreement(mesh: Mesh, halves: list[Sums], smoother: Smoother | None) -> float:
     """Correlation of two halves' densities over the surface."""
     first, second = (_smoothed(mesh, half, smoother)[0] / mesh.area for half in halves)
     return float(cc(first, second, mesh.area))

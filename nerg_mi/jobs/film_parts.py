@@ -38,7 +38,7 @@ _LAYERS_SHARE = 0.8
 def render_parts(scene: Path, output: Path, options: FilmOptions, reporter: Reporter) -> PictureResult:
     """Render the scene file ``scene`` to ``output``, each picture a part; see `film.render_film`."""
     asked = asked_pictures(scene, output, options)
-    parts = Parts(options, output, reporter)
+    parts = Parts(options, output, reporter, options.threads)
     reporter.progress(0.0, "reading the scene")
     mode = activate(options.mode)
     if options.threads:

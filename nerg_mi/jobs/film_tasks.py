@@ -17,7 +17,7 @@ from nerg_mi.files.npy import read_npy
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.rendering.scene_file import files_of_scene
-from nerg_mi.threads import set_thread_count, threads_of_worker
+from nerg_mi.threads import use_share
 
 from .options.pictures import PictureOptions
 from .overlays import check_memory, layers_of, stacked, style_of, unstacked
@@ -72,8 +72,7 @@ def _given(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> tuple[P
     """The scene and its options, with files where they are here."""
     defaults = {k: v if isinstance(v, str) else str(inputs[v["input"]]) for k, v in parameters["defaults"].items()}
     scene = inputs[parameters["scene"]]
-    if threads := threads_of_worker():
-        set_thread_count(threads)
+    use_share()
     options = replace(PictureOptions(**parameters["options"]), defaults=defaults)
     activate(options.mode)
     known = {path.resolve() for path in inputs.values()}

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
+from nerg_mi.tasks.inputs import InputFile
 from nerg_mi.tasks.opening import open_scheduler
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.protocol import Scheduler
@@ -21,12 +25,18 @@ SUFFIX = ".tasks"
 
 class Parts:
     """The store and the scheduler of one job, which writes ``output``. Raises `NergError` for a folder that cannot be
-    written to, and for a scheduler that there is none of."""
+    written to, and for a scheduler that there is none of. ``threads``: of each process that makes parts."""
 
-    def __init__(self, options: PartOptions, output: Path, reporter: Reporter):
+    def __init__(self, options: PartOptions, output: Path, reporter: Reporter, threads: int | None = None):
         self.store = Store(output.with_suffix(SUFFIX) if options.store is None else options.store)
-        self.scheduler: Scheduler = open_scheduler(options.scheduler)
+        self.scheduler: Scheduler = open_scheduler(options.scheduler, threads or 0)
         self._reporter = reporter
+
+    def hold(self, name: str, values: np.ndarray) -> InputFile:
+        """``values`` as an input of tasks (.npy), which call it ``name``."""
+        content = io.BytesIO()
+        np.lib.format.write_array(content, np.ascontiguousarray(values), allow_pickle=False)
+        return self.store.hold(name, content.getvalue())
 
     def run(self, plan: Plan, since: float = 0.0, until: float = 1.0) -> Iterator[Output]:
         """The outputs of ``plan`` in its order; see `run_plan`. Of the whole job this is from the share ``since`` to

@@ -17,8 +17,9 @@ _HEAD = ("job", "parts", "done", "left", "size", "computed in", "out of date")
 def account_for_store(folder: str | Path, remove: bool = False, reporter: Reporter = SILENT) -> Account:
     """Tell of the jobs in the store ``folder``: how far each is, what it takes, and which inputs have changed.
 
-    ``remove``: take out what no job asks for any more, what was made of files that have changed since, and what workers
-    that died left an hour ago or earlier. Raises `NergError` for a folder that is no store.
+    ``remove``: take out what no job asks for any more, what was made of files that have changed since, and what was
+    left over an hour ago or earlier, by workers that died or for parts that nobody asks for any more. Raises
+    `NergError` for a folder that is no store.
     """
     if not Path(folder).is_dir():
         raise NergError(f'there is no folder "{folder}"; name the one that was given as --store')
@@ -36,7 +37,7 @@ def account_for_store(folder: str | Path, remove: bool = False, reporter: Report
     stale, left = len(account.stale), len(account.leftovers)
     reporter.message(
         f"{size(account.bytes)} in all; stale: {stale} outputs, {size(account.stale_bytes)}; "
-        f"left by workers that died: {left}, {size(account.leftover_bytes)}."
+        f"left over: {left}, {size(account.leftover_bytes)}."
     )
     if remove:
         reporter.message(f"Removed {size(remove_stale(store, account))}.")

@@ -42,7 +42,8 @@ class JobAccount:
 @dataclass(frozen=True)
 class Account:
     """``jobs`` of a store; ``stale``: outputs that no job asks for any more, as it was started last, and those that
-    were made of files that were changed since; ``leftovers``: what workers that died have left."""
+    were made of files that were changed since; ``leftovers``: what workers that died have left, and what the store
+    holds for parts that nobody asks for any more; ``bytes`` of all outputs and of what is held for them."""
 
     jobs: tuple[JobAccount, ...]
     stale: tuple[Receipt, ...]
@@ -70,12 +71,13 @@ def read_account(store: Store, age: float = AGE) -> Account:
         job, current = _job(plan, receipts, checksums)
         jobs.append(job)
         wanted |= current
-    leftovers = tuple(store.leftovers(age))
+    held = {name for plan in plans for name in plan.held}
+    leftovers = (*store.leftovers(age), *(path for path in store.held(age) if path.name not in held))
     return Account(
         tuple(jobs),
         tuple(receipt for key, receipt in receipts.items() if key not in wanted),
         leftovers,
-        sum(receipt.size for receipt in receipts.values()),
+        sum(receipt.size for receipt in receipts.values()) + sum(map(_size, store.held(0.0))),
         sum(_size(path) for path in leftovers),
     )
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from nerg_mi.errors import expected, sentence
+from nerg_mi.threads import VARIABLE, share, threads_of_worker
 
 from .inputs import ChangedInput, Checksums
 from .making import OtherCode, make_output
@@ -50,9 +51,11 @@ def serve(requests: TextIO, answers: TextIO) -> None:
         os._exit(0)
 
     threading.Thread(target=listen, daemon=True, name="requests").start()
-    checksums = Checksums()
+    checksums, own = Checksums(), threads_of_worker()
     while True:
         request = json.loads(waiting.get())
+        # Of one job, and not of the next that this process works for.
+        os.environ[VARIABLE] = str(share(own, request.get("threads", 0)))
         print(json.dumps(answer(request, checksums)), file=answers, flush=True)
 
 

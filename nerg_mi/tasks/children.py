@@ -46,12 +46,12 @@ class Child:
         self._process: subprocess.Popen[str] | None = None
         self._lock = threading.Lock()
 
-    def make(self, task: Task, paths: Mapping[str, str], store: Path) -> Receipt:
-        """Have ``task`` run on the files ``paths`` by name, its output put into ``store``. Raises `ChildDied` and
-        `TaskFailed`."""
+    def make(self, task: Task, paths: Mapping[str, str], store: Path, threads: int = 0) -> Receipt:
+        """Have ``task`` run on the files ``paths`` by name, its output put into ``store``; with ``threads`` at most,
+        where they are fewer than the process has. Raises `ChildDied` and `TaskFailed`."""
         with self._lock:
             process = self._started()
-            request = {"task": task.document(), "paths": dict(paths), "store": str(store)}
+            request = {"task": task.document(), "paths": dict(paths), "store": str(store), "threads": threads}
             assert process.stdin is not None and process.stdout is not None
             try:
                 process.stdin.write(json.dumps(request) + "\n")

@@ -55,14 +55,14 @@ class _Open:
 
 class Cluster:
     """Runs tasks on the workers of the dask scheduler at ``address`` (tcp://HOST:PORT or tls://HOST:PORT), as many at a
-    time as there are workers. A scheduler that is gone is waited for as long as ``patience`` seconds. Raises
-    `NergError` for an address that is none."""
+    time as there are workers, each with ``threads`` at most; 0: with all that it has. A scheduler that is gone is
+    waited for as long as ``patience`` seconds. Raises `NergError` for an address that is none."""
 
-    def __init__(self, address: str, patience: float = PATIENCE, slow: float = SLOW):
+    def __init__(self, address: str, patience: float = PATIENCE, slow: float = SLOW, threads: int = 0):
         check_address(address)
         import_distributed()
         security_for(address)
-        self.address, self.patience, self.slow = address, patience, slow
+        self.address, self.patience, self.slow, self.threads = address, patience, slow, threads
 
     def run(self, tasks: Iterator[Task], store: Store, warn: Warn) -> Generator[Done]:
         danger = unprotected(self.address)
@@ -73,7 +73,7 @@ class Cluster:
             while True:
                 client = self._connected(warn)
                 try:
-                    yield from _Session(client, tasks, open_tasks, store, probe, self.slow, warn).serve()
+                    yield from _Session(client, tasks, open_tasks, store, probe, self.slow, self.threads, warn).serve()
                     return
                 except Lost:
                     warn(f"the scheduler at {self.address} is gone; waiting for it for {self.patience:g} s")
@@ -109,10 +109,11 @@ class _Session:
         store: Store,
         probe: str,
         slow: float,
+        threads: int,
         warn: Warn,
     ):
         self.client, self.tasks, self.open, self.store = client, tasks, open_tasks, store
-        self.probe, self.slow, self.warn = probe, slow, warn
+        self.probe, self.slow, self.threads, self.warn = probe, slow, threads, warn
         self.found: queue.Queue[tuple[str, Any]] = queue.Queue()
         self.workers: list[str] = []
         self.took: list[float] = []
@@ -157,7 +158,7 @@ class _Session:
         kept.since = time.monotonic()
         task, number = kept.task, len(kept.futures)
         key = f"nerg-{task.key[:24]}-{time.monotonic_ns()}-{number}"
-        asked = (dask_worker.perform, task.document(), str(self.store.folder), self.probe)
+        asked = (dask_worker.perform, task.document(), str(self.store.folder), self.probe, self.threads)
         future = self.client.submit(*asked, key=key, pure=False, workers=workers)
         kept.futures.append(future)
         future.add_done_callback(lambda f: self.found.put((task.key, f)))

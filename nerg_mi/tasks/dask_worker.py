@@ -51,8 +51,9 @@ def _own_store() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="nerg-outputs-")
 
 
-def perform(document: Mapping[str, Any], store: str, probe: str) -> dict[str, Any]:
-    """Run the task that ``document`` describes, for the client whose ``store`` holds the file ``probe``.
+def perform(document: Mapping[str, Any], store: str, probe: str, threads: int = 0) -> dict[str, Any]:
+    """Run the task that ``document`` describes, for the client whose ``store`` holds the file ``probe``, with
+    ``threads`` at most; 0: with all that this worker has.
 
     Gives one of: ``receipt``, with ``content`` (names and bytes of files) where the store is not to be seen from here;
     ``needs``, checksums of inputs that have to be sent first, with the ``worker`` that needs them; ``died``, how the
@@ -67,8 +68,8 @@ def perform(document: Mapping[str, Any], store: str, probe: str) -> dict[str, An
         if paths is None:
             return {"needs": _inputs().missing(task.inputs), "worker": distributed.get_worker().address}
         if shares(Path(store), probe):
-            return {"receipt": vars(_child().make(task, paths, Path(store)))}
-        return _made_apart(task, paths)
+            return {"receipt": vars(_child().make(task, paths, Path(store), threads))}
+        return _made_apart(task, paths, threads)
     except ChildDied as error:
         return {"died": str(error)}
     except TaskFailed as error:
@@ -80,10 +81,10 @@ def perform(document: Mapping[str, Any], store: str, probe: str) -> dict[str, An
         return {"error": sentence(error), "kind": "final", "trace": ""}
 
 
-def _made_apart(task: Task, paths: dict[str, str]) -> dict[str, Any]:
+def _made_apart(task: Task, paths: dict[str, str], threads: int) -> dict[str, Any]:
     """An output as names and bytes, which nothing here keeps."""
     store = Store(_own_store().name)
-    receipt = _child().make(task, paths, store.folder)
+    receipt = _child().make(task, paths, store.folder, threads)
     output = store.output(task.key, task.suffix)
     try:
         if receipt.size > MOST_SENT:

@@ -14,7 +14,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import write_text
 from nerg_mi.files.bounded import JSON_BYTES, read_json
 
-from .store import PLANS, Store
+from .store import HELD, PLANS, Store
 from .task import FORMAT, Task
 
 MOST = 500_000
@@ -38,21 +38,25 @@ class Plan:
 
 @dataclass(frozen=True)
 class Remembered:
-    """A plan as a store has it: the ``keys`` of its tasks with their suffixes, and the SHA-256 of the ``inputs`` by
-    path, where they were."""
+    """A plan as a store has it: the ``keys`` of its tasks with their suffixes, the SHA-256 of the ``inputs`` by path,
+    where they were, and those of the files that the store holds for it, ``held``."""
 
     what: str
     keys: dict[str, str]
     inputs: dict[str, str]
+    held: tuple[str, ...] = ()
 
 
 def remember(store: Store, plan: Plan) -> Path:
     """Write down in ``store`` what ``plan`` needs, so that its outputs count as wanted."""
     # What other tasks made is in the store itself, and made anew where it has to be.
     inputs = {f.path: f.sha256 for task in plan.tasks for f in task.inputs if store.folder not in Path(f.path).parents}
+    own = store.folder / HELD
+    held = sorted({f.sha256 for task in plan.tasks for f in task.inputs if Path(f.path).parent == own})
     keys = {task.key: task.suffix for task in plan.tasks}
     path = store.folder / PLANS / f"{hashlib.sha256(plan.what.encode()).hexdigest()[:16]}.json"
-    write_text(path, json.dumps({"format": FORMAT, "what": plan.what, "inputs": inputs, "keys": keys}) + "\n")
+    about = {"format": FORMAT, "what": plan.what, "inputs": inputs, "keys": keys, "held": held}
+    write_text(path, json.dumps(about) + "\n")
     return path
 
 
@@ -68,7 +72,10 @@ def read_plan(path: str | os.PathLike) -> Remembered:
     good = all(_KEY.fullmatch(key) and "/" not in suffix.rstrip("/") for key, suffix in found["keys"].items())
     if not good:
         raise NergError(f'the plan "{path}" names what is no task; remove it, and start its job again')
-    return Remembered(found["what"], found["keys"], found["inputs"])
+    held = found.get("held", [])
+    if not isinstance(held, list) or not all(isinstance(name, str) for name in held):
+        raise NergError(f'the plan "{path}" is damaged; remove it, and start its job again')
+    return Remembered(found["what"], found["keys"], found["inputs"], tuple(held))
 
 
 def read_plans(store: Store) -> list[Remembered]:

@@ -16,20 +16,20 @@ from .task import Task
 
 
 class Processes:
-    """Runs tasks in ``count`` processes, among which the cores are shared out.
+    """Runs tasks in ``count`` processes, each with so many ``threads``; 0: the cores are shared out among them.
 
     One process takes all cores for a picture or a training; more are for tasks that do not, and for memory that a task
     must give back.
     """
 
-    def __init__(self, count: int):
+    def __init__(self, count: int, threads: int = 0):
         if not 1 <= count <= 1024:
             raise NergError(f"{count} worker processes were asked for; choose 1 to 1024")
         self.count = count
+        self.threads = threads or max((os.cpu_count() or 1) // count, 1)
 
     def run(self, tasks: Iterator[Task], store: Store, warn: Warn) -> Generator[Done]:
-        threads = max((os.cpu_count() or 1) // self.count, 1)
-        children = [Child(threads) for _ in range(self.count)]
+        children = [Child(self.threads) for _ in range(self.count)]
         asked: queue.Queue[tuple[Task, int] | None] = queue.Queue()
         found: queue.Queue[tuple[Task, int, Done | Exception]] = queue.Queue()
 

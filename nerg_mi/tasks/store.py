@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import secrets
 import shutil
@@ -13,10 +14,12 @@ from pathlib import Path
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder, make_folder, replacing, replacing_folder, write_bytes, writing
 
+from .inputs import InputFile
 from .receipt import Receipt, digest_of, read_receipt, write_receipt
 from .task import FOLDER, Task
 
 PLANS = "plans"
+HELD = "held"
 _RECEIPT = ".receipt.json"
 
 
@@ -88,6 +91,19 @@ class Store:
             if digest_of(temporary) != (receipt.size, receipt.sha256):
                 raise NergError(f"{task.label} arrived with other bytes than it was sent with; start the job again")
         self.add(receipt)
+
+    def hold(self, name: str, content: bytes) -> InputFile:
+        """What a job has made in memory as an input called ``name``: a file of the store named by its bytes, which is
+        the same when the job is started again. Equal contents are one file."""
+        sha256 = hashlib.sha256(content).hexdigest()
+        path = self.folder / HELD / sha256
+        if not path.is_file() or digest_of(path) != (len(content), sha256):
+            write_bytes(path, content)
+        return InputFile(name, sha256, len(content), str(path))
+
+    def held(self, older: float) -> list[Path]:
+        """All files that jobs hold here and that were written ``older`` seconds ago or earlier."""
+        return [p for p in sorted(self.folder.glob(f"{HELD}/*")) if time.time() - p.lstat().st_mtime > older]
 
     def remove(self, key: str, suffix: str) -> None:
         """Remove an output with its receipt, the receipt first."""

@@ -156,7 +156,9 @@ CASES = (
         "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.ply -o {o}/a.csv -o {o}/a.json",
         ("a.ply", "a.csv", "a.json"),
     ),
-    Case("bake", "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb -o {o}/a.glb", ("a.glb",)),
+    Case(
+        "bake", "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb --store {i}/store -o {o}/a.glb", ("a.glb",)
+    ),
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
     Case("refine", "{i}/ngp.safetensors -o {o}/a.safetensors", ("a.safetensors",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),

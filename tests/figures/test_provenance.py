@@ -13,6 +13,7 @@ import pytest
 import nerg_mi
 from nerg_mi.errors import NergError
 from nerg_mi.figures.provenance import files_among, provenance
+from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.jobs.options.pictures import PictureOptions
 
 
@@ -28,6 +29,11 @@ def test_everything_is_said(tmp_path):
         "drjit": drjit.__version__,
     }
     assert about.text()["Software"] == ", ".join(f"{k} {found['versions'][k]}" for k in ("nerg_mi", "mitsuba", "drjit"))
+
+
+def test_who_made_it_and_where_it_is_kept_is_not_said(tmp_path):
+    options = BakeOptions(store=tmp_path, scheduler="local:2", detail=0.5, seed=4)
+    assert dict(provenance("x", [], 4, options).settings) == {"detail": 0.5}
 
 
 def test_no_path_of_the_machine(tmp_path):

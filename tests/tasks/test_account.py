@@ -1,6 +1,7 @@
 """What a store holds, and what of it is stale."""
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +11,7 @@ from nerg_mi.tasks.local import Local
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.run import carry_out, run_plan
 from nerg_mi.tasks.store import Store
+from nerg_mi.tasks.task import Task
 from tests.tasks import works
 
 
@@ -72,3 +74,15 @@ def test_leftovers_are_removed_when_they_are_old(store):
 def test_a_folder_that_is_no_store(tmp_path):
     with pytest.raises(NergError, match="holds no parts of jobs; name the folder that was given as --store"):
         read_account(Store(tmp_path))
+
+
+def test_what_is_held_for_parts_that_nobody_asks_for_is_left_over(store):
+    asked, other = store.hold("a", b"12345"), store.hold("a", b"123")
+    task = Task("tests.tasks.works:hashed", {"number": 0}, (asked,), ".txt")
+    carry_out(Plan("p", [task]), store, Local())
+    assert read_account(store).leftovers == ()
+    for file in (asked, other):
+        os.utime(file.path, (1, 1))
+    found = read_account(store)
+    assert found.jobs[0].done == 1 and found.leftovers == (Path(other.path),) and found.bytes == 65 + 8
+    assert remove_stale(store, found) == 3 and Path(asked.path).exists()

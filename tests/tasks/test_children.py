@@ -48,3 +48,14 @@ def test_it_knows_its_share_of_the_cores(child, tmp_path):
     task = Task("tests.tasks.works:threads", {}, (), ".txt")
     child.make(task, {}, tmp_path)
     assert Store(tmp_path).output(task.key, ".txt").read_text() == "1"
+
+
+def test_a_job_asks_for_fewer_threads_and_never_gets_more(monkeypatch, tmp_path):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    task, own = Task("tests.tasks.works:threads", {}, (), ".txt"), Child(threads=3)
+    try:
+        for asked, given in ((2, "2"), (8, "3"), (0, "3")):
+            own.make(task, {}, tmp_path, asked)
+            assert Store(tmp_path).output(task.key, ".txt").read_text() == given
+    finally:
+        own.close()

@@ -30,6 +30,9 @@ def test_who_shares_the_store_writes_into_it_and_others_send_what_they_made(chil
         assert set(found) == {"receipt"} and store.find(task.key, ".txt") == Receipt(**found["receipt"])
         apart = dask_worker.perform(other.document(), str(tmp_path / "not there"), probe)
         assert apart["content"] == [("", works.expected(1))] and store.find(other.key, ".txt") is None
+        count = Task("tests.tasks.works:threads", {}, (), ".txt")
+        dask_worker.perform(count.document(), str(store.folder), probe, 1)
+        assert store.output(count.key, ".txt").read_text() == "1"
         monkeypatch.setattr(dask_worker, "MOST_SENT", 10)
         large = dask_worker.perform(other.document(), str(tmp_path / "not there"), probe)
         assert "share the store's folder with the workers" in large["error"] and large["kind"] == "final"

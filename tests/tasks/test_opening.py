@@ -12,6 +12,9 @@ def test_names():
     assert isinstance(open_scheduler(None), Local) and isinstance(open_scheduler("local"), Local)
     found = open_scheduler("local:3")
     assert isinstance(found, Processes) and found.count == 3
+    assert open_scheduler("local:3", 5).threads == 5 and open_scheduler("local:1000").threads == 1
+    pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
+    assert open_scheduler("tcp://127.0.0.1:1", 5).threads == 5
 
 
 @pytest.mark.parametrize("name", ["", "dask", "local:", "local:x", "localhost:8786"])

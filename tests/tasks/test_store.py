@@ -141,3 +141,14 @@ def test_receipts_of_others_are_no_receipts(store):
     store.add(replace(receipt, key="f" * 64))
     assert store.find("f" * 64, ".txt") is None
     assert Path(store.receipt_file("f" * 64)).exists()
+
+
+def test_what_is_held_is_named_by_its_bytes(store):
+    first = store.hold("a.npy", b"rays")
+    path = Path(first.path)
+    assert (first.name, first.size, path.name) == ("a.npy", 4, hashlib.sha256(b"rays").hexdigest())
+    before = path.stat().st_ino
+    assert store.hold("b.npy", b"rays").path == first.path and path.stat().st_ino == before
+    path.write_bytes(b"ways")
+    assert Path(store.hold("a.npy", b"rays").path).read_bytes() == b"rays"
+    assert store.held(3600) == [] and store.held(-1) == [path]

@@ -20,6 +20,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.surfaces.gaze_source import GazeSettings, MakeLooker, gaze_sums, lookers_of_field
 from nerg_mi.surfaces.mesh import Mesh
 from nerg_mi.surfaces.population import Crowd
@@ -58,7 +59,8 @@ class BakeScene:
         for vertices, faces in ((self.mesh.vertices, self.mesh.faces), *self.others):
             found.update(np.ascontiguousarray(vertices, "<f8").tobytes() + b"|")
             found.update(np.ascontiguousarray(faces, "<i8").tobytes() + b"|")
-        sums = [None if path is None else file_sha256(path) for path in (self.gaze, self.scene)]
+        files = [] if self.scene is None else files_of_scene(self.scene)
+        sums = [None if path is None else file_sha256(path) for path in (self.gaze, *files)]
         found.update(repr((sums, self.of_gaze, self.of_rays)).encode())
         return found.hexdigest()
 

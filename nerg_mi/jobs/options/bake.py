@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import option, parse_numbers
+from .parts import PartOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class BakeOptions:
+class BakeOptions(PartOptions):
     """Whose gaze is put on which surfaces, and how."""
 
     gaze: Path | None = option(None, "Gaze field (.safetensors).  [default: that of a scene file]")
