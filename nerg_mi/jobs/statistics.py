@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.alignment.record import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.files.atomic import check_folder, make_folder
-from nerg_mi.formats.areas.kinds import Areas, Group
+from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.formats.areas.reading import read_areas
-from nerg_mi.formats.regions import read_regions
 from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.intervals import LEAST_PEOPLE
 from nerg_mi.statistics.landing import Thing
-from nerg_mi.statistics.looks import LookRules
 from nerg_mi.statistics.measures import People
 from nerg_mi.statistics.sums import ALL, Cell, Sums, Total
 from nerg_mi.statistics.tables import (
@@ -34,19 +31,20 @@ from nerg_mi.statistics.tables import (
     person_rows,
     thing_rows,
 )
-from nerg_mi.statistics.visibility import CellsInView, Isovists, Targets
+from nerg_mi.statistics.visibility import Isovists, Targets
 
 from .backend import select_backend
-from .counting.cohorts import read_cohorts
-from .counting.foretold import Foretold, foretell, foretold_people
+from .counting.foretold import Foretold, foretold_people
+from .counting.parts import CountingParts
 from .counting.places import isovist_rows, look_around, places_of
 from .counting.results import write_results
-from .counting.surroundings import Surroundings, surroundings_of_files
-from .counting.things import shapes_of, things_of
-from .counting.tracked import Counting, EyePicker, Eyes, Window, blocks_of, cohort_names, count_block, ray_count
+from .counting.setting import setting_of
+from .counting.surroundings import Surroundings
+from .counting.tracked import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
 from .counting.what_if import what_if_rows
 from .options import parse_numbers
-from .options.statistics import StatisticsOptions, parse_window
+from .options.statistics import StatisticsOptions
+from .parts import Parts
 from .reporter import SILENT, Reporter
 from .scenes.files import kind_of_file
 
@@ -97,9 +95,7 @@ def statistics(
     reporter.progress(0.0, "reading")
     areas = _areas(options)
     ns = select_backend(options.mode, options.threads)
-    with Interruption() as stop:
-        work = _Work(given, areas, options, ns, reporter, stop)
-        result = work.run()
+    result = _Work(given, areas, options, ns, reporter, output).run()
     if output is not None:
         inputs = [p for p in (given.scene, given.field, given.gaze, given.rays) if isinstance(p, Path)]
         inputs += [p for p in (options.areas, options.what_if) if p is not None and p.is_file()]
@@ -140,17 +136,12 @@ class _Work:
         options: StatisticsOptions,
         ns: ModuleType,
         reporter: Reporter,
-        stop: Interruption,
+        output: str | Path | None,
     ):
-        self.given, self.areas, self.options, self.reporter, self.stop = given, areas, options, reporter, stop
-        # What is plainly wrong is told before anything is loaded.
-        self.rules = LookRules(options.gap, options.pause, options.merge, options.least)
-        self.windows = [Window(*parse_window(text)) for text in options.windows]
-        align = None if options.align is None else read_similarity(options.align, "--align", "rays to place")
-        self.around: Surroundings = surroundings_of_files(given.scene, given.field, given.gaze, align, ns)
-        self.things = things_of(areas.things, shapes_of(self.around.scene))
-        self.members = list(areas.members().values())
-        self.margin = options.margin * self.around.scale
+        self.given, self.areas, self.options, self.reporter = given, areas, options, reporter
+        self.setting = setting_of(given.scene, given.field, given.gaze, areas, options, ns)
+        self.around, self.things, self.members = self.setting.around, self.setting.things, self.setting.members
+        self.parts = self._in_parts(output) if options.in_parts else None
 
     def run(self) -> StatisticsResult:
         """All that is asked for."""
@@ -173,7 +164,7 @@ class _Work:
                 times[cell] = dict.fromkeys(eyes.person, 1.0)
         foretold = None
         if self.around.gaze is not None:
-            foretold = self._foretell(self.around, eyes)
+            foretold = self._foretold(eyes)
             for cell in cells:
                 found = foretold_people(foretold, eyes, cell, times[cell], o.glance)
                 if found is not None:
@@ -200,8 +191,7 @@ class _Work:
         return result
 
     def _counting(self, rays: Path | Rays) -> Counting:
-        o = self.options
-        first = next(blocks_of(rays, self.rules))
+        first = next(blocks_of(rays, self.setting.rules))
         hits = self.around.place is None and first.hit is not None and bool(np.isfinite(first.hit).any())
         if self.around.place is None:
             self.reporter.message(
@@ -209,62 +199,56 @@ class _Work:
                 if hits
                 else "no place is given: things hide each other, and nothing else hides them"
             )
-        in_view = None
-        if o.seen:
-            targets = Targets.of(self.things, o.samples)
-            in_view = CellsInView(targets, self._depth_or_things, o.cell * self.around.scale, self.margin)
-        leaves = [k for k, area in enumerate(self.areas.areas) if not isinstance(area, Group)]
-        cohorts = {} if o.cohorts is None else read_cohorts(o.cohorts)
-        return Counting(
-            self.around,
-            self.things,
-            self.areas.names,
-            self.members,
-            leaves,
-            self.rules,
-            self.margin,
-            o.tolerance,
-            hits,
-            o.view,
-            in_view,
-            self.windows,
-            [] if o.zones is None else read_regions(o.zones),
-            cohorts,
-            tuple(sorted(set(cohorts.values()))) if cohorts else cohort_names(rays, first),
-        )
-
-    def _depth_or_things(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """How far is seen: to the surfaces of the place, or, where none is known, to the nearest thing."""
-        if self.around.place is not None:
-            return self.around.depth(o, d)
-        reach = np.full(len(o), np.inf)
-        for thing in self.things:
-            near, far = thing.interval(o, d)
-            met = (near >= 0) & (np.isfinite(near) if thing.open else near < far)
-            reach = np.where(met, np.minimum(reach, near), reach)
-        return reach
+        return self.setting.counting(hits, cohort_names(rays, first))
 
     def _count(self, counting: Counting) -> tuple[Sums, Eyes]:
         assert self.given.rays is not None
         count = ray_count(self.given.rays)
         picker = EyePicker(max(1, count // self.options.eyes))
         total: Total | None = None
-        done = 0
-        for block in blocks_of(self.given.rays, self.rules):
-            self.stop.check()
-            part = count_block(block, counting)
+
+        def pick(block: Rays) -> None:
+            picker.take(block, counting)
+
+        seen = None if self.around.gaze is None else pick
+        if self.parts is None:
+            arriving = self._counted(self.given.rays, counting, seen, count)
+        else:
+            arriving = self.parts.count(self.given.rays, counting, seen)
+        for part in arriving:
             total = total or Total(part.areas, part.cells)
             total.add(part)
-            if self.around.gaze is not None:
-                picker.take(block, counting)
-            done += len(block)
-            self.reporter.progress(0.8 * done / max(count, done), f"{done:,} of {count:,} rays")
         if total is None:
             raise NergError("there are no rays to count; import some")
         sums = total.sums()
-        self.reporter.message(f"{done:,} rays of {len(sums.persons_of(ALL)[0]):,} people")
+        self.reporter.message(f"{count:,} rays of {len(sums.persons_of(ALL)[0]):,} people")
         nobody = Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
         return sums, picker.eyes() if self.around.gaze is not None else nobody
+
+    def _counted(
+        self, rays: Rays | Path, counting: Counting, seen: Callable[[Rays], None] | None, count: int
+    ) -> Iterator[Sums]:
+        """The sums of each block, in this process."""
+        done = 0
+        with Interruption() as stop:
+            for block in blocks_of(rays, self.setting.rules):
+                stop.check()
+                yield count_block(block, counting)
+                if seen is not None:
+                    seen(block)
+                done += len(block)
+                self.reporter.progress(0.8 * done / count, f"{done:,} of {count:,} rays")
+
+    def _in_parts(self, output: str | Path | None) -> CountingParts:
+        g, o = self.given, self.options
+        if output is None and o.store is None:
+            raise NergError("parts are kept in a folder: name one by --store, or an output beside which it is made")
+        import mitsuba as mi
+
+        name = Path(output or o.store or "")
+        parts = Parts(o, name, self.reporter, o.threads)
+        what = f"nerg stats {name.absolute()}"
+        return CountingParts(parts, what, g.scene, g.field, g.gaze, self.areas, o, str(mi.variant()))
 
     def _standing(self) -> Eyes:
         """Observers who were not tracked."""
@@ -281,16 +265,27 @@ class _Work:
         self.reporter.message(f"nobody was tracked: {len(found[::every])} places on the floor, each somebody's")
         return places_of(found[::every])
 
+    @property
+    def _view(self) -> float:
+        """Degrees that people see. Without rays nobody knows where somebody is turned."""
+        return self.options.view if self.given.rays is not None else 360.0
+
+    def _foretold(self, eyes: Eyes) -> Foretold:
+        """What the field says where people stood."""
+        if self.parts is None:
+            return self.setting.foretold(eyes, self._view, self.reporter)
+        return self.parts.foretell(eyes, self._view)
+
     def _foretell(
         self, around: Surroundings, eyes: Eyes, areas: Areas | None = None, things: Sequence[Thing] | None = None
     ) -> Foretold:
-        o = self.options
-        areas = self.areas if areas is None else areas
-        things = self.things if things is None else things
-        members = list(areas.members().values())
-        # Without rays nobody knows where somebody is turned.
-        view = o.view if self.given.rays is not None else 360.0
-        return foretell(around, eyes, things, members, self.margin, view, o.samples, o.directions, self.reporter)
+        own = replace(
+            self.setting,
+            around=around,
+            areas=self.areas if areas is None else areas,
+            things=self.things if things is None else things,
+        )
+        return own.foretold(eyes, self._view, self.reporter)
 
     def _isovists(self) -> Isovists:
         from nerg_mi.statistics.visibility import isovists
@@ -300,7 +295,7 @@ class _Work:
         box = self.around.bounds()
         self.reporter.message(f"{len(points):,} places on the floor")
         reach = float(np.linalg.norm(box[1] - box[0]))
-        return isovists(points, self.around.depth, Targets.of(self.things, o.samples), self.margin, reach)
+        return isovists(points, self.around.depth, Targets.of(self.things, o.samples), self.setting.margin, reach)
 
     def _what_if(self, eyes: Eyes, before: Foretold | None, times: Mapping[str, float], floor: Floor) -> list[Row]:
         if before is None:

@@ -67,16 +67,24 @@ def signature_of(path: str | os.PathLike) -> Signature | None:
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def read_inputs(paths: Iterable[str | os.PathLike], checksums: Checksums | None = None) -> tuple[InputFile, ...]:
+def read_inputs(
+    paths: Iterable[str | os.PathLike], checksums: Checksums | None = None, below: str = ""
+) -> tuple[InputFile, ...]:
     """The files ``paths`` as inputs, called by their paths below the folder that they have in common, so that they can
-    be laid out alike elsewhere. Raises `NergError` for a file that cannot be read."""
+    be laid out alike elsewhere. ``below``: a folder in which all of them are said to lie, apart from other inputs of
+    the task. Raises `NergError` for a file that cannot be read."""
     checksums = checksums or Checksums()
     whole = list(dict.fromkeys(os.path.abspath(path) for path in paths))
     if not whole:
         return ()
     above = os.path.commonpath([os.path.dirname(path) for path in whole])
     return tuple(
-        InputFile(Path(path).relative_to(above).as_posix(), checksums.of(path), os.path.getsize(path), path)
+        InputFile(
+            PurePosixPath(below, Path(path).relative_to(above).as_posix()).as_posix(),
+            checksums.of(path),
+            os.path.getsize(path),
+            path,
+        )
         for path in whole
     )
 

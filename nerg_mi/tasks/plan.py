@@ -39,7 +39,7 @@ class Plan:
 @dataclass(frozen=True)
 class Remembered:
     """A plan as a store has it: the ``keys`` of its tasks with their suffixes, the SHA-256 of the ``inputs`` by path,
-    where they were, and those of the files that the store holds for it, ``held``."""
+    where they were, and the names of the files that the store holds for it, ``held``."""
 
     what: str
     keys: dict[str, str]
@@ -52,7 +52,7 @@ def remember(store: Store, plan: Plan) -> Path:
     # What other tasks made is in the store itself, and made anew where it has to be.
     inputs = {f.path: f.sha256 for task in plan.tasks for f in task.inputs if store.folder not in Path(f.path).parents}
     own = store.folder / HELD
-    held = sorted({f.sha256 for task in plan.tasks for f in task.inputs if Path(f.path).parent == own})
+    held = sorted({Path(f.path).name for task in plan.tasks for f in task.inputs if Path(f.path).parent == own})
     keys = {task.key: task.suffix for task in plan.tasks}
     path = store.folder / PLANS / f"{hashlib.sha256(plan.what.encode()).hexdigest()[:16]}.json"
     about = {"format": FORMAT, "what": plan.what, "inputs": inputs, "keys": keys, "held": held}

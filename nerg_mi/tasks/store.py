@@ -96,7 +96,7 @@ class Store:
         """What a job has made in memory as an input called ``name``: a file of the store named by its bytes, which is
         the same when the job is started again. Equal contents are one file."""
         sha256 = hashlib.sha256(content).hexdigest()
-        path = self.folder / HELD / sha256
+        path = self.folder / HELD / f"{sha256}{Path(name).suffix}"
         if not path.is_file() or digest_of(path) != (len(content), sha256):
             write_bytes(path, content)
         return InputFile(name, sha256, len(content), str(path))

@@ -113,7 +113,7 @@ CASES = (
     Case("rays plot", "{i}/rays.npz -o {o}/a.png", ("a.png",)),
     Case(
         "stats",
-        "{i}/rays.npz -o {o}/numbers --areas {i}/areas.json --resamples 199 -m llvm_ad_rgb",
+        "{i}/rays.npz -o {o}/numbers --areas {i}/areas.json --resamples 199 -m llvm_ad_rgb --store {i}/store",
         _below("numbers", STATS),
         ("numbers",),
     ),

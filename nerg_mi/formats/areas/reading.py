@@ -11,7 +11,7 @@ from nerg_mi.files.bounded import is_count
 from nerg_mi.formats.regions import MOST, Entry, check_name, parse_box, read_entries
 
 from .kinds import Area, Areas, Group, MeshPart, SceneShape
-from .twin_objects import read_twin_objects
+from .twin_objects import files_of_twin, read_twin_objects
 
 MESHES = (".ply", ".obj")
 """Suffixes of meshes that an area can be a part of."""
@@ -54,6 +54,16 @@ def read_areas(path: str | Path) -> Areas:
         return Areas(tuple(found), tuple(others))
     except NergError as error:
         raise NergError(f'"{path}": {error}') from error
+
+
+def files_of_areas(path: str | Path, areas: Areas) -> list[Path]:
+    """The files that `read_areas` and whoever loads the meshes of its ``areas`` read of ``path``."""
+    path = Path(path)
+    if path.is_dir():
+        return files_of_twin(path)
+    meshes = [area.file for area in areas.areas if isinstance(area, MeshPart)]
+    twins = [file for given in areas.others if "adt" in given for file in files_of_twin(path.parent / given["adt"])]
+    return list(dict.fromkeys([path, *meshes, *twins]))
 
 
 def _other(entry: Entry, path: Path) -> list[Area]:

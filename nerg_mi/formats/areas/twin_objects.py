@@ -34,6 +34,11 @@ _TURN = [f"q_wo_{axis}" for axis in "xyzw"]
 _UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
+def files_of_twin(folder: Path) -> list[Path]:
+    """Those files that `read_twin_objects` reads of a recording's ``folder`` and that are there."""
+    return [folder / name for name in (BOXES, POSES, NAMES) if (folder / name).is_file()]
+
+
 def read_twin_objects(folder: Path, categories: Collection[str] | None = None) -> list[Region]:
     """The objects that stand still, sorted by name; of ``categories`` alone, if any. Equal names are numbered.
 

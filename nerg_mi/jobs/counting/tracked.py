@@ -129,11 +129,13 @@ def count_block(rays: Rays, counting: Counting) -> Sums:
     return partial_sums(rays, landed, counting.names, cells, counting.rules, counting.visible(rays), counting.movable)
 
 
-def blocks_of(source: Rays | str | Path, rules: LookRules, most: int = BLOCK) -> Iterator[Rays]:
+def blocks_of(source: Rays | RayDataset | str | Path, rules: LookRules, most: int = BLOCK) -> Iterator[Rays]:
     """The rays of a file, or of a dataset, in blocks of about ``most`` that hold sittings as a whole; persons sorted by
     name, and each one's rays by time. The same blocks every time. Raises `NergError` for rays that cannot be read."""
-    if not isinstance(source, Rays) and is_dataset(source):
-        data = RayDataset.open(source).one_place()
+    if isinstance(source, (str, Path)) and is_dataset(source):
+        source = RayDataset.open(source)
+    if isinstance(source, RayDataset):
+        data = source.one_place()
         parts = (
             ((source.id, part.day, part.bucket), rays)
             for source, part in data.parts

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import option, parse_numbers
+from .parts import PartOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class StatisticsOptions:
+class StatisticsOptions(PartOptions):
     """What is counted, and how. Positions are in the coordinates of the place, times in seconds."""
 
     areas: Path | None = option(

@@ -9,7 +9,7 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas.kinds import Group, MeshPart, SceneShape
-from nerg_mi.formats.areas.reading import read_areas
+from nerg_mi.formats.areas.reading import files_of_areas, read_areas
 from nerg_mi.formats.regions import Region, read_regions, to_json
 
 BOX = {"name": "shelf", "min": [0, 0, 0], "max": [1, 2, 3]}
@@ -42,6 +42,7 @@ def test01_one_of_every_kind(tmp_path):
     assert areas.areas[1].chosen(12).nonzero()[0].tolist() == [0, 4, 5, 6, 7, 8, 9]
     with pytest.raises(NergError, match="face 9"):
         areas.areas[1].chosen(9)
+    assert files_of_areas(path, areas) == [path, tmp_path / "sign.ply"] and files_of_areas(tmp_path, areas) == []
     # Boxes alone, for those who know nothing else; and what they save again has all of them.
     assert read_regions(path) == [areas.areas[0]] == areas.boxes
     (tmp_path / "b.json").write_text(to_json(areas.boxes, areas.others))

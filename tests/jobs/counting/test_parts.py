@@ -1,0 +1,104 @@
+"""Counts in parts: the tables of one go to the byte, whoever makes the parts, and only what has to be made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nerg_mi.files.checksum import file_sha256
+from nerg_mi.formats.fields import save_gaze
+from nerg_mi.jobs.counting import tracked
+from nerg_mi.jobs.counting.parts import _place_beside
+from nerg_mi.jobs.options.statistics import StatisticsOptions
+from nerg_mi.jobs.statistics import statistics
+from nerg_mi.jobs.store_account import account_for_store
+from tests.conftest import ROOT
+from tests.jobs.recorder import Recorder
+from tests.plugins import fields
+from tests.rays.dataset.making import DAY, recipe, update_dataset, write_dataset, write_source
+
+from .place import people, write_place
+
+FAST = {"resamples": 199, "eyes": 40, "directions": 128, "samples": 6, "names": True, "mode": "llvm_ad_rgb"}
+
+
+@pytest.fixture(autouse=True)
+def engine(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    # Blocks of about a person each.
+    monkeypatch.setattr(tracked.blocks_of, "__defaults__", (100,))
+
+
+@pytest.fixture
+def place(tmp_path, rgb):
+    write_place(tmp_path)
+    people().save(tmp_path / "rays.npz")
+    return tmp_path
+
+
+def count(place, folder, rays="rays.npz", **more):
+    told = Recorder()
+    options = StatisticsOptions(areas=place / "areas.json", **{**FAST, **more})
+    statistics([place / "scene.xml", place / rays], place / folder, options, told)
+    return {p.name: p.read_bytes() for p in (place / folder).iterdir()}, told
+
+
+def made(told):
+    """How many parts of the rays, and of the places, were not kept from before."""
+    found = []
+    for _, text in told.steps:
+        if " parts" in text:
+            done, total = int(text.split()[0]), int(text.split()[2])
+            if not found or found[-1][0] != total:
+                found.append([total, done, done])
+            found[-1][2] = done
+    return [last - first for _, first, last in found]
+
+
+def test_two_processes_give_the_tables_of_one(place):
+    whole, _ = count(place, "one", seen=True, cell=0.5, windows=("early=0,8",))
+    parts, told = count(place, "two", seen=True, cell=0.5, windows=("early=0,8",), scheduler="local:2")
+    assert parts == whole and {"things.csv", "moves.csv", "people.csv", "about.json"} <= set(whole)
+    account = account_for_store(place / "two.tasks", reporter=told)
+    assert [(job.what.partition(" /")[0], job.left) for job in account.jobs] == [("nerg stats", 0)] * 2
+    assert [job.total for job in account.jobs] == [6, 2]
+    assert len(account.jobs[0].changed) == 0
+
+
+def test_what_changes_is_counted_again_and_nothing_else(place):
+    parts = lambda: count(place, "out", store=place / "store")[1]
+    assert made(parts()) == [6, 2] and made(parts()) == [0, 0]
+    # A person's rays turn round; the field is asked where people stood, and nobody moved.
+    rays = people()
+    turned = np.where((rays.person == 3)[:, None], rays.direction * (-1, -1, 1), rays.direction)
+    replace(rays, direction=turned).save(place / "rays.npz")
+    assert made(parts())[0] == 1
+    # An area is another one: all is.
+    (place / "areas.json").write_text((place / "areas.json").read_text().replace("1.5", "1.6"))
+    assert made(parts()) == [6, 2]
+
+
+def test_parts_of_a_dataset_are_read_where_they_lie(place):
+    pytest.importorskip("pyarrow")
+    write_dataset(place, 2)
+    whole, _ = count(place, "one", "shop.rays")
+    parts, told = count(place, "two", "shop.rays", store=place / "store")
+    assert parts == whole and made(told)[0] > 3 and not list((place / "store").glob("held/*"))
+    # Of another source those parts alone are new that are its own.
+    write_source(place / "files" / "2.csv", 2, start=DAY)
+    update_dataset(place / "shop.rays", [place / "files" / "2.csv"], recipe())
+    _, more = count(place, "two", "shop.rays", store=place / "store")
+    assert 0 < made(more)[0] < made(told)[0]
+
+
+def test_a_gaze_field_brings_the_place_that_it_was_trained_in(tmp_path, rgb):
+    field, (room, gaze) = fields.gaze(tmp_path / "g.safetensors"), (tmp_path / n for n in ("r.vol", "a.safetensors"))
+    room.write_bytes(b"voxels")
+    save_gaze(field, gaze, {"geometry_file": {"file": "r.vol", "sha256": file_sha256(room)}})
+    assert _place_beside(gaze, None) == [room]
+    save_gaze(field, gaze, {"geometry": "none"})
+    assert _place_beside(gaze, None) == []
+    save_gaze(field, gaze, {"field_file": {"file": "r.safetensors", "sha256": "0"}})
+    assert _place_beside(gaze, tmp_path / "elsewhere.safetensors") == []
