@@ -1,4 +1,4 @@
-"""`nerg eval`: the command line of `nerg_mi.jobs.radiance`, and of the evaluation of gaze fields."""
+"""`nerg eval`: the command line of `nerg_mi.jobs.radiance`, and of the evaluations of gaze fields."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import typer
 
 from nerg_mi.jobs.options.radiance import RadianceScoreOptions
 
+from .eval_folds import eval_folds
 from .eval_gaze import eval_gaze
 from .mode import OldMode, mode_of
 from .options import takes
@@ -17,6 +18,7 @@ from .progress import TerminalReporter
 
 app = typer.Typer(no_args_is_help=True, help="Score trained fields.")
 app.command("gaze")(eval_gaze)
+app.command("folds")(eval_folds)
 
 
 @app.command("radiance")

@@ -6,9 +6,11 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from nerg_mi.rays.rays import Rays
 from nerg_mi.tasks.inputs import InputFile
 from nerg_mi.tasks.opening import open_scheduler
 from nerg_mi.tasks.plan import Plan
@@ -37,6 +39,13 @@ class Parts:
         content = io.BytesIO()
         np.lib.format.write_array(content, np.ascontiguousarray(values), allow_pickle=False)
         return self.store.hold(name, content.getvalue())
+
+    def hold_rays(self, name: str, rays: Rays) -> InputFile:
+        """``rays`` as an input of tasks (.npz), which call it ``name``."""
+        with TemporaryDirectory(prefix="nerg-rays-") as folder:
+            file = Path(folder) / "rays.npz"
+            rays.save(file)
+            return self.store.hold(name, file.read_bytes())
 
     def run(self, plan: Plan, since: float = 0.0, until: float = 1.0) -> Iterator[Output]:
         """The outputs of ``plan`` in its order; see `run_plan`. Of the whole job this is from the share ``since`` to

@@ -145,6 +145,13 @@ CASES = (
         ("eval", "a.json"),
     ),
     Case(
+        "eval folds",
+        "{i}/rays.npz -o {o}/folds --store {i}/store --geometry none --folds 2 --zones 1 --positions 3 --radius 0.6 "
+        "--probes 8 --steps 2 --directions 128 --min-rays 8 --splits pos --first 1",
+        _below("folds", "folds.md folds.csv folds.json"),
+        ("folds",),
+    ),
+    Case(
         "eval gaze",
         "{i}/gaze.safetensors {i}/rays.npz -o {o}/eval --min-rays 8 --directions 128 --resamples 2 --pictures 1",
         _below("eval", EVALUATION),
@@ -207,6 +214,7 @@ INPUTS = {
     "train radiance": {"dataset"},
     "train gaze": {"rays", "views", "align_views", "field", "scene", "align"},
     "eval radiance": {"field", "dataset"},
+    "eval folds": {"rays", "field", "scene", "align"},
     "eval gaze": {"gaze", "rays", "field", "scene", "geometry"},
     "import": {"file"},
     "refine": {"field"},

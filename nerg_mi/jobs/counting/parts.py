@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -111,10 +110,7 @@ class CountingParts:
             persons=tuple(block.persons[k] for k in used.tolist()),
             metadata={"frame": block.metadata["frame"]},
         )
-        with TemporaryDirectory(prefix="nerg-rays-") as folder:
-            file = Path(folder) / "rays.npz"
-            own.save(file)
-            return self.parts.store.hold(RAYS, file.read_bytes())
+        return self.parts.hold_rays(RAYS, own)
 
     def _files(self) -> tuple[dict[str, str], tuple[InputFile, ...]]:
         """What the files of the setting are called by tasks, and all inputs that it has."""

@@ -1,0 +1,165 @@
+"""Gaze fields over folds: trained and scored again and again, each time without other people and other zones."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from nerg_mi.errors import NergError
+from nerg_mi.evaluation.gaze.evaluation import SCORES, SPLITS
+from nerg_mi.evaluation.gaze.folds import mean_rows
+from nerg_mi.evaluation.gaze.report import markdown
+from nerg_mi.files.atomic import check_folder, write_text
+from nerg_mi.files.bounded import read_json
+from nerg_mi.files.tables import write_csv, write_json
+from nerg_mi.rays.dataset.layout import is_dataset
+from nerg_mi.rays.dataset.opening import load_rays
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.scene_file import files_of_scene
+from nerg_mi.tasks.code import RENDERS, versions
+from nerg_mi.tasks.inputs import InputFile, name_of, read_input, read_inputs
+from nerg_mi.tasks.plan import Plan
+from nerg_mi.tasks.task import FOLDER, Task
+from nerg_mi.threads import use_share
+
+from .evaluation import evaluate_gaze
+from .gaze import train_gaze
+from .gaze_places import place_kind
+from .options.evaluation import GazeEvaluationOptions
+from .options.folds import FoldOptions
+from .options.gaze import GazeOptions
+from .parts import Parts
+from .reporter import SILENT, Reporter
+
+FIELD, SCORED = "gaze.safetensors", "scores.json"
+"""What the output of a fold holds: its field, and the rows of each split."""
+
+_RAYS = "of-the-job/rays.npz"
+_TRAINING = ("recipe", "variant", "radius", "probes", "steps", "mode")
+_SCORING = ("kappa", "directions", "min_rays", "mode")
+
+
+@dataclass(frozen=True)
+class FoldResult:
+    """``rows``: a row a split and method, means over folds (`evaluation.gaze.folds.mean_rows`); ``each``: a row a fold,
+    split and method; ``fields``: the checkpoint of each fold, where the store keeps it; ``files`` written."""
+
+    rows: list[dict[str, Any]]
+    each: list[dict[str, Any]]
+    fields: list[Path]
+    files: list[Path]
+
+
+def evaluate_folds(
+    rays: Rays | str | Path, output: str | Path, options: FoldOptions | None = None, reporter: Reporter = SILENT
+) -> FoldResult:
+    """Train and score a gaze field for each fold on ``rays``, or their file or dataset, and write one table into the
+    folder ``output``: folds.md, folds.csv (fold by fold), folds.json.
+
+    A fold is a part that is kept, in ``OUTPUT.tasks`` or in ``options.store``: it depends on the rays, the place, its
+    seed and its options. Equal ones give equal scores to the bit with one thread, and to rounding with more. Raises
+    `NergError` for what the user can mend.
+    """
+    options, output = options or FoldOptions(), Path(output)
+    splits = _splits(options.splits)
+    place_kind(options)
+    check_folder(output)
+    parts = Parts(options, output, reporter, options.threads)
+    reporter.progress(0.0, "reading")
+    inputs, files = _inputs(rays, options, parts)
+    seeds = range(options.first, options.first + options.folds)
+    common = {
+        "files": files,
+        "splits": splits,
+        "geometry": options.geometry,
+        "training": {name: getattr(options, name) for name in _TRAINING}
+        | {"test_zones": options.zones, "test_positions": options.positions, "test_people": options.people},
+        "scoring": {name: getattr(options, name) for name in _SCORING},
+    }
+    what = f"nerg eval folds {os.path.abspath(output)}"
+    work = f"{__name__}:train_and_score"
+    tasks = [
+        Task(work, {**common, "seed": seed}, inputs, FOLDER, versions(*RENDERS, "scipy"), f"fold {seed}")
+        for seed in seeds
+    ]
+    each, fields, by_split = [], [], {split: [] for split in splits}
+    for seed, made in zip(seeds, parts.run(Plan(what, tasks))):
+        found: Any = read_json(made.path / SCORED, "scores of a fold")
+        fields.append(made.path / FIELD)
+        for split in splits:
+            by_split[split].append(found[split]["rows"])
+            each += [{"fold": seed, "split": split, **row} for row in found[split]["rows"]]
+        score = by_split[splits[0]][-1][0]
+        reporter.message(f"fold {seed}, {splits[0]}: KLD {score['KLD']:.3f}, CC {score['CC']:.3f}")
+    rows = [{"split": split, **row} for split, found in by_split.items() for row in mean_rows(found)]
+    written = _write(output, rows, each, splits, options)
+    for path in written:
+        reporter.message(f"wrote {path}")
+    reporter.message(f"The folds are kept in {parts.store.folder}; nerg jobs says what they take.")
+    return FoldResult(rows, each, fields, written)
+
+
+def train_and_score(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
+    """A fold: a gaze field that was trained without some people and zones (`FIELD`), and its rows in each split
+    (`SCORED`), into the folder ``output``. ``parameters``: ``files`` by what they are called among ``inputs``,
+    ``geometry``, ``seed``, ``splits``, and options of ``training`` and ``scoring``."""
+    files = {kind: inputs[name] for kind, name in parameters["files"].items()}
+    place = {kind: files.get(kind) for kind in ("field", "scene")}
+    use_share()
+    gaze, seed = output / FIELD, parameters["seed"]
+    given = {**place, "geometry": parameters["geometry"], "align": files.get("align"), **parameters["training"]}
+    train_gaze(files["rays"], gaze, GazeOptions(**given, seed=seed))
+    found = {}
+    for split in parameters["splits"]:
+        scoring = GazeEvaluationOptions(**place, **parameters["scoring"], split=split, seed=seed, resamples=0)
+        scored = evaluate_gaze(gaze, files["rays"], None, scoring)
+        found[split] = {"rows": scored.rows, "positions": scored.positions, "people": scored.people}
+    write_json(output / SCORED, found)
+
+
+def _splits(text: str) -> list[str]:
+    found = list(dict.fromkeys(text.split(",")))
+    unknown = [split for split in found if split not in SPLITS]
+    if unknown:
+        raise NergError(f'--splits names some of {", ".join(SPLITS)}, got "{unknown[0]}"')
+    return found
+
+
+def _inputs(
+    rays: Rays | str | Path, options: FoldOptions, parts: Parts
+) -> tuple[tuple[InputFile, ...], dict[str, str]]:
+    """The files that each fold reads, and what tasks call them by their kinds."""
+    if isinstance(rays, Rays) or is_dataset(rays):
+        data = rays if isinstance(rays, Rays) else load_rays(rays, options.most, options.first)
+        found = [parts.hold_rays(_RAYS, data)]
+    else:
+        found = [read_input(f"of-the-job/rays{Path(rays).suffix}", rays)]
+    names = {"rays": found[0].name}
+    for kind, path in (("field", options.field), ("scene", options.scene), ("align", options.align)):
+        if path is not None:
+            more = read_inputs(files_of_scene(path) if kind == "scene" else [path], below=kind)
+            found += more
+            names[kind] = name_of(path, more)
+    return tuple(found), names
+
+
+def _write(
+    folder: Path, rows: list[dict[str, Any]], each: list[dict[str, Any]], splits: list[str], options: FoldOptions
+) -> list[Path]:
+    files = [folder / name for name in ("folds.md", "folds.csv", "folds.json")]
+    text = (
+        f"# {options.folds} folds\n\nEach holds out {100 * options.people:g} % of the people and {options.positions} "
+        f"positions in {options.zones} zones. Means over folds; brackets: 95 % of Student's t for {options.folds} "
+        "folds, which share people who train: the spread over what was held out. The last row of each table is a "
+        "difference fold by fold.\n"
+    )
+    for split in splits:
+        own = [row for row in rows if row["split"] == split]
+        text += f"\n## {split}\n\n{markdown(own, ('method', *SCORES, 'integral', 'folds'))}"
+    write_text(files[0], text)
+    write_csv(files[1], each)
+    write_json(files[2], {"folds": options.folds, "first": options.first, "methods": rows})
+    return files

@@ -1,0 +1,36 @@
+"""Options of the evaluation of gaze fields over folds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from . import option
+from .parts import PartOptions
+from .place import PlaceOptions
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoldOptions(PlaceOptions, PartOptions):
+    """How many folds there are, what each holds out, and how its field is trained and scored. Lengths are metres."""
+
+    folds: int = option(5, "Folds: each holds out other people and other zones.", min=2, max=10_000)
+    first: int = option(0, "Seed of the first fold; the others have those that follow.", min=0)
+    splits: str = option(
+        "both,pos,people", "What is new, with commas between: both (people and positions), pos, people."
+    )
+    zones: int = option(3, "Zones of test positions of a fold.", min=1)
+    positions: int = option(60, "Test positions in them.", min=1)
+    people: float = option(0.5, "Share of the people who are held out of a fold's training.", min=0.01, max=0.99)
+    recipe: str = option("default", "Recipe of the trainings; see docs/gaze-training.md.")
+    variant: str = option("emit_capture", "emit, capture or emit_capture.")
+    align: Path | None = option(None, "JSON file with the 4x4 similarity from the rays' frame to the place's.")
+    radius: float | None = option(None, "Radius R of a probe in metres. Default: the recipe's.")
+    probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.")
+    steps: int | None = option(None, "Steps of a training. Default: the recipe's.")
+    most: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --first.", min=1)
+    kappa: float = option(20.0, "Concentration of the kernel of truth and baselines.")
+    directions: int = option(2048, "Directions that maps are compared in.")
+    min_rays: int = option(64, "Rays at a test position at least.")
+    threads: int | None = option(None, "CPU threads. Default: all; 1 makes a training repeat itself to the bit.")
+    mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
