@@ -6,7 +6,7 @@ import hashlib
 import importlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -53,16 +53,17 @@ class AblationResult:
 
 
 @dataclass(frozen=True)
-class _Bench:
-    """What all variants have in common."""
+class Bench:
+    """What all variants have in common: the rays of training, tests at ``centres`` (T, 3) and so many ``people`` who
+    are held out, the place, and the ``folder`` of checkpoints."""
 
     train: Rays
     tests: dict[str, GazeTest]
+    centres: np.ndarray
+    people: int
     place: GazePlace
     folder: Path
     ns: ModuleType
-    # Seconds a frame of a checkpoint; None: frames are not timed.
-    frame_seconds: Callable[[Path], float] | None
     options: AblationOptions
 
 
@@ -72,7 +73,9 @@ def ablate(
     """Train and score every variant of the recipes in one place, on ``rays`` of attention or their file.
 
     Checkpoints go to the folder ``output``, each with its row: what an earlier run with the same rays, place, tests and
-    settings has left there is not trained again. Raises `NergError` for what the user can mend.
+    settings has left there is not trained again. With ``options.store`` or ``options.scheduler`` a training is a part,
+    which is kept with its row and may be run by others; frames are timed here all the same. Raises `NergError` for what
+    the user can mend.
     """
     options, output = options or AblationOptions(), Path(output)
     place_kind(options)
@@ -80,33 +83,29 @@ def ablate(
     recipes = options.recipes.split(",")
     known = ablation.all_variants(options.field is not None, recipes)
     variants = _chosen(known, options.variant)
-    truth = _law(options.law) if options.law else None
+    if options.law:
+        _law(options.law)
     check_folder(output)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "preparing")
     data = rays if isinstance(rays, Rays) else load_rays(rays)
-    _, account = hold_out(data, options.radius, options.zones, options.positions, 0, options.min_rays, options.people)
-    train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")
-    place = make_place(options, train, (), output / "place.vol", ns, reporter=reporter)
-    # Bad places are part of what may be compared: it is told, and no more.
-    check_place(place, train, f"--{place.kind} FILE", True, reporter)
-    render = None
+    bench = bench_of(data, options, output, ns, reporter)
+    timer = None
     if options.cameras:
         folder = output if options.field is None else Path(options.field).parent
-        render = frame_timer(place, np.asarray(centres), folder, options.cameras, width, height)
-    tests = ablation.make_tests(scored, train, centres, options.radius, options.kappa, options.min_rays, truth)
-    bench = _Bench(train, tests, place, output, ns, render, options)
+        timer = frame_timer(bench.place, bench.centres, folder, options.cameras, width, height)
     due = [(v, seed) for v in variants for seed in range(options.seeds if gaze_recipe(v.recipe).quick else 1)]
     rows = []
-    for k, (variant, seed) in enumerate(due):
-        reporter.progress(k / len(due), f"{variant.recipe} {variant.name}, seed {seed}")
-        rows.append(_row(variant, seed, bench))
+    for (variant, seed), row in zip(due, _rows(due, bench, data, reporter)):
+        if timer is not None:
+            row["frame_seconds"] = timer(output / variant.file_name(seed))
+        rows.append(row)
         reporter.message(
-            f"{variant.recipe:8s} {variant.name:28s} seed {seed}: test KLD {rows[-1]['test_KLD']:.3f}, "
-            f"CC {rows[-1]['test_CC']:.3f}; {rows[-1]['train_seconds']:.0f} s"
+            f"{variant.recipe:8s} {variant.name:28s} seed {seed}: test KLD {row['test_KLD']:.3f}, "
+            f"CC {row['test_CC']:.3f}; {row['train_seconds']:.0f} s"
         )
     ablation.relate(rows)
-    notes = _notes(len(centres), len(account["people"]), (len(train), len(data)), options, render is not None)
+    notes = _notes(len(bench.centres), bench.people, (len(bench.train), len(data)), options, timer is not None)
     made = provenance("nerg ablate", files_among(rays, options.field, options.scene), None, options)
     files = ablation.write_ablation(output, rows, notes, made)
     for path in files:
@@ -114,11 +113,63 @@ def ablate(
     return AblationResult(rows, files)
 
 
-def _row(variant: Variant, seed: int, bench: _Bench) -> dict:
+def bench_of(data: Rays, options: AblationOptions, folder: Path, ns: ModuleType, reporter: Reporter) -> Bench:
+    """What all variants have in common that are trained on some of the rays ``data`` and scored on the others; a place
+    of hit points is written into ``folder``."""
+    truth = _law(options.law) if options.law else None
+    _, account = hold_out(data, options.radius, options.zones, options.positions, 0, options.min_rays, options.people)
+    train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")
+    place = make_place(options, train, (), folder / "place.vol", ns, reporter=reporter)
+    # Bad places are part of what may be compared: it is told, and no more.
+    check_place(place, train, f"--{place.kind} FILE", True, reporter)
+    tests = ablation.make_tests(scored, train, centres, options.radius, options.kappa, options.min_rays, truth)
+    return Bench(train, tests, np.asarray(centres), len(account["people"]), place, folder, ns, options)
+
+
+def train_variant(variant: Variant, seed: int, path: Path, bench: Bench) -> dict:
+    """Scores and times of one training, whose checkpoint is written to ``path``."""
+    made = {"recipe": variant.recipe, "variant": variant.name, "seed": seed}
+    return _train(made, _plan(variant, seed, bench), path, bench)
+
+
+def _rows(due: list[tuple[Variant, int]], bench: Bench, data: Rays, reporter: Reporter) -> Iterator[dict]:
+    """The row of each training that is ``due``."""
+    if bench.options.in_parts:
+        # Which needs what is here.
+        from .ablation_tasks import rows_in_parts
+
+        for (variant, seed), row in zip(due, rows_in_parts(due, bench, data, reporter)):
+            _keep(row, variant, seed, bench)
+            yield row
+        return
+    for k, (variant, seed) in enumerate(due):
+        reporter.progress(k / len(due), f"{variant.recipe} {variant.name}, seed {seed}")
+        yield _row(variant, seed, bench)
+
+
+def _row(variant: Variant, seed: int, bench: Bench) -> dict:
     """Scores and times of one training, which an earlier run may have left."""
-    plan = _plan(variant, seed, bench)
     path = bench.folder / variant.file_name(seed)
-    identity = {
+    kept = path.with_suffix(".json")
+    found = read_json(kept, "kept row") if path.exists() and kept.exists() else None
+    same = json.loads(json.dumps(_identity(variant, seed, bench)))
+    if isinstance(found, dict) and "row" in found and found.get("same") == same:
+        return found["row"]
+    row = train_variant(variant, seed, path, bench)
+    _keep(row, variant, seed, bench)
+    return row
+
+
+def _keep(row: dict, variant: Variant, seed: int, bench: Bench) -> None:
+    """Write ``row`` beside its checkpoint."""
+    path = (bench.folder / variant.file_name(seed)).with_suffix(".json")
+    write_json(path, {"row": row, "same": _identity(variant, seed, bench)})
+
+
+def _identity(variant: Variant, seed: int, bench: Bench) -> dict:
+    """All that a row depends on, as JSON has it."""
+    plan = _plan(variant, seed, bench)
+    return {
         "architecture": plan.config.to_dict(),
         "settings": plan.settings.to_dict(),
         "probes": plan.probes.to_dict(),
@@ -127,19 +178,9 @@ def _row(variant: Variant, seed: int, bench: _Bench) -> dict:
         "begin": variant.begin,
         **bench.place.about,
     }
-    kept = path.with_suffix(".json")
-    found = read_json(kept, "kept row") if path.exists() and kept.exists() else None
-    if isinstance(found, dict) and "row" in found and found.get("same") == json.loads(json.dumps(identity)):
-        row = found["row"]
-    else:
-        row = _train({"recipe": variant.recipe, "variant": variant.name, "seed": seed}, plan, path, bench)
-        write_json(kept, {"row": row, "same": identity})
-    if bench.frame_seconds is not None:
-        row["frame_seconds"] = bench.frame_seconds(path)
-    return row
 
 
-def _plan(variant: Variant, seed: int, bench: _Bench) -> GazePlan:
+def _plan(variant: Variant, seed: int, bench: Bench) -> GazePlan:
     options, quick = bench.options, gaze_recipe(variant.recipe).quick
     plan = plan_gaze(
         GazeOptions(
@@ -161,7 +202,7 @@ def _plan(variant: Variant, seed: int, bench: _Bench) -> GazePlan:
     return plan.with_settings(watched_rays=min(watched, options.min_rays))
 
 
-def _train(made: dict, plan: GazePlan, path: Path, bench: _Bench) -> dict:
+def _train(made: dict, plan: GazePlan, path: Path, bench: Bench) -> dict:
     """Train, write the checkpoint (``made``: what it is), and score. Raises ``KeyboardInterrupt`` after Ctrl-C."""
     started = time.perf_counter()
     result = train_planned(Supervision(bench.train), bench.place, plan, bench.ns)

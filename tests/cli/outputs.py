@@ -176,7 +176,7 @@ CASES = (
     Case(
         "ablate",
         "{i}/rays.npz -o {o}/rows --geometry hits --recipes default --variant emit_capture --seeds 1 --default-steps 2 "
-        "--zones 1 --positions 4 --min-rays 8 --radius 0.5 --cameras 0 --probes 8",
+        "--zones 1 --positions 4 --min-rays 8 --radius 0.5 --cameras 0 --probes 8 --store {i}/store",
         _below("rows", ABLATION),
         ("rows",),
     ),

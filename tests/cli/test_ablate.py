@@ -29,6 +29,8 @@ ASKED = {
     "law": "a:B",
     "cameras": 1,
     "size": "16x9",
+    "store": "kept",
+    "scheduler": "local:2",
     "threads": 2,
     "mode": "llvm_ad_mono",
 }
@@ -42,7 +44,7 @@ def test_the_job_is_given_what_was_asked_for(monkeypatch):
         with pytest.raises(SystemExit) as end:
             main(["ablate", "rays.npz", "-o", "out", *more])
         assert not end.value.code
-    asked = {k: Path(v) if k in ("field", "scene") else v for k, v in ASKED.items()}
+    asked = {k: Path(v) if k in ("field", "scene", "store") else v for k, v in ASKED.items()}
     options = AblationOptions(**asked, variant=("emit", "begins as the field"), refit=False)
     files = Path("rays.npz"), Path("out")
     assert given == [(*files, options), (*files, AblationOptions())]

@@ -103,7 +103,7 @@ def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
 
     fields.radiance(tmp_path / "field.safetensors")
     place = place_of_field(tmp_path / "field.safetensors", ns)
-    bench = job._Bench(None, {}, place, tmp_path, ns, None, replace(OPTIONS, geometry=None))
+    bench = job.Bench(None, {}, None, 0, place, tmp_path, ns, replace(OPTIONS, geometry=None))
     for variant in ablation.all_variants(True, ["small"]):
         plan = job._plan(variant, 0, bench)
         c = plan.config

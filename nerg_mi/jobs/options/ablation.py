@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from . import option
+from .parts import PartOptions
 from .place import PlaceOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class AblationOptions(PlaceOptions):
+class AblationOptions(PlaceOptions, PartOptions):
     """Which variants are trained, on what they are scored, and how a frame is timed. Lengths are metres."""
 
     recipes: str = option("default,paper", "Recipes to ablate, separated by commas.")
