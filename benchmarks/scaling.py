@@ -1,0 +1,131 @@
+"""Bakes and counts on one worker and on two: throughput, what a part costs, and the model that follows.
+
+    python benchmarks/scaling.py [--observers 48] [--rays 1500000] [--out out/benchmarks/scaling]
+
+A room of 8 x 6 x 3 m with the gaze field of the demo store. Bakes of a path of observers on a coarse and on a fine
+mesh, and counts of synthetic rays, by dask with one worker and with two of one thread each, after a warm run. Every
+result is compared with that of one go. What a part computed is said by its receipt; what it costs besides is the rest
+of the time that was waited.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import tempfile
+import time
+from importlib.resources import files
+from pathlib import Path
+
+from output import write_rows
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+DETAILS = (0.4, 0.15)
+
+
+def room(folder: Path, observers: int, count: int) -> None:
+    """The room as a mesh and a scene, a path in it, and rays of 40 people who look about."""
+    from nerg_mi.formats.ply import write_columns
+    from nerg_mi.rays.rays import Rays
+
+    from tests.jobs.counting.place import write_place
+    from tests.surfaces.meshes import box
+
+    vertices, faces = box((0, 0, 0), (8, 6, 3))
+    write_columns(folder / "room.ply", dict(zip("xyz", vertices.T)), faces)
+    rng = np.random.default_rng(0)
+    at = rng.uniform((2, 2, 1.4), (6, 4, 1.8), (observers, 3))
+    np.savetxt(folder / "path.csv", at, delimiter=",", header="x,y,z", comments="")
+    write_place(folder, gaze=False)
+    person = np.repeat(np.arange(40), count // 40)
+    d = rng.normal((1, 0, 0), 0.4, (len(person), 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    origin = np.column_stack([rng.uniform((0.3, 0.3), (2.2, 3.7), (len(person), 2)), np.full(len(person), 1.6)])
+    t = np.tile(0.02 * np.arange(count // 40), 40)
+    names = tuple(f"person {k:02d}" for k in range(40))
+    Rays(t, person, names, origin, d, np.ones(len(person))).save(folder / "rays.npz")
+
+
+def bake(folder: Path, name: str, detail: float, **more) -> tuple[int, bytes]:
+    """Observers and the bytes of what is made of them."""
+    from nerg_mi.jobs.bake import bake
+    from nerg_mi.jobs.options.bake import BakeOptions
+    from nerg_mi.scenes import store
+
+    out = folder / f"{name}.ply"
+    gaze = files(store) / "shoppers.safetensors"
+    given = {"gaze": gaze, "path": folder / "path.csv", "detail": detail, "angle": 2.0, "mode": "llvm_ad_rgb"}
+    found = bake(folder / "room.ply", [out], BakeOptions(**given, **more))
+    return len(found.mesh.faces), out.read_bytes()
+
+
+def count(folder: Path, name: str, **more) -> tuple[int, bytes]:
+    """Rays and the bytes of the table."""
+    from nerg_mi.jobs.options.statistics import StatisticsOptions
+    from nerg_mi.jobs.statistics import statistics as stats
+
+    options = StatisticsOptions(areas=folder / "areas.json", resamples=199, names=True, mode="llvm_ad_rgb", **more)
+    stats([folder / "scene.xml", folder / "rays.npz"], folder / name, options)
+    return 0, (folder / name / "things.csv").read_bytes()
+
+
+def main() -> None:
+    from nerg_mi.tasks.store import Store
+
+    from tests.tasks.clusters import ClusterOfProcesses
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--observers", type=int, default=48)
+    parser.add_argument("--rays", type=int, default=1_500_000)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/scaling"))
+    args = parser.parse_args()
+    os.environ["PYTHONPATH"] = str(ROOT)
+    rows: list[dict] = []
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        room(folder, args.observers, args.rays)
+        works = {
+            f"bake, detail {d:g}": (args.observers, lambda name, d=d, **m: bake(folder, name, d, **m)) for d in DETAILS
+        }
+        works["stats"] = (args.rays, lambda name, **more: count(folder, name, **more))
+        whole = {what: work(f"whole {what}", threads=1) for what, (_, work) in works.items()}
+        with ClusterOfProcesses(folder) as cluster:
+            for workers in (1, 2):
+                cluster.start_worker()
+                for what, (units, work) in works.items():
+                    given = {"scheduler": cluster.address, "threads": 1}
+                    work(f"warm {what}", **given, store=folder / f"warm {what} {workers}")
+                    store = folder / f"{what} {workers}"
+                    start = time.perf_counter()
+                    faces, made = work(f"{what} {workers}", **given, store=store)
+                    seconds = time.perf_counter() - start
+                    receipts = list(Store(store).receipts())
+                    each = [r.seconds for r in receipts]
+                    size = sum(r.size for r in receipts) / len(receipts)
+                    row = {
+                        "what": what,
+                        "workers": workers,
+                        "units": units,
+                        "faces": faces,
+                        "parts": len(each),
+                        "seconds": round(seconds, 2),
+                        "units_a_second": round(units / seconds, 2),
+                        "computed_a_part": round(statistics.median(each), 3),
+                        "besides_a_part": round((workers * seconds - sum(each)) / len(each), 3),
+                        "bytes_a_part": round(size),
+                        "equal": made == whole[what][1],
+                    }
+                    rows.append(row)
+                    print(json.dumps(row), flush=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_rows(args.out / "scaling.csv", rows)
+
+
+if __name__ == "__main__":
+    main()
