@@ -1,7 +1,6 @@
-"""Numbers of attention on things against what is true: errors, coverage of intervals, time.
+"""Numbers of attention on things against what is true: errors (coverage of intervals: object_coverage.py).
 
     python benchmarks/object_statistics.py errors      # the store's law and brute-force ray casts
-    python benchmarks/object_statistics.py coverage    # 200 data sets of shoppers: how often intervals hold the truth
     python benchmarks/object_statistics.py time        # rays against seconds and memory
 
 The shoppers' walks are those of the demo store (`nerg_mi.scenes.store.shoppers`), each tracked once in 0.8 s; where
@@ -95,48 +94,6 @@ class Walks:
         names = tuple(f"{k:04d}" for k in range(len(who)))
         ones = np.ones(len(rows))
         return Rays(self.time[rows], person, names, self.origin[rows], self.draw(rows, rng), ones)
-
-
-def coverage(sets: int, people: tuple[int, ...]) -> None:
-    from nerg_mi.jobs.counting.tracked import count_block
-    from nerg_mi.statistics.measures import MEASURES, People
-    from nerg_mi.statistics.sums import ALL
-
-    around, areas, things = made_store()
-    counting = counting_of(around, areas, things)
-    walks = Walks(POOL)
-    rng = np.random.default_rng(3)
-    x = {m.name: 0.0 for m in MEASURES}
-    y = {m.name: 0.0 for m in MEASURES}
-    for _ in range(TRUTHS):
-        found = People.of(count_block(walks.rays(np.arange(POOL), rng), counting), ALL, True)
-        for m in MEASURES:
-            a, b = m.pair(found)
-            x[m.name], y[m.name] = x[m.name] + a.sum(axis=0), y[m.name] + b.sum(axis=0)
-    truth = {name: x[name] / y[name] for name in x}
-    print(f"{len(areas.names)} things, {sets} data sets; truth of {TRUTHS} x {POOL} walks\n")
-    print(
-        "| people | measure | held | least of a thing | width | without |\n| ---: | --- | ---: | ---: | ---: | ---: |"
-    )
-    for n in people:
-        held = {m.name: [] for m in MEASURES}
-        for _ in range(sets):
-            who = rng.integers(0, POOL, n)
-            found = People.of(count_block(walks.rays(who, rng), counting), ALL, True)
-            for m in MEASURES:
-                e = m.estimate(found, 499, int(rng.integers(1 << 30)))
-                inside = (e.low <= truth[m.name] + 1e-12) & (truth[m.name] <= e.high + 1e-12)
-                held[m.name].append(np.stack([inside, np.isnan(e.low), (e.high - e.low) / truth[m.name]]))
-        for m in MEASURES:
-            inside, without, width = np.moveaxis(np.array(held[m.name], float), 1, 0)
-            known = without == 0
-            each = np.where(known, inside, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-            worst = each[known.sum(axis=0) > 50].min()
-            print(
-                f"| {n} | {m.name} | {100 * inside[known].mean():.1f} % | {100 * worst:.1f} % | "
-                f"{100 * np.nanmedian(width[known]):.0f} % | {100 * without.mean():.1f} % |",
-                flush=True,
-            )
 
 
 def errors() -> None:
@@ -290,7 +247,7 @@ def timing(counts: tuple[int, ...]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("errors", "coverage", "time"))
+    parser.add_argument("what", choices=("errors", "time"))
     parser.add_argument("--sets", type=int, default=200, help="data sets of the coverage (200)")
     parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 30], help="people of each (8 16 30)")
     parser.add_argument("--rays", type=int, nargs="+", default=[100_000, 1_000_000, 10_000_000])

@@ -16,7 +16,7 @@ from nerg_mi.formats.areas.reading import read_areas
 from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
-from nerg_mi.statistics.intervals import LEAST_PEOPLE
+from nerg_mi.statistics.estimates import LEAST_PEOPLE
 from nerg_mi.statistics.landing import Thing
 from nerg_mi.statistics.measures import People
 from nerg_mi.statistics.sums import ALL, Cell, Sums, Total

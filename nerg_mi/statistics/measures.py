@@ -7,7 +7,9 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from .intervals import Estimates, proportions, ratios
+from .estimates import Estimates
+from .intervals import ratios
+from .proportions import proportions
 from .sums import Cell, Sums
 
 

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from .intervals import adjusted, proportion_differences, ratio_differences
+from .estimates import adjusted
+from .intervals import ratio_differences
 from .measures import MEASURES, Measure, People
+from .proportions import proportion_differences
 from .sums import BINS, Cell, Sums
 
 TRACKED, FIELD = "tracked", "field"

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.formats.areas.kinds import Areas
-from nerg_mi.statistics.intervals import adjusted, ratio_differences
+from nerg_mi.statistics.estimates import adjusted
+from nerg_mi.statistics.intervals import ratio_differences
 from nerg_mi.statistics.landing import Thing
 from nerg_mi.statistics.tables import FIELD, Floor, Row
 

@@ -1,0 +1,312 @@
+"""How often 95 % intervals of attention on things hold the truth, and how often equal groups are found to differ.
+
+    python benchmarks/object_coverage.py shares        # intervals of shares of people, exactly
+    python benchmarks/object_coverage.py ratios        # ways to make intervals of ratios of sums over people
+    python benchmarks/object_coverage.py numbers       # each number of `nerg stats` as it is
+    python benchmarks/object_coverage.py differences   # differences of two groups of the same people
+
+The population are the sums of 8,000 visits of the demo store's shoppers: 200 walks, each looked along 40 times anew by
+the store's law. Its numbers are the truth, and known exactly; a data set is so many visits, drawn with replacement.
+Things are the store's 30 goods, which nearly all look at, and 15 labels of 12 cm on them, which few do.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import defaultdict
+from pathlib import Path
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.statistics.estimates import adjusted
+from nerg_mi.statistics.measures import BY_NAME, MEASURES
+from nerg_mi.statistics.tables import COMPARED
+
+import numpy as np
+from object_statistics import Walks, counting_of, made_store
+from scipy import stats
+
+WALKS, VISITS = 200, 40
+RESAMPLES = 599
+DRAWN = 50
+"""Fewer data sets than so many with an interval say nothing of a thing."""
+
+
+class Population:
+    """Numerators and denominators (N, K) of each measure, its ``truth`` (K,), and which things are ``common``: looked
+    at by half of the people or more."""
+
+    def __init__(self, file: Path | None) -> None:
+        if file is not None and file.is_file():
+            with np.load(file) as kept:
+                found = {
+                    m.name: (kept[f"x_{m.name}"].astype(float), kept[f"y_{m.name}"].astype(float)) for m in MEASURES
+                }
+        else:
+            found = _visits()
+            if file is not None:
+                np.savez(file, **{f"{w}_{k}": v for k, pair in found.items() for w, v in zip("xy", pair)})
+        self.pairs = found
+        self.truth = {k: x.sum(axis=0) / y.sum(axis=0) for k, (x, y) in found.items()}
+        self.common = self.truth["reach"] >= 0.5
+        self.count = len(found["reach"][0])
+
+    def draw(self, measure: str, who: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x, y = self.pairs[measure]
+        return x[who], y[who]
+
+
+def _visits() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    from nerg_mi.formats.areas.kinds import Areas
+    from nerg_mi.formats.regions import Region
+    from nerg_mi.jobs.counting.things import things_of
+    from nerg_mi.jobs.counting.tracked import count_block
+    from nerg_mi.statistics.measures import People
+    from nerg_mi.statistics.sums import ALL
+
+    around, goods, _ = made_store()
+    labels = []
+    for box in goods.boxes[::2]:
+        middle, size = box.middle, np.subtract(box.upper, box.lower)
+        half = np.where(size == size.min(), size / 2, np.minimum(size / 2, 0.06))
+        labels.append(Region.of(f"label of {box.name}", middle - half, middle + half))
+    areas = Areas((*goods.areas, *labels))
+    counting = counting_of(around, areas, things_of(areas.things, {}))
+    walks, rng = Walks(WALKS), np.random.default_rng(3)
+    found: dict[str, list] = defaultdict(list)
+    for _ in range(VISITS):
+        people = People.of(count_block(walks.rays(np.arange(WALKS), rng), counting), ALL, True)
+        for m in MEASURES:
+            found[m.name].append(m.pair(people))
+    made = {k: [np.concatenate(w).astype(float) for w in zip(*v)] for k, v in found.items()}
+    return {k: (x, y) for k, (x, y) in made.items()}
+
+
+def shares(people: tuple[int, ...]) -> None:
+    """Coverage for all probabilities, from the binomial distribution."""
+    p = np.linspace(0.001, 0.999, 1997)
+    print("| interval of a share of people | people | held | least | below 90 % | mean width |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: |")
+    for name, interval in _share_intervals().items():
+        for n in people:
+            k = np.arange(n + 1)
+            low, high = interval(k, np.full(n + 1, n))
+            weight = stats.binom.pmf(k[:, None], n, p)
+            held = (weight * ((low[:, None] <= p) & (p <= high[:, None]))).sum(axis=0)
+            width = (weight * (high - low)[:, None]).sum(axis=0).mean()
+            print(
+                f"| {name} | {n} | {100 * held.mean():.1f} % | {100 * held.min():.1f} % | "
+                f"{100 * (held < 0.9).mean():.1f} % | {width:.3f} |"
+            )
+
+
+def _share_intervals() -> dict:
+    from nerg_mi.statistics.proportions import mid_p
+
+    z = stats.norm.ppf(0.975)
+    cut = lambda low, high: (np.maximum(low, 0), np.minimum(high, 1))
+
+    def wald(x, n):
+        half = z * np.sqrt(x / n * (1 - x / n) / n)
+        return cut(x / n - half, x / n + half)
+
+    def wilson(x, n):
+        middle = (x + z**2 / 2) / (n + z**2)
+        half = z * np.sqrt(x * (n - x) / n + z**2 / 4) / (n + z**2)
+        return cut(middle - half, middle + half)
+
+    def agresti_coull(x, n):
+        middle = (x + z**2 / 2) / (n + z**2)
+        half = z * np.sqrt(middle * (1 - middle) / (n + z**2))
+        return cut(middle - half, middle + half)
+
+    def beta(extra):
+        def ends(x, n):
+            low = stats.beta.ppf(0.025, x + extra, n - x + 1 - extra)
+            high = stats.beta.ppf(0.975, x + 1 - extra, n - x + extra)
+            return np.where(x == 0, 0, low), np.where(x == n, 1, high)
+
+        return ends
+
+    return {
+        "Wald": wald,
+        "Wilson (1927)": wilson,
+        "Agresti and Coull (1998)": agresti_coull,
+        "Jeffreys": beta(0.5),
+        "Clopper and Pearson (1934)": beta(0.0),
+        "mid-p (kept)": mid_p,
+    }
+
+
+def ratio_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
+    """Ends of the intervals (K,) of Σ x / Σ y in several ways."""
+    from nerg_mi.statistics.intervals import ratios
+
+    n, count = (y > 0).sum(axis=0), len(x)
+    m = x.sum(axis=0) / y.sum(axis=0)
+    wider = n / (n - 1)
+    s = np.sqrt(((x - m * y) ** 2).sum(axis=0) * wider) / y.sum(axis=0)
+    without = (x.sum(axis=0) - x) / (y.sum(axis=0) - y)
+    jack = np.sqrt((((without - m) ** 2) * (y > 0)).sum(axis=0) / wider)
+    c = stats.t.ppf(0.975, n - 1)
+    logit, expit = (lambda v: np.log(v / (1 - v))), (lambda v: 1 / (1 + np.exp(-v)))
+    half = c * jack / (m * (1 - m))
+    out = {
+        "linearised, Student's t": (m - c * s, m + c * s),
+        "jackknife, Student's t": (m - c * jack, m + c * jack),
+        "jackknife, logit, Student's t": (expit(logit(m) - half), expit(logit(m) + half)),
+    }
+    w = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=RESAMPLES).astype(float)
+    sx, sy = w @ x, w @ y
+    star = sx / sy
+    spread = np.maximum((w @ x**2 - 2 * star * (w @ (x * y)) + star**2 * (w @ y**2)) / sy**2, 0) * wider
+    t = (star - m) / np.sqrt(0.99 * spread + 0.01 * s**2)
+    low, high = np.nanquantile(t, (0.025, 0.975), axis=0)
+    out["bootstrap, percentiles"] = tuple(np.nanquantile(star, (0.025, 0.975), axis=0))
+    out["BCa bootstrap"] = _bca(star, m, without)
+    out["bootstrap-t, two tails"] = (m - high * s, m - low * s)
+    kept = ratios(x, y, resamples=RESAMPLES, seed=seed)
+    out["symmetric bootstrap-t, jackknife (kept)"] = (kept.low, kept.high)
+    return out
+
+
+def _bca(star: np.ndarray, m: np.ndarray, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Efron (1987)."""
+    order = np.sort(star, axis=0)
+    bias = stats.norm.ppf(np.clip((star < m).mean(axis=0) + 0.5 * (star == m).mean(axis=0), 1e-3, 1 - 1e-3))
+    pull = without.mean(axis=0) - without
+    bend = (pull**3).sum(axis=0) / (6 * (pull**2).sum(axis=0) ** 1.5)
+    ends = []
+    for z in stats.norm.ppf((0.025, 0.975)):
+        at = stats.norm.cdf(bias + (bias + z) / (1 - bend * (bias + z)))
+        row = np.clip((np.nan_to_num(at, nan=0.5) * len(star)).astype(int), 0, len(star) - 1)
+        ends.append(order[row, np.arange(order.shape[1])])
+    return ends[0], ends[1]
+
+
+class Held:
+    """How often intervals held the ``truth`` (K,), thing by thing."""
+
+    def __init__(self, truth: np.ndarray, common: np.ndarray, most: float):
+        self.truth, self.common, self.most = truth, common, most
+        self.rows: list[np.ndarray] = []
+
+    def add(self, low: np.ndarray, high: np.ndarray, known: np.ndarray) -> None:
+        low, high = np.clip(low, 0, self.most), np.clip(high, 0, self.most)
+        inside = known & (low <= self.truth + 1e-12) & (self.truth <= high + 1e-12)
+        self.rows.append(np.stack([inside, known, np.where(known, (high - low) / self.truth, np.nan)]))
+
+    def cells(self, common: bool) -> str:
+        """Mean, least, median width and how many are without, of things that are common or rare."""
+        inside, known, width = (v[:, self.common == common] for v in np.moveaxis(np.array(self.rows, float), 1, 0))
+        some = known.sum(axis=0) >= DRAWN
+        if not some.any():
+            return "| | | | 100 % "
+        each = inside.sum(axis=0)[some] / known.sum(axis=0)[some]
+        middle = np.nanmedian(np.nanmedian(width[:, some], axis=0))
+        return (
+            f"| {100 * each.mean():.1f} % | {100 * each.min():.1f} % | {100 * middle:.0f} % | "
+            f"{100 * (1 - known.mean()):.0f} % "
+        )
+
+
+HEAD = (
+    "| people | held | least of a thing | width | without | held, rare | least | width | without |\n"
+    "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"
+)
+
+
+def compare(population: Population, sets: int, people: tuple[int, ...], names: tuple[str, ...]) -> None:
+    for name in names:
+        print(f"\n{BY_NAME[name].title}\n\n| interval {HEAD}")
+        for n in people:
+            rng, found = np.random.default_rng(n), {}
+            for _ in range(sets):
+                x, y = population.draw(name, rng.integers(0, population.count, n))
+                with np.errstate(all="ignore"):
+                    made = ratio_intervals(x, y, int(rng.integers(1 << 30)))
+                known = np.isfinite(made["symmetric bootstrap-t, jackknife (kept)"][0])
+                for way, (low, high) in made.items():
+                    held = Held(population.truth[name], population.common, BY_NAME[name].most)
+                    found.setdefault(way, held).add(low, high, known)
+            for way, held in found.items():
+                print(f"| {way} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
+
+
+def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
+    from nerg_mi.statistics.intervals import ratios
+    from nerg_mi.statistics.proportions import proportions
+
+    print(f"\n| number {HEAD}")
+    for n in people:
+        rng = np.random.default_rng(n)
+        found = {m.name: Held(population.truth[m.name], population.common, m.most) for m in MEASURES}
+        for _ in range(sets):
+            who, seed = rng.integers(0, population.count, n), int(rng.integers(1 << 30))
+            for m in MEASURES:
+                x, y = population.draw(m.name, who)
+                e = proportions(x, y) if m.counts else ratios(x, y, resamples=RESAMPLES, seed=seed, most=m.most)
+                found[m.name].add(e.low, e.high, np.isfinite(e.low))
+        for name, held in found.items():
+            print(f"| {name} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
+
+
+def differences(population: Population, sets: int, pairs: tuple[tuple[int, int], ...]) -> None:
+    """How often two groups of one population are found to differ, p <= 0.05, and how often after the adjustment."""
+    from nerg_mi.statistics.intervals import ratio_differences
+    from nerg_mi.statistics.proportions import proportion_differences
+
+    print("\n| people | number | p <= 0.05 | most of a thing | rare | most | a set has a false discovery |")
+    print("| --- | --- | ---: | ---: | ---: | ---: | ---: |")
+    for m, n in pairs:
+        rng, found, wrong = np.random.default_rng([m, n]), defaultdict(list), []
+        first = (np.arange(m + n) < m).astype(float)[:, None]
+        for _ in range(sets):
+            who, seed = rng.integers(0, population.count, m + n), int(rng.integers(1 << 30))
+            every = []
+            for name in COMPARED:
+                x, y = population.draw(name, who)
+                a, b = (x * first, y * first), (x * (1 - first), y * (1 - first))
+                if BY_NAME[name].counts:
+                    d = proportion_differences(a, b)
+                else:
+                    d = ratio_differences(a, b, resamples=RESAMPLES, seed=seed)
+                found[name].append(d.p)
+                every.append(d.p)
+            wrong.append(bool((adjusted(np.concatenate(every)) <= 0.05).any()))
+        for name, p in found.items():
+            rate = (np.array(p) <= 0.05).mean(axis=0)
+            cells = [f"{100 * f(rate[population.common == c]):.1f} %" for c in (True, False) for f in (np.mean, np.max)]
+            print(f"| {m} and {n} | {name} | {' | '.join(cells)} | {100 * np.mean(wrong):.1f} % |", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("shares", "ratios", "numbers", "differences"))
+    parser.add_argument("--sets", type=int, default=1000, help="data sets (1000)")
+    parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 40], help="people of each (8 16 40)")
+    parser.add_argument("--of", nargs="+", default=["share", "given_visible", "distance"], help="numbers of the ratios")
+    parser.add_argument("--population", type=Path, help=".npz file of the sums, written where there is none")
+    given = parser.parse_args()
+    people = tuple(given.people)
+    if given.what == "shares":
+        shares(people)
+        return
+    population = Population(given.population)
+    truth = population.truth["reach"]
+    print(
+        f"{given.sets} data sets; reach of {population.common.sum()} common things {truth[population.common].min():.2f}"
+    )
+    print(
+        f"to {truth.max():.4f}, of {(~population.common).sum()} rare ones {truth.min():.2f} to "
+        f"{truth[~population.common].max():.2f}"
+    )
+    if given.what == "ratios":
+        compare(population, given.sets, people, tuple(given.of))
+    elif given.what == "numbers":
+        numbers(population, given.sets, people)
+    else:
+        differences(population, given.sets, tuple((n, n) for n in people) + ((6, 20),))
+
+
+if __name__ == "__main__":
+    main()
