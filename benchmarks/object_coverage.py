@@ -20,9 +20,9 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 from nerg_mi.statistics.estimates import adjusted
 from nerg_mi.statistics.measures import BY_NAME, MEASURES
 from nerg_mi.statistics.tables import COMPARED
+from object_statistics import Walks, counting_of, made_store
 
 import numpy as np
-from object_statistics import Walks, counting_of, made_store
 from scipy import stats
 
 WALKS, VISITS = 200, 40

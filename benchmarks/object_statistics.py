@@ -248,14 +248,10 @@ def timing(counts: tuple[int, ...]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("errors", "time"))
-    parser.add_argument("--sets", type=int, default=200, help="data sets of the coverage (200)")
-    parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 30], help="people of each (8 16 30)")
     parser.add_argument("--rays", type=int, nargs="+", default=[100_000, 1_000_000, 10_000_000])
     given = parser.parse_args()
     if given.what == "errors":
         errors()
-    elif given.what == "coverage":
-        coverage(given.sets, tuple(given.people))
     else:
         timing(tuple(given.rays))
 

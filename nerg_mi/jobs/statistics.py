@@ -34,13 +34,14 @@ from nerg_mi.statistics.tables import (
 from nerg_mi.statistics.visibility import Isovists, Targets
 
 from .backend import select_backend
-from .counting.foretold import Foretold, foretold_people
+from .counting.foretold import Foretold, eyes_of_some, foretold_people
 from .counting.parts import CountingParts
 from .counting.places import isovist_rows, look_around, places_of
 from .counting.results import write_results
 from .counting.setting import setting_of
 from .counting.surroundings import Surroundings
 from .counting.tracked import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
+from .counting.trust import add_trust, tell_support
 from .counting.what_if import what_if_rows
 from .options import parse_numbers
 from .options.statistics import StatisticsOptions
@@ -165,6 +166,7 @@ class _Work:
         foretold = None
         if self.around.gaze is not None:
             foretold = self._foretold(eyes)
+            tell_support(foretold, self.reporter)
             for cell in cells:
                 found = foretold_people(foretold, eyes, cell, times[cell], o.glance)
                 if found is not None:
@@ -173,6 +175,8 @@ class _Work:
         names = self.areas.names
         self.reporter.progress(0.9, "intervals")
         things = thing_rows(names, people, floor, resamples=o.resamples, seed=o.seed)
+        if foretold is not None:
+            add_trust(things, foretold, eyes, times, o.glance)
         result = StatisticsResult(
             things,
             difference_rows(
@@ -223,7 +227,9 @@ class _Work:
         sums = total.sums()
         self.reporter.message(f"{count:,} rays of {len(sums.persons_of(ALL)[0]):,} people")
         nobody = Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
-        return sums, picker.eyes() if self.around.gaze is not None else nobody
+        return sums, eyes_of_some(
+            picker.eyes(), self.options.eyes, self.reporter
+        ) if self.around.gaze is not None else nobody
 
     def _counted(
         self, rays: Rays | Path, counting: Counting, seen: Callable[[Rays], None] | None, count: int

@@ -175,13 +175,15 @@ def person_rows(sums: Sums, names: Mapping[str, str], seen: bool) -> list[Row]:
 
 
 def shown(row: Row, measure: Measure) -> str:
-    """A value with its interval as Markdown has it: shares in percent."""
+    """A value with its interval as Markdown has it, and, after ±, its spread over the members of an ensemble: shares in
+    percent, small ones with two digits behind the point."""
     value = row.get(measure.name)
     if value is None:
         return ""
-    scale, digits = (100.0, 1) if measure.most == 1.0 else (1.0, 2)
+    scale, digits = (100.0, 2 if 0 < value < 0.01 else 1) if measure.most == 1.0 else (1.0, 2)
     text = f"{scale * value:.{digits}f}" + (" %" if scale > 1 else "")
     low, high = row.get(measure.name + "_low"), row.get(measure.name + "_high")
-    if low is None or high is None:
-        return text
-    return text + f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
+    if low is not None and high is not None:
+        text += f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
+    spread = row.get(measure.name + "_spread")
+    return text if spread is None else text + f" ± {scale * spread:.{digits}f}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from zlib import crc32
 
 import numpy as np
 
@@ -32,12 +33,27 @@ _RAYS = 1 << 20
 @dataclass(frozen=True, eq=False)
 class Foretold:
     """Of E eyes and A areas: ``share`` (E, A) of the gaze, ``distance`` (E, A) its mean in metres, times the share,
-    ``visible`` (E, A) bool, ``support`` (E,) rays that the field learnt from there, NaN where it does not say."""
+    ``visible`` (E, A) bool, ``support`` (E,) rays that the field learnt from there, NaN where it does not say;
+    ``members`` (M, E, A): the share by each member of an ensemble, by one field the same share again."""
 
     share: np.ndarray
     distance: np.ndarray
     visible: np.ndarray
     support: np.ndarray
+    members: np.ndarray
+
+
+def eyes_of_some(eyes: Eyes, most: int, reporter: Reporter) -> Eyes:
+    """Those of at most ``most`` people, who are the same whatever the order in which they came: those whose names have
+    the least checksums."""
+    people = sorted(set(eyes.person), key=lambda name: (crc32(name.encode("utf-8", "surrogatepass")), name))
+    if len(people) <= most:
+        return eyes
+    reporter.message(f"the field is asked of {most:,} of {len(people):,} people; --eyes {len(people)} asks of all")
+    chosen = set(people[:most])
+    rows = [k for k, person in enumerate(eyes.person) if person in chosen]
+    person, cells = tuple(eyes.person[k] for k in rows), tuple(eyes.cells[k] for k in rows)
+    return Eyes(eyes.positions[rows], eyes.ahead[rows], person, cells)
 
 
 def foretell(
@@ -55,26 +71,37 @@ def foretell(
     d = fibonacci_directions(directions)
     E, A = len(eyes.positions), len(members)
     share, distance = np.zeros((E, A)), np.zeros((E, A))
+    members_share: list[np.ndarray] = []
     each = max(1, _RAYS // directions)
     for a in range(0, E, each):
         eye = eyes.positions[a : a + each]
         o, along = np.repeat(eye, directions, axis=0), np.tile(d, (len(eye), 1))
         depth = None if around.place is None else around.depth(o, along)
-        gaze = np.stack([np.maximum(around.density(p, d), 0) for p in eye])
-        total = gaze.sum(axis=1, keepdims=True)
-        weight = (gaze / np.where(total > 0, total, 1)).ravel()
+        gaze = np.maximum(np.stack([around.densities(p, d) for p in eye], axis=1), 0)
+        weight, *apart = (_shared_out(g) for g in (gaze.mean(axis=0), *(gaze if len(gaze) > 1 else ())))
+        own = np.zeros((len(apart), len(eye), A))
         found = regroup(land(things, o, along, depth, margin), members)
         for k, (rows, far) in enumerate(zip(found.rows, found.distance)):
             of = rows // directions
             share[a : a + len(eye), k] = np.bincount(of, weights=weight[rows], minlength=len(eye))
             far = far / around.scale
             distance[a : a + len(eye), k] = np.bincount(of, weights=weight[rows] * far, minlength=len(eye))
+            for m, w in enumerate(apart):
+                own[m, :, k] = np.bincount(of, weights=w[rows], minlength=len(eye))
+        members_share.append(own)
         reporter.progress(min(1.0, (a + each) / E), f"the field: place {min(a + each, E)} of {E}")
     targets = Targets.of(things, samples)
     seen = in_view(targets, eyes.positions, eyes.ahead, unhidden(targets, eyes.positions, around.depth, margin), view)
     visible = np.stack([seen[:, list(of)].any(axis=1) for of in members], axis=1)
     support = np.array([around.support(p) for p in eyes.positions])
-    return Foretold(share, distance, visible, support)
+    own = np.concatenate(members_share, axis=1) if members_share else np.zeros((0, E, A))
+    return Foretold(share, distance, visible, support, own if len(own) else share[None])
+
+
+def _shared_out(gaze: np.ndarray) -> np.ndarray:
+    """``gaze`` (E, D) as shares that add up to one at each eye, (E D,)."""
+    total = gaze.sum(axis=1, keepdims=True)
+    return (gaze / np.where(total > 0, total, 1)).ravel()
 
 
 def foretold_people(

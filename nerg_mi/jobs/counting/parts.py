@@ -27,7 +27,7 @@ from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.task import Task
 
 from .foretold import Foretold
-from .tasks import OF_COUNTS, OF_FIELDS, RAYS, count_part, described, foretell_part, read_foretold, read_sums
+from .tasks import OF_COUNTS, OF_EYES, OF_FIELDS, RAYS, count_part, described, foretell_part, read_foretold, read_sums
 from .tracked import Counting, Eyes, blocks_of
 
 EYES = 32
@@ -93,9 +93,8 @@ class CountingParts:
             tasks.append(self._task(foretell_part, {**common, "positions": at, "ahead": ahead}, inputs, label))
         plan = Plan(f"{self.what} (the field)", tasks)
         found = [read_foretold(made.path) for made in self.parts.run(plan, _COUNTED, _DONE)]
-        return Foretold(
-            *(np.concatenate([getattr(f, n) for f in found]) for n in ("share", "distance", "visible", "support"))
-        )
+        each = (np.concatenate([getattr(f, name) for f in found]) for name in OF_EYES)
+        return Foretold(*each, np.concatenate([f.members for f in found], axis=1))
 
     def _task(self, function: Callable, parameters: dict, inputs: tuple[InputFile, ...], label: str) -> Task:
         name = f"{function.__module__}:{function.__name__}"

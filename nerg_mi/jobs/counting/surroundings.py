@@ -62,8 +62,9 @@ class Surroundings:
         depth, opacity = trace_depth(self.place, o, d, kind=self.kind)
         return np.where((opacity >= SURFACE_OPACITY) & (depth > 0), depth, np.inf).astype(np.float64)
 
-    def density(self, eye: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Gaze (D,) in 1/sr of an observer at ``eye`` (3,) in unit directions ``d`` (D, 3)."""
+    def densities(self, eye: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """Gaze (M, D) in 1/sr of an observer at ``eye`` (3,) in unit directions ``d`` (D, 3), by each of M members of
+        an ensemble, or by one field."""
         import mitsuba as mi
 
         assert self.gaze is not None
@@ -73,8 +74,8 @@ class Surroundings:
         )
         center = mi.Point3f(*np.asarray(eye, float).tolist())
         observed = self.gaze.at([center], place, settings)
-        found = np.array(observed.along(center, mi.Vector3f(np.ascontiguousarray(d.T, np.float32))), np.float64)
-        return np.broadcast_to(found, (len(d),))
+        found = observed.members_along(center, mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
+        return np.array([np.broadcast_to(np.array(gaze, np.float64), (len(d),)) for gaze in found])
 
     def support(self, eye: np.ndarray) -> float:
         """Rays that the field learnt from around ``eye`` (3,); NaN where it does not say."""

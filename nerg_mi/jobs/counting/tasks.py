@@ -36,6 +36,9 @@ OF_COUNTS = ("tolerance", "margin", "gap", "pause", "merge", "least", "seen", "v
 OF_FIELDS = ("margin", "samples", "directions")
 """Those on which depends what a field foretells."""
 
+OF_EYES = ("share", "distance", "visible", "support")
+"""What is foretold of each eye, a row each; by the members of an ensemble apart it has an axis before that."""
+
 RAYS = "of-the-job/rays.npz"
 """What a task calls rays that a job holds."""
 
@@ -63,7 +66,7 @@ def foretell_part(parameters: Mapping[str, Any], inputs: Mapping[str, Path], out
     at, ahead = np.array(parameters["positions"]), np.array(parameters["ahead"])
     found = setting.foretold(Eyes(at, ahead, ("",) * len(at), (frozenset(),) * len(at)), parameters["view"])
     with replacing(output) as temporary, temporary.open("wb") as out:
-        np.savez(out, share=found.share, distance=found.distance, visible=found.visible, support=found.support)
+        np.savez(out, **{name: getattr(found, name) for name in (*OF_EYES, "members")})
 
 
 def described(

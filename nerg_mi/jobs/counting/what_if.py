@@ -20,6 +20,7 @@ from .places import places_of
 from .surroundings import Surroundings
 from .things import shapes_of, things_of
 from .tracked import Eyes
+from .trust import support_of
 
 Foretell = Callable[[Surroundings, Eyes, Areas, "list[Thing]"], Foretold]
 
@@ -36,8 +37,9 @@ def what_if_rows(
     seed: int,
 ) -> list[Row]:
     """Of each area and measure (``share`` of gaze, ``visible`` share of people's time) what the field says ``before``
-    and ``after`` the changes in the file ``path``, the ``difference`` with its interval over people, and the
-    ``support``: rays that the field learnt from around an eye, at the median after the changes. Raises `NergError`."""
+    and ``after`` the changes in the file ``path``, the ``difference`` with its interval over people and, of an
+    ensemble's shares, its ``difference_spread`` over the members, and the ``support``: rays that the field learnt from
+    around an eye, at the median after the changes. Raises `NergError`."""
     changes = read_changes(path)
     after_areas = changed_areas(areas, changes)
     scene, shapes = around.scene, shapes_of(around.scene)
@@ -53,13 +55,21 @@ def what_if_rows(
     after = foretell(there, others, after_areas, things_of(after_areas.things, shapes))
     # People who are the same before and after are compared with themselves.
     names = sorted({*eyes.person, *others.person})
-    support = float(np.nanmedian(after.support)) if np.isfinite(after.support).any() else None
+    support = support_of(after)
     rows: list[Row] = []
     for name in dict.fromkeys((*areas.names, *after_areas.names)):
         for measure in ("share", "visible"):
             old = _of(eyes, names, getattr(before, measure), areas, name)
             new = _of(others, names, getattr(after, measure), after_areas, name)
-            rows.append(_row(name, measure, old, new, floor, resamples, seed) | {"support": support, "source": FIELD})
+            row = _row(name, measure, old, new, floor, resamples, seed)
+            row["difference_spread"] = None
+            if measure == "share" and row["difference"] is not None and len(after.members) > 1:
+                apart = [
+                    _mean(_of(others, names, to, after_areas, name)) - _mean(_of(eyes, names, at, areas, name))
+                    for at, to in zip(before.members, after.members)
+                ]
+                row["difference_spread"] = float(np.std(apart, ddof=1))
+            rows.append(row | {"support": support, "source": FIELD})
     corrected = adjusted(np.array([np.nan if row["p"] is None else row["p"] for row in rows], float))
     for row, p in zip(rows, corrected):
         row["p_adjusted"] = float(p) if np.isfinite(p) else None
@@ -77,8 +87,12 @@ def _of(eyes: Eyes, names: list[str], values: np.ndarray, areas: Areas, name: st
     return total / np.maximum(count, 1), (count > 0).astype(float)
 
 
+def _mean(pair: tuple[np.ndarray, np.ndarray]) -> float:
+    return float(pair[0].sum() / pair[1].sum())
+
+
 def _row(name: str, measure: str, old, new, floor: Floor, resamples: int, seed: int) -> Row:
-    mean = lambda pair: float(pair[0].sum() / pair[1].sum()) if pair[1].sum() else None
+    mean = lambda pair: _mean(pair) if pair[1].sum() else None
     people = int(min(old[1].sum() or new[1].sum(), new[1].sum() or old[1].sum()))
     told = floor.passes(people)
     row: Row = {"thing": name, "measure": measure, "people": people if told else None}

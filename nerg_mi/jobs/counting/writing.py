@@ -11,7 +11,10 @@ from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
 from nerg_mi.rays.io import pyarrow_modules
 from nerg_mi.statistics.measures import MEASURES
-from nerg_mi.statistics.tables import Row, shown
+from nerg_mi.statistics.tables import FIELD, Row, shown
+
+SUPPORT = "support [rays]"
+_MEASURES = {"share": "share of gaze", "visible": "visible share"}
 
 Cells = Callable[[Row], Sequence[Any]]
 
@@ -46,16 +49,45 @@ def cell_name(row: Row) -> str:
 def thing_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
     """Head and cells of the table of things, with the measures that any row has."""
     used = [m for m in MEASURES if any(row.get(m.name) is not None for row in rows)]
-    head = ["cell", "thing", "source", "people", *(m.title for m in used)]
+    foretold = any(row["source"] == FIELD for row in rows)
+    head = ["cell", "thing", "source", "people", *(m.title for m in used), *([SUPPORT] if foretold else [])]
 
     def cells(row: Row) -> list[Any]:
         people = "" if row["people"] is None else row["people"]
-        return [cell_name(row), row["thing"], row["source"], people, *(shown(row, m) for m in used)]
+        found = [cell_name(row), row["thing"], row["source"], people, *(shown(row, m) for m in used)]
+        return [*found, support_words(row)] if foretold else found
 
     return head, cells
 
 
-def plain_columns(rows: Sequence[Row], names: Sequence[str]) -> tuple[list[str], Cells]:
+def support_words(row: Row) -> str:
+    """How many rays a number of a field rests on, or that its checkpoint does not say."""
+    if row["source"] != FIELD or row["people"] is None:
+        return ""
+    return "not in the checkpoint" if row.get("support") is None else f"{row['support']:.3g}"
+
+
+def what_if_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
+    """Head and cells of the table of changes: shares in percent, their differences in points of it."""
+    spread = any(row["difference_spread"] is not None for row in rows)
+    head = ["thing", "measure", "people", "before [%]", "after [%]", "difference [points]"]
+    head += [*(["± members"] if spread else []), "p", "p, adjusted", SUPPORT]
+
+    def cells(row: Row) -> list[Any]:
+        number = lambda value, form: "" if value is None else format(value, form)
+        percent = lambda value: "" if value is None else f"{100 * value:.2f}"
+        moved = number(None if row["difference"] is None else 100 * row["difference"], "+.2f")
+        if row["low"] is not None:
+            moved += f" [{100 * row['low']:+.2f}, {100 * row['high']:+.2f}]"
+        found = [row["thing"], _MEASURES[row["measure"]], "" if row["people"] is None else row["people"]]
+        found += [percent(row["before"]), percent(row["after"]), moved]
+        found += [percent(row["difference_spread"])] if spread else []
+        return [*found, number(row["p"], ".3g"), number(row["p_adjusted"], ".3g"), support_words(row)]
+
+    return head, cells
+
+
+def plain_columns(rows: Sequence[Row], names: Sequence[str] = ()) -> tuple[list[str], Cells]:
     """Head and cells of a table whose columns are told as they are."""
     head = list(dict.fromkeys(key for row in rows for key in row)) or list(names)
 

@@ -142,6 +142,10 @@ class ObservedGaze:
         """Density (1/sr) of the observer at ``p_o`` (one lane) in unit directions ``r_o``, carrying no derivatives.
 
         On surfaces it is what the integrator shows there, and elsewhere what the field was trained to be."""
+        return mean([(gaze,) for gaze in self.members_along(p_o, r_o)])[0]
+
+    def members_along(self, p_o: Point3f, r_o: Vector3f) -> list[Float]:
+        """``along`` of each member of an ensemble by itself; of one field that alone."""
         import mitsuba as mi
 
         with dr.suspend_grad():
@@ -151,9 +155,9 @@ class ObservedGaze:
             distance, escaped = distance_along(placed.field, placed.to_world, self._place, center, r_o, self._settings)
             o = center + dr.zeros(mi.Point3f, width)
             everywhere = dr.full(mi.Bool, True, width)
-            gaze = self.evaluate(o + r_o * distance, o, r_o, everywhere, escaped=escaped)[0]
+            found = self._each(o + r_o * distance, o, r_o, everywhere, None, escaped)
             # A constant variant returns one lane for all.
-            return gaze + dr.zeros(mi.Float, width)
+            return [gaze + dr.zeros(mi.Float, width) for gaze, *_ in found]
 
     def _each(
         self, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, semantic: list[Float] | None, escaped: Bool

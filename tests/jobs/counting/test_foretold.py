@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 
 from nerg_mi.formats.regions import Region
-from nerg_mi.jobs.counting.foretold import foretell, foretold_people
+from nerg_mi.jobs.counting.foretold import eyes_of_some, foretell, foretold_people
 from nerg_mi.jobs.counting.surroundings import Surroundings
 from nerg_mi.jobs.counting.tracked import Eyes
 from nerg_mi.jobs.reporter import SILENT
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.statistics.landing import Box
 from nerg_mi.statistics.sums import ALL, Cell
+from tests.jobs.recorder import Recorder
 
 
 class Law(Surroundings):
     """A gaze that is known: twice as dense ahead (x > 0) as behind, and seven units of support."""
 
-    def density(self, eye, d):
-        return np.where(d[:, 0] > 0, 2.0, 1.0)
+    def densities(self, eye, d):
+        return np.where(d[:, 0] > 0, 2.0, 1.0)[None]
 
     def support(self, eye):
         return 7.0
@@ -60,3 +61,32 @@ def test02_people():
     assert people.reached[0, 0] == pytest.approx(1 - missed)
     (bo,) = foretold_people(found, EYES, Cell("zone", "z"), {"Bo": 6.0}, 0.3).names
     assert bo == "Bo" and foretold_people(found, EYES, Cell("zone", "other"), {"Bo": 6.0}, 0.3) is None
+
+
+class Two(Law):
+    """Two members who look to opposite sides, ten times as long at one as at the other."""
+
+    def densities(self, eye, d):
+        return np.array([np.where(s * d[:, 0] > 0, 10.0, 1.0) for s in (1, -1)])
+
+
+def test03_members_of_an_ensemble():
+    things = [Box(Region.of("ahead", [1, -1, -1], [2, 1, 1])), Box(Region.of("behind", [-2, -1, -1], [-1, 1, 1]))]
+    found = foretell(Two(None, None, Similarity()), EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 1 << 15, SILENT)
+    # A sixth of the sphere each: evenly of both, and 10/11 or 1/11 of a hemisphere's third by one.
+    assert found.members.shape == (2, 3, 2) and np.allclose(found.share[0], 1 / 6, rtol=3e-3)
+    assert np.allclose(found.members[:, 0], [[10 / 33, 1 / 33], [1 / 33, 10 / 33]], rtol=3e-3)
+    assert foretell(AROUND, EYES, things, [(0,), (1,)], 0.0, 120.0, 24, 64, SILENT).members.shape == (1, 3, 2)
+
+
+def test04_of_very_many_people_some_are_asked():
+    names = tuple(f"{k // 2:04d}" for k in range(400))
+    many = Eyes(np.arange(1200.0).reshape(400, 3), np.ones((400, 3)), names, (frozenset([ALL]),) * 400)
+    told = Recorder()
+    some = eyes_of_some(many, 50, told)
+    assert len(set(some.person)) == 50 and len(some.person) == 100 and len(some.positions) == len(some.cells) == 100
+    assert all((some.positions[k] == many.positions[names.index(n) + k % 2]).all() for k, n in enumerate(some.person))
+    back = np.arange(400)[::-1]
+    turned = eyes_of_some(Eyes(many.positions[back], many.ahead, names[::-1], many.cells), 50, SILENT)
+    assert set(turned.person) == set(some.person) and eyes_of_some(many, 200, SILENT) is many
+    assert "50 of 200 people" in told.messages[0]

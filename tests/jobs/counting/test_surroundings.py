@@ -35,7 +35,10 @@ def test02_gaze_of_the_scene_or_beside_it(folder):
     own = surroundings_of_files(folder / "scene.xml", None, None, None, ns)
     beside = surroundings_of_files(folder / "bare" / "scene.xml", None, folder / "gaze.safetensors", None, ns)
     eye = np.array([1.0, 1.0, 1.5])
-    assert np.allclose(own.density(eye, d), beside.density(eye, d), rtol=1e-4) and own.density(eye, d).shape == (2,)
+    assert np.allclose(own.densities(eye, d), beside.densities(eye, d), rtol=1e-4) and own.densities(eye, d).shape == (
+        1,
+        2,
+    )
     assert np.isnan(own.support(eye))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,12 +21,14 @@ AREAS = Areas((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [
 EYES = places_of(np.arange(15.0).reshape(5, 3))
 
 
-def told(share, support=5.0):
+def told(share, support=5.0, members=1):
+    """Of an ensemble the members differ by 0.1 times their number from the first, at the first eye."""
     share = np.asarray(share, float)
-    return Foretold(share, share, share > 0, np.full(len(share), support))
+    each = np.stack([share + 0.1 * k * (np.arange(len(share)) == 0)[:, None] for k in range(members)])
+    return Foretold(share, share, share > 0, np.full(len(share), support), each)
 
 
-def rows(tmp_path, changes, after, floor=None):
+def rows(tmp_path, changes, after, floor=None, members=1):
     (tmp_path / "c.json").write_text(json.dumps(changes))
     asked = []
 
@@ -33,7 +36,7 @@ def rows(tmp_path, changes, after, floor=None):
         asked.append((eyes, areas, things))
         return after
 
-    before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]])
+    before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
     around = Surroundings(None, None, Similarity())
     found = what_if_rows(tmp_path / "c.json", around, AREAS, EYES, before, foretell, floor or Floor(), 199, 0)
     return {(r["thing"], r["measure"]): r for r in found}, asked[0]
@@ -61,3 +64,19 @@ def test03_a_floor_on_people(tmp_path):
     floor = Floor(9)
     found, _ = rows(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5), floor)
     assert all(r["before"] is None and r["difference"] is None for r in found.values()) and floor.blanked == 4
+
+
+def test04_members_of_an_ensemble(tmp_path):
+    after = told([[0.2, 0.1]] * 5, members=2)
+    found, _ = rows(tmp_path, {"shift": [0, 0, 1]}, after, members=2)
+    # Both move alike, of which the mean says nothing; then only one of them.
+    assert found["a", "share"]["difference_spread"] == pytest.approx(0, abs=1e-12)
+    assert found["a", "visible"]["difference_spread"] is None
+    found, _ = rows(tmp_path, {"shift": [0, 0, 1]}, replace(after, members=after.members[[0, 0]]), members=2)
+    assert found["a", "share"]["difference_spread"] == pytest.approx(0.1 / 5 / np.sqrt(2))
+    assert rows(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5))[0]["a", "share"]["difference_spread"] is None
+
+
+def test05_no_support(tmp_path):
+    found, _ = rows(tmp_path, {"shift": [0, 0, 1]}, told([[0.2, 0.1]] * 5, np.nan))
+    assert all(row["support"] is None for row in found.values())

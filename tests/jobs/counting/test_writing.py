@@ -35,3 +35,30 @@ def test03_things_show_what_is_known():
     head, cells = writing.thing_columns([row])
     assert head == ["cell", "thing", "source", "people", "share of time"]
     assert cells(row) == ["cohort x", "a", "tracked", "", "50.0 %"] and writing.cell_name({"cell": "all"}) == "all"
+
+
+def test04_what_a_field_foretells_with_its_spread_and_support():
+    row = {"cell": "all", "value": "", "thing": "a", "source": "field", "people": 5, "share": 0.5, "share_low": 0.4}
+    row |= {"share_high": 0.6, "share_spread": 0.021, "support": 1234.0}
+    head, cells = writing.thing_columns([row, row | {"source": "tracked"}])
+    assert head[-1] == "support [rays]"
+    assert cells(row)[-2:] == ["50.0 % [40.0, 60.0] ± 2.1", "1.23e+03"]
+    assert (
+        cells(row | {"support": None})[-1] == "not in the checkpoint" and cells(row | {"source": "tracked"})[-1] == ""
+    )
+    assert cells(row | {"share": 0.0004, "share_low": 0, "share_high": 0.001})[-2] == "0.04 % [0.00, 0.10] ± 2.10"
+
+
+def test05_what_a_change_does():
+    row = {"thing": "a", "measure": "share", "people": 5, "before": 0.5, "after": 0.25, "difference": -0.25}
+    row |= {"low": -0.3, "high": -0.2, "p": 0.0005, "p_adjusted": 0.001, "difference_spread": None, "support": None}
+    new = row | {"thing": "b", "measure": "visible", "before": None, "difference": None, "low": None, "p": None}
+    rows = [row | {"source": "field"}, new | {"source": "field", "p_adjusted": None, "support": 12.5}]
+    head, cells = writing.what_if_columns(rows)
+    assert head[3:6] == ["before [%]", "after [%]", "difference [points]"] and len(head) == len(cells(rows[0])) == 9
+    told = ["50.00", "25.00", "-25.00 [-30.00, -20.00]", "0.0005", "0.001", "not in the checkpoint"]
+    assert cells(rows[0]) == ["a", "share of gaze", 5, *told]
+    assert cells(rows[1]) == ["b", "visible share", 5, "", "25.00", "", "", "", "12.5"]
+    spread = [r | {"difference_spread": 0.01} for r in rows]
+    head, cells = writing.what_if_columns(spread)
+    assert head[6] == "± members" and cells(spread[0])[6] == "1.00"
