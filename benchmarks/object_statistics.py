@@ -1,25 +1,21 @@
 """Numbers of attention on things against what is true: errors (coverage of intervals: object_coverage.py).
 
     python benchmarks/object_statistics.py errors      # the store's law and brute-force ray casts
-    python benchmarks/object_statistics.py time        # rays against seconds and memory
+    python benchmarks/object_statistics.py shop        # the rays of docs/shop.md, as shop.npz in this folder
 
-The shoppers' walks are those of the demo store (`nerg_mi.scenes.store.shoppers`), each tracked once in 0.8 s; where
-they look is drawn anew from its law for every data set. The truth of the coverage is that of the pool of walks, from 60
-draws of all of them; a data set is so many shoppers of the pool, drawn with replacement.
+The shoppers' walks are those of the demo store (`nerg_mi.scenes.store.shoppers`), each tracked once in 0.8 s (in
+the shop five times a second); where they look is drawn from the store's law.
 """
 
 from __future__ import annotations
 
 import argparse
-import resource
-import time
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 
 import numpy as np
 
 SENSORS = 4  # every so manieth sample of a walk
-TRUTHS, POOL = 60, 60
 STEP = 0.8
 
 
@@ -54,7 +50,7 @@ def counting_of(around, areas, things, seen: bool = True):
 class Walks:
     """A pool of walks with the law's mixture at each position, from which directions are drawn."""
 
-    def __init__(self, count: int, seed: int = 11):
+    def __init__(self, count: int, seed: int = 11, every: int = SENSORS):
         from nerg_mi.scenes.store import layout, shoppers
         from nerg_mi.scenes.store.attention_law import AttentionLaw
 
@@ -65,8 +61,8 @@ class Walks:
         self.heads, self.times = [], []
         for _ in range(count):
             visit = shoppers.walk(store, rng, int(rng.integers(8, 21)), weights)
-            self.heads.append(visit.head[::SENSORS])
-            self.times.append(visit.time[::SENSORS])
+            self.heads.append(visit.head[::every])
+            self.times.append(visit.time[::every])
         self.lengths = np.array([len(h) for h in self.heads])
         self.start = np.r_[0, np.cumsum(self.lengths)]
         self.origin = np.concatenate(self.heads)
@@ -210,50 +206,16 @@ def errors() -> None:
     print(f"| visible share, each thing | the same | {np.abs(seen.mean(axis=0) - exact.mean(axis=0)).max():.2g} |")
 
 
-def timing(counts: tuple[int, ...]) -> None:
-    from nerg_mi.jobs.counting.tracked import blocks_of, count_block
-    from nerg_mi.rays.rays import Rays
-    from nerg_mi.statistics.sums import Total
-
-    around, areas, things = made_store()
-    walks = Walks(20, seed=7)
-    rng = np.random.default_rng(0)
-    base = walks.rays(np.arange(20), rng)
-    print("| rays | what could be seen | seconds | of the CPU | rays a second of it | sums [MB] | all [MB] |")
-    print("| ---: | --- | ---: | ---: | ---: | ---: | ---: |", flush=True)
-    for n in counts:
-        for seen in (False, True) if n <= 1_000_000 else (False,):
-            counting = counting_of(around, areas, things, seen)
-            count_block(base, counting)
-            copies, done, total = -(-n // len(base)), 0, None
-            began, busy = time.perf_counter(), time.process_time()
-            # People and days are new in every copy, as a dataset's parts would give them.
-            for c in range(copies):
-                names = tuple(f"{c % 50:03d}-{p}" for p in base.persons)
-                rays = Rays(base.t + 1e5 * c, base.person, names, base.origin, base.direction, base.confidence)
-                for block in blocks_of(rays, counting.rules):
-                    found = count_block(block, counting)
-                    total = total or Total(found.areas, found.cells)
-                    total.add(found)
-                    done += len(block)
-            seconds, cpu = time.perf_counter() - began, time.process_time() - busy
-            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-            print(
-                f"| {done:,} | {'yes' if seen else 'no'} | {seconds:.1f} | {cpu:.1f} | {done / cpu:,.0f} | "
-                f"{total.sums().nbytes / 1e6:.1f} | {peak:.0f} |",
-                flush=True,
-            )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("errors", "time"))
-    parser.add_argument("--rays", type=int, nargs="+", default=[100_000, 1_000_000, 10_000_000])
-    given = parser.parse_args()
-    if given.what == "errors":
+    parser.add_argument("what", choices=("errors", "shop"))
+    if parser.parse_args().what == "errors":
         errors()
-    else:
-        timing(tuple(given.rays))
+        return
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    Walks(20, seed=7, every=1).rays(np.arange(20), np.random.default_rng(0)).save("shop.npz")
 
 
 if __name__ == "__main__":

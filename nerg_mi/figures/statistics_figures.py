@@ -39,15 +39,16 @@ def things_figure(rows: Sequence[Row], title: str = "Attention on things") -> An
             some = [r for r in rows if r["source"] == source and r["thing"] in place and r.get(key) is not None]
             y = np.array([place[r["thing"]] for r in some], float)
             x = scale * np.array([r[key] for r in some], float)
+            # A field's numbers stand below the middle of the bar, and in their colour.
+            shift, color = (0.0, INK) if source == "tracked" else (-0.2, _COLORS[source])
             if source == "tracked":
-                axis.barh(y, x, 0.62, color=_COLORS[source], alpha=0.75, zorder=2)
+                axis.barh(y, x, 0.62, color=_COLORS[source], alpha=0.6, zorder=2)
             else:
-                axis.plot(x, y, "o", markersize=5, color=_COLORS[source], zorder=4)
-            shift = 0.0 if source == "tracked" else -0.22
+                axis.plot(x, y + shift, "o", markersize=4.5, color=color, zorder=4)
             for r, at in zip(some, y):
                 low, high = r.get(f"{key}_low"), r.get(f"{key}_high")
                 if low is not None and high is not None:
-                    axis.plot([scale * low, scale * high], [at + shift] * 2, "-", color=INK, linewidth=1.1, zorder=3)
+                    axis.plot([scale * low, scale * high], [at + shift] * 2, "-", color=color, linewidth=1.1, zorder=3)
         axis.set_xlabel(label, fontsize=8, color=INK)
         axis.tick_params(labelsize=7.5, colors=INK, length=2)
         axis.grid(axis="x", color=_GRID, linewidth=0.6, zorder=0)
@@ -69,17 +70,20 @@ def moves_figure(names: Sequence[str], moves: np.ndarray, title: str = "From thi
     total = moves.sum(axis=1, keepdims=True)
     share = 100 * moves / np.where(total > 0, total, 1)
     side = 26 * max(len(names), 4)
-    page = new_page(260 + side + 90, 230 + side)
-    width, height = (100 * v for v in page.get_size_inches())
-    axis = page.add_axes((230 / width, 180 / height, side / width, side / height))
-    image = axis.imshow(np.ma.masked_equal(share, 0), cmap="viridis", vmin=0, vmax=max(float(share.max()), 1.0))
     short = [n if len(n) <= 30 else n[:29] + "…" for n in names]
+    room = 45 + 5.5 * max(map(len, short), default=0)
+    page = new_page(room + side + 120, room + side + 50)
+    width, height = (100 * v for v in page.get_size_inches())
+    axis = page.add_axes((room / width, room / height, side / width, side / height))
+    image = axis.imshow(np.ma.masked_equal(share, 0), cmap="viridis", vmin=0, vmax=max(float(share.max()), 1.0))
     axis.set_xticks(range(len(names)), short, rotation=90, fontsize=7, color=INK)
     axis.set_yticks(range(len(names)), short, fontsize=7, color=INK)
     axis.set_xlabel("next look at", fontsize=8, color=INK)
     axis.set_ylabel("after a look at", fontsize=8, color=INK)
     axis.set_title(title, fontsize=10, color=INK, loc="left")
-    bar = page.colorbar(image, cax=page.add_axes(((240 + side) / width, 180 / height, 12 / width, side / height)))
+    bar = page.colorbar(
+        image, cax=page.add_axes(((room + side + 10) / width, room / height, 12 / width, side / height))
+    )
     bar.set_label("% of the moves from there", fontsize=7, color=INK)
     bar.ax.tick_params(labelsize=7, colors=INK, length=2)
     return page

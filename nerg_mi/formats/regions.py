@@ -46,7 +46,10 @@ class Region:
     def __post_init__(self) -> None:
         corners = np.array([self.lower, self.upper], float)
         if corners.shape != (2, 3) or not (np.abs(corners) < 1e30).all() or not (corners[0] < corners[1]).all():
-            raise NergError(f'the area "{plain(self.name, 40)}" needs a lower and an upper corner of three numbers')
+            raise NergError(
+                f'the area "{plain(self.name, 40)}" needs a lower and an upper corner of three numbers, each '
+                "less in the lower one"
+            )
         check_name(self.name)
         if self.turn is not None:
             size = math.hypot(*self.turn) if len(self.turn) == 4 else math.nan

@@ -34,6 +34,7 @@ from nerg_mi.statistics.tables import (
 from nerg_mi.statistics.visibility import Isovists, Targets
 
 from .backend import select_backend
+from .counting.changes import read_changes
 from .counting.foretold import Foretold, eyes_of_some, foretold_people
 from .counting.parts import CountingParts
 from .counting.places import isovist_rows, look_around, places_of
@@ -108,6 +109,8 @@ def _sort(files: Sequence[str | Path | Rays]) -> _Given:
     found: dict[str, Path | Rays] = {}
     for given in files:
         path = given if isinstance(given, Rays) else Path(given)
+        if not isinstance(path, Rays) and path.suffix.lower() in (".json", ".csv"):
+            raise NergError(f'"{path}" is no rays, scene or field; areas are given with --areas, and so on')
         kind = "rays" if isinstance(path, Rays) else kind_of_file(path)
         if kind not in ("scene", "field", "gaze", "rays"):
             raise NergError(f'"{path}" is a {kind}; statistics take rays, a scene (.xml), a gaze and a radiance field')
@@ -140,8 +143,13 @@ class _Work:
         output: str | Path | None,
     ):
         self.given, self.areas, self.options, self.reporter = given, areas, options, reporter
+        if options.what_if is not None:
+            # What is plainly wrong is told before anything is loaded.
+            read_changes(options.what_if)
         self.setting = setting_of(given.scene, given.field, given.gaze, areas, options, ns)
         self.around, self.things, self.members = self.setting.around, self.setting.things, self.setting.members
+        if options.what_if is not None and self.around.gaze is None:
+            raise NergError("--what-if is what a gaze field foretells: give one, or a scene that has one")
         self.parts = self._in_parts(output) if options.in_parts else None
 
     def run(self) -> StatisticsResult:
@@ -304,19 +312,10 @@ class _Work:
         return isovists(points, self.around.depth, Targets.of(self.things, o.samples), self.setting.margin, reach)
 
     def _what_if(self, eyes: Eyes, before: Foretold | None, times: Mapping[str, float], floor: Floor) -> list[Row]:
-        if before is None:
-            raise NergError("--what-if is what a gaze field foretells: give one, or a scene that has one")
-        assert self.options.what_if is not None
+        o = self.options
+        assert o.what_if is not None and before is not None
         return what_if_rows(
-            self.options.what_if,
-            self.around,
-            self.areas,
-            eyes,
-            before,
-            self._foretell,
-            floor,
-            self.options.resamples,
-            self.options.seed,
+            o.what_if, self.around, self.areas, eyes, before, self._foretell, floor, o.resamples, o.seed
         )
 
     def _people(self, sums: Sums | None, seen: bool) -> list[Row]:

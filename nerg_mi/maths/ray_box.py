@@ -30,12 +30,14 @@ def intersect_box(o, d, lower, upper):
 def box_interval(o: ArrayLike, d: ArrayLike, lower: ArrayLike, upper: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """The same for NumPy rays: ``o``, ``d`` broadcast to (N, 3); ``t_near`` and ``t_far`` (N,), infinite where no
     component of ``d`` leaves its slab."""
-    o, d = np.asarray(o), np.asarray(d)
-    still = d == 0
-    along = np.where(still, 1, d)
-    with np.errstate(over="ignore"):
-        a, b = (np.asarray(lower) - o) / along, (np.asarray(upper) - o) / along
-    outside = still & ((o < lower) | (o > upper))
-    near = np.where(still, -np.inf, np.minimum(a, b)).max(axis=-1)
-    far = np.where(still, np.where(outside, -np.inf, np.inf), np.maximum(a, b)).min(axis=-1)
-    return near, far
+    near, far = -np.inf, np.inf
+    # Axis by axis: NumPy's reductions over three numbers take several times as long.
+    for oc, dc, lo, hi in zip(*(np.moveaxis(np.asarray(v), -1, 0) for v in (o, d, lower, upper))):
+        still = dc == 0
+        along = np.where(still, 1, dc)
+        with np.errstate(over="ignore"):
+            a, b = (lo - oc) / along, (hi - oc) / along
+        outside = still & ((oc < lo) | (oc > hi))
+        near = np.maximum(near, np.where(still, -np.inf, np.minimum(a, b)))
+        far = np.minimum(far, np.where(still, np.where(outside, -np.inf, np.inf), np.maximum(a, b)))
+    return np.asarray(near), np.asarray(far)

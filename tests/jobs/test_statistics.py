@@ -128,6 +128,9 @@ def test04_the_field_beside_the_rays_and_what_if(folder, tmp_path):
     assert sign["source"] == "field" and sign["after"] > sign["before"] and sign["people"] == 6
     assert rows["new", "share"]["before"] is None and rows["new", "share"]["after"] > 0
     assert rows["the sign", "share"]["after"] != rows["the sign", "share"]["before"]
+    # Its checkpoint says nothing of what it learnt from.
+    assert any("keeps no support" in text for text in recorder.messages) and field[0]["support"] is None
+    assert "not in the checkpoint" in (tmp_path / "out" / "what_if.md").read_text()
     names = {p.name for p in found.files}
     assert {"things.csv", "things.md", "what_if.csv", "things.png", "about.json", "people.csv"} <= names
     assert all(p.is_file() for p in found.files)
@@ -233,6 +236,8 @@ def test10_datasets_count_as_files_do(folder, tmp_path):
         (["scene.xml"], {"observers": ("1,2",)}, "--observer"),
         (["rays.npz"], {}, 'no shape "stand"'),
         (["rays.npz"], {"pause": 0.1}, "--pause"),
+        (["rays.npz", "areas.json"], {}, "--areas"),
+        (["scene.xml", "rays.npz"], {"what_if": "changes"}, "holds no changes"),
     ],
 )
 def test11_what_cannot_be_done_is_told(folder, given, options, said):

@@ -17,10 +17,12 @@ from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.statistics.sums import Sums
 from nerg_mi.statistics.tables import Row
 
-from .writing import has_parquet, plain_columns, thing_columns, what_if_columns, write_rows
+from .writing import difference_columns, has_parquet, plain_columns, thing_columns, what_if_columns, write_rows
 
 LARGEST_MATRIX = 60
 """Things of which moves are drawn at most."""
+
+_COLUMNS = {"things": thing_columns, "differences": difference_columns, "what_if": what_if_columns}
 
 
 class Results(Protocol):
@@ -63,7 +65,7 @@ def write_results(
     for name in ("things", "differences", "moves", "durations", "people", "what_if", "isovists"):
         rows: list[Row] = getattr(result, name)
         if rows:
-            columns = {"things": thing_columns, "what_if": what_if_columns}.get(name, plain_columns)(rows)
+            columns = _COLUMNS.get(name, plain_columns)(rows)
             files += write_rows(folder, name, rows, *columns)
     if result.things:
         first = [r for r in result.things if r["cell"] == result.things[0]["cell"]]

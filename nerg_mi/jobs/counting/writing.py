@@ -10,11 +10,12 @@ from typing import Any
 from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
 from nerg_mi.rays.io import pyarrow_modules
-from nerg_mi.statistics.measures import MEASURES
+from nerg_mi.statistics.measures import BY_NAME, MEASURES
 from nerg_mi.statistics.tables import FIELD, Row, shown
 
 SUPPORT = "support [rays]"
 _MEASURES = {"share": "share of gaze", "visible": "visible share"}
+_WORDS = {"cell", "value", "first", "second", "thing", "source", "person", "from", "to", "measure", "found"}
 
 Cells = Callable[[Row], Sequence[Any]]
 
@@ -30,7 +31,7 @@ def write_rows(folder: Path, name: str, rows: Sequence[Row], head: Sequence[str]
     columns = list(dict.fromkeys(key for row in rows for key in row)) or list(head)
     written = [folder / f"{name}.csv", folder / f"{name}.md"]
     write_csv(written[0], [{k: "" if v is None else v for k, v in row.items()} for row in rows], columns)
-    right = [title for title in head if title not in ("cell", "thing", "source", "person", "from", "to", "measure")]
+    right = [title for title in head if title not in _WORDS]
     write_text(written[1], markdown_table(head, [cells(row) for row in rows], right) + "\n")
     if has_parquet():
         pa, pq = pyarrow_modules()
@@ -56,6 +57,25 @@ def thing_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
         people = "" if row["people"] is None else row["people"]
         found = [cell_name(row), row["thing"], row["source"], people, *(shown(row, m) for m in used)]
         return [*found, support_words(row)] if foretold else found
+
+    return head, cells
+
+
+def difference_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
+    """Head and cells of the table of differences: shares in points of a percent, times in seconds."""
+    head = ["cell", "first", "second", "thing", "measure", "second - first", "p", "p, adjusted", "found"]
+
+    def cells(row: Row) -> list[Any]:
+        measure = BY_NAME[row["measure"]]
+        scale, unit = (100.0, " points") if measure.most == 1.0 else (1.0, " s" if "[s]" in measure.title else "")
+        told = ""
+        if row["difference"] is not None:
+            told = f"{scale * row['difference']:+.2f}{unit}"
+            if row["low"] is not None:
+                told += f" [{scale * row['low']:+.2f}, {scale * row['high']:+.2f}]"
+        p = ["" if row[key] is None else f"{row[key]:.3g}" for key in ("p", "p_adjusted")]
+        name = measure.title.removesuffix(" [s]")
+        return [row["cell"], row["first"], row["second"], row["thing"], name, told, *p, "yes" if row["found"] else ""]
 
     return head, cells
 

@@ -62,3 +62,13 @@ def test05_what_a_change_does():
     spread = [r | {"difference_spread": 0.01} for r in rows]
     head, cells = writing.what_if_columns(spread)
     assert head[6] == "± members" and cells(spread[0])[6] == "1.00"
+
+
+def test06_differences_in_their_units():
+    row = {"cell": "zone", "first": "front", "second": "back", "thing": "a", "measure": "share", "difference": -0.06}
+    row |= {"low": -0.08, "high": -0.04, "p": 0.001, "p_adjusted": 0.0014, "found": True}
+    head, cells = writing.difference_columns([row])
+    told = ["zone", "front", "back", "a", "share of time", "-6.00 points [-8.00, -4.00]", "0.001", "0.0014", "yes"]
+    assert head[5] == "second - first" and cells(row) == told
+    blank = row | {"measure": "dwell", "difference": 1.5, "low": None, "p": None, "p_adjusted": None, "found": False}
+    assert cells(blank)[4:] == ["dwell", "+1.50 s", "", "", ""]
