@@ -332,6 +332,8 @@ class _Work:
         return person_rows(sums, named, seen)
 
     def _tell(self, people: Mapping[Cell, Mapping[str, People]]) -> None:
+        for cell in (c for c, found in people.items() if TRACKED in found and not found[TRACKED].names):
+            self.reporter.message(f"nobody is in the {cell.dimension} {cell.value}; windows are on the rays' own clock")
         few = [cell for cell, found in people.items() for p in found.values() if 0 < p.there.sum() < LEAST_PEOPLE]
         if few:
             which = "all of it" if few[0] == ALL else f"{few[0].dimension} {few[0].value}"

@@ -89,6 +89,8 @@ def difference_rows(
         values = [cell for cell in cells if cell.dimension == dimension and source in cells[cell]][:MOST_VALUES]
         for first, second in combinations(values, 2):
             a, b = cells[first][source], cells[second][source]
+            if not a.names or not b.names:
+                continue
             names = sorted({*a.names, *b.names})
             pair = a.aligned(names), b.aligned(names)
             for measure in (m for m in MEASURES if m.name in compared):

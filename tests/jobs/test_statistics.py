@@ -88,12 +88,13 @@ def test03_windows_zones_and_cohorts_of_a_file(folder, tmp_path):
         areas=folder / "areas.json",
         zones=tmp_path / "zones.json",
         cohorts=tmp_path / "cohorts.csv",
-        windows=("early=0,8", "late=8,100"),
+        windows=("early=0,8", "late=8,100", "never=1e6,2e6"),
         margin=0.001,
         **FAST,
     )
-    rays = people()
-    found = statistics([folder / "bare" / "scene.xml", rays], options=options)
+    rays, recorder = people(), Recorder()
+    found = statistics([folder / "bare" / "scene.xml", rays], options=options, reporter=recorder)
+    assert [text for text in recorder.messages if "nobody is in the window never" in text]
     on = np.array([first_box(o, d)[0] == "sign" for o, d in zip(rays.origin, rays.direction)])
     masks = {
         ("window", "early"): rays.t < 8,

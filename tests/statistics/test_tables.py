@@ -103,3 +103,8 @@ def test06_as_markdown_has_it():
     row = {"share": 0.1234, "share_low": 0.1, "share_high": 0.2, "dwell": 3.456, "dwell_low": None, "dwell_high": None}
     assert shown(row, BY_NAME["share"]) == "12.3 % [10.0, 20.0]" and shown(row, BY_NAME["dwell"]) == "3.46"
     assert shown(row, BY_NAME["reach"]) == ""
+
+
+def test09_nobody_is_compared_with_nobody():
+    cells = {A: {TRACKED: people(15, 0.2, 0, "a")}, B: {TRACKED: people(0, 0.4, 1, "b")}}
+    assert difference_rows(("x", "y"), cells, Floor(), **HOW) == []
