@@ -93,8 +93,8 @@ class CountingParts:
             tasks.append(self._task(foretell_part, {**common, "positions": at, "ahead": ahead}, inputs, label))
         plan = Plan(f"{self.what} (the field)", tasks)
         found = [read_foretold(made.path) for made in self.parts.run(plan, _COUNTED, _DONE)]
-        each = (np.concatenate([getattr(f, name) for f in found]) for name in OF_EYES)
-        return Foretold(*each, np.concatenate([f.members for f in found], axis=1))
+        each = {name: np.concatenate([getattr(f, name) for f in found]) for name in OF_EYES}
+        return Foretold(**each, members=np.concatenate([f.members for f in found], axis=1))
 
     def _task(self, function: Callable, parameters: dict, inputs: tuple[InputFile, ...], label: str) -> Task:
         name = f"{function.__module__}:{function.__name__}"

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 _INTEGRAL = 2048
+"""Directions of the integral of a normalised field, at most: of one field it cancels out of the shares, and of an
+ensemble only the members' weights beside each other rest on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +72,9 @@ class Surroundings:
         assert self.gaze is not None
         place = self.place if self.place is not None else Place(None)
         settings = self.settings or ObserverSettings(
-            march=default_settings(place), depth=self.kind, surface_opacity=SURFACE_OPACITY, directions=_INTEGRAL
+            march=default_settings(place), depth=self.kind, surface_opacity=SURFACE_OPACITY
         )
+        settings = replace(settings, directions=min(settings.directions, _INTEGRAL))
         center = mi.Point3f(*np.asarray(eye, float).tolist())
         observed = self.gaze.at([center], place, settings)
         found = observed.members_along(center, mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
