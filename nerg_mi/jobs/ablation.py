@@ -3,42 +3,29 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
 import json
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-
-import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import ablation
 from nerg_mi.evaluation.ablation import Variant
 from nerg_mi.evaluation.frame_time import frame_timer
-from nerg_mi.evaluation.gaze.baselines import Baseline
-from nerg_mi.evaluation.gaze.evaluation import GazeTest, held_out_rays
-from nerg_mi.evaluation.gaze.scores import gaze_field
 from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json
-from nerg_mi.formats.fields import save_gaze
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.gaze.plan import GazePlan
 from nerg_mi.training.gaze.recipes import gaze_recipe
-from nerg_mi.training.gaze.splits import hold_out
-from nerg_mi.training.gaze.supervision import Supervision, digest_rays
-from nerg_mi.training.geometry.places import GazePlace
+from nerg_mi.training.gaze.supervision import digest_rays
 
+from .ablation_bench import Bench, bench_of, law_of, plan_of, train_variant
+from .ablation_tasks import rows_in_parts
 from .backend import select_backend
-from .gaze import train_planned
-from .gaze_places import check_place, make_place, place_kind
-from .gaze_plan import plan_gaze
+from .gaze_places import place_kind
 from .options.ablation import AblationOptions
-from .options.gaze import GazeOptions
 from .reporter import SILENT, Reporter
 
 
@@ -50,21 +37,6 @@ class AblationResult:
     rows: list[dict]
     # Tables and plot that were written.
     files: list[Path]
-
-
-@dataclass(frozen=True)
-class Bench:
-    """What all variants have in common: the rays of training, tests at ``centres`` (T, 3) and so many ``people`` who
-    are held out, the place, and the ``folder`` of checkpoints."""
-
-    train: Rays
-    tests: dict[str, GazeTest]
-    centres: np.ndarray
-    people: int
-    place: GazePlace
-    folder: Path
-    ns: ModuleType
-    options: AblationOptions
 
 
 def ablate(
@@ -84,7 +56,7 @@ def ablate(
     known = ablation.all_variants(options.field is not None, recipes)
     variants = _chosen(known, options.variant)
     if options.law:
-        _law(options.law)
+        law_of(options.law)
     check_folder(output)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "preparing")
@@ -113,31 +85,9 @@ def ablate(
     return AblationResult(rows, files)
 
 
-def bench_of(data: Rays, options: AblationOptions, folder: Path, ns: ModuleType, reporter: Reporter) -> Bench:
-    """What all variants have in common that are trained on some of the rays ``data`` and scored on the others; a place
-    of hit points is written into ``folder``."""
-    truth = _law(options.law) if options.law else None
-    _, account = hold_out(data, options.radius, options.zones, options.positions, 0, options.min_rays, options.people)
-    train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")
-    place = make_place(options, train, (), folder / "place.vol", ns, reporter=reporter)
-    # Bad places are part of what may be compared: it is told, and no more.
-    check_place(place, train, f"--{place.kind} FILE", True, reporter)
-    tests = ablation.make_tests(scored, train, centres, options.radius, options.kappa, options.min_rays, truth)
-    return Bench(train, tests, np.asarray(centres), len(account["people"]), place, folder, ns, options)
-
-
-def train_variant(variant: Variant, seed: int, path: Path, bench: Bench) -> dict:
-    """Scores and times of one training, whose checkpoint is written to ``path``."""
-    made = {"recipe": variant.recipe, "variant": variant.name, "seed": seed}
-    return _train(made, _plan(variant, seed, bench), path, bench)
-
-
 def _rows(due: list[tuple[Variant, int]], bench: Bench, data: Rays, reporter: Reporter) -> Iterator[dict]:
     """The row of each training that is ``due``."""
     if bench.options.in_parts:
-        # Which needs what is here.
-        from .ablation_tasks import rows_in_parts
-
         for (variant, seed), row in zip(due, rows_in_parts(due, bench, data, reporter)):
             _keep(row, variant, seed, bench)
             yield row
@@ -168,7 +118,7 @@ def _keep(row: dict, variant: Variant, seed: int, bench: Bench) -> None:
 
 def _identity(variant: Variant, seed: int, bench: Bench) -> dict:
     """All that a row depends on, as JSON has it."""
-    plan = _plan(variant, seed, bench)
+    plan = plan_of(variant, seed, bench)
     return {
         "architecture": plan.config.to_dict(),
         "settings": plan.settings.to_dict(),
@@ -180,59 +130,12 @@ def _identity(variant: Variant, seed: int, bench: Bench) -> dict:
     }
 
 
-def _plan(variant: Variant, seed: int, bench: Bench) -> GazePlan:
-    options, quick = bench.options, gaze_recipe(variant.recipe).quick
-    plan = plan_gaze(
-        GazeOptions(
-            recipe=variant.recipe,
-            variant=variant.gaze,
-            semantic=variant.semantic,
-            semantic_own=variant.semantic_own,
-            begin="field" if variant.begin else "random",
-            freeze=variant.frozen,
-            steps=(options.default_steps if quick else options.steps) or None,
-            probes=options.probes or None,
-            refit=options.refit or quick,
-            seed=seed,
-        ),
-        bench.place,
-    )
-    # Positions that validate are to be had wherever there are some that test.
-    watched = plan.settings.watched_rays or plan.probes.min_rays
-    return plan.with_settings(watched_rays=min(watched, options.min_rays))
-
-
-def _train(made: dict, plan: GazePlan, path: Path, bench: Bench) -> dict:
-    """Train, write the checkpoint (``made``: what it is), and score. Raises ``KeyboardInterrupt`` after Ctrl-C."""
-    started = time.perf_counter()
-    result = train_planned(Supervision(bench.train), bench.place, plan, bench.ns)
-    if result.interrupted:
-        raise KeyboardInterrupt
-    seconds = time.perf_counter() - started
-    save_gaze(result.field, path, {**bench.place.about, **result.provenance, **made})
-    density = gaze_field(result.field, bench.place.medium, bench.place.align, plan.probes.depth)
-    times = {"steps": result.provenance["steps"], "train_seconds": seconds}
-    return {**made, **times, **ablation.score(bench.tests, density)}
-
-
 def _chosen(variants: list[Variant], names: tuple[str, ...]) -> list[Variant]:
     """Those of ``variants`` that are called one of ``names``; all without any."""
     known = list(dict.fromkeys(v.name for v in variants))
     if unknown := sorted(set(names) - set(known)):
         raise NergError(f'--variant must be one of {", ".join(known)} here, got "{unknown[0]}"')
     return [v for v in variants if not names or v.name in names]
-
-
-def _law(name: str) -> Baseline:
-    """The density of an instance of the class that ``MODULE:CLASS`` names."""
-    module, _, kind = name.partition(":")
-    try:
-        return getattr(importlib.import_module(module), kind)().density
-    except (ImportError, AttributeError, ValueError) as error:
-        raise NergError(
-            "--law needs MODULE:CLASS that can be imported, such as nerg_mi.scenes.store.attention_law:AttentionLaw, "
-            f'got "{name}"'
-        ) from error
 
 
 def _size(text: str) -> tuple[int, int]:

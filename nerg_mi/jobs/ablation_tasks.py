@@ -22,7 +22,7 @@ from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.task import FOLDER, Task
 from nerg_mi.threads import use_share
 
-from .ablation import Bench, bench_of, train_variant
+from .ablation_bench import Bench, bench_of, train_variant
 from .backend import select_backend
 from .options.ablation import AblationOptions
 from .parts import Parts

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.evaluation import ablation
-from nerg_mi.jobs import ablation as job
+from nerg_mi.jobs import ablation_bench
 from nerg_mi.jobs.ablation import ablate
 from nerg_mi.jobs.options.ablation import AblationOptions
 from tests.evaluation.gaze.test_evaluation import crowd
@@ -49,7 +48,9 @@ def test_rows_are_made_once(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "ablation.json").read_text())["rows"] == found.rows
     # What is there already is not trained again; what would be another training is.
     trained = []
-    monkeypatch.setattr(job, "_train", lambda made, plan, path, bench: trained.append(path.stem) or found.rows[0])
+    monkeypatch.setattr(
+        ablation_bench, "_train", lambda made, plan, path, bench: trained.append(path.stem) or found.rows[0]
+    )
     ablate(crowd(3000), tmp_path, OPTIONS)
     assert trained == []
     other = replace(OPTIONS, law="tests.jobs.test_ablation:Uniform", seeds=1, variant=("capture",))
@@ -85,7 +86,7 @@ def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, s
         path.write_bytes(b"")
         return {**made, **row}
 
-    monkeypatch.setattr(job, "_train", kept)
+    monkeypatch.setattr(ablation_bench, "_train", kept)
     options = replace(OPTIONS, recipes=recipe, variant=("emit",), steps=5, refit=False, cameras=0)
     ablate(crowd(1000), tmp_path, options)
     assert sorted(plans) == seeds
@@ -93,21 +94,3 @@ def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, s
         s = plan.settings
         assert (s.seed, s.steps, s.refit, plan.config.variant, plan.probes.count) == (seed, steps, refit, "emit", 12)
         assert s.watched_rays == 8
-
-
-def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
-    import drjit.llvm.ad as ns
-
-    from nerg_mi.training.geometry.places import place_of_field
-    from tests.plugins import fields
-
-    fields.radiance(tmp_path / "field.safetensors")
-    place = place_of_field(tmp_path / "field.safetensors", ns)
-    bench = job.Bench(None, {}, None, 0, place, tmp_path, ns, replace(OPTIONS, geometry=None))
-    for variant in ablation.all_variants(True, ["small"]):
-        plan = job._plan(variant, 0, bench)
-        c = plan.config
-        assert (c.variant, c.semantic, c.semantic_own) == (variant.gaze, variant.semantic, variant.semantic_own)
-        assert (plan.initial is not None, plan.settings.frozen) == (variant.begin, variant.frozen)
-        if variant.semantic or variant.begin:
-            assert c.geometry == place.radiance.config.geometry
