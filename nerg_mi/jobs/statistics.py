@@ -143,13 +143,13 @@ class _Work:
         output: str | Path | None,
     ):
         self.given, self.areas, self.options, self.reporter = given, areas, options, reporter
-        if options.what_if is not None:
-            # What is plainly wrong is told before anything is loaded.
-            read_changes(options.what_if)
         self.setting = setting_of(given.scene, given.field, given.gaze, areas, options, ns)
         self.around, self.things, self.members = self.setting.around, self.setting.things, self.setting.members
         if options.what_if is not None and self.around.gaze is None:
             raise NergError("--what-if is what a gaze field foretells: give one, or a scene that has one")
+        if options.what_if is not None:
+            # What is wrong with it is told before anything is counted.
+            read_changes(options.what_if)
         self.parts = self._in_parts(output) if options.in_parts else None
 
     def run(self) -> StatisticsResult:

@@ -87,6 +87,7 @@ CASES = (
     Case("draw floor", "{i}/rays.npz -o {o}/a.svg --scene {i}/ball.xml -m llvm_ad_rgb", ("a.svg",)),
     Case("draw sheet", "{i}/a.exr {i}/b.exr -o {o}/a.png --overlay gaze", ("a.png",)),
     Case("draw difference", "{i}/a.exr {i}/b.exr -o {o}/a.svg", ("a.svg",)),
+    Case("draw surface", "{i}/baked.ply -o {o}/a.png -m llvm_ad_rgb --width 32 --height 32", ("a.png",)),
     Case("draw sphere", "{i}/watched/gaze.xml -o {o}/a.png -m llvm_ad_rgb --width 64 --spp 1", ("a.png",)),
     Case("draw triptych", "{i}/watched/gaze.xml -o {o}/a.png -m llvm_ad_rgb --spp 1", ("a.png",)),
     Case("scene", "{i}/rays.npz -o {o}/a.xml -m llvm_ad_rgb --geometry none", ("a.xml",)),
@@ -204,6 +205,7 @@ INPUTS = {
     "draw floor": {"files", "scene"},
     "draw sheet": {"files"},
     "draw difference": {"files"},
+    "draw surface": {"files"},
     "align": {"rays", "field", "scene", "surface", "pairs", "twin", "cameras", "place_cameras", "start"},
     "rays import": {"files", "salt", "poses", "place"},
     "rays guess": {"file"},
@@ -257,6 +259,8 @@ def make_inputs(folder: Path) -> Path:
     rays.save(folder / "rays.npz")
     vertices, faces = box((-9, -9, -1), (9, 9, 4))
     write_columns(folder / "room.ply", dict(zip("xyz", vertices.T)), faces)
+    columns = dict(zip("xyz", vertices.T)) | {"value": np.arange(len(vertices), dtype=np.float32)}
+    write_columns(folder / "baked.ply", columns, faces)
     fields.radiance(folder / "field.safetensors")
     save(folder / "nerg.pth", small_gaze(), nerf=small_state())
     write_torch(folder / "ngp.pth", {"model": nerf_state(1, np.random.default_rng(1))})

@@ -137,7 +137,7 @@ MENDINGS = (
         undo(
             "an ablation goes on with the next variant",
             ["tests/cli/test_interrupts.py::test_a_command_ends_at_once[ablate]"],
-            ("nerg_mi/jobs/ablation.py", "    if result.interrupted:\n        raise KeyboardInterrupt\n", ""),
+            ("nerg_mi/jobs/ablation_bench.py", "    if result.interrupted:\n        raise KeyboardInterrupt\n", ""),
         ),
         undo(
             "a training of gaze ends as if it were done",

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from nerg_mi.errors import NergError
 
-from . import difference, floor, sheet, sphere, triptych
+from . import difference, floor, sheet, sphere, surface, triptych
 from .kind import Kind
 
-KINDS: dict[str, Kind] = {kind.KIND.name: kind.KIND for kind in (sphere, triptych, floor, sheet, difference)}
+KINDS: dict[str, Kind] = {kind.KIND.name: kind.KIND for kind in (sphere, triptych, floor, sheet, difference, surface)}
 
 
 def find_kind(name: str) -> Kind:

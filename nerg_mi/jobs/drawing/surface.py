@@ -1,0 +1,181 @@
+"""A baked surface: gaze on a mesh, with its scale."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.figures.overlay import Heat, top_of
+from nerg_mi.figures.plots import gaze_figure
+from nerg_mi.files.bounded import reading
+from nerg_mi.jobs.options import option, parse_numbers
+from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.jobs.scenes.cameras import given_point
+from nerg_mi.rendering.mesh_file import check_ply
+from nerg_mi.rendering.pictures import activate
+from nerg_mi.surfaces.mesh import Mesh
+
+from .kind import Drawing, Kind, ScaleOptions
+
+_HEADER = 1 << 16
+_BARE, _LIT, _PAPER = 0.18, 0.3, 1.0
+_FRAME = 1.04
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceOptions(ScaleOptions):
+    """From where a baked surface is drawn; positions in its own units."""
+
+    camera: tuple[float, ...] | None = option(
+        None, "Position of the camera, x,y,z.  [default: where all of it is seen from above]", parse=parse_numbers
+    )
+    target: tuple[float, ...] | None = option(
+        None, "What the camera looks at, x,y,z.  [default: the middle]", parse=parse_numbers
+    )
+    up: tuple[float, ...] | None = option(None, "Which way is up, x,y,z.  [default: 0,0,1]", parse=parse_numbers)
+    below: float | None = option(None, "Leave out what is higher than this along up: a ceiling, for instance.")
+    fov: float = option(50.0, "Degrees that the picture is wide.", min=1.0, max=170.0)
+    width: int = option(960, "Width of the picture in pixels.", min=16, max=4096)
+    height: int = option(640, "Height of the picture in pixels.", min=16, max=4096)
+    title: str | None = option(None, "Title.  [default: what its values are]")
+    mode: str | None = option(
+        None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class BakedSurface:
+    """``mesh`` with ``values`` (V,) of its vertices; ``label``: what they are, with their unit; ``made_of``: the names
+    of the files of its gaze."""
+
+    mesh: Mesh
+    values: np.ndarray
+    label: str
+    made_of: tuple[str, ...]
+
+
+def draw(files: Sequence[Path], options: SurfaceOptions, reporter: Reporter) -> Drawing:
+    """The picture of the surface that `nerg bake` has written."""
+    style = options.style()
+    (path,) = files
+    activate(options.mode)
+    baked = read_baked(path)
+    up = _unit(given_point(options.up, "--up"), np.array([0.0, 0, 1]), "--up")
+    mesh, values = baked.mesh, baked.values
+    if options.below is not None:
+        kept = (mesh.vertices[mesh.faces] @ up).min(axis=1) < options.below
+        if not kept.any():
+            raise NergError(f'nothing of "{path}" is below {options.below:g}; give a larger --below')
+        mesh = Mesh(mesh.vertices, mesh.faces[kept])
+    value, shade, met = _seen(mesh, values, up, options)
+    if not met.any():
+        raise NergError(f'nothing of "{path}" is in the picture; give another --camera or --target')
+    grey = np.where(met, _BARE + _LIT * shade, _PAPER)
+    heat = Heat(options.top or top_of(value, met), style.colors or "inferno", decades=style.decades)
+    title = options.title or baked.label.partition("[")[0].strip().capitalize()
+    note = f"made of {', '.join(baked.made_of)}" if baked.made_of else ""
+    color = np.repeat(grey[..., None], 3, axis=2)
+    # Beside the surface there is nothing that could be known: it is paper, and not hatched.
+    return Drawing(gaze_figure(color, value, met, heat, title, baked.label, note=note), [path])
+
+
+def read_baked(path: Path) -> BakedSurface:
+    """A mesh with values in a PLY file, as `nerg bake` writes it. Raises `NergError` for any other file."""
+    if path.suffix.lower() != ".ply":
+        raise NergError(f'"{path}" is no baked surface that is drawn; give the .ply that "nerg bake" writes')
+    if not path.is_file():
+        raise MissingFile(f'there is no file "{path}"; correct its name')
+    check_ply(path)
+    with reading(path, "baked surface"):
+        with path.open("rb") as file:
+            head = file.read(_HEADER).partition(b"end_header")[0].decode("utf-8", "replace").splitlines()
+        import trimesh
+
+        found = trimesh.load(path, process=False)
+        assert isinstance(found, trimesh.Trimesh), "a file of triangles is one mesh"
+        raw = found.metadata["_ply_raw"]["vertex"]["data"]
+        if raw.dtype.names is None or "value" not in raw.dtype.names:
+            raise NergError(f'the vertices of "{path}" have no property value; give a .ply that "nerg bake" wrote')
+        values = np.asarray(raw["value"], np.float64).reshape(-1)
+        mesh = Mesh(np.asarray(found.vertices, np.float64), np.asarray(found.faces, np.int64))
+    said = {key: rest for key, _, rest in (line.removeprefix("comment ").partition(" ") for line in head)}
+    label = said.get("value:", "value")
+    try:
+        inputs = json.loads(said.get("nerg_mi", "{}")).get("inputs", {})
+    except ValueError as error:
+        raise NergError(f'the header of "{path}" is damaged ({error}); bake it again') from error
+    return BakedSurface(mesh, values, label, tuple(inputs))
+
+
+def _seen(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: SurfaceOptions) -> tuple[np.ndarray, ...]:
+    """Value, shade and whether there is a surface (h, w) for each pixel's middle."""
+    import mitsuba as mi
+
+    w, h = options.width, options.height
+    eye, across, rise, ahead = _camera(mesh, up, options)
+    half = np.tan(np.radians(options.fov) / 2)
+    x, y = np.meshgrid((np.arange(w) + 0.5) / w * 2 - 1, (1 - (np.arange(h) + 0.5) / h * 2) * h / w)
+    d = (ahead + half * (x[..., None] * across + y[..., None] * rise)).reshape(-1, 3)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    ours: mi.Mesh = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces))
+    params = mi.traverse(ours)
+    params["vertex_positions"] = mi.Float(np.ravel(mesh.vertices).astype(np.float32))
+    params["faces"] = mi.UInt32(np.ravel(mesh.faces).astype(np.uint32))
+    params.update()
+    scene: mi.Scene = mi.load_dict({"type": "scene", "surface": ours})
+    ray = mi.Ray3f(mi.Point3f(*eye.tolist()), mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
+    found = scene.ray_intersect_preliminary(ray)
+    met = np.array(found.is_valid(), bool)
+    face = mesh.faces[np.where(met, np.array(found.prim_index, np.int64), 0)]
+    u, v = np.array(found.prim_uv, np.float64)
+    weights = np.stack([1 - u - v, u, v], axis=1)
+    a, b, c = (mesh.vertices[face[:, k]] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    # Both sides are lit, from above more than from the camera, so that floors and walls differ.
+    shade = 0.6 * np.abs((normal * d).sum(axis=1)) + 0.4 * np.abs(normal @ up)
+    value = np.where(met, (weights * values[face]).sum(axis=1), 0.0)
+    return value.reshape(h, w), shade.reshape(h, w), met.reshape(h, w)
+
+
+def _camera(mesh: Mesh, up: np.ndarray, options: SurfaceOptions) -> tuple[np.ndarray, ...]:
+    """Where the camera is, and its axes: to the right, up and ahead. Raises `NergError` for one that sees nothing."""
+    corners = mesh.vertices[np.unique(mesh.faces)]
+    lower, upper = corners.min(axis=0), corners.max(axis=0)
+    target = given_point(options.target, "--target")
+    target = (lower + upper) / 2 if target is None else target
+    eye = given_point(options.camera, "--camera")
+    if eye is None:
+        side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
+        back = np.cross(side, up)
+        way = 0.9 * up - 0.8 * side / np.linalg.norm(side) + 0.4 * back / np.linalg.norm(back)
+        eye = target + way
+    ahead = _unit(target - eye, None, "--target, which has to be elsewhere than --camera,")
+    across = np.cross(ahead, up)
+    if np.linalg.norm(across) < 1e-6:
+        across = np.cross(ahead, np.roll(up, 1))
+    across /= np.linalg.norm(across)
+    rise = np.cross(across, ahead)
+    if options.camera is None:
+        half = np.tan(np.radians(options.fov) / 2)
+        x, y, z = ((corners - target) @ np.stack([across, rise, ahead], axis=1)).T
+        away = np.maximum(np.abs(x) / half, np.abs(y) / (half * options.height / options.width)) - z
+        eye = target - _FRAME * away.max() * ahead
+    return eye, across, rise, ahead
+
+
+def _unit(vector: np.ndarray | None, otherwise: np.ndarray | None, name: str) -> np.ndarray:
+    vector = otherwise if vector is None else vector
+    assert vector is not None
+    length = float(np.linalg.norm(vector))
+    if not length > 0:
+        raise NergError(f"{name} must not be of length 0")
+    return vector / length
+
+
+KIND = Kind("surface", "Gaze on a mesh, with its scale.", "a baked surface (.ply)", 1, SurfaceOptions, draw)
