@@ -273,19 +273,25 @@ def _ours(values: dict, visibility: str):
     import mitsuba as mi
 
     scene = nerg.Scene.load(store_scene(), **values, visibility=visibility).mitsuba
-    return lambda: np.array(mi.render(scene, sensor=0, spp=1))
+
+    def render() -> np.ndarray:
+        return np.array(mi.render(scene, sensor=0, spp=1))
+
+    return render
 
 
 def measure(frames: dict, size: str, runs: int) -> list[dict]:
     """A row for each of ``frames``, functions by their names, called in turns."""
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in frames}
-    for turn in range(runs + 1):
+    for frame in frames.values():
+        # The first compiles, and fills what is kept of the observer, the next compiles what reads it.
+        for _ in range(1 if isinstance(frame, partial) else 3):
+            frame()
+    for _ in range(runs):
         for name, frame in frames.items():
             wall, cpu = time.perf_counter(), time.process_time()
             frame()
-            # The first compiles, and fills what is kept of the observer.
-            if turn:
-                seconds[name].append((time.perf_counter() - wall, time.process_time() - cpu))
+            seconds[name].append((time.perf_counter() - wall, time.process_time() - cpu))
     medians = {name: statistics.median(wall for wall, _ in taken) for name, taken in seconds.items()}
     ours = medians[next(iter(frames))]
     return [

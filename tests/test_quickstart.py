@@ -20,6 +20,7 @@ SMALLER = {
     "nerg eval": "--min-rays 4",
     "nerg scene": "--width 36",
     "nerg report": "--width 36 --spp 1 --points 500",
+    "nerg stats": "--eyes 8 --directions 256 --resamples 199",
 }
 """What is added to a command, so that it takes a second."""
 
@@ -33,7 +34,7 @@ def lines() -> list[str]:
 
 def test01_the_page_leads_from_a_recording_to_a_picture():
     done = [" ".join(line.split()[:2]) for line in lines()]
-    order = ["nerg rays", "nerg train", "nerg eval", "nerg scene", "nerg render", "nerg report"]
+    order = ["nerg rays", "nerg train", "nerg eval", "nerg scene", "nerg render", "nerg report", "nerg stats"]
     assert [command for command in done[2:] if command in order][-len(order) :] == order
     assert set(SMALLER) <= set(done)
 
