@@ -42,7 +42,7 @@ from .counting.results import write_results
 from .counting.setting import setting_of
 from .counting.surroundings import Surroundings
 from .counting.tracked import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
-from .counting.trust import add_trust, tell_support
+from .counting.trust import add_trust, tell_places, tell_support
 from .counting.what_if import what_if_rows
 from .options import parse_numbers
 from .options.statistics import StatisticsOptions
@@ -234,10 +234,11 @@ class _Work:
             raise NergError("there are no rays to count; import some")
         sums = total.sums()
         self.reporter.message(f"{count:,} rays of {len(sums.persons_of(ALL)[0]):,} people")
-        nobody = Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
-        return sums, eyes_of_some(
-            picker.eyes(), self.options.eyes, self.reporter
-        ) if self.around.gaze is not None else nobody
+        if self.around.gaze is None:
+            return sums, Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ())
+        eyes = eyes_of_some(picker.eyes(), self.options.eyes, self.reporter)
+        tell_places(eyes, self.reporter)
+        return sums, eyes
 
     def _counted(
         self, rays: Rays | Path, counting: Counting, seen: Callable[[Rays], None] | None, count: int

@@ -20,6 +20,10 @@ SPREAD = ("share", "dwell", "reach")
 """Numbers whose spread over members is told."""
 
 
+PLACES = 16
+"""From so many places a person a field should be asked for their reach."""
+
+
 def add_trust(
     rows: Sequence[Row], foretold: Foretold, eyes: Eyes, times: Mapping[Cell, dict[str, float]], glance: float
 ) -> None:
@@ -55,6 +59,17 @@ def tell_support(foretold: Foretold, reporter: Reporter) -> None:
         reporter.message(
             "the gaze field's checkpoint keeps no support, so that the tables cannot say where it learnt from nobody; "
             "nerg train gaze with the rays makes one that does"
+        )
+
+
+def tell_places(eyes: Eyes, reporter: Reporter) -> None:
+    """Say so where a field is asked from too few places a person for their reach: who looks at a thing only where it is
+    near is taken for somebody who does not, unless one of their places is there."""
+    people = len(set(eyes.person))
+    if people and len(eyes.person) < PLACES * people:
+        reporter.message(
+            f"the field is asked from {len(eyes.person) / people:.1f} places a person, by which reach comes out too "
+            f"low; --eyes {PLACES * people} asks from {PLACES}"
         )
 
 

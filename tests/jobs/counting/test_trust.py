@@ -7,7 +7,7 @@ import pytest
 
 from nerg_mi.jobs.counting.foretold import Foretold
 from nerg_mi.jobs.counting.tracked import Eyes
-from nerg_mi.jobs.counting.trust import add_trust, support_of, tell_support
+from nerg_mi.jobs.counting.trust import PLACES, add_trust, support_of, tell_places, tell_support
 from nerg_mi.statistics.sums import ALL, Cell
 from tests.jobs.recorder import Recorder
 
@@ -62,3 +62,14 @@ def test03_a_checkpoint_without_support_is_told_of():
     assert support_of(none) is None and support_of(foretold([1, 1, 1]), np.zeros(3, bool)) is None
     tell_support(none, told)
     assert "keeps no support" in told.messages[0] and "nerg train gaze" in told.messages[0]
+
+
+def test_few_places_a_person_are_told():
+    told = Recorder()
+    tell_places(EYES, told)
+    assert len(told.messages) == 1 and "1.5 places a person" in told.messages[0] and "--eyes 32 " in told.messages[0]
+    count = 2 * PLACES
+    many = Eyes(np.zeros((count, 3)), np.ones((count, 3)), ("Ada", "Bo") * PLACES, (frozenset([ALL]),) * count)
+    tell_places(many, told)
+    tell_places(Eyes(np.zeros((0, 3)), np.zeros((0, 3)), (), ()), told)
+    assert len(told.messages) == 1
