@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.registration import plugin_class
+from nerg_mi.rendering.asked import is_nerg
 
 from .arrays import Floats, listed, points
 from .camera import Camera
@@ -47,7 +48,7 @@ class Scene:
 
     def __init__(self, mitsuba: mi.Scene):
         integrator = mitsuba.integrator()
-        if type(integrator).__name__ != "NergIntegrator":
+        if not is_nerg(integrator):
             have = "none" if integrator is None else f'"{integrator.class_name()}"'
             raise NergError(
                 f'a scene needs the integrator "nerg", and this one has {have}; '

@@ -17,7 +17,7 @@ from nerg_mi.figures.overlay import MOST_DECADES
 from nerg_mi.figures.overlays import Layers, Limits, Overlay, Style, find_overlay, shared_limits
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.interruption import Interruption
-from nerg_mi.rendering.asked import render_asked
+from nerg_mi.rendering.asked import is_nerg, render_asked
 from nerg_mi.rendering.projection import pixel_of
 from nerg_mi.transport.observer.viewpoint import center
 
@@ -181,7 +181,7 @@ def layers_of(
 
 def basis_words(loaded: Any, part: str | None = "gaze") -> str:
     """Rays and people that a ``part`` of the scene rests on, "gaze" or "kde", in words; "" where that is not known."""
-    volume = getattr(loaded.integrator(), "children", {}).get(part)
+    volume = loaded.integrator().children.get(part)
     if volume is None:
         return ""
     basis = volume.kde_view().basis if part == "kde" else volume.field.basis
@@ -191,6 +191,8 @@ def basis_words(loaded: Any, part: str | None = "gaze") -> str:
 def basis_texts(loaded: Any) -> dict[str, str]:
     """The same for the header of a picture, by the names under which `jobs.drawing` finds it: "gaze.basis" and
     "kde.basis", as far as they are known."""
+    if not is_nerg(loaded.integrator()):
+        return {}
     words = {f"{part}.basis": basis_words(loaded, part) for part in ("gaze", "kde")}
     return {name: text for name, text in words.items() if text}
 

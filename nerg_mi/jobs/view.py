@@ -18,6 +18,7 @@ from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.scene_gaze import gaze_of_scene, with_gaze
 
@@ -33,7 +34,6 @@ RAYS = 2_000_000
 """Of larger datasets so many rays are shown, drawn at random."""
 
 _SUFFIXES = {*KINDS, ".safetensors", ".rays"}
-_NERG = "NergIntegrator"
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,7 @@ def _expanded(path: Path) -> list[Path]:
 
 
 def _is_nerg(path: Path) -> bool:
-    return type(load_scene(path).integrator()).__name__ == _NERG
+    return is_nerg(load_scene(path).integrator())
 
 
 def _given_align(options: ViewOptions) -> Similarity | None:

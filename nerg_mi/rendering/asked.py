@@ -42,10 +42,15 @@ class AskedLayer:
         return [(radiance, shown, channels)]
 
 
+def is_nerg(integrator: Any) -> bool:
+    """Whether an integrator, or None, is `nerg`: by name, since each change of variant makes that class anew."""
+    return type(integrator).__name__ == "NergIntegrator"
+
+
 def nerg_of(path: Path, scene: Any) -> Any:
     """The integrator of ``scene``, which was read from ``path``. Raises `NergError` where it is not `nerg`."""
     integrator = scene.integrator()
-    if type(integrator).__name__ != "NergIntegrator":
+    if not is_nerg(integrator):
         kind = "none" if integrator is None else f'"{integrator.class_name()}"'
         raise NergError(
             f'an overlay needs the integrator "nerg", and "{path}" has {kind}; "nerg scene {path} -o new.xml" writes '

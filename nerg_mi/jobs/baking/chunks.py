@@ -19,6 +19,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
+from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.surfaces.gaze_source import GazeSettings, MakeLooker, gaze_sums, lookers_of_field
@@ -107,7 +108,7 @@ def _prepared(scene: BakeScene) -> _Ready:
     medium, settings, falloff, gaze = None, None, 0.0, None
     if scene.scene is not None:
         integrator: Any = load_scene(scene.scene).integrator()
-        if type(integrator).__name__ == "NergIntegrator":
+        if is_nerg(integrator):
             medium, gaze = integrator.medium, integrator.gaze
             settings, falloff = integrator.observer_settings, float(np.ravel(np.array(integrator.falloff))[0])
     target = Target(scene.mesh, list(scene.others), medium, settings if medium is not None else None, falloff)

@@ -14,6 +14,7 @@ from nerg_mi.formats.fields import load_gaze
 from nerg_mi.jobs.gaze_places import align_of_training, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace
@@ -111,7 +112,7 @@ def surroundings_of_scene(path: Path, gaze: Path | None, align: Similarity | Non
 
     scene = load_scene(path, merge=False)
     integrator: Any = scene.integrator()
-    own = type(integrator).__name__ == "NergIntegrator"
+    own = is_nerg(integrator)
     medium = integrator.medium if own else None
     place = Place(medium, scene)
     if medium is None and place.scene is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +42,12 @@ class Kind:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScaleOptions:
-    """The scale of a figure's values."""
+class ColorOptions:
+    """The colours of a figure's values."""
 
-    top: float | None = option(None, "Upper end of the scale, for gaze in 1/sr.  [default: the 99.5th percentile]")
+    top: float | None = option(None, "Upper end of the scale, in its unit.  [default: the 99.5th percentile]")
     cmap: str | None = option(None, "Colour map: inferno, magma, plasma, viridis, cividis.  [default: inferno]")
     decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.")
-    hatching: bool = option(True, "Hatch where nothing is known.")
 
     def style(self, title: str | None = None) -> Style:
         """How overlays are drawn by these options. Raises `NergError` for what cannot be drawn."""
@@ -58,7 +57,18 @@ class ScaleOptions:
             raise NergError(f"--decades must be from 0 (a linear scale) to {MOST_DECADES:.0f}, got {self.decades}")
         if self.cmap is not None:
             find_colors(self.cmap)
-        return Style(self.cmap, self.decades, self.hatching, title)
+        return Style(self.cmap, self.decades, False, title)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleOptions(ColorOptions):
+    """The same of a figure that can be hatched."""
+
+    hatching: bool = option(True, "Hatch where nothing is known.")
+
+    def style(self, title: str | None = None) -> Style:
+        """How overlays are drawn by these options. Raises `NergError` for what cannot be drawn."""
+        return replace(super().style(title), hatched=self.hatching)
 
 
 @dataclass(frozen=True, kw_only=True)

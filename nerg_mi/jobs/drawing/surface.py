@@ -19,8 +19,9 @@ from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.rendering.mesh_file import check_ply
 from nerg_mi.rendering.pictures import activate
 from nerg_mi.surfaces.mesh import Mesh
+from nerg_mi.surfaces.target import mitsuba_mesh
 
-from .kind import Drawing, Kind, ScaleOptions
+from .kind import ColorOptions, Drawing, Kind
 
 _HEADER = 1 << 16
 _BARE, _LIT, _PAPER = 0.18, 0.3, 1.0
@@ -28,7 +29,7 @@ _FRAME = 1.04
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfaceOptions(ScaleOptions):
+class SurfaceOptions(ColorOptions):
     """From where a baked surface is drawn; positions in its own units."""
 
     camera: tuple[float, ...] | None = option(
@@ -122,11 +123,7 @@ def _seen(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: SurfaceOption
     x, y = np.meshgrid((np.arange(w) + 0.5) / w * 2 - 1, (1 - (np.arange(h) + 0.5) / h * 2) * h / w)
     d = (ahead + half * (x[..., None] * across + y[..., None] * rise)).reshape(-1, 3)
     d /= np.linalg.norm(d, axis=1, keepdims=True)
-    ours: mi.Mesh = mi.Mesh("surface", len(mesh.vertices), len(mesh.faces))
-    params = mi.traverse(ours)
-    params["vertex_positions"] = mi.Float(np.ravel(mesh.vertices).astype(np.float32))
-    params["faces"] = mi.UInt32(np.ravel(mesh.faces).astype(np.uint32))
-    params.update()
+    ours = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
     scene: mi.Scene = mi.load_dict({"type": "scene", "surface": ours})
     ray = mi.Ray3f(mi.Point3f(*eye.tolist()), mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
     found = scene.ray_intersect_preliminary(ray)
