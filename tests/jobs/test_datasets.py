@@ -176,9 +176,9 @@ def test_training_and_scores_are_of_the_same_rays(crowded, tmp_path, most):
     rays = load_rays(crowded, most, 3)
     alone = train_gaze(rays, tmp_path / "alone.safetensors", replace(TRAINING, seed=3))
     assert alone.provenance["test"] == trained.provenance["test"]
-    assert [row["KLD"] for row in evaluate_gaze(tmp_path / "alone.safetensors", rays, options=OPTIONS).rows] == [
-        row["KLD"] for row in found.rows
-    ]
+    # Two threads add up a gradient in an order of their own, so that two fits agree to rounding alone.
+    scored = evaluate_gaze(tmp_path / "alone.safetensors", rays, options=OPTIONS)
+    assert [row["KLD"] for row in scored.rows] == pytest.approx([row["KLD"] for row in found.rows], rel=1e-6)
 
 
 def test_another_dataset_is_not_scored(crowded, tmp_path):
