@@ -71,6 +71,19 @@ def color(props, name: str, default: float) -> list[float]:
     return rgb
 
 
+def vector(props, name: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Three finite numbers."""
+    value = props.get(name, None)
+    try:
+        found = np.asarray(default if value is None else value, float).ravel()
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.shape != (3,) or not np.isfinite(found).all():
+        raise NergError(f'"{name}" must be three finite numbers, got {value!r}')
+    x, y, z = found.tolist()
+    return x, y, z
+
+
 def resolved(filename: str) -> str:
     """The path of the file that a scene calls ``filename``, where it is in one of the folders that Mitsuba looks in."""
     import mitsuba as mi

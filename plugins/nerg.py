@@ -86,6 +86,14 @@ Neural radiance and gaze fields (:monosp:`nerg`)
    - |float| or |rgb|
    - Linear radiance behind everything; an environment emitter of the scene takes its place. (Default: 0)
 
+ * - ceiling
+   - |float|
+   - {ceiling}
+
+ * - up
+   - |vector|
+   - Along which ``ceiling`` is measured. (Default: 0, 0, 1)
+
  * - aovs
    - |string|
    - What to compute, in the order wanted, with commas between; see below. (Default: ``depth,opacity``)
@@ -237,6 +245,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         self.falloff = mi.Float(number(props, "falloff", 0.1, low=0))
         self.radiance = boolean(props, "radiance", True)
         self.background = nerg_properties.background_of(props)
+        self.ceiling = nerg_properties.ceiling_of(props)
         self.jitter = boolean(props, "jitter", False)
         self.settings = nerg_properties.march_settings(props, self.medium)
         self.observer_settings = nerg_properties.observer_settings(props, self.settings)
@@ -307,7 +316,7 @@ class NergIntegrator(mi.SamplingIntegrator):
     def traverse(self, cb):
         for name, child in self.children.items():
             if name == "observer":
-                child.traverse(_Pose(cb, "observer."))
+                child.traverse(nerg_properties.Pose(cb, "observer."))
             else:
                 cb.put(name, child, mi.ParamFlags.Differentiable)
         cb.put("falloff", self.falloff, mi.ParamFlags.Differentiable)
@@ -333,18 +342,6 @@ class NergIntegrator(mi.SamplingIntegrator):
 
     def to_string(self):
         return nerg_properties.describe(self)
-
-
-class _Pose(mi.TraversalCallback):
-    """Shows the pose of a sensor as what it is to us. Mitsuba calls it not differentiable, as silhouettes are not."""
-
-    def __init__(self, cb, prefix):
-        super().__init__()
-        self.cb, self.prefix = cb, prefix
-
-    def put(self, name, value, flags, *kind):
-        if name == "to_world":
-            self.cb.put(self.prefix + name, value, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous, *kind)
 
 
 register("integrator", "nerg", NergIntegrator)

@@ -78,7 +78,7 @@ AOVS: dict[str, Aov] = {
             name="depth",
             channels="T",
             summary="distance along the ray from the ray's origin, wherever opacity > 0",
-            compute=lambda p: [p.depth],
+            compute=lambda p: [p.camera_depth],
         ),
         Aov(name="opacity", summary="1 - transmittance", compute=lambda p: [dr.select(p.active, p.view.opacity, 0)]),
         Aov(

@@ -59,11 +59,12 @@ class AskedPixel(Pixel):
 
     def for_origins(self) -> AskedPixel:
         """The same rays, each for an observer at its own origin: of fields that need not be normalised for them."""
-        return self.for_observer(self.ray.o, [], True, ObserverCache())
+        return self.for_observer(self.camera_ray.o, [], True, ObserverCache())
 
     def settle(self, *more) -> None:
         """Compute now what observers have in common, and ``more``, so that their kernels begin with it."""
-        common = [self.ray.o, self.ray.d, self.active, self.depth, self.surface, self.p_d, self.penetration]
+        rays = [self.camera_ray.o, self.ray.o, self.ray.d]
+        common = [*rays, self.active, self.depth, self.surface, self.p_d, self.penetration]
         if self.counting and self.view.march is not None:
             common.append(self.view.march.density_evals)
         dr.eval(common, more)

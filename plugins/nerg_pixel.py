@@ -50,7 +50,9 @@ class Pixel:
     """
 
     def __init__(self, nerg, scene, sensors: list, ray, active, offset):
-        self.nerg, self.sensors, self.ray, self.active = nerg, sensors, ray, active
+        self.nerg, self.sensors, self.camera_ray, self.active = nerg, sensors, ray, active
+        # What is traced, and how far the camera's ray went before it.
+        self.ray, self.ahead = (ray, None) if nerg.ceiling is None else nerg.ceiling.cut(ray)
         medium = nerg.medium
         self.place = Place(medium, scene)
         self.lit = nerg.radiance and medium is not None and medium.has_color
@@ -58,7 +60,7 @@ class Pixel:
         if "features" in nerg.demands and medium is not None:
             painter = FeaturePainter(medium, self.lit)
         self.counting = "counts" in nerg.demands
-        self.view = self.place.trace(ray, active, nerg.settings, offset=offset, count=self.counting, color=painter)
+        self.view = self.place.trace(self.ray, active, nerg.settings, offset=offset, count=self.counting, color=painter)
         gathered = None if self.view.march is None else self.view.march.color
         self.color, self.accumulated_features = gathered, []
         if isinstance(painter, FeaturePainter) and gathered is not None:
@@ -83,8 +85,13 @@ class Pixel:
 
     @cached_property
     def depth(self):
-        """Distance along the ray to its surface, 0 where nothing absorbs."""
+        """Distance along the traced ray to its surface, 0 where nothing absorbs."""
         return self.view.depth(self.nerg.observer_settings.depth, self.some)
+
+    @property
+    def camera_depth(self):
+        """The same from where the camera's ray starts."""
+        return self.depth if self.ahead is None else dr.select(self.some, self.depth + self.ahead, 0)
 
     @cached_property
     def surface(self):
@@ -112,7 +119,7 @@ class Pixel:
     def p_o(self):
         """The observer of this ray."""
         if self.nerg.observer is None:
-            return viewpoint.center_of_ray(self.sensors, self.ray)
+            return viewpoint.center_of_ray(self.sensors, self.camera_ray)
         return viewpoint.center(self.nerg.observer)
 
     @cached_property

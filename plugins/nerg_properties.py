@@ -8,7 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
-from nerg_mi.properties import boolean, choice, color, integer, number
+from nerg_mi.properties import boolean, choice, color, integer, number, vector
+from nerg_mi.transport.ceiling import Ceiling
 from nerg_mi.transport.march.depth import DEPTHS
 from nerg_mi.transport.march.rules import RULES, boundaries
 from nerg_mi.transport.march.settings import MarchSettings, default_growth, default_step
@@ -20,6 +21,9 @@ from nerg_mi.transport.observer.settings import VISIBILITIES, ObserverSettings
 from nerg_mi.transport.observer.views import ObserverView, SupportView
 
 _MARCH_MANUAL = {
+    "ceiling": "Height above which a place is left out of what cameras see from above it, so that a roof hides no "
+    "room: rays that start higher begin where they come below it; depths still count from the camera. What observers "
+    "see is not cut. (Default: none)",
     "dt_gamma": "Steps are at least this share of the distance travelled: for wide views, whose far parts need no "
     "short steps. (Default: 0, i.e. uniform steps; for a field without an end that which it was trained with)",
     "stop": "Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times "
@@ -143,6 +147,12 @@ def observer_settings(props, march: MarchSettings) -> ObserverSettings:
     )
 
 
+def ceiling_of(props) -> Ceiling | None:
+    """What is left out of views from above."""
+    up = vector(props, "up", (0.0, 0.0, 1.0))
+    return Ceiling(number(props, "ceiling", 0), up) if "ceiling" in props else None
+
+
 def background_of(props):
     """Radiance (Spectrum) behind everything."""
     background = mi.Color3f(color(props, "background", 0.0))
@@ -165,6 +175,7 @@ def describe(nerg) -> str:
         "depth": seen.depth,
         "surface_opacity": seen.surface_opacity,
         "radiance": nerg.radiance,
+        "ceiling": "none" if nerg.ceiling is None else nerg.ceiling,
         "aovs": ",".join(nerg.aovs),
         "quadrature": march.quadrature,
         "step": march.step,
@@ -176,3 +187,15 @@ def describe(nerg) -> str:
         "jitter": nerg.jitter,
     }
     return "NergIntegrator[\n" + "".join(f"  {k} = {v},\n" for k, v in body.items()) + "]"
+
+
+class Pose(mi.TraversalCallback):
+    """Shows the pose of a sensor as what it is to us. Mitsuba calls it not differentiable, as silhouettes are not."""
+
+    def __init__(self, cb, prefix):
+        super().__init__()
+        self.cb, self.prefix = cb, prefix
+
+    def put(self, name, value, flags, *kind):
+        if name == "to_world":
+            self.cb.put(self.prefix + name, value, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous, *kind)

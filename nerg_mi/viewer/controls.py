@@ -14,7 +14,7 @@ from nerg_mi.files.png import encode_png
 from nerg_mi.rendering.scene_file import files_of_scene
 
 from . import layers
-from .copied_scene import Shown, copied
+from .copied_scene import copied_view
 from .page import Page, Window
 from .view import View, heading_of
 
@@ -200,7 +200,7 @@ class Controls:
         session, gui, place = self.session, self.gui, self.session.place
         home = gui.add_button("First view")
         above = gui.add_button("From above")
-        cut = gui.add_checkbox("Cut the ceiling off", False)
+        cut = gui.add_checkbox("Cut the ceiling off", session.ceiling is not None)
         height = gui.add_slider("Height of the cut", 0.0, 1.0, 0.01, 0.8)
         shot = gui.add_button("Save the picture (PNG)")
         copy = gui.add_button("Copy as a scene (XML)")
@@ -264,7 +264,7 @@ class Controls:
         proxy = self.session.proxy
         if proxy is None:
             return 0.0, 1.0
-        along = proxy.points @ self.session.place.up
+        along = proxy.points @ self.session.cut_up
         return float(np.percentile(along, 0.5)), float(np.percentile(along, 99.5))
 
 
@@ -333,18 +333,3 @@ def png_bytes(session: Any, colors: np.ndarray, text: dict[str, str] | None = No
         return encode_png(mi.Bitmap(np.ascontiguousarray(colors)), text)
 
     return session.worker.call(encode).result()
-
-
-def copied_view(session: Any, view: View) -> str:
-    """A scene file of ``view`` with the observer, the layer and the settings of ``session``."""
-    check_copied(session)
-    asked = tuple(name for name in layers.quantities(session.shade.layer) if name != "color")
-    falloff = session.falloff
-    shown = Shown(view, session.observer, asked, session.options.width, session.spp, falloff)
-    return copied(session.scene_file, shown)
-
-
-def check_copied(session: Any) -> None:
-    """Raise `NergError` for a place that ends with the viewer, so that no copy of it could be rendered."""
-    if session.place.made and session.scene_file.with_suffix(".vol").exists():
-        raise NergError('the place was made of rays for this viewer; "nerg scene" writes it as a scene of its own')

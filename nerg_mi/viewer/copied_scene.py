@@ -6,6 +6,7 @@ import math
 from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -14,16 +15,21 @@ from nerg_mi.errors import NergError
 from nerg_mi.rendering.nested_scene import name_files, scene_elements, verbatim
 from nerg_mi.rendering.scene_writer import Comment, document, element, numbers, prop
 
+from . import layers
 from .view import View
 
 CAMERA, TARGET, OBSERVER = "view_camera", "view_target", "view_observer"
 """`<default>`s of a copied scene."""
 
+SENSOR = "view"
+"""The name of its camera."""
+
 
 @dataclass(frozen=True, eq=False)
 class Shown:
     """What a page shows: its ``view``, the ``observer`` (3,) or None where the camera is it, AOVs, the ``width`` of the
-    picture in pixels, samples ``spp`` a pixel, and the integrator's ``falloff``."""
+    picture in pixels, samples ``spp`` a pixel, the integrator's ``falloff``, and the height and up (3,) of a
+    ``ceiling`` that is cut off, or None."""
 
     view: View
     observer: np.ndarray | None
@@ -31,6 +37,7 @@ class Shown:
     width: int
     spp: int
     falloff: float
+    ceiling: tuple[float, np.ndarray] | None = None
 
 
 def copied(path: Path, shown: Shown) -> str:
@@ -40,13 +47,16 @@ def copied(path: Path, shown: Shown) -> str:
     Raises `NergError` for a scene whose integrator is not written in the file.
     """
     version, children = scene_elements(path)
-    own = [deepcopy(child) for child in children if child.tag != "path"]
+    eye = [] if shown.observer is None else [element("default", name=OBSERVER, value=numbers(shown.observer))]
+    # What a copy that is viewed itself has of its own is said anew.
+    ours = {("sensor", SENSOR), ("default", CAMERA), ("default", TARGET)} | {("default", OBSERVER) for _ in eye}
+    named = lambda child: (child.tag, child.get("id" if child.tag == "sensor" else "name"))
+    own = [deepcopy(child) for child in children if child.tag != "path" and named(child) not in ours]
     integrators = [child for child in own if child.tag == "integrator"]
     if len(integrators) != 1:
         raise NergError(f'"{path}" has {len(integrators)} integrators, and a copy needs one; leave one of them')
     name_files(own, path, children)
     _observe(integrators[0], shown)
-    eye = [] if shown.observer is None else [element("default", name=OBSERVER, value=numbers(shown.observer))]
     target = shown.view.origin + shown.view.ahead
     nodes = [
         element("default", name=CAMERA, value=numbers(shown.view.origin)),
@@ -60,14 +70,18 @@ def copied(path: Path, shown: Shown) -> str:
 
 
 def _observe(integrator: Element, shown: Shown) -> None:
-    """Put observer, fall-off and AOVs into the ``integrator``."""
-    names = {"observer", "falloff", "aovs"} if shown.observer is not None else {"falloff", "aovs"}
+    """Put observer, fall-off, ceiling and AOVs into the ``integrator``."""
+    names = {"falloff", "aovs", "ceiling", "up"} | ({"observer"} if shown.observer is not None else set())
     for child in [c for c in integrator if c.get("name") in names]:
         integrator.remove(child)
     if shown.observer is not None:
         sensor = SubElement(integrator, "sensor", name="observer", type="perspective")
         SubElement(SubElement(sensor, "transform", name="to_world"), "translate", value=f"${OBSERVER}")
     SubElement(integrator, "float", name="falloff", value=f"{shown.falloff:.9g}")
+    if shown.ceiling is not None:
+        height, up = shown.ceiling
+        SubElement(integrator, "float", name="ceiling", value=f"{height:.9g}")
+        SubElement(integrator, "vector", name="up", value=numbers(up))
     SubElement(integrator, "string", name="aovs", value=",".join(shown.aovs))
 
 
@@ -94,5 +108,24 @@ def _sensor(shown: Shown):
         element("sampler", prop("integer", "sample_count", shown.spp), type="independent"),
         film,
         type="perspective",
-        id="view",
+        id=SENSOR,
     )
+
+
+def copied_view(session: Any, view: View) -> str:
+    """A scene file of ``view`` with the observer, the layer and the settings of ``session``."""
+    check_copied(session)
+    asked = tuple(name for name in layers.quantities(session.shade.layer) if name != "color")
+    settings = session.options.width, session.spp, session.falloff, ceiling_of(session)
+    return copied(session.scene_file, Shown(view, session.observer, asked, *settings))
+
+
+def ceiling_of(session: Any) -> tuple[float, np.ndarray] | None:
+    """The height and the up of what ``session`` leaves out of views from above."""
+    return None if session.ceiling is None else (session.ceiling, session.cut_up)
+
+
+def check_copied(session: Any) -> None:
+    """Raise `NergError` for a place that ends with the viewer, so that no copy of it could be rendered."""
+    if session.place.made and session.scene_file.with_suffix(".vol").exists():
+        raise NergError('the place was made of rays for this viewer; "nerg scene" writes it as a scene of its own')

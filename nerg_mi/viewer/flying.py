@@ -11,8 +11,8 @@ from nerg_mi.files.atomic import write_text
 from nerg_mi.files.video import check_video
 
 from . import layers
-from .controls import check_copied, tell
-from .copied_scene import copied
+from .controls import tell
+from .copied_scene import ceiling_of, check_copied, copied
 from .filming import Film, film_options, shown_of_flight
 from .flights import flight, frames_csv
 from .page import Page
@@ -82,6 +82,7 @@ class Flying:
                 aovs=asked,
                 spp=session.spp,
                 falloff=session.falloff,
+                ceiling=ceiling_of(session),
             )
             scene, frames, video = (Path(folder.name, name) for name in ("view.xml", "view.frames.csv", "flight.mp4"))
             write_text(scene, copied(session.scene_file, shown))

@@ -15,6 +15,7 @@ import numpy as np
 
 from nerg_mi.api.queries import trace
 from nerg_mi.api.scene import Scene
+from nerg_mi.transport.ceiling import Ceiling
 
 from .view import View
 
@@ -75,13 +76,13 @@ def refine(
     spp: int,
     pace: Pace,
     *,
-    ceiling: tuple[np.ndarray, float] | None = None,
+    ceiling: Ceiling | None = None,
     seed: int = 0,
 ) -> Iterator[Picture | None]:
     """Pictures of ``quantities``, each better than the one before; None after each band of one.
 
     ``observer`` (3,): whose gaze it is; None: that of whoever stands at the camera. ``width`` in pixels and ``spp``
-    samples a pixel of the last. ``ceiling``: an up (3,) and a height along it; what is above is not seen from above it.
+    samples a pixel of the last. ``ceiling``: what is left out of views from above, whatever the scene says of it.
     """
     start = time.perf_counter()
     random = np.random.default_rng(seed)
@@ -100,8 +101,8 @@ def refine(
                 part, size = directions[done : done + pace.rays], pace.rays
                 turn = seed + 7919 * sample + done
                 # The last and largest picture is that of the scene's own settings.
-                with rough_integrals(scene, share > 1):
-                    found = _traced(scene, view.origin, filled(part, size), quantities, observer, ceiling, turn)
+                with rough_integrals(scene, share > 1), cut(scene, ceiling):
+                    found = _traced(scene, view.origin, filled(part, size), quantities, observer, turn)
                 parts.append({name: v[: len(part)] for name, v in found.items()})
                 pace.learn(time.perf_counter() - began)
                 done += len(part)
@@ -130,6 +131,18 @@ def rough_integrals(scene: Scene, rough: bool = True) -> Iterator[None]:
         integrator.observer_settings = own
 
 
+@contextmanager
+def cut(scene: Scene, ceiling: Ceiling | None) -> Iterator[None]:
+    """Leave out what is above the ``ceiling`` within the block."""
+    integrator = scene.integrator
+    own = integrator.ceiling
+    integrator.ceiling = ceiling
+    try:
+        yield
+    finally:
+        integrator.ceiling = own
+
+
 def filled(directions: np.ndarray, size: int) -> np.ndarray:
     """``directions`` with the last one again and again, up to ``size``."""
     missing = size - len(directions)
@@ -142,28 +155,9 @@ def _traced(
     directions: np.ndarray,
     quantities: Sequence[str],
     observer: np.ndarray | None,
-    ceiling: tuple[np.ndarray, float] | None,
     seed: int,
 ) -> dict[str, np.ndarray]:
     """Quantities (N,) or (N, channels) of rays from ``origin``."""
-    ahead = np.zeros(len(directions))
-    origins = origin[None]
-    if ceiling is not None:
-        ahead = below(origin, directions, *ceiling)
-        origins = origin + ahead[:, None] * directions if ahead.any() else origins
     eyes = origin if observer is None else observer
-    found = trace(scene, origins, directions, list(quantities), observers=eyes[None], seed=seed)
-    values = {name: np.asarray(found[name][0]) for name in quantities}
-    if "depth" in values and ahead.any():
-        values["depth"] = np.where(values["depth"] > 0, values["depth"] + ahead, 0).astype(np.float32)
-    return values
-
-
-def below(origin: np.ndarray, directions: np.ndarray, up: np.ndarray, height: float) -> np.ndarray:
-    """How far along unit ``directions`` (N, 3) a ray from ``origin`` comes below ``height`` along ``up``; 0 where it is
-    below already, or never comes there."""
-    over = float(origin @ up) - height
-    if over <= 0:
-        return np.zeros(len(directions))
-    falls = -(directions @ up)
-    return np.where(falls > 1e-9, over / np.maximum(falls, 1e-9), 0.0)
+    found = trace(scene, origin[None], directions, list(quantities), observers=eyes[None], seed=seed)
+    return {name: np.asarray(found[name][0]) for name in quantities}

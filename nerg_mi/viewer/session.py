@@ -25,6 +25,7 @@ from nerg_mi.jobs.overlays import basis_words
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.jobs.view import PlaceToView
 from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.transport.ceiling import Ceiling
 
 from . import layers
 from .layers import Layer, Scale, Shade
@@ -96,6 +97,8 @@ class Session:
         self.observer = np.array(given, float)
         self.heading = heading_of(self.home.ahead if own is None else ahead_of(self.scene), self.place.up)
         self.falloff = float(np.ravel(np.array(self.scene.integrator.falloff))[0])
+        cut = self.scene.integrator.ceiling
+        self.cut_up, self.ceiling = (self.place.up, None) if cut is None else (cut.up, cut.height)
         self.tracks = None if self.place.rays is None else Tracks(self.place.rays, self.place.align)
         areas = read_areas(self.options.regions) if self.options.regions is not None else Areas(())
         # What is no box is not shown, and is saved again with what is.
@@ -240,7 +243,7 @@ class Session:
             layer, color, values, np.ones(count, bool), self.scale() if values is not None else Scale()
         )
         if ceiling is not None:
-            below = points @ self.place.up <= ceiling
+            below = points @ self.cut_up <= ceiling
             points, colors = points[below], colors[below]
         return Points(points, colors, size)
 
@@ -302,10 +305,9 @@ class Session:
     ) -> Iterator[None]:
         """``leads``: whether the automatic range is taken from it."""
         with self.lock:
-            shade, at = self.shade, self.observer
-            ceiling = None if self.ceiling is None else (self.place.up, self.ceiling)
-        layer = shade.layer
-        asked = layers.quantities(layer)
+            shade, at, height = self.shade, self.observer, self.ceiling
+        ceiling = None if height is None else Ceiling(height, self.cut_up)
+        layer, asked = shade.layer, layers.quantities(shade.layer)
         for found in refine(self.scene, view, at, asked, width, spp, self.pace, ceiling=ceiling):
             if found is not None:
                 mask = found.values["opacity"] > 0.5

@@ -9,7 +9,8 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
-from nerg_mi.viewer.controls import copied_view, png_bytes, table
+from nerg_mi.viewer.controls import png_bytes, table
+from nerg_mi.viewer.copied_scene import copied_view
 from nerg_mi.viewer.layers import LAYERS, Shade
 from nerg_mi.viewer.view import View
 from nerg_mi.viewer.worker import Worker
@@ -35,6 +36,7 @@ def test02_a_scene_of_what_is_shown(store, tmp_path):
         options=options,
         spp=1,
         falloff=0.1,
+        ceiling=None,
     )
     (tmp_path / "view.xml").write_text(copied_view(shown, view))
     scene = nerg.Scene.load(tmp_path / "view.xml")

@@ -7,6 +7,7 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
+from nerg_mi.transport.ceiling import Ceiling
 from nerg_mi.viewer import copied_scene
 from nerg_mi.viewer.copied_scene import Shown
 from nerg_mi.viewer.refining import Pace, refine
@@ -54,7 +55,24 @@ def test03_shapes_and_no_observer(room, tmp_path):
     assert len(scene.mitsuba.shapes()) == 2 and np.allclose(scene.observer, [0, 0, 0.5])
 
 
-def test04_without_an_integrator_there_is_nothing_to_copy(tmp_path, rgb):
+@pytest.mark.parametrize("up", [(0, 0, 1), (0.1, -0.2, 2)])
+def test04_what_is_cut_off_from_above(room, tmp_path, up):
+    view, up = View.of((1.5, 0, 5), (1.5, 0.01, 0), (0, 0, 1), 0.3, 1.0), np.array(up, float)
+    path = tmp_path / "view.xml"
+    path.write_text(copied_scene.copied(room, Shown(view, None, ("depth",), 32, 1, 0.0, (0.5, up))))
+    rendered = nerg.render(nerg.Scene.load(path), quantities=["depth"]).depth[0]
+    steps = refine(nerg.Scene.load(room), view, None, ["depth"], 32, 1, Pace(), ceiling=Ceiling(0.5, up))
+    viewed = [p for p in steps if p is not None][-1].values["depth"]
+    # The floor, 5 below the camera, in place of the top of a box that is cut through; rays vary within a
+    # pixel, which tells at its edges.
+    assert (np.abs(rendered - viewed) < 0.03).mean() > 0.8 and rendered[16, 16] == pytest.approx(5, abs=0.02)
+    # A copy of the copy that cuts nothing off shows the top again.
+    again = tmp_path / "again.xml"
+    again.write_text(copied_scene.copied(path, Shown(view, None, ("depth",), 32, 1, 0.0)))
+    assert nerg.render(nerg.Scene.load(again), quantities=["depth"]).depth[0, 16, 16] == pytest.approx(4, abs=0.02)
+
+
+def test05_without_an_integrator_there_is_nothing_to_copy(tmp_path, rgb):
     path = tmp_path / "a.xml"
     path.write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
     with pytest.raises(NergError, match="0 integrators"):

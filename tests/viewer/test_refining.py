@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
-from nerg_mi.viewer.refining import DIRECTIONS, SIZES, Pace, below, refine, rough_integrals
+from nerg_mi.transport.ceiling import Ceiling
+from nerg_mi.viewer.refining import DIRECTIONS, SIZES, Pace, refine, rough_integrals
 from nerg_mi.viewer.view import View
 
 QUANTITIES = ["color", "depth", "opacity", "visibility"]
@@ -68,18 +69,12 @@ def test05_from_above_the_ceiling_is_cut_off(room_scene):
     up = np.array([0.0, 0, 1])
     view = View.of((1.5, 0, 5), (1.5, 0.01, 0), up, 0.3, 1.0)
     whole = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, Pace()))[-1]
-    cut = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, Pace(), ceiling=(up, 0.5)))[-1]
+    cut = list(refine(room_scene, view, None, ["depth", "opacity"], 32, 1, Pace(), ceiling=Ceiling(0.5, up)))[-1]
     assert whole is not None and cut is not None
     # The top of the box lies at z = 1, 4 below the camera; below the cut is the floor.
     assert whole.values["depth"][16, 16] == pytest.approx(4, abs=0.02)
     assert cut.values["depth"][16, 16] == pytest.approx(5, abs=0.02)
-
-
-def test06_where_a_ray_comes_below_a_plane():
-    up = np.array([0.0, 0, 1])
-    directions = np.array([[0, 0, -1], [0.6, 0, -0.8], [1, 0, 0], [0, 0, 1.0]])
-    assert np.allclose(below(np.array([0, 0, 3.0]), directions, up, 1.0), [2, 2.5, 0, 0])
-    assert not below(np.array([0, 0, 0.5]), directions, up, 1.0).any()
+    assert room_scene.integrator.ceiling is None
 
 
 def test_integrals_are_rough_until_the_last_picture(store):

@@ -97,7 +97,10 @@ def test02_a_picture_is_replaced_by_the_next(session_of, room):
 
 
 def test03_layers_have_ranges_of_their_own(session_of, room):
+    cut = '<float name="ceiling" value="9"/><vector name="up" value="0, 0.1, 1"/><string name="aovs"'
+    room.write_text(room.read_text().replace('<string name="aovs"', cut))
     session = session_of(room)
+    assert session.ceiling == 9 and np.allclose(session.cut_up, np.array([0, 0.1, 1]) / np.hypot(0.1, 1))
     settle(session)
     session.set_shade(layer=LAYERS["depth"])
     session.picture("a", session.home, lambda p, c: None, 48, 1)
