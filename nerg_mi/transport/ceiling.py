@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Bool, Float, Ray3f
@@ -21,14 +21,14 @@ class Ceiling:
     kernel. Raises `NergError` for an ``up`` that is no direction.
     """
 
-    def __init__(self, height: float, up: Sequence[float] = (0.0, 0.0, 1.0)):
+    def __init__(self, height: float, up: ArrayLike = (0.0, 0.0, 1.0)):
         import drjit as dr
         import mitsuba as mi
 
         direction = np.asarray(up, float)
         length = float(np.linalg.norm(direction))
         if not (length > 0 and np.isfinite(length)):
-            raise NergError(f'"up" must be a direction, three numbers that are not all 0, got {list(map(float, up))}')
+            raise NergError(f'"up" must be a direction, three numbers that are not all 0, got {direction.tolist()}')
         self.height, self.up = float(height), direction / length
         self._height, self._up = mi.Float(self.height), mi.Vector3f(*self.up.tolist())
         dr.make_opaque(self._height, self._up)
