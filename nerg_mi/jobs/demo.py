@@ -7,7 +7,6 @@ the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation.gaze.results import read_results
 from nerg_mi.figures import plots as figures
 from nerg_mi.figures.overlay import Heat, top_of
 from nerg_mi.figures.provenance import Provenance, provenance
@@ -23,6 +23,7 @@ from nerg_mi.figures.saving import save
 from nerg_mi.figures.sphere_figures import sphere_figure
 from nerg_mi.figures.tonemap import srgb, write_png
 from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.interruption import Interruption
@@ -39,6 +40,7 @@ from .options.report import ReportOptions
 from .overlays import basis_texts, basis_words
 from .report import make_report
 from .reporter import SILENT, Reporter
+from .reports.files import RESULTS
 from .versions import versions
 
 CAMERA, OWN, SPHERE = range(3)
@@ -136,7 +138,8 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         title="The demo store and its shoppers" if options.scene is None else None,
     )
     rendered = {"camera": camera, "own": own, "sphere": sphere}
-    made = make_report(inputs[1:], out / "report.html", shown, rendered=rendered)
+    evaluation = evaluation_beside(scene, inputs[2])
+    made = make_report([*inputs[1:], *evaluation], out / "report.html", shown, rendered=rendered)
     files.append(made.path)
     if made.run.objects:
         rows = [{"object": o.name, "observer_share": round(o.field.mean, 6)} for o in made.run.objects]
@@ -155,13 +158,15 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         "gaze_scale_top_per_sr": heat.top,
         "gaze_sphere_integral": sphere_integral(sphere),
         "seconds": {k: round(v, 2) for k, v in clock.seconds.items()},
-        "inputs": {p.name: checksum(p) for p in inputs},
-        "outputs": {p.name: checksum(p) for p in files},
+        "inputs": {p.name: file_sha256(p) for p in [*inputs, *evaluation]},
+        "outputs": {p.name: file_sha256(p) for p in files},
     }
     write_json(out / "run.json", report)
     files.append(out / "run.json")
     for path in files:
         reporter.message(f"wrote {path}")
+    for _, verdict in made.run.verdicts:
+        reporter.message(verdict.sentence)
     return DemoResult(files, clock.seconds, report)
 
 
@@ -170,11 +175,6 @@ def store_scene() -> Path:
     import nerg_mi.scenes as scenes  # pyright: ignore[reportMissingImports] which lies at the root of a checkout
 
     return Path(scenes.__path__[0]).resolve() / "store" / "scene.xml"
-
-
-def checksum(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 # ----------------------------------------------------------------------------
@@ -192,6 +192,12 @@ def _inputs(scene: Path, defaults: Mapping[str, str]) -> list[Path]:
             raise NergError(f'the {name} checkpoint "{path}" is missing: make it with "{MAKE}" (about 20 minutes)')
         paths.append(path)
     return paths
+
+
+def evaluation_beside(scene: Path, gaze: Path) -> list[Path]:
+    """The evaluation that stands beside ``scene``, if it is of this ``gaze`` field."""
+    path = scene.parent / RESULTS
+    return [path] if path.is_file() and read_results(path).sha256 == file_sha256(gaze) else []
 
 
 def _bake(twin: Path, gaze: Path, eye: tuple[float, ...], output: Path, mode: str, seed: int) -> Path:

@@ -100,6 +100,25 @@ def make_gaze(job: Job) -> list[Path]:
     return [path]
 
 
+def make_evaluation(job: Job) -> list[Path]:
+    """Scores of the gaze field at the positions that were held out, beside those of what needs no field."""
+    import mitsuba as mi
+
+    from nerg_mi.jobs.evaluation import evaluate_gaze
+    from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
+    from nerg_mi.jobs.reports.files import RESULTS
+
+    source, gaze = job.build / "rays.npz", job.store / "shoppers.safetensors"
+    _require(source, "rays")
+    _require(gaze, "gaze")
+    options = GazeEvaluationOptions(
+        field=job.store / "store.safetensors", pictures=0, seed=job.seed, mode=mi.variant()
+    )
+    evaluate_gaze(gaze, source, job.build / "shoppers.eval", options)
+    path = job.store / RESULTS
+    return [(job.build / "shoppers.eval" / RESULTS).replace(path)]
+
+
 def _require(path: Path, stage: str) -> None:
     if not path.exists():
         raise FileNotFoundError(
@@ -115,6 +134,7 @@ STAGES = {
     "shoppers": make_shoppers,
     "rays": make_rays,
     "gaze": make_gaze,
+    "evaluation": make_evaluation,
 }
 
 

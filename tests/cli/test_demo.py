@@ -3,11 +3,14 @@
 import csv
 import hashlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import nerg_mi.cli
+from nerg_mi.evaluation.gaze.results import read_results
+from nerg_mi.evaluation.gaze.verdict import judge
 from nerg_mi.jobs import demo
 from nerg_mi.rendering.channels import render_channels
 from tests.cli.test_render import NERG, interrupt
@@ -121,6 +124,17 @@ def test05_the_store_itself(rgb, tmp_path):
     small = rgb.load_file(str(demo.store_scene()), sphere_width="64", sphere_height="32")
     sphere = render_channels(small, small.sensors()[demo.SPHERE], 1)
     assert 0.7 < demo.sphere_integral(sphere) < 1.3  # a density over the sphere
+
+
+def test05b_its_evaluation_is_of_the_field_that_it_carries(standins):
+    store = demo.store_scene()
+    gaze = store.parent / demo.CHECKPOINTS["gaze"]
+    assert demo.evaluation_beside(store, gaze) == [store.parent / "gaze.json"], "run make --stage evaluation"
+    # And of no other one.
+    assert demo.evaluation_beside(store, Path(standins["gaze"])) == []
+    results = read_results(store.parent / "gaze.json")
+    verdict = judge(results.rows, results.split, results.people, results.positions)
+    assert results.people == 100 and results.positions == 64 and "etter than nearest rays" in verdict.sentence
 
 
 def test06_ctrl_c_ends_it_and_leaves_nothing(standins, tmp_path):
