@@ -16,9 +16,9 @@ import numpy as np
 
 from . import paper as study_paper
 from .errors import NAMES, errors
+from .parameters import parameters
 from .reference import Truth
 from .settings import Setting
-from .subject import parameters
 
 COLUMNS = (
     "setting",

@@ -14,6 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import UInt32
+from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.transport.observer.sight import EXACT
 from nerg_mi.transport.observer.viewpoint import center
@@ -23,6 +24,7 @@ from . import reference as study_reference
 from . import scenes as study_scenes
 from . import shapes as study_shapes
 from .errors import errors
+from .parameters import parameters
 from .reference import Truth
 
 KINDS = ("auto", "analytic", "file")
@@ -319,7 +321,7 @@ def load_subject(
 ) -> FileSubject:
     """The scene in the file ``path``, of a field or of shapes; as `open_subject` has it."""
     loaded = load_scene(path, defaults)
-    if type(loaded.integrator()).__name__ != "NergIntegrator":
+    if not is_nerg(loaded.integrator()):
         raise NergError(f'the integrator of "{path}" is not "nerg": name a scene whose integrator is')
     if not loaded.sensors():
         raise NergError(f'"{path}" has no sensor: add the camera that takes the pictures')
@@ -329,22 +331,8 @@ def load_subject(
         )
     if loaded.integrator().medium is not None and len(loaded.shapes()) > 0:
         raise NergError(f'"{path}" holds a field and shapes, of which there is no reference: study each alone')
+    if loaded.integrator().ceiling is not None:
+        raise NergError(f'"{path}" has a "ceiling", of which there is no reference: take it out')
     if loaded.integrator().medium is None:
         return ShapesSubject(path, loaded, width, height)
     return FileSubject(path, loaded, width, height, surfaces(path))
-
-
-def parameters(integrator) -> dict:
-    """The parameters of an integrator of type ``nerg``, read back by the names of its manual page."""
-    names = ("occlusion", "radiance", "jitter")
-    march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse", "refined")
-    out = {n: getattr(integrator, n) for n in names} | {n: getattr(integrator.settings, n) for n in march}
-    observer = integrator.observer_settings
-    return out | {
-        "falloff": float(integrator.falloff[0]),
-        "depth": observer.depth,
-        "surface_opacity": observer.surface_opacity,
-        "visibility": observer.visibility,
-        "map_height": observer.map_height,
-        "background": np.array(integrator.background, float).ravel().tolist(),
-    }

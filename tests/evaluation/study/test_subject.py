@@ -75,12 +75,17 @@ def test_a_scene_file_is_compared_with_its_own_limit(rgb, tmp_path):
         median = 0 if hit is None else march_numpy.slab(4.0, *hit)[2]
         assert abs(known.depth[i] - median) < 1e-5
     assert slab.name == "slab" and known.convergence["depth_mae"] < 1e-5
+    whole = path.read_text()
     bad = (
-        path.read_text()
-        .replace('<integrator type="nerg">', '<integrator type="path">')
+        whole.replace('<integrator type="nerg">', '<integrator type="path">')
         .replace("<volume", "<!--")
         .replace("</volume>", "-->")
     )
     path.write_text(bad)
     with pytest.raises(ValueError, match='is not "nerg"'):
+        open_subject(str(path), "file", 12, 8)
+    path.write_text(
+        whole.replace('<integrator type="nerg">', '<integrator type="nerg"><float name="ceiling" value="1"/>')
+    )
+    with pytest.raises(ValueError, match='has a "ceiling"'):
         open_subject(str(path), "file", 12, 8)
