@@ -23,7 +23,7 @@ from nerg_mi.tasks.code import RENDERS, versions
 from nerg_mi.tasks.inputs import InputFile, name_of, read_input, read_inputs
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.task import FOLDER, Task
-from nerg_mi.threads import use_share
+from nerg_mi.threads import set_thread_count, use_share
 
 from .evaluation import evaluate_gaze
 from .gaze import train_gaze
@@ -68,6 +68,8 @@ def evaluate_folds(
     place_kind(options)
     check_folder(output)
     parts = Parts(options, output, reporter, options.threads)
+    if options.threads:
+        set_thread_count(options.threads)
     reporter.progress(0.0, "reading")
     inputs, files = _inputs(rays, options, parts)
     seeds = range(options.first, options.first + options.folds)

@@ -1,45 +1,70 @@
-"""Folds: trained and scored in processes of their own, kept, and the same in this one."""
+"""Folds: trained and scored by workers of which one is killed, kept, and the same in this process."""
 
+import drjit as dr
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.tables import write_json
 from nerg_mi.jobs import folds
-from nerg_mi.jobs.folds import SCORED, evaluate_folds, train_and_score
+from nerg_mi.jobs.folds import SCORED, evaluate_folds
 from nerg_mi.jobs.options.folds import FoldOptions
 from nerg_mi.jobs.store_account import account_for_store
-from nerg_mi.tasks.store import Store
-from tests.conftest import ROOT
+from nerg_mi.threads import set_thread_count
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.jobs.recorder import Recorder
+from tests.tasks.clusters import ClusterOfProcesses, wait_until
 
 SMALL = {"geometry": "none", "folds": 2, "zones": 1, "positions": 3, "radius": 0.6, "probes": 8, "steps": 2}
 SMALL |= {"directions": 128, "min_rays": 8, "splits": "both,pos", "threads": 1}
 
 
-def test_two_processes_score_as_this_one_does(tmp_path, rgb, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+class Killer(Recorder):
+    """Ends the first worker when the first fold is told of: it has another one in hand then."""
+
+    def __init__(self, cluster):
+        super().__init__()
+        self.cluster = cluster
+
+    def message(self, text):
+        super().message(text)
+        if text.startswith("fold 0"):
+            self.cluster.workers[0].kill()
+
+
+def test_two_workers_of_which_one_is_killed_score_as_this_process_does(tmp_path, rgb):
+    pytest.importorskip("distributed", reason="dask is not installed (extra cluster)")
     crowd(3000).save(tmp_path / "rays.npz")
-    options = FoldOptions(**SMALL, scheduler="local:2")
-    found = evaluate_folds(tmp_path / "rays.npz", tmp_path / "out", options)
+    with ClusterOfProcesses(tmp_path) as cluster:
+        told = Killer(cluster)
+        cluster.start_worker(), cluster.start_worker()
+        wait_until(lambda: all("works for" in cluster.log(f"worker{k}") for k in (0, 1)), "both workers are there")
+        options = FoldOptions(**SMALL | {"folds": 3}, scheduler=cluster.address)
+        found = evaluate_folds(tmp_path / "rays.npz", tmp_path / "out", options, told)
+        assert cluster.workers[0].poll() is not None and cluster.workers[1].poll() is None
     assert {p.name for p in found.files} == {"folds.md", "folds.csv", "folds.json"}
-    assert {row["fold"] for row in found.each} == {0, 1} and {row["split"] for row in found.rows} == {"both", "pos"}
+    assert {row["fold"] for row in found.each} == {0, 1, 2} and {row["split"] for row in found.rows} == {"both", "pos"}
     ours = [row["KLD"] for row in found.each if row["split"] == "both" and row["method"] == "gaze field"]
-    assert found.rows[0]["KLD"] == pytest.approx(sum(ours) / 2) and ours[0] != ours[1]
+    assert found.rows[0]["KLD"] == pytest.approx(sum(ours) / 3) and ours[0] != ours[1]
     assert found.rows[0]["KLD.low"] < found.rows[0]["KLD"] and all(field.is_file() for field in found.fields)
-    store = Store(tmp_path / "out.tasks")
-    receipt = next(r for r in store.receipts() if r.label == "fold 0")
-    (tmp_path / "here").mkdir()
-    train_and_score(receipt.parameters, {"of-the-job/rays.npz": tmp_path / "rays.npz"}, tmp_path / "here")
-    assert (tmp_path / "here" / SCORED).read_bytes() == (found.fields[0].parent / SCORED).read_bytes()
+    here = evaluate_folds(tmp_path / "rays.npz", tmp_path / "here", FoldOptions(**SMALL | {"folds": 3}))
+    assert [f.read_bytes() for f in here.files] == [f.read_bytes() for f in found.files]
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    """What a job sets is the process's: it is set back."""
+    before = dr.thread_count()
+    yield
+    set_thread_count(before)
 
 
 @pytest.fixture
 def trained(monkeypatch):
-    """The seeds of the folds that were trained and scored, which cost nothing here."""
+    """The seeds of the folds that were trained and scored with one thread, which cost nothing here."""
     seeds = []
 
     def score(parameters, inputs, output):
+        assert dr.thread_count() == 1
         seeds.append(parameters["seed"])
         rows = [{"method": "gaze field", "KLD": 1.0 / (1 + parameters["seed"]), "CC": 0.5}]
         write_json(output / SCORED, {split: {"rows": rows} for split in parameters["splits"]})
