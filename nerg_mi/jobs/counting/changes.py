@@ -25,8 +25,9 @@ from nerg_mi.errors import NergError, plain
 from nerg_mi.files.bounded import read_json
 from nerg_mi.formats.areas.kinds import Area, Areas, Group, SceneShape
 from nerg_mi.formats.regions import Entry, Region, check_name, is_number, parse_box
+from nerg_mi.surfaces.target import mitsuba_mesh
 
-from .things import make_mesh, mesh_of_file, scene_of, shape_named, shapes_of
+from .things import mesh_of_file, scene_of, shape_named, shapes_of
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -217,7 +218,7 @@ def _moved_shape(shape: Any, move: Move) -> Any:
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     c, s = np.cos(np.radians(move.turn)), np.sin(np.radians(move.turn))
     turned = (vertices - middle) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + middle + move.by
-    return make_mesh(move.name, turned, np.array(params["faces"]).reshape(-1, 3))
+    return mitsuba_mesh(turned, np.array(params["faces"]).reshape(-1, 3), move.name)
 
 
 def _made(put: Put) -> Any:
@@ -226,7 +227,7 @@ def _made(put: Put) -> Any:
     if isinstance(put.what, Path):
         params: Any = mi.traverse(mesh_of_file(put.what))
         vertices, faces = np.array(params["vertex_positions"]), np.array(params["faces"])
-        return make_mesh(put.name, vertices.reshape(-1, 3), faces.reshape(-1, 3))
+        return mitsuba_mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), put.name)
     corner = lambda *bits: sum(b << k for k, b in enumerate(bits))
     faces = []
     for axis in range(3):
@@ -237,4 +238,4 @@ def _made(put: Put) -> Any:
                 at[n][axis], at[n][u], at[n][v] = side, a, b
             q = [corner(*bits) for bits in at]
             faces += [[q[0], q[1], q[2]], [q[0], q[2], q[3]]]
-    return make_mesh(put.name, put.what.vertices, np.array(faces))
+    return mitsuba_mesh(put.what.vertices, np.array(faces), put.name)

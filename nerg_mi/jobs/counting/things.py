@@ -14,6 +14,7 @@ from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
 from nerg_mi.formats.regions import Region
 from nerg_mi.rendering.mesh_file import check_obj, check_ply
 from nerg_mi.statistics.landing import Box, Thing
+from nerg_mi.surfaces.target import mitsuba_mesh
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -109,7 +110,7 @@ def load_mesh(part: MeshPart) -> Any:
     chosen = faces[part.chosen(len(faces))]
     used, index = np.unique(chosen, return_inverse=True)
     vertices = np.array(params["vertex_positions"], np.float32).reshape(-1, 3)[used]
-    return make_mesh(part.name, vertices, index.reshape(-1, 3))
+    return mitsuba_mesh(vertices, index.reshape(-1, 3), part.name)
 
 
 def mesh_of_file(path: Path) -> Any:
@@ -122,15 +123,3 @@ def mesh_of_file(path: Path) -> Any:
     (check_ply if kind == "ply" else check_obj)(path)
     with mitsuba_says():
         return mi.load_dict({"type": kind, "filename": str(path)})
-
-
-def make_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """A Mitsuba mesh of ``vertices`` (V, 3) and ``faces`` (F, 3)."""
-    import mitsuba as mi
-
-    mesh = mi.Mesh(name, len(vertices), len(faces))
-    params: Any = mi.traverse(mesh)
-    params["vertex_positions"] = np.ravel(np.asarray(vertices, np.float32))
-    params["faces"] = np.ravel(np.asarray(faces, np.uint32))
-    params.update()
-    return mesh

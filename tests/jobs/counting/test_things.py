@@ -8,8 +8,9 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
 from nerg_mi.formats.regions import Region
-from nerg_mi.jobs.counting.things import make_mesh, scene_of, shape_named, shapes_of, thing_of_shape, things_of
+from nerg_mi.jobs.counting.things import scene_of, shape_named, shapes_of, thing_of_shape, things_of
 from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.surfaces.target import mitsuba_mesh
 
 from .place import SIGN, STAND, write_place
 
@@ -83,6 +84,6 @@ def test05_meshes_keep_their_names_in_a_scene():
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    mesh = make_mesh("tri", np.eye(3), np.array([[0, 1, 2]]))
+    mesh = mitsuba_mesh(np.eye(3), np.array([[0, 1, 2]]), "tri")
     before = mesh.id()
     assert len(scene_of({"tri": mesh}).shapes()) == 1 and mesh.id() == before
