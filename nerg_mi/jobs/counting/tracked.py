@@ -215,30 +215,36 @@ class Eyes:
 
 
 class EyePicker:
-    """Takes every so manieth ray of a stream, and one of each block whose people would have none."""
+    """Takes every so manieth ray of a stream, and one of each block whose people would have none: of each a position, a
+    direction, and whose and of which cells it is, which is less than what is counted of its person."""
 
     def __init__(self, every: int):
         self._every, self._passed = max(1, every), 0
-        self._found: list[tuple[np.ndarray, np.ndarray, str, frozenset[Cell]]] = []
+        self._points: list[np.ndarray] = [np.zeros((0, 6))]
+        self._person: list[str] = []
+        self._cells: list[frozenset[Cell]] = []
+        self._same: dict[frozenset[Cell], frozenset[Cell]] = {}
 
     def take(self, rays: Rays, counting: Counting) -> None:
         """The chosen of a block."""
         number = self._passed + np.arange(len(rays))
         chosen = number % self._every == self._every // 2
-        for code in np.unique(rays.person):
-            own = np.flatnonzero(rays.person == code)
-            if not chosen[own].any():
-                chosen[own[len(own) // 2]] = True
+        order = np.argsort(rays.person, kind="stable")
+        _, start, count = np.unique(rays.person[order], return_index=True, return_counts=True)
+        none = ~np.logical_or.reduceat(chosen[order], start)
+        chosen[order[(start + count // 2)[none]]] = True
         self._passed += len(rays)
         rows = np.flatnonzero(chosen)
         some = rays.select(rows)
         at, turned = counting.around.points(some.origin), counting.around.directions(ahead(some))
+        self._points.append(np.hstack([at, turned]))
+        self._person += [some.persons[k] for k in some.person.tolist()]
         cells = counting.cells(some, at)
         for k in range(len(rows)):
             mine = frozenset(cell for cell, mask in cells if mask is None or mask[k])
-            self._found.append((at[k], turned[k], some.persons[some.person[k]], mine))
+            self._cells.append(self._same.setdefault(mine, mine))
 
     def eyes(self) -> Eyes:
         """All that were taken."""
-        position, turned, person, cells = zip(*self._found)
-        return Eyes(np.array(position), np.array(turned), tuple(person), tuple(cells))
+        found = np.concatenate(self._points)
+        return Eyes(found[:, :3], found[:, 3:], tuple(self._person), tuple(self._cells))
