@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 LEAST_PEOPLE = 3
-"""Fewer people than these give no interval."""
+"""Fewer people than these, or than these who add anything to a number, give no interval."""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,11 @@ the 95 % quantile of t*. For few people it errs by less than the one with two ta
 of the same: how often t* is at least that of the data. s* is that of the linearised residuals x_p - m* y_p (Cochran
 1977, section 6.4), drawn towards that of the data, s*² <- (1 - λ) s*² + λ s² (as the constant of Tusher et al. 2001):
 some draws of few people have hardly any spread, and would make it endless.
+
+A number to which fewer than three people add anything has no interval. Where it concerns at most half of the people,
+and they weigh differently (y_p), as in the mean distance to what few look at, one or two of them may decide it: c is
+then at least that of Student's t of n - 1 degrees of freedom, n = (Σ j²)² / Σ j⁴ the effective number of people (Kish
+1965, section 8.2) of what each one adds to the jackknife's error, j_p.
 """
 
 from __future__ import annotations
@@ -36,14 +41,18 @@ def ratios(
 ) -> Estimates:
     """Σ x / Σ y over P people of K numbers, (P, K) each, y >= 0; ``most``: no interval goes beyond it, or below 0."""
     value, residual, people = _linear(x, y)
-    linear, error = _spread(residual, people), _spread(_left_out(x, y, value, people), people)
+    apart = _left_out(x, y, value, people)
+    linear, error = _spread(residual, people), _spread(apart, people)
+    few = (people <= len(x) / 2) & (np.where(y > 0, y, np.inf).min(axis=0, initial=np.inf) < y.max(axis=0, initial=0))
+    least = np.where(few, _student(apart), 0.0)
     more = _more(people)
     t = np.full((resamples, x.shape[1]), np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         for part, w in _blocks(len(x), resamples, seed, np.zeros(len(x), int)):
             m, square = _moments(w, x, y)
             t[part] = _studentised(m - value, square * more, linear)
-    low, high = _ends(value, error, t)
+    c = np.where((x != 0).sum(axis=0) >= LEAST_PEOPLE, np.maximum(_quantile(t, error), least), np.nan)
+    low, high = value - c * error, value + c * error
     return Estimates(value, np.clip(low, 0.0, most), np.clip(high, 0.0, most), people)
 
 
@@ -66,7 +75,8 @@ def ratio_differences(first: Pair, second: Pair, *, resamples: int = RESAMPLES, 
             cross = w @ (x * u) - ma * (w @ (y * u)) - mb * (w @ (x * v)) + ma * mb * (w @ (y * v))
             cross *= 2 * np.sqrt(more_a * more_b) / ((w @ y) * (w @ v))
             t[part] = _studentised(mb - ma - value, np.maximum(more_a * sa + more_b * sb - cross, 0.0), linear)
-    low, high = _ends(value, error, t)
+    reach = _quantile(t, error) * error
+    low, high = value - reach, value + reach
     with np.errstate(divide="ignore", invalid="ignore"):
         far = t >= np.abs(value / error)
     p = np.where(np.isfinite(low), (far.sum(axis=0) + 1) / (np.isfinite(t).sum(axis=0) + 1), np.nan)
@@ -129,12 +139,21 @@ def _moments(w: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, n
     return m, np.maximum(square, 0.0)
 
 
-def _ends(value: np.ndarray, error: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of the intervals by the draws ``t`` (B, K); NaN where nothing varies, such as where nobody looks."""
-    known = np.isfinite(t).mean(axis=0) if len(t) else np.zeros(value.shape)
+def _student(parts: np.ndarray) -> np.ndarray:
+    """Quantile of Student's t (K,) for the effective number of people of ``parts`` (P, K) of an error."""
+    from scipy.special import stdtrit
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        people = (parts**2).sum(axis=0) ** 2 / (parts**4).sum(axis=0)
+    return stdtrit(np.maximum(people - 1, 1.0), (1 + _HELD) / 2)
+
+
+def _quantile(t: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """c (K,) of the draws ``t`` (B, K); NaN where nothing varies, such as where nobody looks."""
+    known = np.isfinite(t).mean(axis=0) if len(t) else np.zeros(error.shape)
     every, some = (known == 1) & (error > 0), (known >= 0.9) & (known < 1) & (error > 0)
-    reach = np.full(value.shape, np.nan)
-    reach[every] = np.quantile(t[:, every], _HELD, axis=0) * error[every]
+    found = np.full(error.shape, np.nan)
+    found[every] = np.quantile(t[:, every], _HELD, axis=0)
     for k in np.flatnonzero(some):
-        reach[k] = np.quantile(t[np.isfinite(t[:, k]), k], _HELD) * error[k]
-    return value - reach, value + reach
+        found[k] = np.quantile(t[np.isfinite(t[:, k]), k], _HELD)
+    return found

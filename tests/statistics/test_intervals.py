@@ -123,3 +123,26 @@ def test09_equal_seeds_give_equal_intervals():
     x = np.random.default_rng(5).random((12, 3))
     a, b = ratios(x, ONES(x.shape), seed=4), ratios(x, ONES(x.shape), seed=4)
     assert np.array_equal(a.low, b.low) and not np.array_equal(a.low, ratios(x, ONES(x.shape), seed=5).low)
+
+
+def test10_what_two_people_have_done_has_no_interval():
+    x = np.zeros((40, 2))
+    x[:2, 0], x[:3, 1] = 1, 1
+    found = ratios(x, ONES(x.shape), resamples=99)
+    assert found.value == pytest.approx([0.05, 0.075]) and found.people.tolist() == [40, 40]
+    assert np.isnan(found.low[0]) and np.isnan(found.high[0]) and found.high[1] > 0.075
+
+
+def test11_what_few_decide_is_as_uncertain_as_that():
+    """Means weighed by times of few of 40 people: most are near, and who is far looks for long."""
+    rng = np.random.default_rng(8)
+    looks = rng.random((40, 800)) < 0.17
+    far = rng.random(looks.shape) < 0.1
+    y = looks * np.where(far, 1.0, 0.3) * rng.gamma(2, 1, looks.shape)
+    x = y * np.where(far, 4.0, 1.0)
+    truth = (0.1 * 4 + 0.9 * 0.3) / (0.1 + 0.9 * 0.3)
+    held = lambda e: ((e.low <= truth) & (truth <= e.high))[np.isfinite(e.low)].mean()
+    found = ratios(x, y, resamples=199)
+    # As if most others were there too, and had hardly looked at it: then they are not few, and draws alone tell.
+    by_draws = ratios(x, np.where(looks, y, 1e-9), resamples=199)
+    assert held(by_draws) < 0.8 and held(found) > held(by_draws) + 0.05
