@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 
@@ -17,7 +17,6 @@ from nerg_mi.interruption import Interruption
 from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.estimates import LEAST_PEOPLE
-from nerg_mi.statistics.landing import Thing
 from nerg_mi.statistics.measures import People
 from nerg_mi.statistics.sums import ALL, Cell, Sums, Total
 from nerg_mi.statistics.tables import (
@@ -39,8 +38,7 @@ from .counting.foretold import Foretold, eyes_of_some, foretold_people
 from .counting.parts import CountingParts
 from .counting.places import isovist_rows, look_around, places_of
 from .counting.results import write_results
-from .counting.setting import setting_of
-from .counting.surroundings import Surroundings
+from .counting.setting import Setting, setting_of
 from .counting.tracked import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
 from .counting.trust import add_trust, tell_places, tell_support
 from .counting.what_if import what_if_rows
@@ -193,7 +191,7 @@ class _Work:
             [] if sums is None else move_rows(sums, floor),
             [] if sums is None else duration_rows(sums, floor),
             self._people(sums, seen),
-            [] if o.what_if is None else self._what_if(eyes, foretold, times[ALL], floor),
+            [] if o.what_if is None else self._what_if(eyes, foretold, floor),
             [],
             sums,
             floor.blanked,
@@ -291,17 +289,6 @@ class _Work:
             return self.setting.foretold(eyes, self._view, self.reporter)
         return self.parts.foretell(eyes, self._view)
 
-    def _foretell(
-        self, around: Surroundings, eyes: Eyes, areas: Areas | None = None, things: Sequence[Thing] | None = None
-    ) -> Foretold:
-        own = replace(
-            self.setting,
-            around=around,
-            areas=self.areas if areas is None else areas,
-            things=self.things if things is None else things,
-        )
-        return own.foretold(eyes, self._view, self.reporter)
-
     def _isovists(self) -> Isovists:
         from nerg_mi.statistics.visibility import isovists
 
@@ -312,12 +299,16 @@ class _Work:
         reach = float(np.linalg.norm(box[1] - box[0]))
         return isovists(points, self.around.depth, Targets.of(self.things, o.samples), self.setting.margin, reach)
 
-    def _what_if(self, eyes: Eyes, before: Foretold | None, times: Mapping[str, float], floor: Floor) -> list[Row]:
-        o = self.options
+    def _what_if(self, eyes: Eyes, before: Foretold | None, floor: Floor) -> list[Row]:
+        o, parts = self.options, self.parts
         assert o.what_if is not None and before is not None
-        return what_if_rows(
-            o.what_if, self.around, self.areas, eyes, before, self._foretell, floor, o.resamples, o.seed
-        )
+
+        def foretell(there: Setting, others: Eyes) -> Foretold:
+            if parts is None:
+                return there.foretold(others, self._view, self.reporter)
+            return parts.foretell(others, self._view, o.what_if)
+
+        return what_if_rows(o.what_if, self.setting, eyes, before, foretell, floor, o.resamples, o.seed)
 
     def _people(self, sums: Sums | None, seen: bool) -> list[Row]:
         o = self.options

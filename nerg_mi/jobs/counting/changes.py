@@ -100,6 +100,12 @@ def read_changes(path: str | Path) -> Changes:
         raise NergError(f'"{path}": {error}') from error
 
 
+def files_of_changes(path: str | Path, changes: Changes) -> list[Path]:
+    """The files that ``changes`` were read from: the ``path`` and its meshes."""
+    meshes = [put.what for put in (*changes.add, *changes.swap) if isinstance(put.what, Path)]
+    return list(dict.fromkeys([Path(path), *meshes]))
+
+
 def _listed(found: dict[str, Any], key: str) -> list[Any]:
     given = found.get(key, [])
     if not isinstance(given, list) or len(given) > MOST or (key in found and not given):

@@ -26,6 +26,7 @@ from nerg_mi.tasks.inputs import Checksums, InputFile, name_of, read_inputs
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.task import Task
 
+from .changes import files_of_changes, read_changes
 from .foretold import Foretold
 from .tasks import OF_COUNTS, OF_EYES, OF_FIELDS, RAYS, count_part, described, foretell_part, read_foretold, read_sums
 from .tracked import Counting, Eyes, blocks_of
@@ -35,6 +36,7 @@ EYES = 32
 
 _COUNTED = 0.6  # of all, where a field is asked too
 _DONE = 0.8
+_TOLD, _CHANGED = 0.9, 0.99  # when intervals are known, and after changes
 
 
 @dataclass(frozen=True)
@@ -82,17 +84,22 @@ class CountingParts:
         for made in self.parts.run(Plan(self.what, tasks), 0.0, until):
             yield from read_sums(made.path)
 
-    def foretell(self, eyes: Eyes, view: float) -> Foretold:
-        """What the field says of ``eyes`` that see ``view`` degrees."""
+    def foretell(self, eyes: Eyes, view: float, changes: Path | None = None) -> Foretold:
+        """What the field says of ``eyes`` that see ``view`` degrees, after the ``changes`` of a file, if there are
+        any."""
         names, inputs = self._files()
+        what, since, until = f"{self.what} (the field)", _COUNTED, _DONE
+        if changes is not None:
+            found = read_inputs(files_of_changes(changes, read_changes(changes)), below="changes")
+            names, inputs = {**names, "changes": name_of(changes, found)}, (*inputs, *found)
+            what, since, until = f"{self.what} (after the changes)", _TOLD, _CHANGED
         common = {**described(names, self.options, OF_FIELDS, self.mode, inputs), "view": view}
         tasks = []
         for a in range(0, len(eyes.positions), EYES):
             at, ahead = eyes.positions[a : a + EYES].tolist(), eyes.ahead[a : a + EYES].tolist()
             label = f"places {a + 1} to {a + len(at)}"
             tasks.append(self._task(foretell_part, {**common, "positions": at, "ahead": ahead}, inputs, label))
-        plan = Plan(f"{self.what} (the field)", tasks)
-        found = [read_foretold(made.path) for made in self.parts.run(plan, _COUNTED, _DONE)]
+        found = [read_foretold(made.path) for made in self.parts.run(Plan(what, tasks), since, until)]
         each = {name: np.concatenate([getattr(f, name) for f in found]) for name in OF_EYES}
         return Foretold(**each, members=np.concatenate([f.members for f in found], axis=1))
 

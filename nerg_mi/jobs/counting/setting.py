@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +19,7 @@ from nerg_mi.statistics.landing import Thing
 from nerg_mi.statistics.looks import LookRules
 from nerg_mi.statistics.visibility import CellsInView, Targets
 
+from .changes import Changes, changed_areas, changed_scene
 from .cohorts import read_cohorts
 from .foretold import Foretold, foretell
 from .surroundings import Surroundings, surroundings_of_files
@@ -74,6 +75,14 @@ class Setting:
             table,
             tuple(sorted(set(table.values()))) if table else cohorts,
         )
+
+    def changed(self, changes: Changes) -> Setting:
+        """The same after ``changes`` of shapes and areas. Raises `NergError` for those that cannot be made."""
+        areas, around, shapes = changed_areas(self.areas, changes), self.around, shapes_of(self.around.scene)
+        if changes.of_shapes:
+            scene, shapes = changed_scene(around.scene, changes)
+            around = around.within(scene)
+        return replace(self, around=around, areas=areas, things=things_of(areas.things, shapes))
 
     def foretold(self, eyes: Eyes, view: float, reporter: Reporter = SILENT) -> Foretold:
         """What the field says of the gaze of ``eyes`` that see so many degrees (``view``)."""

@@ -26,6 +26,7 @@ from nerg_mi.tasks.inputs import InputFile
 from nerg_mi.tasks.task import canonical
 from nerg_mi.threads import use_share
 
+from .changes import read_changes
 from .foretold import Foretold
 from .setting import Setting, setting_of
 from .tracked import Counting, Eyes, blocks_of, count_block
@@ -129,7 +130,7 @@ def _blocks(parameters: Mapping[str, Any], inputs: Mapping[str, Path], rules: Lo
 
 
 def _setting(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> Setting:
-    """The setting of the files and options of ``parameters``, in its Mitsuba variant."""
+    """The setting of the files and options of ``parameters``, in its Mitsuba variant, after changes if it has any."""
     files = {kind: inputs[name] for kind, name in parameters["files"].items()}
     areas = files["areas"]
     areas = areas.parent if areas.suffix == ".csv" else areas
@@ -137,7 +138,8 @@ def _setting(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> Setti
     given |= {"windows": tuple(given["windows"])} if "windows" in given else {}
     options = StatisticsOptions(**given, areas=areas)
     ns = select_backend(parameters["mode"])
-    return setting_of(files.get("scene"), files.get("field"), files.get("gaze"), read_areas(areas), options, ns)
+    made = setting_of(files.get("scene"), files.get("field"), files.get("gaze"), read_areas(areas), options, ns)
+    return made.changed(read_changes(files["changes"])) if "changes" in files else made
 
 
 def _prepared(parameters: Mapping[str, Any], make: Callable[[], Any]) -> Any:

@@ -11,24 +11,21 @@ import numpy as np
 from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.statistics.estimates import adjusted
 from nerg_mi.statistics.intervals import ratio_differences
-from nerg_mi.statistics.landing import Thing
 from nerg_mi.statistics.tables import FIELD, Floor, Row
 
-from .changes import changed_areas, changed_scene, read_changes
+from .changes import read_changes
 from .foretold import Foretold
 from .places import places_of
-from .surroundings import Surroundings
-from .things import shapes_of, things_of
+from .setting import Setting
 from .tracked import Eyes
 from .trust import support_of
 
-Foretell = Callable[[Surroundings, Eyes, Areas, "list[Thing]"], Foretold]
+Foretell = Callable[[Setting, Eyes], Foretold]
 
 
 def what_if_rows(
     path: Path,
-    around: Surroundings,
-    areas: Areas,
+    setting: Setting,
     eyes: Eyes,
     before: Foretold,
     foretell: Foretell,
@@ -39,20 +36,17 @@ def what_if_rows(
     """Of each area and measure (``share`` of gaze, ``visible`` share of people's time) what the field says ``before``
     and ``after`` the changes in the file ``path``, the ``difference`` with its interval over people and, of an
     ensemble's shares, its ``difference_spread`` over the members, and the ``support``: rays that the field learnt from
-    around an eye, at the median after the changes. Raises `NergError`."""
+    around an eye, at the median after the changes. ``foretell`` is asked what the field says in the changed setting of
+    the observers that there are then. Raises `NergError`."""
     changes = read_changes(path)
-    after_areas = changed_areas(areas, changes)
-    scene, shapes = around.scene, shapes_of(around.scene)
-    there = around
-    if changes.of_shapes:
-        scene, shapes = changed_scene(around.scene, changes)
-        there = around.within(scene)
+    there = setting.changed(changes)
+    areas, after_areas = setting.areas, there.areas
     others = eyes
     if changes.observers is not None:
         others = places_of(changes.observers)
     if changes.shift is not None:
         others = replace(others, positions=others.positions + changes.shift)
-    after = foretell(there, others, after_areas, things_of(after_areas.things, shapes))
+    after = foretell(there, others)
     # People who are the same before and after are compared with themselves.
     names = sorted({*eyes.person, *others.person})
     support = support_of(after)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -58,12 +59,17 @@ def made(told):
 
 
 def test_two_processes_give_the_tables_of_one(place):
-    whole, _ = count(place, "one", seen=True, cell=0.5, windows=("early=0,8",))
-    parts, told = count(place, "two", seen=True, cell=0.5, windows=("early=0,8",), scheduler="local:2")
-    assert parts == whole and {"things.csv", "moves.csv", "people.csv", "about.json"} <= set(whole)
+    (place / "poster.obj").write_text("v 5 1 1\nv 5 2 1\nv 5 1 2\nf 1 2 3\n")
+    changes = {"move": [{"shape": "stand", "by": [0, 1.9, 0]}], "add": [{"name": "poster", "mesh": "poster.obj"}]}
+    (place / "changes.json").write_text(json.dumps(changes | {"shift": [0, 0, 0.1]}))
+    asked = {"seen": True, "cell": 0.5, "windows": ("early=0,8",), "what_if": place / "changes.json"}
+    whole, _ = count(place, "one", **asked)
+    parts, told = count(place, "two", **asked, scheduler="local:2")
+    assert parts == whole and {"things.csv", "moves.csv", "people.csv", "what_if.csv", "about.json"} <= set(whole)
+    assert b"poster" in whole["what_if.csv"]
     account = account_for_store(place / "two.tasks", reporter=told)
-    assert [(job.what.partition(" /")[0], job.left) for job in account.jobs] == [("nerg stats", 0)] * 2
-    assert [job.total for job in account.jobs] == [6, 2]
+    assert [(job.what.partition(" /")[0], job.left) for job in account.jobs] == [("nerg stats", 0)] * 3
+    assert sorted(job.total for job in account.jobs) == [2, 2, 6]
     assert len(account.jobs[0].changed) == 0
 
 

@@ -12,9 +12,13 @@ from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.counting.foretold import Foretold
 from nerg_mi.jobs.counting.places import places_of
+from nerg_mi.jobs.counting.setting import Setting
 from nerg_mi.jobs.counting.surroundings import Surroundings
+from nerg_mi.jobs.counting.things import things_of
 from nerg_mi.jobs.counting.what_if import what_if_rows
+from nerg_mi.jobs.options.statistics import StatisticsOptions
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.statistics.looks import LookRules
 from nerg_mi.statistics.tables import Floor
 
 AREAS = Areas((Region.of("a", [0, 0, 0], [1, 1, 1]), Region.of("b", [2, 0, 0], [3, 1, 1])))
@@ -32,13 +36,14 @@ def rows(tmp_path, changes, after, floor=None, members=1):
     (tmp_path / "c.json").write_text(json.dumps(changes))
     asked = []
 
-    def foretell(around, eyes, areas, things):
-        asked.append((eyes, areas, things))
+    def foretell(there, eyes):
+        asked.append((eyes, there.areas, there.things))
         return after
 
     before = told([[0.1, 0], [0.2, 0], [0.1, 0], [0.2, 0], [0.15, 0]], members=members)
-    around = Surroundings(None, None, Similarity())
-    found = what_if_rows(tmp_path / "c.json", around, AREAS, EYES, before, foretell, floor or Floor(), 199, 0)
+    around, things = Surroundings(None, None, Similarity()), things_of(AREAS.things, {})
+    setting = Setting(around, AREAS, things, StatisticsOptions(), LookRules(1, 60, 0.15, 0.1), ())
+    found = what_if_rows(tmp_path / "c.json", setting, EYES, before, foretell, floor or Floor(), 199, 0)
     return {(r["thing"], r["measure"]): r for r in found}, asked[0]
 
 
