@@ -27,6 +27,8 @@ TRIANGLES = 20_000_000
 
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
+_FLOATS = {5126: "<f4"}
+_SHARES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}
 _TRIANGLES = 4
 
 
@@ -35,6 +37,7 @@ Attribute = tuple[str, np.ndarray, bool]
 
 _KINDS = {"float32": 5126, "uint16": 5123, "uint32": 5125}
 _SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+_WIDTHS = {name: width for width, name in _SHAPES.items()}
 
 
 def shown_unlit(
@@ -115,8 +118,8 @@ def parse_glb(raw: bytes, path: str | os.PathLike) -> tuple[np.ndarray, np.ndarr
     """The same of the bytes ``raw`` of the file ``path``."""
     # Whatever stands where another kind of value belongs is the file's mistake.
     with reading(path, "mesh", "export it again", also=(TypeError, AttributeError)):
-        document, data = _parts(raw, path)
-        found = list(_instances(document))
+        document, data = read_parts(raw, path)
+        found = list(instances(document))
         vertices: list[np.ndarray] = []
         faces: list[np.ndarray] = []
         count = triangles = 0
@@ -140,7 +143,8 @@ def parse_glb(raw: bytes, path: str | os.PathLike) -> tuple[np.ndarray, np.ndarr
         return np.concatenate(vertices), np.concatenate(faces)
 
 
-def _parts(raw: bytes, path: str | os.PathLike) -> tuple[dict[str, Any], bytes]:
+def read_parts(raw: bytes, path: str | os.PathLike, what: str = "mesh") -> tuple[dict[str, Any], bytes]:
+    """The document and the binary chunk of the bytes ``raw`` of the file ``path``, a kind of file called ``what``."""
     magic, version, _ = struct.unpack_from("<III", raw)
     if magic != _MAGIC or version != 2:
         raise ValueError("it is no binary glTF of version 2")
@@ -151,7 +155,7 @@ def _parts(raw: bytes, path: str | os.PathLike) -> tuple[dict[str, Any], bytes]:
         if len(part) < length:
             raise ValueError("it ends within one of its chunks")
         if kind == _JSON and document is None:
-            document = parse_json(part, path, "mesh")
+            document = parse_json(part, path, what)
         elif kind == _BINARY and not data:
             data = part
         at += 8 + length
@@ -160,8 +164,8 @@ def _parts(raw: bytes, path: str | os.PathLike) -> tuple[dict[str, Any], bytes]:
     return document, data
 
 
-def _instances(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Primitives of triangles, and where each stands: the matrix (4, 4) of its node in the scene."""
+def instances(document: dict[str, Any], mode: int = _TRIANGLES) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Primitives of ``mode``, and where each stands: the matrix (4, 4) of its node in the scene."""
     nodes = document.get("nodes", [])
     scenes = document.get("scenes")
     roots = scenes[_index(document.get("scene", 0))]["nodes"] if scenes else range(len(nodes))
@@ -177,7 +181,7 @@ def _instances(document: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.nd
         waiting += [(_index(k), here, depth + 1) for k in reversed(node.get("children", []))]
         if "mesh" in node:
             for primitive in document["meshes"][_index(node["mesh"])]["primitives"]:
-                if primitive.get("mode", _TRIANGLES) == _TRIANGLES:
+                if primitive.get("mode", _TRIANGLES) == mode:
                     yield primitive, here
 
 
@@ -202,34 +206,40 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 def _triangles(
     document: dict[str, Any], data: bytes, position: object, indices: object
 ) -> tuple[np.ndarray, np.ndarray]:
-    corners = _values(document, data, position, "VEC3", {5126: "<f4"}).astype(np.float64)
+    corners = accessor_values(document, data, position, "VEC3").astype(np.float64)
     if indices is None:
         index = np.arange(len(corners))
     else:
-        index = _values(document, data, indices, "SCALAR", _INDICES).reshape(-1).astype(np.int64)
+        index = accessor_values(document, data, indices, "SCALAR", _INDICES).reshape(-1).astype(np.int64)
     if len(index) % 3 or (len(index) and index.max() >= len(corners)):
         raise ValueError("its triangles have corners that are none of its vertices")
     return corners, index.reshape(-1, 3)
 
 
-def _values(document: dict[str, Any], data: bytes, number: object, shape: str, kinds: dict[int, str]) -> np.ndarray:
-    """An accessor's values (N, components), as far as the bytes that are there hold them."""
+def accessor_values(
+    document: dict[str, Any], data: bytes, number: object, shape: str, kinds: Mapping[int, str] = _FLOATS
+) -> np.ndarray:
+    """An accessor's values (N, components), as far as the bytes that are there hold them. ``kinds``: NumPy's type of
+    each component type that is read. Integers that stand for 0 to 1, or for -1 to 1, become floats."""
     accessor = document["accessors"][_index(number)]
-    if accessor["type"] != shape or accessor["componentType"] not in kinds or "sparse" in accessor:
+    shared = bool(accessor.get("normalized")) and kinds is _FLOATS
+    known = _SHARES if shared else kinds
+    if accessor["type"] != shape or accessor["componentType"] not in known or "sparse" in accessor:
         raise ValueError(
             "its positions or indices are of a kind that is not read; export it again, without compression"
         )
     view = document["bufferViews"][_index(accessor["bufferView"])]
     if _index(view.get("buffer", 0)) != 0 or "uri" in document["buffers"][0]:
         raise ValueError("its triangles are in another file; export it as one .glb")
-    dtype, width = np.dtype(kinds[accessor["componentType"]]), {"SCALAR": 1, "VEC3": 3}[shape]
+    dtype, width = np.dtype(known[accessor["componentType"]]), _WIDTHS[shape]
     count, step = _index(accessor["count"]), _index(view.get("byteStride", 0)) or dtype.itemsize * width
     start = _index(view.get("byteOffset", 0)) + _index(accessor.get("byteOffset", 0))
     if step < dtype.itemsize * width or (count and start + (count - 1) * step + dtype.itemsize * width > len(data)):
         raise ValueError("it ends before the values that it announces")
     if not count:
         return np.zeros((0, width), dtype)
-    return np.ndarray((count, width), dtype, data, start, (step, dtype.itemsize)).copy()
+    values = np.ndarray((count, width), dtype, data, start, (step, dtype.itemsize)).copy()
+    return np.maximum(values / np.float32(np.iinfo(dtype).max), -1) if shared else values
 
 
 def _index(value: object) -> int:

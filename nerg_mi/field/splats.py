@@ -1,0 +1,153 @@
+"""Gaussian splats: a place as many small Gaussians, each with an opacity and a colour that depends on direction.
+
+Along a ray a Gaussian absorbs ``opacity exp(-r^2 / 2)`` of the light where it is densest, r its least distance from the
+centre in standard deviations (Kerbl et al. 2023; the peak along the ray as in Moenne-Loccoz et al. 2024, "3D Gaussian
+Ray Tracing"). Held as NumPy arrays: what rays meet of them is `nerg_mi.transport.splats`'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.maths.harmonics import C0, DEGREES, rotated_harmonics
+from nerg_mi.maths.similarity import Similarity
+
+_LEAST_SCALE = 1e-9
+_LEAST_OPACITY = 1e-7
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians, activated: what they mean, not what a training stores. float32, in the file's own frame and units.
+
+    Raises `NergError` for shapes that do not fit, for numbers that are not finite, and for none at all. Rotations are
+    normalised, opacities clipped to [0, 1], scales to at least 1e-9.
+    """
+
+    # (N, 3).
+    centers: np.ndarray
+    # Standard deviations along the Gaussian's own axes, (N, 3).
+    scales: np.ndarray
+    # Unit quaternions (N, 4), w first: from the Gaussian's own axes to the frame of the centres.
+    rotations: np.ndarray
+    # Share of light that is absorbed on a ray through the centre, (N,).
+    opacities: np.ndarray
+    # Coefficients of real spherical harmonics (`maths.harmonics`), (N, K, 3) with K = 1, 4, 9 or 16: the colour seen
+    # along a unit direction d of the ray is max(0, 1/2 + sum_k c_k Y_k(d)), in the colour space of the training.
+    harmonics: np.ndarray
+    # Further columns of the file, (N,) each, by name.
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.centers)
+        shapes = {"centers": (3,), "scales": (3,), "rotations": (4,), "opacities": ()}
+        for name, shape in shapes.items():
+            value = np.asarray(getattr(self, name), np.float32)
+            if value.shape != (n, *shape):
+                raise NergError(f"the {name} of {n:,} Gaussians have the shape {value.shape}; export the splats again")
+            object.__setattr__(self, name, value)
+        colors = np.asarray(self.harmonics, np.float32)
+        if colors.ndim != 3 or len(colors) != n or colors.shape[1] not in DEGREES or colors.shape[2] != 3:
+            raise NergError(
+                f"the harmonics of {n:,} Gaussians have the shape {colors.shape}, which is no degree from 0 to 3; "
+                "export the splats again"
+            )
+        object.__setattr__(self, "harmonics", colors)
+        if n == 0:
+            raise NergError("there are no Gaussians in it; export the splats again")
+        for name in (*shapes, "harmonics"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise NergError(f"some of the {name} of its Gaussians are not finite; remove these in a splat editor")
+        length = np.linalg.norm(self.rotations.astype(np.float64), axis=1, keepdims=True)
+        if not (length > 0).all():
+            raise NergError("some of its Gaussians have a rotation of length 0; remove these in a splat editor")
+        object.__setattr__(self, "rotations", (self.rotations / length).astype(np.float32))
+        object.__setattr__(self, "opacities", np.clip(self.opacities, 0, 1))
+        object.__setattr__(self, "scales", np.maximum(self.scales, np.float32(_LEAST_SCALE)))
+
+    def __len__(self) -> int:
+        return len(self.centers)
+
+    @property
+    def degree(self) -> int:
+        """Of the harmonics: 0 to 3."""
+        return DEGREES[self.harmonics.shape[1]]
+
+    def placed(self, to_world: Similarity) -> Splats:
+        """These Gaussians in another frame, harmonics and all."""
+        if to_world.identity:
+            return self
+        turn = to_world.matrix[:3, :3] / to_world.scale
+        centers = self.centers @ to_world.matrix[:3, :3].T + to_world.matrix[:3, 3]
+        rotations = multiply_quaternions(quaternion_of(turn), self.rotations.astype(np.float64))
+        colors = rotated_harmonics(self.harmonics, turn)
+        return Splats(centers, self.scales * to_world.scale, rotations, self.opacities, colors, self.extra)
+
+    def axes(self) -> np.ndarray:
+        """Rotation matrices (N, 3, 3), float64: columns are the Gaussians' own axes."""
+        return matrices_of(self.rotations)
+
+
+def from_trained(
+    centers: np.ndarray,
+    log_scales: np.ndarray,
+    rotations: np.ndarray,
+    logits: np.ndarray,
+    harmonics: np.ndarray,
+    extra: Mapping[str, np.ndarray] | None = None,
+) -> Splats:
+    """Splats of what a training stores: logarithms of the scales, logits of the opacities; quaternions w first, of any
+    length."""
+    with np.errstate(over="ignore"):
+        scales = np.exp(np.asarray(log_scales, np.float64))
+        opacities = 1 / (1 + np.exp(-np.asarray(logits, np.float64)))
+    return Splats(centers, scales, rotations, opacities, harmonics, extra or {})
+
+
+def logits_of(opacities: np.ndarray) -> np.ndarray:
+    """Logits of ``opacities``, float64, of which those that are 0 or 1 are kept finite."""
+    p = np.clip(np.asarray(opacities, np.float64), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
+    return np.log(p) - np.log1p(-p)
+
+
+def harmonics_of(colors: np.ndarray) -> np.ndarray:
+    """Harmonics of degree 0, (N, 1, 3), of ``colors`` (N, 3) that are the same from everywhere."""
+    return ((np.asarray(colors, np.float64) - 0.5) / C0)[:, None]
+
+
+def matrices_of(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation matrices (N, 3, 3), float64, of unit ``quaternions`` (N, 4), w first."""
+    w, x, y, z = np.asarray(quaternions, np.float64).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def quaternion_of(rotation: np.ndarray) -> np.ndarray:
+    """The quaternion (4,), w first, of the rotation matrix (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return np.array([w, x, y, z])
+
+
+def multiply_quaternions(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The products (N, 4) of quaternions ``a`` and ``b`` ((4,) or (N, 4) each), w first: first ``b``, then ``a``."""
+    aw, ax, ay, az = np.moveaxis(np.asarray(a), -1, 0)
+    bw, bx, by, bz = np.moveaxis(np.asarray(b), -1, 0)
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )

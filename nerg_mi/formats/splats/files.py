@@ -1,0 +1,39 @@
+"""Gaussian splats of a file, whichever of the formats it is in."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.splats import Splats
+
+from .antimatter import read_splat
+from .khronos import read_gltf_splats
+from .ply import read_ply_splats
+from .spz import read_spz
+
+READERS: dict[str, Callable[[str | os.PathLike], Splats]] = {
+    ".ply": read_ply_splats,
+    ".splat": read_splat,
+    ".spz": read_spz,
+    ".glb": read_gltf_splats,
+}
+"""Reader by the ending of a file's name."""
+
+_OTHERS = (".sog", ".ksplat", ".lcc", ".gltf", ".json")
+
+
+def read_splats(path: str | os.PathLike) -> Splats:
+    """The Gaussian splats in ``path``, in the file's own frame and units.
+
+    Raises `NergError` for a file that is missing, damaged, of another format, or larger than is read.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in READERS:
+        known = ", ".join(READERS)
+        hint = f'npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
+        other = f"; convert it: {hint}" if suffix in _OTHERS else ""
+        raise NergError(f'Gaussian splats are read from {known}, and "{path}" is none of these{other}')
+    return READERS[suffix](path)

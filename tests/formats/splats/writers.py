@@ -1,0 +1,136 @@
+"""Files of Gaussian splats as other programs write them, byte by byte after their sources: what the readers read."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.field.splats import Splats
+from nerg_mi.formats.gltf import pack_glb
+
+C0 = 0.28209479177387814
+
+
+def random_splats(count: int = 40, degree: int = 3, seed: int = 0, size: float = 0.2) -> Splats:
+    """Gaussians of all kinds in the unit cube around the origin."""
+    rng = np.random.default_rng(seed)
+    return Splats(
+        rng.uniform(-1, 1, (count, 3)),
+        size * np.exp(rng.normal(0, 0.6, (count, 3))),
+        rng.normal(size=(count, 4)),
+        rng.uniform(0.05, 0.99, count),
+        rng.normal(0, 0.4, (count, (degree + 1) ** 2, 3)),
+    )
+
+
+def write_inria(path: Path, splats: Splats, style: str = "binary_little_endian", shuffled: bool = False) -> None:
+    """As graphdeco-inria/gaussian-splatting saves a model; ``shuffled``: columns in another order, one more of them,
+    and no normals, as other trainings do."""
+    rest = splats.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)
+    p = splats.opacities.astype(np.float64)
+    columns = {name: splats.centers[:, i] for i, name in enumerate("xyz")}
+    columns |= {} if shuffled else {f"n{a}": np.zeros(len(p)) for a in "xyz"}
+    columns |= {f"f_dc_{i}": splats.harmonics[:, 0, i] for i in range(3)}
+    columns |= {f"f_rest_{i}": rest[:, i] for i in range(rest.shape[1])}
+    columns |= {"opacity": np.log(p / (1 - p))}
+    columns |= {f"scale_{i}": np.log(splats.scales[:, i]) for i in range(3)}
+    columns |= {f"rot_{i}": 2 * splats.rotations[:, i] for i in range(4)}
+    names = list(columns)
+    if shuffled:
+        columns["label"] = np.arange(len(p))
+        names = list(np.random.default_rng(1).permutation([*columns]))
+    head = f"ply\nformat {style} 1.0\ncomment SplatRenderMode: default\nelement vertex {len(p)}\n"
+    head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    table = np.stack([columns[name] for name in names], axis=1).astype("<f4")
+    text = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in table) + "\n"
+    path.write_bytes(head.encode() + (text.encode() if style == "ascii" else table.tobytes()))
+
+
+def write_antimatter(path: Path, splats: Splats) -> None:
+    """As antimatter15/splat's ``processPlyBuffer``."""
+    rows = bytearray()
+    for c, s, q, a, h in zip(splats.centers, splats.scales, splats.rotations, splats.opacities, splats.harmonics):
+        color = np.clip([*((0.5 + C0 * h[0]) * 255), a * 255], 0, 255).astype(np.uint8)
+        turn = np.clip(q / np.linalg.norm(q) * 128 + 128, 0, 255).astype(np.uint8)
+        rows += struct.pack("<6f", *c, *s) + color.tobytes() + turn.tobytes()
+    path.write_bytes(bytes(rows))
+
+
+def write_spz(path: Path, splats: Splats, version: int = 3, fraction: int = 12) -> None:
+    """As nianticlabs/spz packs a cloud, with all bits of its bytes."""
+    n, degree = len(splats), splats.degree
+    if version == 1:
+        positions = splats.centers.astype("<f2").tobytes()
+    else:
+        fixed = np.round(splats.centers.astype(np.float64) * (1 << fraction)).astype(np.int64) & 0xFFFFFF
+        positions = b"".join(int(v).to_bytes(3, "little") for v in fixed.ravel())
+    byte = lambda v: np.clip(np.round(v), 0, 255).astype(np.uint8).tobytes()
+    alphas = byte(splats.opacities * 255)
+    colors = byte(splats.harmonics[:, 0] * (0.15 * 255) + 127.5)
+    scales = byte((np.log(splats.scales) + 10) * 16)
+    xyzw = splats.rotations[:, [1, 2, 3, 0]].astype(np.float64)
+    if version < 3:
+        signed = np.where(xyzw[:, 3:] < 0, -xyzw, xyzw)[:, :3]
+        turns = byte(signed * 127.5 + 127.5)
+    else:
+        turns = b"".join(struct.pack("<I", _smallest_three(q)) for q in xyzw)
+    rest = byte(splats.harmonics[:, 1:] * 128 + 128)
+    head = struct.pack("<IIIBBBB", 0x5053474E, version, n, degree, fraction, 0, 0)
+    path.write_bytes(gzip.compress(head + positions + alphas + colors + scales + turns + rest))
+
+
+def _smallest_three(q: np.ndarray) -> int:
+    largest = int(np.argmax(np.abs(q)))
+    negate = q[largest] < 0
+    packed = largest
+    for i in range(4):
+        if i != largest:
+            sign = int((q[i] < 0) ^ negate)
+            magnitude = int(511 * (abs(q[i]) / np.sqrt(0.5)) + 0.5)
+            packed = packed << 10 | sign << 9 | magnitude
+    return packed
+
+
+def write_khronos(path: Path, splats: Splats, node: dict | None = None, shares: bool = False) -> None:
+    """A primitive of KHR_gaussian_splatting; ``node``: of its node; ``shares``: opacities as normalised bytes."""
+    own = "KHR_gaussian_splatting:"
+    arrays = {
+        "POSITION": splats.centers,
+        own + "ROTATION": splats.rotations[:, [1, 2, 3, 0]],
+        own + "SCALE": splats.scales,
+        own + "OPACITY": np.round(splats.opacities * 255).astype(np.uint8) if shares else splats.opacities,
+    }
+    k = 0
+    for degree in range(splats.degree + 1):
+        for n in range(2 * degree + 1):
+            arrays[f"{own}SH_DEGREE_{degree}_COEF_{n}"] = splats.harmonics[:, k]
+            k += 1
+    views, accessors, data = [], [], b""
+    for values in arrays.values():
+        kind = {"float32": 5126, "uint8": 5121}[values.dtype.name]
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes})
+        shape = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
+        accessors.append({"bufferView": len(views) - 1, "componentType": kind, "count": len(values), "type": shape})
+        accessors[-1] |= {"normalized": True} if kind == 5121 else {}
+        data += np.ascontiguousarray(values).tobytes()
+        data += b"\0" * (-len(data) % 4)
+    primitive = {
+        "mode": 0,
+        "attributes": {name: i for i, name in enumerate(arrays)},
+        "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    document = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **(node or {})}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    path.write_bytes(b"".join(pack_glb(document, data)))
