@@ -22,6 +22,7 @@ PLUGINS = (
     ("nerf", "volume"),
     ("gazefield", "volume"),
     ("gazekde", "volume"),
+    ("splats", "volume"),
     ("nerg", "integrator"),
 )
 """Name and kind of each plugin; the module `nerg_mi.plugins.<name>` registers it. Order: a plugin follows those it

@@ -12,7 +12,7 @@ from nerg_mi.properties import boolean, choice, color, integer, number, vector
 from nerg_mi.transport.ceiling import Ceiling
 from nerg_mi.transport.march.depth import DEPTHS
 from nerg_mi.transport.march.rules import RULES, boundaries
-from nerg_mi.transport.march.settings import MarchSettings, default_growth, default_step
+from nerg_mi.transport.march.settings import MarchSettings, default_growth, default_step, default_stop
 from nerg_mi.transport.media.protocol import Medium
 from nerg_mi.transport.media.volume import KnownEmpty, VolumeMedium
 from nerg_mi.transport.observer import viewpoint
@@ -80,7 +80,9 @@ def medium_of(children: dict) -> tuple[Medium | None, KnownEmpty | None]:
         if paint is not None:
             raise NergError('"color" goes with "density"; a "field" brings its own colour')
         if not hasattr(field, "medium"):
-            raise NergError('"field" must be a volume of type "nerf"; give other volumes as "density" and "color"')
+            raise NergError(
+                '"field" must be a volume of type "nerf" or "splats"; give other volumes as "density" and "color"'
+            )
         return field.medium(), None
     if density is None:
         if paint is not None:
@@ -121,7 +123,7 @@ def march_settings(props, medium: Medium | None) -> MarchSettings:
     settings = MarchSettings(
         step=step or default_step(medium),
         dt_gamma=number(props, "dt_gamma", default_growth(medium), low=0, high=1),
-        stop=number(props, "stop", MarchSettings.stop, low=0, high=1),
+        stop=number(props, "stop", default_stop(medium), low=0, high=1),
         color_cutoff=number(props, "color_cutoff", MarchSettings.color_cutoff, low=0, high=1),
         quadrature=choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),
         coarse=number(props, "coarse", MarchSettings.coarse, low=1),

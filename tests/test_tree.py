@@ -59,6 +59,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "nerg_mi/tasks/protocol.py": "only fields: tests/tasks/test_run.py fulfils it in three more ways",
     "nerg_mi/viewer/__init__.py": "a docstring only",
     "nerg_mi/viewer/page.py": "what browsers are sent: tests/viewer/test_in_chromium.py looks at it in one",
+    "nerg_mi/transport/media/hits.py": "only fields: tests/transport/media/splats/test_nearest.py makes them",
     "nerg_mi/transport/media/local_ray.py": "only fields: tests/transport/media/test_protocol.py makes them",
     "tools/mending/__init__.py": _MENDINGS,
     "tools/mending/house.py": _MENDINGS,

@@ -21,7 +21,7 @@ from tools import command_pages, manual
 from tools.imports import ROOT
 from tools.page import table
 
-PLUGINS = ("nerg", "nerf", "gazefield", "gazekde", "panorama")
+PLUGINS = ("nerg", "nerf", "splats", "gazefield", "gazekde", "panorama")
 
 
 def plugins() -> str:

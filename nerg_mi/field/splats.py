@@ -7,7 +7,7 @@ Ray Tracing"). Held as NumPy arrays: what rays meet of them is `nerg_mi.transpor
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -90,6 +90,14 @@ class Splats:
     def axes(self) -> np.ndarray:
         """Rotation matrices (N, 3, 3), float64: columns are the Gaussians' own axes."""
         return matrices_of(self.rotations)
+
+
+def joined(parts: Sequence[Splats]) -> Splats:
+    """All Gaussians of ``parts``, without further columns. Raises `NergError` for several degrees of harmonics."""
+    if len({splats.degree for splats in parts}) > 1:
+        raise NergError("its splats have harmonics of several degrees; export them one by one")
+    take = lambda name: np.concatenate([getattr(splats, name) for splats in parts])
+    return Splats(take("centers"), take("scales"), take("rotations"), take("opacities"), take("harmonics"))
 
 
 def from_trained(

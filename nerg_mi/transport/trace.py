@@ -12,7 +12,7 @@ from nerg_mi.field.backend import namespace
 from nerg_mi.maths.types import Float, Point3f, Vector3f
 
 from .march.depth import DEPTHS
-from .march.settings import MarchSettings, default_growth, default_step
+from .march.settings import MarchSettings, default_growth, default_step, default_stop
 from .media.protocol import Medium
 from .place import Place, SceneRay, as_place
 
@@ -23,7 +23,7 @@ BATCH = 1 << 19
 def default_settings(subject: Medium | Place) -> MarchSettings:
     """The march of the integrator ``nerg`` with nothing set."""
     medium = as_place(subject).medium
-    return MarchSettings(step=default_step(medium), dt_gamma=default_growth(medium))
+    return MarchSettings(step=default_step(medium), dt_gamma=default_growth(medium), stop=default_stop(medium))
 
 
 def trace_depth(

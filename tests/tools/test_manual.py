@@ -87,7 +87,7 @@ def test_what_it_cannot_read_is_named(old, new):
         manual.read(PAGE.replace(old, new))
 
 
-@pytest.mark.parametrize("name", ["nerg", "nerf", "gazefield", "gazekde", "panorama"])
+@pytest.mark.parametrize("name", ["nerg", "nerf", "splats", "gazefield", "gazekde", "panorama"])
 def test_the_plugins_manuals_can_be_read(name):
     page = manual.read(import_module(f"nerg_mi.plugins.{name}").__doc__)
     assert f"`{name}`" in page.title and len(page.parameters) >= 3 and "```xml" in page.body

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.field.splats import Splats
+from nerg_mi.field.splats import Splats, joined
 from nerg_mi.files.bounded import read_bytes, reading
 from nerg_mi.formats.gltf import BYTES, accessor_values, instances, read_parts
 from nerg_mi.maths.similarity import Similarity
@@ -36,10 +36,7 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
             found.append(_splats(document, data, primitive["attributes"]).placed(Similarity(matrix)))
         if not found:
             raise ValueError(f"its scene has no splats of {EXTENSION}")
-        if len({splats.degree for splats in found}) > 1:
-            raise ValueError("its splats have harmonics of several degrees; export them one by one")
-        names = ("centers", "scales", "rotations", "opacities", "harmonics")
-        return Splats(*(np.concatenate([getattr(splats, name) for splats in found]) for name in names))
+        return joined(found)
 
 
 def _splats(document: dict[str, Any], data: bytes, attributes: dict[str, Any]) -> Splats:

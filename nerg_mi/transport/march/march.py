@@ -11,12 +11,14 @@ from typing import Any
 
 import drjit as dr
 
+from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Bool, Float
 from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import Painter
 from nerg_mi.transport.media.protocol import Medium
 
 from .adjoint import attached, differentiable_march
+from .hits import march_hits
 from .occlusion import Occlusion
 from .primal import march_primal
 from .settings import MarchResult, MarchSettings
@@ -53,7 +55,14 @@ def march(
     Float = type(ray.t_near)
     active = dr.mask_t(Float)(active) & (t0 < t1)
     arguments = (Float(t0), Float(t1), active, settings, offset, color, count, until, fine_from)
-    if attached(medium, ray, t0, t1):
+    if medium.hits is not None:
+        if attached(medium, ray, t0, t1):
+            raise NergError(
+                "Gaussian splats carry no derivatives: render them without gradients of a camera, of an observer or of "
+                "the splats"
+            )
+        result = march_hits(medium, medium.hits, ray, *arguments[:4], color, count, until, occlusion)
+    elif attached(medium, ray, t0, t1):
         result = differentiable_march(medium, ray, *arguments)
     else:
         result = march_primal(medium, ray, *arguments, occlusion)
@@ -81,7 +90,7 @@ def scouted_march(
     medium: Medium, ray: LocalRay, t0: Float, t1: Float, active: Bool, settings: MarchSettings, **options: Any
 ) -> MarchResult:
     """``march`` with coarse steps in front of all matter, where ``settings.coarse`` asks for them."""
-    if settings.coarse <= 1:
+    if settings.coarse <= 1 or medium.hits is not None:
         return march(medium, ray, t0, t1, active, settings, **options)
     fine_from, scouted = fine_start(medium, ray, t0, t1, active, settings)
     result = march(medium, ray, t0, t1, active, settings, fine_from=fine_from, **options)

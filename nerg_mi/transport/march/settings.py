@@ -13,6 +13,9 @@ from nerg_mi.transport.media.protocol import Medium
 
 from .quadrature import absorbed_share
 
+HITS_STOP = 1e-4
+"""Transmittance at which the rasteriser of Gaussian splats stops (Kerbl et al. 2023)."""
+
 
 @dataclass(frozen=True)
 class MarchSettings:
@@ -53,6 +56,11 @@ def default_step(medium: Medium | None) -> float:
 def default_growth(medium: Medium | None) -> float:
     """Growth of steps with distance (`MarchSettings.dt_gamma`) where none is asked for: what suits the medium."""
     return MarchSettings.dt_gamma if medium is None else medium.growth
+
+
+def default_stop(medium: Medium | None) -> float:
+    """`MarchSettings.stop` where none is asked for: of a medium of hits what its renderers and trainings stop at."""
+    return MarchSettings.stop if medium is None or medium.hits is None else HITS_STOP
 
 
 @dataclass

@@ -24,6 +24,7 @@ class FieldMedium:
 
     has_color = True
     cells = None
+    hits = None
 
     def __init__(self, field: RadianceField, to_world: Similarity | None = None):
         self.field, self.to_world = field, to_world or Similarity()

@@ -19,7 +19,8 @@ class Painter(Protocol):
     def paint(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         """The contribution of a sample that absorbs all light, attached to whatever carries derivatives.
 
-        ``features``: of the same point, as ``medium.density_features`` returned them; ``p``, ``w``: the point and the
+        ``features``: of the same point, as ``medium.density_features`` returned them, or the index of a hit (`hits`);
+        ``p``, ``w``: the point and the
         unit direction of the ray in the medium's coordinates.
         """
         ...

@@ -15,6 +15,7 @@ import numpy as np
 from nerg_mi.maths.types import Array3f, Bool, Color, Float, Point3f, UInt32, Vector3f
 
 from .cells import VoxelCells
+from .hits import Hits
 from .local_ray import LocalRay
 
 MAX_DENSITY = 1e30
@@ -89,6 +90,12 @@ class Medium(Protocol):
         """Voxels between which the density has no kinks, in the local frame; None for a medium that is no grid."""
         ...
 
+    @property
+    def hits(self) -> Hits | None:
+        """What rays meet instead of a density, of a medium that has none: its densities may not be asked for. None for
+        one that is marched in steps."""
+        ...
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the axis-aligned box around the medium, (3,) each, in the scene's frame."""
         ...
@@ -128,7 +135,7 @@ class Medium(Protocol):
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         """Colour in ``color_space`` at local points ``p`` in the unit local direction ``w`` of the ray. Only to be
-        called where ``has_color``."""
+        called where ``has_color``. ``features``: of the points, or the index of the hit alone in a medium of hits."""
         ...
 
     def background(self, o: Point3f, d: Vector3f) -> Color | None:

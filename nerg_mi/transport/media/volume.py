@@ -35,6 +35,7 @@ class VolumeMedium:
 
     color_space = "spectrum"
     feature_count = 0
+    hits = None
 
     def __init__(self, density: mi.Volume, color: mi.Volume | None = None):
         import mitsuba as mi

@@ -11,6 +11,7 @@ from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.protocol import MAX_DENSITY, Medium, bounded
 from nerg_mi.transport.media.volume import VolumeMedium
+from tests.transport.media.splats.scenes import medium_of, stack
 
 from .test_field import field
 
@@ -21,7 +22,12 @@ ASKED = {name: what for name, what in ASKED.items() if not name.startswith("_")}
 def media(mi):
     grid = {"type": "gridvolume", "grid": mi.VolumeGrid(np.ones((2, 2, 2), np.float32))}
     fog = {"type": "constvolume", "value": 2.0}
-    return [FieldMedium(field()), VolumeMedium(mi.load_dict(fog)), VolumeMedium(mi.load_dict(grid), mi.load_dict(fog))]
+    return [
+        FieldMedium(field()),
+        VolumeMedium(mi.load_dict(fog)),
+        VolumeMedium(mi.load_dict(grid), mi.load_dict(fog)),
+        medium_of(stack([0.2, 0.8], [0.5, 0.5], scale=0.25)),
+    ]
 
 
 def test01_every_medium_has_what_is_asked(rgb):
@@ -45,13 +51,15 @@ def test02_and_answers_as_it_says(rgb):
         o, d = rgb.Point3f(0.4, 0.6, -1), rgb.Vector3f(0, 0, 1)
         ray = medium.local(o, d)
         assert isinstance(ray, LocalRay) and 0 < ray.t_near[0] < ray.t_far[0] < 10
+        assert medium.refresh() is None and medium.parameters()
+        if medium.hits is not None:
+            continue
         p = medium.to_local(rgb.Point3f(0.4, 0.6, 0.5))
         sigma, features = medium.density_features(p, True)
         assert sigma[0] == medium.density(p, True)[0] > 0 and len(features) == medium.feature_count
         if medium.has_color:
             color = np.array(medium.color(features, p, ray.w, True)).ravel()
             assert color.shape == (3,) and (color >= 0).all()
-        assert medium.refresh() is None and medium.parameters()
 
 
 @pytest.mark.parametrize("wrong, right", [(-1, 0), (np.nan, 0), (np.inf, MAX_DENSITY), (3e38, MAX_DENSITY), (2.5, 2.5)])

@@ -1,0 +1,1 @@
+"""Gaussian splats as a medium: what rays meet of them, nearest first."""

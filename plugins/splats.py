@@ -1,0 +1,132 @@
+r"""
+.. _volume-splats:
+
+Gaussian splats (:monosp:`splats`)
+----------------------------------
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - Gaussian splats as 3DGS ``.ply`` (any order of columns, with or without normals), ``.splat``, ``.spz`` of version 1
+     to 3, or ``.glb`` with KHR_gaussian_splatting. Relative names are looked up beside the scene file.
+
+ * - to_world
+   - |transform|
+   - A rotation, a uniform scale and a translation that place the splats in the scene; colours that depend on direction
+     turn with them. (Default: none)
+
+ * - color_space
+   - |string|
+   - What the colours are that their harmonics give: ``srgb``, as photos train them, or ``linear``. (Default: ``srgb``)
+
+ * - extent
+   - |float|
+   - Where Gaussians are cut off, in standard deviations. (Default: 3)
+
+ * - centers, scales, rotations, opacities, harmonics
+   - |tensor|
+   - What the Gaussians are, each flat: 3, 3, 4 (quaternion, w first), 1 and 3 (degree + 1)² numbers a Gaussian.
+   - |exposed|
+
+A place as many small Gaussians, as most photogrammetry gives it today: the ``field`` of the integrator
+:ref:`nerg <integrator-nerg>`, which gives of it all that it gives of a trained field. It is no volume for other
+plugins, since splats have no density at a point.
+
+A ray meets a Gaussian where it is nearest to its centre by the Gaussian's own measure, and loses there the share
+:math:`\alpha = \min(o\,e^{-r^2/2}, 0.9999)` of its light, :math:`r` that distance in standard deviations and :math:`o`
+the opacity. Gaussians are met in the order of these peaks, ray by ray, so that nothing pops as the camera turns;
+cameras and observers may stand inside of them. Colours are composited in their colour space and then made linear.
+
+Depth is that of the peaks: ``expected`` their mean, ``median`` (and ``refined``) the peak at which half of the ray's
+own opacity is reached. Of the parameters of a march only ``stop`` applies (here 1e-4 by default), and ``step``, by
+which the tolerance of occlusion is measured: by default the median thickness of the Gaussians. There are no
+derivatives.
+
+.. tabs::
+    .. code-tab:: xml
+        :name: splats-volume
+
+        <volume type="splats" name="field">
+            <string name="filename" value="store.ply"/>
+        </volume>
+
+    .. code-tab:: python
+
+        'field': {
+            'type': 'splats',
+            'filename': 'store.ply'
+        }
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.splats import Splats
+from nerg_mi.formats.splats.files import read_splats
+from nerg_mi.maths.similarity import Similarity
+from nerg_mi.properties import choice, number, resolved, text, transform, volume_of
+from nerg_mi.registration import register
+from nerg_mi.transport.media.splats.arrays import SplatArrays
+from nerg_mi.transport.media.splats.medium import SplatMedium
+
+
+class SplatsVolume(mi.Volume):
+    __doc__ = __doc__
+
+    def __init__(self, props, splats=None):
+        # ``splats``: Gaussians in memory in place of a file; see ``of``.
+        self._similarity = Similarity(transform(props, "to_world"))
+        self.color_space = choice(props, "color_space", "srgb", ("srgb", "linear"))
+        extent = number(props, "extent", 3, low=0.1, high=10)
+        self.filename = "" if splats is not None else resolved(text(props, "filename"))
+        super().__init__(props)
+        self.splats = splats if splats is not None else read_splats(self.filename)
+        self.arrays = SplatArrays(self.splats, namespace(mi.Float), extent)
+
+    @classmethod
+    def of(cls, splats: Splats, to_world=None, name: str = "in memory") -> SplatsVolume:
+        """The volume of splats in memory, for a scene that is made from Python; ``to_world``: a Mitsuba transform,
+        ``name``: what it is called where others have a file's name."""
+        if not isinstance(splats, Splats):
+            raise NergError(f"splats in memory are needed, got {type(splats).__name__}; read them from their file")
+        return volume_of(cls, "splats", splats, to_world, name)
+
+    def medium(self) -> SplatMedium:
+        """The splats as rays meet them."""
+        return SplatMedium(self.arrays, self._similarity, self.color_space)
+
+    def bbox(self):
+        lower, upper = self.medium().bounds()
+        return mi.ScalarBoundingBox3f(lower.tolist(), upper.tolist())
+
+    def channel_count(self):
+        return 1
+
+    def eval_1(self, it, active=True):
+        raise NergError('"splats" have no density at a point: give them to "nerg" as its "field"')
+
+    def eval(self, it, active=True):
+        return self.eval_1(it, active)
+
+    def traverse(self, cb):
+        for name, value in self.arrays.parameters().items():
+            cb.put(name, value, mi.ParamFlags.NonDifferentiable)
+
+    def parameters_changed(self, keys=()):
+        self.arrays.pack()
+
+    def to_string(self):
+        lower, upper = self.medium().bounds()
+        return (
+            f"SplatsVolume[\n  filename = {self.filename},\n"
+            f"  count = {len(self.splats)},\n  degree = {self.splats.degree},\n"
+            f"  bbox = {lower.round(4).tolist()} to {upper.round(4).tolist()},\n"
+            f"  color_space = {self.color_space}\n]"
+        )
+
+
+register("volume", "splats", SplatsVolume)

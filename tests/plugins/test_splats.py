@@ -1,0 +1,168 @@
+"""The volume `splats` in the integrator: against Mitsuba's own renderer of splats, and beside shapes and observers."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from nerg_mi.field.splats import Splats, harmonics_of, joined
+from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.registration import plugin_class
+from tests.formats.splats.writers import random_splats
+
+from .scenes import camera, look_at
+from .scenes import render as draw
+
+
+@pytest.fixture
+def render(rgb, tmp_path):
+    """What `nerg` renders of splats, by the names of its channels."""
+
+    def rendered(splats, sensor=None, others=(), field=(), **parameters):
+        write_ply_splats(tmp_path / "a.ply", splats)
+        place = {"type": "splats", "filename": str(tmp_path / "a.ply"), **dict(field)}
+        integrator = {"type": "nerg", "field": place, **parameters}
+        image = draw(rgb, integrator, sensor, **dict(others))
+        names = rgb.load_dict(integrator).aov_names()
+        # All channels of an AOV together; one alone without an axis of its own.
+        found: dict = {}
+        for name, value in zip(names, np.moveaxis(image[..., image.shape[-1] - len(names) :], -1, 0)):
+            found.setdefault(name.split(".")[0], []).append(value)
+        found = {name: v[0] if len(v) == 1 else np.stack(v, axis=-1) for name, v in found.items()}
+        return found | {"color": image[..., :3]}
+
+    return rendered
+
+
+def linear(srgb):
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def srgb(linear):
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 0) ** (1 / 2.4) - 0.055)
+
+
+def wall(z=0.0, opacity=0.99, half=2.0, spacing=0.08, color=(0.2, 0.5, 0.8)):
+    """A square of flat Gaussians at ``z``, across the z axis."""
+    x = np.arange(-half, half + 1e-6, spacing)
+    grid = np.stack(np.meshgrid(x, x, [z], indexing="ij"), axis=-1).reshape(-1, 3)
+    n = len(grid)
+    scales = np.tile([spacing, spacing, 1e-3], (n, 1))
+    return Splats(grid, scales, [[1, 0, 0, 0]] * n, np.full(n, opacity), harmonics_of(np.tile(color, (n, 1))))
+
+
+def of_mitsuba(mi, path, sensor):
+    """The sum of its colours, which it makes linear as it is."""
+    scene = {"type": "scene", "i": {"type": "volprim_rf_basic"}, "s": sensor, "e": {"type": "ellipsoids"}}
+    scene["e"]["filename"] = str(path)
+    return srgb(np.array(mi.render(mi.load_dict(scene), spp=1))[..., :3])
+
+
+def test_colors_are_those_of_mitsubas_own_renderer(rgb, tmp_path, render):
+    # Balls of one size, few and thin: theirs stops at a hundredth of the light, and takes what overlaps by its shells.
+    some = random_splats(25, degree=3)
+    scales = np.full((25, 3), 0.12)
+    some = Splats(some.centers, scales, some.rotations, 0.4 * some.opacities, some.harmonics)
+    ours = render(some, aovs="opacity", sensor=camera(rgb, size=32))
+    opacity = ours["opacity"][..., None]
+    sums = opacity * srgb(ours["color"] / np.maximum(opacity, 1e-9))
+    apart = np.abs(sums - of_mitsuba(rgb, tmp_path / "a.ply", camera(rgb, size=32))).max(-1)[opacity[..., 0] > 0]
+    assert len(apart) > 300 and np.median(apart) < 1e-6 and (apart < 1e-4).mean() > 0.9
+
+
+def test_a_gaussian_is_met_once(rgb, tmp_path, render):
+    # Mitsuba 3.9.1 meets one that is thin a second time where a ray grazes it: its next ray starts outside again.
+    one = Splats([[0, 0, 0]], [[0.3, 0.05, 0.1]], [[0.8, 0.3, 0.4, 0.2]], [0.5], harmonics_of([[1, 1, 1]]))
+    opacity = render(one, aovs="opacity", sensor=camera(rgb, size=64))["opacity"]
+    theirs = of_mitsuba(rgb, tmp_path / "a.ply", camera(rgb, size=64))[..., 0]
+    # Within the rim, where both cut it off.
+    met = opacity > 0
+    theirs, opacity = theirs[met], opacity[met]
+    twice = theirs > 1.2 * opacity
+    assert met.sum() > 500 and twice.mean() < 0.05 and np.allclose(theirs[~twice], opacity[~twice], atol=1e-5)
+    assert np.allclose(theirs[twice], 1 - (1 - opacity[twice]) ** 2, atol=1e-5)
+
+
+def test_a_wall_is_where_it_stands_for_camera_and_observer(rgb, render):
+    found = render(
+        wall(),
+        aovs="depth,opacity,position,visibility,observer_depth",
+        observer={"type": "perspective", "to_world": look_at(rgb, (1, 0.5, -2), (0, 0, 0))},
+    )
+    assert found["opacity"].min() > 0.99
+    assert np.abs(found["position"][..., 2]).max() < 2e-3
+    # From the near plane on.
+    assert np.allclose(found["depth"], np.linalg.norm(found["position"] - [0.5, 0.4, -3], axis=-1), atol=0.02)
+    assert found["visibility"].min() == 1
+    assert np.allclose(linear(np.array([0.2, 0.5, 0.8])), found["color"].mean((0, 1)), atol=1e-3)
+
+
+@pytest.mark.parametrize("visibility", ["depth", "transmittance", "map"])
+def test_what_stands_between_hides(rgb, render, visibility):
+    back, front = wall(), wall(-1, half=0.6)
+    both = joined([back, front])
+    # The camera looks at the far wall below the near one, behind which the observer stands.
+    observer = {"type": "perspective", "to_world": look_at(rgb, (0, 0, -3), (0, 0, 0))}
+    sensor = camera(rgb, (0, 0, -0.5), (0, 0, 0), fov=140)
+    found = render(
+        both, sensor, aovs="position,visibility", observer=observer, visibility=visibility, falloff=0.0, map_height=256
+    )
+    x, y = np.abs(found["position"][..., :2]).max(-1), found["visibility"]
+    inside = (x < 1.9) & (np.abs(found["position"][..., 2]) < 0.01)
+    # A shadow of what is 2 away on what is 3 away; its rim is as soft as the last Gaussians.
+    assert y[inside & (x < 0.75)].max() < 0.05 and y[inside & (x > 1.3)].min() > 0.95
+    assert (inside & (x < 0.75)).sum() > 3 and (inside & (x > 1.3)).sum() > 3
+
+
+def test_eyes_stand_inside_of_gaussians(rgb, render):
+    # A haze around camera and wall: its peak lies behind the camera on one side, before it on the other.
+    haze = Splats([[0.5, 0.4, -2.5]], [[3, 3, 3]], [[1, 0, 0, 0]], [0.5], harmonics_of([[1, 1, 1]]))
+    found = render(haze, aovs="opacity,depth")
+    assert found["opacity"].min() > 0.4 and found["depth"].max() <= 0.5
+    away = render(haze, camera(rgb, (0.5, 0.4, -2), (0.5, 0.4, 0)), aovs="opacity")
+    assert away["opacity"].max() == 0
+
+
+def test_shapes_hide_and_are_hidden(rgb, render):
+    ball = {"ball": {"type": "sphere", "radius": 0.5, "center": [0, 0, 1]}}
+    behind = render(wall(opacity=0.3), others=ball, aovs="depth,opacity")
+    middle = behind["depth"].shape[0] // 2
+    assert behind["opacity"][middle, middle] == 1 and behind["depth"][middle, middle] < 3.1
+    ball["ball"]["center"] = [0, 0, -1]
+    before = render(wall(), others=ball, aovs="depth")
+    assert np.isclose(before["depth"][middle, middle], np.linalg.norm([0.5, 0.4, 2]) - 0.5, atol=0.02)
+
+
+def test_a_turned_place_shows_its_colors_turned(rgb, render):
+    splats = random_splats(25, degree=3, size=0.15)
+    turn = Rotation.random(rng=np.random.default_rng(4)).as_matrix()
+    matrix = np.eye(4)
+    matrix[:3, :3] = 2 * turn
+    to_world = rgb.ScalarTransform4f(matrix)
+    eye, target = np.array([0.5, 0.4, -3]), np.zeros(3)
+    here = render(splats, aovs="depth,opacity")
+    up = turn @ [0, 1, 0]
+    moved = camera(rgb) | {"to_world": look_at(rgb, 2 * turn @ eye, target, up)}
+    there = render(splats, moved, field={"to_world": to_world}, aovs="depth,opacity")
+    assert np.abs(there["color"] - here["color"]).max() < 1e-4
+    # Rays begin at the near plane, which has not grown.
+    assert np.allclose(there["depth"], 2 * here["depth"], atol=0.02)
+
+
+def test_the_volume_says_what_it_is(rgb, tmp_path):
+    write_ply_splats(tmp_path / "a.ply", wall())
+    volume = rgb.load_dict({"type": "splats", "filename": str(tmp_path / "a.ply"), "color_space": "linear"})
+    assert "count = 2601" in str(volume) and volume.medium().color_space == "linear"
+    assert np.allclose(np.array(volume.bbox().max).ravel(), [2.24, 2.24, 0.003], atol=1e-3)
+    params = rgb.traverse(volume)
+    params["centers"] = params["centers"] + 1
+    params.update()
+    assert np.allclose(np.array(volume.bbox().max).ravel(), [3.24, 3.24, 1.003], atol=1e-3)
+    with pytest.raises(Exception, match="no density at a point"):
+        volume.eval_1(rgb.Interaction3f())
+    kind = plugin_class("splats")
+    assert "in memory" in str(kind.of(wall()))
+    with pytest.raises(Exception, match="splats in memory are needed"):
+        kind.of(3)
+    with pytest.raises(RuntimeError, match="lacks the column"):
+        (tmp_path / "b.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n")
+        rgb.load_dict({"type": "splats", "filename": str(tmp_path / "b.ply")})
