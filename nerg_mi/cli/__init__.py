@@ -35,7 +35,7 @@ COMMANDS = {
     "eval": "Score a trained radiance field on held-out views, or a gaze field on held-out rays.",
     "report": "Write a report on a gaze field: one HTML file with a verdict, pictures, scores and the place in 3D.",
     "import": "Convert checkpoints of torch-ngp and of the NeRG paper's authors.",
-    "export": "Write a radiance field as a mesh, points, grid volumes or a torch-ngp checkpoint.",
+    "export": "Write a radiance field as a mesh, points, Gaussian splats, grid volumes or a torch-ngp checkpoint.",
     "refine": "Find more closely where a radiance field holds matter, so that it renders faster.",
     "bake": "Put gaze on surfaces: how much of it each square metre receives, as colours and tables.",
     "ablate": "Train every variant of a gaze field alike, and compare them.",

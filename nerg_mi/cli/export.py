@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from nerg_mi.jobs.options.export import MeshOptions, PointOptions, TorchNgpOptions, VolumeOptions
+from nerg_mi.jobs.options.export import MeshOptions, PointOptions, SplatOptions, TorchNgpOptions, VolumeOptions
 
 from .mode import OldMode, mode_of
 from .options import takes
@@ -38,6 +38,16 @@ def export_points(field: _Field, output: _Output, options: PointOptions, variant
 
     with TerminalReporter() as reporter:
         export.export_points(field, output, replace(options, mode=mode_of(options.mode, variant)), reporter)
+
+
+@app.command("splats")
+@takes(SplatOptions)
+def export_splats(field: _Field, output: _Output, options: SplatOptions) -> None:
+    """Gaussian splats on the surface, with its colours: .ply, for viewers of splats and the volume "splats"."""
+    from nerg_mi.jobs import export
+
+    with TerminalReporter() as reporter:
+        export.export_splats(field, output, replace(options, mode=mode_of(options.mode, None)), reporter)
 
 
 @app.command("volume")

@@ -83,7 +83,7 @@ class Splats:
             return self
         turn = to_world.matrix[:3, :3] / to_world.scale
         centers = self.centers @ to_world.matrix[:3, :3].T + to_world.matrix[:3, 3]
-        rotations = multiply_quaternions(quaternion_of(turn), self.rotations.astype(np.float64))
+        rotations = multiply_quaternions(quaternions_of(turn), self.rotations.astype(np.float64))
         colors = rotated_harmonics(self.harmonics, turn)
         return Splats(centers, self.scales * to_world.scale, rotations, self.opacities, colors, self.extra)
 
@@ -138,12 +138,11 @@ def matrices_of(quaternions: np.ndarray) -> np.ndarray:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    """The quaternion (4,), w first, of the rotation matrix (3, 3)."""
+def quaternions_of(rotations: np.ndarray) -> np.ndarray:
+    """The quaternions (N, 4), or (4,), w first, of rotation matrices (N, 3, 3), or (3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    return np.array([w, x, y, z])
+    return Rotation.from_matrix(rotations).as_quat()[..., [3, 0, 1, 2]]
 
 
 def multiply_quaternions(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,4 +1,5 @@
-"""Radiance fields for other tools, in the field's own units: meshes, points, grid volumes, torch-ngp checkpoints."""
+"""Radiance fields for other tools, in the field's own units: meshes, points, Gaussian splats, grid volumes,
+torch-ngp checkpoints."""
 
 from __future__ import annotations
 
@@ -11,12 +12,14 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.atomic import check_writable
 from nerg_mi.formats.fields import load_radiance
+from nerg_mi.formats.splats.ply import write_ply_splats
+from nerg_mi.formats.splats.surfels import splats_of_field
 from nerg_mi.formats.surfaces import Surface, mesh, points, write_glb, write_ply
 from nerg_mi.formats.torch_ngp.fields import write_torch_ngp
 from nerg_mi.formats.volumes import density_and_color, write_volume
 
 from .backend import select_backend
-from .options.export import MeshOptions, PointOptions, TorchNgpOptions, VolumeOptions
+from .options.export import MeshOptions, PointOptions, SplatOptions, TorchNgpOptions, VolumeOptions
 from .reporter import SILENT, Reporter
 
 
@@ -78,6 +81,24 @@ def export_points(
     write(found, output)
     reporter.message(f"{len(found.vertices):,} points, at a density of {found.report['threshold']:.4g} / unit")
     return _written([output], start, reporter, found)
+
+
+def export_splats(
+    field: str | Path | RadianceField,
+    output: str | Path,
+    options: SplatOptions | None = None,
+    reporter: Reporter = SILENT,
+) -> Export:
+    """Write Gaussian splats on the field's surface: .ply. Raises `NergError` for what the user can mend."""
+    options, output, start = options or SplatOptions(), Path(output), time.perf_counter()
+    check_writable(output, ".ply")
+    splats, done = splats_of_field(_load(field, options.mode, reporter), options.resolution, options.density)
+    write_ply_splats(output, splats, comments=("Gaussian splats of a radiance field, by nerg_mi",))
+    reporter.message(
+        f"{len(splats):,} Gaussians, cells of {done['cell']:.4g} units; moved by {done['moved']:.2g} units (median) to "
+        "the depth that rays find"
+    )
+    return _written([output], start, reporter)
 
 
 def export_volume(

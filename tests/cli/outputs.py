@@ -172,6 +172,7 @@ CASES = (
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.glb --resolution 8 --density 3", ("a.glb",)),
     Case("export points", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
+    Case("export splats", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
     Case("export volume", "{i}/field.safetensors -o {o}/a.vol --color {o}/c.vol --resolution 8", ("a.vol", "c.vol")),
     Case("export torch-ngp", "{i}/ngp.safetensors -o {o}/a.pth", ("a.pth",)),
     Case(
@@ -222,6 +223,7 @@ INPUTS = {
     "refine": {"field"},
     "export mesh": {"field"},
     "export points": {"field"},
+    "export splats": {"field"},
     "export volume": {"field"},
     "export torch-ngp": {"field"},
     "ablate": {"rays", "field", "scene"},

@@ -42,6 +42,7 @@ def test02_volumes(tmp_path, field):
         (["mesh", "f.safetensors", "-o", "m.obj"], "end in .ply or .glb"),
         (["points", "f.safetensors", "-o", "p.ply", "--resolution", "8", "--density", "1e9"], "nowhere"),
         (["points", "f.safetensors", "-o", "p.glb", "--up", "x"], "--up must be z or y"),
+        (["splats", "f.safetensors", "-o", "s.splat"], "end in .ply"),
         (["volume", "f.safetensors", "-o", "d.exr"], "end in .vol"),
         (["torch-ngp", "f.safetensors", "-o", "x.pth"], "no torch-ngp form"),
         (["volume", "none.safetensors", "-o", "d.vol"], "does not exist"),

@@ -6,7 +6,8 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.jobs.export import PointOptions, VolumeOptions, export_points, export_volume
+from nerg_mi.formats.splats.files import read_splats
+from nerg_mi.jobs.export import PointOptions, SplatOptions, VolumeOptions, export_points, export_splats, export_volume
 from tests.jobs.recorder import Recorder
 from tests.plugins import fields
 
@@ -25,6 +26,14 @@ def test_a_field_and_its_file_are_exported_alike(field, tmp_path):
     assert np.array_equal(first.surface.vertices, second.surface.vertices)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
     assert told.messages[0].startswith("50 points") and told.messages[1].startswith(f"wrote {tmp_path / 'a.ply'}")
+
+
+def test_splats_lie_on_the_surface(field, tmp_path):
+    told = Recorder()
+    done = export_splats(field, tmp_path / "a.ply", SplatOptions(resolution=16, density=3.0), told)
+    splats = read_splats(tmp_path / "a.ply")
+    assert done.files == [tmp_path / "a.ply"] and told.messages[0].startswith(f"{len(splats):,} Gaussians")
+    assert (np.abs(splats.centers) < 1.3).all()
 
 
 def test_a_volume_with_its_colour(field, tmp_path):

@@ -43,6 +43,15 @@ class PointOptions(SurfaceOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SplatOptions(LatticeOptions):
+    """How many Gaussians a surface becomes, and where it lies."""
+
+    density: float | None = option(
+        None, "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]"
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class VolumeOptions(LatticeOptions):
     """What a grid volume holds."""
 
