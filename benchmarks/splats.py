@@ -1,0 +1,216 @@
+"""The demo store as Gaussian splats against the store as a field and as shapes; speed beside Mitsuba's own renderer.
+
+    python benchmarks/splats.py [--resolution 208] [--width 180] [--runs 5] [--picture FILE.png]
+    [--out out/benchmarks/splats.csv]
+
+Splats are made of the trained field as `nerg export splats` makes them (`--splats FILE` takes others). First table:
+field and splats against exact ray casts to the twin, as in store_visibility.py, and the share of pixels in which their
+visibility is the same. Second table: seconds for 320 x 180 pixels of one ray each, median of `--runs` runs that are
+made in turn, and CPU seconds of all threads, which other programs of the machine change less; kernels are compiled
+before. `volprim_rf_basic` is Mitsuba's renderer of splats, which has colour alone, in the order of shells, and stops at
+a hundredth of the light; the row "colour, stop 0.01" does too.
+
+The picture: rows field, splats, shapes; columns colour, depth, gaze, visibility.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
+
+SIZE = 320, 180
+DEEPEST = 6.0
+PAIR = "demo"
+
+
+def make(path: Path, resolution: int) -> None:
+    """Splats of the store's field."""
+    from nerg_mi.jobs.demo import store_scene
+    from nerg_mi.jobs.export import SplatOptions, export_splats
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    export_splats(store_scene().parent / "store.safetensors", path, SplatOptions(resolution=resolution))
+
+
+def splat_scene(folder: Path) -> Path:
+    """The store's scene with splats for a field, written to ``folder``."""
+    from nerg_mi.jobs.demo import store_scene
+
+    path = folder / "splats.xml"
+    text = store_scene().read_text()
+    path.write_text(text.replace('name="field" type="nerf"', 'name="field" type="splats"'))
+    return path
+
+
+def values(pair: str, width: int, height: int, **more: str) -> dict[str, str]:
+    """Parameters of the scene files for one camera and observer."""
+    from store_visibility import PAIRS
+
+    camera, target, eye = PAIRS[pair]
+    size = {"width": str(width), "height": str(height)}
+    return {"camera": camera, "target": target, "eye": eye, **size, "falloff": "0", **more}
+
+
+def compare(scenes: dict[str, tuple[Path, dict]], width: int) -> list[dict]:
+    """Rows of the first table."""
+    from store_visibility import PAIRS, measure
+
+    rows = []
+    for pair in PAIRS:
+        for name, (scene, files) in scenes.items():
+            row = measure(scene, pair, "median", "depth", files, width, 2)
+            rows.append({"place": name} | {k: v for k, v in row.items() if k not in ("depth", "visibility")})
+    return rows
+
+
+def same_depth(scenes: dict[str, tuple[Path, dict]], width: int) -> list[dict]:
+    """How far the depths of the splats are from those of the field, in centimetres, ray by ray."""
+    from store_visibility import PAIRS
+
+    rows = []
+    for pair in PAIRS:
+        depth, seen = [], []
+        for scene, files in scenes.values():
+            picture = render(scene, values(pair, width, 2 * width // 3, aovs="depth,visibility", **files))
+            depth.append(picture[..., 3])
+            seen.append(picture[..., 4] > 0.5)
+        apart = 100 * np.abs(depth[0] - depth[1])
+        same = float((seen[0] == seen[1]).mean())
+        rows.append({"pair": pair, "median cm": np.median(apart), "p90 cm": np.percentile(apart, 90), "same": same})
+    return rows
+
+
+def render(scene: Path, parameters: dict[str, str], spp: int = 1) -> np.ndarray:
+    import mitsuba as mi
+
+    return np.array(mi.render(mi.load_file(str(scene), **parameters), sensor=0, spp=spp, seed=1), np.float64)
+
+
+def times(scene: Path, files: dict, runs: int) -> list[dict]:
+    """Rows of the second table."""
+    from store_visibility import PAIRS
+
+    import mitsuba as mi
+
+    loaded = {}
+    width, height = SIZE
+    colour, observed = {"aovs": "opacity", "occlusion": "false"}, {"aovs": "depth,opacity,gaze,visibility"}
+    for name, more in {
+        "colour, stop 0.01": colour | {"stop": "0.01"},
+        "colour": colour,
+        "colour, depth and gaze of an observer": observed,
+        "the same, by the observer's map": observed | {"visibility": "map"},
+    }.items():
+        stop = more.pop("stop", None)
+        path = scene
+        if stop is not None:
+            path = scene.with_name("stop.xml")
+            text = scene.read_text().replace(
+                '<string name="depth"', f'<float name="stop" value="{stop}"/><string name="depth"'
+            )
+            path.write_text(text)
+        loaded[name] = mi.load_file(str(path), **values(PAIR, width, height, spp="1", **more, **files))
+    camera, target, _ = ([float(v) for v in text.split(",")] for text in PAIRS[PAIR])
+    sensor = {"type": "perspective", "fov": 78, "fov_axis": "x"}
+    sensor["to_world"] = mi.ScalarTransform4f().look_at(camera, target, [0, 0, 1])
+    sensor["film"] = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+    shape = {"type": "ellipsoids", "filename": files["field"]}
+    theirs = {"type": "scene", "integrator": {"type": "volprim_rf_basic"}, "sensor": sensor, "splats": shape}
+    loaded["volprim_rf_basic"] = mi.load_dict(theirs)
+    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in loaded}
+    for run in range(runs + 1):
+        for name, what in loaded.items():
+            wall, cpu = time.perf_counter(), time.process_time()
+            np.array(mi.render(what, sensor=0, spp=1, seed=run))
+            if run:
+                taken[name].append((time.perf_counter() - wall, time.process_time() - cpu))
+    middle = {name: np.median(found, axis=0) for name, found in taken.items()}
+    peer = middle["volprim_rf_basic"]
+    return [
+        {"what": name, "s": float(m[0]), "CPU s": float(m[1]), "of volprim": float(m[1] / peer[1])}
+        for name, m in middle.items()
+    ]
+
+
+def picture(path: Path, scenes: dict[str, tuple[Path, dict]]) -> None:
+    """Field, splats and shapes, one below the other."""
+    from nerg_mi.figures.tonemap import srgb, write_png
+
+    rows, brightest = [], None
+    for scene, files in scenes.values():
+        found = render(scene, values(PAIR, *SIZE, aovs="depth,gaze,visibility", **files), spp=16)
+        brightest = brightest or found[..., 4].max()
+        depth, gaze, seen = found[..., 3] / DEEPEST, np.sqrt(found[..., 4] / brightest), found[..., 5]
+        grey = [np.repeat(np.clip(v, 0, 1)[..., None], 3, axis=2) for v in (depth, gaze, seen)]
+        rows.append(np.concatenate([srgb(found[..., :3]), *grey], axis=1))
+    write_png(path, np.concatenate(rows))
+
+
+def show(title: str, rows: list[dict]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    out = Table(title=title)
+    for name in rows[0]:
+        out.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
+    for row in rows:
+        out.add_row(*(v if isinstance(v, str) else f"{v:.3g}" for v in row.values()))
+    Console(width=max(150, Console().width)).print(out)
+
+
+def means(rows: list[dict], by: str) -> list[dict]:
+    """The mean of each number over the rows of one kind."""
+    out = []
+    for kind in dict.fromkeys(row[by] for row in rows):
+        mine = [row for row in rows if row[by] == kind]
+        numbers = [k for k, v in mine[0].items() if not isinstance(v, str)]
+        out.append({by: kind} | {k: float(np.mean([row[k] for row in mine])) for k in numbers})
+    return out
+
+
+def main(argv=None) -> None:
+    from output import write_rows
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--splats", type=Path, help="file of splats (default: made of the field)")
+    parser.add_argument("--resolution", type=int, default=208, help="lattice cells of what is made")
+    parser.add_argument("--width", type=int, default=180, help="width of a picture of the first table in pixels (3:2)")
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--picture", type=Path, help="PNG file to write")
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/splats.csv"), help="CSV file to write")
+    args = parser.parse_args(argv)
+
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    from nerg_mi.jobs.demo import store_scene
+
+    folder = args.out.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    if args.splats is None:
+        args.splats = folder / "store.ply"
+        make(args.splats, args.resolution)
+    store = store_scene()
+    gaze = {"gaze": str((store.parent / "shoppers.safetensors").resolve())}
+    files = gaze | {"field": str(args.splats.resolve())}
+    scenes = {"field": (store, gaze), "splats": (splat_scene(folder), files)}
+    if args.picture:
+        picture(args.picture, scenes | {"shapes": (store.parent / "shapes.xml", gaze)})
+        print(f"wrote {args.picture}", flush=True)
+    speed = times(scenes["splats"][0], files, args.runs)
+    show(f"{SIZE[0]} x {SIZE[1]} pixels of {args.splats.name}", speed)
+    write_rows(args.out, speed)
+    exact = compare(scenes, args.width)
+    show("Against exact ray casts, mean of all pairs (errors in cm, shares of 1)", means(exact, "place"))
+    own = same_depth(scenes, args.width)
+    show("Splats against the field", own)
+    write_rows(args.out.with_name("splats_exact.csv"), exact)
+
+
+if __name__ == "__main__":
+    main()
