@@ -128,18 +128,20 @@ def test04_areas_are_read(tmp_path):
         assert all(region.holds(region.corners).all() for region in read_regions(tmp_path / "a.json"))
 
 
-XML_PAGES = ("gaze-training.md", "plugins.md", "shapes-and-fields.md")
+XML_PAGES = ("gaze-training.md", "plugins.md", "shapes-and-fields.md", "splats.md")
 
 
 @pytest.fixture
 def place(rgb, tmp_path, monkeypatch):
     """A folder with what snippets name: stand-ins of the store's fields, a scene of them, rays."""
     from tests.evaluation.gaze.test_evaluation import crowd
+    from tests.formats.splats.writers import random_splats, write_inria
 
     write_standins(tmp_path)
     shutil.copy(demo.store_scene(), tmp_path)
     shutil.copy(tmp_path / "store.safetensors", tmp_path / "field.safetensors")
     crowd().save(tmp_path / "day.npz")
+    write_inria(tmp_path / "store.ply", random_splats())
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -152,7 +154,7 @@ def as_scene(text: str) -> str:
         aovs = '<string name="aovs" value="kde"/>' if "gazekde" in text else ""
         field = (
             ""
-            if 'type="nerf"' in text
+            if 'name="field"' in text
             else '<volume name="field" type="nerf"><string name="filename" value="store.safetensors"/></volume>'
         )
         text = f'<integrator type="nerg">{field}{text}{aovs}</integrator>'

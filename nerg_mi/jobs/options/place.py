@@ -12,7 +12,7 @@ from . import option
 class PlaceOptions:
     """Exactly one of them is given."""
 
-    field: Path | None = option(None, "Radiance field in which people looked around.")
+    field: Path | None = option(None, "Radiance field, or Gaussian splats, in which people looked around.")
     scene: Path | None = option(None, "Or: a Mitsuba scene, whose shapes they looked at.")
     geometry: str | None = option(
         None, 'Or: "hits" makes a place from the rays\' own hit points, "none" does without any.'

@@ -12,6 +12,7 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_radiance
+from nerg_mi.formats.splats.files import READERS, read_splats
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.contraction import AnyBox
@@ -20,6 +21,8 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.mesh_file import check_vol
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.media.splats.arrays import SplatArrays
+from nerg_mi.transport.media.splats.medium import SplatMedium
 from nerg_mi.transport.media.volume import VolumeMedium
 from nerg_mi.transport.place import Place
 
@@ -30,12 +33,16 @@ NOWHERE = 2.0
 """How far away everything is taken to be where no geometry is known, in the field's units."""
 
 
+_STRAY, _AROUND = 0.002, 0.02
+"""Share of Gaussians that may lie beyond each side of the box of splats, and what is added around the others."""
+
+
 @dataclass(frozen=True, eq=False)
 class GazePlace:
     """Where people looked around, and how their frame lies in it."""
 
     # What depths are traced in, in the field's frame (`transport.trace.trace_depth`); None where nothing is known.
-    medium: FieldMedium | VolumeMedium | Place | None
+    medium: FieldMedium | VolumeMedium | SplatMedium | Place | None
     # Where a gaze field lives, in that frame.
     box: AnyBox
     # What it was made of: "field", "scene", "hits" or "none".
@@ -62,10 +69,21 @@ class GazePlace:
 
 
 def place_of_field(path: Path, ns: ModuleType) -> GazePlace:
-    """A trained radiance field, read from ``path`` with arrays of the backend ``ns``."""
+    """A trained radiance field, or Gaussian splats, read from ``path`` with arrays of the backend ``ns``."""
+    if path.suffix.lower() in READERS:
+        return _place_of_splats(path, ns)
     radiance, _ = load_radiance(path, ns)
     about = {"field_file": file_identity(path)}
     return GazePlace(FieldMedium(radiance), radiance.box, "field", about, radiance=radiance)
+
+
+def _place_of_splats(path: Path, ns: ModuleType) -> GazePlace:
+    splats = read_splats(path)
+    # Of splats that photos have trained a few lie far outside of the place.
+    lower, upper = np.quantile(splats.centers.astype(np.float64), (_STRAY, 1 - _STRAY), axis=0)
+    pad = _AROUND * max(upper - lower) + float(splats.scales.max(axis=1).mean())
+    box = Box(tuple(lower - pad), tuple(upper + pad))
+    return GazePlace(SplatMedium(SplatArrays(splats, ns)), box, "field", {"field_file": file_identity(path)})
 
 
 def place_of_scene(path: Path) -> GazePlace:

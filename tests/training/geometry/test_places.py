@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import struct
 
+import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.field.splats import Splats, joined
+from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.training.geometry.places import GazePlace, place_of_nothing, place_of_scene, place_of_volume
+from nerg_mi.training.geometry.places import (
+    GazePlace,
+    place_of_field,
+    place_of_nothing,
+    place_of_scene,
+    place_of_volume,
+)
+from nerg_mi.transport.trace import trace_depth
+from tests.formats.splats.writers import random_splats
 
 
 @pytest.fixture
@@ -82,3 +93,15 @@ def test_a_scene_without_anything_is_no_place(rgb, tmp_path):
     (tmp_path / "empty.xml").write_text('<scene version="3.0.0"/>')
     with pytest.raises(NergError, match="neither shapes nor a field"):
         place_of_scene(tmp_path / "empty.xml")
+
+
+def test_splats_are_a_place_without_their_strays(tmp_path):
+    splats = random_splats(1000, degree=0, size=0.02)
+    far = Splats([[90, 0, 0]], [[1, 1, 1]], [[1, 0, 0, 0]], [0.5], np.zeros((1, 1, 3)))
+    write_ply_splats(tmp_path / "a.ply", joined([splats, far]))
+    place = place_of_field(tmp_path / "a.ply", ns)
+    assert place.kind == "field" and place.radiance is None and place.about["field_file"]["file"] == "a.ply"
+    assert np.allclose(place.box.upper, 1, atol=0.15) and np.allclose(place.box.lower, -1, atol=0.15)
+    origin, along = np.float32([[0, 0, -3]]), np.float32([[0, 0, 1]])
+    # Trained in as it is rendered.
+    assert 1.9 < trace_depth(place.medium, origin, along)[0][0] < 4.1
