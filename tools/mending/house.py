@@ -73,7 +73,7 @@ MENDINGS = (
             ["tests/test_docs.py::test03_defaults_of_the_march_are_the_integrators"],
             (
                 "plugins/nerg_properties.py",
-                'number(props, "stop", MarchSettings.stop, low=0, high=1)',
+                'number(props, "stop", default_stop(medium), low=0, high=1)',
                 'number(props, "stop", 1e-2, low=0, high=1)',
             ),
         ),

@@ -11,7 +11,7 @@ from nerg_mi.field.splats import Splats
 
 from .antimatter import read_splat
 from .khronos import read_gltf_splats
-from .ply import read_ply_splats
+from .ply import has_splats, read_ply_splats
 from .spz import read_spz
 
 READERS: dict[str, Callable[[str | os.PathLike], Splats]] = {
@@ -25,6 +25,12 @@ READERS: dict[str, Callable[[str | os.PathLike], Splats]] = {
 _OTHERS = (".sog", ".ksplat", ".lcc", ".gltf", ".json")
 
 
+def is_splats(path: str | os.PathLike) -> bool:
+    """Whether ``path`` is a file of Gaussian splats, by its name; a ``.ply``, which may be a mesh, by its header."""
+    suffix = Path(path).suffix.lower()
+    return suffix in READERS and (suffix != ".ply" or has_splats(path))
+
+
 def read_splats(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in ``path``, in the file's own frame and units.
 
@@ -35,5 +41,5 @@ def read_splats(path: str | os.PathLike) -> Splats:
         known = ", ".join(READERS)
         hint = f'npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
         other = f"; convert it: {hint}" if suffix in _OTHERS else ""
-        raise NergError(f'Gaussian splats are read from {known}, and "{path}" is none of these{other}')
+        raise NergError(f'"{path}" is no file of Gaussian splats, which are read from {known}{other}')
     return READERS[suffix](path)

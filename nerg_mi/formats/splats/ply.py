@@ -40,6 +40,12 @@ _BASE, _NORMAL = tuple(f"f_dc_{i}" for i in range(3)), ("nx", "ny", "nz")
 _THIN = np.log(1e-3)
 
 
+def has_splats(path: str | os.PathLike) -> bool:
+    """Whether the header of the PLY file ``path`` names what Gaussian splats have."""
+    with reading(path, "PLY file"), open(path, "rb") as file:
+        return re.search(rb"^property [a-z0-9]+ f_dc_0\s*$", file.read(HEADER_BYTES), re.MULTILINE) is not None
+
+
 def read_ply_splats(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in the PLY file ``path``; `NergError` for another kind of file, and for a damaged one."""
     raw = read_bytes(path, "splat file", BYTES)

@@ -9,6 +9,7 @@ from pathlib import Path
 from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import is_field
+from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.jobs.gaze_places import align_of_training, file_of_training, place_key
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.maths.similarity import Similarity
@@ -28,7 +29,7 @@ PLACES = ("field", "mesh", "hits", "scene")
 class GivenFiles:
     """``place``: the file that shows where people are, of ``kind`` "field", "mesh", "hits", "scene", or None and "none"
     where nothing is known of it; ``gaze``, ``rays``: files or None; ``about``: provenance of the gaze field;
-    ``field_about``: metadata of the radiance field."""
+    ``field_about``: metadata of the radiance field; of Gaussian splats, which are a field as well, there are none."""
 
     place: Path | None
     kind: str
@@ -55,11 +56,13 @@ def kind_of_file(path: Path) -> str:
         if kind not in ("radiance", "gaze"):
             raise NergError(f'"{path}" holds a {plain(kind, 40)} field; a scene shows radiance and gaze fields')
         return {"radiance": "field", "gaze": "gaze"}[kind]
+    if is_splats(path):
+        return "field"
     if suffix in (".pth", ".pt"):
         raise NergError(f'"{path}" is a checkpoint of torch; make fields of it with "nerg import"')
     if suffix not in KINDS:
         raise NergError(
-            f"a scene is written for checkpoints (.safetensors), rays and datasets of them, meshes and scenes "
+            f"a scene is written for checkpoints (.safetensors), splats, rays and datasets of them, meshes and scenes "
             f'({", ".join(KINDS)}), and "{path}" is none of these'
         )
     return KINDS[suffix]
@@ -93,7 +96,8 @@ def recognise(files: Sequence[Path], geometry: str | None, reporter: Reporter) -
         kind, place = _trained_in(gaze, about)
     elif place is None:
         kind = geometry or ("hits" if _have_hits(rays) else "none")
-    field_about = read_metadata(place) if kind == "field" and place is not None else {}
+    trained = kind == "field" and place is not None and not is_splats(place)
+    field_about = read_metadata(place) if trained and place is not None else {}
     return GivenFiles(place, kind, gaze, rays, about, field_about)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import reading
+from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.rendering.mesh_file import check_obj, check_ply, check_vol
 from nerg_mi.rendering.nested_scene import nested_place
@@ -57,6 +58,8 @@ def place_of_files(given: GivenFiles, output: Path) -> WrittenPlace:
 
 def _words(given: GivenFiles) -> str:
     name = "" if given.place is None else given.place.name
+    if given.kind == "field" and given.place is not None and is_splats(given.place):
+        return f"The Gaussian splats {name}"
     return {
         "field": f"The radiance field {name}",
         "mesh": f"The mesh {name}",
@@ -76,7 +79,9 @@ def _name(path: Path, folder: Path) -> str:
 
 
 def _field(path: Path, folder: Path) -> Place:
-    volume = element("volume", prop("string", "filename", "$field"), name="field", type="nerf")
+    volume = element(
+        "volume", prop("string", "filename", "$field"), name="field", type="splats" if is_splats(path) else "nerf"
+    )
     return Place(inside=(volume,), files={"field": _name(path, folder)})
 
 

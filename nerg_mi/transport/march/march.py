@@ -58,8 +58,8 @@ def march(
     if medium.hits is not None:
         if attached(medium, ray, t0, t1):
             raise NergError(
-                "Gaussian splats carry no derivatives: render them without gradients of a camera, of an observer or of "
-                "the splats"
+                "there are no derivatives of Gaussian splats: render them without gradients of a camera, an observer "
+                "or of the splats"
             )
         result = march_hits(medium, medium.hits, ray, *arguments[:4], color, count, until, occlusion)
     elif attached(medium, ray, t0, t1):

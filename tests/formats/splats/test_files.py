@@ -1,7 +1,7 @@
 import pytest
 
 from nerg_mi.errors import MissingFile, NergError
-from nerg_mi.formats.splats.files import READERS, read_splats
+from nerg_mi.formats.splats.files import READERS, is_splats, read_splats
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos, write_spz
 
 WRITERS = {".ply": write_inria, ".splat": write_antimatter, ".spz": write_spz, ".glb": write_khronos}
@@ -19,6 +19,13 @@ def test_other_formats_name_the_converter(tmp_path):
         read_splats(tmp_path / "a.sog")
     with pytest.raises(NergError, match=r"are read from \.ply"):
         read_splats(tmp_path / "a.txt")
+
+
+def test_a_mesh_is_told_by_its_header(tmp_path):
+    write_inria(tmp_path / "a.ply", random_splats(3))
+    assert is_splats(tmp_path / "a.ply") and is_splats("b.spz") and not is_splats("b.obj")
+    (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
+    assert not is_splats(tmp_path / "a.ply")
 
 
 def test_missing_files(tmp_path):

@@ -10,8 +10,11 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.jobs.scenes.files import kind_of_file, recognise
+from nerg_mi.jobs.scenes.places import place_of_files
 from nerg_mi.rays.rays import Rays
+from nerg_mi.rendering.scene_writer import document
 from nerg_mi.training.geometry.places import file_identity
+from tests.formats.splats.writers import random_splats, write_inria
 from tests.jobs.recorder import Recorder
 
 ONE = {"a": np.zeros(1, np.float32)}
@@ -56,6 +59,16 @@ def test_kinds(folder):
     ):
         with pytest.raises(NergError, match=said):
             kind_of_file(folder / name)
+
+
+def test_splats_are_a_field_and_a_mesh_is_not(folder):
+    write_inria(folder / "place.ply", random_splats(3))
+    given = recognise([folder / "place.ply", folder / "nowhere.safetensors"], None, Recorder())
+    assert given.kind == "field" and given.field_about == {}
+    place = place_of_files(given, folder / "scene.xml")
+    (volume,) = place.make(folder, {}).inside
+    assert place.words == "The Gaussian splats place.ply" and 'type="splats"' in document([volume], "h")
+    assert kind_of_file(folder / "a.ply") == "mesh"
 
 
 def test_the_place_of_a_gaze_field_is_beside_it(folder):
