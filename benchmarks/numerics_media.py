@@ -79,7 +79,7 @@ def smooth(tau, length=1.0, panels=2000):
 class Profile:
     """A medium in z from 0 to ``length``, of density ``f(z, *parameters)``, that states no bound."""
 
-    occupancy = cells = step = None
+    occupancy = cells = step = hits = None
 
     def __init__(self, f, *parameters, length=1.0):
         self.f, self._parameters, self.length = f, list(parameters), length

@@ -27,7 +27,7 @@ Gaussian splats (:monosp:`splats`)
  * - centers, scales, rotations, opacities, harmonics
    - |tensor|
    - What the Gaussians are, each flat: 3, 3, 4 (quaternion, w first), 1 and 3 (degree + 1)² numbers a Gaussian.
-   - |exposed|
+   - |exposed|, |differentiable|
 
 A place as many small Gaussians, as most photogrammetry gives it today: the ``field`` of the integrator
 :ref:`nerg <integrator-nerg>`, which gives of it all that it gives of a trained field. It is no volume for other
@@ -40,8 +40,10 @@ cameras and observers may stand inside of them. Colours are composited in their 
 
 Depth is that of the peaks: ``expected`` their mean, ``median`` (and ``refined``) the peak at which half of the ray's
 own opacity is reached. Of the parameters of a march only ``stop`` applies (here 1e-4 by default), and ``step``, by
-which the tolerance of occlusion is measured: by default the median thickness of the Gaussians. There are no
-derivatives.
+which the tolerance of occlusion is measured: by default the median thickness of the Gaussians.
+
+Derivatives reach the Gaussians, cameras and observers as those of a trained field do, with memory that does not grow
+with the number of hits. They do not see which Gaussians a ray meets, nor in which order.
 
 .. tabs::
     .. code-tab:: xml
@@ -114,7 +116,7 @@ class SplatsVolume(mi.Volume):
 
     def traverse(self, cb):
         for name, value in self.arrays.parameters().items():
-            cb.put(name, value, mi.ParamFlags.NonDifferentiable)
+            cb.put(name, value, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
         self.arrays.pack()

@@ -1,5 +1,6 @@
 """The volume `splats` in the integrator: against Mitsuba's own renderer of splats, and beside shapes and observers."""
 
+import drjit as dr
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -146,6 +147,27 @@ def test_a_turned_place_shows_its_colors_turned(rgb, render):
     assert np.abs(there["color"] - here["color"]).max() < 1e-4
     # Rays begin at the near plane, which has not grown.
     assert np.allclose(there["depth"], 2 * here["depth"], atol=0.02)
+
+
+def test_a_picture_is_differentiated(rgb, tmp_path):
+    write_ply_splats(tmp_path / "a.ply", random_splats(20, degree=0, size=0.2))
+    place = {"type": "splats", "filename": str(tmp_path / "a.ply")}
+    scene = rgb.load_dict({"type": "scene", "i": {"type": "nerg", "id": "i", "field": place}, "s": camera(rgb)})
+    params = rgb.traverse(scene)
+    key = next(k for k in params.keys() if k.endswith("field.opacities"))
+    before = rgb.Float(params[key])
+    value = rgb.Float(before)
+    dr.enable_grad(value)
+    params[key] = value
+    params.update()
+    dr.backward(dr.mean(rgb.render(scene, params, spp=1, seed=0)[:, :, :4], axis=None))
+    found = float(dr.sum(dr.grad(value))[0])
+    ends = []
+    for sign in (1, -1):
+        params[key] = before + sign * 1e-3
+        params.update()
+        ends.append(np.array(rgb.render(scene, params, spp=1, seed=0), np.float64)[..., :4].mean())
+    assert abs(found) > 1e-2 and np.isclose(found, (ends[0] - ends[1]) / 2e-3, rtol=2e-2)
 
 
 def test_the_volume_says_what_it_is(rgb, tmp_path):

@@ -44,6 +44,7 @@ def attached(medium: Medium, ray: LocalRay, t0: Float, t1: Float) -> bool:
 
 
 def differentiable_march(
+    operation: type[March],
     medium: Medium,
     ray: LocalRay,
     t0: Float,
@@ -56,11 +57,11 @@ def differentiable_march(
     until: Float | None,
     fine_from: Float | None,
 ) -> MarchResult:
-    """``march_primal`` as one differentiable operation; the arguments are those of ``march.march``."""
+    """A march as one differentiable ``operation``; the other arguments are those of ``march.march``."""
     # Every sample gets its own colour: a shared one would hand its derivative to the wrong samples.
     settings = replace(settings, color_cutoff=0.0)
     fixed = (medium, active, settings, offset, color, count, until, fine_from)
-    out = dr.custom(_March, ray.o, ray.d, ray.w, t0, t1, fixed)
+    out = dr.custom(operation, ray.o, ray.d, ray.w, t0, t1, fixed)
     result = MarchResult(*out)
     for name in ("half_slope", "enter", "enter_tau"):
         setattr(result, name, dr.detach(getattr(result, name)))
@@ -81,7 +82,7 @@ class _State:
 
 
 @dataclass
-class _Replayed:
+class Replayed:
     """One repeated step, attached to what derivatives are asked of."""
 
     active: Bool
@@ -97,13 +98,13 @@ class _Replayed:
     crossing: Float
 
 
-class _March(dr.CustomOp):
+class March(dr.CustomOp):
     """A march as one node of the graph: ``march_primal`` forwards, and once more for the derivatives."""
 
     def eval(self, o, d, w, t0, t1, fixed):
         self.fixed = fixed
         self.inputs = (o, d, w, t0, t1)
-        medium, active, settings, offset, color, count, until, fine_from = fixed
+        medium = fixed[0]
         # The medium's weights are read, not passed: tell the graph that the result depends on them.
         for parameter in medium.parameters():
             self.add_input(parameter)
@@ -111,9 +112,7 @@ class _March(dr.CustomOp):
             # Symbolic also where an enclosing derivative has switched loops to evaluated ones: the
             # steps must not be stored.
             with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
-                result = march_primal(
-                    medium, LocalRay(*self.inputs), t0, t1, active, settings, offset, color, count, until, fine_from
-                )
+                result = self._primal()
         self.result = result
         return (
             result.tau,
@@ -126,6 +125,11 @@ class _March(dr.CustomOp):
             result.density_evals,
             result.color_evals,
         )
+
+    def _primal(self) -> MarchResult:
+        medium, *rest = self.fixed
+        t0, t1 = self.inputs[3:]
+        return march_primal(medium, LocalRay(*self.inputs), t0, t1, *rest)
 
     def backward(self):
         active, color = self.fixed[1], self.fixed[4]
@@ -189,7 +193,7 @@ class _March(dr.CustomOp):
         counts = [None if x is None else nothing for x in (primal.density_evals, primal.color_evals)]
         self.set_grad_out((tau_dot, moment_dot, half_dot, nothing, nothing, nothing, color_dot, *counts))
 
-    def _march_again(self, body: Callable[[_State, Any], tuple[_State, Any]], active: Bool, extra: Any) -> Any:
+    def _march_again(self, body: Callable[[Any, Any], tuple[Any, Any]], active: Bool, extra: Any) -> Any:
         """Repeat the primal's steps, threading ``extra`` through ``body(state, extra)``."""
         offset, color = self.fixed[3], self.fixed[4]
         Float = type(self.inputs[3])
@@ -206,7 +210,7 @@ class _March(dr.CustomOp):
             _, extra = dr.while_loop((start, extra), lambda state, _: state.active, body, label="march adjoint")
         return extra
 
-    def _replay(self, leaves: list[Any], state: _State) -> tuple[_Replayed, _State]:
+    def _replay(self, leaves: list[Any], state: Any) -> tuple[Replayed, Any]:
         """The next step, attached to ``leaves`` and the medium, and the state after it."""
         medium, _, settings, _, color, _, until, fine_from = self.fixed
         primal_t0, primal_t1 = self.inputs[3:]
@@ -239,7 +243,7 @@ class _March(dr.CustomOp):
         before = active & (tau_after < goal)
         crosses = active & ~before & (tau < goal)
         crossing = begin + step.crossing(dr.select(crosses, goal - tau, 0))
-        replayed = _Replayed(active, step.dtau, mean, painted, transmittance, before, crosses, crossing)
+        replayed = Replayed(active, step.dtau, mean, painted, transmittance, before, crosses, crossing)
         after = _State(
             active & (t_next < primal_t1) & (tau_after < end),
             t_next,

@@ -11,13 +11,13 @@ from typing import Any
 
 import drjit as dr
 
-from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Bool, Float
 from nerg_mi.transport.media.local_ray import LocalRay
 from nerg_mi.transport.media.painting import Painter
 from nerg_mi.transport.media.protocol import Medium
 
-from .adjoint import attached, differentiable_march
+from .adjoint import March, attached, differentiable_march
+from .hit_adjoint import HitMarch
 from .hits import march_hits
 from .occlusion import Occlusion
 from .primal import march_primal
@@ -57,13 +57,11 @@ def march(
     arguments = (Float(t0), Float(t1), active, settings, offset, color, count, until, fine_from)
     if medium.hits is not None:
         if attached(medium, ray, t0, t1):
-            raise NergError(
-                "there are no derivatives of Gaussian splats: render them without gradients of a camera, an observer "
-                "or of the splats"
-            )
-        result = march_hits(medium, medium.hits, ray, *arguments[:4], color, count, until, occlusion)
+            result = differentiable_march(HitMarch, medium, ray, *arguments)
+        else:
+            result = march_hits(medium, medium.hits, ray, *arguments[:4], color, count, until, occlusion)
     elif attached(medium, ray, t0, t1):
-        result = differentiable_march(medium, ray, *arguments)
+        result = differentiable_march(March, medium, ray, *arguments)
     else:
         result = march_primal(medium, ray, *arguments, occlusion)
     result.origin = arguments[0]

@@ -71,7 +71,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "said"), BAD)
+@pytest.mark.parametrize(("old", "new", "said"), BAD, ids=[said for *_, said in BAD])
 def test_a_damaged_file_is_one_sentence(tmp_path, old, new, said):
     write_inria(tmp_path / "a.ply", random_splats())
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes().replace(old, new, 1))

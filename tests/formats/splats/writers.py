@@ -79,7 +79,7 @@ def write_spz(path: Path, splats: Splats, version: int = 3, fraction: int = 12) 
         turns = b"".join(struct.pack("<I", _smallest_three(q)) for q in xyzw)
     rest = byte(splats.harmonics[:, 1:] * 128 + 128)
     head = struct.pack("<IIIBBBB", 0x5053474E, version, n, degree, fraction, 0, 0)
-    path.write_bytes(gzip.compress(head + positions + alphas + colors + scales + turns + rest))
+    path.write_bytes(gzip.compress(head + positions + alphas + colors + scales + turns + rest, mtime=0))
 
 
 def _smallest_three(q: np.ndarray) -> int:

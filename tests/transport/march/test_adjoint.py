@@ -110,7 +110,7 @@ def test02_memory_does_not_grow_with_samples(rgb):
 class Slanted:
     """Density ``base`` + ``rise`` z, and a colour that is z itself, everywhere."""
 
-    occupancy = cells = step = None
+    occupancy = cells = step = hits = None
 
     def __init__(self, base, rise=0.0):
         self.base, self.rise = ns.Float(base), rise

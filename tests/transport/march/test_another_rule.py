@@ -52,7 +52,7 @@ def simpson():
 class Cubic:
     """Density 2 + z³ times ``gain``."""
 
-    occupancy = cells = step = None
+    occupancy = cells = step = hits = None
 
     def __init__(self, gain=1.0):
         self.gain = ns.Float(gain)

@@ -33,7 +33,7 @@ densities = st.lists(density, min_size=PIECES, max_size=PIECES).map(np.float32)
 class Along:
     """A medium whose density depends on z in [0, 1] only: ``f(z)``, white all over."""
 
-    occupancy = cells = step = None
+    occupancy = cells = step = hits = None
 
     def __init__(self, mi, f, *parameters):
         self.mi, self.f, self._parameters = mi, f, list(parameters)

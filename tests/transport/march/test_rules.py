@@ -106,7 +106,7 @@ class Colored:
     """Density and colour that depend on z only: ``density(z, x)``, ``color(z)``; ``x`` is what derivatives are asked
     of."""
 
-    occupancy = cells = step = None
+    occupancy = cells = step = hits = None
 
     def __init__(self, density, color, x):
         self._density, self._color, self.x = density, color, x
