@@ -13,9 +13,8 @@ import ctypes
 import glob
 import os
 import re
-import subprocess
 import sys
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from .errors import UnusableLLVM
 
@@ -52,8 +51,7 @@ print(*(n.value for n in numbers))
 """
 
 
-@dataclass(frozen=True)
-class Library:
+class Library(NamedTuple):
     """A libLLVM: `path` as found ("" if Dr.Jit chose it by itself), `version` a tuple starting with the major
     number."""
 
@@ -93,6 +91,8 @@ def version_of(path: str) -> tuple[int, ...] | None:
             return tuple(int(part) for part in match[1].split("."))
     if not os.path.isfile(path):
         return None
+    import subprocess
+
     answer = subprocess.run([sys.executable, "-c", _VERSION_PROBE, path], capture_output=True, text=True)
     if answer.returncode != 0:  # not a library, of another machine, or older than LLVM 16, which has no such function
         return None

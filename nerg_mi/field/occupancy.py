@@ -83,13 +83,55 @@ def unpacked(data: np.ndarray, resolution: int) -> np.ndarray:
 
 
 def chessboard(bits: np.ndarray) -> np.ndarray:
-    """Chessboard distance in cells to the nearest occupied one, 0..255 (uint8, 0: occupied), of a bool array."""
+    """Chessboard distance in cells to the nearest occupied one, 0..255 (uint8, 0: occupied), of a bool array.
+
+    The occupied cells are grown by one layer at a time, 64 cells of a row in a word, and cells are counted for as long
+    as they are not reached: the count is kept as the planes of its binary digits, of which a step changes two in the
+    mean. Cells behind the end of a row are reached no sooner than through the row, and left out at last.
+    """
     if not bits.any():
         return np.full(bits.shape, _FAR, np.uint8)
-    from scipy.ndimage import distance_transform_cdt
+    *_, n = bits.shape
+    wide = np.zeros((*bits.shape[:-1], -(-n // 64) * 64), bool)
+    wide[..., :n] = True
+    inside = _words(wide)
+    wide[..., :n] = bits
+    reached, planes = _words(wide), []
+    for _ in range(_FAR):
+        carry = inside & ~reached
+        if not carry.any():
+            break
+        for k in range(8):
+            if k == len(planes):
+                planes.append(np.zeros_like(inside))
+            planes[k], carry = planes[k] ^ carry, planes[k] & carry
+            if not carry.any():
+                break
+        reached = _grown_words(reached)
+    distance = np.zeros(wide.shape, np.uint8)
+    for k, plane in enumerate(planes):
+        distance |= np.unpackbits(plane.view(np.uint8), axis=-1, bitorder="little") << np.uint8(k)
+    return np.ascontiguousarray(distance[..., :n])
 
-    distance: Any = distance_transform_cdt(~bits, metric="chessboard")
-    return np.minimum(distance, _FAR).astype(np.uint8)
+
+def _words(cells: np.ndarray) -> np.ndarray:
+    """Rows of ``cells`` (bool, a multiple of 64 in the last axis) as words, the lowest bit first."""
+    return np.packbits(cells, axis=-1, bitorder="little").view("<u8")
+
+
+def _grown_words(words: np.ndarray) -> np.ndarray:
+    """``grown`` of cells in words."""
+    one, last = np.uint64(1), np.uint64(63)
+    out = words | words << one | words >> one
+    out[..., 1:] |= words[..., :-1] >> last
+    out[..., :-1] |= words[..., 1:] << last
+    for axis in range(words.ndim - 1):
+        before = np.moveaxis(out, axis, 0)
+        out = out.copy()
+        moved = np.moveaxis(out, axis, 0)
+        moved[1:] |= before[:-1]
+        moved[:-1] |= before[1:]
+    return out
 
 
 def grown(cells: np.ndarray) -> np.ndarray:

@@ -9,15 +9,14 @@ from __future__ import annotations
 import json
 import os
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from importlib.metadata import version
 from pathlib import Path, PurePath
 from typing import Any
 
 from nerg_mi import __version__
 from nerg_mi.files.checksum import file_sha256
-from nerg_mi.rays.dataset.opening import rays_digest
 
 _PROGRAMS = ("mitsuba", "drjit")
 
@@ -66,10 +65,18 @@ def provenance(
         while name in sums:
             name, number = f"{path.name} ({number})", number + 1
         if path not in known:
-            known[path] = rays_digest(path) if path.is_dir() else file_sha256(path)
+            known[path] = _digest(path)
         sums[name] = known[path]
     given = {name: value for name, value in _given(settings).items() if name not in _OF_THE_RUN}
     return Provenance(what, sums, seed, {k: _plain(v) for k, v in given.items()}, versions())
+
+
+def _digest(path: Path) -> str:
+    if not path.is_dir():
+        return file_sha256(path)
+    from nerg_mi.rays.dataset.opening import rays_digest
+
+    return rays_digest(path)
 
 
 def files_among(*values: Any) -> list[Path]:
@@ -79,7 +86,16 @@ def files_among(*values: Any) -> list[Path]:
 
 def versions() -> dict[str, str]:
     """Version of each program that has a part in a picture, by name."""
-    return {"nerg_mi": __version__, **{name: version(name) for name in _PROGRAMS}}
+    return {"nerg_mi": __version__, **{name: _version(name) for name in _PROGRAMS}}
+
+
+def _version(name: str) -> str:
+    loaded = sys.modules.get(name)
+    if loaded is not None:  # where a picture was rendered; it says the same as what is installed, at once
+        return loaded.__version__
+    from importlib.metadata import version
+
+    return version(name)
 
 
 def _given(settings: Any) -> dict[str, Any]:

@@ -3,8 +3,9 @@
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_cdt
 
-from nerg_mi.field.occupancy import OccupancyGrid
+from nerg_mi.field.occupancy import OccupancyGrid, chessboard
 
 
 def brute_force(bits):
@@ -20,6 +21,17 @@ def test01_chessboard_distances(share):
     grid = OccupancyGrid(bits, ns, 0.1)
     assert np.array_equal(grid.distance.numpy().reshape(bits.shape), brute_force(bits))
     assert np.isclose(grid.fraction, bits.mean())
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 3, 131), (3, 2, 64), (300, 1, 2)])
+def test01_rows_of_any_length_and_the_farthest(shape):
+    """Rows that fill words of 64 cells, or not; beyond 255 all are alike."""
+    bits = np.random.default_rng(1).random(shape) < 0.01
+    bits[0, 0, 0] = True
+    expected = np.minimum(distance_transform_cdt(~bits, metric="chessboard"), 255)
+    assert np.array_equal(chessboard(bits), expected) and chessboard(bits).dtype == np.uint8
+    bits[...] = False
+    assert (chessboard(bits) == 255).all()
 
 
 def test02_lookup_is_indexed_zyx_and_clamped():
