@@ -18,9 +18,11 @@
 #   make mendings  bring faults of the past back, one at a time: the tests that look for each must fail (a quarter of an hour)
 #   make faults    kill commands at moments spread over their run, fill disks, forbid folders: nothing may be lost
 #   make soak      thousands of frames and steps: memory may not grow
+#   make bench     frames, stages, evaluations, growth and memory beside peers (under ten minutes); ARGS=--long for more
+#   make bench-gpu the same on a CUDA device, where there is one
 #   make packages  build the packages, install and try them with every Python that is here
 #
-# The last seven print a table; ARGS="--update docs/trust.md" puts it there. Set-up is done once: the second run of any of
+# The last nine print tables; ARGS="--update docs/trust.md" puts them there, and of bench ARGS="--page docs/performance.md". Set-up is done once: the second run of any of
 # these only does its own work.
 
 PYTHON ?= python3
@@ -32,7 +34,7 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
-.PHONY: demo test check lint types format docs manual onecore coverage fuzz mutants mendings faults soak packages setup
+.PHONY: demo test check lint types format docs manual onecore coverage fuzz mutants mendings faults soak packages bench bench-gpu setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
@@ -41,6 +43,8 @@ test check onecore coverage fuzz mutants mendings faults soak packages: EXTRAS =
 
 test: setup
 	$(PYTEST) $(ARGS)
+
+bench bench-gpu: EXTRAS = torch
 
 lint types format docs: EXTRAS = lint
 
@@ -77,6 +81,12 @@ coverage: setup
 
 fuzz mutants mendings faults soak packages: setup
 	$(RUN) -m tools.$@ $(ARGS)
+
+bench: setup
+	$(RUN) benchmarks/bench.py $(ARGS)
+
+bench-gpu: setup
+	$(RUN) benchmarks/bench.py --mode cuda_ad_rgb $(ARGS)
 
 setup:
 	@$(PYTHON) tools/setup.py $(EXTRAS)

@@ -9,8 +9,8 @@ ended at T < 1e-4; then the observer's rays to the surfaces, which end where the
 factors of the gaze. Its grid is evaluated as torch-ngp's fallback does, eight gathers a level, and in a second row with
 less traffic in memory; `--compile` adds one with the encoding and the networks through torch.compile. Before anything
 is timed they render the same rays, and the program stops where colours are less alike than 35 dB or the means of gaze
-differ by more than 2 %. Runs are taken in turns; the figures are medians of wall-clock seconds, with the quickest and
-the slowest, and processor seconds.
+differ by more than 2 %. Runs are taken in turns; the figures are medians of wall-clock seconds, with their quartiles,
+and processor seconds.
 """
 
 from __future__ import annotations
@@ -18,9 +18,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import os
-import statistics
 import sys
-import time
 from functools import partial
 from pathlib import Path
 
@@ -32,6 +30,7 @@ from nerg_mi.figures.tonemap import srgb
 from nerg_mi.formats.fields import load_gaze, load_radiance
 from nerg_mi.jobs.demo import store_scene
 from output import print_table, write_rows
+from timing import in_turns, median, spread
 from torch_radiance import _PRIMES, TorchModel, harmonics
 
 import numpy as np
@@ -208,13 +207,13 @@ def agreement(scene, peer: TorchRenderer, width: int = 160, height: int = 90) ->
     """How alike both are on the same rays."""
     o, d = camera_rays(width, height)
     observer = np.asarray(scene.observer, float)
-    ours = nerg.trace(scene, o, d, ["color", "depth", "gaze"], observers=observer[None])
+    found = nerg.trace(scene, o, d, ["color", "depth", "gaze"], observers=observer[None])
     color, depth, gaze = peer.frame(o, d, observer)
-    mse = np.mean((srgb(np.reshape(ours["color"], (-1, 3))) - srgb(color)) ** 2)
-    truth = np.ravel(ours["depth"])
+    mse = np.mean((srgb(np.reshape(found["color"], (-1, 3))) - srgb(color)) ** 2)
+    truth = np.ravel(found["depth"])
     both = np.isfinite(depth) & np.isfinite(truth)
     apart = np.abs(depth - truth)[both]
-    mean = float(np.mean(ours["gaze"]))
+    mean = float(np.mean(found["gaze"]))
     return {
         "color_db": float(-10 * np.log10(mse)),
         "depth_mm": float(1e3 * np.median(apart)),
@@ -261,15 +260,16 @@ def main(argv=None) -> None:
         width, height = map(int, size.split("x"))
         o, d = camera_rays(width, height)
         still = {"width": width, "height": height, "spp": 1, "aovs": "depth,gaze"}
-        frames = {"nerg": _ours(still, "depth"), "nerg, same observer again": _ours(still, "map")}
+        frames = {"nerg": ours(still, "depth"), "nerg, same observer again": ours(still, "map")}
         frames |= {name: partial(peer.frame, o, d, scene.observer) for name, peer in peers.items()}
         rows += measure(frames, size, args.runs)
     write_rows(args.csv, rows)
-    head = "frame|renderer|s|quickest, slowest|CPU s|times nerg".split("|")
+    head = "frame|renderer|s|quartiles|CPU s|times nerg".split("|")
     print_table("A frame beside PyTorch", head, [[r[k] for k in head] for r in rows])
 
 
-def _ours(values: dict, visibility: str):
+def ours(values: dict, visibility: str):
+    """A function that renders the demo store with these values of its scene."""
     import mitsuba as mi
 
     scene = nerg.Scene.load(store_scene(), **values, visibility=visibility).mitsuba
@@ -277,31 +277,24 @@ def _ours(values: dict, visibility: str):
     def render() -> np.ndarray:
         return np.array(mi.render(scene, sensor=0, spp=1))
 
+    # The second fills what is kept of the observer, the next compiles what reads it.
+    render(), render()
     return render
 
 
 def measure(frames: dict, size: str, runs: int) -> list[dict]:
     """A row for each of ``frames``, functions by their names, called in turns."""
-    seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in frames}
-    for frame in frames.values():
-        # The first compiles, and fills what is kept of the observer, the next compiles what reads it.
-        for _ in range(1 if isinstance(frame, partial) else 3):
-            frame()
-    for _ in range(runs):
-        for name, frame in frames.items():
-            wall, cpu = time.perf_counter(), time.process_time()
-            frame()
-            seconds[name].append((time.perf_counter() - wall, time.process_time() - cpu))
-    medians = {name: statistics.median(wall for wall, _ in taken) for name, taken in seconds.items()}
-    ours = medians[next(iter(frames))]
+    seconds = in_turns(frames, runs)
+    medians = {name: median(wall for wall, _ in taken) for name, taken in seconds.items()}
+    first = medians[next(iter(frames))]
     return [
         {
             "frame": size,
             "renderer": name,
             "s": f"{medians[name]:.3g}",
-            "quickest, slowest": f"{min(taken)[0]:.3g}, {max(taken)[0]:.3g}",
-            "CPU s": f"{statistics.median(cpu for _, cpu in taken):.3g}",
-            "times nerg": f"{medians[name] / ours:.2g}",
+            "quartiles": spread(wall for wall, _ in taken),
+            "CPU s": f"{median(cpu for _, cpu in taken):.3g}",
+            "times nerg": f"{medians[name] / first:.2g}",
         }
         for name, taken in seconds.items()
     ]

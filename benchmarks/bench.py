@@ -1,0 +1,335 @@
+"""All that is said of speed, in one run: frames and their stages beside PyTorch, evaluations beside hand-written code,
+densities beside SciPy, volumes beside `volpath`, and how each cost grows.
+
+    python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--page docs/performance.md]
+    [--out out/benchmarks/bench]
+
+Parts: ``frames``, ``stages``, ``density``, ``kde``, ``volume``, ``growth``, ``memory``; all of them without --only.
+Works that are compared do the same, which is checked first, and take turns; figures are medians with their quartiles.
+Prints tables, writes them as CSV and two figures, and puts them into the page that is named. ``--long``: more runs,
+larger sizes, and PyTorch at 1280 x 720. With a CUDA variant the parts without a peer are measured in wall-clock
+seconds; where there is no device it says so and ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import re
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import density_limit
+import torch_frames
+from growth_figures import growth_figure, roofline_figure
+from nerg_mi.figures.saving import save
+from nerg_mi.jobs.demo import store_scene
+from nerg_mi.llvm import has_cuda
+from output import print_table, write_rows
+from timing import at_the_end, exponent, in_turns, median, spread
+
+import numpy as np
+
+STAGES = {
+    "depth": {"radiance": "false", "aovs": "depth"},
+    "depth, colour": {"aovs": "depth"},
+    "depth, colour, the observer's pass": {"aovs": "depth,visibility"},
+    "depth, colour, the observer's pass, gaze": {"aovs": "depth,gaze"},
+}
+
+
+class Run:
+    """What the parts have in common: the options, the variant's namespace, and the fields of the demo store."""
+
+    def __init__(self, args: argparse.Namespace):
+        from nerg_mi.field.backend import namespace
+        from nerg_mi.formats.fields import load_gaze, load_radiance
+
+        import mitsuba as mi
+
+        self.long, self.out, self.page, self.threads = args.long, args.out, args.page, args.threads
+        self.runs = args.runs or (9 if args.long else 5)
+        self.cuda = mi.variant().startswith("cuda")
+        folder, ns = store_scene().parent, namespace(mi.variant())
+        self.field = load_radiance(folder / "store.safetensors", ns)[0]
+        self.gaze = load_gaze(folder / "shoppers.safetensors", ns)[0]
+
+    def cost(self, times) -> list[float]:
+        """Seconds of each run: of the processor, or of the clock where a device computes."""
+        return [wall if self.cuda else cpu for wall, cpu in times]
+
+    def table(self, title: str, head, rows: list[list[str]], name: str) -> None:
+        print_table(title, head, rows, self.page)
+        write_rows(self.out / f"{name}.csv", [dict(zip(head, row)) for row in rows])
+
+    def figure(self, figure, name: str) -> None:
+        path = (self.page.parent / "images" if self.page else self.out) / f"performance-{name}.png"
+        save(figure, path, {"Software": "benchmarks/bench.py"})
+        print(f"wrote {path}\n")
+
+
+def the_run(run: Run) -> None:
+    """What was measured on what."""
+    import drjit
+    import mitsuba as mi
+
+    info = Path("/proc/cpuinfo")
+    name = re.search(r"model name\s*: (.*)", info.read_text()) if info.exists() else None
+    flags = info.read_text() if info.exists() else ""
+    vectors = next((v for k, v in {"avx512f": "AVX-512", "avx2": "AVX2"}.items() if k in flags), "")
+    programs = [f"mitsuba {mi.__version__}", f"drjit {drjit.__version__}", f"numpy {np.__version__}"]
+    if (compiler := density_limit.compiler()) is not None:
+        said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True).stdout
+        programs.append(said.split("\n")[0])
+    rows = [
+        ["processor", " ".join([name[1] if name else platform.processor() or platform.machine(), vectors]).strip()],
+        ["threads", str(run.threads)],
+        ["variant", mi.variant()],
+        ["programs", ", ".join(programs)],
+        ["runs of each", str(run.runs)],
+    ]
+    run.table("The run", ["what", "with"], rows, "run")
+
+
+def peers_of(run: Run, compiled: bool) -> dict[str, torch_frames.TorchRenderer]:
+    """Renderers in PyTorch that give our picture, which is checked; one that does not compile is left out, and why is
+    printed."""
+    import nerg_mi as nerg
+
+    import torch
+
+    torch.set_num_threads(run.threads)
+    scene = nerg.Scene.load(store_scene())
+    falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
+    made = {
+        "PyTorch, eager": {"model": torch_frames.TorchModel},
+        "PyTorch, eager, corner by corner": {},
+        **({"PyTorch, compiled": {"model": torch_frames.TorchModel, "compiled": True}} if compiled else {}),
+    }
+    peers = {}
+    for name, how in made.items():
+        peer = torch_frames.TorchRenderer(run.field, run.gaze, falloff, **how)
+        try:
+            found = torch_frames.agreement(scene, peer)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            print(f"{name}: torch.compile fails here: {str(error).strip().splitlines()[0]}\n")
+            continue
+        print(name, ", ".join(f"{k} {v:.4g}" for k, v in found.items()), "\n", flush=True)
+        if found["color_db"] < 35 or abs(found["gaze_mean"]) > 0.02:
+            raise SystemExit("the two do not render the same picture")
+        peers[name] = peer
+    return peers
+
+
+def frames(run: Run) -> None:
+    peers = {} if run.cuda else peers_of(run, compiled=True)
+    rows = []
+    for width, height in ((320, 180), (1280, 720)):
+        o, d = torch_frames.camera_rays(width, height)
+        values = {"width": width, "height": height, "spp": 1, "aovs": "depth,gaze"}
+        works = {
+            "nerg": torch_frames.ours(values, "depth"),
+            "nerg, same observer again": torch_frames.ours(values, "map"),
+        }
+        if width < 640 or run.long:
+            works |= {name: partial(peer.frame, o, d, (4.4, 2.8, 1.6)) for name, peer in peers.items()}
+        runs = run.runs if width < 640 else max(run.runs // 3, 1)
+        rows += torch_frames.measure(works, f"{width} x {height}", runs)
+    run.table("Frames", list(rows[0]), [list(map(str, r.values())) for r in rows], "frames")
+
+
+def stages(run: Run) -> None:
+    """Each with those before it, of 640 x 360."""
+    width, height = 640, 360
+    values = {"width": width, "height": height, "spp": 1}
+    works = {name: torch_frames.ours({**values, **more}, "depth") for name, more in STAGES.items()}
+    last = list(works)[-1]
+    works["... same observer again"] = torch_frames.ours({**values, **STAGES[last]}, "map")
+    taken = in_turns(works, run.runs)
+    theirs = {} if run.cuda else peer_stages(run, width // 2, height // 2)
+    rows, before = [], 0.0
+    for name, times in taken.items():
+        each = [1e6 * c / (width * height) for c in run.cost(times)]
+        more = "" if name.startswith("...") else f"{median(each) - before:.2f}"
+        before = median(each)
+        peer = theirs.get(name)
+        clock = 1e6 * median(wall for wall, _ in times) / (width * height)
+        cells = [f"{peer / clock:.0f}"] if peer else [""]
+        rows.append([name, f"{median(each):.2f}", spread(each), more, *cells])
+    unit = "us" if run.cuda else "us of CPU"
+    head = ["what", f"{unit} a pixel", "quartiles", "more than above", "times faster than eager PyTorch"]
+    run.table("Stages", head, rows, "stages")
+
+
+def peer_stages(run: Run, width: int, height: int) -> dict[str, float]:
+    """Microseconds a pixel of the eager renderer, by the names of `STAGES`: of the clock, since its threads spin while
+    they wait."""
+    import nerg_mi as nerg
+
+    import torch
+
+    torch.set_num_threads(run.threads)
+    scene = nerg.Scene.load(store_scene())
+    falloff = float(np.ravel(np.array(scene.integrator.falloff))[0])
+    peer = torch_frames.TorchRenderer(run.field, run.gaze, falloff, torch_frames.TorchModel)
+    o, d = torch_frames.camera_rays(width, height)
+    rays = [torch.from_numpy(np.ascontiguousarray(v, np.float32)) for v in (o, d)]
+
+    def marched(colored: bool) -> None:
+        with torch.no_grad():
+            for a in range(0, len(o), torch_frames.RAYS):
+                peer.march(*(v[a : a + torch_frames.RAYS] for v in rays), colored=colored)
+
+    works = {
+        "depth": partial(marched, False),
+        "depth, colour": partial(marched, True),
+        "depth, colour, the observer's pass, gaze": lambda: peer.frame(o, d, np.asarray(scene.observer, float)),
+    }
+    taken = in_turns(works, 1 if not run.long else 3)
+    return {name: 1e6 * median(wall for wall, _ in times) / len(o) for name, times in taken.items()}
+
+
+def density(run: Run) -> None:
+    if run.cuda:
+        print("The hand-written evaluation is of processors: nothing to compare with on a device.\n")
+        return
+    count = 1 << (20 if run.long else 18)
+    points = {
+        "of a frame": density_limit.marched_points(run.field, *torch_frames.camera_rays(320, 180), count),
+        "at random": density_limit.random_points(run.field, count),
+    }
+    work = density_limit.Work.of(run.field.config)
+    rows, found = density_limit.measure(run.field, points, 2 * run.runs, run.threads)
+    shown = density_limit.table(rows, found, work)
+    run.table("Evaluations of density", density_limit.HEAD, shown, "density")
+    if not found:
+        print("No C++ compiler was found (g++, clang++): no hand-written evaluation, and no roof.\n")
+        return
+    ceilings = density_limit.ceilings(found, work, run.threads)
+    run.table("The machine", density_limit.CEILINGS, ceilings, "machine")
+    reached = {f"{r['evaluation']}, points {r['points']}": r["gflops"] for r in rows}
+    roofs = {"table in order": found["table"] / 1e9, "memory in order": found["dram"] / 1e9}
+    roofs["8 bytes at random in the table"] = 8 * found["pairs"] / 1e9
+    run.figure(roofline_figure(found["flops"] / 1e9, roofs, work.flops / work.bytes, reached), "roofline")
+
+
+def kde(run: Run) -> None:
+    import peers
+
+    rows = []
+    for rays in (1000, 10_000, *((100_000,) if run.long else ())):
+        works, apart = peers.kernel_densities(rays, 1 << 13)
+        if not apart < 1e-4:
+            raise SystemExit(f"the two do not give the same densities: {apart:.1e} apart")
+        costs = {name: run.cost(times) for name, times in in_turns(works, run.runs).items()}
+        ours, theirs = costs["nerg"], costs["SciPy"]
+        times = f"{median(theirs) / median(ours):.0f}"
+        rows.append(
+            [f"{rays:,}", *(f"{1e3 * median(c):.3g} ({spread(1e3 * t for t in c)})" for c in (ours, theirs)), times]
+        )
+        rows[-1].append(f"{apart:.0e}")
+    head = ["rays", "nerg, CPU ms (quartiles)", "SciPy, CPU ms (quartiles)", "times", "largest difference"]
+    run.table("Kernel densities beside SciPy", head, rows, "kde")
+
+
+def volume(run: Run) -> None:
+    import peers
+
+    works, error, apart = peers.transmittances(256, 64 if run.long else 16)
+    if not apart < 0.01:
+        raise SystemExit(f"the two do not render the same cloud: means are {apart:.1%} apart")
+    errors = {name: error(work()) for name, work in works.items()}
+    costs = {name: run.cost(times) for name, times in in_turns(works, run.runs).items()}
+    # An estimate by chance is n times as dear for 1 / sqrt(n) of the error.
+    worth = {name: median(cost) * errors[name] ** 2 for name, cost in costs.items()}
+    rows = [
+        [
+            name,
+            f"{1e3 * median(cost):.3g}",
+            spread(1e3 * c for c in cost),
+            f"{errors[name]:.4f}",
+            f"{worth[name] / worth['nerg']:.0f}",
+        ]
+        for name, cost in costs.items()
+    ]
+    head = ["renderer", "CPU ms", "quartiles", "error (rms)", "times at equal error"]
+    run.table("A cloud that absorbs, beside `volpath`", head, rows, "volume")
+
+
+def growth(run: Run) -> None:
+    import sizes
+
+    rows, curves = [], []
+    for found in sizes.growths(run.long):
+        taken = in_turns({str(n): work for n, work in found.works.items()}, run.runs, warm=2)
+        counts, costs = list(found.works), [run.cost(times) for times in taken.values()]
+        middle = [1e3 * median(c) for c in costs]
+        low, high = np.transpose([1e3 * np.quantile(c, (0.25, 0.75)) for c in costs])
+        fitted = exponent(counts, middle)
+        curves.append(
+            {
+                "title": found.what.replace("`", ""),
+                "axis": found.axis,
+                "sizes": counts,
+                "low": low,
+                "middle": middle,
+                "high": high,
+                "exponent": fitted,
+                "unit": "ms" if run.cuda else "CPU ms",
+            }
+        )
+        steps = ", ".join(f"{n:,g}: {c:.3g}" for n, c in zip(counts, middle))
+        last = f"{at_the_end(counts, middle):.2f}"
+        rows.append([found.what, found.axis, steps, f"{fitted:.2f}", last, found.aim])
+    unit = "ms" if run.cuda else "CPU ms"
+    head = ["cost", "against", f"{unit} by size", "exponent", "between the two largest", "aim"]
+    run.table("Growth", head, rows, "growth")
+    run.figure(growth_figure(curves), "growth")
+
+
+def memory(run: Run) -> None:
+    import frame_memory
+
+    rows = [frame_memory.measured(*size) for size in frame_memory.SIZES]
+    run.table("Memory", frame_memory.HEAD, rows, "memory")
+
+
+PARTS = {part.__name__: part for part in (frames, stages, density, kde, volume, growth, memory)}
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default=",".join(PARTS), help=f"parts, comma-separated: {', '.join(PARTS)}")
+    parser.add_argument("--long", action="store_true")
+    parser.add_argument("--runs", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("-m", "--mode", default="llvm_ad_rgb", help="Mitsuba variant")
+    parser.add_argument("--page", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/bench"))
+    args = parser.parse_args(argv)
+    asked = args.only.split(",")
+    if unknown := [name for name in asked if name not in PARTS]:
+        parser.error(f'there is no part "{unknown[0]}"; choose among {", ".join(PARTS)}')
+    if args.mode.startswith("cuda") and not has_cuda():
+        print(f"No CUDA device is here, so {args.mode} was not measured; run this on a machine with an NVIDIA driver.")
+        return
+    import mitsuba as mi
+
+    mi.set_variant(args.mode)
+    import drjit as dr
+
+    dr.set_thread_count(args.threads)
+    run = Run(args)
+    the_run(run)
+    for name in asked:
+        PARTS[name](run)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""How benchmarks measure: works in turns, medians with their spread, and how a cost grows."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+median = statistics.median
+
+Times = list[tuple[float, float]]
+"""Seconds of each run: wall-clock, and of processor."""
+
+
+def in_turns(works: Mapping[str, Callable[[], object]], runs: int, warm: int = 1) -> dict[str, Times]:
+    """Times of ``runs`` calls of each of ``works``, called in turns after ``warm`` calls that compile and fill caches:
+    what else the machine does then falls on all alike."""
+    for work in works.values():
+        for _ in range(warm):
+            work()
+    taken: dict[str, Times] = {name: [] for name in works}
+    for _ in range(runs):
+        for name, work in works.items():
+            wall, cpu = time.perf_counter(), time.process_time()
+            work()
+            taken[name].append((time.perf_counter() - wall, time.process_time() - cpu))
+    return taken
+
+
+def spread(values: Iterable[float]) -> str:
+    """The first and the third quartile."""
+    low, high = np.quantile(list(values), (0.25, 0.75))
+    return f"{low:.3g}, {high:.3g}"
+
+
+def exponent(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """The b of cost = a size^b that fits best in logarithms: 1 where a cost is in proportion to the size."""
+    return float(np.polyfit(np.log(np.asarray(sizes, float)), np.log(np.asarray(costs, float)), 1)[0])
+
+
+def at_the_end(sizes: Sequence[float], costs: Sequence[float]) -> float:
+    """`exponent` between the two largest sizes, where what a call costs at least matters least."""
+    return exponent(sizes[-2:], costs[-2:])
