@@ -1,7 +1,7 @@
 """Small fully connected networks, evaluated inside kernels or as tensor products.
 
 Two execution modes share one set of weights: cooperative vectors (one fused
-kernel, best for rendering) and tensor products (``W @ X`` on whole batches,
+kernel, best for rendering) and tensor products (``X @ W^T`` on whole batches,
 whose weight gradient on the LLVM backend is several times cheaper than the
 atomically accumulated outer products of cooperative vectors; best for training).
 """
@@ -153,15 +153,19 @@ class MLP:
         return x
 
     def tensor(self, x):
-        """Outputs (outputs, N) at inputs ``x`` (inputs, N), both TensorXf, as tensor products."""
+        """Outputs (N, outputs) at inputs ``x`` (N, inputs), both TensorXf, as tensor products.
+
+        Points by rows: the numbers of a point side by side are what Dr.Jit's products of matrices read quickest, by a
+        factor of up to two in the derivatives.
+        """
         for i, w in enumerate(self.weights):
             if self.norms is None:
-                x = w @ x
+                x = dr.matmul(x, w, Bt=True)
             else:
-                x = x - dr.mean(x, axis=0)
-                x = x * dr.rsqrt(dr.mean(x * x, axis=0) + _NORM_EPSILON)
+                x = x - dr.reshape(type(x), dr.mean(x, axis=1), (-1, 1))
+                x = x * dr.reshape(type(x), dr.rsqrt(dr.mean(x * x, axis=1) + _NORM_EPSILON), (-1, 1))
                 w, bias = _folded(w, self.norms[i])
-                x = w @ x + dr.reshape(type(x), bias, (-1, 1))
+                x = dr.matmul(x, w, Bt=True) + bias
             if i + 1 < len(self.weights):
                 x = dr.maximum(x, 0)
         return x

@@ -20,8 +20,8 @@ def evaluated_backwards(net, x, mix, mode):
         out = net([ns.Float(c) for c in x.T])
         value, loss = np.array([o.numpy() for o in out]).T, sum(o * ns.Float(m) for o, m in zip(out, mix.T))
     else:
-        out = net.tensor(ns.TensorXf(x.T.copy()))
-        value, loss = out.numpy().T, out * ns.TensorXf(mix.T.copy())
+        out = net.tensor(ns.TensorXf(x))
+        value, loss = out.numpy(), out * ns.TensorXf(mix)
     dr.backward(dr.sum(loss, axis=None))
     return value
 
@@ -38,7 +38,7 @@ def test01_three_ways_agree(sizes):
     net, weights, x = make(sizes)
     expected = reference.mlp(x, weights)
     coop = np.stack([o.numpy() for o in net([ns.Float(c) for c in x.T])], -1)
-    tensor = net.tensor(ns.TensorXf(np.ascontiguousarray(x.T))).numpy().T
+    tensor = net.tensor(ns.TensorXf(x)).numpy()
     assert coop.shape == expected.shape == tensor.shape
     assert np.allclose(coop, expected, atol=1e-6) and np.allclose(tensor, expected, atol=1e-6)
     assert (net.inputs, net.outputs) == (sizes[0], sizes[-1])
@@ -55,8 +55,8 @@ def test02_gradients_equal_central_differences(mode):
         out = net([ns.Float(c) for c in x.T])
         loss = dr.sum(sum(o * ns.Float(m) for o, m in zip(out, mix.T)))
     else:
-        out = net.tensor(ns.TensorXf(np.ascontiguousarray(x.T)))
-        loss = dr.sum(out * ns.TensorXf(np.ascontiguousarray(mix.T).astype(np.float32)), axis=None)
+        out = net.tensor(ns.TensorXf(x))
+        loss = dr.sum(out * ns.TensorXf(mix.astype(np.float32)), axis=None)
     dr.backward(loss)
     for layer, w in enumerate(weights):
         gradient = dr.grad(net.weights[layer]).numpy()

@@ -12,21 +12,21 @@ from nerg_mi.maths.contraction import AnyBox
 
 
 def stack(rows: list, ns):
-    """Rows (Floats of one length, or constants) as a TensorXf (rows, N)."""
-    flat = dr.ravel(ns.ArrayXf(rows), order="C")
-    return ns.TensorXf(flat, (len(rows), dr.width(flat) // len(rows)))
+    """Rows (Floats of one length, or constants) as a TensorXf (N, rows)."""
+    flat = dr.ravel(ns.ArrayXf(rows), order="F")
+    return ns.TensorXf(flat, (dr.width(flat) // len(rows), len(rows)))
 
 
 def unstack(x, ns) -> list:
-    """Rows of a TensorXf (rows, N) as Floats.
+    """Columns of a TensorXf (N, rows) as Floats.
 
-    A plain slice would send its gradient back through atomic additions; no two rows share an
+    A plain slice would send its gradient back through atomic additions; no two columns share an
     entry, so that ``Permute`` (plain stores) is right.
     """
-    rows, width = x.shape
+    width, rows = x.shape
     index = dr.arange(ns.UInt32, width)
     return [
-        dr.gather(ns.Float, x.array, index + dr.opaque(ns.UInt32, k * width), mode=dr.ReduceMode.Permute)
+        dr.gather(ns.Float, x.array, index * rows + dr.opaque(ns.UInt32, k), mode=dr.ReduceMode.Permute)
         for k in range(rows)
     ]
 

@@ -47,12 +47,12 @@ def test_density_alone_is_that_of_the_field():
 def test_rows_are_stacked_and_taken_apart():
     rows = [ns.Float([1, 2, 3]), ns.Float([4, 5, 6])]
     x = stack(rows, ns)
-    assert x.shape == (2, 3) and np.array_equal(x.numpy(), [[1, 2, 3], [4, 5, 6]])
+    assert x.shape == (3, 2) and np.array_equal(x.numpy(), [[1, 4], [2, 5], [3, 6]])
     assert np.array_equal([r.numpy() for r in unstack(x, ns)], [[1, 2, 3], [4, 5, 6]])
     dr.enable_grad(x)
     a, b = unstack(x, ns)
     dr.backward(dr.sum(a * ns.Float([1, 10, 100]) + 2 * b))
-    assert np.array_equal(dr.grad(x).numpy(), [[1, 10, 100], [2, 2, 2]])
+    assert np.array_equal(dr.grad(x).numpy(), [[1, 2], [10, 2], [100, 2]])
 
 
 def test_tensor_products_equal_the_fields_own_evaluation():
