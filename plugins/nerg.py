@@ -266,8 +266,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         with self.seen_by(sensor, scene), no_collection():
             image = super().render(scene, sensor, seed, spp, develop, evaluate)
         if self.should_stop():
-            # Mitsuba has heard Ctrl-C, and told nobody.
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt  # Mitsuba has heard Ctrl-C, and told nobody.
         return image
 
     @contextmanager
@@ -327,7 +326,8 @@ class NergIntegrator(mi.SamplingIntegrator):
             self.cache.forget()
         if self.medium is not None:
             self.medium.refresh(anyway=not keys or "density" in keys)
-        if self.observer is not None and (not keys or "to_world" in keys):
+        # Of the scene's parameters, and of this integrator's alone.
+        if self.observer is not None and (not keys or {"to_world", "observer.to_world"} & set(keys)):
             self.observer.parameters_changed(["to_world"])
         if recording():
             # What is recorded is not looked at.

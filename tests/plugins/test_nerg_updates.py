@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import numpy as np
 import pytest
 
 from nerg_mi.transport.media import volume
+from nerg_mi.transport.observer import viewpoint
 
 from .scenes import camera, channels, observer_at, wall, with_field
 
@@ -53,6 +55,19 @@ def test01_voxels_are_read_when_they_change_and_not_otherwise(rgb, reads):
     params.update()
     assert len(reads) == 2 and not np.array(scene.integrator().medium.occupancy.bits).any()
     assert (seen(rgb, scene) == 0).all()
+
+
+@pytest.mark.parametrize("of", ["scene", "integrator"])
+def test01b_an_observer_who_moves_is_no_constant_of_the_kernel(rgb, of):
+    """Each position would be compiled anew otherwise, which takes longer than any frame."""
+    scene = behind_a_wall(rgb)
+    params = rgb.traverse(scene if of == "scene" else scene.integrator())
+    name = "integrator.observer.to_world" if of == "scene" else "observer.to_world"
+    params[name] = rgb.Transform4f().translate([0.2, 0, -0.8])
+    params.update()
+    center = viewpoint.center(scene.integrator().observer)
+    assert np.allclose(np.ravel(np.array(center)), [0.2, 0, -0.8])
+    assert scene.integrator().observer.world_transform().matrix[0, 3].state == dr.VarState.Evaluated
 
 
 def test02_voxels_that_were_refused_are_read_again(rgb, reads):
