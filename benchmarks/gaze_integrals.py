@@ -6,7 +6,8 @@ positions.
 
 Positions are uniform in the box of the heads that the field was trained on. The finer integral has twice as many
 directions, others. Prints the largest and the mean difference from one, the share within 1e-3, and what an integral
-costs. ``--sweep``: the same of fewer and more directions, of which no finer sum is needed than that of the most.
+costs. ``--sweep``: the same of fewer and more directions, of which no finer sum is needed than that of the most, and of
+tolerances that decide how many there are.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import numpy as np
 def main(argv=None) -> None:
     from output import write_rows
 
+    import drjit as dr
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
@@ -49,9 +51,12 @@ def main(argv=None) -> None:
     medium = (place_of_volume(args.place) if args.place.suffix == ".vol" else place_of_field(args.place, ns)).medium
     gaze, place, settings = PlacedGaze(field), Place(medium), ObserverSettings(march=default_settings(medium))
 
-    def integral(p: list[float], count: int) -> float:
+    def integral(p: list[float], count: int = COUNT, tolerance: float = 0.0) -> float:
         p_o = mi.Point3f(*p)
-        return float(gaze.at([p_o], place, replace(settings, directions=count)).integrals(p_o)[0][0])
+        # As of a scene: a constant of the kernel would be compiled anew.
+        dr.make_opaque(p_o)
+        asked = replace(settings, directions=count, integral_tolerance=tolerance)
+        return float(gaze.at([p_o], place, asked).integrals(p_o)[0][0])
 
     low, high = np.array(field.config.heads)
     rng, rows = np.random.default_rng(0), []
@@ -74,27 +79,28 @@ def main(argv=None) -> None:
     write_rows(args.out, rows)
 
 
+TOLERANCES = (5e-3, 2e-3, 1e-3, 3e-4)
+
+
 def sweep(integral, positions: list[list[float]]) -> None:
-    """Print error and time of an integral by its number of directions."""
+    """Print error and time of an integral by its number of directions, and by its tolerance."""
     counts = [1 << k for k in range(9, 19)]
-    found = np.empty((len(counts) + 1, len(positions), 2))
-    for row, count in zip(found, [*counts, (1 << 20) + 13]):
-        integral(positions[0], count)  # compiles its kernels
+    true = np.array([integral(p, (1 << 20) + 13) for p in positions])
+    ways = {f"{count:,}": {"count": count} for count in counts}
+    ways |= {f"tolerance {tolerance:g}": {"tolerance": tolerance} for tolerance in TOLERANCES}
+    rows = []
+    for name, options in ways.items():
+        for p in positions[:4]:
+            integral(p, **options)  # compiles its kernels
+        found = np.empty((len(positions), 3))
         for k, p in enumerate(positions):
-            started = time.perf_counter()
-            row[k] = integral(p, count), time.perf_counter() - started
-    off = np.abs(found[:-1, :, 0] / found[-1, :, 0] - 1)
-    rows = [
-        (
-            f"{count:,}",
-            f"{o.mean():.1e}",
-            f"{np.quantile(o, 0.99):.1e}",
-            f"{o.max():.1e}",
-            f"{1e3 * np.median(t):.0f} ms",
-        )
-        for count, o, t in zip(counts, off, found[:-1, :, 1])
-    ]
-    print(markdown_table(("directions", "mean", "99 %", "most", "time"), rows))
+            wall, cpu = time.perf_counter(), time.process_time()
+            value = integral(p, **options)
+            found[k] = value, time.perf_counter() - wall, time.process_time() - cpu
+        off, (wall, cpu) = np.abs(found[:, 0] / true - 1), 1e3 * np.median(found[:, 1:], axis=0)
+        errors = (f"{v:.1e}" for v in (off.mean(), np.quantile(off, 0.99), off.max()))
+        rows.append((name, *errors, f"{wall:.0f} ms", f"{cpu:.0f} ms"))
+    print(markdown_table(("directions", "mean", "99 %", "most", "time", "CPU"), rows))
 
 
 if __name__ == "__main__":

@@ -48,11 +48,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - tolerance
    - |float|
-   - How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands for two march
-     steps, or, without a field, for 1e-4 of the scene's diagonal (or of twice the larger distance of surface and
-     observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The point that the observer
-     looks for lies this far, and as far as light goes into the surface (at most a 64th of the depth), in front of the
-     camera's surface, so that no surface hides itself. More than 1e18 counts as that. (Default: 0)
+   - {tolerance} (Default: 0)
 
  * - visibility
    - |string|
@@ -68,7 +64,11 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - directions
    - |int|
-   - Of the integral that a *normalised* gaze field is divided by, for each observer. (Default: 131072)
+   - Of the integral that a *normalised* gaze field is divided by, for each observer, at most. (Default: 131072)
+
+ * - integral_tolerance
+   - |float|
+   - {integral_tolerance} (Default: 2e-3)
 
  * - depth
    - |string|

@@ -20,10 +20,19 @@ from nerg_mi.transport.observer.gaze import PlacedGaze
 from nerg_mi.transport.observer.settings import VISIBILITIES, ObserverSettings
 from nerg_mi.transport.observer.views import ObserverView, SupportView
 
-_MARCH_MANUAL = {
+_TEXTS = {
     "ceiling": "Height above which a place is left out of what cameras see from above it, so that a roof hides no "
     "room: rays that start higher begin where they come below it; depths still count from the camera. What observers "
     "see is not cut. (Default: none)",
+    "tolerance": "How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands "
+    "for two march steps, or, without a field, for 1e-4 of the scene's diagonal (or of twice the larger distance of "
+    "surface and observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The "
+    "point that the observer looks for lies this far, and as far as light goes into the surface (at most a 64th "
+    "of the depth), in front of the camera's surface, so that no surface hides itself. More than 1e18 counts as "
+    "that.",
+    "integral_tolerance": "Error of that integral, as a share of it, below which fewer directions will do: told by the "
+    "scatter of parts of the sum, which tells more than there is as a rule. 0: always as many; so it is, too, in what "
+    "``dr.freeze`` records.",
     "dt_gamma": "Steps are at least this share of the distance travelled: for wide views, whose far parts need no "
     "short steps. (Default: 0, i.e. uniform steps; for a field without an end that which it was trained with)",
     "stop": "Transmittance below which what lies behind is left out: what then lacks of an expected depth is 16 times "
@@ -34,8 +43,8 @@ _MARCH_MANUAL = {
 
 
 def complete(manual: str) -> str:
-    """The ``manual`` with the kinds of depth and of quadrature that are registered, and what is said of a march."""
-    texts = {"quadratures": RULES.manual(), "depths": DEPTHS.manual(), **_MARCH_MANUAL}
+    """The ``manual`` with the kinds of depth and of quadrature that are registered, and what else is said here."""
+    texts = {"quadratures": RULES.manual(), "depths": DEPTHS.manual(), **_TEXTS}
     for name, text in texts.items():
         manual = manual.replace(f"{{{name}}}", text)
     return manual
@@ -146,6 +155,7 @@ def observer_settings(props, march: MarchSettings) -> ObserverSettings:
         tolerance=number(props, "tolerance", defaults.tolerance, low=0),
         map_height=integer(props, "map_height", defaults.map_height, low=2, high=16384),
         directions=integer(props, "directions", defaults.directions, low=64, high=1 << 24),
+        integral_tolerance=number(props, "integral_tolerance", defaults.integral_tolerance, low=0, high=1),
     )
 
 
@@ -174,6 +184,7 @@ def describe(nerg) -> str:
         "tolerance": seen.tolerance or "2 steps",
         "map_height": seen.map_height,
         "directions": seen.directions,
+        "integral_tolerance": seen.integral_tolerance,
         "depth": seen.depth,
         "surface_opacity": seen.surface_opacity,
         "radiance": nerg.radiance,

@@ -7,10 +7,11 @@ Directions are (N, 3) float64, unit. Solid angles are in steradian and sum to
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
-from .types import Vector3f
+from .types import UInt32, Vector3f
 
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
@@ -30,21 +31,45 @@ def fibonacci_directions(count: int) -> np.ndarray:
     return _from_height(z, i * _GOLDEN_ANGLE)
 
 
-def fibonacci_vectors(count: int) -> Vector3f:
-    """`fibonacci_directions` as a Vector3f of the Mitsuba variant in use, in its precision.
+def fibonacci_vectors(count: int, which: UInt32 | None = None) -> Vector3f:
+    """`fibonacci_directions` as a Vector3f of the Mitsuba variant in use, in its precision; ``which``: only those of
+    these numbers.
 
     Made by its kernels, since frozen functions take no arrays from NumPy.
     """
     import drjit as dr
     import mitsuba as mi
 
-    i = dr.arange(mi.Float, count)
-    z = 1 - (2 * i + 1) / count
+    which = dr.arange(mi.UInt32, count) if which is None else which
+    z = 1 - (2 * mi.Float(which) + 1) / count
     # Turns of the golden angle, of which whole ones are dropped in double precision.
-    turns = dr.arange(mi.Float64, count) * (1.5 - 0.5 * math.sqrt(5))
+    turns = mi.Float64(which) * (1.5 - 0.5 * math.sqrt(5))
     sin, cos = dr.sincos(mi.Float(dr.two_pi * (turns - dr.floor(turns))))
     r = dr.sqrt((1 - z) * (1 + z))
     return mi.Vector3f(r * cos, r * sin, z)
+
+
+@lru_cache(maxsize=8)
+def neighbourly_order(count: int) -> np.ndarray:
+    """The numbers (count,) uint32 of `fibonacci_directions` in an order in which neighbours follow each other.
+
+    Along Morton's curve (1966) through the cube around the sphere. Rays that are traced together then meet much the
+    same; along the spiral each looks elsewhere.
+    """
+    order = np.argsort(_morton(fibonacci_directions(count)), kind="stable").astype(np.uint32)
+    order.flags.writeable = False
+    return order
+
+
+def _morton(d: np.ndarray) -> np.ndarray:
+    """Number of the cell of unit directions (N, 3) along Morton's curve through 1024 cells a side."""
+    code = np.zeros(len(d), np.uint32)
+    for axis in range(3):
+        bits = np.clip((d[:, axis] + 1) * 512, 0, 1023).astype(np.uint32)
+        for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+            bits = (bits | (bits << np.uint32(shift))) & np.uint32(mask)
+        code |= bits << np.uint32(axis)
+    return code
 
 
 def uniform_directions(count: int, rng: np.random.Generator) -> np.ndarray:

@@ -7,7 +7,10 @@ has no densities; ``at`` gives an ``ObservedGaze``, which has.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
+import numpy as np
 
 from nerg_mi.field.gaze.ensemble import mean, spread
 from nerg_mi.field.gaze.protocol import AnyGazeField, GazeDensity
@@ -15,11 +18,13 @@ from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.types import Bool, Float, Point3f, Vector3f
 from nerg_mi.transport.features import observed_features
 from nerg_mi.transport.fingerprint import Fingerprint
+from nerg_mi.transport.freezing import recording
 from nerg_mi.transport.place import Place
 
 from .cache import Known, ObserverCache, fingerprint_of
+from .integral import Integral, integrate
 from .settings import ObserverSettings
-from .surroundings import Surroundings, distance_along, trace_surroundings
+from .surroundings import AllAround, Surroundings, distance_along
 from .viewpoint import select_nearest
 
 
@@ -38,46 +43,28 @@ class PlacedGaze:
     ) -> ObservedGaze:
         """The field for ``observers`` (scene points, one lane each) in ``place``, traced with ``settings``.
 
-        A normalised field is integrated over the sphere around each observer, in ``settings.directions``; the depths
-        carry no derivatives, the integral has those of the field's parameters. A field that is not normalised is the
-        same for all observers. ``cache``: where depths and integrals are kept.
+        A normalised field is integrated over the sphere around each observer, to ``settings.integral_tolerance``; the
+        depths carry no derivatives, the integral has those of the field's parameters. A field that is not normalised
+        is the same for all observers. ``cache``: where depths and integrals are kept.
         """
         if not self.field.config.normalized:
             return ObservedGaze(self, place, settings, [])
         if not observers:
             raise ValueError("a gaze field that is normalised over the observer's sphere needs to know the observers")
         cache = cache or ObserverCache()
-        made_of = (fingerprint_of(place), settings.surfaces, settings.directions)
-        around = cache.of_each(
-            (self, "surroundings"),
-            observers,
-            made_of,
-            lambda center: trace_surroundings(self.field, self.to_world, place, center, settings),
-        )
-        integrals = [self._integrals(member, around, made_of, cache) for member in self.field.members]
+        made_of = (fingerprint_of(place), settings.surfaces)
+        around = cache.of_each((self, "surroundings"), observers, made_of, lambda center: AllAround())
+        made_of = (*made_of, settings.directions, settings.integral_tolerance)
+        integrals = []
+        for member in self.field.members:
+            integral = _SphereIntegral(self, member, place, settings)
+            parameters = list(member.parameters().values())
+            if dr.grad_enabled(parameters):
+                integrals.append([Known(k.center, integral.attached(k)) for k in around])
+                continue
+            of_member = (made_of, Fingerprint(parameters))
+            integrals.append(cache.of_known((self, "integral", member), around, of_member, integral.detached))
         return ObservedGaze(self, place, settings, integrals)
-
-    def _integrals(self, member: GazeDensity, around: list[Known], made_of: tuple, cache: ObserverCache) -> list[Known]:
-        """Of one ``member``, for each observer; members agree on what they need to know of the surroundings."""
-        parameters = list(member.parameters().values())
-        if dr.grad_enabled(parameters):
-            return [Known(k.center, self._integral(member, k.center, k.value)) for k in around]
-
-        def integrate(k: Known) -> Float:
-            with dr.suspend_grad():
-                value = self._integral(member, k.center, k.value)
-                dr.eval(value)
-            return value
-
-        return cache.of_known((self, "integral", member), around, (made_of, Fingerprint(parameters)), integrate)
-
-    def _integral(self, member: GazeDensity, center: Point3f, around: Surroundings) -> Float:
-        """The integral (one lane) of ``member`` over what is ``around`` the observer at ``center``."""
-        o = center + dr.zeros(type(center), dr.width(around.directions))
-        emit, capture = self.unnormalized(
-            member, o + around.directions * around.distance, o, around.directions, True, around.escaped
-        )
-        return dr.mean(emit * capture + dr.zeros(type(around.distance), dr.width(around.distance))) * (4 * dr.pi)
 
     def unnormalized(
         self, member: GazeDensity, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, escaped: Bool = False
@@ -91,6 +78,53 @@ class PlacedGaze:
             active,
             escaped=escaped,
         )
+
+
+@dataclass(frozen=True)
+class _SphereIntegral:
+    """The integral of one ``member`` of the ``placed`` field over the sphere around observers (``cache.Known``, with
+    their ``AllAround``) in ``place``."""
+
+    placed: PlacedGaze
+    member: GazeDensity
+    place: Place
+    settings: ObserverSettings
+
+    def detached(self, known: Known) -> Float:
+        """Its value (one lane)."""
+        if recording():
+            with dr.suspend_grad():
+                return self.attached(known)
+        return dr.opaque(type(known.center.x), self._integrate(known).value)
+
+    def attached(self, known: Known) -> Float:
+        """The same with derivatives. What is recorded to be replayed elsewhere is summed over all directions."""
+        count = self.settings.directions if recording() else self._integrate(known).directions
+        return dr.mean(self._integrand(known, self._around(known, count))) * (4 * dr.pi)
+
+    def _integrate(self, known: Known) -> Integral:
+        def numbered(count: int) -> np.ndarray:
+            around = self._around(known, count)
+            with dr.suspend_grad():
+                found = self._integrand(known, around).numpy()
+            if around.number is None:
+                return found
+            values = np.empty_like(found)
+            values[around.number] = found
+            return values
+
+        return integrate(numbered, self.settings.directions, self.settings.integral_tolerance)
+
+    def _around(self, known: Known, count: int) -> Surroundings:
+        placed = self.placed
+        return known.value.of(count, placed.field, placed.to_world, self.place, known.center, self.settings)
+
+    def _integrand(self, known: Known, around: Surroundings) -> Float:
+        o = known.center + dr.zeros(type(known.center), dr.width(around.directions))
+        emit, capture = self.placed.unnormalized(
+            self.member, o + around.directions * around.distance, o, around.directions, True, around.escaped
+        )
+        return emit * capture + dr.zeros(type(around.distance), dr.width(around.distance))
 
 
 class ObservedGaze:

@@ -9,7 +9,8 @@ from nerg_mi.transport.march.settings import MarchSettings
 VISIBILITIES = ("depth", "transmittance", "map")
 
 DIRECTIONS = 1 << 17
-"""Of an integral over an observer's sphere: enough for a thousandth at depths that jump from surface to surface."""
+"""Of an integral over an observer's sphere at most: enough for a thousandth at depths that jump from surface to
+surface."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +29,10 @@ class ObserverSettings:
     tolerance: float = 0.0
     # Rows of a map; it has twice as many columns.
     map_height: int = 512
-    # Directions of the integral that a normalised gaze field is divided by.
+    # Directions, at most, of the integral that a normalised gaze field is divided by.
     directions: int = DIRECTIONS
+    # Error of that integral, as a share of it, below which fewer will do; 0: always as many.
+    integral_tolerance: float = 2e-3
 
     @property
     def surfaces(self) -> tuple:

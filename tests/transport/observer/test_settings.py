@@ -16,7 +16,9 @@ OTHERS = {
     "tolerance": 0.1,
     "map_height": 8,
     "directions": 64,
+    "integral_tolerance": 0.1,
 }
+OF_A_POINT = ("visibility", "tolerance", "map_height", "directions", "integral_tolerance")
 
 
 def test_each_setting_is_tried():
@@ -27,4 +29,4 @@ def test_each_setting_is_tried():
 def test_surfaces_are_decided_by_the_ray_and_not_by_what_is_compared(name):
     """What an observer sees all around is kept for other visibilities, and made anew for other surfaces."""
     other = replace(SETTINGS, **{name: OTHERS[name]})
-    assert (other.surfaces == SETTINGS.surfaces) == (name in ("visibility", "tolerance", "map_height", "directions"))
+    assert (other.surfaces == SETTINGS.surfaces) == (name in OF_A_POINT)
