@@ -48,7 +48,8 @@ def march_primal(
     cells = boundaries(quadrature, medium)
 
     def body(active, t, share, carry, lost, tau, moment, half, slope, enter, enter_tau, total, pending, n, m, known):
-        active, t, delta, t_next = advance(medium, ray, t, t1, share, settings, active, cells, fine_from)
+        part = Float(1) if share is None else share
+        active, t, delta, t_next = advance(medium, ray, t, t1, part, settings, active, cells, fine_from)
         if occlusion is not None:
             clear = active & occlusion.clear(t, tau)
             known, active = known | clear, active & ~clear
@@ -84,7 +85,7 @@ def march_primal(
         return (
             active,
             t_next,
-            Float(1),
+            None if share is None else Float(1),
             step.carry,
             (lost_tau, lost_moment),
             tau,
@@ -103,7 +104,8 @@ def march_primal(
     start = (
         active,
         t0,
-        Float(1 if offset is None else offset),
+        # A state that never changes would have the loop recorded twice.
+        None if offset is None else Float(offset),
         quadrature.start(Float),
         (Float(0), Float(0)),
         Float(0),
