@@ -193,14 +193,29 @@ class Pixel:
             )
             return Attention(shown(density), dr.select(unknown, networks, 0))
         needed = self.surface if "factors" in nerg.demands else attended
-        evaluate = gaze.spread if "spread" in nerg.demands else gaze.evaluate
-        density, emit, capture, *spread = evaluate(sight.p_od, p_o, r_o, needed)
+        density, emit, capture, *spread = self._evaluated(needed)
         return Attention(
             shown(density),
-            dr.select(self.surface, networks, 0),
+            dr.select(needed, networks, 0),
             dr.select(self.surface, emit, 0),
             dr.select(self.surface, capture, 0),
             shown(spread[0]) if spread else None,
+        )
+
+    def _evaluated(self, needed) -> tuple:
+        """``(gaze, emit, capture)``, and the spread if it is demanded, where they are ``needed``."""
+        gaze, p_od, p_o, r_o = self.gaze, self.sight.p_od, self.p_o, self.r_o
+        with_spread = "spread" in self.nerg.demands
+        evaluate = gaze.spread if with_spread else gaze.evaluate
+        if self.nerg.gaze.field.config.features or dr.grad_enabled(p_od, p_o, r_o, *gaze.parameters()):
+            return evaluate(p_od, p_o, r_o, needed)
+        # What is hidden lies together: where none of a packet is needed its networks are passed over.
+        return dr.if_stmt(
+            (needed,),
+            needed,
+            lambda needed: tuple(mi.Float(v) for v in evaluate(p_od, p_o, r_o, needed)),
+            lambda needed: (mi.Float(0),) * (4 if with_spread else 3),
+            label="gaze",
         )
 
     def view_of_observer(self, name: str):

@@ -6,7 +6,7 @@ import pytest
 
 from nerg_mi.transport.place import Place
 
-from .scenes import camera, observer_at, with_gaze
+from .scenes import camera, named, observer_at, with_gaze
 
 
 @pytest.fixture
@@ -53,6 +53,30 @@ def test03_gaze_is_zero_without_a_surface(rgb, files):
     for value in (found.attention.gaze, found.attention.emit, found.attention.capture):
         assert ((value.numpy() > 0) == surface).all()
     assert found.attention.evaluations.numpy().tolist() == [2, 2, 0] and found.attention.spread is None
+
+
+def test03b_networks_are_evaluated_where_gaze_is_seen(rgb, files):
+    """And give what they give everywhere, as derivatives have it; with factors, wherever there is a surface."""
+
+    def attention(aovs, attached):
+        integrator = with_gaze(files, aovs, observer=observer_at(rgb, -0.2, 3, 0.1), falloff=0.0)
+        scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, (0.5, 0.4, -3))})
+        if attached:
+            params = rgb.traverse(scene)
+            dr.enable_grad(params["integrator.gaze.emit_head.0"])
+            params.update()
+        found = named(rgb, np.array(rgb.render(scene, spp=1)), integrator)
+        return {name.split(".")[0]: values for name, values in found.items()}
+
+    aovs = "gaze,gaze_evals,visibility,opacity"
+    seen, everywhere = (attention(aovs, attached) for attached in (False, True))
+    np.testing.assert_array_equal(seen["gaze"], everywhere["gaze"])
+    surface, visible = seen["opacity"] >= 0.5, seen["visibility"] > 0
+    assert (surface & visible).any() and (surface & ~visible).any() and (seen["gaze"][surface & visible] > 0).all()
+    np.testing.assert_array_equal(seen["gaze_evals"], np.where(surface & visible, 2, 0))
+    whole = attention(aovs + ",emit", False)
+    np.testing.assert_array_equal(whole["gaze_evals"], np.where(surface, 2, 0))
+    np.testing.assert_allclose(whole["gaze"], seen["gaze"], rtol=1e-5)
 
 
 def test04_evaluations_are_those_of_all_that_was_traced(rgb, files):
