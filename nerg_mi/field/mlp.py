@@ -152,7 +152,7 @@ class MLP:
             x = [ns.Float(c) if half else c for c in nn.matvec(self._views[2 * i], v, self._views[2 * i + 1])]
         return x
 
-    def tensor(self, x):
+    def tensor(self, x: Any) -> Any:
         """Outputs (N, outputs) at inputs ``x`` (N, inputs), both TensorXf, as tensor products.
 
         Points by rows: the numbers of a point side by side are what Dr.Jit's products of matrices read quickest, by a

@@ -111,9 +111,7 @@ def make_evaluation(job: Job) -> list[Path]:
     source, gaze = job.build / "rays.npz", job.store / "shoppers.safetensors"
     _require(source, "rays")
     _require(gaze, "gaze")
-    options = GazeEvaluationOptions(
-        field=job.store / "store.safetensors", pictures=0, seed=job.seed, mode=mi.variant()
-    )
+    options = GazeEvaluationOptions(field=job.store / "store.safetensors", pictures=0, seed=job.seed, mode=mi.variant())
     evaluate_gaze(gaze, source, job.build / "shoppers.eval", options)
     path = job.store / RESULTS
     return [(job.build / "shoppers.eval" / RESULTS).replace(path)]

@@ -11,7 +11,7 @@ def parameters(integrator) -> dict:
     march = ("step", "dt_gamma", "stop", "color_cutoff", "quadrature", "coarse", "refined")
     out = {n: getattr(integrator, n) for n in names} | {n: getattr(integrator.settings, n) for n in march}
     observer = integrator.observer_settings
-    seen = ("depth", "surface_opacity", "visibility", "tolerance", "map_height", "directions")
+    seen = ("depth", "surface_opacity", "visibility", "tolerance", "map_height", "directions", "integral_tolerance")
     return out | {
         "falloff": float(integrator.falloff[0]),
         **{n: getattr(observer, n) for n in seen},

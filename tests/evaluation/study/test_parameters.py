@@ -30,6 +30,7 @@ def test_all_settings_are_read_back_and_make_the_same_integrator(rgb):
         "tolerance": 0.5,
         "map_height": 64,
         "directions": 4096,
+        "integral_tolerance": 0.125,
         "background": [0.25, 0.5, 0.75],
     }
     density = {"type": "constvolume", "value": 3.0}
