@@ -78,7 +78,7 @@ def test01_equal_to_derivatives_through_the_loop(rgb, monkeypatch, quadrature):
             return march_primal(medium, ray, t0, t1, active, replace(settings, color_cutoff=0.0), *more)
 
     called = []
-    monkeypatch.setattr(front, "differentiable_march", lambda *a: called.append(1) or through_the_loop(*a))
+    monkeypatch.setattr(front, "differentiable_march", lambda operation, *a: called.append(1) or through_the_loop(*a))
     expected = gradients(rgb, scene)
     assert called
     for g, e in zip(got, expected):

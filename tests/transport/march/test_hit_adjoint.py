@@ -1,5 +1,7 @@
 """Derivatives of splats against central differences in float64, of the ray and of what Gaussians are."""
 
+import gc
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.painting import ColorPainter
 from tests.formats.splats.writers import random_splats
 from tests.reference.splats import peaks, trace
-from tests.transport.media.splats.scenes import medium_of, rays
+from tests.transport.media.splats.scenes import medium_of, rays, stack
 
 # Ends nowhere, so that the sums are smooth but for the rims of Gaussians.
 SETTINGS = MarchSettings(0.01, stop=0.0)
@@ -86,3 +88,30 @@ def test_gradients_of_rays(rgb, case, mode):
     getattr(dr, mode)(loss if mode == "backward" else shift)
     found = dr.grad(shift if mode == "backward" else loss)[0]
     assert np.isclose(found, (ends[0] - ends[1]) / (2 * STEP), rtol=1e-3)
+
+
+def test_memory_does_not_grow_with_hits(rgb):
+    medium, count = medium_of(stack(np.arange(1, 401) * 0.5, np.full(400, 0.01))), 1 << 14
+
+    def gradient(end):
+        o = rgb.Point3f(dr.linspace(rgb.Float, -0.1, 0.1, count), 0, 0)
+        dr.enable_grad(o)
+        ray = medium.local(o, rgb.Vector3f(0, 0, 1))
+        result = march(medium, ray, rgb.Float(0), rgb.Float(end), True, SETTINGS, color=ColorPainter(rgb.Color3f))
+        dr.backward(result.tau + result.color.x)
+        dr.eval(dr.grad(o))
+        return result.tau.numpy().mean()
+
+    found, memory = [], []
+    for end in (4.2, 200.0):
+        gradient(end)
+        gc.collect()
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+        found.append(gradient(end))
+        dr.sync_thread()
+        memory.append(dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before)
+    # Eight hits and 399; a number for each of these would be 26 MB.
+    assert found[1] > 40 * found[0] > 0 and abs(memory[1] - memory[0]) < 1e6, memory
