@@ -1,12 +1,14 @@
 """Our trainer beside a plain PyTorch trainer of the same model: steps a second, and PSNR after equal minutes.
 
-    python benchmarks/torch_radiance.py [--minutes 2] [--width 135] [--validate] [--data DIR]
+    python benchmarks/torch_radiance.py [--minutes 2] [--width 135] [--validate] [--data DIR] [--turns 0]
 
 Same grid, networks, initial weights, rays, step table, occupancy grid, density pass, losses, optimiser and schedule, on
 the same machine in the same run, one after the other; the peer is eager PyTorch, gathers and sums, autograd. Before
 they start, both evaluate the same random points, and the program stops if they differ. Without our trainer's extras:
 thinned samples, damped derivatives near cameras, cleared cells, and the settling of the grid, which are switched off in
-both. Both fields are scored by the integrator, under the occupancy found in the same way.
+both. Both fields are scored by the integrator, under the occupancy found in the same way. ``--turns``: instead, both
+take 8 steps in turns, so often, after 100 that clear the first fog, marching finely from the start, and what a step
+takes is printed.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from fox_radiance import default_data, validation
+from step_times import take_turns
 
 import numpy as np
 
@@ -268,6 +271,7 @@ def main(argv=None) -> None:
     parser.add_argument("--size", default="small")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--validate", action="store_true")
+    parser.add_argument("--turns", type=int, default=0, help="only compare what a step takes, so often, in turns")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/torch_radiance"))
     args = parser.parse_args(argv)
 
@@ -290,8 +294,9 @@ def main(argv=None) -> None:
     data = validation(data) if args.validate else data
     if any(v.has_alpha or v.mask is not None for v in data.train):
         raise SystemExit("the peer knows neither alpha nor masks; give a set of plain photos")
+    fine = {"strides": ()} if args.turns else {}
     settings = RadianceSettings(
-        minutes=args.minutes, settle=2.0, empty_weight=0.0, grid_decay=0.0, thin_least=1.0, reach=0.0
+        minutes=args.minutes, settle=2.0, empty_weight=0.0, grid_decay=0.0, thin_least=1.0, reach=0.0, **fine
     )
     make = lambda: RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -301,6 +306,9 @@ def main(argv=None) -> None:
     print(f"same weights, same points: densities and colours differ by {difference:.1e} at most")
     if not difference < 1e-3:
         raise SystemExit("the two are not the same model")
+    if args.turns:
+        take_turns(ours, peer, args.turns)
+        return
     rows = []
     for name, trainer in (("nerg_mi", ours), ("PyTorch", peer)):
         load = os.getloadavg()[0]

@@ -127,3 +127,18 @@ def test10_memory_of_this_process(benchmark):
     assert memory.status("VmHWM") >= memory.status("VmRSS") > 10
     with pytest.raises(RuntimeError, match="VmNothing"):
         memory.status("VmNothing")
+
+
+def test11_steps_in_turns(benchmark, capsys):
+    """As many steps of both, and the ratio of what they take."""
+
+    class Trainer:
+        steps = 0
+
+        def step(self):
+            self.steps += 1
+
+    ours, peer = Trainer(), Trainer()
+    benchmark("step_times").take_turns(ours, peer, 3, steps=2, before=5)
+    assert ours.steps == peer.steps == 5 + 2 + 3 * 2
+    assert capsys.readouterr().out.splitlines()[-1].startswith("PyTorch takes ")
