@@ -15,6 +15,8 @@ _PANEL = (330, 250)
 def growth_figure(curves: Sequence[Mapping]):
     """A panel for each of ``curves``: ``title``, ``axis``, ``sizes`` (n,), ``low``, ``middle`` and ``high`` (n,)
     milliseconds, and the fitted ``exponent``; both axes logarithmic, with the slope of proportion in grey."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
     columns = 3
     rows = -(-len(curves) // columns)
     figure = new_page(columns * _PANEL[0], rows * _PANEL[1])
@@ -26,6 +28,10 @@ def growth_figure(curves: Sequence[Mapping]):
         axes.errorbar(sizes, middle, [middle - ends[0], ends[1] - middle], color=_OURS, marker="o", ms=3, lw=1.2)
         axes.set_xscale("log")
         axes.set_yscale("log")
+        axes.set_xticks(sizes, [f"{n:,g}" for n in sizes])
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,g}"))
+        axes.minorticks_off()
         axes.set_title(curve["title"], fontsize=8, color=INK)
         axes.set_xlabel(curve["axis"], fontsize=7, color=INK)
         axes.set_ylabel(curve.get("unit", "CPU ms"), fontsize=7, color=INK)

@@ -19,7 +19,8 @@ LATE = {
 """Where imports within functions are the rule -> the reason."""
 
 LATE_HERE: dict[tuple[str, str], str] = {
-    ("nerg_mi.rendering.bands", "nerg_mi.transport.observer.viewpoint"): "a film is described without Dr.Jit"
+    ("nerg_mi.rendering.bands", "nerg_mi.transport.observer.viewpoint"): "a film is described without Dr.Jit",
+    ("nerg_mi.figures.provenance", "nerg_mi.rays.dataset.opening"): "a picture without rays starts without datasets",
 }
 """Importing and imported module -> why this one import waits for the call."""
 
