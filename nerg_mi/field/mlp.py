@@ -160,15 +160,19 @@ class MLP:
         """
         for i, w in enumerate(self.weights):
             if self.norms is None:
-                x = dr.matmul(x, w, Bt=True)
+                x = _products(x, w)
             else:
                 x = x - dr.reshape(type(x), dr.mean(x, axis=1), (-1, 1))
                 x = x * dr.reshape(type(x), dr.rsqrt(dr.mean(x * x, axis=1) + _NORM_EPSILON), (-1, 1))
                 w, bias = _folded(w, self.norms[i])
-                x = dr.matmul(x, w, Bt=True) + bias
+                x = _products(x, w) + bias
             if i + 1 < len(self.weights):
                 x = dr.maximum(x, 0)
         return x
+
+
+def _products(x: Any, w: Any) -> Any:
+    return dr.matmul(x, w, Bt=True)
 
 
 def _folded(w, norm: dict[str, Any]) -> tuple:
