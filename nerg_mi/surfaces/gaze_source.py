@@ -166,7 +166,8 @@ def _along(looker: Looker, cone: float) -> Callable[[Vector3f], Any]:
 def _vectors(values: np.ndarray) -> Vector3f:
     import mitsuba as mi
 
-    return mi.Vector3f(np.ascontiguousarray(values.T, np.float32))
+    # Component by component: taken from one array their number would be a constant of the kernel, compiled each time.
+    return mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in values.T))
 
 
 def _center(eye: np.ndarray) -> Point3f:
