@@ -48,7 +48,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - tolerance
    - |float|
-   - {tolerance} (Default: 0)
+   - {apart} (Default: 0)
 
  * - visibility
    - |string|

@@ -20,11 +20,11 @@ from nerg_mi.transport.observer.gaze import PlacedGaze
 from nerg_mi.transport.observer.settings import VISIBILITIES, ObserverSettings
 from nerg_mi.transport.observer.views import ObserverView, SupportView
 
-_TEXTS = {
+TEXTS = {
     "ceiling": "Height above which a place is left out of what cameras see from above it, so that a roof hides no "
     "room: rays that start higher begin where they come below it; depths still count from the camera. What observers "
     "see is not cut. (Default: none)",
-    "tolerance": "How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands "
+    "apart": "How far apart the camera's and the observer's idea of a surface may be, in scene units; 0 stands "
     "for two march steps, or, without a field, for 1e-4 of the scene's diagonal (or of twice the larger distance of "
     "surface and observer from the origin, if that is less: a far-away sky dome does not blunt shadows). The "
     "point that the observer looks for lies this far, and as far as light goes into the surface (at most a 64th "
@@ -44,7 +44,7 @@ _TEXTS = {
 
 def complete(manual: str) -> str:
     """The ``manual`` with the kinds of depth and of quadrature that are registered, and what else is said here."""
-    texts = {"quadratures": RULES.manual(), "depths": DEPTHS.manual(), **_TEXTS}
+    texts = {"quadratures": RULES.manual(), "depths": DEPTHS.manual(), **TEXTS}
     for name, text in texts.items():
         manual = manual.replace(f"{{{name}}}", text)
     return manual

@@ -1,5 +1,7 @@
 """The integrator's parameters and children: what is read of a scene, and what is refused."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -182,3 +184,12 @@ def test07_missing_files_are_named(rgb, tmp_path):
             )
         with pytest.raises(RuntimeError, match='"filename"'):
             rgb.load_dict({"type": kind})
+
+
+def test_each_text_of_the_manual_has_one_place(rgb):
+    from nerg_mi.plugins import nerg_properties
+
+    source = Path(nerg_properties.__file__).with_name("nerg.py").read_text("utf-8").split('"""')[1]
+    names = [*nerg_properties.TEXTS, "quadratures", "depths", "aovs"]
+    # No formula is one of them.
+    assert {name: source.count(f"{{{name}}}") for name in names} == dict.fromkeys(names, 1)
