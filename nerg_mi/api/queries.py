@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.maths.arrays import vector_of
 
 from . import arrays
 from .arrays import Floats, Labelled, same_for_all
@@ -121,7 +122,7 @@ class _Tracer:
         import mitsuba as mi
 
         o, d = o[first : first + BATCH], d[first : first + BATCH]
-        ray = mi.RayDifferential3f(mi.Point3f(np.ascontiguousarray(o.T)), mi.Vector3f(np.ascontiguousarray(d.T)))
+        ray = mi.RayDifferential3f(vector_of(mi.Point3f, o), vector_of(mi.Vector3f, d))
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(self.seed + first, len(o))
         with dr.suspend_grad():
@@ -197,7 +198,7 @@ def _at_points(observer: ObserverOf, p: Floats, with_gaze: bool) -> dict[str, Fl
     for a in range(0, len(p), BATCH):
         part = p[a : a + BATCH]
         with dr.suspend_grad():
-            values = observer.sees(mi.Point3f(np.ascontiguousarray(part.T)), with_gaze)
+            values = observer.sees(vector_of(mi.Point3f, part), with_gaze)
             dr.eval(values)
         for name, value in values.items():
             parts.setdefault(name, []).append(_lanes(value, len(part)))

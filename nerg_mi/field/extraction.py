@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.arrays import vector_of
+
 from .radiance import RadianceField
 
 # Points a kernel launch: some hundred megabytes of intermediate values at most.
@@ -54,7 +56,7 @@ class Sampler:
         self.field, self.ns = field, field.ns
 
     def _point(self, p):
-        return self.ns.Array3f(np.ascontiguousarray(np.asarray(p, np.float32).T))
+        return vector_of(self.ns.Array3f, p)
 
     def _density(self, p, masked: bool = True):
         active = self.ns.Bool(True)

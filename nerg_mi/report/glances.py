@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry.places import GazePlace
@@ -75,7 +76,7 @@ class Onlooker:
 
         center = mi.Point3f(*np.asarray(observer, float).tolist())
         observed = self._gaze.at([center], self._place, self._settings)
-        return np.array(observed.along(center, mi.Vector3f(np.ascontiguousarray(directions.T, np.float32))))
+        return np.array(observed.along(center, vector_of(mi.Vector3f, directions)))
 
     def on_points(self, observer: np.ndarray, points: np.ndarray, spacing: float) -> np.ndarray:
         """Gaze (N,) in 1/sr that the ``observer`` (3,) gives ``points`` (N, 3) of surfaces, none to those that are

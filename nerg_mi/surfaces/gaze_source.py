@@ -22,6 +22,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.density.received import Density, attended
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import Point3f, Vector3f
 from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.observer.gaze import PlacedGaze
@@ -100,9 +101,11 @@ def gaze_sums(
 
 
 def _of_one(target: Target, looker: Looker, weight: float, eye: np.ndarray, settings: GazeSettings) -> Sums:
+    import mitsuba as mi
+
     mesh, eye = target.mesh, np.asarray(eye, np.float64)
     along = _along(looker, settings.cone)
-    everywhere = lambda d: np.broadcast_to(np.array(along(_vectors(d)), np.float64), (len(d),))
+    everywhere = lambda d: np.broadcast_to(np.array(along(vector_of(mi.Vector3f, d)), np.float64), (len(d),))
     directions, angles = sphere_rule(everywhere, settings.directions)
     share = weight * angles * everywhere(directions)
     ends = target.ends(np.broadcast_to(eye, directions.shape), directions)
@@ -139,8 +142,8 @@ def _unhidden(looker: Looker, density: Density, pieces: Pieces) -> np.ndarray:
     import mitsuba as mi
 
     middle = pieces.relative.mean(axis=1)
-    r_o = _vectors(middle / np.linalg.norm(middle, axis=1, keepdims=True))
-    p_od, p_o = mi.Point3f(_vectors(pieces.center)), looker.center + dr.zeros(mi.Point3f, len(pieces))
+    r_o = vector_of(mi.Vector3f, middle / np.linalg.norm(middle, axis=1, keepdims=True))
+    p_od, p_o = vector_of(mi.Point3f, pieces.center), looker.center + dr.zeros(mi.Point3f, len(pieces))
     found = density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(pieces)))
     return np.broadcast_to(np.array(found, np.float64), (len(pieces),))
 
@@ -149,8 +152,8 @@ def _launch(target: Target, center: Point3f, density: Density, pieces: Pieces) -
     """``density`` (P,) after occlusion by what may be a medium, at the centroids of ``pieces``, in 1/sr."""
     import mitsuba as mi
 
-    p_o, p = center + dr.zeros(mi.Point3f, len(pieces)), mi.Point3f(_vectors(pieces.center))
-    normals = _vectors(target.mesh.normals[pieces.face])
+    p_o, p = center + dr.zeros(mi.Point3f, len(pieces)), vector_of(mi.Point3f, pieces.center)
+    normals = vector_of(mi.Vector3f, target.mesh.normals[pieces.face])
     found = attended(target.place, density, p_o, p, normals, target.falloff, target.settings, True)
     return np.broadcast_to(np.array(found, np.float64), (len(pieces),))
 
@@ -161,13 +164,6 @@ def _uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
 
 def _along(looker: Looker, cone: float) -> Callable[[Vector3f], Any]:
     return looker.along if cone == 0 else lambda directions: blurred(looker.along, directions, cone)
-
-
-def _vectors(values: np.ndarray) -> Vector3f:
-    import mitsuba as mi
-
-    # Component by component: taken from one array their number would be a constant of the kernel, compiled each time.
-    return mi.Vector3f(*(mi.Float(np.ascontiguousarray(c, np.float32)) for c in values.T))
 
 
 def _center(eye: np.ndarray) -> Point3f:

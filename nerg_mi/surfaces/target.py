@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.arrays import aligned, vector_of
 from nerg_mi.transport.media.protocol import Medium
 from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place
@@ -73,7 +74,7 @@ class Target:
 
         to = points - eye
         distance = np.linalg.norm(to, axis=1)
-        d = mi.Vector3f(np.ascontiguousarray((to / np.where(distance > 0, distance, 1)[:, None]).T, np.float32))
+        d = vector_of(mi.Vector3f, to / np.where(distance > 0, distance, 1)[:, None])
         o = mi.Point3f(np.asarray(eye, np.float64).tolist())
         # A position that is a constant of the kernel would be compiled anew for every observer.
         dr.make_opaque(o)
@@ -82,16 +83,16 @@ class Target:
             view = self.place.trace(mi.Ray3f(o, d), dr.full(mi.Bool, True, count), self.settings.march)
             assert view.cast is not None, "a target has shapes"
             own = (view.cast.shape == mi.ShapePtr(self._shape)) & (
-                view.cast.prim_index == mi.UInt32(faces.astype(np.uint32))
+                view.cast.prim_index == mi.UInt32(aligned(faces, np.uint32))
             )
-            seen = ~view.hit | own | (view.distance >= mi.Float((distance * (1 - NEAR)).astype(np.float32)))
+            seen = ~view.hit | own | (view.distance >= mi.Float(aligned(distance * (1 - NEAR))))
         return np.broadcast_to(np.array(seen).astype(bool), (count,)) & (distance > 0)
 
     def ends(self, origins: np.ndarray, directions: np.ndarray) -> Ends:
         """Where rays with ``origins`` (N, 3) and unit ``directions`` (N, 3) end."""
         import mitsuba as mi
 
-        o, d = (mi.Point3f(np.ascontiguousarray(v.T, np.float32)) for v in (origins, directions))
+        o, d = (vector_of(mi.Point3f, v) for v in (origins, directions))
         count = len(origins)
         with dr.suspend_grad():
             view = self.place.trace(mi.Ray3f(o, mi.Vector3f(d)), dr.full(mi.Bool, True, count), self.settings.march)

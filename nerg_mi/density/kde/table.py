@@ -12,6 +12,7 @@ import math
 import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import Array3f, Float, UInt32
 
 from .estimate import SphericalKde
@@ -62,7 +63,7 @@ class SphericalKdeTable:
         """Texels (6, width, width) that lookups in ``directions`` read."""
         ns = self.ns
         hit = dr.zeros(ns.UInt32, 6 * self.width * self.width)
-        first = self._cell(ns.Array3f(np.ascontiguousarray(np.asarray(directions, np.float32).reshape(-1, 3).T)))[0]
+        first = self._cell(vector_of(ns.Array3f, directions.reshape(-1, 3)))[0]
         dr.scatter(hit, ns.UInt32(1), first)
         corner = np.array(hit).reshape(6, self.width, self.width) > 0
         out = corner.copy()
@@ -101,7 +102,7 @@ class SphericalKdeTable:
 
     def evaluate(self, directions: np.ndarray) -> np.ndarray:
         """Densities (N,) float32 in ``directions`` (N, 3), 1/sr."""
-        d = self.ns.Array3f(np.ascontiguousarray(np.asarray(directions, np.float32).T))
+        d = vector_of(self.ns.Array3f, directions)
         return np.array(self.density(d))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
 from nerg_mi.transport.observer.gaze import ObservedGaze, PlacedGaze
@@ -62,7 +63,7 @@ def gaze_field(
         new = key not in observed
         if new:
             observed[key] = gaze.at([p_o], place, settings)
-        r_o = mi.Vector3f(np.ascontiguousarray(directions.T, np.float32))
+        r_o = vector_of(mi.Vector3f, directions)
         density = np.array(observed[key].along(p_o, r_o))
         if new and on_position is not None:
             on_position(len(observed))

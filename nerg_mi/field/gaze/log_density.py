@@ -25,6 +25,7 @@ from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
 from nerg_mi.field.radiance import assign, sigmoid
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.contraction import AnyBox
 
 from .basis import Basis
@@ -321,6 +322,6 @@ def blind_table(density: np.ndarray, rows: int, ns: ModuleType, directions: np.n
     """
     density = np.asarray(density, np.float64)
     log = np.log((1 - _FLOOR) * density + _FLOOR / (4 * np.pi))
-    d = ns.Array3f(np.ascontiguousarray(directions.T, np.float32))
+    d = vector_of(ns.Array3f, directions)
     found = np.asarray(dr.exp(look_up(ns.Float(log.astype(np.float32)), rows, d)), np.float64)
     return (log - np.log(4 * np.pi * found.mean())).reshape(rows, 2 * rows).astype(np.float32)

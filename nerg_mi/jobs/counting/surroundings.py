@@ -13,6 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.jobs.gaze_places import align_of_training, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
@@ -78,7 +79,7 @@ class Surroundings:
         settings = replace(settings, directions=min(settings.directions, _INTEGRAL))
         center = mi.Point3f(*np.asarray(eye, float).tolist())
         observed = self.gaze.at([center], place, settings)
-        found = observed.members_along(center, mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
+        found = observed.members_along(center, vector_of(mi.Vector3f, d))
         return np.array([np.broadcast_to(np.array(gaze, np.float64), (len(d),)) for gaze in found])
 
     def support(self, eye: np.ndarray) -> float:

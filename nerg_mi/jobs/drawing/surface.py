@@ -16,6 +16,7 @@ from nerg_mi.files.bounded import reading
 from nerg_mi.jobs.options import option, parse_numbers
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.jobs.scenes.cameras import given_point
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.rendering.mesh_file import check_ply
 from nerg_mi.rendering.pictures import activate
 from nerg_mi.surfaces.mesh import Mesh
@@ -125,7 +126,7 @@ def _seen(mesh: Mesh, values: np.ndarray, up: np.ndarray, options: SurfaceOption
     d /= np.linalg.norm(d, axis=1, keepdims=True)
     ours = mitsuba_mesh(mesh.vertices, mesh.faces, "surface")
     scene: mi.Scene = mi.load_dict({"type": "scene", "surface": ours})
-    ray = mi.Ray3f(mi.Point3f(*eye.tolist()), mi.Vector3f(np.ascontiguousarray(d.T, np.float32)))
+    ray = mi.Ray3f(mi.Point3f(*eye.tolist()), vector_of(mi.Vector3f, d))
     found = scene.ray_intersect_preliminary(ray)
     met = np.array(found.is_valid(), bool)
     face = mesh.faces[np.where(met, np.array(found.prim_index, np.int64), 0)]
