@@ -4,9 +4,7 @@
 // points; the two features of a vertex are one load of eight bytes. Beside it are the loops that say what the machine
 // can do: products and sums a second, bytes a second, and loads of eight bytes a second at random places.
 //
-//     g++ -O3 -march=native -ffast-math -shared -fPIC -pthread density_limit.cpp -o density_limit.so
-//
-// Built and called by density_limit.py.
+// Built, with its options, and called by density_limit.py.
 
 #include <algorithm>
 #include <atomic>
