@@ -10,6 +10,8 @@ import numpy as np
 
 median = statistics.median
 
+_SETTLE = 0.05
+
 Times = list[tuple[float, float]]
 """Seconds of each run: wall-clock, and of processor."""
 
@@ -23,6 +25,8 @@ def in_turns(works: Mapping[str, Callable[[], object]], runs: int, warm: int = 1
     taken: dict[str, Times] = {name: [] for name in works}
     for _ in range(runs):
         for name, work in works.items():
+            # Threads of the work before spin for a while before they sleep: Dr.Jit's, PyTorch's, OpenBLAS's.
+            time.sleep(_SETTLE)
             wall, cpu = time.perf_counter(), time.process_time()
             work()
             taken[name].append((time.perf_counter() - wall, time.process_time() - cpu))
