@@ -11,6 +11,7 @@ import numpy as np
 median = statistics.median
 
 _SETTLE = 0.05
+"""Seconds in which threads that spin go to sleep."""
 
 Times = list[tuple[float, float]]
 """Seconds of each run: wall-clock, and of processor."""

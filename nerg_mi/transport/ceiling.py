@@ -37,6 +37,7 @@ class Ceiling:
         """``ray`` (unit direction) from where it comes below the plane, and how far it went until then: 0 where it
         starts below, or never comes there. Differentiable in the ray."""
         import drjit as dr
+        import mitsuba as mi
 
         over, fall = dr.dot(ray.o, self._up) - self._height, -dr.dot(ray.d, self._up)
         cuts: Bool = (over > 0) & (fall > _LEAST_FALL)
@@ -44,7 +45,7 @@ class Ceiling:
         moved = type(ray)(ray)
         moved.o = dr.fma(ray.d, ahead, ray.o)
         moved.maxt = ray.maxt - ahead
-        if hasattr(ray, "o_x"):
+        if isinstance(ray, mi.RayDifferential3f):
             moved.o_x, moved.o_y = dr.fma(ray.d_x, ahead, ray.o_x), dr.fma(ray.d_y, ahead, ray.o_y)
         return moved, ahead
 

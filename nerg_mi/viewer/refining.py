@@ -23,7 +23,7 @@ BAND_SECONDS = 0.35
 """A band of rays should take so long at most: what is more urgent waits for its end."""
 
 SIZES = tuple(1 << k for k in range(13, 18))
-"""Numbers of rays in a band. They are few, since kernels are compiled for each."""
+"""Numbers of rays in a band."""
 
 DIRECTIONS = 1 << 12
 """Of the integral over an observer's sphere that a normalised gaze field is divided by: right to some thousandths, in a
