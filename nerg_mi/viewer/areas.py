@@ -62,7 +62,6 @@ class Areas:
         client, name = event.client, self._name.value
         if client is None:
             return
-        tell(client, "Areas", "Draw a rectangle around a thing: a box is laid around what is in it.")
         scene = client.scene
 
         @scene.on_rect_select()
@@ -79,6 +78,9 @@ class Areas:
                 tell(client, "Areas", sentence(error))
                 return
             self._name.value = f"area {len(self.session.regions) + 1}"
+
+        # Messages arrive in order: whoever reads this can draw, and does not turn the camera instead.
+        tell(client, "Areas", "Draw a rectangle around a thing: a box is laid around what is in it.")
 
     def _remove(self, event: Any) -> None:
         self.session.regions = [r for r in self.session.regions if r.name != self._chosen.value]

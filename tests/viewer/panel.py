@@ -86,9 +86,14 @@ class Panel:
         return path.read_bytes()
 
     def close_notes(self) -> None:
-        """Close the notes in the corner."""
-        for button in self.driver.find_elements("css selector", ".mantine-Notification-closeButton"):
-            self.driver.execute_script("arguments[0].click()", button)
+        """Close the notes in the corner, and wait until they are gone: they slide over the view."""
+        end = time.monotonic() + 20
+        while self.driver.find_elements("css selector", ".mantine-Notification-root"):
+            assert time.monotonic() < end, "the notes do not close"
+            self.driver.execute_script(
+                "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
+            )
+            time.sleep(0.1)
 
     def _one(self, where: str) -> Any:
         seen = [e for e in self.driver.find_elements("xpath", where) if e.is_displayed()]

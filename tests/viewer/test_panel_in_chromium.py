@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import time
 from xml.etree import ElementTree
 
 import numpy as np
@@ -157,7 +156,8 @@ def test06_an_area_is_drawn_named_and_saved(running, panel):
     panel.open("Areas of interest", "Draw a box in the view")
     panel.write("Name", "coolers")
     panel.press("Draw a box in the view")
-    time.sleep(0.5)
+    until(lambda: "Draw a rectangle around a thing" in panel.texts())
+    panel.close_notes()
     drag(panel.driver, (220, 300), (420, 440))
     region = until(lambda: next(iter(session.regions), None))
     panel.press("Save (JSON)")
