@@ -80,6 +80,8 @@ def plan_of(variant: Variant, seed: int, bench: Bench) -> GazePlan:
             steps=(options.default_steps if quick else options.steps) or None,
             probes=options.probes or None,
             refit=options.refit or quick,
+            # Heads are compared: what is mixed in besides would make them alike.
+            mix_folds=0,
             seed=seed,
         ),
         bench.place,

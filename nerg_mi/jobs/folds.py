@@ -38,7 +38,7 @@ FIELD, SCORED = "gaze.safetensors", "scores.json"
 """What the output of a fold holds: its field, and the rows of each split."""
 
 _RAYS = "of-the-job/rays.npz"
-_TRAINING = ("recipe", "variant", "radius", "probes", "steps", "mode")
+_TRAINING = ("recipe", "variant", "radius", "probes", "steps", "mix_folds", "mode")
 _SCORING = ("kappa", "directions", "min_rays", "mode")
 
 

@@ -36,6 +36,9 @@ from .gaze_plan import check_plan, plan_gaze
 from .options.gaze import GazeOptions
 from .reporter import SILENT, Reporter
 
+# From this share of the blind density on, that is most of what a field says.
+_MOSTLY_BLIND = 0.5
+
 
 @dataclass(frozen=True)
 class GazeResult:
@@ -229,5 +232,16 @@ def _tell(result: GazeResult, reporter: Reporter) -> None:
         f"{about['steps']} steps; {about['seconds']:.0f} s in all, of it {about['seconds_preparing']:.0f} s for the "
         f"probes{'; interrupted' if result.interrupted else ''}"
     )
+    if "mix" in about:
+        m = about["mix"]
+        reporter.message(
+            f"unseen people at unseen places, {m['folds']} folds: KLD {m['kld_field']:.3f} of the field, "
+            f"{m['kld_blind']:.3f} of the blind density; {100 * m['mix']:.0f} % of the latter are mixed in"
+        )
+        if m["mix"] >= _MOSTLY_BLIND:
+            reporter.warn(
+                "position tells little of where others look here: the gaze field is mostly where people look wherever "
+                "they stand; record more people, or give the place's surfaces"
+            )
     if result.output is not None:
         reporter.message(f"wrote {result.output} ({result.output.stat().st_size / 1e6:.2f} MB)")

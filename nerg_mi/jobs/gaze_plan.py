@@ -112,6 +112,7 @@ def _settings(options: GazeOptions) -> Mapping[str, Any]:
         loss=options.loss,
         zones=options.zones,
         refit=options.refit,
+        mix_folds=options.mix_folds,
         frozen=options.freeze,
         learning_rate=options.learning_rate,
         weight_decay=options.weight_decay,

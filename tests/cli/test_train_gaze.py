@@ -48,6 +48,7 @@ ASKED = {
     "learning_rate": 0.1,
     "weight_decay": 0.2,
     "zones": 2,
+    "mix_folds": 3,
     "test_zones": 4,
     "test_positions": 5,
     "test_people": 0.5,

@@ -90,8 +90,8 @@ class LogGazeConfig:
                 raise ValueError(f'"{what}" of a gaze field must be one of {", ".join(known)}, got "{value}"')
         if min(self.width, self.layers, self.sh_degree) < 1 or self.prior < 2 or not self.reach > 0:
             raise ValueError(f"every size of a gaze field must be positive, got {self}")
-        if not 0 <= self.mix < 1:
-            raise ValueError(f"the share of the blind density must lie in [0, 1), got {self.mix}")
+        if not 0 <= self.mix <= 1:
+            raise ValueError(f"the share of the blind density must lie in [0, 1], got {self.mix}")
         if np.shape(self.heads) != (2, 3) or not np.all(np.isfinite(self.heads)):
             raise ValueError(f"the box of heads needs two finite corners, got {self.heads}")
 

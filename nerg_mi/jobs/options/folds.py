@@ -28,6 +28,9 @@ class FoldOptions(PlaceOptions, PartOptions):
     radius: float | None = option(None, "Radius R of a probe in metres. Default: the recipe's.")
     probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.")
     steps: int | None = option(None, "Steps of a training. Default: the recipe's.")
+    mix_folds: int | None = option(
+        None, "Folds within each training that choose the share of the blind density. Default: the recipe's."
+    )
     most: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --first.", min=1)
     kappa: float = option(20.0, "Concentration of the kernel of truth and baselines.")
     directions: int = option(2048, "Directions that maps are compared in.")

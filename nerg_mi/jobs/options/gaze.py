@@ -66,6 +66,11 @@ class GazeOptions(PlaceOptions):
     zones: int | None = option(
         None, "Zones of positions watched as validation, whose best weights count; 0: none. Default: the recipe's."
     )
+    mix_folds: int | None = option(
+        None,
+        "Folds of people and positions that choose how much of the blind density default mixes in; 0: a twentieth. "
+        "Default: the recipe's.",
+    )
     refit: bool = option(True, "Train again on all rays once the best number of steps is known.")
     test_zones: int = option(0, "Zones of test positions that are left out of everything; 0: none.")
     test_positions: int = option(64, "Test positions in them.")

@@ -28,6 +28,7 @@ from nerg_mi.training.common.run_state import kept_unless, require_same
 from nerg_mi.training.geometry.places import GazePlace
 
 from .fit import GazeProgress, Listener
+from .mixing import MINUTES, choose_mix, give_mix, mixes
 from .plan import GazePlan
 from .run import train_gaze
 from .settings import GazeSettings
@@ -105,8 +106,11 @@ def train_ensemble(
     """
     state = state or StateSettings()
     rays, path = _resampled(members, supervision, plan), state.path
+    # Folds of resamples would have a person on both sides: the share of the blind density is chosen once, on the rays.
+    whole, plan = plan, plan.with_settings(mix_folds=0)
     if plan.settings.minutes is not None:
-        plan = plan.with_settings(minutes=plan.settings.minutes / members)
+        share = 1 - MINUTES if mixes(whole) else 1.0
+        plan = plan.with_settings(minutes=share * plan.settings.minutes / members)
     _, kind = blocks_of(rays)
     parts = [path and path.with_name(f"{path.stem}.member{k}.safetensors") for k in range(members)]
     is_file = lambda file: file is not None and file.is_file()
@@ -135,9 +139,14 @@ def train_ensemble(
                 raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {kept}")
         fields.append(field)
         each.append(provenance)
+    choice = None
+    if mixes(whole):
+        choice = choose_mix(supervision, place, whole, ns, tell or (lambda progress: None))
+        for field in fields if choice else ():
+            give_mix(field, choice.mix)
     ensemble = GazeEnsemble(fields, supervision.support(plan.probes.radius, place))
     ensemble.basis = basis_of(supervision.counts())
-    provenance = _account(each, plan.settings, rays, kind)
+    provenance = _account(each, plan.settings, rays, kind) | ({"mix": choice.to_dict()} if choice else {})
     if write is not None:
         # Every member is in its file by now: there is nothing more to keep if this fails.
         with kept_unless(path, lambda: None, done=False):

@@ -39,8 +39,7 @@ class LikelihoodTrainer(GazeTrainer):
     ):
         self._blind = targets.blind
         # Capture's encoding spans where people's heads were.
-        low, high = targets.positions.min(axis=0), targets.positions.max(axis=0)
-        config = replace(config, heads=(tuple(low.tolist()), tuple(np.maximum(high, low + 1e-3 * box.side).tolist())))
+        config = replace(config, heads=targets.heads or heads_box(targets.positions, box))
         super().__init__(targets, box, config, settings, ns, schedule, initial)
         trained = set(self.optimiser.keys())
         self.constant = {k: v for k, v in self.initial.parameters().items() if k not in trained}
@@ -76,17 +75,40 @@ class LikelihoodTrainer(GazeTrainer):
     def _logit(self, batch: Batch, parameters: dict) -> Any:
         return log_gaze(self.config, self.box, parameters, batch.p_od, batch.p_o, batch.r_o, batch.escaped, self.ns)
 
+    def densities(self, targets: Targets) -> tuple[np.ndarray, np.ndarray]:
+        """Densities (P, D) of the averaged weights in the directions of ``targets``, as the field is without its share
+        of the blind density; and the blind density there."""
+        parts, D = [], targets.truth.shape[1]
+        with dr.suspend_grad():
+            for batch in self.batches(targets):
+                density = self._normalised(batch, self._logit(batch, {**self.constant, **self.averaged}))
+                blind = dr.exp(self.initial.log_blind(batch.r_o))
+                parts.append([np.asarray(v).reshape(-1, D) for v in (density, blind)])
+        field, blind = (np.concatenate(v) for v in zip(*parts))
+        return field, blind
+
     def density(self, batch: Batch, parameters: dict) -> Any:
         logit, mix = self._logit(batch, parameters), self.config.mix
-        D = dr.width(logit) // dr.width(batch.extent)
-        density = dr.exp(logit - dr.repeat(log_mean_exp(logit, D) + dr.log(batch.extent), D))
+        density = self._normalised(batch, logit)
         if mix:
             # Of a view the share counts as on the sphere: the field's integral there is not known from within.
             density = (1 - mix) * density + mix * batch.given_view(dr.exp(self.initial.log_blind(batch.r_o)))
         return density
 
+    @staticmethod
+    def _normalised(batch: Batch, logit: Any) -> Any:
+        D = dr.width(logit) // dr.width(batch.extent)
+        return dr.exp(logit - dr.repeat(log_mean_exp(logit, D) + dr.log(batch.extent), D))
+
     def judge(self, kld: float, cc: float, mae: float, off: float) -> float:
         return kld
+
+
+def heads_box(positions: np.ndarray, box: AnyBox) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Corners of the box of observers at ``positions`` (N, 3), with some extent along each axis of the place's
+    ``box``."""
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    return tuple(low.tolist()), tuple(np.maximum(high, low + 1e-3 * box.side).tolist())
 
 
 def log_mean_exp(logit: Any, count: int) -> Any:

@@ -219,6 +219,7 @@ register(
             "weight_decay": 4.0,
             "average": 0.95,
             "watched_rays": 64,
+            "mix_folds": 5,
         },
         # Evenly over where people stood: as many at each place as there are rays would follow where people linger.
         # By person, not by time: whoever stays long at a place says little of others.

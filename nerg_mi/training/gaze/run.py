@@ -19,6 +19,7 @@ from nerg_mi.training.common.run_state import kept_unless
 from nerg_mi.training.geometry.places import GazePlace
 
 from .fit import Fit, GazeProgress, Listener, fit_again, fit_watched, rounded
+from .mixing import MINUTES, choose_mix, give_mix, mixes
 from .plan import GazePlan, alignment
 from .ray_targets import targets_of_rays
 from .splits import split_validation
@@ -49,8 +50,9 @@ def train_gaze(
 
     Some zones of positions are held out, purged by 2R, and watched: the weights that score best there count (the loss
     that is trained), and the run ends when they get no better. With ``refit`` a second fit then uses everything for as
-    many steps; the scores stay those of the first. Ctrl-C ends the run after the step at hand, with what it has come
-    to. Raises `NergError` when the rays make no probe.
+    many steps; the scores stay those of the first. Where there are rays, and ``plan.settings.mix_folds`` asks for them,
+    folds of people and positions then choose a log density's share of the blind density (``mixing``). Ctrl-C ends the
+    run after the step at hand, with what it has come to. Raises `NergError` when the rays make no probe.
 
     ``state``: where the state of the run is kept, and whether to go on from it. ``tell``: is told how the run goes.
     ``write``: is given the result, which it puts into a file. Once it has done so, the state of a run that is done is
@@ -63,7 +65,8 @@ def train_gaze(
     split, watched = split_validation(supervision, place, settings, plan.probes), None
     if split.watched is not None:
         watched = make_targets(split.watched, place, plan, needs, settings.seed + 2, split.centres)
-    refits = settings.refit and watched is not None
+    refits, mixed = settings.refit and watched is not None, mixes(plan) and supervision.rays is not None
+    share = (0.5 if refits else 1.0) * (1 - MINUTES if mixed else 1.0)
     prepared, again = 0.0, file.stage == "refit"
     used = supervision if again else split.learn
     targets = make_targets(used, place, plan, needs, settings.seed)
@@ -71,7 +74,7 @@ def train_gaze(
         first = Fit.of(file.found)
     else:
         prepared = time.perf_counter() - started
-        first = fit_watched(targets, watched, place.box, plan, ns, 0.5 if refits else 1.0, file, tell)
+        first = fit_watched(targets, watched, place.box, plan, ns, share, file, tell)
         again = refits and not first.interrupted
         if again:
             # Making the targets of everything may take long: what was found is kept before.
@@ -79,7 +82,15 @@ def train_gaze(
             used, targets = supervision, make_targets(supervision, place, plan, needs, settings.seed)
     last = fit_again(targets, first, place.box, plan, ns, file, tell) if again else first
     trainer = last.trainer
+    interrupted, choice = first.interrupted or last.interrupted, None
+    if mixed and not interrupted:
+        try:
+            choice = choose_mix(supervision, place, plan, ns, tell)
+        except KeyboardInterrupt:
+            interrupted = True
     field = trainer.field(last.weights)
+    if choice is not None:
+        give_mix(field, choice.mix)
     field.support = used.support(plan.probes.radius, place)
     field.basis = basis_of(supervision.counts())
     provenance = _provenance(supervision, place, plan, targets) | {
@@ -87,8 +98,10 @@ def train_gaze(
         "seconds": round(file.spent, 1),
         "seconds_preparing": round(prepared, 1),
         "refitted": again,
-        "interrupted": first.interrupted or last.interrupted,
+        "interrupted": interrupted,
     }
+    if choice is not None:
+        provenance["mix"] = choice.to_dict()
     if watched is not None and first.scores is not None:
         provenance["validation"] = {
             "zones": settings.zones,

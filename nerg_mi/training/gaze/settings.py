@@ -95,6 +95,8 @@ class GazeSettings:
     watched_rays: int | None = None
     # Whether to train again on everything, the validation's part too, for as many steps as were best.
     refit: bool = True
+    # Folds of people and positions that choose a log density's share of the blind density; 0: it is the architecture's.
+    mix_folds: int = 0
     # Whether weights that were given to begin with stay as they are.
     frozen: bool = False
 
@@ -108,7 +110,7 @@ class GazeSettings:
         if (
             min(self.probes, self.directions, self.rays, self.looks) < 1
             or min(self.weight_decay, self.integral) < 0
-            or min(self.zones, self.patience) < 0
+            or min(self.zones, self.patience, self.mix_folds) < 0
         ):
             raise NergError(f"a training needs probes, directions and looks, and nothing negative, got {self}")
 

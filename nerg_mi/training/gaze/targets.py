@@ -55,6 +55,8 @@ class Targets:
     blind: np.ndarray | None = None
     # The same observers in other directions, for the epoch that is given, where each epoch has its own.
     renew: Callable[[int], Targets] | None = None
+    # Corners of the box of observers that capture's encoding spans; None: that of the positions.
+    heads: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     # Solid angle (P,), sr, of which the D directions are parts and over which the truth integrates to one; None: 4π.
     extent: np.ndarray | None = None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -140,21 +141,25 @@ class GazeTrainer(ABC):
 
     def measure(self, targets: Targets, weights: dict | None = None) -> Scores:
         """Scores of the averaged weights (or of ``weights``) on other targets, all of their directions."""
-        data = TargetArrays(targets, self.ns)
-        block, rows = max(1, _CHUNK // data.directions), []
-        every = np.arange(data.directions)[None]
+        rows = []
         with dr.suspend_grad():
-            for a in range(0, data.count, block):
-                observers = np.arange(a, min(a + block, data.count))
-                batch = data.batch(observers, np.broadcast_to(every, (len(observers), data.directions)))
+            for batch in self.batches(targets):
                 density = self.density(batch, {**self.constant, **(weights or self.averaged)})
-                parts = gaze_loss(density, batch.truth, data.directions)
+                parts = gaze_loss(density, batch.truth, targets.truth.shape[1])
                 integral = batch.integral(density)
                 means = parts.kld, parts.cc, parts.mae, dr.mean(integral), dr.mean(dr.square(1 - integral))
-                rows.append((len(observers), *(float(v[0]) for v in means)))
+                rows.append((dr.width(batch.extent), *(float(v[0]) for v in means)))
         rows = np.array(rows)
         kld, cc, mae, integral, off = rows[:, 0] @ rows[:, 1:] / rows[:, 0].sum()
         return Scores(self.judge(kld, cc, mae, off), kld, cc, mae, integral)
+
+    def batches(self, targets: Targets) -> Iterator[Batch]:
+        """All of ``targets`` in all of their directions, some observers at a time."""
+        data = TargetArrays(targets, self.ns)
+        block, every = max(1, _CHUNK // data.directions), np.arange(data.directions)[None]
+        for a in range(0, data.count, block):
+            observers = np.arange(a, min(a + block, data.count))
+            yield data.batch(observers, np.broadcast_to(every, (len(observers), data.directions)))
 
     def weights(self) -> dict:
         """A copy of the averaged weights."""

@@ -186,7 +186,7 @@ def test_file(tmp_path, half):
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"mix": 1.0},
+        {"mix": 1.01},
         {"variant": "both"},
         {"geometry": "flat"},
         {"escaped": "never"},

@@ -1,0 +1,257 @@
+"""Places of boxes whose people follow known laws of attention: a gallery, an office with windows, a corridor, a stage.
+
+Unlike the demo store's, whose people share one law, these people differ: each has a taste of their own for every thing
+to look at. What they look at is held for a while, as fixations are. Everything follows from a seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+
+import numpy as np
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+# Standard deviation of the logarithm of a person's taste, and of the angle at which a thing is met (radians).
+_TASTE, _JITTER = 0.5, np.radians(8.0)
+# Share of samples at which a new thing is looked at: five samples a second, and some 0.6 s a look.
+_NEW_LOOK = 0.33
+_RATE = 5.0
+_SPEED = 0.7
+
+
+@dataclass(frozen=True)
+class Thing:
+    """A rectangle that draws eyes: its middle and half edges (3,), metres, and how much it draws."""
+
+    middle: tuple[float, float, float]
+    half: tuple[float, float, float]
+    draw: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneratedPlace:
+    """A place and a law. The chance of a thing is its draw and the person's taste, times 1 / (1 + (d / falloff)²) and
+    the cosine at which it is seen, where it is seen at all; ``ahead`` and ``around`` are draws of the way that is
+    walked, and of no thing in particular."""
+
+    name: str
+    boxes: tuple[Box, ...]
+    things: tuple[Thing, ...]
+    # Corners (2, 2) of the floor that people walk on; beyond are the walls.
+    floor: tuple[tuple[float, float], tuple[float, float]]
+    falloff: float = 1e3
+    ahead: float = 0.1
+    around: float = 0.2
+    # Metres that a person strays from where they begin; None: they walk everywhere.
+    strays: float | None = None
+    seated: bool = False
+    free: Callable[[np.ndarray], np.ndarray] = field(default=lambda p: np.ones(len(p), bool))
+
+    def write(self, path: Path) -> Path:
+        """The scene as XML, in metres, z up."""
+        shape = lambda low, high: (
+            '  <shape type="cube"><transform name="to_world">'
+            f'<scale x="{(high[0] - low[0]) / 2:g}" y="{(high[1] - low[1]) / 2:g}" z="{(high[2] - low[2]) / 2:g}"/>'
+            + '<translate x="{:g}" y="{:g}" z="{:g}"/>'.format(*((a + b) / 2 for a, b in zip(low, high)))
+            + "</transform></shape>"
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(
+            '<scene version="3.5.0">\n' + "\n".join(shape(low, high) for low, high in self.boxes) + "\n</scene>\n"
+        )
+        return path
+
+    def record(self, scene: Path, people: int = 16, seconds: float = 240.0, seed: int = 0):
+        """Rays of ``people`` in ``scene`` (its file), ``seconds`` each."""
+        from nerg_mi.rays.rays import Rays
+
+        import mitsuba as mi
+
+        twin = mi.load_file(str(scene))
+        rng = np.random.default_rng(seed)
+        count = round(seconds * _RATE)
+        middles = np.array([t.middle for t in self.things])
+        halves = np.array([t.half for t in self.things])
+        normals = np.eye(3)[np.argmin(halves, axis=1)]
+        draws = np.array([t.draw for t in self.things])
+        origins, directions, who, times = [], [], [], []
+        for person in range(people):
+            p, way = self._walk(rng, count)
+            taste = np.exp(_TASTE * rng.normal(size=len(draws)))
+            offset = middles[None] - p[:, None]
+            distance = np.linalg.norm(offset, axis=2)
+            cosine = np.abs(np.einsum("nkc,kc->nk", offset / distance[..., None], normals))
+            seen = self._seen(twin, p, middles)
+            weight = draws * taste * cosine * seen / (1 + (distance / self.falloff) ** 2)
+            weight = np.concatenate([weight, np.full((count, 1), self.ahead), np.full((count, 1), self.around)], axis=1)
+            chosen = self._look(rng, weight)
+            d = np.empty((count, 3))
+            spot = rng.uniform(-1, 1, (count, 3))
+            for i, k in enumerate(chosen):
+                if k < len(draws):
+                    d[i] = middles[k] + 0.8 * spot[i] * halves[k] - p[i]
+                elif k == len(draws):
+                    d[i] = [*way[i], -0.15]
+                else:
+                    d[i] = [*rng.normal(size=2), 0.3 * rng.normal() - 0.15]
+            d /= np.linalg.norm(d, axis=1, keepdims=True)
+            d += _JITTER * rng.normal(size=d.shape)
+            origins.append(p)
+            directions.append(d / np.linalg.norm(d, axis=1, keepdims=True))
+            who.append(np.full(count, person))
+            times.append(np.arange(count) / _RATE)
+        joined = [np.concatenate(v) for v in (times, who, origins, directions)]
+        names = tuple(f"{self.name}-{k:02d}" for k in range(people))
+        return Rays(joined[0], joined[1], names, joined[2], joined[3], np.ones(len(joined[0])))
+
+    def _walk(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Heads (count, 3) and ways (count, 2) of a person who walks from point to point and rests there."""
+        (low, high), height = np.array(self.floor), rng.normal(1.22 if self.seated else 1.63, 0.07)
+
+        def point(near: np.ndarray | None) -> np.ndarray:
+            while True:
+                at = rng.uniform(low, high) if near is None else near + self.strays * rng.uniform(-1, 1, 2)
+                if np.all((at >= low) & (at <= high)) and self.free(at[None])[0]:
+                    return at
+
+        home = point(None) if self.strays is not None else None
+        at, goal, rest = point(home), point(home), 0
+        heads, ways, way = np.empty((count, 3)), np.empty((count, 2)), np.array([1.0, 0.0])
+        for i in range(count):
+            away = goal - at
+            far = np.linalg.norm(away)
+            if rest:
+                rest -= 1
+            elif far < _SPEED / _RATE:
+                goal, rest = point(home), int(rng.integers(5, 40))
+            else:
+                way = away / far
+                ahead = at + way * _SPEED / _RATE
+                if self.free(ahead[None])[0]:
+                    at = ahead
+                else:
+                    goal = point(home)
+            heads[i], ways[i] = [*at, height + 0.01 * rng.normal()], way
+        return heads, ways
+
+    def _look(self, rng: np.random.Generator, weight: np.ndarray) -> np.ndarray:
+        """What is looked at (N,), held for a while, by chances (N, K)."""
+        drawn = (np.cumsum(weight, axis=1) / weight.sum(axis=1, keepdims=True) < rng.random((len(weight), 1))).sum(
+            axis=1
+        )
+        new, out = rng.random(len(weight)) < _NEW_LOOK, drawn.copy()
+        for i in range(1, len(out)):
+            # A thing that has gone out of sight is looked at no longer.
+            if not new[i] and weight[i, out[i - 1]] > 0:
+                out[i] = out[i - 1]
+        return out
+
+    @staticmethod
+    def _seen(twin, p: np.ndarray, middles: np.ndarray) -> np.ndarray:
+        """Whether nothing lies between (N, K); a thing itself is not in its own way."""
+        from nerg_mi.maths.arrays import vector_of
+
+        import mitsuba as mi
+
+        a, b = np.repeat(p, len(middles), axis=0), np.tile(middles, (len(p), 1))
+        way = b - a
+        ray = mi.Ray3f(vector_of(mi.Point3f, a), vector_of(mi.Vector3f, way))
+        ray.maxt = mi.Float(0.97)
+        return ~np.array(twin.ray_test(ray)).reshape(len(p), len(middles))
+
+
+def _walls(x: float, y: float, z: float, thick: float = 0.1) -> list[Box]:
+    return [
+        ((-thick, -thick, -thick), (x + thick, y + thick, 0)),
+        ((-thick, -thick, z), (x + thick, y + thick, z + thick)),
+        ((-thick, 0, 0), (0, y, z)),
+        ((x, 0, 0), (x + thick, y, z)),
+        ((0, -thick, 0), (x, 0, z)),
+        ((0, y, 0), (x, y + thick, z)),
+    ]
+
+
+def _gallery() -> GeneratedPlace:
+    """Pictures on the walls and on a partition that hides half of the room; near or far makes no difference."""
+    boxes = [*_walls(10, 8, 3.5), ((4.9, 2, 0), (5.1, 6, 3)), ((2, 6.4, 0), (2.5, 6.9, 1.1))]
+    things = [Thing((x, 0.02, 1.6), (0.5, 0.01, 0.4), d) for x, d in ((1.5, 1.0), (4, 0.6), (6.5, 2.0), (8.8, 0.5))]
+    things += [Thing((x, 7.98, 1.6), (0.4, 0.01, 0.6), d) for x, d in ((1.2, 0.8), (4.2, 1.5), (7.5, 1.0))]
+    things += [Thing((4.88, 4, 1.6), (0.01, 0.9, 0.6), 2.5), Thing((5.12, 4, 1.6), (0.01, 0.5, 0.7), 1.2)]
+    things += [Thing((9.98, 4, 1.6), (0.01, 1.0, 0.6), 1.5), Thing((2.25, 6.65, 1.3), (0.2, 0.15, 0.2), 1.2)]
+    free = lambda p: (
+        ~(
+            ((np.abs(p[:, 0] - 5) < 0.45) & (p[:, 1] > 1.6) & (p[:, 1] < 6.4))
+            | ((np.abs(p[:, 0] - 2.25) < 0.6) & (np.abs(p[:, 1] - 6.65) < 0.6))
+        )
+    )
+    return GeneratedPlace(
+        name="gallery", boxes=tuple(boxes), things=tuple(things), floor=((0.6, 0.6), (9.4, 7.4)), falloff=4.0, free=free
+    )
+
+
+def _office() -> GeneratedPlace:
+    """Desks with screens, near, and two windows without glass, through which there is nothing to meet."""
+    boxes = [box for box in _walls(9, 6, 2.8) if box[0] != (0, 6, 0)]
+    # The wall of the windows, in pieces around them.
+    boxes += [((0, 6, 0), (9, 6.1, 0.9)), ((0, 6, 2.3), (9, 6.1, 2.8))]
+    boxes += [((a, 6, 0.9), (b, 6.1, 2.3)) for a, b in ((0, 1), (3.5, 5.5), (8, 9))]
+    things = [Thing((2.25, 6.05, 1.6), (1.2, 0.01, 0.6), 0.7), Thing((6.75, 6.05, 1.6), (1.2, 0.01, 0.6), 0.7)]
+    spots = [(x, y) for x in (1.5, 4.5, 7.5) for y in (1.6, 3.8)]
+    for x, y in spots:
+        boxes.append(((x - 0.8, y - 0.4, 0.7), (x + 0.8, y + 0.4, 0.75)))
+        boxes.append(((x - 0.3, y - 0.05, 0.8), (x + 0.3, y, 1.2)))
+        things.append(Thing((x, y - 0.07, 1.0), (0.28, 0.01, 0.18), 3.0))
+    things.append(Thing((8.98, 3, 1.5), (0.01, 0.6, 0.45), 0.8))
+    desks = lambda p: np.any(
+        [(np.abs(p[:, 0] - x) < 0.85) & (p[:, 1] > y - 0.45) & (p[:, 1] < y + 0.45) for x, y in spots], axis=0
+    )
+    return GeneratedPlace(
+        name="office",
+        boxes=tuple(boxes),
+        things=tuple(things),
+        floor=((0.4, 0.4), (8.6, 5.6)),
+        falloff=1.5,
+        strays=1.2,
+        seated=True,
+        free=lambda p: ~desks(p),
+    )
+
+
+def _corridor() -> GeneratedPlace:
+    """Twenty metres to walk along, with a few doors and posters: ahead is what most look at."""
+    things = [Thing((x, 0.02, 1.4), (0.4, 0.01, 0.5), d) for x, d in ((3, 0.6), (8, 0.3), (15, 0.9))]
+    things += [Thing((x, 1.98, 1.5), (0.4, 0.01, 0.5), d) for x, d in ((5, 0.4), (12, 0.8))]
+    things.append(Thing((19.98, 1, 1.6), (0.01, 0.6, 0.7), 1.5))
+    return GeneratedPlace(
+        name="corridor",
+        boxes=tuple(_walls(20, 2, 2.6)),
+        things=tuple(things),
+        floor=((0.5, 0.5), (19.5, 1.5)),
+        falloff=2.5,
+        ahead=0.8,
+    )
+
+
+def _stage() -> GeneratedPlace:
+    """Rows of seats before a stage: everybody looks far ahead, and hardly moves."""
+    boxes = [*_walls(12, 16, 6), ((2, 0.5, 0), (10, 4, 1.0)), ((5.7, 2, 1.0), (6.3, 2.4, 2.1))]
+    boxes += [((1, y, 0), (11, y + 0.1, 0.9)) for y in (7.6, 9.0, 10.4, 11.8, 13.2)]
+    things = [Thing((6, 2.2, 2.3), (0.5, 0.2, 0.4), 4.0), Thing((3.4, 2, 2.0), (0.5, 0.3, 0.8), 1.5)]
+    things += [Thing((8.8, 2.4, 2.0), (0.5, 0.3, 0.8), 1.0), Thing((6, 0.02, 4.3), (2.5, 0.01, 1.0), 1.2)]
+    return GeneratedPlace(
+        name="stage",
+        boxes=tuple(boxes),
+        things=tuple(things),
+        floor=((1.2, 7.0), (10.8, 14.5)),
+        strays=0.3,
+        seated=True,
+        around=0.3,
+    )
+
+
+PLACES: Sequence[Callable[[], GeneratedPlace]] = (_gallery, _office, _corridor, _stage)

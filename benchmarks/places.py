@@ -1,0 +1,179 @@
+"""One protocol for gaze in many places: where is a field better than what knows less, and where is it worse?
+
+    python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--recipe default]
+        [--out out/benchmarks/places]
+
+Real people in a supermarket (surfaces from their hit points) and in three scenes of EyeNavGS (no geometry), the demo
+store's shoppers among its field, and four generated places with laws of their own (`generated_places.py`), among their
+walls. In each fold half of the people train, and the others are scored at 60 positions in three zones that nobody was
+trained on within 2R of. Beside the field: uniform, position-blind, nearest probes and nearest rays, and how well one
+half of those who are scored foretells the other. `rank` is among the methods that are no split half; `less` is the
+field less the best of the others, fold by fold, with 95 % of Student's t; `way` is how far the field goes from the
+blind density to the split half in CC. `--mix-folds 0` is a field without a chosen share of the blind density.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from output import write_rows
+
+ROOT = Path(__file__).resolve().parents[1]
+OURS, BLIND, HALF = "gaze field", "position-blind", "split half"
+# Higher is better.
+SCORES = {"KLD": False, "CC": True, "bits": True}
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
+    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
+    parser.add_argument("--only", help="names of places, with commas between. Default: all whose data is there.")
+    parser.add_argument("--recipe", default="default")
+    parser.add_argument("--folds", type=int, default=4)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
+    parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/places"))
+    args = parser.parse_args(argv)
+    args.out = args.out.resolve()
+    args.out.mkdir(parents=True, exist_ok=True)
+    places = makers(args.data)
+    names = args.only.split(",") if args.only else list(places)
+    each: list[dict] = []
+    for name in names:
+        if name not in places:
+            raise SystemExit(
+                f'no place is called "{name}" here; there are {", ".join(places)} (set NERG_DATA for more)'
+            )
+        each += score(name, places[name], args)
+    rows = summarise(each)
+    write_rows(args.out / "places.csv", rows)
+    write_rows(args.out / "folds.csv", each)
+    show(rows)
+
+
+def makers(data: Path) -> dict[str, Callable[[Path], tuple[Path, dict]]]:
+    """By name, what writes the rays of a place into a folder and says where it is: options of a fold."""
+    from generated_places import PLACES
+
+    out: dict[str, Callable[[Path], tuple[Path, dict]]] = {}
+    if files := sorted((data / "vr_supermarket").glob("*.csv.gz")):
+        out["supermarket"] = lambda folder: (recorded(files, "vr_supermarket", folder), {"geometry": "hits"})
+    for scene in ("room", "playroom", "truck"):
+        if files := sorted((data / "eyenavgs" / scene).glob("*.csv.gz")):
+            out[scene] = lambda folder, files=files: (recorded(files, "eyenavgs", folder), {"geometry": "none"})
+    out["store"] = store
+    for make in PLACES:
+        place = make()
+        out[place.name] = lambda folder, place=place: generated(place, folder)
+    return out
+
+
+def recorded(files: list[Path], reader: str, folder: Path) -> Path:
+    """Rays of recordings; those that are frozen for long are told of and left out."""
+    from nerg_mi.errors import NergError
+    from nerg_mi.jobs.tracking import ImportOptions, import_rays
+
+    path = folder / "rays.npz"
+    used = []
+    for file in files:
+        try:
+            import_rays([file], ImportOptions(reader=reader, output=path))
+            used.append(file)
+        except NergError as error:
+            print(f"  left out: {file.name}: {error}")
+    import_rays(used, ImportOptions(reader=reader, output=path))
+    return path
+
+
+def store(folder: Path) -> tuple[Path, dict]:
+    """The demo store's shoppers among its radiance field."""
+    from nerg_mi.jobs import demo
+    from nerg_mi.jobs.tracking import ImportOptions, import_rays
+    from nerg_mi.scenes.store import make
+
+    csv = Path(make.__file__).parent / "build" / "shoppers.csv"
+    if not csv.is_file():
+        make.main(["--stage", "shoppers"])
+    path = folder / "rays.npz"
+    import_rays([csv], ImportOptions(reader="skeleton22", tick=0.001, output=path))
+    return path, {"field": demo.store_scene().parent / "store.safetensors"}
+
+
+def generated(place, folder: Path) -> tuple[Path, dict]:
+    scene, path = place.write(folder / "scene.xml"), folder / "rays.npz"
+    place.record(scene).save(path)
+    return path, {"scene": scene}
+
+
+def score(name: str, make: Callable[[Path], tuple[Path, dict]], args: argparse.Namespace) -> list[dict]:
+    """A row a fold and method."""
+    from nerg_mi.cli.progress import TerminalReporter
+    from nerg_mi.jobs.backend import select_backend
+    from nerg_mi.jobs.folds import evaluate_folds
+    from nerg_mi.jobs.options.folds import FoldOptions
+
+    folder = args.out / name
+    folder.mkdir(exist_ok=True)
+    select_backend("llvm_ad_rgb", args.threads)
+    rays, where = make(folder)
+    options = FoldOptions(
+        **where,
+        recipe=args.recipe,
+        folds=args.folds,
+        first=args.first,
+        splits="both",
+        mix_folds=args.mix_folds,
+        threads=args.threads,
+    )
+    with TerminalReporter() as reporter:
+        found = evaluate_folds(rays, folder / "eval", options, reporter)
+    return [{"place": name, **{k: row[k] for k in ("fold", "method", *SCORES)}} for row in found.each]
+
+
+def summarise(each: list[dict]) -> list[dict]:
+    """A row a place: the field's scores, those of the best of the others, and how they differ."""
+    import numpy as np
+    from scipy.stats import t
+
+    out = []
+    for name in dict.fromkeys(row["place"] for row in each):
+        own = [row for row in each if row["place"] == name]
+        methods = [m for m in dict.fromkeys(row["method"] for row in own) if m != HALF]
+        row: dict = {"place": name, "folds": len({r["fold"] for r in own})}
+        for s, high in SCORES.items():
+            values = {m: np.array([r[s] for r in own if r["method"] == m], float) for m in methods}
+            means = {m: v.mean() for m, v in values.items()}
+            order = sorted(methods, key=lambda m: -means[m] if high else means[m])
+            best = next(m for m in order if m != OURS)
+            less = values[OURS] - values[best]
+            reach = t.ppf(0.975, len(less) - 1) * less.std(ddof=1) / np.sqrt(len(less)) if len(less) > 1 else np.nan
+            row |= {s: means[OURS], f"{s} blind": means[BLIND], f"{s} best": means[best], f"{s} best is": best}
+            row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": reach}
+            half = [r[s] for r in own if r["method"] == HALF]
+            row[f"{s} half"] = float(np.mean(half)) if half else np.nan
+        row["way"] = (row["CC"] - row["CC blind"]) / (row["CC half"] - row["CC blind"])
+        out.append(row)
+    return out
+
+
+def show(rows: list[dict]) -> None:
+    for s in SCORES:
+        print(f"\n{s:12s} field  blind   best  half  rank  field less best")
+        for r in rows:
+            print(
+                f"{r['place']:12s}{r[s]:6.3f}{r[f'{s} blind']:7.3f}{r[f'{s} best']:7.3f}{r[f'{s} half']:6.2f}"
+                f"{r[f'{s} rank']:6d}  {r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}  {r[f'{s} best is']}"
+            )
+    ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
+    worst = max(rows, key=lambda r: r["KLD less"])
+    print(f"\nmean rank {sum(ranks) / len(ranks):.2f}; worst place in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
+    print("way from blind to split half in CC: " + ", ".join(f"{r['place']} {r['way']:.0%}" for r in rows))
+
+
+if __name__ == "__main__":
+    main()

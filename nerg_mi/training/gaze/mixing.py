@@ -1,0 +1,159 @@
+"""How much of the blind density a gaze field is given, so that it is not worse than one that knows no position.
+
+Where few people were tracked, or hardly moved, a field follows those whom it has seen, and is worse for others than
+where people look wherever they stand. Folds of the training rays tell: in each some people are held out, at places that
+are held out too, and a field is trained on the others. The share of the blind density is that which foretells those who
+were held out best, by a mixture of both densities (stacking, Wolpert 1992; Smyth and Wolpert 1999). Of shares that
+cannot be told apart the largest is taken: the simpler density unless the field is better by a standard error (Breiman
+et al. 1984). Where the field needs none of it in the first folds, the others are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from types import ModuleType
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.gaze.log_density import LogGazeField
+from nerg_mi.interruption import Interruption
+from nerg_mi.rays.rays import Rays
+from nerg_mi.rays.splits import purge, split_by_position
+from nerg_mi.training.geometry.places import GazePlace
+
+from .fit import GazeProgress, Listener
+from .likelihood import LikelihoodTrainer, heads_box
+from .plan import GazePlan
+from .ray_targets import targets_of_rays
+from .supervision import Supervision
+from .targets import TargetNeeds
+
+SHARES = np.linspace(0.05, 1.0, 20)
+"""Shares of the blind density that are tried: never none, so that no density is zero."""
+MINUTES = 0.5
+"""Share of the minutes of a training that the folds take."""
+# Zones, positions in all of them and rays at each, of what a fold holds out; and directions that it is judged in.
+_ZONES, _POSITIONS, _RAYS, _DIRECTIONS = 3, 48, 16, 1024
+# Folds after which a field that needs no more than the least share in any is believed; probes of a fold at most, and
+# its steps as a share of the training's: both end alike for this question.
+_ENOUGH, _PROBES, _STEPS = 2, 512, 0.5
+# Of a density (1/sr), so that its logarithm is finite.
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True)
+class MixChoice:
+    """The share of the blind density that was chosen, and why."""
+
+    # The share.
+    mix: float
+    # How many folds had positions to be judged at.
+    folds: int
+    # KLD (nats) of what was held out, means over folds: with this share, of the field as it is (with the least share
+    # that is tried), and of the blind density alone; of kernel densities, so that none reaches zero.
+    kld: float
+    kld_field: float
+    kld_blind: float
+
+    def to_dict(self) -> dict:
+        """As JSON, for the provenance."""
+        return {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(self).items()}
+
+
+def mixes(plan: GazePlan) -> bool:
+    """Whether ``plan`` asks for a share that folds choose."""
+    return plan.settings.mix_folds > 0 and plan.trainer is LikelihoodTrainer
+
+
+def give_mix(field: LogGazeField, mix: float) -> None:
+    """Let the share of the blind density of ``field`` be ``mix``."""
+    field.config = replace(field.config, mix=mix)
+
+
+def choose_mix(
+    supervision: Supervision, place: GazePlace, plan: GazePlan, ns: ModuleType, tell: Listener = lambda progress: None
+) -> MixChoice | None:
+    """The share of the blind density for a field that ``plan`` trains on ``supervision``, which has rays, in ``place``;
+    None where no fold has people and positions enough to be judged by.
+
+    ``tell`` is told how it goes. Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does. The place is that
+    of all rays in each fold: one of hit points knows the surfaces that those who are held out have met, not who looked
+    there.
+    """
+    rays, curves = supervision.rays, []
+    if rays is None:
+        raise ValueError("folds are of rays, and there are none")
+    if plan.settings.minutes is not None:
+        plan = plan.with_settings(minutes=MINUTES * plan.settings.minutes / plan.settings.mix_folds)
+    settings, needs = plan.settings, TargetNeeds.of(plan.config)
+    probes = replace(plan.probes, count=min(plan.probes.count, _PROBES), fresh=False)
+    if settings.steps is not None:
+        settings = replace(settings, steps=math.ceil(_STEPS * settings.steps))
+    box = heads_box(place.points_from_rays(rays.origin), place.box)
+    for k, (learn, held, centres) in enumerate(inner_folds(rays, plan)):
+        try:
+            targets = targets_of_rays(learn, place, probes, needs, seed=settings.seed)
+        except NergError:
+            # Those who are left make no probe: this fold says nothing.
+            continue
+        judged = replace(probes, directions=_DIRECTIONS, min_rays=1)
+        truth = targets_of_rays(held, place, judged, needs, centres, settings.seed + 3)
+        trainer = LikelihoodTrainer(replace(targets, heads=box), place.box, plan.config, settings, ns)
+        with Interruption() as stop:
+            while trainer.progress < 1:
+                trainer.step()
+                done = (k + trainer.progress) / settings.mix_folds
+                tell(GazeProgress(f"fold {k + 1}", done, trainer.steps, trainer.seconds, None))
+                stop.check()
+        field, blind = trainer.densities(truth)
+        curves.append([_kld(truth.truth, (1 - m) * field + m * blind) for m in SHARES])
+        if len(curves) == _ENOUGH and all(int(np.argmin(curve)) == 0 for curve in curves):
+            break
+    return _choose(np.array(curves)) if curves else None
+
+
+def inner_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.ndarray]]:
+    """``(learn, held, centres)`` of each fold: the rays of some people away from ``centres`` (T, 3), and those of the
+    others, who are judged there. One person alone is held out at places only. A fold without such places is left out.
+    """
+    settings, radius = plan.settings, plan.probes.radius
+    rng = np.random.default_rng(settings.seed + 7)
+    people = rng.permutation(np.unique(rays.person))
+    alone = len(people) == 1
+    groups = [people] * settings.mix_folds if alone else np.array_split(people, min(settings.mix_folds, len(people)))
+    for k, group in enumerate(groups):
+        mask = np.isin(rays.person, group)
+        held = rays.select(mask)
+        try:
+            split = split_by_position(
+                held, radius, zones=_ZONES, test_probes=_POSITIONS, min_rays=_RAYS, seed=1000 * settings.seed + k
+            )
+        except NergError:
+            # These people have no zones with rays enough, or nothing else.
+            continue
+        learn = purge(rays, split.test_centres, 2 * radius)
+        if not alone:
+            learn &= ~mask
+        if learn.any():
+            yield rays.select(learn), held, split.test_centres
+
+
+def _kld(truth: np.ndarray, density: np.ndarray) -> float:
+    """Mean over observers of KLD (nats) of densities (P, D) in directions of equal area, each normalised."""
+    p = truth / truth.sum(axis=1, keepdims=True, dtype=np.float64)
+    q = np.maximum(density, _LEAST)
+    q = q / q.sum(axis=1, keepdims=True, dtype=np.float64)
+    return float((p * np.log(np.maximum(p, _LEAST / p.shape[1]) / q)).sum(axis=1).mean())
+
+
+def _choose(curves: np.ndarray) -> MixChoice:
+    """The largest of `SHARES` that is worse than the best by no more than a standard error over folds (F, S)."""
+    mean, count = curves.mean(axis=0), len(curves)
+    best = int(mean.argmin())
+    more = curves - curves[:, best : best + 1]
+    error = more.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.zeros(len(SHARES))
+    chosen = int(np.flatnonzero(more.mean(axis=0) <= error)[-1])
+    return MixChoice(float(SHARES[chosen]), count, float(mean[chosen]), float(mean[0]), float(mean[-1]))
