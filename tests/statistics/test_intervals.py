@@ -146,3 +146,28 @@ def test11_what_few_decide_is_as_uncertain_as_that():
     # As if most others were there too, and had hardly looked at it: then they are not few, and draws alone tell.
     by_draws = ratios(x, np.where(looks, y, 1e-9), resamples=199)
     assert held(by_draws) < 0.8 and held(found) > held(by_draws) + 0.05
+
+
+def test12_a_difference_from_what_one_has_done_has_no_interval():
+    # Ten people against ten others. Of the first, all add something; of the second, one, two, three, all and nobody.
+    rng = np.random.default_rng(9)
+    first, second = np.repeat([[1.0], [0]], 10, axis=0), np.repeat([[0.0], [1]], 10, axis=0)
+    x, u = rng.gamma(2, 1, (20, 5)) * first, rng.gamma(2, 1, (20, 5)) * second
+    for k, some in enumerate((1, 2, 3, 10, 0)):
+        u[10 + some :, k] = 0
+    pair = lambda v, who: (v, np.repeat(who, 5, axis=1))
+    for a, b in ((pair(x, first), pair(u, second)), (pair(u, second), pair(x, first))):
+        found = ratio_differences(a, b, resamples=199)
+        assert np.isfinite(found.value).all()
+        for ends in (found.low, found.high, found.p):
+            assert np.isfinite(ends).tolist() == [False, False, True, True, False]
+    # The same people, of whom one is counted in both: still chance. What is taken from all of them for certain is not.
+    before, after, there = x[:10], np.zeros((10, 5)), ONES((10, 5))
+    after[0] = 1
+    assert np.isnan(ratio_differences((before, there), (after, there), resamples=199).low).all()
+    gone = ratio_differences((before, there), (0 * after, there), resamples=199, changes=True)
+    alone = ratios(before, there, resamples=199)
+    assert gone.value == pytest.approx(-alone.value) and gone.low == pytest.approx(-2 * alone.value - gone.high)
+    assert (gone.high < 0).all() and (gone.p <= 0.05).all()
+    one = ratio_differences((after, there), (0 * after, there), resamples=199, changes=True)
+    assert np.isnan(one.low).all() and np.isnan(one.p).all()
