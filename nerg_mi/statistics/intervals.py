@@ -10,10 +10,11 @@ of the same: how often t* is at least that of the data. s* is that of the linear
 1977, section 6.4), drawn towards that of the data, s*² <- (1 - λ) s*² + λ s² (as the constant of Tusher et al. 2001):
 some draws of few people have hardly any spread, and would make it endless.
 
-A number to which fewer than three people add anything has no interval, and no difference from it has one. Where it concerns at most half of the people,
-and they weigh differently (y_p), as in the mean distance to what few look at, one or two of them may decide it: c is
-then at least that of Student's t of n - 1 degrees of freedom, n = (Σ j²)² / Σ j⁴ the effective number of people (Kish
-1965, section 8.2) of what each one adds to the jackknife's error, j_p.
+A number to which fewer than three people add anything has no interval, and no difference from it has one, but that of
+the same people from 0, to which none of them adds. Where a number concerns at most half of the people, and they weigh
+differently (y_p), as in the mean distance to what few look at, one or two of them may decide it: c is then at least
+that of Student's t of n - 1 degrees of freedom, n = (Σ j²)² / Σ j⁴ the effective number of people (Kish 1965, section
+8.2) of what each one adds to the jackknife's error, j_p.
 """
 
 from __future__ import annotations
@@ -56,12 +57,9 @@ def ratios(
     return Estimates(value, np.clip(low, 0.0, most), np.clip(high, 0.0, most), people)
 
 
-def ratio_differences(
-    first: Pair, second: Pair, *, resamples: int = RESAMPLES, seed: int = 0, changes: bool = False
-) -> Differences:
+def ratio_differences(first: Pair, second: Pair, *, resamples: int = RESAMPLES, seed: int = 0) -> Differences:
     """Σ x / Σ y of the ``second`` less that of the ``first``, each of arrays (P, K) over the same list of P people,
-    with y = 0 for those who are not of it: people who are of both are drawn together. ``changes``: both are known of
-    everybody without chance, before and after, so that a person of both adds to it where either is not 0."""
+    with y = 0 for those who are not of it: people who are of both are drawn together."""
     (x, y), (u, v) = first, second
     (a, ra, na), (b, rb, nb) = _linear(x, y), _linear(u, v)
     value, n = b - a, np.minimum(na, nb)
@@ -78,10 +76,10 @@ def ratio_differences(
             cross = w @ (x * u) - ma * (w @ (y * u)) - mb * (w @ (x * v)) + ma * mb * (w @ (y * v))
             cross *= 2 * np.sqrt(more_a * more_b) / ((w @ y) * (w @ v))
             t[part] = _studentised(mb - ma - value, np.maximum(more_a * sa + more_b * sb - cross, 0.0), linear)
-    adds = (x != 0, u != 0)
-    if changes:
-        adds = ((adds[0] | adds[1]) & (y > 0), (adds[0] | adds[1]) & (v > 0))
-    enough = np.minimum(*(some.sum(axis=0) for some in adds)) >= LEAST_PEOPLE
+    adds, others = (x != 0).sum(axis=0), (u != 0).sum(axis=0)
+    # A number to which nobody adds is 0 of each: of people who are of both, the difference is the other number.
+    same = (((x != 0) | (u != 0)) & (y > 0) & (v > 0)).sum(axis=0)
+    enough = np.minimum(np.where(adds, adds, same), np.where(others, others, same)) >= LEAST_PEOPLE
     reach = np.where(enough, _quantile(t, error) * error, np.nan)
     low, high = value - reach, value + reach
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -161,13 +161,14 @@ def test12_a_difference_from_what_one_has_done_has_no_interval():
         assert np.isfinite(found.value).all()
         for ends in (found.low, found.high, found.p):
             assert np.isfinite(ends).tolist() == [False, False, True, True, False]
-    # The same people, of whom one is counted in both: still chance. What is taken from all of them for certain is not.
+    # The same people, of whom one or two add something to the second; of nobody it is the first, the other way round.
     before, after, there = x[:10], np.zeros((10, 5)), ONES((10, 5))
-    after[0] = 1
-    assert np.isnan(ratio_differences((before, there), (after, there), resamples=199).low).all()
-    gone = ratio_differences((before, there), (0 * after, there), resamples=199, changes=True)
+    for some in (1, 2):
+        after[:some] = 1
+        assert np.isnan(ratio_differences((before, there), (after, there), resamples=199).low).all()
+    gone = ratio_differences((before, there), (0 * after, there), resamples=199)
     alone = ratios(before, there, resamples=199)
     assert gone.value == pytest.approx(-alone.value) and gone.low == pytest.approx(-2 * alone.value - gone.high)
     assert (gone.high < 0).all() and (gone.p <= 0.05).all()
-    one = ratio_differences((after, there), (0 * after, there), resamples=199, changes=True)
-    assert np.isnan(one.low).all() and np.isnan(one.p).all()
+    two = ratio_differences((after, there), (0 * after, there), resamples=199)
+    assert np.isnan(two.low).all() and np.isnan(two.p).all()

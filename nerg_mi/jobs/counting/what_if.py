@@ -92,7 +92,7 @@ def _row(name: str, measure: str, old, new, floor: Floor, resamples: int, seed: 
     row: Row = {"thing": name, "measure": measure, "people": people if told else None}
     row |= {"before": mean(old) if told else None, "after": mean(new) if told else None}
     both = bool(old[1].sum() and new[1].sum())
-    found = ratio_differences(old, new, resamples=resamples, seed=seed, changes=True) if both and told else None
+    found = ratio_differences(old, new, resamples=resamples, seed=seed) if both and told else None
     number = lambda v: float(v[0]) if np.isfinite(v[0]) else None
     keys = {"difference": "value", "low": "low", "high": "high", "p": "p"}
     return row | {k: None if found is None else number(getattr(found, v)) for k, v in keys.items()}
