@@ -18,13 +18,13 @@ from nerg_mi.files.video import video_frames
 from nerg_mi.rendering.pictures import activate
 from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.tasks.code import RENDERS, versions
-from nerg_mi.tasks.inputs import Checksums, InputFile, name_of, read_input, read_inputs
+from nerg_mi.tasks.inputs import Checksums, name_of, read_input, read_inputs
 from nerg_mi.tasks.plan import Plan
 from nerg_mi.tasks.run import Output
 from nerg_mi.tasks.task import Task
 from nerg_mi.threads import set_thread_count
 
-from .film_tasks import OF_PICTURES, draw_layers, make_layers, make_picture
+from .film_tasks import OF_PICTURES, draw_layers, make_layers, make_picture, named_defaults
 from .options.parts import FilmOptions
 from .overlays import check_scale, shares_a_scale
 from .parts import Parts
@@ -91,7 +91,7 @@ class _Film:
         parameters = {
             "scene": name_of(self.scene, inputs),
             "options": self.chosen,
-            "defaults": {name: _portable(value, inputs) for name, value in values.items()},
+            "defaults": named_defaults(values, inputs),
         }
         return Task(_name(function), parameters, inputs, suffix, self.versions, f"picture {k + 1}")
 
@@ -127,15 +127,6 @@ class _Film:
                 last = made.notes
                 add(_pixels(made.path))
         return last
-
-
-def _portable(value: str, inputs: tuple[InputFile, ...]) -> str | dict[str, str]:
-    """A value of a scene's `<default>`, with a file that it names by a whole path as the input that this is."""
-    if os.path.isabs(value):
-        found = {file.path: file.name for file in inputs}.get(os.path.abspath(value))
-        if found is not None:
-            return {"input": found}
-    return value
 
 
 def _pixels(path: Path) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from nerg_mi.files.npy import read_npy
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.rendering.scene_file import files_of_scene
+from nerg_mi.tasks.inputs import InputFile
 from nerg_mi.threads import use_share
 
 from .options.pictures import PictureOptions
@@ -68,13 +70,18 @@ def draw_layers(parameters: Mapping[str, Any], inputs: Mapping[str, Path], outpu
     save(figure, output, parameters["about"])
 
 
-def _given(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> tuple[Path, PictureOptions]:
-    """The scene and its options, with files where they are here."""
+def named_defaults(values: Mapping[str, str], inputs: Iterable[InputFile]) -> dict[str, str | dict[str, str]]:
+    """Values of a scene's `<default>`s, with files that they name by a whole path as the ``inputs`` that these are."""
+    names = {file.path: file.name for file in inputs}
+    given = {k: names.get(os.path.abspath(value)) if os.path.isabs(value) else None for k, value in values.items()}
+    return {k: values[k] if name is None else {"input": name} for k, name in given.items()}
+
+
+def placed_scene(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> tuple[Path, dict[str, str]]:
+    """The ``scene`` of ``parameters`` and its ``defaults``, with files where they are here. Raises `NergError` for one
+    that reads other files than ``inputs``."""
     defaults = {k: v if isinstance(v, str) else str(inputs[v["input"]]) for k, v in parameters["defaults"].items()}
     scene = inputs[parameters["scene"]]
-    use_share()
-    options = replace(PictureOptions(**parameters["options"]), defaults=defaults)
-    activate(options.mode)
     known = {path.resolve() for path in inputs.values()}
     for file in files_of_scene(scene, defaults):
         if file.resolve() not in known:
@@ -82,4 +89,13 @@ def _given(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> tuple[P
                 f'the scene "{scene.name}" reads "{file}", which is not the file that the job was planned with; name '
                 "files relative to the scene, so that workers find the same ones"
             )
-    return scene, options
+    return scene, defaults
+
+
+def _given(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> tuple[Path, PictureOptions]:
+    """The scene and its options."""
+    use_share()
+    options = PictureOptions(**parameters["options"])
+    activate(options.mode)
+    scene, defaults = placed_scene(parameters, inputs)
+    return scene, replace(options, defaults=defaults)

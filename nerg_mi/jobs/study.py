@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 import time
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.study import errors, measure, plots, tables
 from nerg_mi.evaluation.study.settings import Setting, settings
-from nerg_mi.evaluation.study.subject import ExactSurfaces, Subject, open_subject
+from nerg_mi.evaluation.study.subject import Subject, open_subject
 from nerg_mi.figures.provenance import Provenance, files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.rendering.pictures import activate
@@ -19,6 +18,7 @@ from nerg_mi.rendering.scene_file import files_of_scene
 
 from .options.study import StudyOptions
 from .reporter import SILENT, Reporter
+from .study_tasks import measured_in_parts, twin_beside
 from .versions import versions
 
 
@@ -34,7 +34,9 @@ def run_study(
     scene: str | Path, out: str | Path, options: StudyOptions | None = None, reporter: Reporter = SILENT
 ) -> StudyResult:
     """Study ``scene``, a scene file or the name of an analytic scene, and write tables and plots into the folder
-    ``out``: study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots.
+    ``out``: study.csv (a row a setting), study.md (the same by factor), scaling.csv, study.json and two plots. With
+    ``options.store`` or ``options.scheduler`` a few settings are a part, which is kept and may be measured by others:
+    errors are the same, and times those of whoever took them, with that one's time of the default beside them.
 
     Raises `NergError` for what the user can mend, before anything is written.
     """
@@ -55,7 +57,8 @@ def run_study(
     reporter.progress(0.0, "open")
     subject = open_subject(str(scene), options.scene_kind, width, height, options.defaults, twin_beside)
     rows = _chosen(settings(subject, options.quick), wanted, options.only)
-    repeats = 1 if options.quick else options.repeats
+    repeats, samples = (1, 16) if options.quick else (options.repeats, measure.PIXEL_SPP)
+    timed_by: list[dict] = []
     done = 0
 
     def step(name: str) -> None:
@@ -64,9 +67,13 @@ def run_study(
         reporter.progress(min(done / (2.2 * len(rows)), 0.99), name)
         done += 1
 
-    table = measure.measure(subject, rows, repeats, 16 if options.quick else measure.PIXEL_SPP, step)
+    if options.in_parts:
+        numbers = (repeats, samples)
+        table, scaling, timed_by = measured_in_parts(subject, scene, out, rows, numbers, mode, options, reporter)
+    else:
+        table = measure.measure(subject, rows, repeats, samples, step)
+        scaling = measure.scaling(subject, min(repeats, 3), options.quick, step)
     tables.mark_fronts(table)
-    scaling = measure.scaling(subject, min(repeats, 3), options.quick, step)
     known = subject.truth(measure.SEED, "expected", "depth")
     report = {
         "scene": subject.name,
@@ -80,7 +87,8 @@ def run_study(
         "precision": measure.precision(),
         "gaze_kld_eps": errors.KLD_EPS,
         "repeats": repeats,
-        "threads": dr.thread_count(),
+        "threads": timed_by[0]["threads"] if timed_by else dr.thread_count(),
+        "timed_by": timed_by,
         "peak_mb": "what Dr.Jit allocated at most during a first render, in MiB, beyond scene and field",
         "seconds_of_study": time.perf_counter() - begin,
         "versions": versions(mode),
@@ -113,17 +121,6 @@ def _chosen(all_settings: list[Setting], wanted: re.Pattern, only: str) -> list[
             f'no setting matches "{only}"; their names are those of an earlier study.csv, such as "{others[0].name}"'
         )
     return rows
-
-
-def twin_beside(scene: Path) -> ExactSurfaces | None:
-    """The surfaces of the ``twin.xml`` beside a scene file; None where there is none."""
-    file = scene.parent / "twin.xml"
-    if not file.is_file():
-        return None
-    from nerg_mi.scenes.store import twin  # pyright: ignore[reportMissingImports] at the root of a checkout
-
-    shapes = twin.load_twin(file)
-    return ExactSurfaces(partial(twin.cast, scene=shapes), partial(twin.visible, scene=shapes))
 
 
 def _write(out: Path, subject: Subject, report: dict, about: Provenance) -> list[Path]:

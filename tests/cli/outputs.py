@@ -184,7 +184,7 @@ CASES = (
     ),
     Case(
         "study",
-        "slab -o {o}/study --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
+        "slab -o {o}/study --store {i}/store --quick --width 12 --height 8 --only jitter -m llvm_ad_rgb",
         _below("study", STUDY),
         ("study",),
         ("evaluation.study.measure.measure", "evaluation.study.measure.scaling"),

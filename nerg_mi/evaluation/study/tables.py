@@ -14,6 +14,9 @@ from .settings import PAPER
 FRONTS = ("color_rmse", "depth_mae", "visibility_mae", "gaze_mae")
 """The errors that are set against time; a row's ``pareto`` names those for which it is on the front."""
 
+BESIDE = ("default_seconds", "default_cpu_seconds", "timed_by")
+"""Columns of rows that were timed in parts: the default's times by the process that timed the row, and which it was."""
+
 
 def pareto(points: list[tuple[float, float]]) -> list[bool]:
     """Which of the points (time, error) no other one beats: no other is at most as large in both and smaller in one."""
@@ -88,7 +91,8 @@ def write_tables(out: Path, report: dict) -> list[Path]:
     """Write ``study.csv`` (the rows), ``study.md`` (the same by factor, to read), ``scaling.csv`` and ``study.json``
     (all of ``report``); returns their paths."""
     paths = [out / "study.csv", out / "study.md", out / "scaling.csv", out / "study.json"]
-    for path, rows, columns in ((paths[0], report["rows"], COLUMNS), (paths[2], report["scaling"], None)):
+    of_rows = [*COLUMNS, *(BESIDE if report.get("timed_by") else ())]
+    for path, rows, columns in ((paths[0], report["rows"], of_rows), (paths[2], report["scaling"], None)):
         write_csv(
             path,
             ({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows),
@@ -157,6 +161,8 @@ def markdown(report: dict) -> str:
     if report["reference_change_when_step_halved"]:
         change = ", ".join(f"{k} {v:.2g}" for k, v in report["reference_change_when_step_halved"].items())
         text.append(f"Steps twice as long change the reference by: {change}")
+    if report.get("timed_by"):
+        text.append(_timed_by(report["timed_by"]))
     for group in dict.fromkeys(r["group"] for r in rows[1:]):
         mine = [default, *(r for r in rows if r["group"] == group)]
         cells = [[r["setting"], *(f"{r[k] * by:.3g}" if k in r else "" for k, _, by in shown)] for r in mine]
@@ -172,3 +178,13 @@ def markdown(report: dict) -> str:
         title = f"against the paper's marching, by {clock.replace('_', ' ')}"
         text.append(f"### {title}\n\n{markdown_table(head, cells)}")
     return "\n\n".join(text) + "\n"
+
+
+def _timed_by(who: list[dict]) -> str:
+    """Who took the times, in a sentence."""
+    of_each = (
+        f"process {found['process']} ({found['processor']}, {found['threads']} threads), {found['rows']} settings, "
+        "the default in {:.3g} to {:.3g} ms".format(*(1e3 * s for s in found["seconds"]))
+        for found in who
+    )
+    return f"Times are those of whoever measured a setting: {'; '.join(of_each)}."

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from . import option
+from .parts import PartOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyOptions:
+class StudyOptions(PartOptions):
     """What a study renders, and how often."""
 
     scene_kind: str = option("auto", "What SCENE is: auto, analytic or file.")
