@@ -8,7 +8,8 @@ millimetre from a wall: the share that is found neither on surfaces nor outside,
 double precision. `error`: of the demo store's twin in two sizes of faces, from one observer at several angles of
 pieces, the differences from the finest and the time. `detail`: heat on a plane from
 a point at several edges, against the Gaussian. `smoothing`: the same at several numbers of steps. `observers`: how far
-the shoppers are from those that stand for them. `halves`: CC over the twin's faces between two halves of the
+the shoppers are from those that stand for them. `stand-ins`: what so many leave on the twin by the store's field,
+against 32. `halves`: CC over the twin's faces between two halves of the
 shoppers, by lines and by cones of 1.5 degrees, smoothed along the surface. Shoppers are simulated; `--rays` takes
 others. `supermarket`: the same of the people tracked in a VR supermarket, on voxels of what their rays hit.
 """
@@ -25,7 +26,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 import numpy as np
 
 EYE = (4.4, 2.8, 1.6)
-TABLES = ("conservation", "error", "detail", "smoothing", "observers", "halves", "supermarket")
+TABLES = ("conservation", "error", "detail", "smoothing", "observers", "stand-ins", "halves", "supermarket")
 
 
 def law(kappa: float):
@@ -176,6 +177,45 @@ def observers(args) -> list[dict]:
     return rows
 
 
+def stand_ins(args) -> list[dict]:
+    """Bakes of the store's field by fewer observers than 32, against theirs."""
+    from nerg_mi.evaluation.saliency import cc
+    from nerg_mi.jobs.bake import bake
+    from nerg_mi.jobs.options.bake import BakeOptions
+    from nerg_mi.scenes import store
+
+    folder, rays = Path(store.__file__).parent, shoppers(args)
+    rows, best = [], None
+    for count in (32, 4, 8, 16):
+        given = {
+            "gaze": folder / "shoppers.safetensors",
+            "observers": count,
+            "angle": 8.0,
+            "detail": 2.0,
+            "mode": "llvm_ad_rgb",
+        }
+        start = time.process_time()
+        found = bake(folder / "twin.ply", (), BakeOptions(**given), rays=rays)
+        seconds = time.process_time() - start
+        best = found if best is None else best
+        row = {"observers": count, "L1": float(np.abs(found.share - best.share).sum())}
+        shelves, theirs = (_shelf_shares(f, store) for f in (found, best))
+        row |= {"CC": float(cc(found.density, best.density, found.mesh.vertex_area))}
+        row |= {"share of a good, median off": float(np.median(np.abs(shelves / theirs - 1)))}
+        rows.append({**row, "CPU seconds": seconds})
+    return rows[1:]
+
+
+def _shelf_shares(found, store) -> np.ndarray:
+    """Of each of the store's goods the share of faces whose centres lie in its box."""
+    from nerg_mi.formats.areas.reading import read_areas
+
+    centres = found.mesh.corners.mean(axis=1)
+    boxes = read_areas(Path(store.__file__).parent / "regions.json").boxes
+    within = [((centres >= b.lower) & (centres <= b.upper)).all(axis=1) for b in boxes]
+    return np.array([found.share[w].sum() for w in within])
+
+
 def halves(args) -> list[dict]:
     rays = shoppers(args)
     return [row for some in (8, len(rays.persons)) for row in agreement(rays, twin_surface(0.15).mesh, some)]
@@ -261,7 +301,7 @@ def main(argv=None) -> None:
     args = parser.parse_args(argv)
     every = []
     for name in args.tables.split(","):
-        rows = globals()[name](args)
+        rows = globals()[name.replace("-", "_")](args)
         cell = lambda v: f"{v:.3g}" if isinstance(v, float) else v
         print(
             f"{name}\n\n{markdown_table(list(rows[0]), [[cell(v) for v in row.values()] for row in rows])}\n",

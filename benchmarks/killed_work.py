@@ -117,6 +117,7 @@ def disturbed(folder: Path, name: str, line: tuple[str, ...], cluster) -> tuple[
 def main() -> None:
     from nerg_mi.tasks.store import Store
 
+    from tests.tasks import clusters
     from tests.tasks.clusters import ELSEWHERE, ClusterOfProcesses
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -125,6 +126,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/killed_work"))
     args = parser.parse_args()
     os.environ["PYTHONPATH"] = str(ROOT)
+    # A training is a part, and may take minutes beside other work.
+    clusters.DEADLINE = 600.0
     rows: list[dict] = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

@@ -3,6 +3,7 @@
     python benchmarks/object_coverage.py shares        # intervals of shares of people, exactly
     python benchmarks/object_coverage.py ratios        # ways to make intervals of ratios of sums over people
     python benchmarks/object_coverage.py numbers       # each number of `nerg stats` as it is
+    python benchmarks/object_coverage.py few           # what may hold numbers that few people decide
     python benchmarks/object_coverage.py differences   # differences of two groups of the same people
 
 The population are the sums of 8,000 visits of the demo store's shoppers: 200 walks, each looked along 40 times anew by
@@ -215,7 +216,7 @@ HEAD = (
 )
 
 
-def compare(population: Population, sets: int, people: tuple[int, ...], names: tuple[str, ...]) -> None:
+def compare(population: Population, sets: int, people: tuple[int, ...], names: tuple[str, ...], ways=ratio_intervals):
     for name in names:
         print(f"\n{BY_NAME[name].title}\n\n| interval {HEAD}")
         for n in people:
@@ -223,13 +224,38 @@ def compare(population: Population, sets: int, people: tuple[int, ...], names: t
             for _ in range(sets):
                 x, y = population.draw(name, rng.integers(0, population.count, n))
                 with np.errstate(all="ignore"):
-                    made = ratio_intervals(x, y, int(rng.integers(1 << 30)))
-                known = np.isfinite(made["symmetric bootstrap-t, jackknife (kept)"][0])
+                    made = ways(x, y, int(rng.integers(1 << 30)))
+                known = np.isfinite(next(ends for way, ends in made.items() if "kept" in way)[0])
                 for way, (low, high) in made.items():
                     held = Held(population.truth[name], population.common, BY_NAME[name].most)
                     found.setdefault(way, held).add(low, high, known)
             for way, held in found.items():
                 print(f"| {way} | {n} {held.cells(True)}{held.cells(False)}|", flush=True)
+
+
+def few_intervals(x: np.ndarray, y: np.ndarray, seed: int) -> dict:
+    """Ends of the intervals (K,) with other factors of the error where few people decide a number."""
+    from nerg_mi.statistics import intervals
+    from nerg_mi.statistics.intervals import ratios
+
+    kept = ratios(x, y, resamples=RESAMPLES, seed=seed)
+    value, _, people = intervals._linear(x, y)
+    apart = intervals._left_out(x, y, value, people)
+    error, square = np.sqrt((apart**2).sum(axis=0)), apart**2
+    c = (kept.high - value) / error
+    few = (people <= len(x) / 2) & (np.where(y > 0, y, np.inf).min(axis=0) < y.max(axis=0))
+    t = lambda freedom: stats.t.ppf(0.975, np.maximum(freedom, 1.0))
+    effective = square.sum(axis=0) ** 2 / (square**2).sum(axis=0)
+    adds = (x != 0).sum(axis=0)
+    factors = {
+        "kept": c,
+        "at least t of half the freedom": np.where(few, np.maximum(c, t((effective - 1) / 2)), c),
+        "at least t of all by the largest": np.where(few, np.maximum(c, t(square.sum(0) / square.max(0) - 1)), c),
+        "at least t, two thirds": np.where(people <= len(x) * 2 / 3, np.maximum(c, t(effective - 1)), c),
+        "t alone": np.where(adds <= len(x) / 2, t(effective - 1), c),
+        "at most t of those who add": np.where(adds <= len(x) / 2, np.minimum(c, t(adds - 1)), c),
+    }
+    return {name: (value - factor * error, value + factor * error) for name, factor in factors.items()}
 
 
 def numbers(population: Population, sets: int, people: tuple[int, ...]) -> None:
@@ -281,7 +307,7 @@ def differences(population: Population, sets: int, pairs: tuple[tuple[int, int],
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("shares", "ratios", "numbers", "differences"))
+    parser.add_argument("what", choices=("shares", "ratios", "few", "numbers", "differences"))
     parser.add_argument("--sets", type=int, default=1000, help="data sets (1000)")
     parser.add_argument("--people", type=int, nargs="+", default=[8, 16, 40], help="people of each (8 16 40)")
     parser.add_argument("--of", nargs="+", default=["share", "given_visible", "distance"], help="numbers of the ratios")
@@ -302,6 +328,8 @@ def main() -> None:
     )
     if given.what == "ratios":
         compare(population, given.sets, people, tuple(given.of))
+    elif given.what == "few":
+        compare(population, given.sets, people, tuple(given.of), few_intervals)
     elif given.what == "numbers":
         numbers(population, given.sets, people)
     else:

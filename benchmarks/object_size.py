@@ -1,6 +1,7 @@
 """Ten million tracked rays through `nerg stats`: seconds, processor seconds and memory of the command.
 
-    python benchmarks/object_size.py [--rays 100000 1000000 10000000] [--seen 100000 1000000] [--folder FOLDER]
+    python benchmarks/object_size.py [--rays 100000 1000000 10000000] [--seen 100000 1000000] [--min-people N]
+                                     [--folder FOLDER]
 
 The rays are walks of the demo store's shoppers, tracked once in 0.8 s, with directions by the store's law; every copy
 of the 60 walks is of other people an hour later, ten copies a day, turned by a degree at random. They are written as
@@ -82,6 +83,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rays", type=int, nargs="*", default=[100_000, 1_000_000, 10_000_000])
     parser.add_argument("--seen", type=int, nargs="*", default=[100_000, 1_000_000])
+    parser.add_argument("--min-people", type=int, default=1, help="of the command: 2 or more leave out single people")
     parser.add_argument("--folder", type=Path, help="where datasets are made and kept")
     given = parser.parse_args()
     folder = given.folder or Path(tempfile.mkdtemp())
@@ -94,7 +96,7 @@ def main() -> None:
             path = made_dataset(folder, count)
             data = RayDataset.open(path)
             out = folder / f"numbers-{count}-{seen}"
-            more = ["--seen"] if seen else []
+            more = ["--min-people", str(given.min_people), *(["--seen"] if seen else [])]
             asked = ["stats", str(path), str(store / "shapes.xml"), "--areas", str(store / "regions.json")]
             wall, cpu, memory = run([*asked, "-o", str(out), *more])
             print(
