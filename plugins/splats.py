@@ -72,6 +72,7 @@ from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.properties import choice, number, resolved, text, transform, volume_of
 from nerg_mi.registration import register
+from nerg_mi.transport.freezing import recording
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from nerg_mi.transport.media.splats.medium import SplatMedium
 
@@ -119,6 +120,11 @@ class SplatsVolume(mi.Volume):
             cb.put(name, value, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys=()):
+        if recording():
+            raise NergError(
+                "Gaussians cannot be changed inside of a function that dr.freeze records, as their tree is built "
+                "outside of kernels: call params.update() before the function"
+            )
         self.arrays.pack()
 
     def to_string(self):

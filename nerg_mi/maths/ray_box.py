@@ -10,13 +10,15 @@ from numpy.typing import ArrayLike
 def intersect_box(o, d, lower, upper):
     """Parameters ``(t_near, t_far)`` at which ``o + t d`` enters and leaves the box.
 
-    ``o``, ``d``: Array3f; ``lower``, ``upper``: sequences of 3 numbers. The ray misses where
+    ``o``, ``d``: Array3f; ``lower``, ``upper``: sequences of 3 numbers, which kernels are compiled with, or of 3 Floats,
+    which they read. The ray misses where
     ``t_near >= t_far``. ``t_near`` is not clamped to 0. A component of ``d`` that is zero
     never divides: such a ray is inside that slab for all t or for none.
     """
     Float = type(o.x)
+    lower, upper = ([v if dr.is_array_v(v) else float(v) for v in corner] for corner in (lower, upper))
     near, far = Float(-dr.inf), Float(dr.inf)
-    for oc, dc, lo, hi in zip((o.x, o.y, o.z), (d.x, d.y, d.z), map(float, lower), map(float, upper)):
+    for oc, dc, lo, hi in zip((o.x, o.y, o.z), (d.x, d.y, d.z), lower, upper):
         parallel = dc == 0
         inverse = 1 / dr.select(parallel, 1, dc)
         a, b = (lo - oc) * inverse, (hi - oc) * inverse

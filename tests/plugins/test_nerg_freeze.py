@@ -6,6 +6,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from nerg_mi.registration import plugin_class
+from tests.formats.splats.writers import random_splats
+
 from . import fields
 from .scenes import camera, observer_at, with_gaze
 
@@ -153,3 +156,59 @@ def test09_garbage_waits_until_a_recording_is_over(rgb, files):
     assert seen == [False] and gc.isenabled()
     with freezing.no_collection():
         assert gc.isenabled()
+
+
+def splat_scene(mi, **more):
+    place = plugin_class("splats").of(random_splats(40, degree=1, size=0.2))
+    integrator = {"type": "nerg", "id": "integrator", "field": place, "aovs": "depth,opacity", **more}
+    return mi.load_dict({"type": "scene", "i": integrator, "s": camera(mi, size=6)})
+
+
+def test10_gaussians_that_move(rgb):
+    check(rgb, splat_scene(rgb), "integrator.field.centers", lambda mi, value, i: value + 0.1 * i)
+
+
+def test11_gaussians_that_learn(rgb):
+    """As weights do; and no kernel is compiled for where Gaussians have gone."""
+    names = [f"integrator.field.{name}" for name in ("centers", "scales", "rotations", "opacities", "harmonics")]
+    ways, reference = [], rgb.render(splat_scene(rgb), spp=1) * 0.9
+    for frozen in (False, True):
+        scene = splat_scene(rgb)
+        params = rgb.traverse(scene)
+        opt = rgb.ad.Adam(lr=1e-2, params={name: params[name] for name in names})
+        params.update(opt)
+
+        def step(scene, params, reference, seed):
+            loss = dr.mean(dr.square(rgb.render(scene, params, spp=1, seed=seed) - reference), axis=None)
+            dr.backward(loss)
+            return loss
+
+        step, way = dr.freeze(step) if frozen else step, []
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            for i in range(5):
+                if i == 3:
+                    dr.kernel_history_clear()
+                way.append(step(scene, params, reference, rgb.UInt32(i)).numpy().item())
+                opt.step()
+                params.update(opt)
+            # Of all 36 pixels; others pack the Gaussians.
+            found = [kernel["cache_hit"] for kernel in dr.kernel_history() if kernel["size"] == 36]
+        assert all(found) and (frozen or found)
+        ways.append(way)
+    assert ways[0][1] != ways[0][0] and np.allclose(ways[0], ways[1], rtol=1e-4)
+    assert step.n_recordings <= 3
+
+
+def test12_gaussians_are_not_changed_inside(rgb):
+    scene = splat_scene(rgb)
+    params = rgb.traverse(scene)
+
+    @dr.freeze
+    def move(scene, params, by):
+        params["integrator.field.centers"] = params["integrator.field.centers"] + by
+        params.update()
+        return rgb.render(scene, spp=1)
+
+    with pytest.raises(RuntimeError) as found:
+        move(scene, params, rgb.Float(0.1))
+    assert "call params.update() before the function" in str(found.value.__cause__)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -21,6 +21,7 @@ MOST_ABSORBED = 0.9999
 """Share of light that one Gaussian absorbs at most, as in Mitsuba's ``volprim_rf_basic``."""
 
 _NAMES = ("centers", "scales", "rotations", "opacities", "harmonics")
+_PACKED = ("shapes", "colors", "nodes", "places", "order", "corners")
 
 
 class SplatArrays:
@@ -29,8 +30,11 @@ class SplatArrays:
     ``ns``: namespace of the backend. The attributes ``centers``, ``scales``, ``rotations`` (w first), ``opacities`` and
     ``harmonics`` are flat Floats in the order of ``splats``; after a change of them ``pack`` is to be called. What
     kernels read is derived from them, with derivatives, in the order of a tree: ``shapes`` and ``colors``; ``nodes``
-    and ``places``: see `tree`.
+    and ``places``: see `tree`; ``corners``: the lower and the upper corner of all, 6 Floats of one number.
     """
+
+    # So that Dr.Jit finds them in frozen functions.
+    DRJIT_STRUCT: ClassVar[dict[str, Any]] = dict.fromkeys((*_NAMES, *_PACKED))
 
     centers: Float
     scales: Float
@@ -63,6 +67,8 @@ class SplatArrays:
         half = self.extent * np.sqrt(((matrices_of(rotations) * scales[:, None]) ** 2).sum(axis=2))
         tree = build_tree(centers - half, centers + half)
         self.lower, self.upper = (centers - half).min(axis=0), (centers + half).max(axis=0)
+        # Read by kernels, which would be compiled anew if they held the numbers, as often as Gaussians are moved.
+        self.corners = [dr.opaque(ns.Float, float(v)) for v in (*self.lower, *self.upper)]
         self.thickness = float(np.median(scales.min(axis=1)))
         self.leaves = tree.leaves
         self.nodes, self.places = ns.Float(tree.nodes.ravel()), ns.UInt32(tree.places)

@@ -61,7 +61,7 @@ class SplatMedium:
         along = self.to_world.vector_to_local(d)
         w = self.to_world.direction_to_local(d)
         p = self.to_world.point_to_local(o)
-        near, far = intersect_box(p, along, self.arrays.lower, self.arrays.upper)
+        near, far = intersect_box(p, along, self.arrays.corners[:3], self.arrays.corners[3:])
         return LocalRay(p, along, w, near, far)
 
     def to_local(self, p: Point3f) -> Point3f:
