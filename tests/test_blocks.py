@@ -27,6 +27,7 @@ RUN_ELSEWHERE = {
     ("pictures.md", "py"): "tests/test_pictures_page.py",
     ("python.md", "python"): "tests/api/test_page.py",
     ("sign.md", "python"): "tests/test_sign_page.py",
+    ("splats.md", "python"): "tests/plugins/test_splats.py",
     ("rays.md", "python"): "tests/rays/test_manual.py",
     ("shop.md", "json"): "tests/test_shop_page.py",
     ("shop.md", "python"): "tests/test_shop_page.py",

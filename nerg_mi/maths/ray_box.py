@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike
 def intersect_box(o, d, lower, upper):
     """Parameters ``(t_near, t_far)`` at which ``o + t d`` enters and leaves the box.
 
-    ``o``, ``d``: Array3f; ``lower``, ``upper``: sequences of 3 numbers, which kernels are compiled with, or of 3 Floats,
-    which they read. The ray misses where
-    ``t_near >= t_far``. ``t_near`` is not clamped to 0. A component of ``d`` that is zero
-    never divides: such a ray is inside that slab for all t or for none.
+    ``o``, ``d``: Array3f; ``lower``, ``upper``: sequences of 3 numbers, which kernels are compiled with, or of 3
+    Floats, which they read. The ray misses where ``t_near >= t_far``. ``t_near`` is not clamped to 0. A component of
+    ``d`` that is zero never divides: such a ray is inside that slab for all t or for none.
     """
     Float = type(o.x)
     lower, upper = ([v if dr.is_array_v(v) else float(v) for v in corner] for corner in (lower, upper))

@@ -1,5 +1,7 @@
 """The volume `splats` in the integrator: against Mitsuba's own renderer of splats, and beside shapes and observers."""
 
+import re
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.field.splats import Splats, harmonics_of, joined
 from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.registration import plugin_class
+from tests.conftest import ROOT
 from tests.formats.splats.writers import random_splats
 
 from .scenes import camera, look_at
@@ -168,6 +171,42 @@ def test_a_picture_is_differentiated(rgb, tmp_path):
         params.update()
         ends.append(np.array(rgb.render(scene, params, spp=1, seed=0), np.float64)[..., :4].mean())
     assert abs(found) > 1e-2 and np.isclose(found, (ends[0] - ends[1]) / 2e-3, rtol=2e-2)
+
+
+def test_the_page_on_fitting_runs(rgb, tmp_path, monkeypatch):
+    """The block of docs/splats.md."""
+    write_ply_splats(tmp_path / "store.ply", random_splats(20, degree=0, size=0.2))
+    monkeypatch.chdir(tmp_path)
+    (text,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "splats.md").read_text("utf-8"), re.M | re.S)
+    names: dict = {}
+    exec(compile(text, "splats.md", "exec"), names)
+    losses = [loss.numpy().item() for loss in names["losses"]]
+    assert len(losses) == 4 and losses[-1] < 0.9 * losses[0]
+
+
+def test_all_sizes_and_opacities_give_finite_pictures(rgb, tmp_path):
+    # Needles, pancakes, points and haloes, many of them overlapping and hardly to be seen; the camera is inside.
+    rng = np.random.default_rng(5)
+    n = 300
+    sizes = np.array([[1e-6] * 3, [1e-6, 1e-6, 1], [1e-6, 1, 1], [1e3] * 3, [1e3, 1e-6, 1e3], [0.3] * 3])
+    opacities = rng.choice([0, 1e-3, 0.05, 1], n)
+    colors = harmonics_of(rng.uniform(-1, 2, (n, 3)))
+    some = Splats(rng.normal(0, 1, (n, 3)), rng.choice(sizes, n), rng.normal(size=(n, 4)), opacities, colors)
+    place = plugin_class("splats").of(some)
+    integrator = {"type": "nerg", "id": "i", "field": place, "aovs": "depth,opacity,position"}
+    scene = rgb.load_dict({"type": "scene", "i": integrator, "s": camera(rgb, (0, 0, 0), (0.3, 0.2, 1), size=8)})
+    params = rgb.traverse(scene)
+    for name in ("centers", "scales", "rotations", "opacities", "harmonics"):
+        dr.enable_grad(params[f"i.field.{name}"])
+    params.update()
+    picture = rgb.render(scene, params, spp=1)
+    found = np.array(picture)
+    assert np.isfinite(found).all() and found[..., 4].min() >= 0 and found[..., 4].max() <= 1
+    assert found[..., 4].max() > 0.1
+    dr.backward(dr.mean(picture, axis=None))
+    for name in ("centers", "scales", "rotations", "opacities", "harmonics"):
+        grad = np.array(dr.grad(params[f"i.field.{name}"]))
+        assert np.isfinite(grad).all(), (name, (~np.isfinite(grad)).sum())
 
 
 def test_the_volume_says_what_it_is(rgb, tmp_path):

@@ -16,7 +16,7 @@ import numpy as np
 
 from . import paper as study_paper
 from .errors import NAMES, errors
-from .parameters import parameters
+from .parameters import extent, parameters
 from .reference import Truth
 from .settings import Setting
 
@@ -38,6 +38,7 @@ COLUMNS = (
     "coarse",
     "dt_gamma",
     "stop",
+    "extent",
     "color_cutoff",
     "refined",
     "depth",
@@ -52,6 +53,8 @@ COLUMNS = (
 )
 MARCHING = ("quadrature", "step", "coarse", "dt_gamma", "stop", "color_cutoff", "refined", "depth", "jitter")
 """The parameters that mean nothing where nothing is marched."""
+OF_HITS = ("stop", "depth")
+"""Those of them that mean something where Gaussians are met."""
 COUNTS = ("density_evals", "color_evals", "gaze_evals")
 SEED = 1
 # Samples a pixel of the picture that settings with several are compared with.
@@ -99,10 +102,12 @@ def _parameters(subject, row: Setting, integrator) -> dict:
         values["map_height"] = ""
     if not subject.marched:
         values |= dict.fromkeys(MARCHING, "")
+    if subject.hits:
+        values |= dict.fromkeys((n for n in MARCHING if n not in OF_HITS), "") | {"extent": extent(integrator)}
     return {n: values[n] for n in values if n in COLUMNS} | {
         "setting": row.name,
         "group": row.group,
-        "steps": subject.extent / values["step"] if subject.marched else "",
+        "steps": subject.extent / values["step"] if subject.marched and not subject.hits else "",
         "aovs": ",".join(integrator.aovs),
         "spp": row.spp,
         "resolution": row.resolution or "",
@@ -202,7 +207,7 @@ def scaling(
     size = subject.size
     plan = [("pixels", k, {}) for k in ((16, 32) if quick else (16, 32, 64, 128, 256, 512))]
     plan += [("samples", k, {}) for k in ((1, 2) if quick else (1, 2, 4, 8, 16, 32))]
-    if subject.marched:
+    if subject.marched and not subject.hits:
         plan += [("extent", k, {"step": subject.step / k}) for k in ((1, 2) if quick else (1, 2, 4, 8, 16))]
     out = []
     for axis, value, params in plan:

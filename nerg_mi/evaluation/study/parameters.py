@@ -17,3 +17,9 @@ def parameters(integrator) -> dict:
         **{n: getattr(observer, n) for n in seen},
         "background": np.array(integrator.background, float).ravel().tolist(),
     }
+
+
+def extent(integrator) -> float | None:
+    """Where the Gaussians of its field are cut off, in standard deviations; None where its field is none of these."""
+    medium = integrator.medium
+    return None if medium is None or medium.hits is None else medium.arrays.extent

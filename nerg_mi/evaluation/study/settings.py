@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from nerg_mi.transport.march.depth import DEPTHS
 from nerg_mi.transport.march.rules import RULES
 
+from . import splats
 from .paper import DT_GAMMA, STEPS, as_in_the_paper
 
 STEP_COUNTS = (16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
@@ -50,6 +51,9 @@ def settings(subject, quick: bool = False) -> list[Setting]:
     def some(values):
         return values[:: max(len(values) - 1, 1)] if quick else values
 
+    if subject.hits:
+        return [*_met(some), *_visibility(quick), *_left_out(subject), *_samples(quick)]
+
     def steps(n):
         return {"step": subject.extent / n}
 
@@ -85,6 +89,17 @@ def settings(subject, quick: bool = False) -> list[Setting]:
                 )
     rows += [] if quick else _together(subject)
     return rows + _paper(quick)
+
+
+def _met(some) -> list[Setting]:
+    """Of Gaussian splats, which are met one by one and not marched."""
+    rows = [Setting("default", "default")]
+    rows += [Setting(f"stop {s:g}", "stop", {"stop": s}) for s in some(splats.STOPS)]
+    rows += [Setting(f"extent {e:g}", "extent", {"extent": e}) for e in some(splats.EXTENTS)]
+    # The others are the median here.
+    rows += [Setting(f"depth {k}", "depth", {"depth": k}) for k in ("expected", "median")]
+    loose = [(2.0, 1e-2), (2.5, 1e-2), (2.5, 1e-3)]
+    return rows + [Setting(f"extent {e:g}, stop {s:g}", "together", {"extent": e, "stop": s}) for e, s in some(loose)]
 
 
 def _visibility(quick: bool) -> list[Setting]:

@@ -23,6 +23,7 @@ from nerg_mi.transport.place import Place
 from . import reference as study_reference
 from . import scenes as study_scenes
 from . import shapes as study_shapes
+from . import splats as study_splats
 from .errors import errors
 from .parameters import parameters
 from .reference import Truth
@@ -87,6 +88,8 @@ class Subject:
     has_gaze = True
     marched = True
     """Whether there is a medium, whose marching can be set."""
+    hits = False
+    """Whether that is Gaussian splats, which are met one by one."""
     resampled = False
     """Whether its density can be had as a grid of other resolutions."""
 
@@ -109,7 +112,7 @@ class Subject:
 
         if resolution:
             raise NergError(f'"{self.name}" has no grids of other resolutions; only analytic scenes do')
-        return mi.load_dict({"type": "nerg", **self.base, **params})
+        return mi.load_dict({"type": "nerg", **study_splats.cut_off({**self.base, **params})})
 
     def aovs(self) -> str:
         return AOVS if self.has_gaze else AOVS.replace(",gaze", "")
@@ -239,7 +242,8 @@ class FileSubject(Subject):
         self.name = path.stem if path.stem != "scene" else path.resolve().parent.name
         self.surfaces, self.opaque = surfaces, surfaces is not None
         children = integrator.children
-        self.has_gaze = "gaze" in children
+        self.has_gaze, medium = "gaze" in children, integrator.medium
+        self.hits = medium is not None and medium.hits is not None
         self._set_up(loaded, sensor, {**children, **parameters(integrator), "aovs": self.aovs()})
         self.resize(width, height)
 
@@ -249,15 +253,15 @@ class FileSubject(Subject):
         return np.array(center(observer if observer is not None else self.sensor), float).reshape(3)
 
     def _find_truth(self, seed: int, depth: str, visibility: str) -> Truth:
-        """A render with steps `FINER` times shorter, and how far one with steps twice as long is from it."""
+        """A render with steps `FINER` times shorter, or with Gaussians cut off far out, and how far one with steps
+        twice as long, or Gaussians cut off nearer, is from it."""
+        limits = study_splats.LIMITS if self.hits else [{"step": self.step / n} for n in (FINER, FINER // 2)]
         kinds = {**_CONVERGED, "depth": depth, "visibility": visibility, "radiance": True}
-        fine, half = (
-            self.channels(self.integrator({**kinds, "step": self.step / n}), 1, seed) for n in (FINER, FINER // 2)
-        )
+        fine, half = (self.channels(self.integrator({**kinds, **limit}), 1, seed) for limit in limits)
         known = Truth(
             **{n: fine[n] for n in ("color", "opacity", "depth", "visibility")},
             gaze=fine.get("gaze", np.zeros(len(fine["depth"]))),
-            source=f"render with steps of {self.step / FINER:.3g} units",
+            source=study_splats.SOURCE if self.hits else f"render with steps of {self.step / FINER:.3g} units",
             convergence={},
         )
         return replace(known, convergence=errors(half, known))

@@ -160,7 +160,7 @@ def markdown(report: dict) -> str:
     ]
     if report["reference_change_when_step_halved"]:
         change = ", ".join(f"{k} {v:.2g}" for k, v in report["reference_change_when_step_halved"].items())
-        text.append(f"Steps twice as long change the reference by: {change}")
+        text.append(f"The next coarser reference differs by: {change}")
     if report.get("timed_by"):
         text.append(_timed_by(report["timed_by"]))
     for group in dict.fromkeys(r["group"] for r in rows[1:]):

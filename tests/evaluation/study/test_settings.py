@@ -14,7 +14,7 @@ from nerg_mi.evaluation.study.subject import open_subject
 
 @pytest.fixture(scope="module")
 def rows():
-    return settings(SimpleNamespace(marched=True, extent=2.0, has_gaze=True, resampled=True))
+    return settings(SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=True, resampled=True))
 
 
 def test_sweeps_are_even_on_a_log_axis(rows):
@@ -55,7 +55,7 @@ def test_rows_do_what_their_names_say(rows):
 
 @pytest.mark.parametrize("has_gaze", [True, False])
 def test_gaze_is_left_out_where_there_is_one(has_gaze):
-    subject = SimpleNamespace(marched=True, extent=2.0, has_gaze=has_gaze, resampled=True)
+    subject = SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=has_gaze, resampled=True)
     left_out = {r.name: r.params.get("aovs", "") for r in settings(subject) if r.group == "leave out"}
     assert ("no gaze" in left_out) == has_gaze and all("gaze" not in aovs for aovs in left_out.values())
     assert not has_gaze or "visibility" in left_out["no gaze"]
