@@ -122,7 +122,7 @@ class SplatsVolume(mi.Volume):
     def parameters_changed(self, keys=()):
         if recording():
             raise NergError(
-                "Gaussians cannot be changed inside of a function that dr.freeze records, as their tree is built "
+                "the Gaussians cannot be changed inside of a function that dr.freeze records, as their tree is built "
                 "outside of kernels: call params.update() before the function"
             )
         self.arrays.pack()
