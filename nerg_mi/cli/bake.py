@@ -16,20 +16,26 @@ from .progress import TerminalReporter
 @takes(BakeOptions)
 def command(
     surface: Annotated[
-        Path, typer.Argument(help="Mesh (.ply, .obj, .glb), scene (.xml), or radiance field (.safetensors).")
+        Path,
+        typer.Argument(
+            help="Mesh (.ply, .obj, .glb), scene (.xml), radiance field (.safetensors), or Gaussian splats."
+        ),
     ],
     output: Annotated[
         list[Path],
         typer.Option(
             "-o",
             "--output",
-            help="Files to write, repeatable: .ply, .glb (with colours), .csv (of faces), .json (summary).",
+            help="Files to write, repeatable: .ply, .glb (with colours), .csv (of faces), .json (summary); of Gaussian "
+            "splats .ply.",
         ),
     ],
     options: BakeOptions,
 ) -> None:
     """Put gaze on surfaces: how much of it each square metre receives, from a gaze field or from tracked rays."""
-    from nerg_mi.jobs import bake
+    from nerg_mi.formats.splats.files import is_splats
+    from nerg_mi.jobs.bake import bake
+    from nerg_mi.jobs.bake_splats import bake_splats
 
     with TerminalReporter() as reporter:
-        bake.bake(surface, output, options, reporter)
+        (bake_splats if is_splats(surface) else bake)(surface, output, options, reporter)

@@ -96,10 +96,12 @@ def attended(
     falloff: Float = 0.0,
     settings: ObserverSettings | None = None,
     two_sided: bool = False,
+    penetration: Float = 0.0,
 ) -> Float:
     """Attention per solid angle, in 1/sr, that the observer ``p_o`` gives ``p`` with normal ``n`` after occlusion.
 
-    Arguments as of ``arriving``, which is this times the Jacobian from solid angle to area.
+    Arguments as of ``arriving``, which is this times the Jacobian from solid angle to area. ``penetration``: how far,
+    along the normal, what is seen of ``p`` may begin before it, in scene units.
     """
     import mitsuba as mi
 
@@ -111,7 +113,7 @@ def attended(
         settings = settings or ObserverSettings(march=default_settings(place))
         # Looked for a tolerance above the surface, as if a camera stood there.
         ray = mi.Ray3f(p + n, -n)
-        found = trace_sight(place, ray, p, p_o, 0, active, mi.Float(falloff), settings, whole=False)
+        found = trace_sight(place, ray, p, p_o, penetration, active, mi.Float(falloff), settings, whole=False)
         p_od, seen = found.p_od, found.visibility
         active &= seen > 0
     return dr.select(active, density(p_od, p_o, r_o, active) * seen, 0)

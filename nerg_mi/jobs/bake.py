@@ -11,18 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.alignment.record import read_similarity
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.saliency import cc
-from nerg_mi.figures.colors import find_colors
 from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.files.atomic import check_writable
-from nerg_mi.formats.checkpoint import read_metadata
-from nerg_mi.maths.similarity import Similarity
-from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
-from nerg_mi.surfaces.cones import WIDEST
 from nerg_mi.surfaces.gaze_source import GazeSettings
 from nerg_mi.surfaces.mesh import Mesh
 from nerg_mi.surfaces.population import Crowd, ray_seconds
@@ -32,11 +26,10 @@ from nerg_mi.surfaces.sums import Sums, merge
 
 from .backend import select_backend
 from .baking.chunks import BakeScene
-from .baking.lookers import check_weights, find_crowd, tracked_rays
+from .baking.lookers import alignment_of, check_values, find_crowd, rays_of, tracked_rays
 from .baking.outputs import SUFFIXES, Baked, check_texture, write_output
 from .baking.receivers import Receivers, cut, read_receivers
 from .baking.summing import halves_of, sums_in_one_go, sums_in_parts
-from .gaze_places import align_of_training
 from .options.bake import BakeOptions
 from .parts import Parts
 from .reporter import SILENT, Reporter
@@ -78,7 +71,8 @@ def bake(
     reporter: Reporter = SILENT,
     rays: Rays | None = None,
 ) -> Bake:
-    """Put the gaze of ``options`` on ``surface``: a mesh (.ply, .obj, .glb), a scene (.xml), or a radiance field.
+    """Put the gaze of ``options`` on ``surface``: a mesh (.ply, .obj, .glb), a scene (.xml), or a radiance field;
+    on Gaussian splats `bake_splats.bake_splats` puts it.
 
     ``outputs``: files to write, by their suffixes (.ply, .glb, .csv, .json). ``rays``: in memory, in place of the file
     in ``options``. With ``options.store`` or ``options.scheduler`` some observers, or rays, at a time are a part, which
@@ -89,12 +83,8 @@ def bake(
     source = _check(surface, paths, options, rays)
     ns = select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
-    tracked = rays
-    if tracked is None and options.rays is not None:
-        tracked = load_rays(options.rays, options.most, options.seed)
-    if tracked is not None and not len(tracked):
-        raise NergError("there are no rays in what --rays names; give some")
-    align = _alignment(options)
+    tracked = rays_of(options, rays)
+    align = alignment_of(options)
     receivers = read_receivers(surface, options.shapes, options.resolution, ns, reporter)
     across = receivers.mesh.diagonal / align.scale
     if across > _LARGEST:
@@ -160,8 +150,7 @@ def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | 
     for path in paths:
         check_writable(path, *SUFFIXES)
     check_texture(paths, options.texture)
-    check_weights(options.weights)
-    find_colors(options.cmap)
+    check_values(options)
     people = rays is not None or options.rays is not None
     of_scene = surface.suffix.lower() == ".xml"
     source = options.source or ("field" if options.gaze is not None or (of_scene and not people) else "rays")
@@ -175,21 +164,9 @@ def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | 
         raise NergError("--observer and --path look with a gaze field; give --gaze, or leave them out")
     if source == "field" and (options.unit == "seconds" or options.halves):
         raise NergError("--unit seconds and --halves are of rays, whose time is known; add --from rays")
-    if options.cone is not None and not 0 <= options.cone <= WIDEST:
-        raise NergError(f"--cone is 0 to {WIDEST:g} degrees, got {options.cone:g}")
     if not (np.isfinite(options.smooth) and options.smooth >= 0):
         raise NergError(f"--smooth is a length in metres, got {options.smooth:g}")
-    if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
-        raise NergError(f"--top must be positive, got {options.top}")
     return source
-
-
-def _alignment(options: BakeOptions) -> Similarity:
-    if options.align is not None:
-        return read_similarity(options.align, "--align", "rays to place")
-    return (
-        Similarity() if options.gaze is None else align_of_training(read_metadata(options.gaze).get("provenance", {}))
-    )
 
 
 def _smoothed(mesh: Mesh, sums: Sums, smoother: Smoother | None) -> tuple[np.ndarray, np.ndarray]:

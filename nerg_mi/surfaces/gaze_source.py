@@ -26,6 +26,8 @@ from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.types import Point3f, Vector3f
 from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.place import Place
 
 from .cones import blurred
 from .outlines import visible_pieces
@@ -74,13 +76,13 @@ def lookers_of_law(law: Callable[[Vector3f], Any]) -> MakeLooker:
     return make
 
 
-def lookers_of_field(gaze: PlacedGaze, target: Target) -> MakeLooker:
-    """Observers whose gaze is the field ``gaze`` in the place of ``target``."""
+def lookers_of_field(gaze: PlacedGaze, place: Place, settings: ObserverSettings) -> MakeLooker:
+    """Observers whose gaze is the field ``gaze`` in ``place``, traced with ``settings``."""
 
     def make(eye: np.ndarray) -> Looker:
         center = _center(eye)
         # Nobody is asked for twice, and what is known of all of them would fill the memory.
-        observed = gaze.at([center], target.place, target.settings, ObserverCache())
+        observed = gaze.at([center], place, settings, ObserverCache())
         return Looker(
             center,
             lambda p_od, p_o, r_o, active: observed.evaluate(p_od, p_o, r_o, active)[0],
@@ -123,11 +125,9 @@ def _received(
     target: Target, looker: Looker, pieces: Pieces, total: float, cone: float
 ) -> Iterator[tuple[Pieces, np.ndarray]]:
     """Pieces, some of which may be cut again, and the gaze (P,) that each receives."""
-    density = looker.density
-    if cone > 0:
-        density = lambda p_od, p_o, r_o, active: blurred(looker.along, r_o, cone)
+    density = density_through(looker, cone)
     if target.sharp:
-        yield from visible_pieces(target, pieces, lambda some: _unhidden(looker, density, some), total, BATCH)
+        yield from visible_pieces(target, pieces, lambda some: _of_pieces(looker, density, some), total, BATCH)
         return
     for a in range(0, len(pieces), BATCH):
         # Most of a place is hidden from wherever one stands, and gaze costs more than rays.
@@ -137,15 +137,27 @@ def _received(
             yield some, some.solid_angle * _launch(target, looker.center, density, some)
 
 
-def _unhidden(looker: Looker, density: Density, pieces: Pieces) -> np.ndarray:
-    """``density`` (P,) at the centroids of ``pieces``, in 1/sr, whatever may stand between."""
+def unhidden(looker: Looker, density: Density, points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """``density`` (N,) of ``looker`` at ``points`` (N, 3), along unit ``directions`` (N, 3), in 1/sr, whatever may
+    stand between."""
     import mitsuba as mi
 
+    r_o, p_od = vector_of(mi.Vector3f, directions), vector_of(mi.Point3f, points)
+    p_o = looker.center + dr.zeros(mi.Point3f, len(points))
+    found = density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(points)))
+    return np.broadcast_to(np.array(found, np.float64), (len(points),))
+
+
+def density_through(looker: Looker, cone: float) -> Density:
+    """The density of ``looker`` seen through a cone of standard deviation ``cone`` in radian; 0: itself."""
+    if cone == 0:
+        return looker.density
+    return lambda p_od, p_o, r_o, active: blurred(looker.along, r_o, cone)
+
+
+def _of_pieces(looker: Looker, density: Density, pieces: Pieces) -> np.ndarray:
     middle = pieces.relative.mean(axis=1)
-    r_o = vector_of(mi.Vector3f, middle / np.linalg.norm(middle, axis=1, keepdims=True))
-    p_od, p_o = vector_of(mi.Point3f, pieces.center), looker.center + dr.zeros(mi.Point3f, len(pieces))
-    found = density(p_od, p_o, r_o, dr.full(mi.Bool, True, len(pieces)))
-    return np.broadcast_to(np.array(found, np.float64), (len(pieces),))
+    return unhidden(looker, density, pieces.center, middle / np.linalg.norm(middle, axis=1, keepdims=True))
 
 
 def _launch(target: Target, center: Point3f, density: Density, pieces: Pieces) -> np.ndarray:

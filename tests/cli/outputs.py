@@ -15,6 +15,7 @@ from nerg_mi.formats.ply import write_columns
 from nerg_mi.rays.rays import Rays
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.figures.standins import write_standins
+from tests.formats.splats.writers import random_splats, write_inria
 from tests.formats.torch_ngp.test_fields import small_state
 from tests.formats.torch_ngp.test_nerg import save, small_gaze
 from tests.jobs.drawing.scenes import write_scene
@@ -167,6 +168,9 @@ CASES = (
     Case(
         "bake", "{i}/room.ply --rays {i}/rays.npz --detail 2 -m llvm_ad_rgb --store {i}/store -o {o}/a.glb", ("a.glb",)
     ),
+    Case(
+        "bake", "{i}/splats.ply --gaze {i}/gaze.safetensors --observer 0,0,-3 -m llvm_ad_rgb -o {o}/a.ply", ("a.ply",)
+    ),
     Case("import", "{i}/nerg.pth -o {o}/a.safetensors -g {o}/g.safetensors", ("a.safetensors", "g.safetensors")),
     Case("refine", "{i}/ngp.safetensors -o {o}/a.safetensors", ("a.safetensors",)),
     Case("export mesh", "{i}/field.safetensors -o {o}/a.ply --resolution 8 --density 3", ("a.ply",)),
@@ -264,6 +268,7 @@ def make_inputs(folder: Path) -> Path:
     columns = dict(zip("xyz", vertices.T)) | {"value": np.arange(len(vertices), dtype=np.float32)}
     write_columns(folder / "baked.ply", columns, faces)
     fields.radiance(folder / "field.safetensors")
+    write_inria(folder / "splats.ply", random_splats(9))
     save(folder / "nerg.pth", small_gaze(), nerf=small_state())
     write_torch(folder / "ngp.pth", {"model": nerf_state(1, np.random.default_rng(1))})
     save_radiance(read_torch_ngp(folder / "ngp.pth", ns)[0], folder / "ngp.safetensors", {}, half=True)

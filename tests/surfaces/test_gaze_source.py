@@ -100,7 +100,8 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
     twin = read_mesh(here / "twin.ply")
     target = Target(joined(thing), [twin])
     # Looked at as if it stood there: the goods in the box hide it, as they hide the box of `attention`.
-    sums = gaze_sums(target, lookers_of_field(scene.integrator.gaze, target), np.array([eye]), [1.0], SETTINGS)
+    make = lookers_of_field(scene.integrator.gaze, target.place, target.settings)
+    sums = gaze_sums(target, make, np.array([eye]), [1.0], SETTINGS)
     assert expected.share[0] > 0.001
     assert np.isclose(sums.face.sum(), expected.share[0], rtol=0.03)
 

@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.splats import Splats
 
 from .antimatter import read_splat
-from .khronos import read_gltf_splats
+from .khronos import has_gltf_splats, read_gltf_splats
 from .ply import has_splats, read_ply_splats
 from .spz import read_spz
 
@@ -26,9 +26,11 @@ _OTHERS = (".sog", ".ksplat", ".lcc", ".gltf", ".json")
 
 
 def is_splats(path: str | os.PathLike) -> bool:
-    """Whether ``path`` is a file of Gaussian splats, by its name; a ``.ply``, which may be a mesh, by its header."""
+    """Whether ``path`` is a file of Gaussian splats, by its name; a ``.ply`` or ``.glb``, which may be a mesh, by its
+    header."""
     suffix = Path(path).suffix.lower()
-    return suffix in READERS and (suffix != ".ply" or has_splats(path))
+    tell = {".ply": has_splats, ".glb": has_gltf_splats}.get(suffix)
+    return suffix in READERS if tell is None else tell(path)
 
 
 def read_splats(path: str | os.PathLike) -> Splats:

@@ -8,13 +8,21 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.field.splats import Splats, joined
-from nerg_mi.files.bounded import read_bytes, reading
+from nerg_mi.files.bounded import JSON_BYTES, read_bytes, reading
 from nerg_mi.formats.gltf import BYTES, accessor_values, instances, read_parts
 from nerg_mi.maths.similarity import Similarity
 
 EXTENSION = "KHR_gaussian_splatting"
 
 _POINTS = 0
+
+
+def has_gltf_splats(path: str | os.PathLike) -> bool:
+    """Whether the document of the .glb file ``path``, which may be a mesh, names `EXTENSION`."""
+    with reading(path, "splat file"), open(path, "rb") as file:
+        head = file.read(20)
+        length = int.from_bytes(head[12:16], "little")
+        return EXTENSION.encode() in file.read(min(length, JSON_BYTES))
 
 
 def read_gltf_splats(path: str | os.PathLike) -> Splats:

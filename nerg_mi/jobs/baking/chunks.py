@@ -114,6 +114,6 @@ def _prepared(scene: BakeScene) -> _Ready:
     target = Target(scene.mesh, list(scene.others), medium, settings if medium is not None else None, falloff)
     if scene.gaze is not None:
         gaze = PlacedGaze(load_gaze(scene.gaze, namespace(mi.Float))[0])
-    make = None if gaze is None else lookers_of_field(gaze, target)
+    make = None if gaze is None else lookers_of_field(gaze, target.place, target.settings)
     _last.append(_Ready(scene.digest, variant, target, make))
     return _last[0]

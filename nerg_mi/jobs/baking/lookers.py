@@ -6,12 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.alignment.record import read_similarity
 from nerg_mi.errors import NergError
+from nerg_mi.figures.colors import find_colors
+from nerg_mi.formats.checkpoint import read_metadata
+from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
+from nerg_mi.surfaces.cones import WIDEST
 from nerg_mi.surfaces.population import WEIGHTS, Crowd, ray_weights, thin
 from nerg_mi.surfaces.ray_source import TrackedRays
 
@@ -39,6 +45,17 @@ def read_path(path: Path) -> Crowd:
     if (weights < 0).any() or not weights.sum() > 0:
         raise NergError(f'the path "{path}" has weights that are negative, or all 0; correct them')
     return Crowd(rows[:, :3], weights / weights.sum())
+
+
+def rays_of(options: BakeOptions, given: Rays | None) -> Rays | None:
+    """The rays that are ``given``, or those that --rays names, or None. Raises `NergError` where there are none in
+    it."""
+    found = given
+    if found is None and options.rays is not None:
+        found = load_rays(options.rays, options.most, options.seed)
+    if found is not None and not len(found):
+        raise NergError("there are no rays in what --rays names; give some")
+    return found
 
 
 def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, reporter: Reporter) -> Crowd:
@@ -75,7 +92,21 @@ def placed(points: np.ndarray, align: Similarity) -> np.ndarray:
     return points @ align.matrix[:3, :3].T + align.matrix[:3, 3]
 
 
-def check_weights(name: str) -> None:
-    """Raise `NergError` for a word that is none of `WEIGHTS`."""
-    if name not in WEIGHTS:
-        raise NergError(f'--weights is {", ".join(WEIGHTS)}, got "{name}"')
+def check_values(options: BakeOptions) -> None:
+    """Raise `NergError` for weights, a cone or a scale of colours that are none."""
+    if options.weights not in WEIGHTS:
+        raise NergError(f'--weights is {", ".join(WEIGHTS)}, got "{options.weights}"')
+    if options.cone is not None and not 0 <= options.cone <= WIDEST:
+        raise NergError(f"--cone is 0 to {WIDEST:g} degrees, got {options.cone:g}")
+    if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
+        raise NergError(f"--top must be positive, got {options.top}")
+    find_colors(options.cmap)
+
+
+def alignment_of(options: BakeOptions) -> Similarity:
+    """From the rays to the place: what --align says, or as the gaze field was trained."""
+    if options.align is not None:
+        return read_similarity(options.align, "--align", "rays to place")
+    return (
+        Similarity() if options.gaze is None else align_of_training(read_metadata(options.gaze).get("provenance", {}))
+    )

@@ -1,6 +1,8 @@
+import numpy as np
 import pytest
 
 from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.formats.gltf import shown_unlit
 from nerg_mi.formats.splats.files import READERS, is_splats, read_splats
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos, write_spz
 
@@ -26,6 +28,9 @@ def test_a_mesh_is_told_by_its_header(tmp_path):
     assert is_splats(tmp_path / "a.ply") and is_splats("b.spz") and not is_splats("b.obj")
     (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     assert not is_splats(tmp_path / "a.ply")
+    write_khronos(tmp_path / "a.glb", random_splats(3))
+    (tmp_path / "b.glb").write_bytes(b"".join(shown_unlit([("POSITION", np.eye(3, dtype="<f4"), False)], None)))
+    assert is_splats(tmp_path / "a.glb") and not is_splats(tmp_path / "b.glb")
 
 
 def test_missing_files(tmp_path):

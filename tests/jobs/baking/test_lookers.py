@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.jobs.baking.lookers import check_weights, find_crowd, read_path, tracked_rays
+from nerg_mi.jobs.baking.lookers import check_values, find_crowd, read_path, tracked_rays
 from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
@@ -63,4 +63,4 @@ def test04_one_observer_or_nobody():
         with pytest.raises(NergError, match=said):
             find_crowd(options, None, TURNED, Recorder())
     with pytest.raises(NergError, match="--weights is time, person, equal"):
-        check_weights("money")
+        check_values(BakeOptions(weights="money"))
