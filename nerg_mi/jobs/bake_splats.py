@@ -94,7 +94,7 @@ def bake_splats(
     seen = found > 0
     if not seen.any():
         raise NergError(
-            f'nobody who looks sees any of the Gaussians of "{path}"; let --observer, --path or --align place them there'
+            f'nobody who looks sees any of the Gaussians of "{path}"; place them in it by --observer, --path or --align'
         )
     attention = found * align.scale**2
     heat = Heat(options.top or top_of(attention, seen), options.cmap, decades=options.decades)
