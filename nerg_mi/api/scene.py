@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.field.splats import Splats
+from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.registration import plugin_class
 from nerg_mi.rendering.asked import is_nerg
 
@@ -130,7 +132,7 @@ class Scene:
 
 
 def make_scene(
-    field: FilePath | TrainedField[RadianceField] | RadianceField | None = None,
+    field: FilePath | TrainedField[RadianceField] | RadianceField | Splats | None = None,
     gaze: FilePath | TrainedField[AnyGazeField] | AnyGazeField | None = None,
     *,
     shapes: object = None,
@@ -141,7 +143,8 @@ def make_scene(
 ) -> Scene:
     """A scene of a trained place, a gaze field, or shapes, without writing XML.
 
-    ``field``, ``gaze``: what `load_field`, `load_gaze` or a training gave, or the name of a checkpoint. ``shapes``:
+    ``field``, ``gaze``: what `load_field`, `load_gaze` or a training gave, or the name of a checkpoint; a place may
+    be Gaussian splats, too: a file of them, or what `nerg_mi.formats.splats.files.read_splats` gave. ``shapes``:
     what stands in the field, or is all there is: a mesh file (.ply, .obj), a scene file, a dict for ``mi.load_dict``,
     a Mitsuba scene or shape, or several of these in a list or a dict by name. ``camera``: a `Camera`, or a sensor as
     Mitsuba takes it. ``observer``: position (3,) of the one whose gaze it is; without it the camera is the observer.
@@ -221,8 +224,9 @@ def asked_quantities(scene: Scene, names: object, known: tuple[str, ...] | None 
 
 def _volume(given: object, role: str, to_world: Any) -> Any:
     """The volume of a field, which is a file or in memory, for the integrator's property ``role``."""
-    plugin = {"field": "nerf", "gaze": "gazefield"}[role]
+    plugin = {"field": "splats" if isinstance(given, Splats) else "nerf", "gaze": "gazefield"}[role]
     if isinstance(given, (str, os.PathLike)):
+        plugin = plugin_of_field(given) if role == "field" else plugin
         where = {} if to_world is None else {"to_world": to_world}
         return {"type": plugin, "filename": os.path.abspath(given), **where}
     volume = plugin_class(plugin)

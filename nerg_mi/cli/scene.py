@@ -18,7 +18,7 @@ def command(
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="In any order: a place (radiance field, .ply, .obj, .xml scene, .vol), a gaze field, rays.",
+            help="In any order: a place (radiance field, splats, mesh, .xml scene, .vol), a gaze field, rays.",
             metavar="FILES",
         ),
     ],

@@ -16,7 +16,7 @@ from .progress import TerminalReporter
 @takes(StatisticsOptions)
 def command(
     files: Annotated[
-        list[Path], typer.Argument(help="Rays or a dataset, a scene, a gaze field, a radiance field; in any order.")
+        list[Path], typer.Argument(help="Rays or a dataset, a scene, a gaze field, a place; in any order.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for tables and pictures.")],
     options: StatisticsOptions,

@@ -18,7 +18,7 @@ def command(
     files: Annotated[
         list[Path],
         typer.Argument(
-            help="In any order: a scene, or a place (radiance field, .ply, .obj, .vol), a gaze field, rays; a folder.",
+            help="A scene, or a place (radiance field, splats, mesh, .vol), a gaze field, rays; a folder.",
             metavar="FILES",
         ),
     ],

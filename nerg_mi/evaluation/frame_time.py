@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.training.geometry.hit_geometry import volume_dict
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.place import Place
@@ -62,7 +63,8 @@ def frame_timer(
 def _medium(place: GazePlace, folder: Path) -> dict:
     """What the integrator of ``place`` marches, as parameters of its plugin."""
     if place.kind == "field":
-        return {"field": {"type": "nerf", "filename": str(folder / place.about["field_file"]["file"])}}
+        path = folder / place.about["field_file"]["file"]
+        return {"field": {"type": plugin_of_field(path), "filename": str(path)}}
     if place.kind == "hits":
         return {"density": volume_dict(folder / place.about["geometry_file"]["file"])}
     return {}

@@ -75,6 +75,8 @@ def _check_header(path: Path) -> None:
     with reading(path, "checkpoint"), open(path, "rb") as file:
         header = int.from_bytes(file.read(8), "little")
     if size < 8 or header > size - 8:
+        if path.suffix.lower() != ".safetensors":
+            raise NergError(f'"{path}" is no checkpoint of a field; name one (.safetensors), as "nerg train" makes it')
         raise NergError(
             f'"{path}" is not a readable safetensors file: its header claims {header:,} bytes and the file has '
             f"{size:,}; copy it again, or make it anew"

@@ -13,6 +13,7 @@ from nerg_mi.alignment.record import read_similarity
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.atomic import write_text
 from nerg_mi.formats.checkpoint import read_metadata
+from nerg_mi.formats.splats.files import READERS, is_splats
 from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.dataset.layout import is_dataset
@@ -33,7 +34,7 @@ from .scenes.files import KINDS, kind_of_file, training_place
 RAYS = 2_000_000
 """Of larger datasets so many rays are shown, drawn at random."""
 
-_SUFFIXES = {*KINDS, ".safetensors", ".rays"}
+_SUFFIXES = {*KINDS, *READERS, ".safetensors", ".rays"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +134,8 @@ def _expanded(path: Path) -> list[Path]:
     if not path.is_dir() or is_dataset(path):
         return [path]
     inside = sorted(p for p in path.iterdir() if p.suffix.lower() in _SUFFIXES)
+    # Of glTF a viewer shows splats alone.
+    inside = [p for p in inside if p.suffix.lower() != ".glb" or is_splats(p)]
     if not inside:
         raise NergError(f'the folder "{path}" holds nothing that a viewer shows; name a file, or another folder')
     ready = [p for p in inside if p.suffix.lower() == ".xml"]

@@ -6,6 +6,7 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.api.fields import TrainedField
 from nerg_mi.api.scene import asked_quantities
+from tests.formats.splats.writers import random_splats, write_inria
 
 BALL = {"type": "sphere", "radius": 0.3}
 
@@ -45,6 +46,17 @@ def test02_a_field_in_memory_is_its_file(files, camera):
     assert "field: field.safetensors" in repr(nerg.make_scene(field)) and "in memory" in repr(
         nerg.make_scene(field.network)
     )
+
+
+def test02_splats_are_a_place_as_a_field_is(camera, tmp_path):
+    splats = random_splats(20)
+    write_inria(tmp_path / "place.ply", splats)
+    from_file = nerg.make_scene(tmp_path / "place.ply", camera=camera)
+    assert "field: place.ply" in repr(from_file)
+    expected = nerg.render(from_file, spp=2)
+    assert expected.opacity.max() > 0.2
+    found = nerg.render(nerg.make_scene(splats, camera=camera), spp=2)
+    assert np.allclose(found.depth, expected.depth, atol=1e-4)
 
 
 def test03_where_the_fields_are_placed(files):

@@ -10,6 +10,7 @@ from nerg_mi.evaluation import frame_time
 from nerg_mi.evaluation.frame_time import frame_timer
 from nerg_mi.maths.box import Box
 from nerg_mi.training.geometry.places import GazePlace, place_of_field, place_of_hits, place_of_scene
+from tests.formats.splats.writers import random_splats, write_inria
 from tests.plugins import fields
 from tests.training.gaze.looks import looking_at
 
@@ -31,13 +32,16 @@ def made(kind, folder):
     if kind == "field":
         fields.radiance(folder / "place.safetensors", density_scale=30.0)
         return place_of_field(folder / "place.safetensors", ns)
+    if kind == "splats":
+        write_inria(folder / "place.ply", random_splats(50))
+        return place_of_field(folder / "place.ply", ns)
     if kind == "hits":
         return place_of_hits(looking_at((1.5, 0.4, 1.2)), folder / "place.vol", 0.2)
     (folder / "room.xml").write_text(ROOM)
     return place_of_scene(folder / "room.xml")
 
 
-@pytest.mark.parametrize("kind", ["field", "scene", "hits"])
+@pytest.mark.parametrize("kind", ["field", "splats", "scene", "hits"])
 def test_it_is_the_mean_of_all_frames_but_the_first(rgb, tmp_path, clock, kind):
     saved(tmp_path / "gaze.safetensors", "linear", BOX)
     render = frame_timer(made(kind, tmp_path), CENTRES, tmp_path, cameras=2, width=8, height=4)

@@ -10,10 +10,12 @@ import pytest
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import write_checkpoint
+from nerg_mi.formats.gltf import shown_unlit
 from nerg_mi.jobs import demo
 from nerg_mi.jobs.options.view import ViewOptions
 from nerg_mi.jobs.view import place_to_view, write_variants
 from nerg_mi.rendering.scene_gaze import gaze_of_scene
+from tests.formats.splats.writers import random_splats, write_spz
 from tests.jobs.recorder import Recorder
 
 MESH = "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n"
@@ -49,6 +51,7 @@ def test03_a_folder_stands_for_what_is_in_it(rgb, tmp_path, rays):
         place_to_view([run], tmp_path)
     (run / "a.obj").write_text(MESH)
     (run / "notes.txt").write_text("x")
+    (run / "mesh.glb").write_bytes(b"".join(shown_unlit([("POSITION", np.eye(3, dtype="<f4"), False)], None)))
     assert place_to_view([run], tmp_path).name == "a.obj"
     for name in ("scene.xml", "other.xml"):
         shutil.copy(demo.store_scene().parent / "shapes.xml", run / name)
@@ -57,6 +60,14 @@ def test03_a_folder_stands_for_what_is_in_it(rgb, tmp_path, rays):
     (run / "scene.xml").unlink()
     with pytest.raises(NergError, match="name the one to view"):
         place_to_view([run], tmp_path)
+
+
+def test03_splats_in_a_folder(rgb, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    write_spz(run / "a.spz", random_splats(9))
+    place = place_to_view([run], tmp_path, ViewOptions(observer=(0.0, 0.0, -3.0)))
+    assert place.made and place.name == "a.spz" and 'type="splats"' in place.scene.read_text()
 
 
 def test04_two_of_a_kind_are_told(rgb, tmp_path, rays):

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 import nerg_mi as nerg
+from nerg_mi.field.splats import Splats
 from nerg_mi.viewer.proxy import BATCH, LEVELS, bake, gather, ordered, thin
 
 
@@ -22,6 +23,16 @@ def test01_points_lie_on_the_surfaces(room_scene):
     assert (np.abs(off) < 1e-3).sum() > 100
     lower, upper = proxies[-1].bounds
     assert (lower > -3.01).all() and (upper < 3.01).all() and upper[2] > 0.9
+
+
+def test01_and_on_a_floor_of_splats(rgb):
+    x, y = (v.ravel() for v in np.meshgrid(np.linspace(-2, 2, 21), np.linspace(-2, 2, 21)))
+    n = len(x)
+    centers, turns = np.stack([x, y, 0 * x], axis=1), np.tile([1.0, 0, 0, 0], (n, 1))
+    floor = Splats(centers, np.tile([0.15, 0.15, 0.01], (n, 1)), turns, np.full(n, 0.95), np.ones((n, 1, 3)))
+    points = last(gather(nerg.make_scene(floor), [np.array([0, 0, 1.5])], places=2)).points
+    inside = np.abs(points[:, :2]).max(axis=1) < 2
+    assert inside.sum() > 1000 and np.abs(points[inside, 2]).max() < 0.03
 
 
 def test02_one_point_in_a_cell():

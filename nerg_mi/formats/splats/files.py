@@ -22,7 +22,8 @@ READERS: dict[str, Callable[[str | os.PathLike], Splats]] = {
 }
 """Reader by the ending of a file's name."""
 
-_OTHERS = (".sog", ".ksplat", ".lcc", ".gltf", ".json")
+_OTHERS = (".sog", ".ksplat", ".lcc")
+_AMONG_OTHERS = (*_OTHERS, ".gltf", ".json")
 
 
 def is_splats(path: str | os.PathLike) -> bool:
@@ -31,6 +32,17 @@ def is_splats(path: str | os.PathLike) -> bool:
     suffix = Path(path).suffix.lower()
     tell = {".ply": has_splats, ".glb": has_gltf_splats}.get(suffix)
     return suffix in READERS if tell is None else tell(path)
+
+
+def plugin_of_field(path: str | os.PathLike) -> str:
+    """The volume plugin that shows the file of a place: that of splats, or that of radiance fields."""
+    return "splats" if is_splats(path) else "nerf"
+
+
+def refuse_others(path: str | os.PathLike) -> None:
+    """Raise `NergError`, which names the converter, for splats in a format that is not read."""
+    if Path(path).suffix.lower() in _OTHERS:
+        read_splats(path)
 
 
 def read_splats(path: str | os.PathLike) -> Splats:
@@ -42,6 +54,6 @@ def read_splats(path: str | os.PathLike) -> Splats:
     if suffix not in READERS:
         known = ", ".join(READERS)
         hint = f'npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
-        other = f"; convert it: {hint}" if suffix in _OTHERS else ""
+        other = f"; convert it: {hint}" if suffix in _AMONG_OTHERS else ""
         raise NergError(f'"{path}" is no file of Gaussian splats, which are read from {known}{other}')
     return READERS[suffix](path)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import struct
+from pathlib import Path
 
 import numpy as np
 
@@ -26,7 +27,8 @@ def read_spz(path: str | os.PathLike) -> Splats:
     with reading(path, "splat file"):
         with open(path, "rb") as file:
             start = file.read(4)
-    with reading(path, "splat file", "convert it by: npx @playcanvas/splat-transform in.spz out.ply"):
+    convert = f'convert it by: npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
+    with reading(path, "splat file", convert):
         if start == struct.pack("<I", _MAGIC):
             raise ValueError("it is SPZ of version 4 or later, and versions 1 to 3 are read")
         with open_gzip(path, "splat file") as stream:

@@ -11,6 +11,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import load_radiance
+from nerg_mi.formats.splats.files import refuse_others
 from nerg_mi.formats.surfaces import mesh as mesh_of_field
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.rendering.pictures import load_scene
@@ -57,6 +58,7 @@ def read_receivers(
         assert body.faces is not None, "a mesh has faces"
         found = {path.stem: (body.vertices, body.faces)}
     else:
+        refuse_others(path)
         found = {path.stem: read_mesh(path)}
     return _joined(path, found, others, reporter)
 
@@ -82,9 +84,7 @@ def _of_scene(path: Path, shapes: tuple[str, ...]) -> tuple[dict[str, Triangles]
         known = f"it has {', '.join(every)}" if every else "it has none"
         raise NergError(f'the scene "{path}" has no shape "{missing[0]}"; {known}')
     if not every:
-        raise NergError(
-            f'the scene "{path}" has no shapes to put gaze on; name its radiance field (.safetensors) in its place'
-        )
+        raise NergError(f'the scene "{path}" has no shapes to put gaze on; name its field, or its splats, in its place')
     found, others = {}, []
     for name, shape in every.items():
         triangles = shape_triangles(shape)

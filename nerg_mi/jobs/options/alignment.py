@@ -12,7 +12,7 @@ from . import option
 class AlignOptions:
     """What an alignment is found from, and what is known beforehand. Lengths of the tracking are metres."""
 
-    field: Path | None = option(None, "The place: a radiance field.")
+    field: Path | None = option(None, "The place: a radiance field, or Gaussian splats.")
     scene: Path | None = option(None, "Or: a Mitsuba scene.")
     surface: Path | None = option(
         None, "Or: a mesh or points on surfaces (.ply, .obj, .npy, .csv of x,y,z or of Aria)."

@@ -12,7 +12,7 @@ from . import option
 class GazeEvaluationOptions:
     """What a gaze field is scored on. The place is the one that it was trained in."""
 
-    field: Path | None = option(None, "Radiance field that it was trained in. Default: its name, beside it.")
+    field: Path | None = option(None, "Radiance field, or splats, it was trained in. Default: its name, beside it.")
     scene: Path | None = option(None, "Or: the Mitsuba scene.")
     geometry: Path | None = option(None, "Or: the place of hit points (.vol).")
     split: str | None = option(

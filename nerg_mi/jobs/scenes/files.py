@@ -9,7 +9,7 @@ from pathlib import Path
 from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import is_field
-from nerg_mi.formats.splats.files import is_splats
+from nerg_mi.formats.splats.files import is_splats, refuse_others
 from nerg_mi.jobs.gaze_places import align_of_training, file_of_training, place_key
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.maths.similarity import Similarity
@@ -58,6 +58,7 @@ def kind_of_file(path: Path) -> str:
         return {"radiance": "field", "gaze": "gaze"}[kind]
     if is_splats(path):
         return "field"
+    refuse_others(path)
     if suffix in (".pth", ".pt"):
         raise NergError(f'"{path}" is a checkpoint of torch; make fields of it with "nerg import"')
     if suffix not in KINDS:

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import reading
-from nerg_mi.formats.splats.files import is_splats
+from nerg_mi.formats.splats.files import is_splats, plugin_of_field
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.rendering.mesh_file import check_obj, check_ply, check_vol
 from nerg_mi.rendering.nested_scene import nested_place
@@ -79,9 +79,7 @@ def _name(path: Path, folder: Path) -> str:
 
 
 def _field(path: Path, folder: Path) -> Place:
-    volume = element(
-        "volume", prop("string", "filename", "$field"), name="field", type="splats" if is_splats(path) else "nerf"
-    )
+    volume = element("volume", prop("string", "filename", "$field"), name="field", type=plugin_of_field(path))
     return Place(inside=(volume,), files={"field": _name(path, folder)})
 
 

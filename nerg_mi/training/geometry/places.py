@@ -12,7 +12,7 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.splats.files import READERS, read_splats
+from nerg_mi.formats.splats.files import READERS, read_splats, refuse_others
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.contraction import AnyBox
@@ -72,6 +72,7 @@ def place_of_field(path: Path, ns: ModuleType) -> GazePlace:
     """A trained radiance field, or Gaussian splats, read from ``path`` with arrays of the backend ``ns``."""
     if path.suffix.lower() in READERS:
         return _place_of_splats(path, ns)
+    refuse_others(path)
     radiance, _ = load_radiance(path, ns)
     about = {"field_file": file_identity(path)}
     return GazePlace(FieldMedium(radiance), radiance.box, "field", about, radiance=radiance)

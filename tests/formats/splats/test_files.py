@@ -3,7 +3,9 @@ import pytest
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.formats.gltf import shown_unlit
-from nerg_mi.formats.splats.files import READERS, is_splats, read_splats
+from nerg_mi.formats.splats.files import READERS, is_splats, plugin_of_field, read_splats, refuse_others
+from nerg_mi.jobs.scenes.files import kind_of_file
+from nerg_mi.training.geometry.places import place_of_field
 from tests.formats.splats.writers import random_splats, write_antimatter, write_inria, write_khronos, write_spz
 
 WRITERS = {".ply": write_inria, ".splat": write_antimatter, ".spz": write_spz, ".glb": write_khronos}
@@ -21,6 +23,15 @@ def test_other_formats_name_the_converter(tmp_path):
         read_splats(tmp_path / "a.sog")
     with pytest.raises(NergError, match=r"are read from \.ply"):
         read_splats(tmp_path / "a.txt")
+
+
+def test_other_splats_are_refused_wherever_a_place_is_given(tmp_path):
+    (tmp_path / "a.sog").write_bytes(b"PK")
+    for asked in (refuse_others, kind_of_file, lambda path: place_of_field(path, None)):
+        with pytest.raises(NergError, match=r'splat-transform "a\.sog" out\.ply'):
+            asked(tmp_path / "a.sog")
+    refuse_others(tmp_path / "a.obj")
+    assert plugin_of_field(tmp_path / "a.splat") == "splats" and plugin_of_field("a.safetensors") == "nerf"
 
 
 def test_a_mesh_is_told_by_its_header(tmp_path):

@@ -40,7 +40,7 @@ def squeezed(**header):
         (squeezed(degree=4), "version 1 to 3"),
         (squeezed(count=4_000_000_000), "4,000,000,000"),
         (squeezed(), "too early"),
-        (packed(version=4), "version 4"),
+        (packed(version=4), 'version 4.*convert it by: npx @playcanvas/splat-transform "a.spz" out.ply'),
         (b"nothing", "cannot be read"),
     ],
     ids=["later", "other", "degree", "count", "short", "zstd", "no gzip"],
