@@ -16,6 +16,7 @@ from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_json
+from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.recipes import gaze_recipe
@@ -53,7 +54,8 @@ def ablate(
     place_kind(options)
     width, height = _size(options.size)
     recipes = options.recipes.split(",")
-    known = ablation.all_variants(options.field is not None, recipes)
+    radiance = options.field is not None and not is_splats(options.field)
+    known = ablation.all_variants(radiance, recipes)
     variants = _chosen(known, options.variant)
     if options.law:
         law_of(options.law)

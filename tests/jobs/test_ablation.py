@@ -13,6 +13,7 @@ from nerg_mi.jobs import ablation_bench
 from nerg_mi.jobs.ablation import ablate
 from nerg_mi.jobs.options.ablation import AblationOptions
 from tests.evaluation.gaze.test_evaluation import crowd
+from tests.formats.splats.writers import random_splats, write_inria
 
 OPTIONS = AblationOptions(
     geometry="hits",
@@ -73,6 +74,15 @@ def test_what_is_wrong_is_told_before_any_work(tmp_path, change, said):
     with pytest.raises(NergError, match=said):
         ablate(crowd(100), tmp_path / "new", replace(OPTIONS, **change))
     assert not (tmp_path / "new").exists()
+
+
+def test_splats_have_no_features_of_a_radiance_field(tmp_path):
+    write_inria(tmp_path / "place.ply", random_splats(5))
+    given = replace(
+        OPTIONS, geometry=None, field=tmp_path / "place.ply", recipes="small", variant=("semantic snapshot",)
+    )
+    with pytest.raises(NergError, match="emit_capture here, got"):
+        ablate(crowd(100), tmp_path / "new", given)
 
 
 @pytest.mark.parametrize("recipe, seeds, steps, refit", [("default", [0, 1], 2, True), ("small", [0], 5, False)])

@@ -38,7 +38,8 @@ class ReportFiles:
         """Role, name and SHA-256 of each file."""
         out = [("gaze field", self.gaze.name, file_sha256(self.gaze))]
         if self.scene.place is not None:
-            out.append((_ROLES[self.scene.kind], self.scene.place.name, file_sha256(self.scene.place)))
+            role = "splats" if self.scene.splats else _ROLES[self.scene.kind]
+            out.append((role, self.scene.place.name, file_sha256(self.scene.place)))
         if self.rays is not None:
             out.append(("rays", self.rays.name, rays_digest(self.rays)))
         return out + [("evaluation", f"{p.parent.name}/{p.name}", file_sha256(p)) for p in self.results]

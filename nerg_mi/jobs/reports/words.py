@@ -11,6 +11,8 @@ from .files import ReportFiles
 def place_words(given: ReportFiles) -> str:
     """The place, in a sentence."""
     name = "" if given.scene.place is None else given.scene.place.name
+    if given.scene.splats:
+        return f"Gaussian splats, {name}."
     return {
         "field": f"A radiance field trained on photos, {name}.",
         "mesh": f"The mesh {name}.",

@@ -39,6 +39,11 @@ class GivenFiles:
     field_about: dict
 
     @property
+    def splats(self) -> bool:
+        """Whether the field is one of Gaussian splats."""
+        return self.kind == "field" and self.place is not None and is_splats(self.place)
+
+    @property
     def align(self) -> Similarity:
         """From the rays to the place, as the gaze field was trained."""
         return align_of_training(self.about)

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import reading
-from nerg_mi.formats.splats.files import is_splats, plugin_of_field
+from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.rendering.mesh_file import check_obj, check_ply, check_vol
 from nerg_mi.rendering.nested_scene import nested_place
@@ -58,7 +58,7 @@ def place_of_files(given: GivenFiles, output: Path) -> WrittenPlace:
 
 def _words(given: GivenFiles) -> str:
     name = "" if given.place is None else given.place.name
-    if given.kind == "field" and given.place is not None and is_splats(given.place):
+    if given.splats:
         return f"The Gaussian splats {name}"
     return {
         "field": f"The radiance field {name}",

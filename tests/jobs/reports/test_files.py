@@ -10,8 +10,10 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.jobs.reports.files import sort_files
+from nerg_mi.jobs.reports.words import place_words
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.figures.standins import write_standins
+from tests.formats.splats.writers import random_splats, write_inria
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +43,13 @@ def test_inputs_have_their_checksums(folder):
     roles = {role: digest for role, _, digest in sort_files([folder]).inputs()}
     assert roles["rays"] == file_sha256(folder / "rays.npz") and roles["radiance field"] != roles["gaze field"]
     assert set(roles) == {"gaze field", "radiance field", "rays", "evaluation"}
+
+
+def test_splats_are_called_so(folder, tmp_path):
+    write_inria(tmp_path / "place.ply", random_splats(5))
+    found = sort_files([folder / "shoppers.safetensors", tmp_path / "place.ply"])
+    assert found.inputs()[1][0] == "splats" and place_words(found) == "Gaussian splats, place.ply."
+    assert place_words(sort_files([folder])).startswith("A radiance field")
 
 
 def test_what_makes_no_report(folder, tmp_path):
