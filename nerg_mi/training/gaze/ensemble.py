@@ -142,7 +142,8 @@ def train_ensemble(
     choice = None
     if mixes(whole):
         choice = choose_mix(supervision, place, whole, ns, tell or (lambda progress: None))
-        for field in fields if choice else ():
+    if choice is not None:
+        for field in fields:
             give_mix(field, choice.mix)
     ensemble = GazeEnsemble(fields, supervision.support(plan.probes.radius, place))
     ensemble.basis = basis_of(supervision.counts())

@@ -18,7 +18,7 @@ from types import ModuleType
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.gaze.log_density import LogGazeField
+from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.interruption import Interruption
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.splits import purge, split_by_position
@@ -83,9 +83,9 @@ def choose_mix(
     of all rays in each fold: one of hit points knows the surfaces that those who are held out have met, not who looked
     there.
     """
-    rays, curves = supervision.rays, []
-    if rays is None:
-        raise ValueError("folds are of rays, and there are none")
+    rays, config, curves = supervision.rays, plan.config, []
+    if rays is None or not isinstance(config, LogGazeConfig):
+        raise ValueError("folds are of rays, and of log densities")
     if plan.settings.minutes is not None:
         plan = plan.with_settings(minutes=MINUTES * plan.settings.minutes / plan.settings.mix_folds)
     settings, needs = plan.settings, TargetNeeds.of(plan.config)
@@ -101,7 +101,7 @@ def choose_mix(
             continue
         judged = replace(probes, directions=_DIRECTIONS, min_rays=1)
         truth = targets_of_rays(held, place, judged, needs, centres, settings.seed + 3)
-        trainer = LikelihoodTrainer(replace(targets, heads=box), place.box, plan.config, settings, ns)
+        trainer = LikelihoodTrainer(replace(targets, heads=box), place.box, config, settings, ns)
         with Interruption() as stop:
             while trainer.progress < 1:
                 trainer.step()

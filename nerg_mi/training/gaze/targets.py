@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -99,7 +100,7 @@ def observe(
 def concatenate(a: Targets, b: Targets) -> Targets:
     """The observers of both, with as many directions each; the blind density is that of ``a``."""
     rows = lambda name: np.concatenate([getattr(a, name), getattr(b, name)])
-    out = {k: rows(k) for k in ("positions", "directions", "truth", "distance", "escaped")}
+    out: dict[str, Any] = {k: rows(k) for k in ("positions", "directions", "truth", "distance", "escaped")}
     extent = [np.full(len(t.truth), 4 * np.pi, np.float32) if t.extent is None else t.extent for t in (a, b)]
     semantic = None if a.semantic is None else rows("semantic")
     renew, of_a, of_b = None, a.renew, b.renew

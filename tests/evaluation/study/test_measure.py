@@ -15,7 +15,7 @@ from nerg_mi.evaluation.study.subject import open_subject
 class Recorded:
     """A subject of step 0.5 that renders nothing and keeps what it was asked for."""
 
-    size, step, marched = (12, 8), 0.5, True
+    size, step, marched, hits = (12, 8), 0.5, True, False
 
     def __init__(self):
         self.renders, self.steps = [], []
