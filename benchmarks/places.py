@@ -9,7 +9,8 @@ walls. In each fold half of the people train, and the others are scored at 60 po
 trained on within 2R of. Beside the field: uniform, position-blind, nearest probes and nearest rays, and how well one
 half of those who are scored foretells the other. `rank` is among the methods that are no split half; `less` is the
 field less the best of the others, fold by fold, with 95 % of Student's t; `way` is how far the field goes from the
-blind density to the split half in CC. `--mix-folds 0` is a field without a chosen share of the blind density.
+blind density to the split half in CC, where that is better than blind. `--mix-folds 0` is a field without a chosen
+share of the blind density.
 """
 
 from __future__ import annotations
@@ -74,19 +75,11 @@ def makers(data: Path) -> dict[str, Callable[[Path], tuple[Path, dict]]]:
 
 
 def recorded(files: list[Path], reader: str, folder: Path) -> Path:
-    """Rays of recordings; those that are frozen for long are told of and left out."""
-    from nerg_mi.errors import NergError
+    """Rays of recordings; a reader leaves out those whose gaze is frozen, and says so."""
     from nerg_mi.jobs.tracking import ImportOptions, import_rays
 
     path = folder / "rays.npz"
-    used = []
-    for file in files:
-        try:
-            import_rays([file], ImportOptions(reader=reader, output=path))
-            used.append(file)
-        except NergError as error:
-            print(f"  left out: {file.name}: {error}")
-    import_rays(used, ImportOptions(reader=reader, output=path))
+    import_rays(files, ImportOptions(reader=reader, output=path))
     return path
 
 
@@ -156,7 +149,9 @@ def summarise(each: list[dict]) -> list[dict]:
             row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": reach}
             half = [r[s] for r in own if r["method"] == HALF]
             row[f"{s} half"] = float(np.mean(half)) if half else np.nan
-        row["way"] = (row["CC"] - row["CC blind"]) / (row["CC half"] - row["CC blind"])
+        # With few people one half says less of the other than the blind density does: there is no way to go.
+        further = row["CC half"] - row["CC blind"]
+        row["way"] = (row["CC"] - row["CC blind"]) / further if further > 0 else np.nan
         out.append(row)
     return out
 
@@ -172,7 +167,8 @@ def show(rows: list[dict]) -> None:
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
     worst = max(rows, key=lambda r: r["KLD less"])
     print(f"\nmean rank {sum(ranks) / len(ranks):.2f}; worst place in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
-    print("way from blind to split half in CC: " + ", ".join(f"{r['place']} {r['way']:.0%}" for r in rows))
+    far = [r for r in rows if r["way"] == r["way"]]
+    print("way from blind to split half in CC: " + ", ".join(f"{r['place']} {r['way']:.0%}" for r in far))
 
 
 if __name__ == "__main__":

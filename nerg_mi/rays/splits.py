@@ -48,6 +48,7 @@ def split_by_position(
     zone_radius: float = 0.2,
     test_probes: int = 150,
     min_rays: int = 64,
+    min_train: int | None = None,
     seed: int = 0,
 ) -> PositionSplit:
     """Hold out zones of positions for probes of ``radius`` R (metres).
@@ -57,7 +58,8 @@ def split_by_position(
     origins inside them with at least ``min_rays`` rays within R. Training rays
     lie farther than 2R from each test centre, so that no probe of radius R on
     the training side comes within R of a test centre. A few zones purge far
-    less than scattered centres would. The same seed gives the same split.
+    less than scattered centres would. ``min_train``: training rays that are left at least (``min_rays``). The same seed
+    gives the same split.
 
     Raises `NergError` when the rays hold no such zone or too little is left.
     """
@@ -96,7 +98,7 @@ def split_by_position(
 
     near = _distance_to(test_centres, rays.origin)
     train = near > 2.0 * radius
-    if train.sum() < min_rays:
+    if train.sum() < (min_rays if min_train is None else min_train):
         raise NergError(f"{train.sum()} rays are left to train on; choose fewer or smaller zones, or a smaller radius")
     return PositionSplit(train, near <= radius, test_centres, zone_centres, zone)
 

@@ -128,8 +128,15 @@ def inner_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.nda
         mask = np.isin(rays.person, group)
         held = rays.select(mask)
         try:
+            # Those who hardly moved leave nothing of their own to learn from: the others are learnt from.
             split = split_by_position(
-                held, radius, zones=_ZONES, test_probes=_POSITIONS, min_rays=_RAYS, seed=1000 * settings.seed + k
+                held,
+                radius,
+                zones=_ZONES,
+                test_probes=_POSITIONS,
+                min_rays=_RAYS,
+                min_train=0,
+                seed=1000 * settings.seed + k,
             )
         except NergError:
             # These people have no zones with rays enough, or nothing else.

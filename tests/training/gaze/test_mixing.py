@@ -49,6 +49,10 @@ def test01_those_who_are_judged_are_not_learnt_from():
         assert not set(learn.person) & set(held.person) and len(np.unique(held.person)) == 2
         assert np.linalg.norm(learn.origin[:, None] - centres[None], axis=2).min() > 2 * PROBES_HERE.radius
     assert set(np.concatenate([np.unique(held.person) for _, held, _ in folds])) == set(range(6))
+    # People who sit: the zones take all that is theirs.
+    seated = people(1.0)
+    seated = replace(seated, origin=np.column_stack([seated.person, 0 * seated.person, 1.2 + 0 * seated.person]))
+    assert [len(learn) for learn, _, _ in inner_folds(seated, plan_of())] == [1600] * 3
     for learn, held, _ in inner_folds(people(1.0, count=1), plan_of()):
         assert len(held) == 400 and 0 < len(learn) < 400
 
