@@ -3,8 +3,8 @@
     python benchmarks/splats_noise.py [--splats FILE] [--width 48] [--out out/benchmarks/splats_noise.csv]
 
 The store's Gaussians (`--splats FILE`, or made of the field on a coarse lattice), each drawn twice with other centres
-(3 cm), scales (a factor of e^0.6), rotations and opacities (.02 to .3), and a quarter as many floaters as there
-were Gaussians, of up to .05. Rows are settings, errors are against rays that cut Gaussians off at 8 standard deviations and
+(3 cm), scales (a factor of e^0.6), rotations and opacities (.02 to .3), and a quarter as many floaters as there were
+Gaussians, of up to .05. Rows are settings, errors are against rays that cut Gaussians off at 8 standard deviations and
 end at 1e-9 of the light, with the default tolerance: a row of another tolerance says how much the choice matters, not
 which one is right.
 """
