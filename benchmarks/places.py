@@ -62,8 +62,8 @@ def makers(data: Path) -> dict[str, Callable[[Path], tuple[Path, dict]]]:
     from generated_places import PLACES
 
     out: dict[str, Callable[[Path], tuple[Path, dict]]] = {}
-    if files := sorted((data / "vr_supermarket").glob("*.csv.gz")):
-        out["supermarket"] = lambda folder: (recorded(files, "vr_supermarket", folder), {"geometry": "hits"})
+    if shop := sorted((data / "vr_supermarket").glob("*.csv.gz")):
+        out["supermarket"] = lambda folder: (recorded(shop, "vr_supermarket", folder), {"geometry": "hits"})
     for scene in ("room", "playroom", "truck"):
         if files := sorted((data / "eyenavgs" / scene).glob("*.csv.gz")):
             out[scene] = lambda folder, files=files: (recorded(files, "eyenavgs", folder), {"geometry": "none"})
