@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 
 from nerg_mi.field.splats import Splats, matrices_of
+from nerg_mi.maths.arrays import aligned
 from nerg_mi.maths.types import Bool, Color, Float, UInt32, Vector3f
 
 from .tree import build_tree
@@ -49,7 +50,7 @@ class SplatArrays:
         # Packets of four are gathered at once.
         self._stride = -(-3 * self.terms // 4) * 4
         for name in _NAMES:
-            setattr(self, name, ns.Float(np.ascontiguousarray(getattr(splats, name), np.float32).ravel()))
+            setattr(self, name, ns.Float(aligned(getattr(splats, name))))
         self.pack()
 
     def parameters(self) -> dict[str, Any]:
@@ -71,8 +72,9 @@ class SplatArrays:
         self.corners = [dr.opaque(ns.Float, float(v)) for v in (*self.lower, *self.upper)]
         self.thickness = float(np.median(scales.min(axis=1)))
         self.leaves = tree.leaves
-        self.nodes, self.places = ns.Float(tree.nodes.ravel()), ns.UInt32(tree.places)
-        order = ns.UInt32(tree.order.astype(np.uint32))
+        # Aligned alike each time: frozen functions tell arrays by it, and would be recorded anew.
+        self.nodes, self.places = ns.Float(aligned(tree.nodes)), ns.UInt32(aligned(tree.places, np.uint32))
+        order = ns.UInt32(aligned(tree.order, np.uint32))
         take = lambda values, width: [dr.gather(ns.Float, values, order * width + i) for i in range(width)]
         c, s, q = take(self.centers, 3), take(self.scales, 3), take(self.rotations, 4)
         inverse = dr.rcp(dr.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
