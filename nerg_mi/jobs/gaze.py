@@ -234,10 +234,16 @@ def _tell(result: GazeResult, reporter: Reporter) -> None:
     )
     if "mix" in about:
         m = about["mix"]
-        reporter.message(
-            f"unseen people at unseen places, {m['folds']} folds: KLD {m['kld_field']:.3f} of the field, "
-            f"{m['kld_blind']:.3f} of the blind density; {100 * m['mix']:.0f} % of the latter are mixed in"
-        )
+        if m["folds"]:
+            folds = f"{m['folds']} fold{'' if m['folds'] == 1 else 's'}"
+            reporter.message(
+                f"held out in {folds}: KLD {m['kld_field']:.3f} of the field, {m['kld_blind']:.3f} of where people look "
+                f"wherever they stand; {100 * m['mix']:.0f} % of the latter are mixed in"
+            )
+        else:
+            reporter.message(
+                "too few rays at any place to hold people out: whether position tells where others look is not known"
+            )
         if m["mix"] >= _MOSTLY_BLIND:
             reporter.warn(
                 "position tells little of where others look here: the gaze field is mostly where people look wherever "

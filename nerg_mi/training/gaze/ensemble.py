@@ -142,7 +142,6 @@ def train_ensemble(
     choice = None
     if mixes(whole):
         choice = choose_mix(supervision, place, whole, ns, tell or (lambda progress: None))
-    if choice is not None:
         for field in fields:
             give_mix(field, choice.mix)
     ensemble = GazeEnsemble(fields, supervision.support(plan.probes.radius, place))

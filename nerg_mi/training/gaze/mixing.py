@@ -46,17 +46,17 @@ _LEAST = 1e-9
 
 @dataclass(frozen=True)
 class MixChoice:
-    """The share of the blind density that was chosen, and why."""
+    """The share of the blind density that was chosen, and why; of no folds the share that was given, and no KLD."""
 
     # The share.
     mix: float
-    # How many folds had positions to be judged at.
+    # How many folds had people and positions enough to be judged by.
     folds: int
     # KLD (nats) of what was held out, means over folds: with this share, of the field as it is (with the least share
     # that is tried), and of the blind density alone; of kernel densities, so that none reaches zero.
-    kld: float
-    kld_field: float
-    kld_blind: float
+    kld: float | None = None
+    kld_field: float | None = None
+    kld_blind: float | None = None
 
     def to_dict(self) -> dict:
         """As JSON, for the provenance."""
@@ -75,9 +75,9 @@ def give_mix(field: LogGazeField, mix: float) -> None:
 
 def choose_mix(
     supervision: Supervision, place: GazePlace, plan: GazePlan, ns: ModuleType, tell: Listener = lambda progress: None
-) -> MixChoice | None:
-    """The share of the blind density for a field that ``plan`` trains on ``supervision``, which has rays, in ``place``;
-    None where no fold has people and positions enough to be judged by.
+) -> MixChoice:
+    """The share of the blind density for a field that ``plan`` trains on ``supervision``, which has rays, in ``place``:
+    that of the plan where no fold has people and positions enough to be judged by.
 
     ``tell`` is told how it goes. Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does. The place is that
     of all rays in each fold: one of hit points knows the surfaces that those who are held out have met, not who looked
@@ -112,7 +112,8 @@ def choose_mix(
         curves.append([_kld(truth.truth, (1 - m) * field + m * blind) for m in SHARES])
         if len(curves) == _ENOUGH and all(int(np.argmin(curve)) == 0 for curve in curves):
             break
-    return _choose(np.array(curves)) if curves else None
+    tell(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
+    return _choose(np.array(curves)) if curves else MixChoice(config.mix, 0)
 
 
 def inner_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.ndarray]]:
@@ -139,7 +140,7 @@ def inner_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.nda
                 seed=1000 * settings.seed + k,
             )
         except NergError:
-            # These people have no zones with rays enough, or nothing else.
+            # These people have no zones with rays enough.
             continue
         learn = purge(rays, split.test_centres, 2 * radius)
         if not alone:
