@@ -237,8 +237,8 @@ def _tell(result: GazeResult, reporter: Reporter) -> None:
         if m["folds"]:
             folds = f"{m['folds']} fold{'' if m['folds'] == 1 else 's'}"
             reporter.message(
-                f"held out in {folds}: KLD {m['kld_field']:.3f} of the field, {m['kld_blind']:.3f} of where people look "
-                f"wherever they stand; {100 * m['mix']:.0f} % of the latter are mixed in"
+                f"held out in {folds}: KLD {m['kld_field']:.3f} of the field, {m['kld_blind']:.3f} of where people "
+                f"look wherever they stand; {100 * m['mix']:.0f} % of the latter are mixed in"
             )
         else:
             reporter.message(
