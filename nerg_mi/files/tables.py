@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from .atomic import write_text
+from .atomic import replacing, write_text
 
 
 def write_csv(path: str | os.PathLike, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
     """Write ``rows`` as CSV with a line of names first; what a row lacks stays empty.
 
-    ``columns``: default, all keys in the order in which they appear. Raises ``ValueError`` for a row with others.
+    ``columns``: default, all keys in the order in which they appear; where they are given, rows are taken one by one.
+    Raises ``ValueError`` for a row with others.
     """
-    rows = list(rows)
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, columns or list(dict.fromkeys(k for row in rows for k in row)), restval="")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(path, text.getvalue())
+    if not columns:
+        rows = list(rows)
+        columns = list(dict.fromkeys(k for row in rows for k in row))
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[Any]], right: Collection[str] = ()) -> str:

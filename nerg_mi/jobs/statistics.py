@@ -18,18 +18,9 @@ from nerg_mi.rays.pseudonyms import pseudonyms, read_salt
 from nerg_mi.rays.rays import Rays
 from nerg_mi.statistics.estimates import LEAST_PEOPLE
 from nerg_mi.statistics.measures import People
+from nerg_mi.statistics.persons import PersonRows
 from nerg_mi.statistics.sums import ALL, Cell, Sums, Total
-from nerg_mi.statistics.tables import (
-    FIELD,
-    TRACKED,
-    Floor,
-    Row,
-    difference_rows,
-    duration_rows,
-    move_rows,
-    person_rows,
-    thing_rows,
-)
+from nerg_mi.statistics.tables import FIELD, TRACKED, Floor, Row, difference_rows, duration_rows, move_rows, thing_rows
 from nerg_mi.statistics.visibility import Isovists, Targets
 
 from .backend import select_backend
@@ -59,7 +50,7 @@ class StatisticsResult:
     differences: list[Row] = field(default_factory=list)
     moves: list[Row] = field(default_factory=list)
     durations: list[Row] = field(default_factory=list)
-    people: list[Row] = field(default_factory=list)
+    people: Sequence[Row] = ()
     what_if: list[Row] = field(default_factory=list)
     isovists: list[Row] = field(default_factory=list)
     sums: Sums | None = None
@@ -310,18 +301,18 @@ class _Work:
 
         return what_if_rows(o.what_if, self.setting, eyes, before, foretell, floor, o.resamples, o.seed)
 
-    def _people(self, sums: Sums | None, seen: bool) -> list[Row]:
+    def _people(self, sums: Sums | None, seen: bool) -> Sequence[Row]:
         o = self.options
         if sums is None:
-            return []
+            return ()
         if o.min_people > 1:
             self.reporter.message("no table of single people is made, since each number in it would be of one person")
-            return []
+            return ()
         persons = sums.persons_of(ALL)[1]
         named = {p: p for p in persons}
         if not o.names:
             named = pseudonyms(persons, None if o.salt is None else read_salt(o.salt))
-        return person_rows(sums, named, seen)
+        return PersonRows(sums, named, seen)
 
     def _tell(self, people: Mapping[Cell, Mapping[str, People]]) -> None:
         for cell in (c for c, found in people.items() if TRACKED in found and not found[TRACKED].names):

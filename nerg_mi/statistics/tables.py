@@ -160,22 +160,6 @@ def duration_rows(sums: Sums, floor: Floor) -> list[Row]:
     return rows
 
 
-def person_rows(sums: Sums, names: Mapping[str, str], seen: bool) -> list[Row]:
-    """Each person's own sums of each area, over all that was recorded; ``names``: what each is called."""
-    rows = []
-    of_all, persons = sums.persons_of(Cell("all", ""))
-    shown = sorted(zip(persons, of_all), key=lambda found: names[found[0]])
-    for person, r in shown:
-        for a, area in enumerate(sums.areas):
-            looked = sums.looks[r, a] > 0
-            first = sums.first_sum[r, a] / sums.first_count[r, a] if looked else None
-            row: Row = {"person": names[person], "thing": area, "time": float(sums.time[r]), "rays": int(sums.rays[r])}
-            row |= {"dwell": float(sums.on_time[r, a]), "looks": int(sums.looks[r, a])}
-            row |= {"first_look": first if first is None else float(first)}
-            rows.append(row | {"visible": float(sums.visible[r, a]) if seen else None})
-    return rows
-
-
 def shown(row: Row, measure: Measure) -> str:
     """A value with its interval as Markdown has it, and, after ±, its spread over the members of an ensemble: shares in
     percent, small ones with two digits behind the point."""

@@ -7,16 +7,7 @@ import pytest
 
 from nerg_mi.statistics.measures import BY_NAME, People
 from nerg_mi.statistics.sums import ALL, BINS, Cell, Sums
-from nerg_mi.statistics.tables import (
-    TRACKED,
-    Floor,
-    difference_rows,
-    duration_rows,
-    move_rows,
-    person_rows,
-    shown,
-    thing_rows,
-)
+from nerg_mi.statistics.tables import TRACKED, Floor, difference_rows, duration_rows, move_rows, shown, thing_rows
 
 A, B = Cell("cohort", "a"), Cell("cohort", "b")
 HOW = {"resamples": 299, "seed": 0}
@@ -88,15 +79,12 @@ def sums():
     return found
 
 
-def test05_moves_durations_and_people():
+def test05_moves_and_durations():
     rows = move_rows(sums(), Floor())
     assert [(r["from"], r["to"], r["moves"], r["share"]) for r in rows] == [("x", "y", 3, 1.0), ("y", "x", 1, 1.0)]
     assert all(r["moves"] is None for r in move_rows(sums(), Floor(3)))
     lasted = duration_rows(sums(), Floor())
     assert len(lasted) == 2 and lasted[0]["0.2 to 0.5 s"] == 3 and len(lasted[0]) == 3 + len(BINS) - 1
-    persons = person_rows(sums(), {"Ada": "p2", "Bo": "p1"}, False)
-    assert [r["person"] for r in persons] == ["p1", "p1", "p2", "p2"]
-    assert [r["first_look"] for r in persons] == [4.0, 3.0, 1.0, None] and persons[0]["visible"] is None
 
 
 def test06_as_markdown_has_it():

@@ -41,7 +41,7 @@ class Results(Protocol):
     def durations(self) -> list[Row]: ...
 
     @property
-    def people(self) -> list[Row]: ...
+    def people(self) -> Sequence[Row]: ...
 
     @property
     def what_if(self) -> list[Row]: ...
@@ -63,7 +63,7 @@ def write_results(
     about = provenance("nerg stats", inputs, options.seed, options)
     files: list[Path] = []
     for name in ("things", "differences", "moves", "durations", "people", "what_if", "isovists"):
-        rows: list[Row] = getattr(result, name)
+        rows: Sequence[Row] = getattr(result, name)
         if rows:
             columns = _COLUMNS.get(name, plain_columns)(rows)
             files += write_rows(folder, name, rows, *columns)

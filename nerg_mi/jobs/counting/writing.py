@@ -11,7 +11,13 @@ from nerg_mi.files.atomic import replacing, write_text
 from nerg_mi.files.tables import markdown_table, write_csv
 from nerg_mi.rays.io import pyarrow_modules
 from nerg_mi.statistics.measures import BY_NAME, MEASURES
+from nerg_mi.statistics.persons import PersonRows
 from nerg_mi.statistics.tables import FIELD, Row, shown
+
+MOST_LINES = 10_000
+"""Rows of a table in Markdown: more are nobody's to read."""
+
+_PART = 1 << 16
 
 SUPPORT = "support [rays]"
 _MEASURES = {"share": "share of gaze", "visible": "visible share"}
@@ -27,19 +33,46 @@ def has_parquet() -> bool:
 
 def write_rows(folder: Path, name: str, rows: Sequence[Row], head: Sequence[str], cells: Cells) -> list[Path]:
     """``rows`` as ``name``.csv, .md and, where that can be, .parquet in a ``folder``; ``head`` and ``cells``: the
-    columns of the Markdown. Of no rows there is a table of names alone."""
-    columns = list(dict.fromkeys(key for row in rows for key in row)) or list(head)
+    columns of the Markdown, which has `MOST_LINES` rows at most and says how many there are. Of no rows there is a
+    table of names alone. Rows are read in parts, so that those of `PersonRows` are never there all at once."""
+    columns = _names(rows) or list(head)
     written = [folder / f"{name}.csv", folder / f"{name}.md"]
-    write_csv(written[0], [{k: "" if v is None else v for k, v in row.items()} for row in rows], columns)
+    write_csv(written[0], rows, columns)
     right = [title for title in head if title not in _WORDS]
-    write_text(written[1], markdown_table(head, [cells(row) for row in rows], right) + "\n")
+    text = markdown_table(head, [cells(row) for row in rows[:MOST_LINES]], right) + "\n"
+    if len(rows) > MOST_LINES:
+        text += f"\nThe first {MOST_LINES:,} of {len(rows):,} rows; all are in {name}.csv.\n"
+    write_text(written[1], text)
     if has_parquet():
-        pa, pq = pyarrow_modules()
-        table = pa.table({k: [row.get(k) for row in rows] for k in columns})
         written.append(folder / f"{name}.parquet")
-        with replacing(written[-1]) as temporary:
-            pq.write_table(table, temporary)
+        _write_parquet(written[-1], rows, columns)
     return written
+
+
+def _names(rows: Sequence[Row]) -> list[str]:
+    """All columns, in the order in which they appear."""
+    if isinstance(rows, PersonRows):
+        return list(rows.columns)
+    return list(dict.fromkeys(key for row in rows for key in row))
+
+
+def _write_parquet(path: Path, rows: Sequence[Row], columns: Sequence[str]) -> None:
+    pa, pq = pyarrow_modules()
+
+    def table(start: int) -> Any:
+        part = rows[start : start + _PART]
+        return pa.table({k: [row.get(k) for row in part] for k in columns})
+
+    first = table(0)
+    schema = first.schema
+    if len(rows) > _PART:
+        # What is not known in the first part may be a number in others.
+        kinds = [pa.float64() if pa.types.is_null(f.type) else f.type for f in schema]
+        schema = pa.schema(list(zip(columns, kinds)))
+    with replacing(path) as temporary, pq.ParquetWriter(temporary, schema) as writer:
+        writer.write_table(first.cast(schema))
+        for start in range(_PART, len(rows), _PART):
+            writer.write_table(table(start).cast(schema))
 
 
 def cell_name(row: Row) -> str:
@@ -109,7 +142,7 @@ def what_if_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:
 
 def plain_columns(rows: Sequence[Row], names: Sequence[str] = ()) -> tuple[list[str], Cells]:
     """Head and cells of a table whose columns are told as they are."""
-    head = list(dict.fromkeys(key for row in rows for key in row)) or list(names)
+    head = _names(rows) or list(names)
 
     def cells(row: Row) -> list[Any]:
         return ["" if row.get(k) is None else f"{row[k]:.4g}" if isinstance(row[k], float) else row[k] for k in head]

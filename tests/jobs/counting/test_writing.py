@@ -7,6 +7,8 @@ import csv
 import pytest
 
 from nerg_mi.jobs.counting import writing
+from nerg_mi.statistics.persons import PersonRows
+from nerg_mi.statistics.sums import ALL, Sums
 
 ROWS = [
     {"cell": "all", "value": "", "thing": "a|b", "n": 3, "x": 0.125},
@@ -72,3 +74,20 @@ def test06_differences_in_their_units():
     assert head[5] == "second - first" and cells(row) == told
     blank = row | {"measure": "dwell", "difference": 1.5, "low": None, "p": None, "p_adjusted": None, "found": False}
     assert cells(blank)[4:] == ["dwell", "+1.50 s", "", "", ""]
+
+
+def test07_many_people_are_written_in_parts(tmp_path, monkeypatch):
+    sums = Sums.empty(("x", "y"), (ALL,), [(ALL, f"p{k}") for k in range(5)])
+    # The first part of the file knows no first look.
+    sums.looks[3:], sums.first_sum[3:], sums.first_count[3:] = 1, 2.5, 1
+    rows = PersonRows(sums, {f"p{k}": f"p{k}" for k in range(5)}, False)
+    monkeypatch.setattr(writing, "_PART", 3)
+    monkeypatch.setattr(writing, "MOST_LINES", 4)
+    files = writing.write_rows(tmp_path, "people", rows, *writing.plain_columns(rows))
+    with files[0].open() as file:
+        told = list(csv.DictReader(file))
+    assert len(told) == 10 and told[0]["first_look"] == "" and told[9]["first_look"] == "2.5"
+    text = files[1].read_text().splitlines()
+    assert len(text) == 8 and text[-1] == "The first 4 of 10 rows; all are in people.csv."
+    pq = pytest.importorskip("pyarrow.parquet")
+    assert pq.read_table(files[2]).to_pylist() == list(rows)
