@@ -86,10 +86,10 @@ def make_gaze(job: Job) -> list[Path]:
     path = job.store / "shoppers.safetensors"
     options = GazeOptions(
         field=place,
-        recipe="small",
-        steps=800,
-        # Heads are drawn from the law at 5 Hz, so rays are independent and a narrow kernel is not noise.
-        kappa=100.0,
+        # Heads are drawn from the law at 5 Hz: rays are exact and independent, so that a narrow kernel is no noise and
+        # more steps do not follow the people at hand.
+        kappa=200.0,
+        steps=640,
         test_zones=8,
         test_positions=64,
         seed=job.seed,
