@@ -1,12 +1,16 @@
 """Attention of each Gaussian of the store's splats, beside that of the twin's mesh for the same observers.
 
-    python benchmarks/splats_attention.py [--splats FILE] [--resolution 208] [--out out/benchmarks/splats_attention.csv]
+    python benchmarks/splats_attention.py [--splats FILE] [--resolution 208] [--shoppers 40]
+        [--out out/benchmarks/splats_attention.csv]
 
 Both are what `nerg bake` writes, on the splats that `nerg export splats` makes of the field (or `--splats FILE`) and on
 `twin.ply`. A Gaussian is compared with the face of the cut mesh whose middle is nearest, where that is within 5 cm and
 its normal within 25 degrees of the Gaussian's shortest axis: `matched` of them are. `cc`: correlation; `ratio`: median
 over Gaussians and faces that both receive something; `agree`: share in which both do or neither does; `lost`: share of
-the twin's gaze on matched faces that Gaussians have none of.
+the twin's gaze on matched faces that Gaussians have none of. First table: observers of the store's field. Second: the
+rays of simulated shoppers themselves (`--from rays`), by lines and by cones, smoothed along the surface or not;
+`halves` and `of the twin`: CC between the halves of the people, on the Gaussians and on the mesh; `on`: share of gaze
+on either. Files of the last lie beside `--out`.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 import numpy as np
 
 NEAR, ALIKE = 0.05, np.cos(np.radians(25))
+CASES = ((0.0, 0.0), (1.5, 0.0), (1.5, 0.05), (1.5, 0.1))
 EYES = ((4.4, 2.8, 1.6), (2.0, 1.2, 1.6), (6.4, 3.2, 1.6))
 
 
@@ -50,6 +55,32 @@ def compare(splats, attention: np.ndarray, mesh, density: np.ndarray) -> dict[st
     }
 
 
+def of_rays(args, twin: Path) -> list[dict]:
+    """Rows of the second table."""
+    from bake import shoppers
+    from nerg_mi.jobs.bake import bake
+    from nerg_mi.jobs.bake_splats import bake_splats
+    from nerg_mi.jobs.options.bake import BakeOptions
+
+    args.rays, rows = None, []
+    rays = shoppers(args)
+    print(f"{len(rays):,} rays of {args.shoppers} shoppers", flush=True)
+    for cone, smooth in CASES:
+        options = BakeOptions(source="rays", cone=cone, smooth=smooth, halves=True)
+        outputs = [args.out.parent / f"rays-{kind}.ply" for kind in ("splats", "twin")]
+        started = time.perf_counter()
+        ours = bake_splats(args.splats, outputs[:1], options, rays=rays)
+        middle = time.perf_counter()
+        theirs = bake(twin, outputs[1:], options, rays=rays)
+        row = {"cone": f"{cone:g}", "smoothed cm": f"{100 * smooth:g}"}
+        row |= compare(ours.splats, ours.attention, theirs.mesh, theirs.density)
+        row |= {"halves": ours.summary["halves_cc"], "of the twin": theirs.summary["halves_cc"]}
+        row |= {"on": ours.summary["on_splats"], "on the twin": theirs.on_surface}
+        row["unaccounted"] = ours.summary["unaccounted"]
+        rows.append(row | {"s": middle - started, "s of the twin": time.perf_counter() - middle})
+    return rows
+
+
 def main(argv=None) -> None:
     from output import write_rows
     from splats import make, show
@@ -57,6 +88,7 @@ def main(argv=None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--splats", type=Path, help="file of splats (default: made of the field)")
     parser.add_argument("--resolution", type=int, default=208, help="lattice cells of what is made")
+    parser.add_argument("--shoppers", type=int, default=40, help="people whose rays are put on both")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/splats_attention.csv"))
     args = parser.parse_args(argv)
     from nerg_mi.jobs.backend import select_backend
@@ -81,6 +113,9 @@ def main(argv=None) -> None:
         rows.append({"observer": ", ".join(f"{v:g}" for v in eye), **found, "s": seconds})
     show("Attention of Gaussians beside that of the twin", rows)
     write_rows(args.out, rows)
+    rows = of_rays(args, store / "twin.ply")
+    show("Tracked rays on Gaussians beside those on the twin", rows)
+    write_rows(args.out.with_name("splats_rays.csv"), rows)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,19 @@
 """Gaussian splats fitted to photos through ``mi.render``: PSNR of held-out views before and after, time, memory.
 
-    python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 150] [--rays 8192] [--update
-    docs/splats.md]
+    python benchmarks/splats_fit.py [--resolution 96] [--views 24] [--width 96] [--steps 150] [--rays 8192] [--seeds 3]
+    [--update docs/splats.md]
 
-Photos are those that a photographer takes of the demo store's twin, at cameras chosen as for the store's field; held-
-out ones are a shopper's. Fitted are the splats that `nerg export splats` makes of the field (`--splats FILE` takes
-others), as they are and disturbed: centres moved by 2 cm in each axis, scales off by a third, axes turned by some 10
-degrees, opacities cut by 3 tenths, colours off by a tenth (standard deviations, all of one seed). All that a Gaussian
-has is optimised: Adam over its centre, the logarithms of its scales, its quaternion, the logit of its opacity and its
-harmonics; rays are random pixels of all photos, errors are squared differences of sRGB values. None is added or taken
-away.
+Photos are those that a photographer takes of the demo store's twin, at cameras chosen as for the store's field; eight
+others, a shopper's, say which learning rates are taken (`RATES` times one of `FACTORS`, by the disturbed splats of seed
+0), and eight more, of which nothing was chosen, are what is reported. Seeds decide the disturbance, the order of the
+rays and their samples; after ± is the standard deviation over them. Fitted are the splats that `nerg export splats`
+makes of the field (`--splats FILE` takes others), as they are and disturbed: centres moved by 2 cm in each axis, scales
+off by a third, axes turned by some 10 degrees, opacities cut by 3 tenths, colours off by a tenth (standard deviations).
+All that a Gaussian has is optimised: Adam over its centre, the logarithms of its scales, its quaternion, the logit of
+its opacity and its harmonics; rays are random pixels of all photos, errors are squared differences of sRGB values. None
+is added or taken away.
 
-Second table: the most that Dr.Jit holds during one derivative, beyond what it held before, against the number of hits a
+Last table: the most that Dr.Jit holds during one derivative, beyond what it held before, against the number of hits a
 ray: the same 4,096 rays through stacks of walls, each figure of its own process. Nothing passes or fails here.
 """
 
@@ -42,6 +44,7 @@ import numpy as np
 PREFIX = "integrator.field."
 # A step of Adam moves by about so much: metres, logarithms, quaternions, logits, harmonics.
 RATES = {"centers": 1e-3, "log_scales": 0.02, "rotations": 0.01, "logits": 0.05, "harmonics": 0.02}
+FACTORS = (0.5, 1.0, 2.0)
 HITS = (16, 64, 256, 1024)
 SIDE, WARM = 64, 4
 
@@ -61,25 +64,24 @@ def disturbed(splats: Splats, seed: int = 0) -> Splats:
 
 
 class Photos:
-    """Of the store's twin, from cameras to train on and others."""
+    """Of the store's twin: ``fitted``, ``choosing`` and ``held_out``, cameras with their pictures."""
 
     def __init__(self, count: int, width: int):
         from nerg_mi.scenes.store import cameras, layout, views
 
         camera = cameras.Pinhole(width, 3 * width // 4)
-        poses = cameras.choose_views(layout.build(0), camera, count, 8)
+        plan = layout.build(0)
+        poses = [*cameras.choose_views(plan, camera, count, 8), cameras.choose_views(plan, camera, 1, 8, seed=1)[1]]
         photographer = views.Photographer(camera)
-        taken = [
-            [photographer.picture(pose, seed, spp) for seed, pose in enumerate(group)]
-            for group, spp in zip(poses, (16, 64))
-        ]
-        self.seen, self.held_out = ([srgb(picture) for picture in group] for group in taken)
         film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
         film["component_format"] = "float32"
         sensor = {"type": "perspective", "fov": camera.fov_x, "fov_axis": "x", "near_clip": 0.01, "film": film}
-        self.cameras, self.others = (
-            [mi.load_dict(sensor | {"to_world": mi.ScalarTransform4f(views.mitsuba_pose(p))}) for p in group]
-            for group in poses
+        self.fitted, self.choosing, self.held_out = (
+            (
+                [mi.load_dict(sensor | {"to_world": mi.ScalarTransform4f(views.mitsuba_pose(p))}) for p in group],
+                [srgb(photographer.picture(pose, seed, spp)) for seed, pose in enumerate(group)],
+            )
+            for group, spp in zip(poses, (16, 64, 64))
         )
 
 
@@ -103,26 +105,27 @@ def as_srgb(x):
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
-def fit(scene, photos: Photos, steps: int, rays: int) -> None:
-    """Optimise all Gaussians of ``scene``."""
+def fit(scene, photos: Photos, steps: int, rays: int, factor: float, seed: int) -> None:
+    """Optimise all Gaussians of ``scene`` by ``factor`` times the rates."""
     params = mi.traverse(scene)
     params.keep([PREFIX + name for name in ("centers", "scales", "rotations", "opacities", "harmonics")])
     opacities = dr.clip(params[PREFIX + "opacities"], 1e-4, 1 - 1e-4)
     start = {name: params[PREFIX + name] for name in ("centers", "rotations", "harmonics")}
     start |= {"log_scales": dr.log(params[PREFIX + "scales"]), "logits": dr.log(opacities / (1 - opacities))}
     opt = mi.ad.Adam(lr=1e-3, params=start)
-    targets = [mi.TensorXf(photo.astype(np.float32)) for photo in photos.seen]
-    loader = mi.ad.loaders.RayDataLoader(photos.cameras, targets, pixels_per_batch=rays, regular_reshuffle=True)
+    cameras, pictures = photos.fitted
+    targets = [mi.TensorXf(picture.astype(np.float32)) for picture in pictures]
+    loader = mi.ad.loaders.RayDataLoader(cameras, targets, pixels_per_batch=rays, seed=seed, regular_reshuffle=True)
     for i in range(steps):
         # Slower towards the end, down to a tenth.
-        opt.set_learning_rate({name: rate * 0.1 ** (i / steps) for name, rate in RATES.items()})
+        opt.set_learning_rate({name: factor * rate * 0.1 ** (i / steps) for name, rate in RATES.items()})
         for name in ("centers", "rotations", "harmonics"):
             params[PREFIX + name] = opt[name]
         params[PREFIX + "scales"] = dr.exp(opt["log_scales"])
         params[PREFIX + "opacities"] = 1 / (1 + dr.exp(-opt["logits"]))
         params.update()
         wanted, sensor = loader.next()
-        picture = mi.render(scene, params, sensor=sensor, spp=1, seed=i)
+        picture = mi.render(scene, params, sensor=sensor, spp=1, seed=seed * steps + i)
         dr.backward(dr.mean(dr.square(as_srgb(picture[..., :3]) - wanted), axis=None))
         opt.step()
 
@@ -169,18 +172,26 @@ def held_at_most(work) -> float:
     return (dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before) / 1e6
 
 
-def fitted(name: str, splats: Splats, photos: Photos, args) -> list[str]:
-    """A row of the first table."""
+def fitted(splats: Splats, photos: Photos, args, factor: float, seed: int) -> dict[str, float]:
+    """Of one fit, by the names of the first table's columns."""
     scene = scene_of(splats)
-    before = [psnr(scene, photos.cameras, photos.seen), psnr(scene, photos.others, photos.held_out)]
+    before = {"before": psnr(scene, *photos.held_out), "fitted to, before": psnr(scene, *photos.fitted)}
     start, cpu = time.perf_counter(), time.process_time()
-    memory = held_at_most(lambda: fit(scene, photos, args.steps, args.rays))
+    memory = held_at_most(lambda: fit(scene, photos, args.steps, args.rays, factor, seed))
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
-    after = [psnr(scene, photos.cameras, photos.seen), psnr(scene, photos.others, photos.held_out)]
-    row = [name, *(f"{v:.2f}" for v in (before[1], after[1], before[0], after[0]))]
-    row += [f"{seconds:.0f}", f"{1e3 * cpu / args.steps:.0f}", f"{memory:.0f}"]
-    print(row, file=sys.stderr, flush=True)
+    after = {"after": psnr(scene, *photos.held_out), "fitted to, after": psnr(scene, *photos.fitted)}
+    row = before | after | {"choosing": psnr(scene, *photos.choosing), "s": seconds}
+    row |= {"CPU ms a step": 1e3 * cpu / args.steps, "MB at most": memory}
+    print(factor, seed, row, file=sys.stderr, flush=True)
     return row
+
+
+def summary(found: list[dict[str, float]]) -> list[str]:
+    """Cells of a row of the fits ``found``."""
+    of = lambda key: np.array([row[key] for row in found])
+    keys = ("before", "after", "fitted to, before", "fitted to, after")
+    cells = [f"{of(k).mean():.2f} ± {of(k).std(ddof=1):.2f}" for k in keys]
+    return cells + [f"{of(k).mean():.0f}" for k in ("s", "CPU ms a step", "MB at most")]
 
 
 def main(argv=None) -> None:
@@ -191,6 +202,7 @@ def main(argv=None) -> None:
     parser.add_argument("--width", type=int, default=96, help="of a photo in pixels (4:3)")
     parser.add_argument("--steps", type=int, default=150, help="of Adam")
     parser.add_argument("--rays", type=int, default=8192, help="rays a step")
+    parser.add_argument("--seeds", type=int, default=3, help="fits of each kind, two at least")
     parser.add_argument("--hits", type=int, help="print the memory for so many hits, measured in this process")
     parser.add_argument("--update", type=Path, help="a document whose tables are replaced")
     args = parser.parse_args(argv)
@@ -206,7 +218,19 @@ def main(argv=None) -> None:
         path = Path("out/benchmarks/fit.ply")
         make(path, args.resolution)
     splats, photos = read_splats(path), Photos(args.views, args.width)
-    rows = [fitted("as they are", splats, photos, args), fitted("disturbed", disturbed(splats), photos, args)]
+    tried = {factor: fitted(disturbed(splats), photos, args, factor, 0) for factor in FACTORS}
+    factor = max(tried, key=lambda f: tried[f]["choosing"])
+    rows = [[f"{f:g}", f"{row['choosing']:.2f}"] for f, row in tried.items()]
+    print_table("Learning rates, by other photos", ["times", "PSNR, dB"], rows, args.update)
+    kinds = {"as they are": lambda seed: splats, "disturbed": lambda seed: disturbed(splats, seed)}
+    rows = []
+    for name, of_seed in kinds.items():
+        known = tried[factor] if name == "disturbed" else None
+        found = [
+            known if seed == 0 and known else fitted(of_seed(seed), photos, args, factor, seed)
+            for seed in range(args.seeds)
+        ]
+        rows.append([name, *summary(found)])
     head = ["splats", "held-out photos, before", "after", "photos fitted to, before", "after"]
     head += ["s", "CPU ms a step", "MB at most"]
     print_table("PSNR of photos, dB", head, rows, args.update)

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.evaluation.saliency import cc
 from nerg_mi.figures.overlay import Heat
 from nerg_mi.figures.provenance import provenance
@@ -25,6 +24,7 @@ from nerg_mi.surfaces.smoothing import Smoother
 from nerg_mi.surfaces.sums import Sums, merge
 
 from .backend import select_backend
+from .baking.asked import UNITS, cone_of, source_of
 from .baking.chunks import BakeScene
 from .baking.lookers import alignment_of, check_values, find_crowd, rays_of, tracked_rays
 from .baking.outputs import SUFFIXES, Baked, check_texture, write_output
@@ -34,9 +34,6 @@ from .options.bake import BakeOptions
 from .parts import Parts
 from .reporter import SILENT, Reporter
 
-UNITS = {"share": "share of gaze per square metre [1/m²]", "seconds": "gaze per square metre [s/m²]"}
-SOURCES = ("field", "rays")
-_CONE = 1.5  # degrees: the error of good trackers, and the radius of the fovea
 _ERROR = 2e-3  # of what there was; more is said to be too much
 _LARGEST = 1000.0  # metres; no place that people were tracked in measures more
 
@@ -95,7 +92,7 @@ def bake(
     refined = cut(receivers, options.detail, align.scale)
     mesh = refined.mesh
     reporter.message(f"{len(receivers.mesh.faces):,} triangles, cut into {len(mesh.faces):,} to hold gaze")
-    cone = math.radians(_CONE if options.cone is None and source == "rays" else options.cone or 0.0)
+    cone = cone_of(options, source)
     scene = BakeScene(
         mesh,
         receivers.others,
@@ -146,27 +143,12 @@ def bake(
 
 
 def _check(surface: Path, paths: list[Path], options: BakeOptions, rays: Rays | None) -> str:
-    """Whose gaze it is, of `SOURCES`. Raises `NergError` for options that contradict each other."""
+    """Whose gaze it is, of `asked.SOURCES`. Raises `NergError` for options that contradict each other."""
     for path in paths:
         check_writable(path, *SUFFIXES)
     check_texture(paths, options.texture)
     check_values(options)
-    people = rays is not None or options.rays is not None
-    of_scene = surface.suffix.lower() == ".xml"
-    source = options.source or ("field" if options.gaze is not None or (of_scene and not people) else "rays")
-    if source not in SOURCES:
-        raise NergError(f'--from is {" or ".join(SOURCES)}, got "{source}"')
-    if options.unit not in UNITS:
-        raise NergError(f'--unit is {" or ".join(UNITS)}, got "{options.unit}"')
-    if source == "rays" and not people:
-        raise NergError("whose gaze is it? give a gaze field by --gaze, or rays by --rays")
-    if source == "rays" and (options.observer is not None or options.path is not None):
-        raise NergError("--observer and --path look with a gaze field; give --gaze, or leave them out")
-    if source == "field" and (options.unit == "seconds" or options.halves):
-        raise NergError("--unit seconds and --halves are of rays, whose time is known; add --from rays")
-    if not (np.isfinite(options.smooth) and options.smooth >= 0):
-        raise NergError(f"--smooth is a length in metres, got {options.smooth:g}")
-    return source
+    return source_of(options, rays, surface.suffix.lower() == ".xml")
 
 
 def _smoothed(mesh: Mesh, sums: Sums, smoother: Smoother | None) -> tuple[np.ndarray, np.ndarray]:

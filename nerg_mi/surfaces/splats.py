@@ -25,6 +25,7 @@ from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place
 
 from .gaze_source import Looker, MakeLooker, density_through, unhidden
+from .splat_areas import shortest_axes, sides_of
 
 BATCH = 1 << 18
 """Gaussians in one launch."""
@@ -40,17 +41,18 @@ def splat_densities(
     cone: float = 0.0,
     falloff: float = 0.0,
 ) -> np.ndarray:
-    """Gaze (N,), float64, that each of ``splats`` receives per square scene unit from observers at ``eyes`` (M, 3) who
-    count by ``weights`` (M,): a sum over them.
+    """Gaze (2, N), float64, that each side of ``splats`` receives per square scene unit from observers at ``eyes``
+    (M, 3) who count by ``weights`` (M,): a sum over them. Sides are those of `splat_areas.sides_of`.
 
     ``place``: what hides, the splats themselves among it, in their frame, traced with ``settings``; ``cone``: standard
     deviation in radian of the cone that gaze is seen through, ``falloff`` as of the integrator. From within its own
     width a Gaussian receives what it does from as far as it is wide.
     """
-    out = np.zeros(len(splats))
+    out, every, axes = np.zeros((2, len(splats))), np.arange(len(splats)), shortest_axes(splats)
     with dr.suspend_grad():
         for eye, weight in zip(np.asarray(eyes, np.float64), weights):
-            out += float(weight) * _of_one(splats, place, make(eye), eye, settings, cone, falloff)
+            found = float(weight) * _of_one(splats, place, make(eye), eye, settings, cone, falloff)
+            out[sides_of(splats.centers - eye, axes), every] += found
     return out
 
 

@@ -1,5 +1,7 @@
 """Gaze that is written back to Gaussian splats: from files to a file."""
 
+import json
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
@@ -8,12 +10,16 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.colors import color_values
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.splats.files import read_splats
+from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.jobs.bake_splats import COLUMN, bake_splats
+from nerg_mi.jobs.baking import chunks
 from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.maths.harmonics import C0
+from nerg_mi.rays.rays import Rays
 from tests.formats.splats.writers import random_splats, write_inria
 from tests.jobs.recorder import Recorder
 from tests.plugins import fields
+from tests.surfaces.walls import wall
 
 OPTIONS = {"mode": "llvm_ad_rgb", "observer": (0.0, 0.0, -3.0)}
 
@@ -67,10 +73,12 @@ def test02_people_on_a_path_and_places_in_other_units(rgb, place):
 @pytest.mark.parametrize(
     "options, said",
     [
-        ({"smooth": 0.1}, "--smooth is of surfaces with triangles"),
+        ({"texture": 512}, "--texture is of surfaces with triangles"),
         ({"shapes": ("a",)}, "--shape is of surfaces"),
-        ({"source": "rays"}, "nerg train gaze RAYS --field SPLATS"),
-        ({"gaze": None}, "name one by --gaze"),
+        ({"source": "rays"}, "rays by --rays"),
+        ({"source": "field", "gaze": None}, "nerg train gaze RAYS --field SPLATS"),
+        ({"unit": "seconds"}, "add --from rays"),
+        ({"smooth": -1.0}, "--smooth is a length"),
         ({"source": "eyes"}, 'got "eyes"'),
         ({"observer": None}, "nobody looks"),
         ({"observer": (1e4, 0.0, 0.0), "top": -1.0}, "--top must be positive"),
@@ -80,6 +88,50 @@ def test03_what_splats_have_not(rgb, place, options, said):
     given = BakeOptions(**({"gaze": place / "gaze.safetensors"} | OPTIONS | options))
     with pytest.raises(NergError, match=said):
         bake_splats(place / "place.ply", [place / "out.ply"], given)
-    with pytest.raises(NergError, match="end in .ply"):
+    with pytest.raises(NergError, match=".ply"):
         bake(place, "out.glb")
     assert not (place / "out.ply").exists()
+
+
+def looks(n=600):
+    """Rays of two people from before a wall of a square metre, at it."""
+    rng = np.random.default_rng(0)
+    d = np.concatenate([rng.normal(0, 0.12, (n, 2)), np.ones((n, 1))], axis=1)
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    return Rays(np.arange(n) / 10, np.arange(n) % 2, ("a", "b"), np.tile([0.0, 0, -1], (n, 1)), d, np.ones(n))
+
+
+def test04_rays_themselves_in_parts_and_in_one_go(rgb, tmp_path, monkeypatch):
+    """Shares, seconds, halves, smoothed; the files are the same to the byte."""
+    monkeypatch.setattr(chunks, "RAYS", 200)
+    write_ply_splats(tmp_path / "wall.ply", wall(0.0, 1.0, 0.03, 0.0005))
+    looks().save(tmp_path / "rays.npz")
+    common = {"rays": tmp_path / "rays.npz", "mode": "llvm_ad_rgb", "bundle": 4, "halves": True, "smooth": 0.05}
+    for folder, more in (("one", {}), ("parts", {"store": tmp_path / "store"})):
+        told = Recorder()
+        outputs = [tmp_path / folder / f"a{suffix}" for suffix in (".ply", ".json")]
+        found = bake_splats(tmp_path / "wall.ply", outputs, BakeOptions(**common, **more), told)
+    for name in ("a.ply", "a.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
+    summary = json.loads((tmp_path / "one" / "a.json").read_text())
+    assert abs(summary["on_splats"] + summary["escaped"] - 1) < 1e-3 and summary["on_splats"] > 0.9
+    assert 0.7 < summary["halves_cc"] <= 1 and summary["lookers"] == 600
+    assert any("lies on Gaussians" in line for line in told.messages)
+    # Where they look most: a Gaussian of the law, the cone and the smoothing.
+    most = 1 / (2 * np.pi * (0.12**2 + np.radians(1.5) ** 2 + 0.05**2))
+    middle = np.linalg.norm(found.splats.centers[:, :2], axis=1) < 0.06
+    assert np.isclose(np.median(found.attention[middle]), most, rtol=0.15)
+    seconds = bake_splats(tmp_path / "wall.ply", (), BakeOptions(**common, unit="seconds", store=tmp_path / "store"))
+    assert np.allclose(seconds.attention, 120 * found.attention, rtol=0.01) and seconds.summary["unit"].endswith(
+        "[s/m^2]"
+    )
+
+
+def test05_a_field_smoothed_and_in_parts(rgb, place):
+    (place / "walk.csv").write_text("x,y,z\n0,0,-3\n0,1,-3\n1,0,-3\n")
+    common = {"observer": None, "path": place / "walk.csv"}
+    one, parts = bake(place, "one.ply", **common), bake(place, "two.ply", store=place / "store", **common)
+    assert np.array_equal(one.attention, parts.attention)
+    # Balls that are apart and turned anyhow have nobody to share with.
+    smoothed = bake(place, "three.ply", smooth=0.01, **common)
+    assert np.median(np.abs(smoothed.attention / one.attention - 1)) < 0.01

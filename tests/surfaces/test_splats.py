@@ -20,7 +20,8 @@ ALONG = np.array([0.0, 0, 1])
 def found(splats, law, eyes=EYE, weights=(1.0,), **more):
     place = Place(medium_of(splats))
     settings = ObserverSettings(march=default_settings(place))
-    return splat_densities(splats, place, lookers_of_law(law), np.asarray(eyes), np.asarray(weights), settings, **more)
+    make, eyes, weights = lookers_of_law(law), np.asarray(eyes), np.asarray(weights)
+    return splat_densities(splats, place, make, eyes, weights, settings, **more).sum(axis=0)
 
 
 def uniform(rgb):

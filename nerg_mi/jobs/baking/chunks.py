@@ -53,6 +53,11 @@ class BakeScene:
     of_gaze: GazeSettings = field(default_factory=GazeSettings)
     of_rays: RaySettings = field(default_factory=RaySettings)
 
+    @property
+    def nothing(self) -> Sums:
+        """Of nobody."""
+        return Sums.none(len(self.mesh.faces), len(self.mesh.vertices))
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 of everything, the files' bytes included."""

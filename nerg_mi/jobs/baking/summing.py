@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -15,40 +16,51 @@ from nerg_mi.surfaces.population import Crowd
 from nerg_mi.surfaces.ray_source import TrackedRays
 from nerg_mi.surfaces.sums import Sums
 from nerg_mi.tasks.plan import Plan
+from nerg_mi.tasks.task import Task
 
-from .chunks import BakeScene, bake_chunk, parts_of
+from .chunks import bake_chunk, parts_of
 from .tasks import read_sums, tasks_of
 
 _BEGIN, _END = 0.05, 0.9  # of a bake is this
 
 
-def sums_in_one_go(scene: BakeScene, groups: Sequence[Crowd | TrackedRays], reporter: Reporter) -> list[Sums]:
-    """The sums of each of ``groups``, of which nothing is kept."""
+def sums_in_one_go(
+    scene: Any, groups: Sequence[Crowd | TrackedRays], reporter: Reporter, make: Callable[..., Sums] = bake_chunk
+) -> list[Sums]:
+    """The sums of each of ``groups``, of which nothing is kept. ``make``: the sums of a ``scene`` of its kind, such as
+    a `BakeScene`, and of a part."""
     parts = [list(parts_of(group)) for group in groups]
     count, done, found = sum(map(len, parts)), 0, []
     with Interruption() as stop:
         for group in parts:
-            sums = _none(scene)
+            sums = scene.nothing
             for part in group:
                 stop.check()
-                sums = sums.plus(bake_chunk(scene, part))
+                sums = sums.plus(make(scene, part))
                 done += 1
                 reporter.progress(_BEGIN + (_END - _BEGIN) * done / count, f"part {done} of {count}")
             found.append(sums)
     return found
 
 
-def sums_in_parts(scene: BakeScene, groups: Sequence[Crowd | TrackedRays], parts: Parts, what: str) -> list[Sums]:
-    """The sums of each of ``groups``, whose parts are kept; ``what``: the job, as its user calls it."""
+def sums_in_parts(
+    scene: Any,
+    groups: Sequence[Crowd | TrackedRays],
+    parts: Parts,
+    what: str,
+    plan: Callable[..., list[Task]] = tasks_of,
+) -> list[Sums]:
+    """The sums of each of ``groups``, whose parts are kept; ``what``: the job, as its user calls it; ``plan``: the
+    tasks of a ``scene`` of its kind, of a group of them, the variant and the parts."""
     import mitsuba as mi
 
-    tasks = [tasks_of(scene, group, str(mi.variant()), parts) for group in groups]
+    tasks = [plan(scene, group, str(mi.variant()), parts) for group in groups]
     arriving = parts.run(Plan(what, [task for group in tasks for task in group]), _BEGIN, _END)
     found = []
     for group in tasks:
-        sums = _none(scene)
+        sums = scene.nothing
         for _ in group:
-            sums = sums.plus(read_sums(next(arriving), len(scene.mesh.faces)))
+            sums = sums.plus(read_sums(next(arriving), len(scene.nothing.face)))
         found.append(sums)
     return found
 
@@ -64,7 +76,3 @@ def halves_of(who: TrackedRays, rays: Rays, seed: int) -> list[Crowd | TrackedRa
         TrackedRays(who.origins[rows], who.directions[rows], who.weights[rows], start)
         for rows, start in zip(order, [0, len(order[0])])
     ]
-
-
-def _none(scene: BakeScene) -> Sums:
-    return Sums.none(len(scene.mesh.faces), len(scene.mesh.vertices))

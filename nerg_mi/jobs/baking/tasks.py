@@ -42,14 +42,18 @@ def bake_part(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output:
     the ``first`` of the rays that are among ``inputs``."""
     select_backend(parameters["mode"])
     use_share()
-    sums = bake_chunk(_scene(parameters, inputs), _part(parameters, inputs))
+    return write_sums(bake_chunk(_scene(parameters, inputs), part_of(parameters, inputs)), output)
+
+
+def write_sums(sums: Sums, output: Path) -> dict[str, float]:
+    """``sums`` as a task leaves them: arrays in a file, and the others, which are returned, as notes."""
     with replacing(output) as temporary, temporary.open("wb") as out:
         np.save(out, np.concatenate([sums.face, sums.vertex]))
     return {name: getattr(sums, name) for name in _NUMBERS}
 
 
 def read_sums(made: Output, faces: int) -> Sums:
-    """What `bake_part` has made, of a mesh of so many ``faces``."""
+    """What `write_sums` has written, of so many ``faces``."""
     values = read_npy(made.path, "part of a bake")
     return Sums(values[:faces], values[faces:], **{name: made.notes[name] for name in _NUMBERS})
 
@@ -57,6 +61,19 @@ def read_sums(made: Output, faces: int) -> Sums:
 def tasks_of(scene: BakeScene, who: Crowd | TrackedRays, mode: str, parts: Parts) -> list[Task]:
     """A task for each part of ``who``, in their order; meshes and rays are held by the store of ``parts``."""
     around, inputs = _describe(scene, parts)
+    return tasks_around(f"{__name__}:bake_part", around, inputs, who, mode, parts)
+
+
+def tasks_around(
+    function: str,
+    around: dict[str, Any],
+    inputs: tuple[InputFile, ...],
+    who: Crowd | TrackedRays,
+    mode: str,
+    parts: Parts,
+) -> list[Task]:
+    """A task for ``function`` for each part of ``who``, ``around`` which is what is the same for all of them, of which
+    it reads ``inputs``."""
     files = {file.name: file.sha256 for file in inputs}
     common = {"mode": mode, "around": around, "digest": hashlib.sha256(canonical([around, files]).encode()).hexdigest()}
     found, start = [], 0
@@ -64,11 +81,8 @@ def tasks_of(scene: BakeScene, who: Crowd | TrackedRays, mode: str, parts: Parts
         count = len(part.weights)
         label = f"{'rays' if isinstance(part, TrackedRays) else 'observers'} {start + 1} to {start + count}"
         own, more = _given(part, parts)
-        found.append(
-            Task(
-                f"{__name__}:bake_part", {**common, **own}, (*inputs, *more), ".npy", versions(*RENDERS, "scipy"), label
-            )
-        )
+        needed = versions(*RENDERS, "scipy")
+        found.append(Task(function, {**common, **own}, (*inputs, *more), ".npy", needed, label))
         start += count
     return found
 
@@ -80,7 +94,8 @@ def _given(part: Crowd | TrackedRays, parts: Parts) -> tuple[dict[str, Any], tup
     return {"positions": part.positions.tolist(), "weights": part.weights.tolist()}, ()
 
 
-def _part(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> Crowd | TrackedRays:
+def part_of(parameters: Mapping[str, Any], inputs: Mapping[str, Path]) -> Crowd | TrackedRays:
+    """The observers, or the rays, of a task that `tasks_around` made."""
     if "first" not in parameters:
         return Crowd(np.array(parameters["positions"]), np.array(parameters["weights"]))
     values = read_npy(inputs[_RAYS], "rays of a bake")

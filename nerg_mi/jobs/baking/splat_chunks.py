@@ -1,0 +1,114 @@
+"""The work of a bake of Gaussian splats in parts: as `chunks`, of files alone."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.field.backend import namespace
+from nerg_mi.field.splats import Splats
+from nerg_mi.files.checksum import file_sha256
+from nerg_mi.formats.fields import load_gaze
+from nerg_mi.formats.splats.files import read_splats
+from nerg_mi.surfaces.gaze_source import MakeLooker, lookers_of_field
+from nerg_mi.surfaces.population import Crowd
+from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
+from nerg_mi.surfaces.splat_areas import shortest_axes
+from nerg_mi.surfaces.splat_rays import splat_ray_sums
+from nerg_mi.surfaces.splats import splat_densities
+from nerg_mi.surfaces.sums import Sums
+from nerg_mi.surfaces.target import SURFACE_OPACITY
+from nerg_mi.transport.media.splats.arrays import SplatArrays
+from nerg_mi.transport.media.splats.medium import SplatMedium
+from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.place import Place
+from nerg_mi.transport.trace import default_settings
+
+
+@dataclass(frozen=True, eq=False)
+class SplatScene:
+    """All that a part needs to know besides who looks; it can be pickled, and refers to files: ``splats``, of which
+    there are ``count``, and the checkpoint of the ``gaze`` field, or None. ``cone``: standard deviation in radian of
+    that through which the field's gaze is seen."""
+
+    splats: Path
+    count: int
+    gaze: Path | None = None
+    cone: float = 0.0
+    of_rays: RaySettings = field(default_factory=RaySettings)
+
+    @property
+    def nothing(self) -> Sums:
+        """Of nobody."""
+        return Sums.none(2 * self.count, 0)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of everything, the files' bytes included."""
+        sums = [None if path is None else file_sha256(path) for path in (self.splats, self.gaze)]
+        return hashlib.sha256(repr((sums, self.cone, self.of_rays)).encode()).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class SplatPlace:
+    """Splats as they are traced: ``arrays`` of them in a ``place``, with ``settings``, and their shortest ``axes``
+    (N, 3)."""
+
+    splats: Splats
+    arrays: SplatArrays
+    place: Place
+    settings: ObserverSettings
+    axes: np.ndarray
+
+    @property
+    def tolerance(self) -> float:
+        """How far apart two ideas of one surface may be, as of `ObserverSettings.tolerance`."""
+        return 2 * self.settings.march.step
+
+
+def splat_place(splats: Splats) -> SplatPlace:
+    """That of ``splats``, in the variant in use."""
+    import mitsuba as mi
+
+    arrays = SplatArrays(splats, namespace(mi.Float))
+    place = Place(SplatMedium(arrays))
+    settings = ObserverSettings(march=default_settings(place), surface_opacity=SURFACE_OPACITY)
+    return SplatPlace(splats, arrays, place, settings, shortest_axes(splats))
+
+
+_last: list[tuple[str, str, SplatPlace, MakeLooker | None]] = []
+
+
+def splat_chunk(scene: SplatScene, part: Crowd | TrackedRays) -> Sums:
+    """Partial sums of the observers, or of the rays, of ``part``: ``face`` is, of rays, shares of gaze on the sides of
+    the Gaussians, and of observers densities of theirs. A variant must be active; what is loaded for a scene is kept
+    for its next part. Raises `NergError`."""
+    there, make = _prepared(scene)
+    if isinstance(part, TrackedRays):
+        return splat_ray_sums(there.arrays, there.axes, part, scene.of_rays)
+    if make is None:
+        raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --from rays")
+    found = splat_densities(
+        there.splats, there.place, make, part.positions, part.weights, there.settings, scene.cone
+    ).ravel()
+    return Sums(found, np.zeros(0), weight=float(part.weights.sum()), count=len(part.weights))
+
+
+def _prepared(scene: SplatScene) -> tuple[SplatPlace, MakeLooker | None]:
+    import mitsuba as mi
+
+    variant = str(mi.variant())
+    if not _last or _last[0][:2] != (scene.digest, variant):
+        _last.clear()
+        there, make = splat_place(read_splats(scene.splats)), None
+        if scene.gaze is not None:
+            gaze = PlacedGaze(load_gaze(scene.gaze, namespace(mi.Float))[0])
+            make = lookers_of_field(gaze, there.place, there.settings)
+        _last.append((scene.digest, variant, there, make))
+    return _last[0][2:]
