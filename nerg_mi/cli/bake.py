@@ -27,7 +27,7 @@ def command(
             "-o",
             "--output",
             help="Files to write, repeatable: .ply, .glb (with colours), .csv (of faces), .json (summary); of Gaussian "
-            "splats .ply.",
+            "splats .ply and .json.",
         ),
     ],
     options: BakeOptions,

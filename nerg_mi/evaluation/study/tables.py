@@ -149,7 +149,8 @@ _SHOWN = (
 
 
 def markdown(report: dict) -> str:
-    """A table for each factor, the default first in all of them, and the comparison with the paper's marching."""
+    """A table for each factor, the default first in all of them, and the comparison with the paper's marching, where
+    there is any."""
     rows = report["rows"]
     shown = [c for c in _SHOWN if any(c[0] in r for r in rows)]
     default = rows[0]
@@ -175,6 +176,8 @@ def markdown(report: dict) -> str:
             cells.append([paper["setting"], f"{1e3 * paper[clock]:.3g}", f"{paper['depth_mae']:.3g}"])
             cells[-1] += [time["setting"], f"{time['error_ratio']:.3g}"] if time else ["none", ""]
             cells[-1] += [error["setting"], f"{error['time_ratio']:.3g}"] if error else ["none", ""]
+        if not cells:
+            continue
         title = f"against the paper's marching, by {clock.replace('_', ' ')}"
         text.append(f"### {title}\n\n{markdown_table(head, cells)}")
     return "\n\n".join(text) + "\n"

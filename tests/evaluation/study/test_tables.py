@@ -25,6 +25,7 @@ def test_a_page_shows_times_in_ms_shares_in_percent_and_errors_as_they_are():
     row |= {name: (k + 1) / 128 for k, name in enumerate(names)}
     about = {"scene": "s", "size": (1, 1), "variant": "v", "reference": "r", "reference_change_when_step_halved": {}}
     page = study_tables.markdown({"rows": [{**row, "group": "default"}, row], **about})
+    assert "against the paper" not in page
     shown = [float(cell) for cell in page.split("| a |")[2].split("\n")[0].strip(" |").split("|")]
     assert sorted(shown) == sorted(float(f"{row[name] * units.get(name, 1):.3g}") for name in names)
 
