@@ -121,7 +121,7 @@ AOVS: dict[str, Aov] = {
         ),
         Aov(
             name="support",
-            summary="how many training rays started around the observer, one at distance d counting 1 - d²/R² (R of "
+            summary="how many training rays started around the observer, one at distance d counting 1 - d²/(5R)² (R of "
             "the training); one number an observer, shown where there is a surface",
             compute=lambda p: [p.view_of_observer("support")],
             of_observer=True,

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze import evaluation
-from nerg_mi.evaluation.gaze.baselines import standard_baselines
+from nerg_mi.evaluation.gaze.baselines import Baseline, standard_baselines
 from nerg_mi.evaluation.gaze.report import side_by_side, write_report
-from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
+from nerg_mi.evaluation.gaze.scores import EPS, FieldDensity, gaze_field
+from nerg_mi.evaluation.gaze.uncertainty import calibration_rows, position_rows, rank_rows
+from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.figures.provenance import files_among, provenance
 from nerg_mi.files.atomic import check_folder
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.rays.dataset.opening import load_rays, rays_digest
 from nerg_mi.rays.rays import Rays
+from nerg_mi.training.geometry.places import GazePlace
 
 from .backend import select_backend
 from .gaze_places import check_place, place_of_training
@@ -25,6 +31,9 @@ from .reporter import SILENT, Reporter
 # Methods whose scores are told for each person, and those that are drawn.
 _BY_PERSON = ("gaze field", "4,096 nearest rays")
 _DRAWN = ("gaze field", "position-blind", "16 nearest probes", "4,096 nearest rays")
+# Those whose regions are looked at, by what they are called.
+_BLIND = "position-blind"
+_CALIBRATED = ("gaze field", _BLIND, "4,096 nearest rays")
 
 
 @dataclass(frozen=True)
@@ -42,6 +51,12 @@ class GazeEvaluation:
     people: int
     # Tables and pictures that were written.
     files: list[Path]
+    # A row a position: its error, and how sure the field is there (`uncertainty.position_rows`).
+    by_position: list[dict[str, Any]] = field(default_factory=list)
+    # A row a signal and error: how well it ranks them (`uncertainty.rank_rows`).
+    uncertainty: list[dict[str, Any]] = field(default_factory=list)
+    # A row a method: what its regions hold (`uncertainty.calibration_rows`).
+    calibration: list[dict[str, Any]] = field(default_factory=list)
 
 
 def evaluate_gaze(
@@ -63,7 +78,7 @@ def evaluate_gaze(
     if output is not None:
         check_folder(output)
     ns = select_backend(options.mode, options.threads)
-    field, metadata = load_gaze(gaze, ns)
+    loaded, metadata = load_gaze(gaze, ns)
     about = metadata["provenance"]
     data = _rays_of_training(gaze, about, rays)
     account, seed = about["test"], options.seed
@@ -73,7 +88,7 @@ def evaluate_gaze(
     test = evaluation.make_test(
         scored, centres, account["radius"], options.kappa, options.directions, options.min_rays, seed=seed
     )
-    place = place_of_training(gaze, about, field.box, options, ns)
+    place = place_of_training(gaze, about, loaded.box, options, ns)
     option = f"--{place.kind} {options.field or options.scene or 'FILE'}"
     # What was trained by force is scored, and told.
     check_place(place, scored, option, True, reporter)
@@ -81,7 +96,7 @@ def evaluate_gaze(
     depth, count = about.get("probes", {}).get("depth", "median"), len(test.centres)
     # Most of the time goes to the densities of the field.
     known = lambda number: reporter.progress(0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}")
-    density = gaze_field(field, place.medium, place.align, depth, known)
+    density = gaze_field(loaded, place.medium, place.align, depth, known)
     methods = {"gaze field": density, **others}
     reporter.progress(0.05, "scores")
     told = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
@@ -90,6 +105,11 @@ def evaluate_gaze(
     rows += [half] if half else []
     reporter.progress(0.86, "each person")
     persons = evaluation.person_rows(test, {k: methods[k] for k in _BY_PERSON}, blind, options.min_rays)
+    reporter.progress(0.9, "uncertainty")
+    places = _positions(test, loaded, place, density, others[_BLIND], _groups(account, split, test.centres), seed)
+    ranks = rank_rows(places, options.resamples, seed)
+    asked = {k: (methods[k](test.centres, test.directions), methods[k](test.centres, test.at)) for k in _CALIBRATED}
+    regions = calibration_rows(test, asked, options.resamples, seed)
     files = []
     if output is not None:
         summary = {
@@ -102,14 +122,45 @@ def evaluate_gaze(
             "resamples": options.resamples,
         }
         notes = _notes(gaze.name, split, test, (len(train), len(data)), account["radius"], options)
-        files = write_report(output, rows, persons, summary, notes)
+        files = write_report(output, rows, persons, summary, notes, places, ranks, regions)
         if options.pictures:
             reporter.progress(0.95, "pictures")
             files.append(output / "positions.png")
             sources = files_among(gaze, rays, options.field, options.scene)
             made = provenance("nerg eval gaze", sources, seed, options)
             side_by_side(test, {k: methods[k] for k in _DRAWN}, files[-1], options.pictures, about=made)
-    return GazeEvaluation(rows, persons, split, len(test.centres), len(test.persons), files)
+    return GazeEvaluation(rows, persons, split, len(test.centres), len(test.persons), files, places, ranks, regions)
+
+
+def _positions(
+    test: evaluation.GazeTest,
+    loaded: AnyGazeField,
+    place: GazePlace,
+    density: FieldDensity,
+    blind: Baseline,
+    groups: list[str] | None,
+    seed: int,
+) -> list[dict[str, Any]]:
+    """The error at each position, and what tells how sure the field ``loaded`` is there."""
+    members = density.members(test.centres, test.directions)
+    support = spread = None
+    if loaded.support is not None:
+        points = place.points_from_rays(test.centres)
+        support = np.array([np.ravel(loaded.support.at(loaded.ns.Array3f(*map(float, p))))[0] for p in points])
+    if len(members) > 1:
+        spread = 4 * np.pi * members.std(axis=0, ddof=1).mean(axis=1)
+    of_blind = np.asarray(blind(test.centres, test.directions))
+    maps = members.mean(axis=0)
+    return position_rows(test, maps, of_blind, support=support, spread=spread, groups=groups, seed=seed)
+
+
+def _groups(account: dict, split: str, centres: np.ndarray) -> list[str] | None:
+    """The zone of each of the ``centres`` (P, 3) that a test held out; None where they lie anywhere, and where a
+    checkpoint of before does not say."""
+    if split == "people" or "zone" not in account:
+        return None
+    whole = np.array(account["centres"])
+    return [str(account["zone"][int(np.argmin(((whole - c) ** 2).sum(axis=1)))]) for c in centres]
 
 
 def _rays_of_training(gaze: Path, about: dict, rays: Rays | str | Path) -> Rays:

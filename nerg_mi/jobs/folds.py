@@ -10,8 +10,9 @@ from typing import Any
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze.evaluation import SCORES, SPLITS
-from nerg_mi.evaluation.gaze.folds import mean_rows
-from nerg_mi.evaluation.gaze.report import markdown
+from nerg_mi.evaluation.gaze.folds import mean_rows, means
+from nerg_mi.evaluation.gaze.report import markdown, uncertainty_text
+from nerg_mi.evaluation.gaze.uncertainty import LEVELS, rank_rows
 from nerg_mi.files.atomic import check_folder, write_text
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_csv, write_json
@@ -37,6 +38,7 @@ from .reporter import SILENT, Reporter
 FIELD, SCORED = "gaze.safetensors", "scores.json"
 """What the output of a fold holds: its field, and the rows of each split."""
 
+_LEVELS = tuple(f"{level:.0%}" for level in LEVELS)
 _RAYS = "of-the-job/rays.npz"
 _TRAINING = ("recipe", "variant", "radius", "probes", "steps", "mix_folds", "mode")
 _SCORING = ("kappa", "directions", "min_rays", "mode")
@@ -45,19 +47,25 @@ _SCORING = ("kappa", "directions", "min_rays", "mode")
 @dataclass(frozen=True)
 class FoldResult:
     """``rows``: a row a split and method, means over folds (`evaluation.gaze.folds.mean_rows`); ``each``: a row a fold,
-    split and method; ``fields``: the checkpoint of each fold, where the store keeps it; ``files`` written."""
+    split and method; ``fields``: the checkpoint of each fold, where the store keeps it; ``files`` written;
+    ``by_position``: a row a fold, split and position; ``uncertainty``: how well a signal ranks the errors of all folds'
+    positions, in each split and in all of them ("anywhere"); ``calibration``: a row a split and method, means over
+    folds."""
 
     rows: list[dict[str, Any]]
     each: list[dict[str, Any]]
     fields: list[Path]
     files: list[Path]
+    by_position: list[dict[str, Any]]
+    uncertainty: list[dict[str, Any]]
+    calibration: list[dict[str, Any]]
 
 
 def evaluate_folds(
     rays: Rays | str | Path, output: str | Path, options: FoldOptions | None = None, reporter: Reporter = SILENT
 ) -> FoldResult:
     """Train and score a gaze field for each fold on ``rays``, or their file or dataset, and write one table into the
-    folder ``output``: folds.md, folds.csv (fold by fold), folds.json.
+    folder ``output``: folds.md, folds.csv (fold by fold), positions.csv (position by position), folds.json.
 
     A fold is a part that is kept, in ``OUTPUT.tasks`` or in ``options.store``: it depends on the rays, the place, its
     seed and its options. Equal ones give equal scores to the bit with one thread, and to rounding with more. Raises
@@ -88,20 +96,30 @@ def evaluate_folds(
         for seed in seeds
     ]
     each, fields, by_split = [], [], {split: [] for split in splits}
+    positions, regions = [], {split: [] for split in splits}
     for seed, made in zip(seeds, parts.run(Plan(what, tasks))):
         found: Any = read_json(made.path / SCORED, "scores of a fold")
         fields.append(made.path / FIELD)
         for split in splits:
             by_split[split].append(found[split]["rows"])
             each += [{"fold": seed, "split": split, **row} for row in found[split]["rows"]]
+            # A zone of one fold is none of another, and its people are others in another split.
+            of = lambda row, seed=seed, split=split: {"group": f"{seed} {split} {row['group']}"}
+            positions += [{"fold": seed, "split": split, **row, **of(row)} for row in found[split]["by_position"]]
+            regions[split].append(found[split]["calibration"])
         score = by_split[splits[0]][-1][0]
         reporter.message(f"fold {seed}, {splits[0]}: KLD {score['KLD']:.3f}, CC {score['CC']:.3f}")
     rows = [{"split": split, **row} for split, found in by_split.items() for row in mean_rows(found)]
-    written = _write(output, rows, each, splits, options)
+    populations = {split: [p for p in positions if p["split"] == split] for split in splits}
+    if len(splits) > 1:
+        populations["anywhere"] = positions
+    ranks = [{"split": split, **row} for split, found in populations.items() for row in rank_rows(found)]
+    held = [{"split": split, **row} for split, found in regions.items() for row in means(found, _LEVELS)]
+    written = _write(output, rows, each, options, positions, ranks, held)
     for path in written:
         reporter.message(f"wrote {path}")
     reporter.message(f"The folds are kept in {parts.store.folder}; nerg jobs says what they take.")
-    return FoldResult(rows, each, fields, written)
+    return FoldResult(rows, each, fields, written, positions, ranks, held)
 
 
 def train_and_score(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> None:
@@ -119,6 +137,7 @@ def train_and_score(parameters: Mapping[str, Any], inputs: Mapping[str, Path], o
         scoring = GazeEvaluationOptions(**place, **parameters["scoring"], split=split, seed=seed, resamples=0)
         scored = evaluate_gaze(gaze, files["rays"], None, scoring)
         found[split] = {"rows": scored.rows, "positions": scored.positions, "people": scored.people}
+        found[split] |= {"by_position": scored.by_position, "calibration": scored.calibration}
     write_json(output / SCORED, found)
 
 
@@ -149,19 +168,31 @@ def _inputs(
 
 
 def _write(
-    folder: Path, rows: list[dict[str, Any]], each: list[dict[str, Any]], splits: list[str], options: FoldOptions
+    folder: Path,
+    rows: list[dict[str, Any]],
+    each: list[dict[str, Any]],
+    options: FoldOptions,
+    positions: list[dict[str, Any]],
+    ranks: list[dict[str, Any]],
+    regions: list[dict[str, Any]],
 ) -> list[Path]:
-    files = [folder / name for name in ("folds.md", "folds.csv", "folds.json")]
+    files = [folder / name for name in ("folds.md", "folds.csv", "positions.csv", "folds.json")]
     text = (
         f"# {options.folds} folds\n\nEach holds out {100 * options.people:g} % of the people and {options.positions} "
         f"positions in {options.zones} zones. Means over folds; brackets: 95 % of Student's t for {options.folds} "
         "folds, which share people who train: the spread over what was held out. The last row of each table is a "
-        "difference fold by fold.\n"
+        "difference fold by fold. How uncertainty ranks errors is of all folds' positions, with 95 % of resamples of "
+        "their zones.\n"
     )
-    for split in splits:
-        own = [row for row in rows if row["split"] == split]
-        text += f"\n## {split}\n\n{markdown(own, ('method', *SCORES, 'integral', 'folds'))}"
+    of = lambda table, split: [row for row in table if row["split"] == split]
+    for split in dict.fromkeys(row["split"] for row in (*rows, *ranks)):
+        text += f"\n# {split}\n\n"
+        if own := of(rows, split):
+            text += f"{markdown(own, ('method', *SCORES, 'integral', 'folds'))}\n"
+        text += uncertainty_text(of(ranks, split), of(regions, split))
     write_text(files[0], text)
     write_csv(files[1], each)
-    write_json(files[2], {"folds": options.folds, "first": options.first, "methods": rows})
+    write_csv(files[2], positions)
+    tables = {"methods": rows, "uncertainty": ranks, "calibration": regions}
+    write_json(files[3], {"folds": options.folds, "first": options.first, **tables})
     return files

@@ -32,7 +32,7 @@ ABLATION = (
     "ablation.md ablation.csv ablation.json ablation.png place.vol "
     "default_emit_capture_0.safetensors default_emit_capture_0.json"
 )
-EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.png"
+EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.csv positions.png"
 STATS = "things.csv things.md things.parquet moves.csv moves.md moves.parquet durations.csv durations.md "
 STATS += "durations.parquet people.csv people.md people.parquet things.png moves.png about.json"
 GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8 --seed 1"
@@ -150,7 +150,7 @@ CASES = (
         "eval folds",
         "{i}/rays.npz -o {o}/folds --store {i}/store --geometry none --folds 2 --zones 1 --positions 3 --radius 0.6 "
         "--probes 8 --steps 2 --directions 128 --min-rays 8 --splits pos --first 1",
-        _below("folds", "folds.md folds.csv folds.json"),
+        _below("folds", "folds.md folds.csv positions.csv folds.json"),
         ("folds",),
     ),
     Case(

@@ -39,7 +39,12 @@ def test_scores_stand_beside_the_baselines(trained, tmp_path):
     assert names[0] == "gaze field" and "uniform" in names and "4,096 nearest rays" in names and found.split == "pos"
     assert all(set(SCORES) <= set(row) for row in found.rows) and 1 <= found.positions <= 3 and found.people >= 2
     assert {row["method"] for row in found.persons} == {"gaze field", "4,096 nearest rays"}
-    assert {p.name for p in found.files} == {"gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.png"}
+    files = {"gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.png", "positions.csv"}
+    assert {p.name for p in found.files} == files
+    # All stand in one zone; a field of no support would say so at each.
+    assert len(found.by_position) == found.positions and {row["group"] for row in found.by_position} == {"0"}
+    assert all(row["support"] >= 0 and row["KLD"] > 0 for row in found.by_position)
+    assert {row["method"] for row in found.calibration} >= {"gaze field", "4,096 nearest rays"}
     assert json.loads((tmp_path / "eval" / "gaze.json").read_text())["methods"][0]["KLD"] == found.rows[0]["KLD"]
     assert "directions of equal area" in (tmp_path / "eval" / "gaze.md").read_text()
 

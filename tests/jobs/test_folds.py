@@ -41,8 +41,12 @@ def test_two_workers_of_which_one_is_killed_score_as_this_process_does(tmp_path,
         options = FoldOptions(**SMALL | {"folds": 3}, scheduler=cluster.address)
         found = evaluate_folds(tmp_path / "rays.npz", tmp_path / "out", options, told)
         assert cluster.workers[0].poll() is not None and cluster.workers[1].poll() is None
-    assert {p.name for p in found.files} == {"folds.md", "folds.csv", "folds.json"}
+    assert {p.name for p in found.files} == {"folds.md", "folds.csv", "positions.csv", "folds.json"}
     assert {row["fold"] for row in found.each} == {0, 1, 2} and {row["split"] for row in found.rows} == {"both", "pos"}
+    # Each fold's zone is a group of its own, and all positions together are asked too.
+    assert {row["group"].split()[0] for row in found.by_position} == {"0", "1", "2"}
+    assert {row["split"] for row in found.uncertainty} == {"both", "pos", "anywhere"}
+    assert found.calibration[0]["folds"] == 3 and 0 <= found.calibration[0]["80%"] <= 1
     ours = [row["KLD"] for row in found.each if row["split"] == "both" and row["method"] == "gaze field"]
     assert found.rows[0]["KLD"] == pytest.approx(sum(ours) / 3) and ours[0] != ours[1]
     assert found.rows[0]["KLD.low"] < found.rows[0]["KLD"] and all(field.is_file() for field in found.fields)
@@ -67,7 +71,10 @@ def trained(monkeypatch):
         assert dr.thread_count() == 1
         seeds.append(parameters["seed"])
         rows = [{"method": "gaze field", "KLD": 1.0 / (1 + parameters["seed"]), "CC": 0.5}]
-        write_json(output / SCORED, {split: {"rows": rows} for split in parameters["splits"]})
+        write_json(
+            output / SCORED,
+            {split: {"rows": rows, "by_position": [], "calibration": []} for split in parameters["splits"]},
+        )
 
     monkeypatch.setattr(folds, "train_and_score", score)
     return seeds

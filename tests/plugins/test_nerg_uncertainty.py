@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
-from nerg_mi.field.gaze.support import RaySupport
+from nerg_mi.field.gaze.support import REACH, RaySupport
 from nerg_mi.formats.fields import load_gaze, save_gaze
 from tests.reference import fields_numpy
 
@@ -116,7 +116,7 @@ def test03_members_are_normalised_each_by_itself(rgb, tmp_path):
 def test04_support_is_that_of_the_observer(rgb, files, ensemble):
     eyes = [(-2, 0.3, -2), (-1.6, 0.3, -2.2), (5.0, 5, 5)]
     for eye in eyes:
-        expected = np.maximum(1 - ((ORIGINS - eye) ** 2).sum(axis=1), 0).sum()
+        expected = np.maximum(1 - ((ORIGINS - eye) ** 2).sum(axis=1) / REACH**2, 0).sum()
         out = channels(
             rgb,
             with_field(files, gaze=volume(ensemble[0]), aovs="support,position", observer=observer_at(rgb, *eye)),
@@ -140,7 +140,7 @@ def test05_support_follows_the_observer_and_the_placement(rgb, files, ensemble):
     }
     integrator = {**placed, "observer": observer_at(rgb, -3, 0.6, -4)}
     scene = rgb.load_dict({"type": "scene", "integrator": integrator, "sensor": camera(rgb, (2, 0.8, -6), (1, 0, 0))})
-    of = lambda eye: np.maximum(1 - ((ORIGINS - eye) ** 2).sum(axis=1), 0).sum()
+    of = lambda eye: np.maximum(1 - ((ORIGINS - eye) ** 2).sum(axis=1) / REACH**2, 0).sum()
     assert np.array(rgb.render(scene, spp=1))[..., 3].max() == pytest.approx(of((-2, 0.3, -2)), rel=0.03)
     params = rgb.traverse(scene)
     params["integrator.observer.to_world"] = rgb.Transform4f().translate([-2.2, 0.6, -4.4])

@@ -17,15 +17,18 @@ from nerg_mi.maths.sphere import Z_UP, latlong_grid
 
 from .baselines import Baseline
 from .evaluation import SCORES, GazeTest
+from .uncertainty import KEPT, LEVELS
 
 # Digits of the scores that have others than three.
 _DIGITS = {"MAE": 4}
+# Columns that hold words.
+_WORDS = ("method", "person", "signal", "error")
 
 
 def markdown(rows: list[dict], columns: tuple[str, ...] = ("method", *SCORES, "integral")) -> str:
     """A table of ``rows``, with intervals in brackets where they are known."""
     shown = [c for c in columns if any(c in r for r in rows)]
-    numbers = [c for c in shown if c not in ("method", "person")]
+    numbers = [c for c in shown if c not in _WORDS]
     return markdown_table(shown, ([_cell(row, c) for c in shown] for row in rows), numbers) + "\n"
 
 
@@ -42,25 +45,57 @@ def _cell(row: dict, column: str) -> str:
     return text
 
 
-def write_report(folder: Path, rows: list[dict], persons: list[dict], about: dict, notes: str) -> list[Path]:
-    """Write ``gaze.md``, ``gaze.csv``, ``persons.csv`` and ``gaze.json`` into ``folder``; returns their paths.
+def write_report(
+    folder: Path,
+    rows: list[dict],
+    persons: list[dict],
+    about: dict,
+    notes: str,
+    positions: list[dict] | None = None,
+    ranks: list[dict] | None = None,
+    regions: list[dict] | None = None,
+) -> list[Path]:
+    """Write ``gaze.md``, ``gaze.csv``, ``persons.csv``, ``gaze.json`` and ``positions.csv`` into ``folder``; returns
+    their paths.
 
     ``rows``, ``persons``: a row a method, and a method and person; ``about``: what was scored (JSON); ``notes``: what
-    the Markdown begins with.
+    the Markdown begins with; ``positions``, ``ranks``, ``regions``: rows of `uncertainty`.
     """
-    files = [folder / name for name in ("gaze.md", "gaze.csv", "persons.csv", "gaze.json")]
+    positions, ranks, regions = positions or [], ranks or [], regions or []
+    files = [folder / name for name in ("gaze.md", "gaze.csv", "persons.csv", "gaze.json", "positions.csv")]
     ours, bar = rows[0], next(r["method"] for r in reversed(rows) if r["method"] != "split half")
     difference = {k.replace(".less", ""): v for k, v in ours.items() if ".less" in k}
     differences = [{"method": f"{ours['method']} less {bar}", **difference}]
     each = markdown(persons, ("method", "person", "rays", "KLD", "CC", "NSS", "AUC", "bits", "loglik"))
-    write_text(files[0], f"{notes}\n\n{markdown(rows)}\n{markdown(differences)}\n## Each person\n\n{each}")
-    for path, table in zip(files[1:3], (rows, persons)):
+    text = f"{notes}\n\n{markdown(rows)}\n{markdown(differences)}\n{uncertainty_text(ranks, regions)}"
+    write_text(files[0], f"{text}## Each person\n\n{each}")
+    for path, table in zip((*files[1:3], files[4]), (rows, persons, positions)):
         write_csv(path, table)
     clean = lambda table: [
         {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in r.items()} for r in table
     ]
-    write_json(files[3], {**about, "methods": clean(rows), "persons": clean(persons)}, allow_nan=False)
+    of_all = {"methods": rows, "persons": persons, "uncertainty": ranks, "calibration": regions}
+    write_json(files[3], {**about, **{k: clean(v) for k, v in of_all.items()}}, allow_nan=False)
     return files
+
+
+def uncertainty_text(ranks: list[dict], regions: list[dict]) -> str:
+    """What a page says of rows of `uncertainty.rank_rows` and `uncertainty.calibration_rows`, as Markdown."""
+    text = ""
+    if ranks:
+        shares = tuple(f"{share:.0%}" for share in KEPT)
+        text += (
+            "## Uncertainty\n\nrho: Spearman's rank correlation of what makes unsure (little support; a wide spread of "
+            "an ensemble's members) with the error at a position: KLD, or its excess over that of half of the people "
+            "under the other half. Then the mean error of the surest positions. A signal that is the same everywhere "
+            f"has no rho.\n\n{markdown(ranks, ('signal', 'error', 'positions', 'rho', *shares))}\n"
+        )
+    if regions:
+        text += (
+            "## Calibration\n\nShare of the rays in the smallest regions that are said to hold so much of the gaze."
+            f"\n\n{markdown(regions, ('method', *(f'{level:.0%}' for level in LEVELS)))}\n"
+        )
+    return text
 
 
 def side_by_side(

@@ -17,11 +17,51 @@ from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
 
-from .baselines import Baseline
-
 # Of the uniform density: what a density of zero counts as in KLD. A truth that is a kernel density has
 # long empty stretches where nothing should hinge on how empty exactly.
 EPS = 1e-6
+
+
+class FieldDensity:
+    """A gaze field in a place, as a function as those of `baselines` are; see `gaze_field`."""
+
+    def __init__(
+        self,
+        field: AnyGazeField,
+        place: Place,
+        align: Similarity,
+        settings: ObserverSettings,
+        on_position: Callable[[int], None] | None,
+    ):
+        self._gaze, self._place, self._align, self._settings = PlacedGaze(field), place, align, settings
+        self._on_position = on_position
+        self._observed: dict[bytes, ObservedGaze] = {}
+
+    def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Densities (P, D) of positions (P, 3) in unit directions (D, 3) or (P, D, 3)."""
+        return self.members(positions, directions).mean(axis=0)
+
+    def members(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """The same of each member of an ensemble (M, P, D); of one field, that alone."""
+        align = self._align
+        positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
+        directions = np.asarray(directions, np.float64) @ (align.matrix[:3, :3] / align.scale).T
+        directions = np.broadcast_to(directions, (len(positions), *directions.shape[-2:]))
+        return np.stack([self._of(p, d) for p, d in zip(positions, directions)], axis=1)
+
+    def _of(self, position: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Densities (M, D) of one observer (3,), both in the field's frame."""
+        import mitsuba as mi
+
+        p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
+        new = key not in self._observed
+        if new:
+            self._observed[key] = self._gaze.at([p_o], self._place, self._settings)
+        r_o = vector_of(mi.Vector3f, directions)
+        density = np.stack([np.array(m) for m in self._observed[key].members_along(p_o, r_o)])
+        if new and self._on_position is not None:
+            self._on_position(len(self._observed))
+        return density
 
 
 def gaze_field(
@@ -30,7 +70,7 @@ def gaze_field(
     align: Similarity | None = None,
     kind: str = "median",
     on_position: Callable[[int], None] | None = None,
-) -> Baseline:
+) -> FieldDensity:
     """``field`` in a place as a function ``(positions (P, 3), directions) -> (P, D)`` of densities in 1/sr of the
     positions' units.
 
@@ -49,33 +89,9 @@ def gaze_field(
             "this gaze field was trained among surfaces, and there is no place that has any: give it the field, the "
             "scene or the geometry"
         )
-    align = align or Similarity()
-    gaze = PlacedGaze(field)
     place = medium if isinstance(medium, Place) else Place(medium)
     settings = ObserverSettings(march=default_settings(place), depth=kind, surface_opacity=SURFACE_OPACITY)
-    observed: dict[bytes, ObservedGaze] = {}
-
-    def of(position: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Densities (D,) of one observer (3,), both in the field's frame."""
-        import mitsuba as mi
-
-        p_o, key = mi.Point3f(*position.tolist()), position.tobytes()
-        new = key not in observed
-        if new:
-            observed[key] = gaze.at([p_o], place, settings)
-        r_o = vector_of(mi.Vector3f, directions)
-        density = np.array(observed[key].along(p_o, r_o))
-        if new and on_position is not None:
-            on_position(len(observed))
-        return density
-
-    def evaluate(positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        positions = np.atleast_2d(np.asarray(positions, np.float64)) @ align.matrix[:3, :3].T + align.matrix[:3, 3]
-        directions = np.asarray(directions, np.float64) @ (align.matrix[:3, :3] / align.scale).T
-        directions = np.broadcast_to(directions, (len(positions), *directions.shape[-2:]))
-        return np.stack([of(p, d) for p, d in zip(positions, directions)])
-
-    return evaluate
+    return FieldDensity(field, place, align or Similarity(), settings, on_position)
 
 
 def scores(truth: np.ndarray, prediction: np.ndarray, eps: float = EPS) -> dict[str, float]:

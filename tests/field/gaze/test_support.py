@@ -4,11 +4,11 @@ import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
-from nerg_mi.field.gaze.support import RaySupport
+from nerg_mi.field.gaze.support import REACH, RaySupport
 
 
-def exact(origins, radius, p):
-    return np.maximum(1 - ((origins - p) ** 2).sum(axis=1) / radius**2, 0).sum()
+def exact(origins, radius, p, reach=REACH):
+    return np.maximum(1 - ((origins - p) ** 2).sum(axis=1) / (reach * radius) ** 2, 0).sum()
 
 
 def at(support, p):
@@ -28,8 +28,8 @@ def test_where_it_is_greatest():
     support = RaySupport.of(origins, 0.3)
     densest = support.densest()
     assert np.linalg.norm(densest - (3, 1, 2)) < 0.1
-    everywhere = [exact(origins, 0.3, p) for p in origins[::7]]
-    assert exact(origins, 0.3, densest) > 0.9 * max(everywhere)
+    everywhere = [exact(origins, 0.3, p, 1) for p in origins[::7]]
+    assert exact(origins, 0.3, densest, 1) > 0.9 * max(everywhere)
 
 
 @pytest.mark.parametrize("radius", [0.1, 0.25, 0.6])
@@ -38,7 +38,7 @@ def test_cells_stand_for_their_rays(radius):
     support = RaySupport.of(origins, radius)
     assert support.cells[:, 3].sum() == len(origins) and len(support.cells) < len(origins)
     rng = np.random.default_rng(1)
-    places = np.concatenate([origins[rng.integers(0, len(origins), 200)], rng.uniform(0, 4, (100, 3))])
+    places = np.concatenate([origins[rng.integers(0, len(origins), 200)], rng.uniform(-6, 10, (100, 3))])
     found, expected = (
         np.array([f(p) for p in places]) for f in (lambda p: at(support, p), lambda p: exact(origins, radius, p))
     )
@@ -52,12 +52,13 @@ def test_cells_stand_for_their_rays(radius):
 def test_inside_of_the_radius_cells_are_exact():
     origins = np.random.default_rng(0).normal(0, 0.05, (1000, 3))
     support = RaySupport.of(origins, 1.0)
-    assert at(support, (0.2, 0.1, 0)) == pytest.approx(exact(origins, 1.0, [0.2, 0.1, 0]), rel=1e-5)
+    assert at(support, (1.2, 2.1, 0)) == pytest.approx(exact(origins, 1.0, [1.2, 2.1, 0]), rel=1e-5)
 
 
-def test_one_ray_counts_one_where_it_started_and_nothing_a_radius_away():
+def test_one_ray_counts_one_where_it_started_and_nothing_five_radii_away():
     support = RaySupport.of([[1.0, 2, 3]], 0.5)
-    assert at(support, (1, 2, 3)) == 1 and at(support, (1, 2, 3.25)) == 0.75 and at(support, (1.5, 2, 3)) < 1e-6
+    assert at(support, (1, 2, 3)) == 1 and at(support, (1, 2, 4.25)) == 0.75 and at(support, (3.5, 2, 3)) < 1e-6
+    assert support.reach == 2.5
 
 
 def test_what_is_no_support_is_refused():

@@ -1,0 +1,74 @@
+"""Does a gaze field know what it does not know? Ranks of errors, risk and regions in many places.
+
+    python benchmarks/gaze_uncertainty.py [--only office,room] [--folds 3] [--zones 6] [--out FOLDER]
+
+Places and protocol are those of `places.py`, with more zones, since positions of a zone are neighbours. A row a place
+and error: Spearman's rank correlation of little support with the error, at new positions ("both") and at any that held-out
+people stood at ("anywhere"), with 95 % of resamples of zones; the mean error of all and of the surest half; and the
+share of held-out rays in the smallest regions that are said to hold 80 % of the gaze.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from output import write_rows
+from places import ROOT, makers
+
+
+def main(argv=None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
+    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
+    parser.add_argument("--only", help="names of places, with commas between. Default: all whose data is there.")
+    parser.add_argument("--folds", type=int, default=3)
+    parser.add_argument("--zones", type=int, default=6)
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/uncertainty"))
+    args = parser.parse_args(argv)
+    args.out = args.out.resolve()
+    args.out.mkdir(parents=True, exist_ok=True)
+    places = makers(args.data)
+    rows = []
+    for name in args.only.split(",") if args.only else places:
+        if name not in places:
+            raise SystemExit(f'no place is called "{name}" here; there are {", ".join(places)}')
+        rows += measure(name, places[name], args)
+        write_rows(args.out / "uncertainty.csv", rows)
+
+
+def measure(name: str, make, args: argparse.Namespace) -> list[dict]:
+    """A row a population and error of one place, which is printed."""
+    from nerg_mi.cli.progress import TerminalReporter
+    from nerg_mi.jobs.backend import select_backend
+    from nerg_mi.jobs.folds import evaluate_folds
+    from nerg_mi.jobs.options.folds import FoldOptions
+
+    folder = args.out / name
+    folder.mkdir(exist_ok=True)
+    select_backend("llvm_ad_rgb", args.threads)
+    rays, where = make(folder)
+    common = {"splits": "both,people", "folds": args.folds, "zones": args.zones, "threads": args.threads}
+    with TerminalReporter() as reporter:
+        found = evaluate_folds(rays, folder / "eval", FoldOptions(**where, **common), reporter)
+    held = {(r["split"], r["method"]): r["80%"] for r in found.calibration}
+    rows = []
+    for rank in found.uncertainty:
+        if rank["signal"] != "support" or rank["split"] == "people":
+            continue
+        low, high = rank.get("rho.low", float("nan")), rank.get("rho.high", float("nan"))
+        row = {"place": name, **{k: rank[k] for k in ("split", "error", "positions", "rho", "100%", "50%")}}
+        row |= {"rho.low": low, "rho.high": high, "of 80%": held["both", "gaze field"]}
+        rows.append(row)
+        print(
+            f"{name:12s}{rank['split']:9s}{rank['error']:7s}{rank['positions']:5d}  rho {rank['rho']:+.2f} "
+            f"[{low:+.2f}, {high:+.2f}]  error {rank['100%']:.3f}, surest half {rank['50%']:.3f}; "
+            f"80 % regions hold {row['of 80%']:.0%}"
+        )
+    return rows
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,171 @@
+"""Whether what tells how sure a gaze field is foretells how far it is off, and whether its regions hold the looks that
+they should.
+
+The error of a position is the KLD of the density of the people who are scored there. Some of it is theirs, who are few:
+what half of them tells of the other half is taken off where both halves have rays enough. Positions of one zone are
+neighbours and are drawn together in a bootstrap; calibration draws persons, as all scores do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from nerg_mi.evaluation import saliency as metrics
+
+from .evaluation import GazeTest
+from .scores import EPS
+
+SIGNALS = {"support": True, "spread": False}
+"""What tells how sure a field is, by its name in a row of `position_rows`, and whether more of it is surer."""
+ERRORS = ("KLD", "excess")
+"""Errors of a position: KLD (nats), and by how much it is above that of one half of the people under the other."""
+KEPT = (1.0, 0.75, 0.5, 0.25)
+"""Shares of the positions, the surest, whose mean error is told."""
+LEVELS = (0.5, 0.8, 0.95)
+"""Shares of the gaze whose smallest regions are looked at."""
+# Halves of the people that are drawn, rays that each half has at a position at least, and the blind density's share of
+# what one half tells of the other, so that where it never looked is not impossible.
+_HALVES, _RAYS, _BLIND = 8, 32, 0.2
+# Groups of positions from which on there is an interval.
+_GROUPS = 5
+
+
+def position_rows(
+    test: GazeTest,
+    maps: np.ndarray,
+    blind: np.ndarray,
+    *,
+    support: np.ndarray | None = None,
+    spread: np.ndarray | None = None,
+    groups: Sequence[Any] | None = None,
+    seed: int = 0,
+) -> list[dict[str, Any]]:
+    """A row a position of ``test``: where it is (m), its ``group``, rays and people, KLD of ``maps`` and of ``blind``
+    (P, D), that of the people's ``half`` and the ``excess`` over it, where they are enough, and how sure the field is:
+    ``support`` (P,), rays, and ``spread`` (P,), the standard deviation over an ensemble's members, integrated over the
+    sphere. ``groups``: of neighbouring positions; None: each is its own."""
+    error, less = (metrics.kld(test.truth, m, eps=EPS) for m in (maps, blind))
+    half = half_errors(test, blind, seed)
+    rows = []
+    for i, (x, y, z) in enumerate(test.centres.tolist()):
+        row = {"x": x, "y": y, "z": z, "group": str(i if groups is None else groups[i])}
+        row |= {"rays": int(test.counts[i].sum()), "people": int(np.count_nonzero(test.counts[i]))}
+        row |= {"KLD": float(error[i]), "blind": float(less[i])}
+        if np.isfinite(half[i]):
+            row |= {"half": float(half[i]), "excess": float(error[i] - half[i])}
+        row |= {k: float(v[i]) for k, v in (("support", support), ("spread", spread)) if v is not None}
+        rows.append(row)
+    return rows
+
+
+def half_errors(test: GazeTest, blind: np.ndarray, seed: int = 0) -> np.ndarray:
+    """KLD (P,) of half of the people under the other half, mixed with a fifth of ``blind`` (P, D): means over both
+    directions and several draws of the halves. NaN where no draw leaves both halves 32 rays."""
+    rng, found = np.random.default_rng(seed), []
+    people = len(test.persons)
+    for _ in range(_HALVES if people > 1 else 0):
+        side = rng.permutation(people) < people // 2
+        counts = [test.counts * side, test.counts * ~side]
+        both = np.logical_and(*(c.sum(axis=1) >= _RAYS for c in counts))
+        error = np.full(len(test.truth), np.nan)
+        shares = [c[both] / c[both].sum(axis=1, keepdims=True) for c in counts]
+        a, b = (np.einsum("pn,pnd->pd", share, test.parts[both]) for share in shares)
+        told = lambda maps, both=both: (1 - _BLIND) * maps + _BLIND * blind[both]
+        error[both] = (metrics.kld(a, told(b), eps=EPS) + metrics.kld(b, told(a), eps=EPS)) / 2
+        found.append(error)
+    each = np.array(found).reshape(-1, len(test.truth))
+    known = np.isfinite(each)
+    return np.where(known.any(axis=0), np.where(known, each, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1), np.nan)
+
+
+def rank_rows(rows: Sequence[Mapping[str, Any]], resamples: int = 200, seed: int = 0) -> list[dict[str, Any]]:
+    """A row a signal of `SIGNALS` that ``rows`` of `position_rows` have, and error: Spearman's rank correlation of what
+    makes unsure with the error, ``rho``, with ``.low`` and ``.high`` of its 95 % interval where there are five groups
+    of positions, and the mean error of the surest `KEPT` of the positions. NaN where a signal is the same everywhere,
+    and so says nothing."""
+    out = []
+    for signal, surer in SIGNALS.items():
+        for error in ERRORS:
+            used = [r for r in rows if signal in r and error in r]
+            if not used:
+                continue
+            doubt = np.array([r[signal] for r in used], float) * (-1 if surer else 1)
+            value = np.array([r[error] for r in used], float)
+            row = {"signal": signal, "error": error, "positions": len(used), "rho": _spearman(doubt, value)}
+            row |= _interval(doubt, value, [r["group"] for r in used], resamples, seed)
+            out.append(row | {f"{share:.0%}": _risk(doubt, value, share) for share in KEPT})
+    return out
+
+
+def calibration_rows(
+    test: GazeTest, methods: Mapping[str, tuple[np.ndarray, np.ndarray]], resamples: int = 200, seed: int = 0
+) -> list[dict[str, Any]]:
+    """A row a method: the share of the rays of ``test`` that lie in the smallest regions which are said to hold
+    `LEVELS` of the gaze, with ``.low`` and ``.high`` where there are three persons. ``methods``: densities in the
+    test's directions (P, D), and at its rays (P, K)."""
+    rng, people = np.random.default_rng(seed), len(test.persons)
+    draws = rng.multinomial(people, np.full(people, 1 / people), resamples if people >= 3 else 0)
+    out = []
+    for name, (maps, at) in methods.items():
+        row: dict[str, Any] = {"method": name}
+        level = region_levels(maps, at)
+        for share in LEVELS:
+            inside, key = level <= share, f"{share:.0%}"
+            row[key] = float(inside.mean())
+            if len(draws):
+                weights = [times[test.who] for times in draws]
+                reach = 1.96 * np.std([(inside * w).sum() / w.sum() for w in weights])
+                row[f"{key}.low"], row[f"{key}.high"] = row[key] - reach, row[key] + reach
+        out.append(row)
+    return out
+
+
+def region_levels(maps: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Share of the gaze (P, K) in the smallest region that a ray lies in, of densities ``maps`` (P, D) in directions of
+    equal area that are ``at`` (P, K) at the rays: what is denser, and half of what is equal (Hyndman 1996)."""
+    out = []
+    for row, values in zip(np.maximum(maps, 0).astype(np.float64), at):
+        ordered = np.sort(row)
+        mass = np.concatenate([[0.0], np.cumsum(ordered)])
+        lower, upper = (mass[np.searchsorted(ordered, values, side)] for side in ("left", "right"))
+        out.append(1 - 0.5 * (lower + upper) / mass[-1] if mass[-1] > 0 else np.full(len(values), 0.5))
+    return np.array(out)
+
+
+def _spearman(a: np.ndarray, b: np.ndarray) -> float:
+    from scipy.stats import rankdata
+
+    a, b = (rankdata(v) for v in (a, b))
+    if len(a) < 3 or np.ptp(a) == 0 or np.ptp(b) == 0:
+        return float("nan")
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _interval(
+    doubt: np.ndarray, error: np.ndarray, groups: Sequence[str], resamples: int, seed: int
+) -> dict[str, float]:
+    """The ends of the interval of ``rho``: quantiles over resamples of the groups, each with all of its positions."""
+    names, own = np.unique(groups, return_inverse=True)
+    if len(names) < _GROUPS or not resamples:
+        return {}
+    rng, members = np.random.default_rng(seed), [np.flatnonzero(own == k) for k in range(len(names))]
+    found = []
+    for _ in range(resamples):
+        drawn = np.concatenate([members[k] for k in rng.integers(0, len(names), len(names))])
+        found.append(_spearman(doubt[drawn], error[drawn]))
+    found = [v for v in found if np.isfinite(v)]
+    if not found:
+        return {}
+    low, high = np.quantile(found, [0.025, 0.975])
+    return {"rho.low": float(low), "rho.high": float(high)}
+
+
+def _risk(doubt: np.ndarray, error: np.ndarray, share: float) -> float:
+    """Mean ``error`` of the surest ``share``; those that are equally sure count alike."""
+    _, place = np.unique(doubt, return_inverse=True)
+    alike = (np.bincount(place, weights=error) / np.bincount(place))[place]
+    surest = np.argsort(place, kind="stable")[: max(1, round(share * len(error)))]
+    return float(alike[surest].mean())
