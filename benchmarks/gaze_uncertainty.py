@@ -3,8 +3,8 @@
     python benchmarks/gaze_uncertainty.py [--only office,room] [--folds 3] [--zones 6] [--out FOLDER]
 
 Places and protocol are those of `places.py`, with more zones, since positions of a zone are neighbours. A row a place
-and error: Spearman's rank correlation of little support with the error, at new positions ("both") and at any that held-out
-people stood at ("anywhere"), with 95 % of resamples of zones; the mean error of all and of the surest half; and the
+and error: Spearman's rho of little support with the error, at new positions ("both") and at any where held-out
+people stood ("anywhere"), with 95 % of resamples of zones; the mean error of all and of the surest half; and the
 share of held-out rays in the smallest regions that are said to hold 80 % of the gaze.
 """
 
