@@ -251,17 +251,16 @@ def score(study: Study, name: str, fields: int) -> list[Scored]:
 def trained(fold: Fold, people: tuple[int, ...]) -> Logs:
     """A gaze field of the default recipe, of the rays of ``people`` in the fold's place."""
     from nerg_mi.evaluation.gaze.scores import gaze_field
+    from nerg_mi.field.backend import namespace
     from nerg_mi.jobs.gaze_plan import plan_gaze
     from nerg_mi.jobs.options.gaze import GazeOptions
     from nerg_mi.training.gaze.run import train_gaze
     from nerg_mi.training.gaze.supervision import Supervision
 
-    import drjit.llvm.ad as ns
-
     rays = fold.pool.select(np.isin(fold.pool.person, people))
     options = GazeOptions(geometry="none" if fold.place.medium is None else "hits")
     plan = plan_gaze(options, fold.place)
-    made = train_gaze(Supervision(rays), fold.place, plan, ns)
+    made = train_gaze(Supervision(rays), fold.place, plan, namespace("llvm"))
     density = gaze_field(made.field, fold.place.medium, fold.place.align)
     logs = [np.log(np.maximum(density(fold.test.centres, d), 1e-9)) for d in (fold.test.directions, fold.at)]
     return normalised(*logs)

@@ -73,6 +73,7 @@ class PriorPlace:
 def prior_place(name: str, make: Callable[[Path], tuple[Path, dict]], folds: int, folder: Path) -> PriorPlace:
     """The place ``name`` that ``make`` writes into ``folder``, with so many ``folds``: halves that change sides."""
     from nerg_mi.density.probes import place_probes
+    from nerg_mi.field.backend import namespace
     from nerg_mi.jobs.gaze_places import make_place
     from nerg_mi.jobs.options.place import PlaceOptions
     from nerg_mi.rays.rays import Rays
@@ -80,13 +81,11 @@ def prior_place(name: str, make: Callable[[Path], tuple[Path, dict]], folds: int
     from nerg_mi.training.gaze.ray_targets import rotated_sets
     from prior_law import blind
 
-    import drjit.llvm.ad as ns
-
     folder.mkdir(parents=True, exist_ok=True)
     path, where = make(folder)
     rays = Rays.load(path)
     # Surfaces of hit points are those of the pool: nothing of those who are scored is known.
-    place_of = lambda some, tag: make_place(PlaceOptions(**where), some, (), folder / f"{tag}.vol", ns)
+    place_of = lambda some, tag: make_place(PlaceOptions(**where), some, (), folder / f"{tag}.vol", namespace("llvm"))
     common = place_of(rays, "all")
     probes = place_probes(
         rays,
