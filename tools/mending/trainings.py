@@ -121,7 +121,7 @@ MENDINGS = (
         undo(
             "the evaluation integrates in 64 directions",
             ["tests/evaluation/gaze/test_scores.py::test01_is_what_is_rendered"],
-            (_SCORES, "gaze.at([p_o], place, settings)", "gaze.at([p_o], place, settings, count=64)"),
+            (_SCORES, "surface_opacity=SURFACE_OPACITY)", "surface_opacity=SURFACE_OPACITY, directions=64)"),
         ),
         undo(
             "the first integral serves all positions",
