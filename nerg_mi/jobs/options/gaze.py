@@ -77,7 +77,7 @@ class GazeOptions(PlaceOptions):
     test_people: float = option(0.0, "Share of the people who are left out of everything besides.")
     ensemble: int = option(
         0,
-        "Train so many fields on resamples of the people; the mean is the gaze, their spread its uncertainty. "
+        "Train so many fields on resamples of the people and the images; the mean is the gaze, their spread its uncertainty. "
         "0: one field.",
     )
     resume: bool = option(False, "Go on with the interrupted run of this output.")

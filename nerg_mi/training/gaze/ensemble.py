@@ -3,7 +3,7 @@ decide.
 
 What repeats itself is drawn together: a person with all of their rays where there are several people, else stretches of
 time of each person (block bootstrap, Künsch 1989). Single rays of one second say the same, and their resamples would
-too.
+too. Salience images are drawn one by one.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.basis import basis_of
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
@@ -40,6 +41,7 @@ FEW = 5
 """Blocks that a resample needs at least; people are the blocks where there are as many of them."""
 BLOCK = 30.0
 """Seconds of a block where there are too few people."""
+VIEWS = "views"
 
 
 def blocks_of(rays: Rays) -> tuple[np.ndarray, str]:
@@ -78,6 +80,13 @@ def resample(rays: Rays, seed: int | tuple[int, int]) -> Rays:
     return replace(drawn, person=drawn.person + known * again, persons=tuple(names))
 
 
+def resample_views(views: tuple[SalienceView, ...], seed: int | tuple[int, int]) -> tuple[SalienceView, ...]:
+    """As many views as ``views`` has, drawn with replacement. Raises ``NergError`` for fewer than five."""
+    if len(views) < FEW:
+        raise NergError(f"{len(views)} salience images are too few to resample; leave out --ensemble")
+    return tuple(views[k] for k in np.random.default_rng(seed).integers(0, len(views), len(views)))
+
+
 class TrainedEnsemble(NamedTuple):
     """What the training of an ensemble came to: the fields, and their provenance (JSON)."""
 
@@ -96,8 +105,8 @@ def train_ensemble(
     tell: Listener | None = None,
     write: Callable[[GazeEnsemble, dict], None] | None = None,
 ) -> TrainedEnsemble:
-    """Train ``members`` gaze fields as ``run.train_gaze`` does, each on a resample of the rays and with a seed of its
-    own.
+    """Train ``members`` gaze fields as ``run.train_gaze`` does, each on a resample of the rays and the views and with
+    a seed of its own.
 
     Minutes are those of all members together. With a file in ``state``, what is done is kept beside it, one file a
     member, and removed once ``write`` has put the ensemble into a file; without ``write`` the members stay. Raises
@@ -105,13 +114,13 @@ def train_ensemble(
     interrupted.
     """
     state = state or StateSettings()
-    rays, path = _resampled(members, supervision, plan), state.path
+    kind, path = _kind(members, supervision, plan), state.path
     # Folds of resamples would have a person on both sides: the share of the blind density is chosen once, on the rays.
+    mixed = mixes(plan) and supervision.rays is not None
     whole, plan = plan, plan.with_settings(mix_folds=0)
     if plan.settings.minutes is not None:
-        share = 1 - MINUTES if mixes(whole) else 1.0
+        share = 1 - MINUTES if mixed else 1.0
         plan = plan.with_settings(minutes=share * plan.settings.minutes / members)
-    _, kind = blocks_of(rays)
     parts = [path and path.with_name(f"{path.stem}.member{k}.safetensors") for k in range(members)]
     is_file = lambda file: file is not None and file.is_file()
     if state.resume and not any(map(is_file, (path, *parts))):
@@ -126,7 +135,7 @@ def train_ensemble(
             field, provenance = _finished(part, identity, own, ns)
         else:
             field, provenance = train_gaze(
-                Supervision(resample(rays, (plan.settings.seed, k))),
+                _resampled(supervision, (plan.settings.seed, k)),
                 place,
                 member_plan,
                 ns,
@@ -140,13 +149,13 @@ def train_ensemble(
         fields.append(field)
         each.append(provenance)
     choice = None
-    if mixes(whole):
+    if mixed:
         choice = choose_mix(supervision, place, whole, ns, tell or (lambda progress: None))
         for field in fields:
             give_mix(field, choice.mix)
     ensemble = GazeEnsemble(fields, supervision.support(plan.probes.radius, place))
     ensemble.basis = basis_of(supervision.counts())
-    provenance = _account(each, plan.settings, rays, kind) | ({"mix": choice.to_dict()} if choice else {})
+    provenance = _account(each, plan.settings, supervision, kind) | ({"mix": choice.to_dict()} if choice else {})
     if write is not None:
         # Every member is in its file by now: there is nothing more to keep if this fails.
         with kept_unless(path, lambda: None, done=False):
@@ -157,17 +166,24 @@ def train_ensemble(
     return TrainedEnsemble(ensemble, provenance)
 
 
-def _resampled(members: int, supervision: Supervision, plan: GazePlan) -> Rays:
-    """The rays that the members' are drawn from. Raises `NergError` for what cannot be resampled."""
+def _kind(members: int, supervision: Supervision, plan: GazePlan) -> str:
+    """What is drawn together. Raises `NergError` for what cannot be resampled."""
     if members < 2:
         raise NergError(f"an ensemble needs at least two members, got {members}")
-    if supervision.rays is None or supervision.views:
-        raise NergError("an ensemble resamples people: it is trained on rays alone; leave out --ensemble or --views")
+    if supervision.rays is None:
+        return VIEWS
     if plan.probes.kappa_rule == "loo":
         raise NergError(
             'an ensemble draws people twice, who would predict themselves; choose the kappa rule "fixed" or "silverman"'
         )
-    return supervision.rays
+    _, kind = blocks_of(supervision.rays)
+    return f"{kind} and {VIEWS}" if supervision.views else kind
+
+
+def _resampled(supervision: Supervision, seed: tuple[int, int]) -> Supervision:
+    """What a member is trained on."""
+    rays, views = supervision.rays, supervision.views
+    return Supervision(None if rays is None else resample(rays, seed), resample_views(views, seed) if views else ())
 
 
 def _of_member(tell: Listener, k: int, members: int) -> Listener:
@@ -206,14 +222,14 @@ def _writer(part: Path, identity: dict) -> Callable[[GazeDensity, dict], None]:
     return write
 
 
-def _account(each: list[dict], settings: GazeSettings, rays: Rays, kind: str) -> dict:
+def _account(each: list[dict], settings: GazeSettings, supervision: Supervision, kind: str) -> dict:
     """One account of all members: means of their scores, sums of their seconds."""
     total = lambda name: round(sum(d[name] for d in each), 1)
     mean = lambda name: round(float(np.mean([d[name] for d in each])), 6)
     out = {
         **each[0],
         "settings": settings.to_dict(),
-        **Supervision(rays).counts(),
+        **supervision.counts(),
         "probes_made": round(mean("probes_made")),
         **{k: mean(k) for k in ("escaped_directions", "escaped_gaze")},
         **{k: total(k) for k in ("steps", "seconds", "seconds_preparing")},

@@ -15,7 +15,7 @@ from nerg_mi.formats.checkpoint import write_checkpoint
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
-from nerg_mi.training.gaze.ensemble import blocks_of, resample, train_ensemble
+from nerg_mi.training.gaze.ensemble import blocks_of, resample, resample_views, train_ensemble
 from nerg_mi.training.gaze.state import StateSettings
 from nerg_mi.training.gaze.supervision import Supervision
 
@@ -188,7 +188,21 @@ def test_what_cannot_be_resampled_is_refused():
     ):
         with pytest.raises(ValueError, match=said):
             together(members, **options)
-    with pytest.raises(ValueError, match="trained on rays alone"):
-        train_ensemble(2, Supervision(None, around(2)), NOWHERE, planned(PLACE, SHORT), ns)
+    with pytest.raises(NergError, match="4 salience images are too few to resample"):
+        train_ensemble(2, Supervision(None, around(4)), NOWHERE, planned(PLACE, SHORT), ns)
     with pytest.raises(NergError, match="nothing to resume"):
         together(path=Path("nowhere.run"), resume=True)
+
+
+def test_views_are_resampled_one_by_one():
+    views = around(12)
+    drawn = resample_views(views, (0, 1))
+    assert len(drawn) == 12 and 5 <= len(set(drawn)) < 12 and set(drawn) <= set(views)
+    assert drawn == resample_views(views, (0, 1)) != resample_views(views, (0, 2))
+    plan = planned(PLACE, replace(SHORT, mix_folds=3))
+    field, about = train_ensemble(2, Supervision(None, views), NOWHERE, plan, ns)
+    assert about["ensemble"]["resampled"] == "views" and about["salience_views"] == 12 and about["rays"] == 0
+    assert field.support is None and "mix" not in about
+    assert not np.array_equal(arrays(field)["0.capture_net.0"], arrays(field)["1.capture_net.0"])
+    _, about = train_ensemble(2, Supervision(crowd(), views), NOWHERE, planned(PLACE, SHORT), ns)
+    assert about["ensemble"]["resampled"] == "people and views" and about["people"] == 6
