@@ -12,7 +12,9 @@ from nerg_mi.jobs.options.folds import FoldOptions
 
 def test_the_job_is_given_what_was_asked_for(monkeypatch, capsys):
     given, row = [], {"split": "pos", "method": "gaze field", "KLD": 0.25, "folds": 3}
-    monkeypatch.setattr(folds, "evaluate_folds", lambda *a: given.append(a[:-1]) or FoldResult([row], [], [], []))
+    monkeypatch.setattr(
+        folds, "evaluate_folds", lambda *a: given.append(a[:-1]) or FoldResult([row], [], [], [], [], [], [])
+    )
     with pytest.raises(SystemExit) as end:
         main(
             "eval folds rays.npz -o out --geometry hits --folds 3 --splits pos --scheduler local:2 --threads 1".split()

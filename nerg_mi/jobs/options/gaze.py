@@ -77,8 +77,8 @@ class GazeOptions(PlaceOptions):
     test_people: float = option(0.0, "Share of the people who are left out of everything besides.")
     ensemble: int = option(
         0,
-        "Train so many fields on resamples of the people and the images; the mean is the gaze, their spread its uncertainty. "
-        "0: one field.",
+        "Train so many fields on resamples of the people and the images; the mean is the gaze, their spread its "
+        "uncertainty. 0: one field.",
     )
     resume: bool = option(False, "Go on with the interrupted run of this output.")
     save_every: float = option(60.0, "Seconds between two states for --resume; 0: only one, when it ends early.")

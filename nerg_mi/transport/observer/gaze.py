@@ -27,6 +27,13 @@ from .settings import ObserverSettings
 from .surroundings import AllAround, Surroundings, distance_along
 from .viewpoint import select_nearest
 
+STEP = 1 / 256
+"""How far an observer is moved for the derivatives of an integral, of the side of the field's box: edges that pass
+then are many directions apart."""
+
+MOVING = 1 << 15
+"""Directions of these integrals at most."""
+
 
 class PlacedGaze:
     """``field`` placed in the scene by ``to_world`` (field to scene); neither is replaced afterwards."""
@@ -44,8 +51,8 @@ class PlacedGaze:
         """The field for ``observers`` (scene points, one lane each) in ``place``, traced with ``settings``.
 
         A normalised field is integrated over the sphere around each observer, to ``settings.integral_tolerance``; the
-        depths carry no derivatives, the integral has those of the field's parameters. A field that is not normalised
-        is the same for all observers. ``cache``: where depths and integrals are kept.
+        depths carry no derivatives, the integral has those of the field's parameters and of the observers' positions. A
+        field that is not normalised is the same for all observers. ``cache``: where depths and integrals are kept.
         """
         if not self.field.config.normalized:
             return ObservedGaze(self, place, settings, [])
@@ -60,10 +67,11 @@ class PlacedGaze:
             integral = _SphereIntegral(self, member, place, settings)
             parameters = list(member.parameters().values())
             if dr.grad_enabled(parameters):
-                integrals.append([Known(k.center, integral.attached(k)) for k in around])
-                continue
-            of_member = (made_of, Fingerprint(parameters))
-            integrals.append(cache.of_known((self, "integral", member), around, of_member, integral.detached))
+                found = [Known(k.center, integral.attached(k)) for k in around]
+            else:
+                of_member = (made_of, Fingerprint(parameters))
+                found = cache.of_known((self, "integral", member), around, of_member, integral.detached)
+            integrals.append([integral.moving(k, p_o) for k, p_o in zip(found, observers)])
         return ObservedGaze(self, place, settings, integrals)
 
     def unnormalized(
@@ -101,6 +109,26 @@ class _SphereIntegral:
         """The same with derivatives. What is recorded to be replayed elsewhere is summed over all directions."""
         count = self.settings.directions if recording() else self._integrate(known).directions
         return dr.mean(self._integrand(known, self._around(known, count))) * (4 * dr.pi)
+
+    def moving(self, known: Known, p_o: Point3f) -> Known:
+        """``known``, an integral, with the derivatives of its observer at ``p_o``, where that has any: central
+        differences of sums over the same directions, since what hides something moves with the observer."""
+        if not dr.grad_enabled(p_o):
+            return known
+        h = STEP * self.placed.to_world.scale * self.placed.field.box.side
+        count = min(MOVING, self.settings.directions)
+
+        def log_integral(center: Point3f) -> Float:
+            dr.make_opaque(center)
+            there = Known(center, AllAround())
+            return dr.log(dr.mean(self._integrand(there, self._around(there, count))))
+
+        with dr.suspend_grad():
+            axes = [type(known.center)(*(h if i == k else 0 for i in range(3))) for k in range(3)]
+            slopes = [(log_integral(known.center + e) - log_integral(known.center - e)) / (2 * h) for e in axes]
+            slope = type(known.center)(*slopes)
+            dr.make_opaque(slope)
+        return Known(known.center, known.value * dr.exp(dr.dot(slope, p_o - dr.detach(p_o))))
 
     def _integrate(self, known: Known) -> Integral:
         def numbered(count: int) -> np.ndarray:

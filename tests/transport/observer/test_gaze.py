@@ -182,3 +182,34 @@ def test_gaze_turns_and_does_not_scale(rgb):
     m = np.array([[0, -50.0, 0, 3], [50, 0, 0, -7], [0, 0, 50, 11], [0, 0, 0, 1]])
     moved = evaluate(PlacedGaze(g, Similarity(m)), (m @ [*p_od, 1])[:3], (m @ [*p_o, 1])[:3], m[:3, :3] @ r / 50)
     assert np.allclose(plain, moved, rtol=1e-4)
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_derivatives_of_the_observer_pass_the_integral(rgb, trained):
+    """Against central differences of sums over walls where a formula says, in many directions."""
+    field = normalized()
+    # Steep, so that it matters where walls are.
+    field.set_parameters({k: 16 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
+    gaze, place, o = PlacedGaze(field), room(rgb), np.array([0.3, -0.2, 0.4])
+    array = lambda v: namespace("llvm_ad_rgb").Array3f(np.ascontiguousarray(v.T, np.float32))
+    d = fibonacci_directions(200_000)
+
+    def integral(at):
+        walls = np.where(d > 0, 1.0, -1.0)
+        distance = np.divide(walls - at, d, out=np.full(d.shape, np.inf), where=d != 0).min(axis=1)
+        points = (at + d * distance[:, None], np.broadcast_to(at, d.shape), d)
+        emit, capture = field.unnormalized(*map(array, points))
+        return 4 * np.pi * np.mean(np.array(emit * capture, np.float64))
+
+    h = 0.02
+    true = [(integral(o + h * e) - integral(o - h * e)) / (2 * h) for e in np.eye(3)]
+    p_o = rgb.Point3f(o)
+    dr.enable_grad(p_o)
+    if trained:
+        dr.enable_grad(field.grid.table)
+    found = gaze.at([p_o], place, replace(SETTINGS, directions=1 << 15)).integrals(p_o)[0]
+    assert float(dr.detach(found)[0]) == pytest.approx(integral(o), rel=2e-3)
+    dr.backward(found)
+    assert np.linalg.norm(true) > 0.1 * integral(o)
+    assert np.linalg.norm(np.array(dr.grad(p_o)).ravel() - true) < 0.03 * np.linalg.norm(true)
+    assert not trained or np.abs(np.array(dr.grad(field.grid.table))).max() > 0
