@@ -109,7 +109,7 @@ def _product(seen: dict[str, np.ndarray]) -> Any:
     figure, (emit, capture, gaze) = _panels(3)
     top = float(np.percentile(seen["gaze"], 99.5))
     _show(emit, seen["emit"], "emit: how much a surface attracts", "1/sr", "inferno")
-    _show(capture, seen["capture"], "sigmoid(capture): what is taken up", "share", "viridis", 1.0)
+    _show(capture, seen["capture"], "sigmoid(capture): what is taken up", "share", "viridis")
     _show(gaze, seen["gaze"], "their product: gaze", "density [1/sr]", "inferno", top)
     return figure
 
