@@ -117,7 +117,8 @@ def support_words(row: Row) -> str:
     """How many rays a number of a field rests on, or that its checkpoint does not say."""
     if row["source"] != FIELD or row["people"] is None:
         return ""
-    return "not in the checkpoint" if row.get("support") is None else f"{row['support']:.3g}"
+    support = row.get("support")
+    return "not in the checkpoint" if support is None else f"{support:,.0f}" if support >= 100 else f"{support:.3g}"
 
 
 def what_if_columns(rows: Sequence[Row]) -> tuple[list[str], Cells]:

@@ -44,7 +44,7 @@ def test04_what_a_field_foretells_with_its_spread_and_support():
     row |= {"share_high": 0.6, "share_spread": 0.021, "support": 1234.0}
     head, cells = writing.thing_columns([row, row | {"source": "tracked"}])
     assert head[-1] == "support [rays]"
-    assert cells(row)[-2:] == ["50.0 % [40.0, 60.0] ± 2.1", "1.23e+03"]
+    assert cells(row)[-2:] == ["50.0 % [40.0, 60.0] ± 2.1", "1,234"]
     assert (
         cells(row | {"support": None})[-1] == "not in the checkpoint" and cells(row | {"source": "tracked"})[-1] == ""
     )
