@@ -51,7 +51,8 @@ _OF_TRIANGLES = ("shapes", "detail", "angle", "texture", "resolution")
 class SplatBake:
     """``splats``: those that were given, in colours of ``attention`` (N,), gaze per square metre, which is one of their
     further columns, too. ``observers``: how many there were, or rays. ``summary``: all that was found, as the JSON file
-    has it; of rays also the shares of gaze ``on_splats``, ``escaped`` and ``unaccounted``. ``files`` written."""
+    has it, with what gaze adds up to, ``total``, and how much of it meets no Gaussian, ``escaped``; of rays also
+    ``on_splats`` and ``unaccounted``. ``files`` written."""
 
     splats: Splats
     attention: np.ndarray
@@ -174,10 +175,10 @@ class _Spread:
 def _summary(sums: Sums, source: str, unit: str, factor: float, attention: np.ndarray) -> dict[str, Any]:
     found = {"source": source, "unit": unit, "factor": factor, "lookers": sums.count, "gaussians": len(attention)}
     found["looked_at"] = int((attention > 0).sum())
+    w = sums.weight
+    found |= {"total": sums.total / w, "escaped": sums.escaped / w}
     if source == "rays":
-        w = sums.weight
-        found |= {"total": sums.total / w, "on_splats": sums.on_surface / w, "escaped": sums.escaped / w}
-        found["unaccounted"] = sums.unaccounted / w
+        found |= {"on_splats": sums.on_surface / w, "unaccounted": sums.unaccounted / w}
     return found
 
 
@@ -193,6 +194,8 @@ def _tell(summary: dict[str, Any], top: float, reporter: Reporter) -> None:
             f"of their gaze {summary['on_splats']:.2%} lies on Gaussians, and {summary['escaped']:.2%} meets none; "
             f"{abs(summary['unaccounted']):.1e} is unaccounted for"
         )
+    else:
+        reporter.message(f"of each one's gaze, {summary['total']:.3f} in all, {summary['escaped']:.2%} meets no Gaussian")
     if "halves_cc" in summary:
         reporter.message(f"two halves of the people agree by CC {summary['halves_cc']:.3f}")
 

@@ -106,7 +106,7 @@ def _of_one(target: Target, looker: Looker, weight: float, eye: np.ndarray, sett
     import mitsuba as mi
 
     mesh, eye = target.mesh, np.asarray(eye, np.float64)
-    along = _along(looker, settings.cone)
+    along = along_through(looker, settings.cone)
     everywhere = lambda d: np.broadcast_to(np.array(along(vector_of(mi.Vector3f, d)), np.float64), (len(d),))
     directions, angles = sphere_rule(everywhere, settings.directions)
     share = weight * angles * everywhere(directions)
@@ -174,7 +174,8 @@ def _uniform(p_od: Any, p_o: Any, r_o: Any, active: Any) -> Any:
     return type(r_o.x)(1)
 
 
-def _along(looker: Looker, cone: float) -> Callable[[Vector3f], Any]:
+def along_through(looker: Looker, cone: float) -> Callable[[Vector3f], Any]:
+    """The density of ``looker`` in unit directions, seen through a cone as `density_through` has it."""
     return looker.along if cone == 0 else lambda directions: blurred(looker.along, directions, cone)
 
 

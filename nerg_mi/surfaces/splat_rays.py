@@ -1,4 +1,4 @@
-r"""What tracked rays leave on Gaussian splats.
+r"""What tracked rays leave on Gaussian splats, and how much gaze meets none.
 
 A ray leaves on each Gaussian that it meets what it would contribute to a picture, T_i α_i: the light that reaches it
 times the share that it takes. All of them and what goes through add up to one. It comes to one of the two sides of the
@@ -10,15 +10,22 @@ surface with the density D, a Gaussian receives D ∫ T_i α_i dA, whatever else
 
 from __future__ import annotations
 
+import drjit as dr
 import numpy as np
 
+from nerg_mi.maths.arrays import vector_of
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 
 from .cones import bundle
+from .gaze_source import Looker, along_through
 from .ray_source import RaySettings, TrackedRays
+from .sphere_rule import sphere_rule
 from .splat_areas import sides_of
 from .splat_hits import groups_of_hits
 from .sums import Sums
+
+DIRECTIONS = 1 << 14
+"""In which an observer's gaze is looked at, about."""
 
 CASTS = 1 << 17
 """Rays that are cast in one launch: each brings a dozen hits."""
@@ -48,3 +55,19 @@ def splat_ray_sums(arrays: SplatArrays, axes: np.ndarray, rays: TrackedRays, set
             escaped += float((weights[group.rows] * group.left)[group.through].sum())
     weight = float(rays.weights.sum())
     return Sums(shares, np.zeros(0), 0.0, escaped, weight, weight, len(rays))
+
+
+def gaze_and_escaped(arrays: SplatArrays, looker: Looker, eye: np.ndarray, cone: float = 0.0) -> tuple[float, float]:
+    """What the gaze of ``looker``, an observer at ``eye`` (3,) in the frame of ``arrays``, adds up to over the sphere,
+    and how much of it meets no Gaussian: what comes through, as of rays. ``cone``: as of `gaze_source.GazeSettings`.
+    """
+    import mitsuba as mi
+
+    along = along_through(looker, cone)
+    density = lambda d: np.broadcast_to(np.array(along(vector_of(mi.Vector3f, d)), np.float64), (len(d),))
+    with dr.suspend_grad():
+        directions, angles = sphere_rule(density, DIRECTIONS)
+        share, escaped = angles * density(directions), 0.0
+        for group in groups_of_hits(arrays, np.broadcast_to(eye, directions.shape), directions):
+            escaped += float((share[group.rows] * group.left)[group.through].sum())
+    return float(share.sum()), escaped

@@ -2,13 +2,17 @@
 
 import drjit.llvm.ad as ns
 import numpy as np
+import pytest
 
 from nerg_mi.field.splats import joined
+from nerg_mi.maths.sphere import fibonacci_directions
+from nerg_mi.surfaces.gaze_source import lookers_of_law
 from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
 from nerg_mi.surfaces.splat_areas import shortest_axes, splat_areas
-from nerg_mi.surfaces.splat_rays import splat_ray_sums
+from nerg_mi.surfaces.splat_rays import gaze_and_escaped, splat_ray_sums
 from nerg_mi.surfaces.sums import merge
 from nerg_mi.transport.media.splats.arrays import SplatArrays
+from tests.surfaces.meshes import vmf
 from tests.surfaces.test_splat_hits import shares, some
 from tests.surfaces.walls import TURN_X, wall
 
@@ -61,3 +65,16 @@ def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
     first, again = (merge(sums(splats, part, CONE) for part in parts) for _ in range(2))
     assert np.array_equal(first.face, again.face) and first.count == 900 and first.escaped == again.escaped
     assert not np.array_equal(sums(splats, parts[0], RaySettings(cone=CONE.cone, bundle=8, seed=6)).face, first.face)
+
+
+@pytest.mark.parametrize("cone", [0.0, 0.03])
+def test04_of_gaze_meets_none_what_comes_through(rgb, cone):
+    """A density along z, most of which a wall stops, and the light of every ray by all Gaussians in float64."""
+    splats, eye, kappa = some(), np.array([0.1, -0.2, -1.5]), 8.0
+    looker = lookers_of_law(vmf(rgb, (0, 0, 1), kappa))(eye)
+    total, escaped = gaze_and_escaped(SplatArrays(splats, ns), looker, eye, cone)
+    d = fibonacci_directions(20_000)
+    share = np.exp(kappa * (d[:, 2] - 1))
+    left = shares(splats, np.broadcast_to(eye, d.shape), d)[1]
+    assert abs(total - 1) < 2e-3 and 0.1 < escaped < 0.95
+    assert np.isclose(escaped, (share * left).sum() / share.sum(), atol=0.01 if cone == 0 else 0.02)

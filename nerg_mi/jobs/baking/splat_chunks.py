@@ -19,7 +19,7 @@ from nerg_mi.surfaces.gaze_source import MakeLooker, lookers_of_field
 from nerg_mi.surfaces.population import Crowd
 from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays
 from nerg_mi.surfaces.splat_areas import shortest_axes
-from nerg_mi.surfaces.splat_rays import splat_ray_sums
+from nerg_mi.surfaces.splat_rays import gaze_and_escaped, splat_ray_sums
 from nerg_mi.surfaces.splats import splat_densities
 from nerg_mi.surfaces.sums import Sums
 from nerg_mi.surfaces.target import SURFACE_OPACITY
@@ -87,17 +87,24 @@ _last: list[tuple[str, str, SplatPlace, MakeLooker | None]] = []
 
 def splat_chunk(scene: SplatScene, part: Crowd | TrackedRays) -> Sums:
     """Partial sums of the observers, or of the rays, of ``part``: ``face`` is, of rays, shares of gaze on the sides of
-    the Gaussians, and of observers densities of theirs. A variant must be active; what is loaded for a scene is kept
-    for its next part. Raises `NergError`."""
+    the Gaussians, and of observers densities of theirs, which are no part of ``total``. A variant must be active; what
+    is loaded for a scene is kept for its next part. Raises `NergError`."""
     there, make = _prepared(scene)
     if isinstance(part, TrackedRays):
         return splat_ray_sums(there.arrays, there.axes, part, scene.of_rays)
     if make is None:
         raise NergError("there is no gaze field: name one by --gaze, or take the gaze of the rays, --from rays")
-    found = splat_densities(
-        there.splats, there.place, make, part.positions, part.weights, there.settings, scene.cone
-    ).ravel()
-    return Sums(found, np.zeros(0), weight=float(part.weights.sum()), count=len(part.weights))
+    found = scene.nothing
+    for k, weight in enumerate(part.weights.tolist()):
+        eye = part.positions[k : k + 1]
+        # What is known of an observer is asked for twice, and made once.
+        looker = make(eye[0])
+        densities = splat_densities(
+            there.splats, there.place, lambda _, own=looker: own, eye, np.array([weight]), there.settings, scene.cone
+        )
+        total, escaped = gaze_and_escaped(there.arrays, looker, eye[0], scene.cone)
+        found = found.plus(Sums(densities.ravel(), np.zeros(0), 0.0, weight * escaped, weight * total, weight, 1))
+    return found
 
 
 def _prepared(scene: SplatScene) -> tuple[SplatPlace, MakeLooker | None]:
