@@ -195,7 +195,9 @@ def _tell(summary: dict[str, Any], top: float, reporter: Reporter) -> None:
             f"{abs(summary['unaccounted']):.1e} is unaccounted for"
         )
     else:
-        reporter.message(f"of each one's gaze, {summary['total']:.3f} in all, {summary['escaped']:.2%} meets no Gaussian")
+        reporter.message(
+            f"of each one's gaze, {summary['total']:.3f} in all, {summary['escaped']:.2%} meets no Gaussian"
+        )
     if "halves_cc" in summary:
         reporter.message(f"two halves of the people agree by CC {summary['halves_cc']:.3f}")
 

@@ -13,6 +13,7 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.figures.overlay import Heat, top_of
 from nerg_mi.figures.plots import gaze_figure
 from nerg_mi.files.bounded import reading
+from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.jobs.options import option, parse_numbers
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.jobs.scenes.cameras import given_point
@@ -92,6 +93,10 @@ def read_baked(path: Path) -> BakedSurface:
         raise NergError(f'"{path}" is no baked surface that is drawn; give the .ply that "nerg bake" writes')
     if not path.is_file():
         raise MissingFile(f'there is no file "{path}"; correct its name')
+    if is_splats(path):
+        raise NergError(
+            f'"{path}" holds Gaussian splats, which show their gaze as they are: nerg scene {path} -o a.xml'
+        )
     check_ply(path)
     with reading(path, "baked surface"):
         with path.open("rb") as file:

@@ -1,7 +1,5 @@
 """Parts of a bake of splats as tasks, run where nothing lies but what was sent, and by two processes."""
 
-import shutil
-
 import pytest
 
 from nerg_mi.formats.splats.ply import write_ply_splats
@@ -15,6 +13,7 @@ from nerg_mi.tasks.run import Output
 from nerg_mi.tasks.store import Store
 from tests.conftest import ROOT
 from tests.jobs.baking.test_summing import crowd, equal, made, parts
+from tests.jobs.baking.test_tasks import sent
 from tests.jobs.recorder import Recorder
 from tests.plugins import fields
 from tests.surfaces.test_splat_rays import falling
@@ -48,11 +47,7 @@ def test01_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again
 
 def test02_files_that_were_sent_serve_as_those_that_lie_there(scene, tmp_path):
     (task,) = splat_tasks.splat_tasks_of(scene, falling(100), "llvm_ad_rgb", parts(tmp_path / "store"))
-    paths = {}
-    for file in task.inputs:
-        paths[file.name] = tmp_path / "sent" / file.name
-        paths[file.name].parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file.path, paths[file.name])
+    paths = sent(task, tmp_path / "sent")
     there = Store(tmp_path / "there")
     receipt = make_output(task, paths, there, Checksums())
     found = tasks.read_sums(Output(there.output(task.key, ".npy"), receipt.notes), 2 * scene.count)

@@ -8,8 +8,10 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay
 from nerg_mi.formats.ply import write_columns
+from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.jobs.drawing.draw import draw
 from nerg_mi.jobs.drawing.surface import read_baked
+from tests.surfaces.walls import wall
 
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 ABOVE = {"camera": (0.0, 0.0, 2.0), "target": (0.0, 0.0, 0.0), "up": (0.0, 1.0, 0.0), "fov": 90.0}
@@ -93,3 +95,9 @@ def test_what_is_refused(tmp_path):
     ):
         with pytest.raises(NergError, match=said):
             draw("surface", path, mode="llvm_ad_rgb", width=32, height=32, **given)
+
+
+def test_splats_show_their_gaze_themselves(tmp_path):
+    write_ply_splats(tmp_path / "splats.ply", wall(0.0, 0.4, 0.05))
+    with pytest.raises(NergError, match="holds Gaussian splats, which show their gaze as they are: nerg scene"):
+        read_baked(tmp_path / "splats.ply")
