@@ -50,7 +50,7 @@ _OF_OVERLAYS = (("top", None), ("cmap", None), ("decades", 0.0), ("hatching", Tr
 
 SUPPORT = 1.0
 """Support, in rays, below which an observer's gaze counts as not known: nobody was recorded within five radii of a
-probe. There the error is 1.4 to 3 times that among people (docs/gaze-evaluation.md)."""
+probe (docs/gaze-evaluation.md)."""
 
 
 def check_overlay(output: Path, options: PictureOptions) -> None:

@@ -3,8 +3,8 @@ kilobytes.
 
 Support at p is the sum over rays of Epanechnikov's kernel, Σ_i max(0, 1 - |o_i - p|² / (5R)²), R the radius of a probe:
 a ray that started at p counts as one, a ray 5R away not at all. A field knows more than its probes: kernels of R are
-zero wherever a field is asked for what it was not shown, where its error grows with the distance still. Of
-kernels of 1 to 12 R those of 5 and 6 rank the errors best (docs/gaze-evaluation.md).
+zero wherever a field is asked for what it was not shown, where its error grows with the distance still. How well
+those of 5 R rank the errors: docs/gaze-evaluation.md.
 
 Rays are kept as cells of R/2 with their number, mean origin and variance. The sum over a cell within reach follows
 from these exactly. In one that the reach cuts, the squared distances are taken to be spread uniformly.
