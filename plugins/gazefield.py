@@ -16,6 +16,12 @@ Trained gaze field (:monosp:`gazefield`)
    - A rotation, a uniform scale and a translation that place the field in the scene; it should be that of the radiance
      field. Densities over directions do not change with scale. (Default: none)
 
+ * - constant_weights
+   - |bool|
+   - Write the weights of the networks into the kernels, for many frames of one field: the same pictures to the bit in
+     about two thirds of the time, after some seconds of compilation for each size of picture. Only on processors, and
+     where nothing is differentiated; weights that change often are not for it. (Default: false)
+
  * - grid.table, position_net.0, ..., direction_net.0, ..., emit_head.0, capture_head.0
    - |tensor|
    - Features of the grid and the weight matrices of the trunk and of the two heads.
@@ -64,11 +70,12 @@ import mitsuba as mi
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
+from nerg_mi.field.constant_weights import set_constant_weights
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.field.gaze.registry import kinds
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.properties import expose_parameters, trained, transform, volume_of
+from nerg_mi.properties import boolean, expose_parameters, trained, transform, volume_of
 from nerg_mi.registration import register
 from nerg_mi.transport.observer.gaze import PlacedGaze
 
@@ -81,6 +88,8 @@ class GazeFieldVolume(mi.Volume):
         super().__init__(props)
         self.field, self.metadata, self.filename = trained(props, network, load_gaze, namespace(mi.Float))
         self._similarity = Similarity(transform(props, "to_world"))
+        if boolean(props, "constant_weights", False):
+            set_constant_weights(self.field)
 
     @classmethod
     def of(cls, network: AnyGazeField, to_world=None, name: str = "in memory") -> GazeFieldVolume:

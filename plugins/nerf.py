@@ -22,6 +22,12 @@ Trained radiance field (:monosp:`nerf`)
      longest way through the box it should stay below 50: a path tracer's work grows with it, and more is opaque anyway.
      :ref:`nerg <integrator-nerg>` knows nothing of it. (Default: 0, no bound, and no use in media)
 
+ * - constant_weights
+   - |bool|
+   - Write the weights of the networks into the kernels, for many frames of one field: the same pictures to the bit in
+     about two thirds of the time, after some seconds of compilation for each size of picture. Only on processors, and
+     where nothing is differentiated; weights that change often are not for it. (Default: false)
+
  * - grid.table, density_net.0, ..., color_net.0, ...
    - |tensor|
    - Features of the grid and the weight matrices of both networks.
@@ -57,10 +63,11 @@ import mitsuba as mi
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
+from nerg_mi.field.constant_weights import set_constant_weights
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.properties import expose_parameters, number, trained, transform, volume_of
+from nerg_mi.properties import boolean, expose_parameters, number, trained, transform, volume_of
 from nerg_mi.registration import register
 from nerg_mi.transport.media.field import FieldMedium
 
@@ -78,6 +85,8 @@ class NerfVolume(mi.Volume):
         super().__init__(props)
         self.filename, self.field, self.metadata, self._similarity = filename, field, metadata, similarity
         self.max_density = number(props, "max_density", 0, low=0)
+        if boolean(props, "constant_weights", False):
+            set_constant_weights(field)
 
     @classmethod
     def of(cls, network: RadianceField, to_world=None, name: str = "in memory") -> NerfVolume:

@@ -16,6 +16,7 @@ import drjit.nn as nn
 import numpy as np
 
 from .backend import is_cuda, namespace
+from .unrolled import evaluate
 
 # torch's LayerNorm (Ba et al. 2016) adds it to the variance.
 _NORM_EPSILON = 1e-5
@@ -41,6 +42,9 @@ class MLP:
         self._views: Any = None
         # What the kernels read: the packed weights of all layers, attached to ``weights``.
         self.buffer = None
+        # Whether they are constants of the kernels instead (``unrolled``), and these as numbers.
+        self.constant = False
+        self._constants: list[list[list[float]]] | None = None
         for first, second in zip(self.weights, self.weights[1:]):
             if first.shape[0] != second.shape[1]:
                 raise ValueError(
@@ -110,6 +114,7 @@ class MLP:
 
     def pack(self) -> None:
         """Refresh what the kernels read after a change of ``weights``; gradients flow through."""
+        self._constants = None
         ns = namespace(self.weights[0])
         weights = self.weights
         if self.norms is not None:
@@ -130,6 +135,10 @@ class MLP:
         # Cooperative vectors do not sum the derivatives of a lane that is shared by all the others.
         width = max(dr.width(c) for c in x)
         x = [c + dr.zeros(ns.Float, width) if dr.width(c) < width else c for c in x]
+        if self.constant and self._may_be_constant(x, ns):
+            if self._constants is None:
+                self._constants = [w.numpy().tolist() for w in self.weights]
+            return evaluate(self._constants, x)
         if self.norms is not None:
             return self._normalized(x, ns, half)
         views: Any = self._views
@@ -140,6 +149,12 @@ class MLP:
                 v = dr.maximum(v, 0)
         out = list(v)
         return [ns.Float(c) for c in out] if half else out
+
+    def _may_be_constant(self, x: list, ns: ModuleType) -> bool:
+        """Whether nothing asks for the weights themselves: derivatives, a recording, a device's units, a norm."""
+        if is_cuda(ns) or self.norms is not None or dr.flag(dr.JitFlag.FreezingScope):
+            return False
+        return not dr.grad_enabled(self.weights, x)
 
     def _normalized(self, x: list, ns: ModuleType, half: bool) -> list:
         for i in range(len(self.weights)):

@@ -197,6 +197,7 @@ class RadianceField:
         # Depth passes need one output of the last layer, not 1 + geometry of them.
         last = self.density_net.weights[-1]
         self._head = MLP(self.density_net.weights[:-1] + [last[0:1, :]])
+        self._head.constant = self.density_net.constant
         self._head.pack()
         if self.background is not None:
             self.background.grid.pack()
