@@ -21,6 +21,8 @@ from nerg_mi.files.video import check_video, video_frames
 from nerg_mi.interruption import Interruption
 from nerg_mi.rendering import bands
 from nerg_mi.rendering.frames_file import numbered, read_frames
+from nerg_mi.rendering.long_renders import prepare_for
+from nerg_mi.rendering.pace import Pace
 from nerg_mi.rendering.picture_file import FORMATS, DisplayRows, picture_rows
 from nerg_mi.rendering.pictures import activate, load_scene
 from nerg_mi.rendering.scene_file import check_samples, files_of_scene
@@ -116,7 +118,7 @@ def render_file(
     mode = activate(options.mode)
     if options.threads:
         set_thread_count(options.threads)
-    start = time.perf_counter()
+    start, pace = time.perf_counter(), Pace()
     done, top, picture = 0, None, Picture((0, 0), 0)
     with Interruption() as stop:
 
@@ -131,7 +133,9 @@ def render_file(
             nonlocal done
             loaded = load_scene(scene, {**(options.defaults or {}), **frame})
             stop.check()
-            made = make(loaded, sensor_of(scene, loaded, options.sensor), on_strip)
+            camera = sensor_of(scene, loaded, options.sensor)
+            prepare_for(len(frames) * samples_of(camera, options.spp), loaded)
+            made = make(loaded, camera, on_strip)
             done += 1
             return made
 
@@ -142,7 +146,7 @@ def render_file(
                 picture, top = overlay_pictures(scene, frames, drawn, options, render, stop)
             else:
                 for frame in frames:
-                    picture = render(frame, partial(_picture, write, options, stop))
+                    picture = render(frame, partial(_picture, write, options, stop, pace))
         # The picture is there, and yet whoever called this does not go on.
         stop.check()
     seconds = time.perf_counter() - start
@@ -211,7 +215,7 @@ def _check_video(output: Path, options: PictureOptions) -> bool:
 
 
 def _picture(
-    write: Write, options: PictureOptions, stop: Interruption, loaded: Any, camera: Any, on_strip: OnStrip
+    write: Write, options: PictureOptions, stop: Interruption, pace: Pace, loaded: Any, camera: Any, on_strip: OnStrip
 ) -> Picture:
     """Render what ``camera`` sees, and ``write`` it."""
     width, height = map(int, camera.film().crop_size())
@@ -221,7 +225,8 @@ def _picture(
 
     def fill(add: Callable[[Any, int], None]) -> None:
         nonlocal channels
-        pieces = bands.render_bands(loaded, camera, spp=options.spp, seed=options.seed, rows=rows, on_strip=on_strip)
+        how: dict[str, Any] = {"spp": options.spp, "seed": options.seed, "rows": rows}
+        pieces = bands.render_bands(loaded, camera, **how, on_strip=on_strip, pace=pace)
         for band in pieces:
             bitmap = band.film.bitmap()
             channels = bitmap.channel_count()
@@ -248,6 +253,12 @@ def sensor_of(path: Path, scene, index: int):
     if not 0 <= index < count:
         raise NergError(f'"{path}" has {count} sensor(s) and number {index} was asked for: choose -s from 0 on')
     return scene.sensors()[index]
+
+
+def samples_of(camera: Any, spp: int) -> int:
+    """Samples of a picture of ``camera``: ``spp`` a pixel, 0 for those of its sampler."""
+    width, height = map(int, camera.film().crop_size())
+    return width * height * (spp or camera.sampler().sample_count())
 
 
 def resident_bytes() -> int:

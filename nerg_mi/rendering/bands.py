@@ -10,8 +10,6 @@ order, and pixels differ by the rounding of single precision.
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -23,15 +21,7 @@ from nerg_mi.maths.types import Bool
 
 from . import pixel_sampler
 from .layers import Layers, OwnLayer
-
-PACKET = 64
-"""Samples that Dr.Jit may add up as one (16 on a CPU, 32 on a GPU): a strip begins at a multiple of this many."""
-
-LEAST = 1 << 12
-"""Samples below which the overhead of a strip outweighs its work."""
-
-STRIP_SECONDS = 0.5
-"""A strip that took longer than this is followed by shorter ones, one that took less than half of it by longer ones."""
+from .pace import Pace
 
 BYTES_PER_VALUE = 22
 """Memory that a band needs for each value (channel of a pixel), in bytes: 4 in the block that samples are added to, the
@@ -110,14 +100,15 @@ def render_bands(
     strip: int = 0,
     on_strip: Callable[[int, int], None] | None = None,
     layers: Layers | None = None,
+    pace: Pace | None = None,
 ) -> Iterator[Band]:
     """Render the picture of ``sensor`` band by band, from the top; in one piece where `why_whole` has a reason.
 
     ``spp``: samples a pixel, 0 for those of the sampler. ``rows`` of a band; 0: all. ``strip``: samples of a strip, 0:
-    as many as take about `STRIP_SECONDS`. ``on_strip`` is told the number of samples done and that of all after every
-    strip, and may raise. ``layers``: in place of the scene's integrator, of a picture that can be divided; the
-    bands of all of them follow each other. Raises ``KeyboardInterrupt`` after a picture in one piece that was to be
-    stopped: there Mitsuba itself takes the signal.
+    as many as take about `pace.STRIP_SECONDS`; ``pace``: that of the pictures before this one. ``on_strip`` is told the
+    number of samples done and that of all after every strip, and may raise. ``layers``: in place of the scene's
+    integrator, of a picture that can be divided; the bands of all of them follow each other. Raises
+    ``KeyboardInterrupt`` after a picture in one piece that was to be stopped: there Mitsuba itself takes the signal.
     """
     if why_whole(scene, sensor):
         yield _whole(scene, sensor, spp, seed, on_strip)
@@ -127,7 +118,7 @@ def render_bands(
     layers = OwnLayer(integrator) if layers is None else layers
     observing = lambda: integrator.seen_by(sensor, scene) if isinstance(integrator, Observing) else nullcontext()
     base = pixel_sampler.base_seed(sensor.sampler())
-    pace = _Pace(strip)
+    pace = pace or Pace(strip)
     done = 0
     for top in range(0, grid.height, grid.rows):
         blocks = [grid.block(names) for names in layers.names]
@@ -298,40 +289,3 @@ def _crop(film, size, offset) -> None:
     params = mi.traverse(film)
     params["crop_size"], params["crop_offset"] = mi.ScalarVector2u(size), mi.ScalarPoint2u(offset)
     params.update()
-
-
-class _Pace:
-    """How many samples a strip has, from the time that those before it took."""
-
-    def __init__(self, fixed: int):
-        import mitsuba as mi
-
-        self._fixed = fixed
-        self._count = fixed or (1 << 20 if str(mi.variant()).startswith("cuda") else 1 << 15)
-        self._most = 1 << 24 if str(mi.variant()).startswith("cuda") else 1 << 18
-        self._since, self._strips = None, 0
-
-    def strips(self, start: int, stop: int, spp: int) -> Iterator[tuple[int, int]]:
-        # With whole pixels in every strip, unless a pixel alone has more samples than a strip may have.
-        unit = math.lcm(PACKET, spp)
-        unit = unit if unit <= self._most else PACKET
-        first = start - start % PACKET
-        while first < stop:
-            last = min(max((first + self._count) // unit, first // unit + 1) * unit, stop)
-            yield first, last - first
-            first = last
-
-    def wait(self) -> None:
-        """Until the strip before is done."""
-        import drjit as dr
-
-        dr.sync_thread()
-        now = time.perf_counter()
-        # The first strip's kernel had to be compiled.
-        if self._strips > 1 and not self._fixed:
-            seconds = now - self._since
-            if seconds > STRIP_SECONDS:
-                self._count = max(self._count // 2, LEAST)
-            elif seconds < STRIP_SECONDS / 2:
-                self._count = min(self._count * 2, self._most)
-        self._since, self._strips = now, self._strips + 1

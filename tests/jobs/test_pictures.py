@@ -4,8 +4,11 @@ import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.exr import read_exr_text
+from nerg_mi.jobs import pictures
 from nerg_mi.jobs.demo import store_scene
 from nerg_mi.jobs.pictures import PictureOptions, render_file
+from nerg_mi.rendering import long_renders
+from nerg_mi.rendering.long_renders import prepare_for
 from tests.cli.test_render import SCENE
 from tests.jobs.recorder import Recorder
 from tests.pictures import mitsuba_bitmap
@@ -51,3 +54,17 @@ def test_the_header_says_what_the_gaze_rests_on(tmp_path):
     text = read_exr_text(render_file(store_scene(), tmp_path / "a.exr", options).path)
     assert text["gaze.basis"].startswith("made of ") and text["gaze.basis"].endswith(" people")
     assert "nerg render" in text["Comment"] and "kde.basis" not in text
+
+
+@pytest.mark.slow
+def test_long_renders_are_prepared_and_the_same_to_the_byte(tmp_path, monkeypatch):
+    options = PictureOptions(defaults={"width": "24", "height": "16"}, spp=2, mode="llvm_ad_rgb")
+    render_file(store_scene(), tmp_path / "a.png", options)
+    prepared = []
+    monkeypatch.setattr(long_renders, "SAMPLES", 24 * 16 * 2)
+    monkeypatch.setattr(
+        pictures, "prepare_for", lambda samples, scene: prepared.append(prepare_for(samples, scene)) or prepared[-1]
+    )
+    render_file(store_scene(), tmp_path / "b.png", options)
+    assert prepared == [True]
+    assert mitsuba_bitmap(tmp_path / "a.png") == mitsuba_bitmap(tmp_path / "b.png")
