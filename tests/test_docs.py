@@ -137,7 +137,7 @@ def test09_files_that_are_named_exist(page):
 
 
 def test10_settings_of_the_study_are_the_studys():
-    subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, resampled=True)
+    subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, normalized=True, resampled=True)
     names = {setting.name for setting in study_settings.settings(subject)}
     told = set()
     for table in re.findall(

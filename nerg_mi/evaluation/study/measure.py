@@ -44,6 +44,7 @@ COLUMNS = (
     "depth",
     "visibility",
     "map_height",
+    "integral_tolerance",
     "jitter",
     "radiance",
     "aovs",
@@ -97,7 +98,7 @@ def _parameters(subject, row: Setting, integrator) -> dict:
             "dt_gamma": dt_gamma,
             "stop": study_paper.STOP,
         }
-        values |= {"color_cutoff": 0.0, "coarse": 1.0, "jitter": False, "depth": "unnormalised"}
+        values |= {"color_cutoff": 0.0, "coarse": 1.0, "jitter": False, "depth": "unnormalised", "refined": False}
     if values["visibility"] != "map":
         values["map_height"] = ""
     if not subject.marched:

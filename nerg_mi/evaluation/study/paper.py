@@ -14,6 +14,7 @@ hidden. A normalised gaze field is divided by the integral that ``nerg`` finds: 
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import drjit as dr
 
@@ -109,13 +110,18 @@ def _integrator_class(variant: str):
     return PaperIntegrator
 
 
+def _whole_cells(occupancy: Any) -> Any:
+    """The grid that is as fine as the paper's, which knows no parts of cells; None where there is none."""
+    return None if occupancy is None else occupancy.coarse
+
+
 def march(medium, ray, t0, t1, active, color, *, steps, shortest, longest, dt_gamma):
     """``(opacity, depth, weighted colour sum, samples)`` of ``ray`` (`LocalRay`) between ``t0`` and ``t1``.
 
     ``color``: array type of the medium's colour, or None for a density-only pass.
     """
     Float = type(ray.t_near)
-    grid = medium.occupancy
+    grid = _whole_cells(medium.occupancy)
 
     def length(t):
         return dr.clip(t * dt_gamma, shortest, longest)

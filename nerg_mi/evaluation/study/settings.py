@@ -46,13 +46,13 @@ def settings(subject, quick: bool = False) -> list[Setting]:
     """All rows for ``subject``; ``quick``: one or two of each factor."""
 
     if not subject.marched:
-        return [Setting("default", "default"), *_visibility(quick), *_left_out(subject), *_samples(quick)]
+        return [Setting("default", "default"), *_observer(subject, quick), *_left_out(subject), *_samples(quick)]
 
     def some(values):
         return values[:: max(len(values) - 1, 1)] if quick else values
 
     if subject.hits:
-        return [*_met(some), *_visibility(quick), *_left_out(subject), *_samples(quick)]
+        return [*_met(some), *_observer(subject, quick), *_left_out(subject), *_samples(quick)]
 
     def steps(n):
         return {"step": subject.extent / n}
@@ -75,7 +75,7 @@ def settings(subject, quick: bool = False) -> list[Setting]:
             rows.append(Setting(f"depth {k}, {n} steps", "depth", {"depth": k, **steps(n)}))
     rows.append(Setting("unrefined", "refined", {"refined": False}))
     rows.append(Setting("jitter", "jitter", {"jitter": True}))
-    rows += _visibility(quick) + _left_out(subject) + _samples(quick)
+    rows += _observer(subject, quick) + _left_out(subject) + _samples(quick)
     if subject.resampled:
         for r in RESOLUTIONS[:1] if quick else RESOLUTIONS:
             for rule in RULES.names():
@@ -109,6 +109,16 @@ def _visibility(quick: bool) -> list[Setting]:
         rows.append(Setting(f"visibility map {h}", "visibility", params))
         rows.append(Setting(f"visibility map {h}, first frame", "visibility", params, first_frame=True))
     return rows
+
+
+def _observer(subject, quick: bool) -> list[Setting]:
+    """What is found out for each observer: visibility, and the integral of a gaze that is divided by one."""
+    if not subject.normalized:
+        return _visibility(quick)
+    return _visibility(quick) + [
+        Setting(f"integral_tolerance {t:g}, first frame", "integral", {"integral_tolerance": t}, first_frame=True)
+        for t in ((0.0, 2e-3) if quick else (0.0, 5e-4, 2e-3, 8e-3, 3.2e-2))
+    ]
 
 
 def _samples(quick: bool) -> list[Setting]:

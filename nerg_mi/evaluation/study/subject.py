@@ -35,7 +35,9 @@ FALLOFF = 0.1
 FINER = 32
 # Nothing is skipped, merged or cut short in a reference.
 _CONVERGED = {"coarse": 1.0, "dt_gamma": 0.0, "jitter": False, "color_cutoff": 0.0, "stop": 1e-9} | {
-    "quadrature": "constant"
+    "quadrature": "constant",
+    "refined": False,
+    "integral_tolerance": 0.0,
 }
 
 
@@ -86,6 +88,8 @@ class Subject:
     name: str
     opaque: bool
     has_gaze = True
+    normalized = False
+    """Whether that gaze is divided by an integral."""
     marched = True
     """Whether there is a medium, whose marching can be set."""
     hits = False
@@ -243,6 +247,7 @@ class FileSubject(Subject):
         self.surfaces, self.opaque = surfaces, surfaces is not None
         children = integrator.children
         self.has_gaze, medium = "gaze" in children, integrator.medium
+        self.normalized = self.has_gaze and integrator.gaze.field.config.normalized
         self.hits = medium is not None and medium.hits is not None
         self._set_up(loaded, sensor, {**children, **parameters(integrator), "aovs": self.aovs()})
         self.resize(width, height)

@@ -14,7 +14,9 @@ from nerg_mi.evaluation.study.subject import open_subject
 
 @pytest.fixture(scope="module")
 def rows():
-    return settings(SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=True, resampled=True))
+    return settings(
+        SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=True, normalized=True, resampled=True)
+    )
 
 
 def test_sweeps_are_even_on_a_log_axis(rows):
@@ -26,6 +28,7 @@ def test_sweeps_are_even_on_a_log_axis(rows):
         "coarse": [r.params["coarse"] for r in rows if r.group == "coarse"],
         "steps at a grid": [2.0 / r.params["step"] for r in rows if re.fullmatch(r"grid 64, cells, \d+ steps", r.name)],
         "map heights": [r.params["map_height"] for r in rows if "map_height" in r.params and not r.first_frame],
+        "tolerances": [r.params["integral_tolerance"] for r in rows if r.group == "integral"][1:],
         "samples": [r.spp for r in rows if r.group == "spp"],
     }
     for name, values in sweeps.items():
@@ -55,10 +58,19 @@ def test_rows_do_what_their_names_say(rows):
 
 @pytest.mark.parametrize("has_gaze", [True, False])
 def test_gaze_is_left_out_where_there_is_one(has_gaze):
-    subject = SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=has_gaze, resampled=True)
+    subject = SimpleNamespace(marched=True, hits=False, extent=2.0, has_gaze=has_gaze, normalized=False, resampled=True)
     left_out = {r.name: r.params.get("aovs", "") for r in settings(subject) if r.group == "leave out"}
     assert ("no gaze" in left_out) == has_gaze and all("gaze" not in aovs for aovs in left_out.values())
     assert not has_gaze or "visibility" in left_out["no gaze"]
+
+
+@pytest.mark.parametrize("normalized", [True, False])
+def test_integrals_are_varied_where_there_are_any(normalized):
+    subject = SimpleNamespace(
+        marched=True, hits=False, extent=2.0, has_gaze=True, normalized=normalized, resampled=False
+    )
+    found = [r.params["integral_tolerance"] for r in settings(subject, quick=True) if r.group == "integral"]
+    assert found == ([0.0, 2e-3] if normalized else [])
 
 
 def test_settings_vary_one_factor_at_a_time():
