@@ -25,6 +25,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import cold_kernels  # noqa: F401
 import density_limit
 import torch_frames
 from growth_figures import growth_figure, roofline_figure
@@ -133,10 +134,7 @@ def frames(run: Run) -> None:
     for width, height in ((320, 180), (1280, 720)):
         o, d = torch_frames.camera_rays(width, height)
         values = {"width": width, "height": height, "spp": 1, "aovs": "depth,gaze"}
-        works = {
-            "nerg": torch_frames.ours(values, "depth"),
-            "nerg, same observer again": torch_frames.ours(values, "map"),
-        }
+        works: dict = {**torch_frames.our_frames(values)}
         if width < 640 or run.long:
             works |= {name: partial(peer.frame, o, d, (4.4, 2.8, 1.6)) for name, peer in peers.items()}
         runs = run.runs if width < 640 else max(run.runs // 3, 1)
@@ -148,9 +146,9 @@ def stages(run: Run) -> None:
     """Each with those before it, of 640 x 360."""
     width, height = 640, 360
     values = {"width": width, "height": height, "spp": 1}
-    works = {name: torch_frames.ours({**values, **more}, "depth") for name, more in STAGES.items()}
+    works = {name: torch_frames.Ours({**values, **more}, "depth") for name, more in STAGES.items()}
     last = list(works)[-1]
-    works["... same observer again"] = torch_frames.ours({**values, **STAGES[last]}, "map")
+    works["... same observer again"] = torch_frames.Ours({**values, **STAGES[last]}, "map")
     taken = in_turns(works, run.runs)
     theirs = {} if run.cuda else peer_stages(run, width // 2, height // 2)
     rows, before = [], 0.0

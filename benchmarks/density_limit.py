@@ -19,7 +19,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
+from nerg_mi.field.constant_weights import set_constant_weights
 from output import print_table
 from timing import in_turns, median, spread
 
@@ -161,8 +161,9 @@ def random_points(field, count: int, seed: int = 0) -> np.ndarray:
     return np.ascontiguousarray(np.resize(p, (count, 3)).T, np.float32)
 
 
-def ours(field, p: np.ndarray):
-    """A function that evaluates the density of the field at ``p`` (3, N), and waits for it."""
+def ours(field, p: np.ndarray, constant: bool = False):
+    """A function that evaluates the density of the field at ``p`` (3, N), and waits for it; ``constant``: with the
+    weights of its networks as constants of the kernel."""
     import drjit as dr
 
     ns = field.ns
@@ -170,7 +171,9 @@ def ours(field, p: np.ndarray):
     dr.eval(points)
 
     def evaluate():
+        set_constant_weights(field, constant)
         out = field.density(points)
+        set_constant_weights(field, False)
         dr.eval(out)
         dr.sync_thread()
         return out
@@ -225,10 +228,10 @@ def measure(field, points: dict[str, np.ndarray], runs: int, threads: int) -> tu
     with tempfile.TemporaryDirectory() as folder:
         limit = Limit(field, build(Path(folder)), threads) if compiler() else None
         for name, p in points.items():
-            functions = {"Dr.Jit": ours(field, p)}
+            functions = {"Dr.Jit": ours(field, p), "Dr.Jit, constant weights": ours(field, p, constant=True)}
             apart = 0.0
             if limit is not None:
-                functions["C++ by hand"] = lambda p=p: limit.density(p)
+                functions[HAND] = lambda p=p: limit.density(p)
                 a, b = np.array(functions["Dr.Jit"]()), limit.density(p)
                 # Places are rounded to 1e-7 of the box, which the finest level and the exponential function enlarge.
                 off = np.abs(a - b) / np.maximum(a, 1e-3)
@@ -245,7 +248,7 @@ def measure(field, points: dict[str, np.ndarray], runs: int, threads: int) -> tu
                         "ns CPU": cpu,
                         "quartiles": spread([1e9 * c / p.shape[1] for _, c in times]),
                         "gflops": work.flops / cpu * threads,
-                        "apart": apart if who != "Dr.Jit" else 0.0,
+                        "apart": apart if who == HAND else 0.0,
                     }
                 )
         if limit is not None:
@@ -253,6 +256,7 @@ def measure(field, points: dict[str, np.ndarray], runs: int, threads: int) -> tu
     return rows, found
 
 
+HAND = "C++ by hand"
 CEILINGS = ("what", "at most", "an evaluation takes", "ns of CPU at least")
 HEAD = ("points", "evaluation", "ns of CPU", "quartiles", "GFLOP/s", "of the roof", "times by hand")
 
@@ -262,7 +266,7 @@ def table(rows: list[dict], found: dict[str, float], work: Work) -> list[list[st
     roof = min(found["flops"], found["table"] / work.bytes * work.flops) / 1e9 if found else None
     cells = []
     for row in rows:
-        hand = [r for r in rows if r["points"] == row["points"] and r["evaluation"] != "Dr.Jit"]
+        hand = [r for r in rows if r["points"] == row["points"] and r["evaluation"] == HAND]
         cells.append(
             [
                 row["points"],

@@ -129,7 +129,7 @@ def test04_areas_are_read(tmp_path):
         assert all(region.holds(region.corners).all() for region in read_regions(tmp_path / "a.json"))
 
 
-XML_PAGES = ("gaze-training.md", "plugins.md", "shapes-and-fields.md", "splats.md")
+XML_PAGES = ("gaze-training.md", "performance.md", "plugins.md", "shapes-and-fields.md", "splats.md")
 
 
 @pytest.fixture
