@@ -12,8 +12,8 @@ def set_constant_weights(field: Any, constant: bool = True) -> None:
     """Whether the networks of ``field`` (a radiance or a gaze field; of an ensemble all members') are evaluated with
     their weights as constants of the kernel.
 
-    It holds for processors, where nothing is differentiated and no function is recorded by ``dr.freeze``; elsewhere
-    evaluations are as before. New weights take a new compilation.
+    It holds for processors, where nothing is differentiated and no function is recorded by ``dr.freeze``; elsewhere,
+    and of networks with normalised layers, evaluations are as before. New weights take a new compilation.
     """
     for net in _networks(field):
         net.constant = constant

@@ -117,3 +117,11 @@ def test06_a_background_is_part_of_its_field():
     field.background = behind
     set_constant_weights(field)
     assert behind.net.constant
+
+
+def test07_normalised_layers_stay_as_they_are():
+    net = MLP.random([8, 16, 3], ns, np.random.default_rng(5), normalized=True)
+    x = [ns.Float(c) for c in np.random.default_rng(6).normal(size=(8, 20)).astype(np.float32)]
+    before = np.array(net(x))
+    net.constant = True
+    assert np.ptp(before) > 0 and np.array_equal(np.array(net(x)), before)

@@ -46,3 +46,12 @@ def test03_wrong_files(rgb, tmp_path):
     fields.radiance(tmp_path / "f.safetensors")
     with pytest.raises(RuntimeError, match="holds a radiance field where a gaze field is needed"):
         load(rgb, tmp_path / "f.safetensors")
+
+
+def test04_constant_weights_change_no_gaze(rgb, tmp_path):
+    fields.gaze(tmp_path / "g.safetensors")
+    where = (0.4, 0.3, 0.6), (-0.5, 0.1, -0.7), (0.6, 0.0, 0.8)
+    plain = volume(tmp_path / "g.safetensors")
+    constant = {**plain, "constant_weights": True}
+    assert rgb.load_dict(constant).field.emit_head.constant
+    assert ask(rgb, plain, *where)[0] > 0 and ask(rgb, constant, *where) == ask(rgb, plain, *where)

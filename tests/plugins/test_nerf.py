@@ -142,3 +142,16 @@ def test_its_bound_caps_densities(rgb, files):
     it.p = rgb.Point3f(np.random.default_rng(0).uniform(-0.9, 0.9, (3, 100)).astype(np.float32))
     free, capped = (np.array(rgb.load_dict({**volume, **more}).eval_1(it)) for more in ({}, {"max_density": 2.2}))
     assert free.max() > 2.2 and np.allclose(capped, np.minimum(free, 2.2))
+
+
+def test_constant_weights_change_no_density(rgb, files):
+    import drjit as dr
+
+    volume = {"type": "nerf", "filename": str(files / "field.safetensors")}
+    it = dr.zeros(rgb.Interaction3f)
+    it.p = rgb.Point3f(np.random.default_rng(0).uniform(-0.9, 0.9, (3, 100)).astype(np.float32))
+    plain, constant = rgb.load_dict(volume), rgb.load_dict({**volume, "constant_weights": True})
+    assert constant.field.color_net.constant and not plain.field.color_net.constant
+    assert np.ptp(plain.eval_1(it)) > 0 and np.array_equal(constant.eval_1(it), plain.eval_1(it))
+    with pytest.raises(RuntimeError, match="constant_weights"):
+        rgb.load_dict({**volume, "constant_weights": "yes"})
