@@ -109,7 +109,7 @@ def test04_shapes_and_other_depths_go_with_it(rgb, simpson):
 
 
 def test05_it_is_offered_wherever_rules_are(rgb, simpson):
-    subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, resampled=True)
+    subject = SimpleNamespace(marched=True, hits=False, extent=1.0, has_gaze=True, normalized=False, resampled=True)
     assert {s.params.get("quadrature") for s in study.settings(subject)} >= {"constant", "linear", "simpson"}
     assert RULES.manual().endswith("``simpson``: three samples a step.")
 
