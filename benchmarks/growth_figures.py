@@ -54,7 +54,7 @@ def roofline_figure(peak: float, bandwidths: Mapping[str, float], intensity: flo
     for k, (name, rate) in enumerate(found.items()):
         ours = name.startswith("Dr.Jit")
         color = _OURS if ours else _HAND
-        axes.plot(intensity, rate, marker="os^v"[k % 4], color=color, linestyle="none", ms=5, label=name)
+        axes.plot(intensity, rate, marker="os^vDP"[k % 6], color=color, linestyle="none", ms=5, label=name)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("operations a byte", fontsize=8, color=INK)
