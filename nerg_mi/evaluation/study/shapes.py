@@ -58,9 +58,9 @@ def observed_gaze(subject, p_o: np.ndarray) -> ObservedGaze:
     """The gaze field of ``subject`` for the observer at ``p_o`` (3,)."""
     import mitsuba as mi
 
-    integrator = subject.integrator()
-    # The integral is the integrator's own: over ray casts, which are exact to single precision, and tested against
-    # ``first_hit``.
+    # The integral is the integrator's own, of all directions: over ray casts, which are exact to single precision, and
+    # tested against ``first_hit``.
+    integrator = subject.integrator({"integral_tolerance": 0.0})
     place = Place(None, subject.scene)
     return integrator.gaze.at([mi.Point3f(*p_o.tolist())], place, integrator.observer_settings)
 

@@ -8,6 +8,8 @@ import pytest
 from nerg_mi.cli import main
 from nerg_mi.evaluation.study import shapes as study_shapes
 from nerg_mi.evaluation.study import subject as study_subject
+from nerg_mi.jobs.demo import store_scene
+from nerg_mi.transport.place import Place
 
 SCENE = """<scene version="3.0.0">
   <integrator type="nerg">
@@ -107,3 +109,15 @@ def test05_shapes_without_triangles_are_refused(tmp_path, scene, capsys):
     with pytest.raises(SystemExit):
         main(["study", str(scene), "--out", str(tmp_path / "out"), "--quick", "-m", "llvm_ad_rgb"])
     assert "a study of shapes needs meshes, and this scene has a Sphere" in " ".join(capsys.readouterr().err.split())
+
+
+def test06_a_normalised_gaze_is_divided_by_the_integral_of_all_directions(rgb):
+    subject = study_subject.open_subject(str(store_scene().with_name("shapes.xml")), "auto", 12, 8)
+    p_o = rgb.Point3f(*subject.eye().tolist())
+
+    def integral(tolerance):
+        made = subject.integrator({"integral_tolerance": tolerance})
+        return made.gaze.at([p_o], Place(None, subject.scene), made.observer_settings).integrals(p_o)[0][0]
+
+    found = study_shapes.observed_gaze(subject, subject.eye()).integrals(p_o)[0][0]
+    assert found == integral(0.0) != integral(2e-3)
