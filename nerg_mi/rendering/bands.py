@@ -119,6 +119,7 @@ def render_bands(
     observing = lambda: integrator.seen_by(sensor, scene) if isinstance(integrator, Observing) else nullcontext()
     base = pixel_sampler.base_seed(sensor.sampler())
     pace = pace or Pace(strip)
+    pace.begin()
     done = 0
     for top in range(0, grid.height, grid.rows):
         blocks = [grid.block(names) for names in layers.names]

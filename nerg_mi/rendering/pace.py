@@ -26,7 +26,11 @@ class Pace:
         self._fixed = fixed
         self._count = fixed or (1 << 20 if str(mi.variant()).startswith("cuda") else 1 << 15)
         self._most = 1 << 24 if str(mi.variant()).startswith("cuda") else 1 << 18
-        self._since, self._strips = None, 0
+        self._since, self._strips = 0.0, 0
+
+    def begin(self) -> None:
+        """A picture begins: what was done since the last one is no strip's time."""
+        self._strips = 0
 
     def strips(self, start: int, stop: int, spp: int) -> Iterator[tuple[int, int]]:
         """``(first, count)`` of strips from sample ``start``, or from the packet that it lies in, to ``stop``."""
@@ -45,7 +49,7 @@ class Pace:
 
         dr.sync_thread()
         now = time.perf_counter()
-        # The first strip's kernel had to be compiled.
+        # The first wait is for nothing, and the first strip's kernel had to be compiled.
         if self._strips > 1 and not self._fixed:
             seconds = now - self._since
             if seconds > STRIP_SECONDS:

@@ -57,7 +57,13 @@ def test03_fixed_ones_stay(rgb, monkeypatch):
 def test04_the_next_picture_goes_on_with_the_pace_of_the_last(rgb, monkeypatch):
     clock, it = Clock(monkeypatch), Pace()
     before = first_strip(it)
-    for _ in range(2):
-        for _ in it.strips(0, 1 << 16, 1):
-            clock.take(it, 0.01)
-    assert first_strip(it) > before
+    clock.take(it, 0.01, 4)
+    grown = first_strip(it)
+    assert grown > before
+    # Reading the next scene is no strip's time.
+    it.begin()
+    clock.take(it, 10 * pace.STRIP_SECONDS)
+    clock.take(it, 10 * pace.STRIP_SECONDS)
+    assert first_strip(it) == grown
+    clock.take(it, 2 * pace.STRIP_SECONDS)
+    assert first_strip(it) == grown // 2
