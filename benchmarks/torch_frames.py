@@ -29,7 +29,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import cold_kernels  # noqa: F401
 import nerg_mi as nerg
-from nerg_mi.field.constant_weights import set_constant_weights
 from nerg_mi.figures.tonemap import srgb
 from nerg_mi.formats.fields import load_gaze, load_radiance
 from nerg_mi.jobs.demo import store_scene
@@ -278,11 +277,10 @@ class Ours:
     def __init__(self, values: dict, visibility: str, constant: bool = False):
         import mitsuba as mi
 
-        self.scene = nerg.Scene.load(store_scene(), **values, visibility=visibility).mitsuba
+        scene = nerg.Scene.load(store_scene(), **values, visibility=visibility)
         if constant:
-            set_constant_weights(self.scene.integrator().medium.field)
-            set_constant_weights(self.scene.integrator().gaze.field)
-        self.render = partial(mi.render, self.scene, sensor=0, spp=1)
+            scene.set_constant_weights()
+        self.render = partial(mi.render, scene.mitsuba, sensor=0, spp=1)
         start = time.perf_counter()
         self()
         self.first = time.perf_counter() - start

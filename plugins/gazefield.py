@@ -18,9 +18,10 @@ Trained gaze field (:monosp:`gazefield`)
 
  * - constant_weights
    - |bool|
-   - Write the weights of the networks into the kernels, for many frames of one field: the same pictures to the bit in
-     about two thirds of the time, after some seconds of compilation for each size of picture. Only on processors, and
-     where nothing is differentiated; weights that change often are not for it. (Default: false)
+   - Write the weights of the networks into the kernels, for many large frames of one field: the same pictures to the
+     bit in less time, after some seconds of compilation for each size of picture (docs/performance.md, "Weights as
+     constants"). Only on processors, and where nothing is differentiated; weights that change often are not for it.
+     (Default: false)
 
  * - grid.table, position_net.0, ..., direction_net.0, ..., emit_head.0, capture_head.0
    - |tensor|

@@ -24,9 +24,10 @@ Trained radiance field (:monosp:`nerf`)
 
  * - constant_weights
    - |bool|
-   - Write the weights of the networks into the kernels, for many frames of one field: the same pictures to the bit in
-     about two thirds of the time, after some seconds of compilation for each size of picture. Only on processors, and
-     where nothing is differentiated; weights that change often are not for it. (Default: false)
+   - Write the weights of the networks into the kernels, for many large frames of one field: the same pictures to the
+     bit in less time, after some seconds of compilation for each size of picture (docs/performance.md, "Weights as
+     constants"). Only on processors, and where nothing is differentiated; weights that change often are not for it.
+     (Default: false)
 
  * - grid.table, density_net.0, ..., color_net.0, ...
    - |tensor|

@@ -94,6 +94,16 @@ class Scene:
         sensor = self.integrator.observer
         return None if sensor is None else np.ravel(np.array(center(sensor), np.float32))
 
+    def set_constant_weights(self, constant: bool = True) -> None:
+        """Write the weights of its trained fields into the kernels, for many pictures or rays of one scene: the same
+        results to the bit in less time, after some seconds of compilation (the page on performance, "Weights as
+        constants"). ``constant`` false takes it back."""
+        from nerg_mi.field.constant_weights import set_constant_weights
+        from nerg_mi.rendering.long_renders import fields_of
+
+        for field in fields_of(self.integrator):
+            set_constant_weights(field, constant)
+
     @property
     def default_quantities(self) -> tuple[str, ...]:
         """What is computed when nothing is asked for by name."""

@@ -167,6 +167,12 @@ class RadianceField:
         return {f"{name}.{key}": value for name in owners for key, value in getattr(self, name).named().items()}
 
     @property
+    def mlps(self) -> list[MLP]:
+        """All of its networks."""
+        nets = [self.density_net, self._head, self.color_net]
+        return nets if self.background is None else [*nets, self.background.net]
+
+    @property
     def ns(self) -> ModuleType:
         """Array types of the field's backend; see ``field.backend.namespace``."""
         return namespace(self.density_net.weights[0])

@@ -225,8 +225,9 @@ def _picture(
 
     def fill(add: Callable[[Any, int], None]) -> None:
         nonlocal channels
-        how: dict[str, Any] = {"spp": options.spp, "seed": options.seed, "rows": rows}
-        pieces = bands.render_bands(loaded, camera, **how, on_strip=on_strip, pace=pace)
+        pieces = bands.render_bands(
+            loaded, camera, spp=options.spp, seed=options.seed, rows=rows, on_strip=on_strip, pace=pace
+        )
         for band in pieces:
             bitmap = band.film.bitmap()
             channels = bitmap.channel_count()

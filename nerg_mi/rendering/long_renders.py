@@ -5,19 +5,30 @@ from __future__ import annotations
 from typing import Any
 
 from nerg_mi.field.constant_weights import set_constant_weights
+from nerg_mi.field.gaze.protocol import AnyGazeField
+from nerg_mi.field.radiance import RadianceField
+from nerg_mi.transport.media.field import FieldMedium
+
+from .asked import is_nerg
 
 SAMPLES = 1 << 27
-"""From so many on a render is long: 146 pictures of 1280 x 720. Each takes about a tenth less time then, from the
-scene to the file, and the compilation some five seconds, once."""
+"""From so many on a render is long: 146 pictures of 1280 x 720 pay for some seconds of compilation many times."""
 
 
 def prepare_for(samples: int, scene: Any) -> bool:
-    """Make ready ``scene``, whose integrator may be ``nerg``, for so many ``samples``, without a change of what it
-    shows; whether there was anything to do."""
-    if samples < SAMPLES:
+    """Make ready ``scene`` for so many ``samples``, without a change of what it shows; whether there was anything to
+    do."""
+    integrator = scene.integrator()
+    if samples < SAMPLES or not is_nerg(integrator):
         return False
-    fields = [getattr(volume, "field", None) for volume in getattr(scene.integrator(), "children", {}).values()]
-    found = [field for field in fields if hasattr(field, "parameters")]
+    found = fields_of(integrator)
     for field in found:
         set_constant_weights(field)
     return bool(found)
+
+
+def fields_of(integrator: Any) -> list[RadianceField | AnyGazeField]:
+    """The trained fields of an integrator `nerg`, those that it has: of its radiance, of its gaze."""
+    medium, gaze = integrator.medium, integrator.gaze
+    found: list[RadianceField | AnyGazeField] = [medium.field] if isinstance(medium, FieldMedium) else []
+    return found if gaze is None else [*found, gaze.field]

@@ -188,3 +188,15 @@ def test12_quantities(scene):
             asked_quantities(scene, wrong)
     with pytest.raises(nerg.NergError, match='no quantity "gazes" here; there are gaze, depth'):
         asked_quantities(scene, "gazes", ("gaze", "depth"))
+
+
+def test_constant_weights_change_nothing_and_are_taken_back(files, camera):
+    scene = nerg.make_scene(files / "field.safetensors", files / "gaze.safetensors", camera=camera, observer=(0, -2, 0))
+    nets = [*scene.integrator.medium.field.mlps, *scene.integrator.gaze.field.mlps]
+    expected = nerg.render(scene, spp=2)
+    scene.set_constant_weights()
+    assert all(net.constant for net in nets)
+    found = nerg.render(scene, spp=2)
+    assert expected.color.max() > 0 and np.array_equal(found.color, expected.color)
+    scene.set_constant_weights(False)
+    assert not any(net.constant for net in nets)

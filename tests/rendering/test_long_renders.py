@@ -4,22 +4,21 @@ import numpy as np
 import pytest
 
 from nerg_mi.jobs.demo import store_scene
-from nerg_mi.rendering.long_renders import SAMPLES, prepare_for
+from nerg_mi.rendering.long_renders import SAMPLES, fields_of, prepare_for
 from nerg_mi.rendering.pictures import load_scene
 
 SMALL = {"width": "24", "height": "16", "spp": "1"}
 
 
 def networks(scene):
-    integrator = scene.integrator()
-    return integrator.medium.field.density_net, integrator.gaze.field.emit_net
+    return [net for field in fields_of(scene.integrator()) for net in field.mlps]
 
 
 @pytest.mark.parametrize(("samples", "prepared"), [(SAMPLES - 1, False), (SAMPLES, True)])
 def test01_long_ones_are_prepared_and_show_the_same_to_the_bit(rgb, samples, prepared):
     plain, scene = load_scene(store_scene(), SMALL), load_scene(store_scene(), SMALL)
     assert prepare_for(samples, scene) is prepared
-    assert [net.constant for net in networks(scene)] == [prepared] * 2
+    assert [net.constant for net in networks(scene)] == [prepared] * 5
     found, expected = (np.array(rgb.render(s, sensor=0, spp=1)) for s in (scene, plain))
     assert expected[..., :3].max() > 0.1 and np.array_equal(found, expected)
 

@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import drjit as dr
 
+from nerg_mi.field.mlp import MLP
 from nerg_mi.maths.contraction import AnyBox
 
 from .basis import Basis
@@ -60,6 +61,11 @@ class GazeEnsemble:
     def networks(self) -> int:
         """Networks that one evaluation of gaze evaluates: all members'."""
         return sum(m.networks for m in self.members)
+
+    @property
+    def mlps(self) -> list[MLP]:
+        """All members' networks."""
+        return [net for member in self.members for net in member.mlps]
 
     @property
     def ns(self) -> ModuleType:

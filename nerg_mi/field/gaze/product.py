@@ -223,6 +223,11 @@ class GazeField:
         """Networks that one evaluation of gaze evaluates: emit's, capture's, or both."""
         return 2 if self.config.variant == "emit_capture" else 1
 
+    @property
+    def mlps(self) -> list[MLP]:
+        """All of its networks."""
+        return [getattr(self, name) for name in self._NETS]
+
     def parameters(self) -> dict:
         """Trainable arrays by name, as checkpoints and ``mi.traverse`` spell them."""
         return {

@@ -139,6 +139,11 @@ class AnyGazeField(Protocol):
         """Networks that one evaluation of gaze evaluates."""
         ...
 
+    @property
+    def mlps(self) -> list[MLP]:
+        """All of its networks, those of all members."""
+        ...
+
     def architecture(self) -> dict:
         """What ``from_arrays`` needs besides the arrays (JSON)."""
         ...
