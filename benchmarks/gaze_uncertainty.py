@@ -5,7 +5,8 @@
 Places and protocol are those of `places.py`, with more zones, since positions of a zone are neighbours. A row a place
 and error: Spearman's rho of little support with the error, at new positions ("both") and at any where held-out
 people stood ("anywhere"), with 95 % of resamples of zones; the mean error of all and of the surest half; and the
-share of held-out rays in the smallest regions that are said to hold 80 % of the gaze.
+share of held-out rays in the smallest regions that are said to hold 80 % of the gaze, and in those that should hold it
+by what the training held out.
 """
 
 from __future__ import annotations
@@ -61,11 +62,12 @@ def measure(name: str, make, args: argparse.Namespace) -> list[dict]:
         low, high = rank.get("rho.low", float("nan")), rank.get("rho.high", float("nan"))
         row = {"place": name, **{k: rank[k] for k in ("split", "error", "positions", "rho", "100%", "50%")}}
         row |= {"rho.low": low, "rho.high": high, "of 80%": held["both", "gaze field"]}
+        row["of 80%, calibrated"] = held.get(("both", "gaze field, calibrated"), float("nan"))
         rows.append(row)
         print(
             f"{name:12s}{rank['split']:9s}{rank['error']:7s}{rank['positions']:5d}  rho {rank['rho']:+.2f} "
             f"[{low:+.2f}, {high:+.2f}]  error {rank['100%']:.3f}, surest half {rank['50%']:.3f}; "
-            f"80 % regions hold {row['of 80%']:.0%}"
+            f"80 % regions hold {row['of 80%']:.0%}, calibrated {row['of 80%, calibrated']:.0%}"
         )
     return rows
 

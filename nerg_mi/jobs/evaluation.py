@@ -109,7 +109,8 @@ def evaluate_gaze(
     places = _positions(test, loaded, place, density, others[_BLIND], _groups(account, split, test.centres), seed)
     ranks = rank_rows(places, options.resamples, seed)
     asked = {k: (methods[k](test.centres, test.directions), methods[k](test.centres, test.at)) for k in _CALIBRATED}
-    regions = calibration_rows(test, asked, options.resamples, seed)
+    found = about.get("mix", {}).get("regions")
+    regions = calibration_rows(test, asked, options.resamples, seed, {"gaze field": found} if found else None)
     files = []
     if output is not None:
         summary = {

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from nerg_mi.density.regions import LEVELS, level_name
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze.evaluation import SCORES, SPLITS
 from nerg_mi.evaluation.gaze.folds import mean_rows, means
 from nerg_mi.evaluation.gaze.report import markdown, uncertainty_text
-from nerg_mi.evaluation.gaze.uncertainty import LEVELS, rank_rows
+from nerg_mi.evaluation.gaze.uncertainty import rank_rows
 from nerg_mi.files.atomic import check_folder, write_text
 from nerg_mi.files.bounded import read_json
 from nerg_mi.files.tables import write_csv, write_json
@@ -38,7 +39,7 @@ from .reporter import SILENT, Reporter
 FIELD, SCORED = "gaze.safetensors", "scores.json"
 """What the output of a fold holds: its field, and the rows of each split."""
 
-_LEVELS = tuple(f"{level:.0%}" for level in LEVELS)
+_LEVELS = tuple(level_name(level) for level in LEVELS)
 _RAYS = "of-the-job/rays.npz"
 _TRAINING = ("recipe", "variant", "radius", "probes", "steps", "mix_folds", "mode")
 _SCORING = ("kappa", "directions", "min_rays", "mode")

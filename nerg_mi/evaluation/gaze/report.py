@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.density.regions import LEVELS, level_name
 from nerg_mi.figures.colors import find_colors
 from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.saving import save
@@ -17,7 +18,7 @@ from nerg_mi.maths.sphere import Z_UP, latlong_grid
 
 from .baselines import Baseline
 from .evaluation import SCORES, GazeTest
-from .uncertainty import KEPT, LEVELS
+from .uncertainty import KEPT
 
 # Digits of the scores that have others than three.
 _DIGITS = {"MAE": 4}
@@ -92,8 +93,9 @@ def uncertainty_text(ranks: list[dict], regions: list[dict]) -> str:
         )
     if regions:
         text += (
-            "## Calibration\n\nShare of the rays in the smallest regions that are said to hold so much of the gaze."
-            f"\n\n{markdown(regions, ('method', *(f'{level:.0%}' for level in LEVELS)))}\n"
+            "## Calibration\n\nShare of the rays in the smallest regions that are said to hold so much of the gaze; "
+            '"calibrated": that should hold so much, by what the training held out.'
+            f"\n\n{markdown(regions, ('method', *(level_name(level) for level in LEVELS)))}\n"
         )
     return text
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from nerg_mi.density.regions import LEVELS, asked_level, level_name, region_levels
 from nerg_mi.evaluation import saliency as metrics
 
 from .evaluation import GazeTest
@@ -24,8 +25,6 @@ ERRORS = ("KLD", "excess")
 """Errors of a position: KLD (nats), and by how much it is above that of one half of the people under the other."""
 KEPT = (1.0, 0.75, 0.5, 0.25)
 """Shares of the positions, the surest, whose mean error is told."""
-LEVELS = (0.5, 0.8, 0.95)
-"""Shares of the gaze whose smallest regions are looked at."""
 # Halves of the people that are drawn, rays that each half has at a position at least, and the blind density's share of
 # what one half tells of the other, so that where it never looked is not impossible.
 _HALVES, _RAYS, _BLIND = 8, 32, 0.2
@@ -101,38 +100,32 @@ def rank_rows(rows: Sequence[Mapping[str, Any]], resamples: int = 200, seed: int
 
 
 def calibration_rows(
-    test: GazeTest, methods: Mapping[str, tuple[np.ndarray, np.ndarray]], resamples: int = 200, seed: int = 0
+    test: GazeTest,
+    methods: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    resamples: int = 200,
+    seed: int = 0,
+    calibrated: Mapping[str, Mapping[str, float]] | None = None,
 ) -> list[dict[str, Any]]:
     """A row a method: the share of the rays of ``test`` that lie in the smallest regions which are said to hold
     `LEVELS` of the gaze, with ``.low`` and ``.high`` where there are three persons. ``methods``: densities in the
-    test's directions (P, D), and at its rays (P, K)."""
+    test's directions (P, D), and at its rays (P, K). ``calibrated``: by methods that have them, what its training found
+    are to be asked for (`density.regions.calibrated_levels`), which make a row "METHOD, calibrated"."""
     rng, people = np.random.default_rng(seed), len(test.persons)
     draws = rng.multinomial(people, np.full(people, 1 / people), resamples if people >= 3 else 0)
     out = []
     for name, (maps, at) in methods.items():
-        row: dict[str, Any] = {"method": name}
-        level = region_levels(maps, at)
-        for share in LEVELS:
-            inside, key = level <= share, f"{share:.0%}"
-            row[key] = float(inside.mean())
-            if len(draws):
-                weights = [times[test.who] for times in draws]
-                reach = 1.96 * np.std([(inside * w).sum() / w.sum() for w in weights])
-                row[f"{key}.low"], row[f"{key}.high"] = row[key] - reach, row[key] + reach
-        out.append(row)
+        level, found = region_levels(maps, at), (calibrated or {}).get(name)
+        for title, asked in ((name, None), (f"{name}, calibrated", found))[: 1 if found is None else 2]:
+            row: dict[str, Any] = {"method": title}
+            for share in LEVELS:
+                inside, key = level <= asked_level(share, asked), level_name(share)
+                row[key] = float(inside.mean())
+                if len(draws):
+                    weights = [times[test.who] for times in draws]
+                    reach = 1.96 * np.std([(inside * w).sum() / w.sum() for w in weights])
+                    row[f"{key}.low"], row[f"{key}.high"] = row[key] - reach, row[key] + reach
+            out.append(row)
     return out
-
-
-def region_levels(maps: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Share of the gaze (P, K) in the smallest region that a ray lies in, of densities ``maps`` (P, D) in directions of
-    equal area that are ``at`` (P, K) at the rays: what is denser, and half of what is equal (Hyndman 1996)."""
-    out = []
-    for row, values in zip(np.maximum(maps, 0).astype(np.float64), at):
-        ordered = np.sort(row)
-        mass = np.concatenate([[0.0], np.cumsum(ordered)])
-        lower, upper = (mass[np.searchsorted(ordered, values, side)] for side in ("left", "right"))
-        out.append(1 - 0.5 * (lower + upper) / mass[-1] if mass[-1] > 0 else np.full(len(values), 0.5))
-    return np.array(out)
 
 
 def _spearman(a: np.ndarray, b: np.ndarray) -> float:

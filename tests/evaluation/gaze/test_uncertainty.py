@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
+from nerg_mi.density.regions import LEVELS, calibrated_levels, level_name, region_levels
 from nerg_mi.evaluation import saliency as metrics
 from nerg_mi.evaluation.gaze import evaluation, uncertainty
-from nerg_mi.maths.sphere import fibonacci_directions
 
 from .test_evaluation import crowd
 
@@ -69,17 +69,6 @@ def test_halves_that_look_alike_agree():
     assert apart[0] > 0.05
 
 
-def test_regions_of_a_cap_hold_what_they_say():
-    """A density that falls with the angle from z: the region that ends at cos a holds (e^k - e^ka) / (e^k - e^-k)."""
-    d, kappa = fibonacci_directions(20_000), 3.0
-    maps, at = np.exp(kappa * d[None, :, 2]), np.array([[1.0, 0.5, 0.0, -1.0]])
-    level = uncertainty.region_levels(maps, np.exp(kappa * at))
-    expected = (np.exp(kappa) - np.exp(kappa * at)) / (2 * np.sinh(kappa))
-    np.testing.assert_allclose(level, expected, atol=1e-3)
-    assert uncertainty.region_levels(np.ones((1, 5)), np.ones((1, 2))).tolist() == [[0.5, 0.5]]
-    assert uncertainty.region_levels(np.zeros((1, 5)), np.zeros((1, 2))).tolist() == [[0.5, 0.5]]
-
-
 def test_rays_of_the_density_are_held_as_often_as_is_said(asked):
     test, _, _ = asked
     rng = np.random.default_rng(0)
@@ -88,6 +77,22 @@ def test_rays_of_the_density_are_held_as_often_as_is_said(asked):
     right = test.truth, np.take_along_axis(test.truth, chosen, axis=1)
     sharp = tuple(v**3 for v in right)
     right, sharp = uncertainty.calibration_rows(drawn, {"right": right, "sharp": sharp})
-    for share in uncertainty.LEVELS:
+    for share in LEVELS:
         assert right[f"{share:.0%}"] == pytest.approx(share, abs=0.03) and sharp[f"{share:.0%}"] < share - 0.05
         assert right[f"{share:.0%}.low"] < right[f"{share:.0%}"] < right[f"{share:.0%}.high"]
+
+
+def test_calibrated_regions_hold_what_is_asked(asked):
+    """A density that is too sharp holds too little; the shares that its own misses ask for hold what they should."""
+    test, _, _ = asked
+    rng = np.random.default_rng(1)
+    chosen = np.stack([rng.choice(256, 4000, p=row / row.sum()) for row in test.truth])
+    drawn = type(test)(**{**vars(test), "who": rng.integers(0, 4, chosen.shape)})
+    sharp = test.truth**3, np.take_along_axis(test.truth**3, chosen, axis=1)
+    half = region_levels(sharp[0], sharp[1][:, :2000]).ravel()
+    found = calibrated_levels(half, np.ones(len(half)))
+    rows = uncertainty.calibration_rows(drawn, {"sharp": sharp, "other": sharp}, 0, 0, {"sharp": found})
+    assert [r["method"] for r in rows] == ["sharp", "sharp, calibrated", "other"]
+    for share in LEVELS:
+        name = level_name(share)
+        assert rows[0][name] == rows[2][name] < share - 0.05 and rows[1][name] == pytest.approx(share, abs=0.03)

@@ -9,7 +9,17 @@ import pytest
 
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze.ensemble import train_ensemble
-from nerg_mi.training.gaze.mixing import SHARES, _choose, _kld, choose_mix, inner_folds, mixes
+from nerg_mi.training.gaze.mixing import (
+    SHARES,
+    MixChoice,
+    _choose,
+    _Judgement,
+    _kld,
+    _regions,
+    choose_mix,
+    inner_folds,
+    mixes,
+)
 from nerg_mi.training.gaze.run import train_gaze
 from nerg_mi.training.gaze.settings import ProbeSettings
 from nerg_mi.training.gaze.supervision import Supervision
@@ -84,6 +94,7 @@ def test04_a_field_counts_where_position_tells(law, kept, rgb):
     told = []
     found = choose_mix(Supervision(people(law)), NOWHERE, plan_of(), ns, told.append)
     assert found is not None and told[-1].stage.startswith("fold") and 0 < told[-1].done <= 1
+    assert found.regions is not None and 0 < found.regions["50%"] < found.regions["80%"] < found.regions["95%"] < 1
     if kept:
         assert found.mix < 0.3 and found.kld < found.kld_blind and found.folds <= 3
     else:
@@ -102,6 +113,8 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
     # Nobody can be held out at places that hold too few rays: the share stays.
     few, about = train_gaze(Supervision(people(0.0, each=12)), NOWHERE, plan, ns)
     assert few.config.mix == LOG.mix and about["mix"]["mix"] == LOG.mix and about["mix"]["folds"] == 0
+    assert "regions" not in about["mix"]
+    assert MixChoice(0.5, 1, regions={"80%": 0.71234}).to_dict()["regions"] == {"80%": 0.7123}
 
     # After Ctrl-C the field is there, as it was before.
     def stop(progress):
@@ -115,3 +128,15 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
 def test06_only_log_densities_have_a_share():
     assert mixes(plan_of()) and not mixes(plan_of(mix_folds=0))
     assert not mixes(planned(SMALL, replace(PRODUCT, mix_folds=3)))
+
+
+def test07_regions_are_those_of_the_mixture():
+    """Of looks in three of four directions, the shares in which they lie are quantiles: half of the looks lie in the
+    region of the second."""
+    field, blind = np.array([[0.8, 0.4, 0.2, 0.0]]), np.array([[0.0, 0.2, 0.2, 0.4]])
+    # Half of each: 0.4, 0.3, 0.2, 0.2.
+    judgement = _Judgement(field, blind, np.array([0, 1, 3]), np.array([0, 3]))
+    found = _regions([judgement], 0.5)
+    np.testing.assert_allclose([found[k] for k in ("50%", "80%", "95%")], [0.55 / 1.1, 0.9 / 1.1, 0.9 / 1.1])
+    # The blind density alone finds the third look the likeliest, and the second as likely as where nobody looked.
+    np.testing.assert_allclose(_regions([judgement], 1.0)["50%"], 1 - 0.5 * (0.2 + 0.2) / 0.8)
