@@ -14,9 +14,11 @@ from .mode import OldMode, mode_of
 from .options import takes
 from .progress import TerminalReporter
 from .train_gaze import train_gaze
+from .train_prior import train_prior
 
 app = typer.Typer(no_args_is_help=True, help="Train fields from recordings.")
 app.command("gaze")(train_gaze)
+app.command("prior")(train_prior)
 
 
 @app.command("radiance")

@@ -166,6 +166,8 @@ def _groups(account: dict, split: str, centres: np.ndarray) -> list[str] | None:
 
 def _rays_of_training(gaze: Path, about: dict, rays: Rays | str | Path) -> Rays:
     """The rays that the field was trained on. Raises `NergError` for others, and where none were held out of it."""
+    if about.get("recipe") == "prior":
+        raise NergError(f'"{gaze}" was learnt in other places, so that none of its rays are of this one to be held out')
     if "test" not in about:
         raise NergError(
             f'"{gaze}" was trained on all positions, so that none is left to score; train it with --test-zones 3'

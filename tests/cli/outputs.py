@@ -140,6 +140,7 @@ CASES = (
         ("a.safetensors",),
         ("a.safetensors", "a.run"),
     ),
+    Case("train prior", "{i}/rays.npz {i}/rays.npz -o {o}/a.safetensors", ("a.safetensors",)),
     Case(
         "eval radiance",
         "{i}/field.safetensors {i}/photos --holdout 2 -o {o}/eval --json {o}/a.json",
@@ -220,6 +221,7 @@ INPUTS = {
     "rays plot": {"rays", "test"},
     "train radiance": {"dataset"},
     "train gaze": {"rays", "views", "align_views", "field", "scene", "align"},
+    "train prior": {"rays"},
     "eval radiance": {"field", "dataset"},
     "eval folds": {"rays", "field", "scene", "align"},
     "eval gaze": {"gaze", "rays", "field", "scene", "geometry"},
