@@ -38,8 +38,8 @@ def calibrated_levels(levels: np.ndarray, weights: np.ndarray) -> dict[str, floa
     weighted quantiles of the shares ``levels`` (n,) of `region_levels` in which they lie, ``weights`` (n,)."""
     order = np.argsort(levels)
     held = np.cumsum(weights[order]) / weights.sum()
-    return {level_name(level): float(levels[order[min(np.searchsorted(held, level), len(order) - 1)]])
-            for level in LEVELS}  # fmt: skip
+    at = lambda level: order[min(np.searchsorted(held, level), len(order) - 1)]
+    return {level_name(level): float(levels[at(level)]) for level in LEVELS}
 
 
 def asked_level(level: float, calibrated: Mapping[str, float] | None) -> float:
