@@ -68,7 +68,7 @@ Neural radiance and gaze fields (:monosp:`nerg`)
 
  * - integral_tolerance
    - |float|
-   - {integral_tolerance} (Default: 2e-3)
+   - {integral_tolerance} (Default: 5e-3)
 
  * - depth
    - |string|

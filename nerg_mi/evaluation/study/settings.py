@@ -117,7 +117,7 @@ def _observer(subject, quick: bool) -> list[Setting]:
         return _visibility(quick)
     return _visibility(quick) + [
         Setting(f"integral_tolerance {t:g}, first frame", "integral", {"integral_tolerance": t}, first_frame=True)
-        for t in ((0.0, 2e-3) if quick else (0.0, 5e-4, 2e-3, 8e-3, 3.2e-2))
+        for t in ((0.0, 5e-3) if quick else (0.0, 3.125e-4, 1.25e-3, 5e-3, 2e-2))
     ]
 
 

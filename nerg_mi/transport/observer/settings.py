@@ -32,7 +32,7 @@ class ObserverSettings:
     # Directions, at most, of the integral that a normalised gaze field is divided by.
     directions: int = DIRECTIONS
     # Error of that integral, as a share of it, below which fewer will do; 0: always as many.
-    integral_tolerance: float = 2e-3
+    integral_tolerance: float = 5e-3
 
     @property
     def surfaces(self) -> tuple:
