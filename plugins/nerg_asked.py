@@ -71,13 +71,14 @@ class AskedPixel(Pixel):
 
 
 class Watcher:
-    """An observer of pixels. What is known of them is made once and kept for as long as the watcher lives."""
+    """An observer of pixels. What is known of them is made once and kept for as long as the watcher lives, and their
+    integral for as long as the integrator remembers it."""
 
     def __init__(self, asked: Asked, position: Sequence[float], alone: bool):
         self.p_o = mi.Point3f(*map(float, position))
         # A position that is a constant of the kernel would be compiled anew for every observer.
         dr.make_opaque(self.p_o)
-        self._cache = asked.cache if alone else ObserverCache()
+        self._cache = asked.cache if alone else ObserverCache(numbers=asked.cache)
         self._has_gaze, self._gaze = "gaze" in asked.demands, None
 
     def pixel(self, pixel: AskedPixel) -> AskedPixel:

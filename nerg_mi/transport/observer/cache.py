@@ -29,21 +29,29 @@ class Known:
     value: Any
 
 
+# Observers whose numbers are kept.
+_MANY = 256
+_Position = tuple[float, float, float]
+
+
 @dataclass(frozen=True)
-class _Entry:
-    position: tuple[float, float, float]
+class _Kept:
+    """What is known of a thing, by observers' positions, the last asked for at the end."""
+
     made_of: Any
-    known: Known
+    known: dict[_Position, Known]
 
 
 class ObserverCache:
     """The cache of one integrator, or of whoever evaluates gaze for several observers in turn.
 
-    Of each thing the entries of those observers are kept who were asked for last.
+    Of each thing the entries of those observers are kept who were asked for last; of numbers those of many more, in
+    ``numbers`` where that is given: a cache that outlives this one.
     """
 
-    def __init__(self) -> None:
-        self._entries: dict[Hashable, list[_Entry]] = {}
+    def __init__(self, numbers: ObserverCache | None = None) -> None:
+        self._kept: dict[Hashable, _Kept] = {}
+        self._numbers = numbers or self
 
     def of_each(
         self, thing: Hashable, observers: list[Point3f], made_of: Any, make: Callable[[Point3f], Any]
@@ -59,26 +67,42 @@ class ObserverCache:
 
     def of_known(self, thing: Hashable, known: list[Known], made_of: Any, make: Callable[[Known], Any]) -> list[Known]:
         """For each of ``known`` what ``make`` makes of it, or made before; otherwise as ``of_each``."""
+        return self._of_known(thing, known, made_of, make, 0)
+
+    def of_numbers(
+        self, thing: Hashable, known: list[Known], made_of: Any, make: Callable[[Known], Any]
+    ) -> list[Known]:
+        """``of_known`` of what is a few numbers for each observer, so that those of 256 who are asked for no more are
+        kept, too."""
+        return self._numbers._of_known(thing, known, made_of, make, _MANY)
+
+    def _of_known(
+        self, thing: Hashable, known: list[Known], made_of: Any, make: Callable[[Known], Any], others: int
+    ) -> list[Known]:
         if recording():
             return [Known(k.center, make(k)) for k in known]
-        before = {e.position: e for e in self._entries.get(thing, ()) if e.made_of == made_of}
-        entries = []
+        kept = self._kept.get(thing)
+        before = kept.known if kept is not None and kept.made_of == made_of else {}
+        asked: dict[_Position, Known] = {}
+        out = []
         for k in known:
             # Read one by one: an array of the three would take a kernel of its own.
             position = k.center.x[0], k.center.y[0], k.center.z[0]
-            if position not in before:
-                before[position] = _Entry(position, made_of, Known(k.center, make(k)))
-            entries.append(before[position])
-        self._entries[thing] = entries
-        return [e.known for e in entries]
+            if position not in asked:
+                asked[position] = before[position] if position in before else Known(k.center, make(k))
+            out.append(asked[position])
+        rest = [(position, k) for position, k in before.items() if position not in asked]
+        self._kept[thing] = _Kept(made_of, dict(rest[-others:] if others else []) | asked)
+        return out
 
     def peek(self, thing: Hashable) -> list[Known]:
         """What is kept of ``thing``, without making any."""
-        return [e.known for e in self._entries.get(thing, ())]
+        kept = self._kept.get(thing)
+        return [] if kept is None else list(kept.known.values())
 
     def forget(self) -> None:
         """Drop everything: something has changed that no array shows."""
-        self._entries.clear()
+        self._kept.clear()
 
 
 def fingerprint_of(place: Place) -> tuple[Fingerprint, Fingerprint]:

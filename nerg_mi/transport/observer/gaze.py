@@ -70,7 +70,7 @@ class PlacedGaze:
                 found = [Known(k.center, integral.attached(k)) for k in around]
             else:
                 of_member = (made_of, Fingerprint(parameters))
-                found = cache.of_known((self, "integral", member), around, of_member, integral.detached)
+                found = cache.of_numbers((self, "integral", member), around, of_member, integral.detached)
             integrals.append([integral.moving(k, p_o) for k, p_o in zip(found, observers)])
         return ObservedGaze(self, place, settings, integrals)
 

@@ -6,7 +6,7 @@ import pytest
 
 from nerg_mi.transport.fingerprint import Fingerprint
 from nerg_mi.transport.media.volume import VolumeMedium
-from nerg_mi.transport.observer.cache import ObserverCache, fingerprint_of
+from nerg_mi.transport.observer.cache import Known, ObserverCache, fingerprint_of
 from nerg_mi.transport.place import Place
 
 
@@ -39,6 +39,27 @@ def test_the_same_position_is_served_again(rgb, made):
     # To the bit.
     next_to = rgb.Point3f(1, 2, float(np.nextafter(np.float32(3), np.float32(4))))
     assert values(cache.of_each("thing", [next_to], 0, make)) == [4]
+
+
+def test_numbers_of_others_are_kept(rgb, made):
+    (calls, make), whole = made, ObserverCache()
+    own = lambda known: make(known.center)
+    at = lambda x: [Known(rgb.Point3f(x, 0, 0), None)]
+    assert [values(whole.of_numbers("n", at(x), 0, own)) for x in (1, 2, 1)] == [[1], [2], [1]]
+    # Of a cache that lives shortly they are those of the whole; what is more than a number is its own.
+    part = ObserverCache(numbers=whole)
+    assert values(part.of_numbers("n", at(2), 0, own)) == [2]
+    assert values(part.of_known("n", at(2), 0, own)) == [3] and values(whole.of_known("m", at(2), 0, own)) == [4]
+    # Others of what has changed are dropped, and of very many those who were asked for first.
+    assert values(whole.of_numbers("n", at(1), 1, own)) == [5] and len(whole.peek("n")) == 1
+    for x in range(2, 300):
+        whole.of_numbers("n", at(x), 1, own)
+    assert len(whole.peek("n")) == 257
+    count = len(calls)
+    whole.of_numbers("n", at(298), 1, own)
+    assert len(calls) == count
+    whole.of_numbers("n", at(1), 1, own)
+    assert len(calls) == count + 1
 
 
 def test_two_who_stand_at_one_place_share(rgb, made):
