@@ -1,7 +1,7 @@
 """One protocol for gaze in many places: where is a field better than what knows less, and where is it worse?
 
     python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--recipe default]
-        [--out out/benchmarks/places]
+        [--variant emit_capture] [--out out/benchmarks/places]
 
 Real people in a supermarket (surfaces from their hit points) and in three scenes of EyeNavGS (no geometry), the demo
 store's shoppers among its field, and four generated places with laws of their own (`generated_places.py`), among their
@@ -34,6 +34,7 @@ def main(argv=None) -> None:
     parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
     parser.add_argument("--only", help="names of places, with commas between. Default: all whose data is there.")
     parser.add_argument("--recipe", default="default")
+    parser.add_argument("--variant", default="emit_capture", help="emit, capture or emit_capture")
     parser.add_argument("--folds", type=int, default=4)
     parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
     parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
@@ -118,6 +119,7 @@ def score(name: str, make: Callable[[Path], tuple[Path, dict]], args: argparse.N
     options = FoldOptions(
         **where,
         recipe=args.recipe,
+        variant=args.variant,
         folds=args.folds,
         first=args.first,
         splits="both",

@@ -30,7 +30,7 @@ def ask(shell: str, line: str) -> subprocess.CompletedProcess[str]:
 def test_bash_is_given_commands_and_those_below():
     assert set(ask("bash", "nerg ").stdout.split()) == set(cli.COMMANDS)
     assert ask("bash", "nerg tr").stdout.split() == ["train"]
-    assert set(ask("bash", "nerg train ").stdout.split()) == {"radiance", "gaze"}
+    assert set(ask("bash", "nerg train ").stdout.split()) == {"radiance", "gaze", "prior"}
     assert {"import", "guess", "show", "filter"} <= set(ask("bash", "nerg rays ").stdout.split())
 
 
