@@ -167,9 +167,10 @@ def show(rows: list[dict]) -> None:
                 f"{r['place']:12s}{r[s]:6.3f}{r[f'{s} blind']:7.3f}{r[f'{s} best']:7.3f}{r[f'{s} half']:6.2f}"
                 f"{r[f'{s} rank']:6d}  {r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}  {r[f'{s} best is']}"
             )
+    print("\nmeans over places: " + ", ".join(f"{s} {sum(r[s] for r in rows) / len(rows):.3f}" for s in SCORES))
     ranks = [r[f"{s} rank"] for r in rows for s in SCORES]
     worst = max(rows, key=lambda r: r["KLD less"])
-    print(f"\nmean rank {sum(ranks) / len(ranks):.2f}; worst place in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
+    print(f"mean rank {sum(ranks) / len(ranks):.2f}; worst place in KLD: {worst['place']}, {worst['KLD less']:+.3f}")
     far = [r for r in rows if r["way"] == r["way"]]
     print("way from blind to split half in CC: " + ", ".join(f"{r['place']} {r['way']:.0%}" for r in far))
 

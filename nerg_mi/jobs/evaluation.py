@@ -25,6 +25,7 @@ from nerg_mi.training.geometry.places import GazePlace
 
 from .backend import select_backend
 from .gaze_places import check_place, place_of_training
+from .gaze_prior import RECIPE as PRIOR
 from .options.evaluation import GazeEvaluationOptions
 from .reporter import SILENT, Reporter
 
@@ -166,7 +167,7 @@ def _groups(account: dict, split: str, centres: np.ndarray) -> list[str] | None:
 
 def _rays_of_training(gaze: Path, about: dict, rays: Rays | str | Path) -> Rays:
     """The rays that the field was trained on. Raises `NergError` for others, and where none were held out of it."""
-    if about.get("recipe") == "prior":
+    if about.get("recipe") == PRIOR:
         raise NergError(f'"{gaze}" was learnt in other places, so that none of its rays are of this one to be held out')
     if "test" not in about:
         raise NergError(

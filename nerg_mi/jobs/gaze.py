@@ -240,10 +240,7 @@ def _tell(result: GazeResult, reporter: Reporter) -> None:
                 f"held out in {folds}: KLD {m['kld_field']:.3f} of the field, {m['kld_blind']:.3f} of where people "
                 f"look wherever they stand; {100 * m['mix']:.0f} % of the latter are mixed in"
             )
-            if "regions" in m:
-                reporter.message(
-                    f"regions of {100 * m['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs"
-                )
+            reporter.message(f"regions of {100 * m['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs")
         else:
             reporter.message(
                 "too few rays at any place to hold people out: whether position tells where others look is not known"

@@ -19,6 +19,9 @@ from .backend import select_backend
 from .options.prior import PriorOptions
 from .reporter import SILENT, Reporter
 
+RECIPE = "prior"
+"""What the provenance of such a field names as its recipe."""
+
 
 @dataclass(frozen=True)
 class PriorResult:
@@ -30,18 +33,20 @@ class PriorResult:
 
 
 def learn_prior(
-    places: Sequence[Rays | str | Path],
+    places: Rays | str | Path | Sequence[Rays | str | Path],
     output: str | Path | None = None,
     options: PriorOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> PriorResult:
     """A gaze field for any place whose z axis points up, of how high people looked in ``places``: rays, or their files
-    (.npz or .parquet) or datasets, one a place. Places count alike, and people within a place. It does not depend on
-    where an observer stands, and is written to ``output`` (.safetensors) where that is given.
+    (.npz or .parquet) or datasets, one a place, or those of one place alone. Places count alike, and people within a
+    place. It does not depend on where an observer stands, and is written to ``output`` (.safetensors) where that is
+    given.
 
     Raises `NergError` for what the user can mend.
     """
     options, output = options or PriorOptions(), None if output is None else Path(output)
+    places = [places] if isinstance(places, (Rays, str, Path)) else places
     if not places:
         raise NergError("a prior is learnt from the rays of other places: give at least one file of them")
     if output is not None:
@@ -58,7 +63,7 @@ def learn_prior(
         raise NergError(f"no ray is in place {', '.join(empty)} of those that a prior is learnt from; leave it out")
     field = prior_field(learnt, ns)
     provenance = {
-        "recipe": "prior",
+        "recipe": RECIPE,
         "kappa": KAPPA,
         "places": files,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),

@@ -45,6 +45,8 @@ def test_scores_stand_beside_the_baselines(trained, tmp_path):
     assert len(found.by_position) == found.positions and {row["group"] for row in found.by_position} == {"0"}
     assert all(row["support"] >= 0 and row["KLD"] > 0 for row in found.by_position)
     assert {row["method"] for row in found.calibration} >= {"gaze field", "4,096 nearest rays"}
+    # By what the folds of the training held out.
+    assert found.calibration[1]["method"] == "gaze field, calibrated"
     assert json.loads((tmp_path / "eval" / "gaze.json").read_text())["methods"][0]["KLD"] == found.rows[0]["KLD"]
     assert "directions of equal area" in (tmp_path / "eval" / "gaze.md").read_text()
 

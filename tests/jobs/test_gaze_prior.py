@@ -40,6 +40,7 @@ def test_its_checkpoint_is_the_density_of_other_places_anywhere(tmp_path, rgb):
     np.testing.assert_allclose(gaze, elevation_density(places, sine), atol=0.006)
     with pytest.raises(NergError, match="learnt in other places"):
         evaluate_gaze(path, places[0])
+    assert learn_prior(tmp_path / "1.npz").provenance["places"] == found.provenance["places"][1:]
     # A notebook has the rays at hand.
     same = learn_prior(places)
     assert same.output is None and "file" not in same.provenance["places"][0]

@@ -7,6 +7,8 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.transport.place import Place
 
+from . import fields
+
 EYES = [(0.3, -3, 0.4), (2.5, -1, 0.5), (-1.5, -2.0, 1.0)]
 
 
@@ -109,3 +111,22 @@ def test07_nothing_to_see(rgb, ray):
     scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg"}})
     with pytest.raises(NergError, match="nothing to render"):
         scene.integrator().asked(["depth"], False).pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
+
+
+def test08_integrals_of_several_observers_are_kept(rgb, files, tmp_path, ray, monkeypatch):
+    """Two observers asked for in turns: each has an integral of their own, which is found once."""
+    from nerg_mi.transport.observer import gaze
+
+    fields.gaze(tmp_path / "gaze.safetensors", normalized=True)
+    volumes = {"field": {"type": "nerf", "filename": str(files / "field.safetensors")}}
+    volumes["gaze"] = {"type": "gazefield", "filename": str(tmp_path / "gaze.safetensors")}
+    scene = rgb.load_dict({"type": "scene", "integrator": {"type": "nerg", **volumes}})
+    found, integrate = [], gaze.integrate
+    monkeypatch.setattr(gaze, "integrate", lambda *a: found.append(1) or integrate(*a))
+    values = []
+    for _ in range(2):
+        asked = scene.integrator().asked(["gaze"], False)
+        pixel = asked.pixel(scene, [], sampler(rgb), ray, rgb.Bool(True))
+        values.append([np.array(asked.watcher(eye).pixel(pixel).channels(["gaze"])[0]) for eye in EYES[:2]])
+    assert len(found) == 2
+    np.testing.assert_array_equal(values[0], values[1])

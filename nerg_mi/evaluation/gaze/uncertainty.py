@@ -114,8 +114,11 @@ def calibration_rows(
     draws = rng.multinomial(people, np.full(people, 1 / people), resamples if people >= 3 else 0)
     out = []
     for name, (maps, at) in methods.items():
-        level, found = region_levels(maps, at), (calibrated or {}).get(name)
-        for title, asked in ((name, None), (f"{name}, calibrated", found))[: 1 if found is None else 2]:
+        level = region_levels(maps, at)
+        rows: dict[str, Mapping[str, float] | None] = {name: None}
+        if calibrated and name in calibrated:
+            rows[f"{name}, calibrated"] = calibrated[name]
+        for title, asked in rows.items():
             row: dict[str, Any] = {"method": title}
             for share in LEVELS:
                 inside, key = level <= asked_level(share, asked), level_name(share)

@@ -50,7 +50,8 @@ _LEAST = 1e-9
 
 @dataclass(frozen=True)
 class MixChoice:
-    """The share of the blind density that was chosen, and why; of no folds the share that was given, and no KLD."""
+    """The share of the blind density that was chosen, and why; of no folds the share that was given, no KLD and no
+    regions."""
 
     # The share.
     mix: float
@@ -66,9 +67,9 @@ class MixChoice:
 
     def to_dict(self) -> dict:
         """As JSON, for the provenance."""
-        of = lambda v: round(v, 4) if isinstance(v, float) else v
-        whole = {k: {n: of(x) for n, x in v.items()} if isinstance(v, dict) else of(v) for k, v in asdict(self).items()}
-        return {k: v for k, v in whole.items() if k != "regions" or v is not None}
+        regions = None if self.regions is None else {k: round(v, 4) for k, v in self.regions.items()}
+        rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(self).items()}
+        return {**rounded, "regions": regions}
 
 
 def mixes(plan: GazePlan) -> bool:

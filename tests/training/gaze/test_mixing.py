@@ -113,7 +113,7 @@ def test05_of_a_training_and_of_an_ensemble(rgb):
     # Nobody can be held out at places that hold too few rays: the share stays.
     few, about = train_gaze(Supervision(people(0.0, each=12)), NOWHERE, plan, ns)
     assert few.config.mix == LOG.mix and about["mix"]["mix"] == LOG.mix and about["mix"]["folds"] == 0
-    assert "regions" not in about["mix"]
+    assert about["mix"]["regions"] is None
     assert MixChoice(0.5, 1, regions={"80%": 0.71234}).to_dict()["regions"] == {"80%": 0.7123}
 
     # After Ctrl-C the field is there, as it was before.
