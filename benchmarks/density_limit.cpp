@@ -140,6 +140,41 @@ void block(const Field &f, const float *const p[3], float *out) {
     }
 }
 
+// Layers without biases, ReLU between them; sizes after the first are multiples of ROWS.
+struct Network {
+    const float *weights[4];  // of each layer (outputs, inputs)
+    int32_t sizes[5], layers;
+};
+
+// Outputs of 64 points, at `at` of `count`, from their inputs; a row of `count` numbers for each.
+void block(const Network &n, const float *in, float *out, int64_t at, int64_t count) {
+    Floats values[2][MOST][PACKETS];
+    for (int i = 0; i < n.sizes[0]; ++i)
+        for (int packet = 0; packet < PACKETS; ++packet) values[0][i][packet] = load(in + i * count + at + packet * LANES);
+    for (int layer = 0; layer < n.layers; ++layer) {
+        const int inputs = n.sizes[layer], outputs = n.sizes[layer + 1];
+        const auto &from = values[layer & 1];
+        auto &to = values[~layer & 1];
+        const bool last = layer + 1 == n.layers;
+        for (int j = 0; j < outputs; j += ROWS) {
+            Floats sums[ROWS][PACKETS] = {};
+            for (int i = 0; i < inputs; ++i)
+                for (int row = 0; row < ROWS; ++row) {
+                    const Floats weight = all(n.weights[layer][(j + row) * inputs + i]);
+                    for (int packet = 0; packet < PACKETS; ++packet) sums[row][packet] += weight * from[i][packet];
+                }
+            for (int row = 0; row < ROWS; ++row)
+                for (int packet = 0; packet < PACKETS; ++packet) {
+                    const Floats h = sums[row][packet];
+                    to[j + row][packet] = last ? h : h > 0 ? h : (Floats){};
+                }
+        }
+    }
+    for (int j = 0; j < n.sizes[n.layers]; ++j)
+        for (int packet = 0; packet < PACKETS; ++packet)
+            std::memcpy(out + j * count + at + packet * LANES, &values[n.layers & 1][j][packet], sizeof(Floats));
+}
+
 // Takes the smallest numbers for 0 while it lives, as Dr.Jit's threads do: they are slow.
 struct Flushing {
 #ifdef __SSE2__
@@ -174,6 +209,19 @@ int densities(const Field *f, const float *x, const float *y, const float *z, fl
                 const float *const p[3] = {x + k, y + k, z + k};
                 block(*f, p, out + k);
             }
+    });
+    return 0;
+}
+
+// Outputs of `count` points, a multiple of 64, on so many threads. Returns 0, or 1 for a network that it does not know.
+int network(const Network *n, const float *in, float *out, int64_t count, int threads) {
+    if (n->layers < 1 || n->layers > 4 || n->sizes[0] > MOST || count % BLOCK) return 1;
+    for (int layer = 1; layer <= n->layers; ++layer)
+        if (n->sizes[layer] > MOST || n->sizes[layer] % ROWS) return 1;
+    std::atomic<int64_t> next{0};
+    on_threads(threads, [&](int) {
+        for (int64_t at; (at = next.fetch_add(CHUNK)) < count;)
+            for (int64_t k = at; k < std::min<int64_t>(at + CHUNK, count); k += BLOCK) block(*n, in, out, k, count);
     });
     return 0;
 }
