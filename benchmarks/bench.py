@@ -4,7 +4,7 @@ densities beside SciPy, volumes beside `volpath`, and how each cost grows.
     python benchmarks/bench.py [--only PARTS] [--long] [--mode llvm_ad_rgb] [--page docs/performance.md]
     [--out out/benchmarks/bench]
 
-Parts: ``frames``, ``stages``, ``density``, ``kde``, ``volume``, ``growth``, ``memory``; all of them without --only.
+Parts: ``frames``, ``stages``, ``density``, ``by_hand``, ``kde``, ``volume``, ``growth``, ``memory``; else all.
 Works that are compared do the same, which is checked first, and take turns; figures are medians with their quartiles.
 Prints tables, writes them as CSV and two figures, and puts them into the page that is named. ``--long``: more runs,
 larger sizes, and PyTorch at 1280 x 720. With a CUDA variant the parts without a peer are measured in wall-clock
@@ -217,6 +217,19 @@ def density(run: Run) -> None:
     run.figure(roofline_figure(found["flops"] / 1e9, roofs, work.flops / work.bytes, reached), "roofline")
 
 
+def by_hand(run: Run) -> None:
+    import frame_limit
+
+    if run.cuda or density_limit.compiler() is None:
+        print("A frame by hand is of processors, and needs a C++ compiler (g++, clang++): not measured.\n")
+        return
+    size = (1280, 720) if run.long else (640, 360)
+    rows = frame_limit.frame_table(*size, run.field, run.gaze, run.threads, run.runs)
+    run.table("A frame by hand", frame_limit.FRAME, rows, "by_hand")
+    rows = frame_limit.colour_table(*size, run.field, run.runs)
+    run.table("Ways to colour", frame_limit.COLOUR, rows, "colour")
+
+
 def kde(run: Run) -> None:
     import peers
 
@@ -298,7 +311,7 @@ def memory(run: Run) -> None:
     run.table("Memory", frame_memory.HEAD, rows, "memory")
 
 
-PARTS = {part.__name__: part for part in (frames, stages, density, kde, volume, growth, memory)}
+PARTS = {part.__name__: part for part in (frames, stages, density, by_hand, kde, volume, growth, memory)}
 
 
 def main(argv=None) -> None:

@@ -115,9 +115,11 @@ def hand_works(field, gaze, library, threads: int, runs: int) -> dict[str, float
     }
 
 
-def frame_table(width: int, height: int, field, gaze, library, threads: int, runs: int) -> list[list[str]]:
-    """Rows of the whole frame beside the sum by hand."""
-    count, by_hand = counted(width, height), hand_works(field, gaze, library, threads, runs)
+def frame_table(width: int, height: int, field, gaze, threads: int, runs: int) -> list[list[str]]:
+    """Rows of the whole frame beside the sum by hand. Raises ``RuntimeError`` where no compiler builds it."""
+    count = counted(width, height)
+    with tempfile.TemporaryDirectory() as folder:
+        by_hand = hand_works(field, gaze, density_limit.build(Path(folder)), threads, runs)
     kinds = (
         ("densities and features of the camera's rays", "camera", "density and features"),
         ("colours", "colour", "colour"),
@@ -269,9 +271,7 @@ def main(argv=None) -> None:
     gaze = load_gaze(folder / "shoppers.safetensors", ns)[0]
     if density_limit.compiler() is None:
         raise SystemExit("no C++ compiler was found (g++, clang++), and nothing to compare with")
-    with tempfile.TemporaryDirectory() as build:
-        library = density_limit.build(Path(build))
-        rows = frame_table(args.width, args.height, field, gaze, library, args.threads, args.runs)
+    rows = frame_table(args.width, args.height, field, gaze, args.threads, args.runs)
     print_table("A frame by hand", FRAME, rows, args.page)
     write_rows(args.out / "frame.csv", [dict(zip(FRAME, row)) for row in rows])
     rows = colour_table(args.width, args.height, field, args.runs)

@@ -1,7 +1,7 @@
 """One protocol for gaze in many places: where is a field better than what knows less, and where is it worse?
 
-    python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--recipe default]
-        [--variant emit_capture] [--out out/benchmarks/places]
+    python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--mix-kappa K]
+        [--recipe default] [--variant emit_capture] [--out out/benchmarks/places]
 
 Real people in a supermarket (surfaces from their hit points) and in three scenes of EyeNavGS (no geometry), the demo
 store's shoppers among its field, and four generated places with laws of their own (`generated_places.py`), among their
@@ -38,6 +38,7 @@ def main(argv=None) -> None:
     parser.add_argument("--folds", type=int, default=4)
     parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
     parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
+    parser.add_argument("--mix-kappa", type=float, help="Default: the recipe's.")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/places"))
     args = parser.parse_args(argv)
@@ -124,6 +125,7 @@ def score(name: str, make: Callable[[Path], tuple[Path, dict]], args: argparse.N
         first=args.first,
         splits="both",
         mix_folds=args.mix_folds,
+        mix_kappa=args.mix_kappa,
         threads=args.threads,
     )
     with TerminalReporter() as reporter:

@@ -47,10 +47,12 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
     kind = place_kind(options)
     if views_alone and options.views is None:
         raise NergError("say what to learn from: a rays file, or --views with --salience, or both")
-    if views_alone and (options.test_zones or kind == "hits" or options.align or options.semantic):
+    of_rays = (options.test_zones, kind == "hits", options.align, options.semantic, options.mix_kappa is not None)
+    if views_alone and any(of_rays):
         raise NergError(
-            "--test-zones, --geometry hits, --align and --semantic belong to rays; give a rays file besides --views "
-            "(or hold views out by leaving their images out of the folder, and align them with --align-views)"
+            "--test-zones, --geometry hits, --align, --semantic and --mix-kappa belong to rays; give a rays file "
+            "besides --views (or hold views out by leaving their images out of the folder, and align them with "
+            "--align-views)"
         )
     if options.geometry is not None and options.align is not None:
         raise NergError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")
@@ -78,6 +80,8 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
         "loss": options.loss,
         "integral": options.integral is not None,
         "normalized": options.normalized,
+        "mix-folds": bool(options.mix_folds),
+        "mix-kappa": options.mix_kappa is not None,
     }
     recipe.require([name for name, given in asked.items() if given])
     if options.loss and options.loss not in recipe.losses:
@@ -130,6 +134,7 @@ def _probes(options: GazeOptions) -> Mapping[str, Any]:
         min_rays=options.min_rays,
         kappa_rule=options.kappa_rule,
         kappa=options.kappa,
+        mix_kappa=options.mix_kappa,
         weights=options.weights,
         directions=options.directions,
         fresh=options.fresh or None,

@@ -49,6 +49,7 @@ ASKED = {
     "weight_decay": 0.2,
     "zones": 2,
     "mix_folds": 3,
+    "mix_kappa": 15.0,
     "test_zones": 4,
     "test_positions": 5,
     "test_people": 0.5,

@@ -31,6 +31,7 @@ class FoldOptions(PlaceOptions, PartOptions):
     mix_folds: int | None = option(
         None, "Folds within each training that choose the share of the blind density. Default: the recipe's."
     )
+    mix_kappa: float | None = option(None, "Concentration of the kernels of that blind density. Default: the recipe's.")
     most: int = option(10_000_000, "Rays of a dataset at most; of more, a sample by --first.", min=1)
     kappa: float = option(20.0, "Concentration of the kernel of truth and baselines.")
     directions: int = option(2048, "Directions that maps are compared in.")

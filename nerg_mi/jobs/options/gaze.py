@@ -71,6 +71,10 @@ class GazeOptions(PlaceOptions):
         "Folds of people and positions that choose how much of the blind density default mixes in; 0: a twentieth. "
         "Default: the recipe's.",
     )
+    mix_kappa: float | None = option(
+        None,
+        "Concentration of the kernels of that blind density, which default also begins with. Default: the recipe's.",
+    )
     refit: bool = option(True, "Train again on all rays once the best number of steps is known.")
     test_zones: int = option(0, "Zones of test positions that are left out of everything; 0: none.")
     test_positions: int = option(64, "Test positions in them.")

@@ -14,9 +14,7 @@ from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
 from nerg_mi.training.geometry.places import GazePlace
 
-# Concentration of the kernels of rays, and of how many rays it is made at most. Wide, because the field learns what it
-# lacks from many probes, but nothing takes back the peaks of a few people, which others do not share.
-_RAYS_KAPPA = 10.0
+# Rays that it is made of at most.
 _MOST_RAYS = 1 << 16
 # Concentration of the kernels that smooth the density of views.
 _VIEWS_KAPPA = 50.0
@@ -29,13 +27,14 @@ _SCALED_OVER = 1 << 16
 
 
 def blind_of_rays(
-    rays: Rays, rows: int, place: GazePlace | None = None, seed: int = 0, weights: str = "equal"
+    rays: Rays, rows: int, place: GazePlace | None = None, seed: int = 0, weights: str = "equal", kappa: float = 10.0
 ) -> np.ndarray:
     """``field.gaze.log_density.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None: that
-    of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs."""
+    of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs; ``kappa``:
+    concentration of the kernel of each ray."""
     which = np.random.default_rng(seed).permutation(len(rays))[:_MOST_RAYS]
     each = person_weights(rays)[which] if weights == "person" else None
-    kde = SphericalKde(rays.direction[which], np.array([0, len(which)]), _RAYS_KAPPA, each)
+    kde = SphericalKde(rays.direction[which], np.array([0, len(which)]), kappa, each)
     directions = table_directions(rows)
     density = kde.evaluate(directions if place is None else place.directions_to_rays(directions))[0]
     return blind_table(density, rows, kde.ns, fibonacci_directions(_SCALED_OVER))

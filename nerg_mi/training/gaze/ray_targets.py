@@ -73,7 +73,8 @@ def targets_of_rays(
     if settings.fresh:
         targets = replace(targets, renew=lambda epoch: turned((seed, epoch)))
     if needs.blind_rows:
-        targets = replace(targets, blind=blind_of_rays(rays, needs.blind_rows, place, seed, settings.weights))
+        blind = blind_of_rays(rays, needs.blind_rows, place, seed, settings.weights, settings.mix_kappa)
+        targets = replace(targets, blind=blind)
     return targets
 
 

@@ -65,7 +65,8 @@ class Recipe:
     probes: Mapping[str, Any]
     # Those of ``settings`` that differ where views are all there is: what they share comes late, after a plateau.
     views_alone: Mapping[str, Any] = field(default_factory=lambda: {"patience": 10})
-    # What may be chosen of it: of "activation", "size", "normalized", "semantic", "begin", "loss", "integral".
+    # What may be chosen of it: of "activation", "size", "normalized", "semantic", "begin", "loss", "integral",
+    # "mix-folds", "mix-kappa".
     takes: frozenset[str] = frozenset()
     # Whether a training is so short that an ablation repeats it with several seeds.
     quick: bool = False
@@ -229,10 +230,12 @@ register(
             "count": 1024,
             "min_rays": 1,
             "kappa": 30.0,
+            "mix_kappa": 10.0,
             "directions": 2048,
             "weights": "person",
         },
         views_alone={"steps": 200, "zones": 3, "patience": 10},
+        takes=frozenset({"mix-folds", "mix-kappa"}),
         quick=True,
     )
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 
 from nerg_mi.errors import NergError
@@ -40,8 +41,13 @@ class ProbeSettings:
     fresh: bool = False
     # What a probe's rays count by (`density.probes.place_probes`).
     weights: str = "equal"
+    # Concentration of the kernels of the blind density, of fields that have one. Wide: such a field learns what it
+    # lacks from many probes, but nothing takes back the peaks of a few people, which others do not share.
+    mix_kappa: float = 10.0
 
     def __post_init__(self) -> None:
+        if not (math.isfinite(self.mix_kappa) and self.mix_kappa > 0):
+            raise NergError(f"the kernels of a blind density need a positive concentration, got {self.mix_kappa:g}")
         if self.directions < 16 or self.count < 1:
             raise NergError(
                 "supervision needs at least one probe and 16 directions, "

@@ -71,4 +71,10 @@ def test_directions_are_turned_anew_where_they_are_to_be(rays, wall):
 
 def test_the_blind_density_is_made_for_whoever_needs_it(rays, wall):
     assert targets_of_rays(rays, wall, PROBES).blind is None
-    assert targets_of_rays(rays, wall, PROBES, TargetNeeds(blind_rows=12)).blind.shape == (12, 24)
+    wide, narrow = (
+        targets_of_rays(rays, wall, replace(PROBES, mix_kappa=kappa), TargetNeeds(blind_rows=12)).blind
+        for kappa in (10.0, 40.0)
+    )
+    assert wide.shape == narrow.shape == (12, 24)
+    # The log of a density: narrower kernels reach higher.
+    assert narrow.max() > wide.max() + 0.5
