@@ -73,7 +73,7 @@ def measure(name: str, make, args: argparse.Namespace, ns) -> list[dict]:
     table = [
         (r["distance"], *(f"{r[k]:.0%}" for k in ("sphere", "gaze", "of the field")))
         + tuple(f"{r[f'KLD {m}']:.3f}" for m in METHODS)
-        + tuple(f"{r[f'bits {m}']:+.2f}" for m in ("field", "nearest"))
+        + tuple("" if np.isnan(r[f"bits {m}"]) else f"{r[f'bits {m}']:+.2f}" for m in ("field", "nearest"))
         for r in rows
         if r["sphere"] > 0.0005
     ]

@@ -1,7 +1,7 @@
 """One protocol for gaze in many places: where is a field better than what knows less, and where is it worse?
 
     python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--mix-kappa K]
-        [--recipe default] [--variant emit_capture] [--out out/benchmarks/places]
+        [--recipe default] [--variant emit_capture] [--against FOLDS.csv] [--out out/benchmarks/places]
 
 Real people in a supermarket (surfaces from their hit points) and in three scenes of EyeNavGS (no geometry), the demo
 store's shoppers among its field, and four generated places with laws of their own (`generated_places.py`), among their
@@ -10,7 +10,7 @@ trained on within 2R of. Beside the field: uniform, position-blind, nearest prob
 half of those who are scored foretells the other. `rank` is among the methods that are no split half; `less` is the
 field less the best of the others, fold by fold, with 95 % of Student's t; `way` is how far the field goes from the
 blind density to the split half in CC, where that is better than blind. `--mix-folds 0` is a field without a chosen
-share of the blind density.
+share of the blind density. `--against` prints the field less that of another run, fold by fold, from its folds.csv.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ def main(argv=None) -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
     parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
     parser.add_argument("--mix-kappa", type=float, help="Default: the recipe's.")
+    parser.add_argument("--against", type=Path, help="folds.csv of a run whose field this one is compared with")
     parser.add_argument("--threads", type=int)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/places"))
     args = parser.parse_args(argv)
@@ -57,6 +58,8 @@ def main(argv=None) -> None:
     write_rows(args.out / "places.csv", rows)
     write_rows(args.out / "folds.csv", each)
     show(rows)
+    if args.against is not None:
+        show_change(each, args.against)
 
 
 def makers(data: Path) -> dict[str, Callable[[Path], tuple[Path, dict]]]:
@@ -136,7 +139,6 @@ def score(name: str, make: Callable[[Path], tuple[Path, dict]], args: argparse.N
 def summarise(each: list[dict]) -> list[dict]:
     """A row a place: the field's scores, those of the best of the others, and how they differ."""
     import numpy as np
-    from scipy.stats import t
 
     out = []
     for name in dict.fromkeys(row["place"] for row in each):
@@ -149,7 +151,7 @@ def summarise(each: list[dict]) -> list[dict]:
             order = sorted(methods, key=lambda m: -means[m] if high else means[m])
             best = next(m for m in order if m != OURS)
             less = values[OURS] - values[best]
-            reach = t.ppf(0.975, len(less) - 1) * less.std(ddof=1) / np.sqrt(len(less)) if len(less) > 1 else np.nan
+            reach = interval(less)
             row |= {s: means[OURS], f"{s} blind": means[BLIND], f"{s} best": means[best], f"{s} best is": best}
             row |= {f"{s} rank": order.index(OURS) + 1, f"{s} less": less.mean(), f"{s} reach": reach}
             half = [r[s] for r in own if r["method"] == HALF]
@@ -159,6 +161,32 @@ def summarise(each: list[dict]) -> list[dict]:
         row["way"] = (row["CC"] - row["CC blind"]) / further if further > 0 else np.nan
         out.append(row)
     return out
+
+
+def interval(values) -> float:
+    """How far 95 % of Student's t reaches either side of the mean of ``values`` (F,); NaN of one alone."""
+    import numpy as np
+    from scipy.stats import t
+
+    count = len(values)
+    return float(t.ppf(0.975, count - 1) * np.std(values, ddof=1) / np.sqrt(count)) if count > 1 else float("nan")
+
+
+def show_change(each: list[dict], before: Path) -> None:
+    """Print by how much the field of ``each`` is above that of the run whose folds.csv is ``before``, place by place in
+    the folds that both have."""
+    import csv
+
+    import numpy as np
+
+    with before.open() as file:
+        known = {(r["place"], int(r["fold"])): r for r in csv.DictReader(file) if r["method"] == OURS}
+    print(f"\nfield less that of {before}")
+    own = [r for r in each if r["method"] == OURS and (r["place"], r["fold"]) in known]
+    for name in dict.fromkeys(r["place"] for r in own):
+        folds = [r for r in own if r["place"] == name]
+        less = {s: np.array([float(r[s]) - float(known[name, r["fold"]][s]) for r in folds]) for s in SCORES}
+        print(f"{name:12s}" + ", ".join(f"{s} {v.mean():+.3f} ± {interval(v):.3f}" for s, v in less.items()))
 
 
 def show(rows: list[dict]) -> None:
