@@ -295,7 +295,7 @@ def growth(run: Run) -> None:
                 "unit": "ms" if run.cuda else "CPU ms",
             }
         )
-        steps = ", ".join(f"{n:,g}: {c:.3g}" for n, c in zip(counts, middle))
+        steps = ", ".join(f"{n:,}: {c:,.0f}" if c >= 1e3 else f"{n:,}: {c:.3g}" for n, c in zip(counts, middle))
         last = f"{at_the_end(counts, middle):.2f}"
         rows.append([found.what, found.axis, steps, f"{fitted:.2f}", last, found.aim])
     unit = "ms" if run.cuda else "CPU ms"

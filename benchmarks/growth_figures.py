@@ -12,6 +12,14 @@ _OURS, _SLOPE, _HAND = "#1f5fa8", "#b9b9b9", "#c0392b"
 _PANEL = (330, 250)
 
 
+def _short(size: float) -> str:
+    """A size as the mark of an axis: 230k, 2.1M."""
+    for unit, letter in ((1e6, "M"), (1e3, "k")):
+        if size >= unit:
+            return f"{size / unit:.{1 if size < 10 * unit else 0}f}{letter}"
+    return f"{size:g}"
+
+
 def growth_figure(curves: Sequence[Mapping]):
     """A panel for each of ``curves``: ``title``, ``axis``, ``sizes`` (n,), ``low``, ``middle`` and ``high`` (n,)
     milliseconds, and the fitted ``exponent``; both axes logarithmic, with the slope of proportion in grey."""
@@ -28,7 +36,7 @@ def growth_figure(curves: Sequence[Mapping]):
         axes.errorbar(sizes, middle, [middle - ends[0], ends[1] - middle], color=_OURS, marker="o", ms=3, lw=1.2)
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.set_xticks(sizes, [f"{n:,g}" for n in sizes])
+        axes.set_xticks(sizes, [_short(n) for n in sizes])
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:,g}"))
         axes.minorticks_off()
