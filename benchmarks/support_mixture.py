@@ -56,7 +56,7 @@ def main(argv=None) -> None:
     keys = [k for k in rows[0] if k not in ("place", "fold")]
     mean = lambda name, key: np.mean([r[key] for r in rows if name in (None, r["place"])])
     table = [
-        (name or "mean", *(f"{mean(name, k):.{2 if 'share' in k else 3}f}" for k in keys))
+        (name or "mean", *(f"{mean(name, k):.{3 if k.startswith('KLD') else 2}f}" for k in keys))
         for name in (*dict.fromkeys(r["place"] for r in rows), None)
     ]
     print_table("Shares of the blind density by support", ("place", *keys), table)
