@@ -10,9 +10,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.evaluation.gaze import evaluation
-from nerg_mi.evaluation.gaze.baselines import Baseline, standard_baselines
+from nerg_mi.evaluation.gaze.baselines import Baseline, Remembered, standard_baselines
 from nerg_mi.evaluation.gaze.report import side_by_side, write_report
-from nerg_mi.evaluation.gaze.scores import EPS, FieldDensity, gaze_field
+from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
 from nerg_mi.evaluation.gaze.uncertainty import calibration_rows, position_rows, rank_rows
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.figures.provenance import files_among, provenance
@@ -97,19 +97,23 @@ def evaluate_gaze(
     depth, count = about.get("probes", {}).get("depth", "median"), len(test.centres)
     # Most of the time goes to the densities of the field.
     known = lambda number: reporter.progress(0.05 + 0.6 * min(number / count, 1), f"position {number} of {count}")
-    density = gaze_field(loaded, place.medium, place.align, depth, known)
-    methods = {"gaze field": density, **others}
+    # Each table asks for the same densities.
+    members = Remembered(gaze_field(loaded, place.medium, place.align, depth, known).members)
+    field_density = lambda positions, directions: members(positions, directions).mean(axis=0)
+    kept = Remembered(blind)
+    methods = {"gaze field": field_density} | {k: kept if m is blind else Remembered(m) for k, m in others.items()}
     reporter.progress(0.05, "scores")
     told = lambda share: reporter.progress(0.65 + 0.2 * share, "scores") if share > 0 else None
-    rows = evaluation.evaluate_gaze(test, methods, blind, options.resamples, seed, told)
+    rows = evaluation.evaluate_gaze(test, methods, kept, options.resamples, seed, told)
     half = evaluation.split_half(scored, test.centres, account["radius"], options.kappa, blind, options.min_rays, seed)
     rows += [half] if half else []
     reporter.progress(0.86, "each person")
-    persons = evaluation.person_rows(test, {k: methods[k] for k in _BY_PERSON}, blind, options.min_rays)
+    persons = evaluation.person_rows(test, {k: methods[k] for k in _BY_PERSON}, kept, options.min_rays)
     reporter.progress(0.9, "uncertainty")
-    places = _positions(test, loaded, place, density, others[_BLIND], _groups(account, split, test.centres), seed)
+    places = _positions(test, loaded, place, members, methods[_BLIND], _groups(account, split, test.centres), seed)
     ranks = rank_rows(places, options.resamples, seed)
-    asked = {k: (methods[k](test.centres, test.directions), methods[k](test.centres, test.at)) for k in _CALIBRATED}
+    at = lambda method: method(test.centres, test.drawn)[:, : test.at.shape[1]]
+    asked = {k: (methods[k](test.centres, test.directions), at(methods[k])) for k in _CALIBRATED}
     found = about.get("mix", {}).get("regions")
     regions = calibration_rows(test, asked, options.resamples, seed, {"gaze field": found} if found else None)
     files = []
@@ -138,13 +142,14 @@ def _positions(
     test: evaluation.GazeTest,
     loaded: AnyGazeField,
     place: GazePlace,
-    density: FieldDensity,
+    members_of: Baseline,
     blind: Baseline,
     groups: list[str] | None,
     seed: int,
 ) -> list[dict[str, Any]]:
-    """The error at each position, and what tells how sure the field ``loaded`` is there."""
-    members = density.members(test.centres, test.directions)
+    """The error at each position, and what tells how sure the field ``loaded`` is there. ``members_of``: densities
+    (M, P, D) of its members."""
+    members = members_of(test.centres, test.directions)
     support = spread = None
     if loaded.support is not None:
         points = place.points_from_rays(test.centres)

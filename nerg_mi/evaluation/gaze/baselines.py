@@ -24,6 +24,24 @@ UNIFORM = 1.0 / (4.0 * np.pi)  # 1/sr
 _LEAF = 16
 
 
+class Remembered:
+    """A function of positions and directions that is not asked twice for the same two arrays: its answers are kept, and
+    cannot be written to. Neither may the arrays change."""
+
+    def __init__(self, method: Baseline):
+        self._method = method
+        self._answers: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def __call__(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        for p, d, answer in self._answers:
+            if p is positions and d is directions:
+                return answer
+        answer = np.asarray(self._method(positions, directions))
+        answer.setflags(write=False)
+        self._answers.append((positions, directions, answer))
+        return answer
+
+
 def uniform() -> Baseline:
     """The density that knows nothing: 1/(4π) everywhere."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -58,6 +59,11 @@ class GazeTest:
     who: np.ndarray
     # Rays drawn at other positions (P, K, 3).
     others: np.ndarray
+
+    @cached_property
+    def drawn(self) -> np.ndarray:
+        """Rays that densities are asked for, (P, 2 K, 3): those drawn at each position, then those at others."""
+        return np.concatenate([self.at, self.others], axis=1)
 
 
 def held_out_rays(rays: Rays, account: dict, split: str = "both", seed: int = 0) -> tuple[Rays, Rays, np.ndarray]:
@@ -209,8 +215,8 @@ def _answers(
     test: GazeTest, methods: dict[str, Baseline], blind: Baseline, on_part: Callable[[float], None] | None = None
 ) -> list[tuple[str, np.ndarray, dict[str, np.ndarray]]]:
     """``(name, maps (P, D), ray scores (P, K) by name)`` of each method. ``on_part`` is told the share that is done."""
-    rays, K = np.concatenate([test.at, test.others], axis=1), test.at.shape[1]
-    ask = lambda method: [np.asarray(method(test.centres, v), np.float64) for v in (test.directions, rays)]
+    K = test.at.shape[1]
+    ask = lambda method: [np.asarray(method(test.centres, v), np.float64) for v in (test.directions, test.drawn)]
     maps, at = ask(blind)
     log_blind, out = _log(at[:, :K], maps), []
     for name, method in methods.items():

@@ -108,3 +108,16 @@ def test_the_standard_ones_are_what_they_are_called(rays):
     assert np.allclose(blind(at, X), baselines.position_blind(rays)(at, X), rtol=1e-6)
     assert np.allclose(named["uniform"](at, X), 1 / (4 * np.pi))
     assert np.allclose(named["4,096 nearest rays"](at, X), baselines.nearest_rays(rays, 4096, kappa=20.0)(at, X))
+
+
+def test_a_remembered_density_is_asked_once_for_the_same_arrays():
+    asked = []
+    method = baselines.Remembered(lambda *given: asked.append(1) or baselines.uniform()(*given))
+    positions, directions = np.zeros((2, 3)), fibonacci_directions(8)
+    first = method(positions, directions)
+    assert method(positions, directions) is first and len(asked) == 1
+    # Equal values are not the same arrays: they are not compared.
+    np.testing.assert_array_equal(method(positions.copy(), directions), first)
+    assert len(asked) == 2
+    with pytest.raises(ValueError, match="read-only"):
+        first[0] = 0
