@@ -47,12 +47,12 @@ def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:
     kind = place_kind(options)
     if views_alone and options.views is None:
         raise NergError("say what to learn from: a rays file, or --views with --salience, or both")
-    of_rays = (options.test_zones, kind == "hits", options.align, options.semantic, options.mix_kappa is not None)
-    if views_alone and any(of_rays):
+    mixed = options.mix_folds or options.mix_kappa is not None
+    if views_alone and (options.test_zones or kind == "hits" or options.align or options.semantic or mixed):
         raise NergError(
-            "--test-zones, --geometry hits, --align, --semantic and --mix-kappa belong to rays; give a rays file "
-            "besides --views (or hold views out by leaving their images out of the folder, and align them with "
-            "--align-views)"
+            "--test-zones, --geometry hits, --align, --semantic, --mix-folds and --mix-kappa belong to rays; give a "
+            "rays file besides --views (or hold views out by leaving their images out of the folder, and align them "
+            "with --align-views)"
         )
     if options.geometry is not None and options.align is not None:
         raise NergError("--align belongs to --field and --scene; a place made from rays is in the rays' own frame")

@@ -9,6 +9,7 @@ import numpy as np
 from nerg_mi.capture.salience.views import SalienceView
 from nerg_mi.density.kde.estimate import SphericalKde
 from nerg_mi.density.probes import person_weights
+from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.log_density import blind_table, table_directions
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
@@ -31,7 +32,13 @@ def blind_of_rays(
 ) -> np.ndarray:
     """``field.gaze.log_density.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None: that
     of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs; ``kappa``:
-    concentration of the kernel of each ray."""
+    concentration of the kernel of each ray. Raises `NergError` for kernels that are narrower than half a
+    texel."""
+    if kappa > (most := (2 * rows / np.pi) ** 2):
+        raise NergError(
+            f"the blind density is kept in a table of {rows} rows, between which kernels of a concentration of "
+            f"{kappa:g} vanish; let it be at most {most:.0f}"
+        )
     which = np.random.default_rng(seed).permutation(len(rays))[:_MOST_RAYS]
     each = person_weights(rays)[which] if weights == "person" else None
     kde = SphericalKde(rays.direction[which], np.array([0, len(which)]), kappa, each)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.capture.salience.solid_angle import pixel_solid_angles
+from nerg_mi.errors import NergError
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.gaze.log_density import look_up, table_directions
 from nerg_mi.maths.similarity import Similarity
@@ -28,6 +29,14 @@ def test_the_blind_density_counts_people_or_rays():
         tail = np.exp(-10.0)  # of the other kernel, at a right angle
         expected = (ratio + tail) / (1 + ratio * tail)
         assert x / y == pytest.approx(expected, rel=0.02), weights
+
+
+def test_kernels_that_the_table_cannot_show_are_refused():
+    """Of one much narrower than a texel nothing would be left but the uniform part."""
+    rays = Rays(np.arange(3.0), np.zeros(3), ("a",), np.zeros((3, 3)), np.tile([0.6, 0.0, 0.8], (3, 1)), np.ones(3))
+    assert np.exp(blind_of_rays(rays, 64, kappa=400.0)).max() > 40  # 1/sr; its peak is 400 / 2π
+    with pytest.raises(NergError, match="table of 64 rows.*at most 1660"):
+        blind_of_rays(rays, 64, kappa=1700.0)
 
 
 def test_it_is_in_the_frame_of_the_place():
