@@ -143,7 +143,7 @@ def frame_table(width: int, height: int, field, gaze, threads: int, runs: int) -
     return rows
 
 
-class _Features:
+class Features:
     """What samples contribute: the features that the colour network is asked with, `transport.media.painting`."""
 
     def __init__(self, count: int):
@@ -193,7 +193,7 @@ def colour_table(width: int, height: int, field, runs: int) -> list[list[str]]:
         return out
 
     def deferred():
-        found = marched(_Features(N), 0.0)
+        found = marched(Features(N), 0.0)
         opacity = absorbed_share(found.tau)
         features = [found.color[k] / dr.maximum(opacity, 1e-6) for k in range(N)]
         out = mi.Color3f(field.color(features, ray.w)) * opacity
