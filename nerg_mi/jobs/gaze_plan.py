@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from nerg_mi.errors import NergError, chosen
+from nerg_mi.training.gaze.blind import check_kernels
 from nerg_mi.training.gaze.plan import GazePlan
 from nerg_mi.training.gaze.recipes import FieldChoices, Recipe, gaze_recipe
 from nerg_mi.training.gaze.settings import ProbeSettings
+from nerg_mi.training.gaze.targets import TargetNeeds
 from nerg_mi.training.geometry.places import GazePlace
 
 from .gaze_places import place_kind
@@ -37,9 +39,12 @@ def check_plan(options: GazeOptions, views_alone: bool = False) -> ProbeSettings
     recipe = gaze_recipe(options.recipe)
     _check(options, recipe, views_alone)
     with chosen(_named(options)):
-        recipe.config(_choices(options, place_kind(options), views_alone))
+        config = recipe.config(_choices(options, place_kind(options), views_alone))
     recipe.gaze_settings(_settings(options), views_alone)
-    return recipe.probe_settings(_probes(options))
+    probes = recipe.probe_settings(_probes(options))
+    if rows := TargetNeeds.of(config).blind_rows:
+        check_kernels(rows, probes.mix_kappa)
+    return probes
 
 
 def _check(options: GazeOptions, recipe: Recipe, views_alone: bool) -> None:

@@ -43,6 +43,7 @@ SCENE = GazePlace(None, BOX, "scene")
         (replace(HITS, recipe="small", mix_kappa=20.0), False, "no choice of --mix-kappa.*add --recipe default"),
         (replace(HITS, recipe="small", mix_folds=2), False, "no choice of --mix-folds.*add --recipe default"),
         (replace(HITS, mix_kappa=0.0), False, "need a positive concentration, got 0"),
+        (replace(HITS, mix_kappa=2000.0), False, "concentration of 2000 vanish; let it be at most 1660"),
         (replace(HITS, activation="exp"), False, "no choice of --activation"),
         (replace(FIELD, loss="likelihood"), False, 'the loss must be one of paper, code, got "likelihood"'),
         (replace(HITS, recipe="large"), False, "one of default, small, paper"),

@@ -27,18 +27,22 @@ _ROUNDS = 100
 _SCALED_OVER = 1 << 16
 
 
-def blind_of_rays(
-    rays: Rays, rows: int, place: GazePlace | None = None, seed: int = 0, weights: str = "equal", kappa: float = 10.0
-) -> np.ndarray:
-    """``field.gaze.log_density.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None: that
-    of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs; ``kappa``:
-    concentration of the kernel of each ray. Raises `NergError` for kernels that are narrower than half a
-    texel."""
+def check_kernels(rows: int, kappa: float) -> None:
+    """Raise `NergError` where kernels of this concentration are narrower than half a texel of a table of ``rows``."""
     if kappa > (most := (2 * rows / np.pi) ** 2):
         raise NergError(
             f"the blind density is kept in a table of {rows} rows, between which kernels of a concentration of "
             f"{kappa:g} vanish; let it be at most {most:.0f}"
         )
+
+
+def blind_of_rays(
+    rays: Rays, rows: int, place: GazePlace | None = None, seed: int = 0, weights: str = "equal", kappa: float = 10.0
+) -> np.ndarray:
+    """``field.gaze.log_density.blind_table`` (rows, 2 rows) of where ``rays`` go, in the frame of ``place`` (None: that
+    of the rays). ``weights``: with ``person`` all people count alike, however many rays are theirs; ``kappa``:
+    concentration of the kernel of each ray; see `check_kernels`."""
+    check_kernels(rows, kappa)
     which = np.random.default_rng(seed).permutation(len(rays))[:_MOST_RAYS]
     each = person_weights(rays)[which] if weights == "person" else None
     kde = SphericalKde(rays.direction[which], np.array([0, len(which)]), kappa, each)
