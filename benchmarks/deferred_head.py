@@ -19,7 +19,7 @@ import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from fox_radiance import default_data
-from frame_limit import Features
+from frame_limit import march_features
 from output import print_table
 
 import numpy as np
@@ -70,7 +70,6 @@ def view_of(field, view, every: int = 1, seed: int = 0) -> dict[str, np.ndarray]
     from nerg_mi.capture.cameras import pixel_directions
     from nerg_mi.field.encoding.harmonics import encode_direction
     from nerg_mi.transport.march.march import march
-    from nerg_mi.transport.march.quadrature import absorbed_share
     from nerg_mi.transport.media.field import FieldMedium
     from nerg_mi.transport.media.painting import ColorPainter
     from nerg_mi.transport.place import Place
@@ -88,15 +87,11 @@ def view_of(field, view, every: int = 1, seed: int = 0) -> dict[str, np.ndarray]
     origin = mi.Point3f(*np.asarray(pose[:3, 3], float).tolist()) + dr.zeros(mi.Vector3f, len(d))
     ray = medium.local(origin, direction)
 
-    def marched(painter):
-        return march(medium, ray, dr.maximum(ray.t_near, 0), ray.t_far, mi.Bool(True), settings, color=painter)
-
-    color = np.array(mi.Color3f(marched(ColorPainter(mi.Color3f)).color)).T
-    found = marched(Features(field.config.geometry))
-    opacity = absorbed_share(found.tau)
-    features = [np.array(found.color[k] / dr.maximum(opacity, 1e-6)) for k in range(field.config.geometry)]
+    near, painter = dr.maximum(ray.t_near, 0), ColorPainter(mi.Color3f)
+    color = np.array(march(medium, ray, near, ray.t_far, mi.Bool(True), settings, color=painter).color).T
+    features, opacity = march_features(medium, ray, settings)
     harmonics = encode_direction(ray.w, field.config.sh_degree)
-    given = [np.broadcast_to(np.array(v), len(d)) for v in harmonics] + features
+    given = [np.broadcast_to(np.array(v), len(d)) for v in (*harmonics, *features)]
     return {
         "color": color,
         "inputs": np.stack(given, axis=1).astype(np.float32),

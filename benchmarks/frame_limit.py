@@ -3,10 +3,10 @@
     python benchmarks/frame_limit.py [--width 640] [--height 360] [--runs 9] [--threads 2] [--page PAGE]
 
 The demo store, colour, depth and gaze of an observer who is not the camera. The frame's evaluations are counted, and
-each kind is timed by ``density_limit.cpp``, on as many points as a million and full packets: densities with the
+each kind is timed by ``density_limit.cpp``, on a quarter of a million points in full packets: densities with the
 features that colours need and without, networks of colour, of emit and of capture, and emit's encoding at the cost a
 level of the density's. Their sum is what is compared; stepping, compositing, activations and what a frame costs once
-are in ours alone. Networks by hand are compared with ours before anything is timed.
+are in ours alone. Networks by hand are compared with float64, densities with ours, before anything is timed.
 
 The second table are the camera's rays alone, at the field's steps: without colour, with it, with the colour network
 asked for the same number of points in full packets, and "deferred", as Hedman et al. (2021) have it: features are
@@ -143,7 +143,25 @@ def frame_table(width: int, height: int, field, gaze, threads: int, runs: int) -
     return rows
 
 
-class Features:
+def march_features(medium, ray, settings):
+    """``(features, opacity)`` of `LocalRay`s through a field: its composited features (list of Floats), as its colour
+    network takes them, and how much is behind them."""
+    from dataclasses import replace
+
+    from nerg_mi.transport.march.march import march
+    from nerg_mi.transport.march.quadrature import absorbed_share
+
+    import drjit as dr
+    import mitsuba as mi
+
+    count, near = medium.feature_count, dr.maximum(ray.t_near, 0)
+    painter, settings = _Features(count), replace(settings, color_cutoff=0.0)
+    found = march(medium, ray, near, ray.t_far, mi.Bool(True), settings, color=painter)
+    opacity = absorbed_share(found.tau)
+    return [found.color[k] / dr.maximum(opacity, 1e-6) for k in range(count)], opacity
+
+
+class _Features:
     """What samples contribute: the features that the colour network is asked with, `transport.media.painting`."""
 
     def __init__(self, count: int):
@@ -165,7 +183,6 @@ def colour_table(width: int, height: int, field, runs: int) -> list[list[str]]:
     from dataclasses import replace
 
     from nerg_mi.transport.march.march import march
-    from nerg_mi.transport.march.quadrature import absorbed_share
     from nerg_mi.transport.media.field import FieldMedium
     from nerg_mi.transport.media.painting import ColorPainter
     from nerg_mi.transport.place import Place
@@ -193,9 +210,7 @@ def colour_table(width: int, height: int, field, runs: int) -> list[list[str]]:
         return out
 
     def deferred():
-        found = marched(Features(N), 0.0)
-        opacity = absorbed_share(found.tau)
-        features = [found.color[k] / dr.maximum(opacity, 1e-6) for k in range(N)]
+        features, opacity = march_features(medium, ray, settings)
         out = mi.Color3f(field.color(features, ray.w)) * opacity
         dr.eval(out)
         return out

@@ -12,12 +12,12 @@ never negative and sums to the KLD over the bands (nats), of the field, of the p
 from __future__ import annotations
 
 import argparse
-import os
-from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from output import print_table, write_rows
-from places import BLIND, OURS, ROOT, makers
+from place_fields import FoldField, fold_fields
+from place_rays import Make, asked_places, parse, place_parser, write_place
+from places import BLIND, OURS
 
 import numpy as np
 
@@ -31,39 +31,19 @@ METHODS = {"field": OURS, "blind": BLIND, "nearest": NEAREST}
 def main(argv=None) -> None:
     from nerg_mi.jobs.backend import select_backend
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
-    parser.add_argument("--only", help="names of places, with commas between. Default: all that have surfaces.")
-    parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/places"), help="folder of places.py")
-    args = parser.parse_args(argv)
-    args.out = args.out.resolve()
-    args.out.mkdir(parents=True, exist_ok=True)
-    ns, places, rows = select_backend("llvm_ad_rgb", args.threads), makers(args.data), []
-    for name in args.only.split(",") if args.only else places:
-        if name not in places:
-            raise SystemExit(f'no place is called "{name}" here; there are {", ".join(places)}')
-        rows += measure(name, places[name], args, ns)
+    args, rows = parse(place_parser(__doc__, "places", folds=3), argv), []
+    ns = select_backend("llvm_ad_rgb", args.threads)
+    for name, make in asked_places(args).items():
+        rows += measure(name, make, args, ns)
     write_rows(args.out / "distance.csv", rows)
 
 
-def measure(name: str, make, args: argparse.Namespace, ns) -> list[dict]:
+def measure(name: str, make: Make, args: argparse.Namespace, ns) -> list[dict]:
     """A row a band of one place, which are printed; none of a place without surfaces."""
-    from nerg_mi.cli.progress import TerminalReporter
-    from nerg_mi.jobs.folds import evaluate_folds
-    from nerg_mi.jobs.options.folds import FoldOptions
-
-    folder = args.out / name
-    folder.mkdir(exist_ok=True)
-    path, where = make(folder)
+    folder, rays, where = write_place(name, make, args)
     if where.get("geometry") == "none":
         return []
-    options = FoldOptions(**where, folds=args.folds, splits="both", threads=args.threads)
-    with TerminalReporter() as reporter:
-        found = evaluate_folds(path, folder / "eval", options, reporter)
-    each = [bands(field, path, where, seed, ns) for seed, field in enumerate(found.fields)]
+    each = [bands(fold) for fold in fold_fields(folder, rays, where, args, ns)]
     rows = []
     for band in BANDS:
         own = [fold[band] for fold in each]
@@ -85,31 +65,16 @@ def measure(name: str, make, args: argparse.Namespace, ns) -> list[dict]:
     return rows
 
 
-def bands(field: Path, rays_path: Path, where: dict, seed: int, ns) -> dict[str, dict[str, float]]:
-    """Of one fold's ``field``, the numbers of each band."""
-    from nerg_mi.evaluation.gaze import evaluation
+def bands(fold: FoldField) -> dict[str, dict[str, float]]:
+    """Of one fold's field, the numbers of each band."""
     from nerg_mi.evaluation.gaze.baselines import standard_baselines
-    from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
-    from nerg_mi.formats.fields import load_gaze
-    from nerg_mi.jobs.gaze_places import place_of_training
-    from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
-    from nerg_mi.rays.rays import Rays
+    from nerg_mi.evaluation.gaze.scores import EPS
     from nerg_mi.training.geometry.surfaces import surface_distances
 
-    loaded, metadata = load_gaze(field, ns)
-    about, rays = metadata["provenance"], Rays.load(rays_path)
-    scoring = GazeEvaluationOptions(**{k: v for k, v in where.items() if k in ("field", "scene")}, seed=seed)
-    account = about["test"]
-    train, scored, centres = evaluation.held_out_rays(rays, account, "both", seed)
-    test = evaluation.make_test(
-        scored, centres, account["radius"], scoring.kappa, scoring.directions, scoring.min_rays, seed=seed
-    )
-    place = place_of_training(field, about, loaded.box, scoring, ns)
-    blind, others = standard_baselines(train, account["radius"], scoring.kappa, scoring.blind_kappa, seed)
-    methods = {
-        "field": gaze_field(loaded, place.medium, place.align),
-        **{k: others[METHODS[k]] for k in list(METHODS)[1:]},
-    }
+    train, test = fold.test("both")
+    place, of = fold.place, fold.scoring
+    blind, others = standard_baselines(train, fold.account["radius"], of.kappa, of.blind_kappa, fold.seed)
+    methods = {k: fold.density() if name == OURS else others[name] for k, name in METHODS.items()}
 
     origins = place.points_from_rays(test.centres)
 

@@ -13,15 +13,12 @@ default recipe, trained on the same rays in so many folds, one draw each.
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from output import write_rows
-from places import ROOT, makers
+from place_rays import asked_places, makers, parse, place_parser
 from prior_cases import Fold, PriorPlace, prior_place
 from prior_features import FEATURES
 from prior_law import LOG_UNIFORM, basis, blind, fit, normalised
@@ -267,27 +264,20 @@ def trained(fold: Fold, people: tuple[int, ...]) -> Logs:
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
-    parser.add_argument("--only", help="places that are scored, with commas between; all are learnt from")
-    parser.add_argument("--folds", type=int, default=4)
-    parser.add_argument("--fields", type=int, default=0, help="folds in which gaze fields are trained, too")
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/gaze_prior"))
-    args = parser.parse_args(argv)
     from nerg_mi.jobs.backend import select_backend
 
+    # All places are learnt from; --only says which are scored.
+    parser = place_parser(__doc__, "gaze_prior", folds=4)
+    parser.add_argument("--fields", type=int, default=0, help="folds in which gaze fields are trained, too")
+    args = parse(parser, argv)
     select_backend("llvm_ad_rgb", args.threads)
-    args.out = args.out.resolve()
-    args.out.mkdir(parents=True, exist_ok=True)
     places = {}
     for name, make in makers(args.data).items():
         places[name] = prior_place(name, make, args.folds, args.out / name)
         known = np.mean([fold.known for fold in places[name].folds])
         print(f"{name}: {100 * known:.0f} % of directions meet a surface", flush=True)
     study, rows = Study(places), []
-    for name in args.only.split(",") if args.only else places:
+    for name in asked_places(args):
         found = summarise(name, score(study, name, args.fields))
         rows += found
         print(f"\n{name:12s} people  KLD    CC     bits                   bits less blind")

@@ -10,13 +10,11 @@ fold by fold, with 95 % of Student's t.
 
 from __future__ import annotations
 
-import argparse
-import os
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from output import print_table, write_rows
-from places import ROOT, makers
+from place_rays import asked_places, parse, place_parser, write_place
 
 import numpy as np
 
@@ -36,24 +34,13 @@ ZONES, POSITIONS, MIN_RAYS, KAPPA = 3, 60, 64, 20.0
 def main(argv=None) -> None:
     from nerg_mi.jobs.backend import select_backend
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data)
-    parser.add_argument("--only", default="supermarket,store")
-    parser.add_argument("--folds", type=int, default=3)
+    parser = place_parser(__doc__, "gaze_probes", folds=3)
+    parser.set_defaults(only="supermarket,store")
     parser.add_argument("--steps", type=int, help="Default: the recipe's.")
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/gaze_probes"))
-    args = parser.parse_args(argv)
-    args.out.mkdir(parents=True, exist_ok=True)
+    args, each = parse(parser, argv), []
     ns = select_backend("llvm_ad_rgb", args.threads)
-    known, each = makers(args.data), []
-    for name in args.only.split(","):
-        if name not in known:
-            raise SystemExit(f'no place is called "{name}" here; there are {", ".join(known)} (set NERG_DATA for more)')
-        folder = args.out / name
-        folder.mkdir(exist_ok=True)
-        path, where = known[name](folder)
+    for name, make in asked_places(args).items():
+        folder, path, where = write_place(name, make, args)
         for fold in range(args.folds):
             for row in score(path, where, fold, folder / "gaze.safetensors", ns, args.steps):
                 each.append({"place": name, "fold": fold, **row})

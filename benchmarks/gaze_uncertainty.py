@@ -12,45 +12,29 @@ by what the training held out.
 from __future__ import annotations
 
 import argparse
-import os
-from pathlib import Path
 
 from output import write_rows
-from places import ROOT, makers
+from place_rays import Make, asked_places, parse, place_parser, write_place
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
-    parser.add_argument("--only", help="names of places, with commas between. Default: all whose data is there.")
-    parser.add_argument("--folds", type=int, default=3)
+    parser = place_parser(__doc__, "uncertainty", folds=3)
     parser.add_argument("--zones", type=int, default=6)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/uncertainty"))
-    args = parser.parse_args(argv)
-    args.out = args.out.resolve()
-    args.out.mkdir(parents=True, exist_ok=True)
-    places = makers(args.data)
-    rows = []
-    for name in args.only.split(",") if args.only else places:
-        if name not in places:
-            raise SystemExit(f'no place is called "{name}" here; there are {", ".join(places)}')
-        rows += measure(name, places[name], args)
+    args, rows = parse(parser, argv), []
+    for name, make in asked_places(args).items():
+        rows += measure(name, make, args)
         write_rows(args.out / "uncertainty.csv", rows)
 
 
-def measure(name: str, make, args: argparse.Namespace) -> list[dict]:
+def measure(name: str, make: Make, args: argparse.Namespace) -> list[dict]:
     """A row a population and error of one place, which is printed."""
     from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.jobs.backend import select_backend
     from nerg_mi.jobs.folds import evaluate_folds
     from nerg_mi.jobs.options.folds import FoldOptions
 
-    folder = args.out / name
-    folder.mkdir(exist_ok=True)
     select_backend("llvm_ad_rgb", args.threads)
-    rays, where = make(folder)
+    folder, rays, where = write_place(name, make, args)
     common = {"splits": "both,people", "folds": args.folds, "zones": args.zones, "threads": args.threads}
     with TerminalReporter() as reporter:
         found = evaluate_folds(rays, folder / "eval", FoldOptions(**where, **common), reporter)

@@ -10,14 +10,12 @@ it, or of 20), half of it that of the 4,096 nearest rays (kernels of 20), or as 
 
 from __future__ import annotations
 
-import argparse
-import os
 from dataclasses import replace
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from output import print_table, write_rows
-from places import ROOT, makers
+from place_rays import asked_places, parse, place_parser, write_place
 
 import numpy as np
 
@@ -37,20 +35,10 @@ SCORES = ("KLD", "CC", "bits")
 def main(argv=None) -> None:
     from nerg_mi.jobs.backend import select_backend
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data)
-    parser.add_argument("--only", help="names of places, with commas between. Default: all whose data is there.")
-    parser.add_argument("--folds", type=int, default=1)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/nearest_mixture"))
-    args = parser.parse_args(argv)
-    args.out.mkdir(parents=True, exist_ok=True)
-    ns, known, rows = select_backend("llvm_ad_rgb", args.threads), makers(args.data), []
-    for name in args.only.split(",") if args.only else known:
-        folder = args.out / name
-        folder.mkdir(exist_ok=True)
-        path, where = known[name](folder)
+    args, rows = parse(place_parser(__doc__, "nearest_mixture", folds=1), argv), []
+    ns = select_backend("llvm_ad_rgb", args.threads)
+    for name, make in asked_places(args).items():
+        _, path, where = write_place(name, make, args)
         for fold in range(args.folds):
             for row in score(path, where, fold, ns):
                 rows.append({"place": name, "fold": fold, **row})

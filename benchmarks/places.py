@@ -16,44 +16,30 @@ share of the blind density. `--against` prints the field less that of another ru
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Callable
 from pathlib import Path
 
 from output import write_rows
+from place_rays import Make, asked_places, parse, place_parser, write_place
 
-ROOT = Path(__file__).resolve().parents[1]
 OURS, BLIND, HALF = "gaze field", "position-blind", "split half"
 # Higher is better.
 SCORES = {"KLD": False, "CC": True, "bits": True}
 
 
 def main(argv=None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
-    parser.add_argument("--only", help="names of places, with commas between. Default: all whose data is there.")
+    parser = place_parser(__doc__, "places", folds=4)
     parser.add_argument("--recipe", default="default")
     parser.add_argument("--variant", default="emit_capture", help="emit, capture or emit_capture")
-    parser.add_argument("--folds", type=int, default=4)
     parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
     parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
     parser.add_argument("--mix-kappa", type=float, help="Default: the recipe's.")
     parser.add_argument("--against", type=Path, help="folds.csv of a run whose field this one is compared with")
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/places"))
-    args = parser.parse_args(argv)
-    args.out = args.out.resolve()
-    args.out.mkdir(parents=True, exist_ok=True)
-    places = makers(args.data)
-    names = args.only.split(",") if args.only else list(places)
+    args = parse(parser, argv)
+    if args.against is not None and not args.against.is_file():
+        parser.error(f'"{args.against}" is not there; it is written by a run whose --out is its folder')
     each: list[dict] = []
-    for name in names:
-        if name not in places:
-            raise SystemExit(
-                f'no place is called "{name}" here; there are {", ".join(places)} (set NERG_DATA for more)'
-            )
-        each += score(name, places[name], args)
+    for name, make in asked_places(args).items():
+        each += score(name, make, args)
     rows = summarise(each)
     write_rows(args.out / "places.csv", rows)
     write_rows(args.out / "folds.csv", each)
@@ -62,64 +48,15 @@ def main(argv=None) -> None:
         show_change(each, args.against)
 
 
-def makers(data: Path) -> dict[str, Callable[[Path], tuple[Path, dict]]]:
-    """By name, what writes the rays of a place into a folder and says where it is: options of a fold."""
-    from generated_places import PLACES
-
-    out: dict[str, Callable[[Path], tuple[Path, dict]]] = {}
-    if shop := sorted((data / "vr_supermarket").glob("*.csv.gz")):
-        out["supermarket"] = lambda folder: (recorded(shop, "vr_supermarket", folder), {"geometry": "hits"})
-    for scene in ("room", "playroom", "truck"):
-        if files := sorted((data / "eyenavgs" / scene).glob("*.csv.gz")):
-            out[scene] = lambda folder, files=files: (recorded(files, "eyenavgs", folder), {"geometry": "none"})
-    out["store"] = store
-    for make in PLACES:
-        place = make()
-        out[place.name] = lambda folder, place=place: generated(place, folder)
-    return out
-
-
-def recorded(files: list[Path], reader: str, folder: Path) -> Path:
-    """Rays of recordings; a reader leaves out those whose gaze is frozen, and says so."""
-    from nerg_mi.jobs.tracking import ImportOptions, import_rays
-
-    path = folder / "rays.npz"
-    import_rays(files, ImportOptions(reader=reader, output=path))
-    return path
-
-
-def store(folder: Path) -> tuple[Path, dict]:
-    """The demo store's shoppers among its radiance field."""
-    from nerg_mi.jobs import demo
-    from nerg_mi.jobs.tracking import ImportOptions, import_rays
-    from nerg_mi.rays.readers.skeleton22 import SkeletonOptions
-    from nerg_mi.scenes.store import make
-
-    csv = Path(make.__file__).parent / "build" / "shoppers.csv"
-    if not csv.is_file():
-        make.main(["--stage", "shoppers"])
-    path = folder / "rays.npz"
-    import_rays([csv], ImportOptions(reader="skeleton22", settings=SkeletonOptions(tick=0.001), output=path))
-    return path, {"field": demo.store_scene().parent / "store.safetensors"}
-
-
-def generated(place, folder: Path) -> tuple[Path, dict]:
-    scene, path = place.write(folder / "scene.xml"), folder / "rays.npz"
-    place.record(scene).save(path)
-    return path, {"scene": scene}
-
-
-def score(name: str, make: Callable[[Path], tuple[Path, dict]], args: argparse.Namespace) -> list[dict]:
+def score(name: str, make: Make, args: argparse.Namespace) -> list[dict]:
     """A row a fold and method."""
     from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.jobs.backend import select_backend
     from nerg_mi.jobs.folds import evaluate_folds
     from nerg_mi.jobs.options.folds import FoldOptions
 
-    folder = args.out / name
-    folder.mkdir(exist_ok=True)
     select_backend("llvm_ad_rgb", args.threads)
-    rays, where = make(folder)
+    folder, rays, where = write_place(name, make, args)
     options = FoldOptions(
         **where,
         recipe=args.recipe,

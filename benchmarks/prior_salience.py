@@ -12,15 +12,13 @@ beyond the uniform density; intervals are 95 % of a bootstrap over the people wh
 
 from __future__ import annotations
 
-import argparse
-import os
 from functools import cache
 from pathlib import Path
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from gaze_prior import REAL
 from output import print_table, write_rows
-from places import ROOT, makers
+from place_rays import makers, parse, place_parser
 from prior_cases import prior_place
 from prior_law import LOG_UNIFORM, normalised
 from prior_scores import Scored, summarise
@@ -39,16 +37,8 @@ LEAST = 0.02
 def main(argv=None) -> None:
     from nerg_mi.jobs.backend import select_backend
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
-    parser.add_argument("--folds", type=int, default=4)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/prior_salience"))
-    args = parser.parse_args(argv)
+    args = parse(place_parser(__doc__, "prior_salience", folds=4, choose=False), argv)
     select_backend("llvm_ad_rgb", args.threads)
-    args.out = args.out.resolve()
-    args.out.mkdir(parents=True, exist_ok=True)
     known = makers(args.data)
     elevation = elevation_of([known[name] for name in REAL if name in known], args.out)
     place, found = prior_place("store", known["store"], args.folds, args.out / "store"), []

@@ -11,13 +11,10 @@ very people who are scored: more than a rule that has to choose by others could 
 
 from __future__ import annotations
 
-import argparse
-import os
-from pathlib import Path
-
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
 from output import print_table, write_rows
-from places import ROOT, makers
+from place_fields import FoldField, fold_fields
+from place_rays import asked_places, parse, place_parser, write_place
 
 import numpy as np
 
@@ -25,33 +22,13 @@ SPLITS = {"both": "new positions", "people": "where others stood"}
 
 
 def main(argv=None) -> None:
-    from nerg_mi.cli.progress import TerminalReporter
     from nerg_mi.jobs.backend import select_backend
-    from nerg_mi.jobs.folds import evaluate_folds
-    from nerg_mi.jobs.options.folds import FoldOptions
 
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    data = Path(os.environ.get("NERG_DATA", ROOT.parent / "shared" / "data"))
-    parser.add_argument("--data", type=Path, default=data, help="folder of vr_supermarket and eyenavgs")
-    parser.add_argument("--only", help="names of places, with commas between. Default: all whose data is there.")
-    parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--out", type=Path, default=Path("out/benchmarks/places-before"))
-    args = parser.parse_args(argv)
-    args.out = args.out.resolve()
-    args.out.mkdir(parents=True, exist_ok=True)
-    ns, places, rows = select_backend("llvm_ad_rgb", args.threads), makers(args.data), []
-    for name in args.only.split(",") if args.only else places:
-        if name not in places:
-            raise SystemExit(f'no place is called "{name}" here; there are {", ".join(places)}')
-        folder = args.out / name
-        folder.mkdir(exist_ok=True)
-        path, where = places[name](folder)
-        options = FoldOptions(**where, folds=args.folds, splits="both", mix_folds=0, threads=args.threads)
-        with TerminalReporter() as reporter:
-            fields = evaluate_folds(path, folder / "eval", options, reporter).fields
-        for fold, field in enumerate(fields):
-            rows.append({"place": name, "fold": fold, **compare(field, path, where, fold, ns)})
+    args, rows = parse(place_parser(__doc__, "places-before", folds=3), argv), []
+    ns = select_backend("llvm_ad_rgb", args.threads)
+    for name, make in asked_places(args).items():
+        for fold in fold_fields(*write_place(name, make, args), args, ns, mix_folds=0):
+            rows.append({"place": name, "fold": fold.seed, **compare(fold)})
     write_rows(args.out / "support_mixture.csv", rows)
     keys = [k for k in rows[0] if k not in ("place", "fold")]
     mean = lambda name, key: np.mean([r[key] for r in rows if name in (None, r["place"])])
@@ -62,32 +39,19 @@ def main(argv=None) -> None:
     print_table("Shares of the blind density by support", ("place", *keys), table)
 
 
-def compare(field: Path, rays_path: Path, where: dict, fold: int, ns) -> dict[str, float]:
+def compare(fold: FoldField) -> dict[str, float]:
     """Best shares and KLD (nats) of one field."""
-    from nerg_mi.evaluation.gaze import evaluation
-    from nerg_mi.evaluation.gaze.scores import EPS, gaze_field
+    from nerg_mi.evaluation.gaze.scores import EPS
     from nerg_mi.evaluation.saliency import kld
-    from nerg_mi.formats.fields import load_gaze
-    from nerg_mi.jobs.gaze_places import place_of_training
-    from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
-    from nerg_mi.rays.rays import Rays
     from nerg_mi.training.gaze.mixing import SHARES, give_mix
 
-    loaded, metadata = load_gaze(field, ns)
-    about, rays = metadata["provenance"], Rays.load(rays_path)
-    scoring = GazeEvaluationOptions(**{k: v for k, v in where.items() if k in ("field", "scene")}, seed=fold)
-    account = about["test"]
-    place = place_of_training(field, about, loaded.box, scoring, ns)
     curves = {}
     for split in SPLITS:
-        _, scored, centres = evaluation.held_out_rays(rays, account, split, fold)
-        test = evaluation.make_test(
-            scored, centres, account["radius"], scoring.kappa, scoring.directions, scoring.min_rays, seed=fold
-        )
+        _, test = fold.test(split)
         densities = []
         for share in (0.0, 1.0):
-            give_mix(loaded, share)
-            densities.append(gaze_field(loaded, place.medium, place.align)(test.centres, test.directions))
+            give_mix(fold.loaded, share)
+            densities.append(fold.density()(test.centres, test.directions))
         mixed = [kld(test.truth, (1 - m) * densities[0] + m * densities[1], eps=EPS).mean() for m in SHARES]
         curves[split] = np.array(mixed)
     whole = np.mean(list(curves.values()), axis=0)
