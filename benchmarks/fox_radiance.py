@@ -50,6 +50,7 @@ def main(argv=None) -> None:
     parser.add_argument("--minutes", default="1,2,4,7,10")
     parser.add_argument("--width", type=int, default=135)
     parser.add_argument("--size", default="small")
+    parser.add_argument("--deferred", action="store_true", help="ask the colour network once a ray")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--validate", action="store_true")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -63,6 +64,8 @@ def main(argv=None) -> None:
 
     mi.set_variant("llvm_ad_rgb")
     dr.set_thread_count(args.threads)
+    from dataclasses import replace
+
     from nerg_mi.capture.dataset import open_dataset
     from nerg_mi.evaluation.images import score_views
     from nerg_mi.field.backend import namespace
@@ -85,7 +88,8 @@ def main(argv=None) -> None:
         f"load {os.getloadavg()[0]:.1f}"
     )
     begin = time.perf_counter()
-    trainer = RadianceTrainer(data.train, data.box, sized_config(args.size, data.box), settings, ns, depth=False)
+    config = replace(sized_config(args.size, data.box), deferred=args.deferred)
+    trainer = RadianceTrainer(data.train, data.box, config, settings, ns, depth=False)
     warm_up(trainer)
     rows = []
     for stop in stops:

@@ -9,8 +9,9 @@ level of the density's. Their sum is what is compared; stepping, compositing, ac
 are in ours alone. Networks by hand are compared with float64, densities with ours, before anything is timed.
 
 The second table are the camera's rays alone, at the field's steps: without colour, with it, with the colour network
-asked for the same number of points in full packets, and "deferred", as Hedman et al. (2021) have it: features are
-composited along the ray and the network is asked once. Errors are against a colour for every sample.
+asked for the same number of points in full packets, and of a deferred field of the same sizes, which asks once a ray.
+Errors are against a colour for every sample; what a deferred field costs in colours is for its training to say
+(`fox_radiance.py --deferred`).
 """
 
 from __future__ import annotations
@@ -116,10 +117,20 @@ def hand_works(field, gaze, library, threads: int, runs: int) -> dict[str, float
 
 
 def frame_table(width: int, height: int, field, gaze, threads: int, runs: int) -> list[list[str]]:
-    """Rows of the whole frame beside the sum by hand. Raises ``RuntimeError`` where no compiler builds it."""
-    count = counted(width, height)
+    """Rows of the whole frame beside the sum by hand, and of that of a deferred field of the same sizes. Raises
+    ``RuntimeError`` where no compiler builds it."""
+    from nerg_mi.formats.fields import save_radiance
+
+    count, values = counted(width, height), {"width": width, "height": height, "spp": 1, "aovs": "depth,gaze"}
     with tempfile.TemporaryDirectory() as folder:
         by_hand = hand_works(field, gaze, density_limit.build(Path(folder)), threads, runs)
+        path = Path(folder) / "deferred.safetensors"
+        save_radiance(deferred_twin(field), path, {})
+        frames = {
+            f"frame{kind}{', constant weights' if constant else ''}": torch_frames.Ours(given, "depth", constant)
+            for kind, given in (("", values), (", deferred field", {**values, "field": path}))
+            for constant in (False, True)
+        }
     kinds = (
         ("densities and features of the camera's rays", "camera", "density and features"),
         ("colours", "colour", "colour"),
@@ -132,56 +143,30 @@ def frame_table(width: int, height: int, field, gaze, threads: int, runs: int) -
         total += us
         rows.append([what, f"{count[counts]:.2f}", f"{by_hand[kind]:.1f}", f"{us:.3f}", ""])
     rows.append([f"sum, {HAND}", "", "", f"{total:.3f}", "1.00"])
-    values = {"width": width, "height": height, "spp": 1, "aovs": "depth,gaze"}
-    frames = {
-        "frame": torch_frames.Ours(values, "depth"),
-        "frame, constant weights": torch_frames.Ours(values, "depth", constant=True),
-    }
     for name, times in in_turns(frames, runs).items():
         us = 1e6 * median(c for _, c in times) / (width * height)
-        rows.append([name, "", "", f"{us:.3f}", f"{us / total:.2f}"])
+        rows.append([name, "", "", f"{us:.3f}", "" if "deferred" in name else f"{us / total:.2f}"])
     return rows
 
 
-def march_features(medium, ray, settings):
-    """``(features, opacity)`` of `LocalRay`s through a field: its composited features (list of Floats), as its colour
-    network takes them, and how much is behind them."""
+def deferred_twin(field):
+    """A deferred field of the same weights, which cost what those of one that was trained so do: its colours mean
+    nothing."""
     from dataclasses import replace
 
-    from nerg_mi.transport.march.march import march
-    from nerg_mi.transport.march.quadrature import absorbed_share
+    from nerg_mi.field.radiance import RadianceField
 
-    import drjit as dr
-    import mitsuba as mi
-
-    count, near = medium.feature_count, dr.maximum(ray.t_near, 0)
-    painter, settings = _Features(count), replace(settings, color_cutoff=0.0)
-    found = march(medium, ray, near, ray.t_far, mi.Bool(True), settings, color=painter)
-    opacity = absorbed_share(found.tau)
-    return [found.color[k] / dr.maximum(opacity, 1e-6) for k in range(count)], opacity
-
-
-class _Features:
-    """What samples contribute: the features that the colour network is asked with, `transport.media.painting`."""
-
-    def __init__(self, count: int):
-        self.count = count
-
-    def zero(self):
-        import mitsuba as mi
-
-        return mi.ArrayXf([mi.Float(0)] * self.count)
-
-    def paint(self, medium, features, p, w, active):
-        import mitsuba as mi
-
-        return mi.ArrayXf(list(features))
+    config, parts = replace(field.config, deferred=True), (field.grid, field.density_net, field.color_net)
+    made = RadianceField(config, field.box, *parts, occupancy=field.occupancy)
+    made.march_step, made.march_growth = field.march_step, field.march_growth
+    return made
 
 
 def colour_table(width: int, height: int, field, runs: int) -> list[list[str]]:
     """Rows of the camera's rays, coloured in several ways."""
     from dataclasses import replace
 
+    from nerg_mi.transport.features import color_painter
     from nerg_mi.transport.march.march import march
     from nerg_mi.transport.media.field import FieldMedium
     from nerg_mi.transport.media.painting import ColorPainter
@@ -191,8 +176,8 @@ def colour_table(width: int, height: int, field, runs: int) -> list[list[str]]:
     import drjit as dr
     import mitsuba as mi
 
-    medium = FieldMedium(field)
-    settings, N = default_settings(Place(medium)), field.config.geometry
+    medium, once = FieldMedium(field), FieldMedium(deferred_twin(field))
+    settings = default_settings(Place(medium))
     o, d = (mi.Vector3f(*map(mi.Float, np.asarray(v, np.float32).T)) for v in torch_frames.camera_rays(width, height))
     ray, pixels = medium.local(mi.Point3f(o), d), width * height
 
@@ -210,14 +195,13 @@ def colour_table(width: int, height: int, field, runs: int) -> list[list[str]]:
         return out
 
     def deferred():
-        features, opacity = march_features(medium, ray, settings)
-        out = mi.Color3f(field.color(features, ray.w)) * opacity
-        dr.eval(out)
-        return out
+        painter, active = color_painter(once, mi.Color3f), mi.Bool(True)
+        found = march(once, ray, dr.maximum(ray.t_near, 0), ray.t_far, active, settings, color=painter)
+        dr.eval(painter.color(once, found.color, found.opacity, ray, active))
 
     asked = round(float(np.mean(marched(ColorPainter(mi.Color3f), settings.color_cutoff, True).color_evals)) * pixels)
     rng = np.random.default_rng(0)
-    features = [mi.Float(v) for v in rng.standard_normal((N, asked)).astype(np.float32)]
+    features = [mi.Float(v) for v in rng.standard_normal((field.config.geometry, asked)).astype(np.float32)]
     along = dr.normalize(mi.Vector3f(*map(mi.Float, rng.standard_normal((3, asked)).astype(np.float32))))
     dr.eval(features, along)
 
@@ -250,7 +234,7 @@ def colour_table(width: int, height: int, field, runs: int) -> list[list[str]]:
                 evaluations = "1.00"
             elif work is packed:
                 evaluations = f"{asked / pixels:.2f}"
-            if (cutoff is not None and cutoff > 0) or work is deferred:
+            if cutoff is not None and cutoff > 0:
                 db = f"{-10 * np.log10(np.mean((np.array(work()) - exact) ** 2)):.1f}"
             weights = "constant" if constant else "in memory"
             rows.append([name, weights, evaluations, f"{median(each):.3f}", spread(each), db])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 import nerg_mi  # noqa: F401  (chooses the libLLVM, so it comes before drjit and mitsuba)
-from nerg_mi.field.radiance import sigmoid
-from nerg_mi.maths.elementary import log1p, one_minus_exp
+from nerg_mi.maths.elementary import log1p, one_minus_exp, sigmoid
 from nerg_mi.maths.ray_box import intersect_box
 from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.rules import RULES

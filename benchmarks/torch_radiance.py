@@ -240,7 +240,7 @@ class TorchTrainer:
 
 def same_model(trainer, peer) -> float:
     """Largest relative difference of densities, and of colours, at random points."""
-    from nerg_mi.training.radiance.model import density_color
+    from nerg_mi.training.radiance.model import density_summand
 
     import drjit as dr
     import torch
@@ -256,7 +256,7 @@ def same_model(trainer, peer) -> float:
         peer.weights["grid.table"] *= 3e3
         theirs = peer.sigma_color(torch.from_numpy(p), harmonics(torch.from_numpy(d)))
         peer.weights["grid.table"].copy_(old["grid.table"])
-    ours = density_color(trainer.config, trainer.box, scaled, ns.Array3f(p.T), ns.Array3f(d.T), ns)
+    ours = density_summand(trainer.config, trainer.box, scaled, ns.Array3f(p.T), ns.Array3f(d.T), ns)
     a, b = ours[0].numpy(), np.stack([c.numpy() for c in ours[1]], 1)
     return max(float(np.abs(a / theirs[0].numpy() - 1).max()), float(np.abs(b - theirs[1].numpy()).max()))
 

@@ -34,8 +34,10 @@ Trained radiance field (:monosp:`nerf`)
    - Features of the grid and the weight matrices of both networks.
    - |exposed|, |differentiable|
 
-Density and view-dependent colour of a place, as a multiresolution hash grid with two small networks. It is meant as the
-``field`` of the integrator :ref:`nerg <integrator-nerg>`. As a plain volume it returns the density, in 1 / scene unit,
+Density and view-dependent colour of a place, as a multiresolution hash grid with two small networks. The second is
+asked for the colour of every sample of a ray; of a checkpoint that was trained so (``nerg train radiance --deferred``)
+once a ray, with the mean of what the first says of its samples (Hedman et al. 2021). It is meant as the ``field`` of
+the integrator :ref:`nerg <integrator-nerg>`. As a plain volume it returns the density, in 1 / scene unit,
 through ``eval_1``: 0 outside of ``bbox()``, and in the cells that the checkpoint's occupancy grid calls empty, which
 are vacuum by definition: training has left them unsampled, and whatever the networks say there is skipped when
 marching. With ``max_density`` it serves as ``sigma_t`` of a ``heterogeneous`` medium. (A plain volume is not told the
@@ -141,7 +143,7 @@ class NerfVolume(mi.Volume):
         return (
             f"NerfVolume[\n  filename = {self.filename},\n"
             f"  grid = {c.grid.describe()},\n"
-            f"  networks = {c.density_sizes}, {c.color_sizes},\n"
+            f"  networks = {c.density_sizes}, {c.color_sizes}{' (once a ray)' if c.deferred else ''},\n"
             f"  bbox = {lower.round(4).tolist()} to {upper.round(4).tolist()},\n"
             f"  color_space = {self.field.color_space}\n]"
         )

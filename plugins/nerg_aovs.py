@@ -68,7 +68,10 @@ def _features_at(p: Pixel) -> list:
 
 def _color_evaluations(p: Pixel) -> list:
     march = p.view.march
-    return [march.color_evals if p.lit and march is not None else mi.Float(0)]
+    if not p.lit or march is None:
+        return [mi.Float(0)]
+    once = dr.select(p.active & (p.view.front > 0), mi.Float(1), 0)
+    return [once if p.nerg.medium.deferred else march.color_evals]
 
 
 AOVS: dict[str, Aov] = {

@@ -5,14 +5,13 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import mitsuba as mi
 
 from nerg_mi.maths.color import composite_to_linear
-from nerg_mi.transport.features import FeaturePainter
-from nerg_mi.transport.media.painting import ColorPainter
+from nerg_mi.transport.features import FeaturePainter, color_painter
 from nerg_mi.transport.observer import viewpoint
 from nerg_mi.transport.observer.gaze import ObservedGaze
 from nerg_mi.transport.observer.sight import Sight, trace_sight
@@ -21,6 +20,9 @@ from nerg_mi.transport.place import Place
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from nerg_mi.transport.march.settings import MarchResult
+    from nerg_mi.transport.media.painting import Painter
 
 
 @dataclass(frozen=True)
@@ -56,17 +58,14 @@ class Pixel:
         medium = nerg.medium
         self.place = Place(medium, scene)
         self.lit = nerg.radiance and medium is not None and medium.has_color
-        painter = ColorPainter(_color_type(medium)) if self.lit else None
-        if "features" in nerg.demands and medium is not None:
-            painter = FeaturePainter(medium, self.lit)
+        painter, features = None, "features" in nerg.demands
+        if medium is not None and self.lit:
+            painter = color_painter(medium, _color_type(medium), features)
+        elif medium is not None and features:
+            painter = FeaturePainter(medium)
+        self.painter = painter
         self.counting = "counts" in nerg.demands
         self.view = self.place.trace(self.ray, active, nerg.settings, offset=offset, count=self.counting, color=painter)
-        gathered = None if self.view.march is None else self.view.march.color
-        self.color, self.accumulated_features = gathered, []
-        if isinstance(painter, FeaturePainter) and gathered is not None:
-            painted = list(gathered)
-            self.color = mi.Color3f(painted[:3]) if self.lit else None
-            self.accumulated_features = [dr.select(active, f, 0) for f in painted[3 * self.lit :]]
         self.some = active & (self.view.opacity > 0)
         self._evaluations: list = []
         self.cache = nerg.cache
@@ -82,6 +81,21 @@ class Pixel:
         other.p_o, other.observers, other.aligned, other.cache = p_o, observers, aligned, cache
         other._evaluations = []
         return other
+
+    @cached_property
+    def color(self):
+        """The medium's colour along the ray, times its opacity; None where there is none."""
+        if not self.lit:
+            return None
+        medium, view, painter = self.nerg.medium, self.view, cast("Painter", self.painter)
+        ray = medium.local(self.ray.o, self.ray.d)
+        return painter.color(medium, cast("MarchResult", view.march).color, view.front, ray, self.active)
+
+    @property
+    def accumulated_features(self) -> list:
+        """Geometry features, accumulated along the ray."""
+        painter, march = cast("FeaturePainter", self.painter), cast("MarchResult", self.view.march)
+        return [dr.select(self.active, f, 0) for f in painter.features(march.color)]
 
     @cached_property
     def depth(self):

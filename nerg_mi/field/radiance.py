@@ -3,7 +3,8 @@
     (h, g) = density_net(encoding(p)),   σ(p) = density_scale · exp(h),   c(p, d) = sigmoid(color_net(Y(d), g))
 
 with Y the spherical harmonics of the direction: NeRF (Mildenhall et al. 2020, section 3) in the architecture of
-instant-ngp (Müller et al. 2022, section 5.4) as torch-ngp and the paper use it.
+instant-ngp (Müller et al. 2022, section 5.4) as torch-ngp and the paper use it. The colour network is asked at every
+sample of a ray, or once a ray of a deferred field: see ``color_head``.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from nerg_mi.maths.contraction import AnyBox
 from .backend import namespace
 from .background import Background
 from .cascades import CascadeGrid
+from .color_head import network_color, network_inputs, point_features
 from .encoding.harmonics import encode_direction
 from .encoding.hashgrid import HashGridConfig
 from .encoding.protocol import Encoding, EncodingConfig
@@ -50,12 +52,20 @@ class RadianceConfig:
     sh_degree: int = 4
     # Density, in 1/unit, where the density net returns 0.
     density_scale: float = 1.0
+    # Whether the colour net is asked once a ray, with the features composited along it, of which three are a colour.
+    deferred: bool = False
 
     def __post_init__(self):
         if min(self.width, self.density_hidden, self.color_hidden, self.geometry, self.sh_degree) < 1:
             raise ValueError(f"every size of a radiance field must be at least 1, got {self}")
         if not (np.isfinite(self.density_scale) and self.density_scale > 0):
             raise ValueError(f"density_scale must be positive and finite, got {self.density_scale}")
+        if not isinstance(self.deferred, bool):
+            raise ValueError(f"deferred must be true or false, got {self.deferred!r}")
+        if self.deferred and self.geometry < 3:
+            raise ValueError(
+                f"a deferred field needs at least 3 geometry features, its diffuse colour; got {self.geometry}"
+            )
 
     @property
     def density_sizes(self) -> list[int]:
@@ -68,8 +78,12 @@ class RadianceConfig:
         return [self.sh_degree**2 + self.geometry] + [self.width] * self.color_hidden + [3]
 
     def to_dict(self) -> dict[str, Any]:
-        """The JSON object that stands in a checkpoint."""
-        return {**asdict(self), "grid": self.grid.to_dict()}
+        """The JSON object that stands in a checkpoint. Where colour is not deferred it says nothing of it, so that
+        releases that know no deferred fields read it."""
+        out = {**asdict(self), "grid": self.grid.to_dict()}
+        if not self.deferred:
+            del out["deferred"]
+        return out
 
     @staticmethod
     def from_dict(d: dict[str, Any]) -> RadianceConfig:
@@ -93,11 +107,6 @@ def assign(field, values: dict) -> None:
 def density_from_log(h, scale: float):
     """Density from the density net's first output, clamped well before fp32 overflows."""
     return scale * dr.exp(dr.minimum(h, _MAX_LOG_DENSITY))
-
-
-def sigmoid(x):
-    """1 / (1 + exp(-x)), finite with its gradient for every finite x."""
-    return dr.fma(0.5, dr.tanh(0.5 * x), 0.5)
 
 
 class RadianceField:
@@ -227,9 +236,11 @@ class RadianceField:
         """Density (1/unit) at ``p`` and the ``geometry`` features (list of Floats) that ``color`` needs."""
         inside = active & self.box.contains(p)
         h = self.density_net(self.grid(self.box.to_unit(p), inside))
-        return dr.select(inside, self._density(h[0], p), 0), h[1:]
+        return dr.select(inside, self._density(h[0], p), 0), point_features(h[1:], self.config.deferred)
 
     def color(self, features: list, d):
-        """Colour (Array3f in ``color_space``, 0..1) of a point with ``features``, seen along unit ``d``."""
-        rgb = self.color_net(encode_direction(d, self.config.sh_degree) + features)
-        return type(d)(*[sigmoid(c) for c in rgb])
+        """Colour (Array3f in ``color_space``, 0..1) of a point with ``features``, seen along unit ``d``; of a deferred
+        field also that of an opaque ray along ``d`` with these features on average (``color_head.mean_features``)."""
+        given = network_inputs(features, self.config.deferred)
+        rgb = self.color_net(encode_direction(d, self.config.sh_degree) + given)
+        return type(d)(*network_color(rgb, given, self.config.deferred))

@@ -76,7 +76,8 @@ class _FieldModule(torch.nn.Module):
         return [t.contiguous() for t in tensors.values()]
 
     def _evaluate(self, function, *inputs):
-        """``function(field, *Array3f)``, a list of rows, at torch ``inputs`` (N, 3): a torch tensor (rows, N)."""
+        """``function(field, *arrays)``, a list of rows, at torch ``inputs``, (N, 3) as Array3f and others as lists of
+        their columns: a torch tensor (rows, N)."""
         ns, field = self._ns, self._field
         tensors = {k for k, v in field.parameters().items() if dr.is_tensor_v(v)}
 
@@ -87,7 +88,7 @@ class _FieldModule(torch.nn.Module):
             columns = [_columns(ns, p) for p in points]
             out = function(here, *columns)
             return ns.TensorXf(
-                dr.ravel(ns.ArrayXf([ns.Float(c) for c in out]), order="C"), (len(out), dr.width(columns[0]))
+                dr.ravel(ns.ArrayXf([ns.Float(c) for c in out]), order="C"), (len(out), dr.width(columns[0][0]))
             )
 
         # dr.wrap knows tensors, and passes by their subclass for parameters.
@@ -103,7 +104,8 @@ class RadianceModule(_FieldModule):
 
     def forward(self, p: torch.Tensor, d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Density (N,) in 1/unit and colour (N, 3) in the field's colour space at ``p`` (N, 3) seen along unit ``d``
-        (N, 3)."""
+        (N, 3). Of a deferred field this is the colour of matter that is opaque there; a ray's is that of its mean
+        features (`density_features`, `color`)."""
 
         def both(field, p, d):
             sigma, features = field.density_features(p)
@@ -115,6 +117,25 @@ class RadianceModule(_FieldModule):
     def density(self, p: torch.Tensor) -> torch.Tensor:
         """Density (N,) in 1/unit at ``p`` (N, 3); 0 outside of the box."""
         return self._evaluate(lambda field, p: [field.density(p)], *self._rows(p=p))[0]
+
+    def density_features(self, p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Density (N,) in 1/unit at ``p`` (N, 3), and the features (N, G) of which `color` makes colours."""
+
+        def both(field, p):
+            sigma, features = field.density_features(p)
+            return [sigma, *features]
+
+        out = self._evaluate(both, *self._rows(p=p))
+        return out[0], out[1:].T
+
+    def color(self, features: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+        """Colour (N, 3) in the field's colour space of ``features`` (N, G) seen along unit ``d`` (N, 3); of a deferred
+        field also that of rays with these mean features, Σ w g / Σ w, times whose opacity, Σ w, it is to be taken."""
+        count = self._field.config.geometry
+        if features.shape[1:] != (count,):
+            raise ValueError(f"features have shape {tuple(features.shape)}, and must have shape (N, {count})")
+        (d,) = self._rows(d=d)
+        return self._evaluate(lambda field, f, d: list(field.color(list(f), d)), features.contiguous(), d).T
 
     def background(self, o: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
         """Colour (N, 3) behind the field of rays from ``o`` (N, 3) along unit ``d`` (N, 3)."""
@@ -262,9 +283,11 @@ class GazeEnsembleModule(torch.nn.Module):
 
 
 def _columns(ns, p):
-    index = 3 * dr.arange(ns.UInt32, p.shape[0])
+    rows, count = p.shape
+    index = count * dr.arange(ns.UInt32, rows)
     # No two points share a number, so that derivatives need no atomic additions.
-    return ns.Array3f(*[dr.gather(ns.Float, p.array, index + k, mode=dr.ReduceMode.Permute) for k in range(3)])
+    columns = [dr.gather(ns.Float, p.array, index + k, mode=dr.ReduceMode.Permute) for k in range(count)]
+    return ns.Array3f(*columns) if count == 3 else columns
 
 
 def _with(field, values: dict):

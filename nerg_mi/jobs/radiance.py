@@ -73,7 +73,7 @@ def train_radiance(
     _tell_about(data, reporter)
     field, provenance = run.train_field(
         data,
-        sized_config(options.size, data.box),
+        sized_config(options.size, data.box, options.deferred),
         settings,
         ns,
         options.depth,

@@ -1,4 +1,4 @@
-"""1 - exp(-x) and log(1 + x) without cancellation, quotients of tiny numbers: what Dr.Jit lacks."""
+"""1 - exp(-x), log(1 + x), quotients of tiny numbers and the logistic function, without cancellation or overflow."""
 
 from __future__ import annotations
 
@@ -22,3 +22,8 @@ def quotient(a, b):
     """a / b for b != 0. Its first derivatives do not square b, which would overflow below 1e-19."""
     value = dr.detach(a) / dr.detach(b)
     return dr.replace_grad(value, (a - value * b) * (1 / dr.detach(b)))
+
+
+def sigmoid(x):
+    """1 / (1 + exp(-x)), finite with its gradient for every finite x."""
+    return dr.fma(0.5, dr.tanh(0.5 * x), 0.5)

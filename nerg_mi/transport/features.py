@@ -13,27 +13,54 @@ from typing import Any
 import drjit as dr
 
 from nerg_mi.field.backend import namespace
-from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f
+from nerg_mi.field.color_head import mean_features
+from nerg_mi.maths.types import Bool, Color, Float, Point3f, Ray3f, Vector3f
 
 from .march.settings import MarchSettings
+from .media.local_ray import LocalRay
+from .media.painting import ColorPainter, Painter
 from .media.protocol import Medium
 from .place import Place
 
 
 class FeaturePainter:
-    """Contributes a sample's features, behind its colour where it is ``colored``, as an ArrayXf (see
-    ``media.painting.Painter``). ``medium``: one that has features."""
+    """Contributes a sample's features as an ArrayXf (see ``media.painting.Painter``).
 
-    def __init__(self, medium: Medium, colored: bool):
-        self.colored, self.count = colored, medium.feature_count
+    ``medium``: one that has features; ``color_type``: array type of a ray's colour, or None for features alone. A
+    deferred medium makes that colour of the features; of another one a sample's own colour stands before them."""
+
+    def __init__(self, medium: Medium, color_type: type | None = None):
+        self.color_type, self.count = color_type, medium.feature_count
+        self._own = color_type is not None and not medium.deferred
         self._ns = namespace(medium.parameters()[0])
 
     def zero(self) -> Any:
-        return self._ns.ArrayXf([self._ns.Float(0)] * (3 * self.colored + self.count))
+        return self._ns.ArrayXf([self._ns.Float(0)] * (3 * self._own + self.count))
 
     def paint(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Any:
-        color = list(medium.color(features, p, w, active)) if self.colored else []
+        color = list(medium.color(features, p, w, active)) if self._own else []
         return self._ns.ArrayXf([*color, *features])
+
+    def color(self, medium: Medium, sums: Any, opacity: Float, ray: LocalRay, active: Bool) -> Color | None:
+        array_type = self.color_type
+        if array_type is None or self._own:
+            return None if array_type is None else array_type(list(sums)[:3])
+        means = mean_features(self.features(sums), opacity)
+        ask = lambda active: array_type(medium.color(means, ray.o, ray.w, active))
+        if dr.grad_enabled(means, ray.w, *medium.parameters()):
+            return dr.select(active, opacity * ask(active), 0)
+        # Where no ray of a packet meets anything, the network is passed over.
+        some = active & (opacity > 0)
+        return opacity * dr.if_stmt((some,), some, ask, lambda _: dr.zeros(array_type), label="deferred colour")
+
+    def features(self, sums: Any) -> list[Float]:
+        """The features in ``sums``, composited but not divided by opacity."""
+        return list(sums)[3 * self._own :]
+
+
+def color_painter(medium: Medium, color_type: type, features: bool = False) -> Painter:
+    """What gathers the colour of a medium that has one, as ``color_type``; with ``features``, a `FeaturePainter`."""
+    return FeaturePainter(medium, color_type) if features or medium.deferred else ColorPainter(color_type)
 
 
 def snapshot(medium: Medium, p: Point3f, active: Bool) -> list[Float]:
@@ -48,7 +75,7 @@ def accumulated(place: Place, ray: Ray3f, active: Bool, settings: MarchSettings)
     What gathers them is always the default's, in training as in every picture: ``color_cutoff`` chooses how exact
     colours are."""
     settings = replace(settings, color_cutoff=MarchSettings.color_cutoff)
-    march: Any = place.trace(ray, active, settings, color=FeaturePainter(_featured(place), False)).march
+    march: Any = place.trace(ray, active, settings, color=FeaturePainter(_featured(place))).march
     return [dr.select(active, f, 0) for f in march.color]
 
 

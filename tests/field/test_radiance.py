@@ -1,12 +1,15 @@
 """The radiance field against its NumPy version, and its handling of parameters."""
 
+from dataclasses import replace
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.hashgrid import HashGrid, HashGridConfig
-from nerg_mi.field.radiance import RadianceConfig, RadianceField, density_from_log, sigmoid
+from nerg_mi.field.radiance import RadianceConfig, RadianceField, density_from_log
 from nerg_mi.maths.box import Box
 from tests.reference import fields_numpy as reference
 
@@ -69,16 +72,6 @@ def test04_density_is_clamped_before_it_overflows():
     assert np.allclose(sigma.numpy(), expected, rtol=1e-5, atol=1e-30)
     dr.backward(dr.sum(sigma))
     assert np.allclose(dr.grad(x).numpy(), np.where(h < 30, expected, 0), rtol=1e-5)
-
-
-def test05_sigmoid_at_its_ends():
-    x = ns.Float([-1e30, -100, -1, 0, 1, 100, 1e30])
-    dr.enable_grad(x)
-    y = sigmoid(x)
-    dr.backward(dr.sum(y))
-    assert np.allclose(y.numpy(), reference.sigmoid(x.numpy().astype(float)), atol=1e-7)
-    e = reference.sigmoid(x.numpy().astype(float))
-    assert np.allclose(dr.grad(x).numpy(), e * (1 - e), atol=1e-6)
 
 
 def test06_set_parameters_changes_every_output():
@@ -188,3 +181,27 @@ def test15_networks_that_do_not_fit_the_grid_are_refused():
 def test16_the_grid_belongs_to_one_configuration():
     grid = HashGrid.random(HashGridConfig(**GRID), ns, np.random.default_rng(0))
     assert grid.config == CONFIG.grid and make().config.grid == CONFIG.grid
+
+
+def test17_a_deferred_field():
+    """Its features and its colours are those of ``color_head``; a file of another field says nothing of it."""
+    config = replace(CONFIG, deferred=True)
+    field, plain, (p, d) = make(config=config), make(), points()
+    sigma, features = field.density_features(ns.Array3f(p.T))
+    same, raw = plain.density_features(ns.Array3f(p.T))
+    assert np.array_equal(sigma.numpy(), same.numpy())
+    g = np.stack([f.numpy() for f in raw])
+    expected = np.concatenate([reference.sigmoid(g[:3]), g[3:]])
+    assert np.allclose(np.stack([f.numpy() for f in features]), expected, atol=1e-6)
+    inside = 1e-3 + (1 - 2e-3) * expected[:3]
+    given = np.concatenate([np.log(inside / (1 - inside)), expected[3:]])
+    outputs = np.array(plain.color_net([*encode_direction(ns.Array3f(d.T), config.sh_degree), *map(ns.Float, given)]))
+    found = np.array(field.color(features, ns.Array3f(d.T)))
+    assert np.allclose(found, reference.sigmoid(outputs + given[:3]), atol=1e-5)
+    assert RadianceConfig.from_dict(config.to_dict()) == config and "deferred" not in CONFIG.to_dict()
+
+
+@pytest.mark.parametrize("change, words", [({"deferred": 1}, "true or false"), ({"geometry": 2}, "at least 3")])
+def test18_deferred_fields_that_cannot_be(change, words):
+    with pytest.raises(ValueError, match=words):
+        RadianceConfig(**{"deferred": True, **change})

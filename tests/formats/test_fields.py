@@ -86,6 +86,14 @@ def test02b_what_a_gaze_field_rests_on(tmp_path):
         assert (None if basis is None else basis.words()) == words
 
 
+def test02c_a_deferred_field(tmp_path):
+    made = RadianceField.random(RadianceConfig(GRID, width=16, deferred=True), Box((-1, -1, -1), (1, 1, 1)), ns)
+    save_radiance(made, tmp_path / "f.safetensors", {})
+    assert load_radiance(tmp_path / "f.safetensors", ns)[0].config.deferred
+    save_radiance(radiance(), tmp_path / "g.safetensors", {})
+    assert "deferred" not in load_radiance(tmp_path / "g.safetensors", ns)[1]["architecture"]
+
+
 def test03_without_occupancy_and_step(tmp_path):
     field = RadianceField.random(RadianceConfig(GRID, width=16), BOX, ns)
     save_radiance(field, tmp_path / "f", {})

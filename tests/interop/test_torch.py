@@ -9,23 +9,18 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.field.background import Background, BackgroundConfig
-from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.ensemble import GazeEnsemble
 from nerg_mi.field.gaze.log_density import LogGazeConfig, LogGazeField
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
-from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import save_gaze
-from nerg_mi.maths.box import Box
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.gaze import PlacedGaze
 from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.observer.surroundings import trace_surroundings
 from nerg_mi.transport.place import Place
 
-GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
-BOX = Box((-1, -1, -1), (1, 1, 1))
-RNG = np.random.default_rng(0)
+from .fields import BOX, GRID, RNG, radiance, rays, varied
+
 _BEGINNING = RNG.bit_generator.state
 
 
@@ -42,28 +37,6 @@ def interop(torch):
     return nerg_mi.interop.torch
 
 
-def varied(field):
-    field.set_parameters({"grid.table": ns.Float(RNG.normal(size=len(field.grid.table)).astype(np.float32))})
-    return field
-
-
-def radiance(background=False):
-    behind = Background.random(
-        BackgroundConfig(3.0, HashGridConfig(levels=2, log2_rows=8, base=4, finest=16, dimensions=2), 16), ns
-    )
-    return varied(
-        RadianceField.random(
-            RadianceConfig(GRID, width=16, geometry=7), BOX, ns, background=behind if background else None
-        )
-    )
-
-
-def rays(torch, n=200):
-    p = RNG.uniform(-1.05, 1.05, (n, 3)).astype(np.float32)
-    d = RNG.normal(size=(n, 3))
-    return torch.tensor(p), torch.tensor((d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32))
-
-
 def test01_values_of_the_field(torch, interop):
     field = radiance(background=True)
     module, (p, d) = interop.RadianceModule(field), rays(torch)
@@ -77,6 +50,28 @@ def test01_values_of_the_field(torch, interop):
     assert {k.replace("__", ".") for k, _ in module.named_parameters()} == set(field.parameters())
     with pytest.raises(ValueError, match="without a background"):
         interop.RadianceModule(radiance()).background(p, d)
+
+
+@pytest.mark.parametrize("deferred", [False, True])
+def test01b_colours_of_features(torch, interop, deferred):
+    """Those of the field, with derivatives that agree with central differences."""
+    field = radiance(deferred=deferred)
+    module, (p, d) = interop.RadianceModule(field), rays(torch)
+    sigma, features = module.density_features(p)
+    expected = field.density_features(ns.Array3f(p.numpy().T))
+    assert np.array_equal(sigma.detach().numpy(), expected[0].numpy())
+    assert np.array_equal(features.detach().numpy().T, np.stack([f.numpy() for f in expected[1]]))
+    assert torch.allclose(module.color(features, d), module(p, d)[1], atol=1e-6)
+    mix = torch.tensor(RNG.normal(size=(len(p), 3)))
+    loss = lambda f, d: (module.color(f, d).double() * mix).sum()
+    f, d = features.detach().requires_grad_(), d.requires_grad_()
+    loss(f, d).backward()
+    for value, ends in ((f, lambda v: loss(v, d)), (d, lambda v: loss(f, v))):
+        way = torch.tensor(np.random.default_rng(1).normal(size=value.shape).astype(np.float32))
+        slope = (ends(value + 2e-4 * way) - ends(value - 2e-4 * way)).item() / 4e-4
+        assert np.isclose(float((value.grad * way).sum()), slope, rtol=0.03, atol=0.02)
+    with pytest.raises(ValueError, match=r"must have shape \(N, 7\)"):
+        module.color(features[:, :3], d)
 
 
 def test02_gradients_of_a_restatement_in_torch(torch, interop):

@@ -30,6 +30,15 @@ def test_a_result_without_any_file(place):  # noqa: F811
     assert shares == sorted(shares) and shares[-1] == 1 and told.steps[1][1].endswith("step 1")
 
 
+def test_a_deferred_field(place, tmp_path):  # noqa: F811
+    """As trained, as written, and as evaluated by the integrator."""
+    out, options = tmp_path / "f.safetensors", RadianceOptions(steps=3, holdout=3, deferred=True)
+    result = train_radiance(place, out, options)
+    assert result.field.config.deferred
+    scores = evaluate_radiance(out, place, RadianceScoreOptions(holdout=3, spp=4))
+    assert np.isfinite(scores.psnr_mean)
+
+
 def test_an_interrupted_run_without_any_file_is_a_result(place):  # noqa: F811
     result = train_radiance(place, options=RadianceOptions(steps=10**6, holdout=0), reporter=Impatient())
     assert result.interrupted and result.provenance["steps"] == 1 and result.psnr is None

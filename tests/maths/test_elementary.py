@@ -4,7 +4,7 @@ import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
-from nerg_mi.maths.elementary import log1p, one_minus_exp, quotient
+from nerg_mi.maths.elementary import log1p, one_minus_exp, quotient, sigmoid
 
 EPS = np.finfo(np.float32).eps
 
@@ -42,3 +42,13 @@ def test04_quotient():
     dr.backward(dr.sum(q))
     assert np.allclose(dr.grad(x).numpy(), 1 / b.astype(float), rtol=1e-6)
     assert np.allclose(dr.grad(y).numpy(), -a.astype(float) / b.astype(float) ** 2, rtol=1e-6)
+
+
+def test05_sigmoid_at_its_ends():
+    x = np.array([-1e30, -100, -1, 0, 1, 100, 1e30], np.float32)
+    v = ns.Float(x)
+    dr.enable_grad(v)
+    y = sigmoid(v)
+    dr.backward(dr.sum(y))
+    e = 0.5 + 0.5 * np.tanh(0.5 * x.astype(float))
+    assert np.allclose(y.numpy(), e, atol=1e-7) and np.allclose(dr.grad(v).numpy(), e * (1 - e), atol=1e-6)

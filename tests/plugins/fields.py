@@ -13,9 +13,9 @@ GRID = HashGridConfig(levels=2, log2_rows=10, base=4, finest=16)
 BOX = Box((-1, -1, -1), (1, 1, 1))
 
 
-def radiance(path, density_scale=2.0, seed=0, occupancy=None, geometry=7, **kwargs):
+def radiance(path, density_scale=2.0, seed=0, occupancy=None, geometry=7, deferred=False, **kwargs):
     field = RadianceField.random(
-        RadianceConfig(GRID, width=16, geometry=geometry, sh_degree=2, density_scale=density_scale),
+        RadianceConfig(GRID, 16, geometry=geometry, sh_degree=2, density_scale=density_scale, deferred=deferred),
         BOX,
         ns,
         seed,

@@ -16,6 +16,7 @@ def files(tmp_path_factory):
     mi.set_variant("llvm_ad_rgb")
     folder = tmp_path_factory.mktemp("fields")
     fields.radiance(folder / "field.safetensors", density_scale=1.5)
+    fields.radiance(folder / "deferred.safetensors", density_scale=1.5, deferred=True)
     fields.gaze(folder / "gaze.safetensors")
     return folder
 
@@ -117,6 +118,12 @@ def test01_density(rgb, files, name, h, channels):
 @pytest.mark.parametrize("name", ["color_net.0", "color_net.2"])
 def test02_colour_net(rgb, files, name):
     check(rgb, scene_of(rgb, neural(rgb, files)), f"integrator.field.{name}", COLOR, 1e-2)
+
+
+@pytest.mark.parametrize("name, h", [("grid.table", 5e-3), ("density_net.1", 2e-3), ("color_net.0", 1e-2)])
+def test02b_a_deferred_field(rgb, files, name, h):
+    field = {"type": "nerf", "filename": str(files / "deferred.safetensors")}
+    check(rgb, scene_of(rgb, neural(rgb, files, field=field)), f"integrator.field.{name}", COLOR, h, picks=3, rtol=0.04)
 
 
 @pytest.mark.parametrize("name", ["grid.table", "position_net.0", "direction_net.1", "emit_head.0", "capture_head.0"])

@@ -1,16 +1,21 @@
 """Features that a gaze field may ask for: of the point itself, or gathered on the way there."""
 
+from dataclasses import replace
+
 import drjit.llvm.ad as ns
 import numpy as np
 import pytest
 
+from nerg_mi.field.color_head import mean_features
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
-from nerg_mi.transport.features import observed_features
+from nerg_mi.transport.features import FeaturePainter, color_painter, observed_features
+from nerg_mi.transport.march.march import march
 from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.media.field import FieldMedium
+from nerg_mi.transport.media.painting import ColorPainter
 from nerg_mi.transport.place import Place
 
 O, D = np.array([0.1, -0.2, -3.0]), np.array([0.0, 0.1, 1.0]) / np.hypot(0.1, 1)
@@ -58,3 +63,29 @@ def test_accumulated_ones_are_weighted_by_what_reaches_the_eye(rgb, place):
     assert found.shape == (3,) and np.allclose(found, weight @ f, atol=5e-3 * np.abs(f).max())
     assert not asked(rgb, place, "accumulated", (0.3, 0.5, 0.2), active=False).any()
     assert np.abs(found - asked(rgb, place, "snapshot", (0.3, 0.5, 0.2))).max() > 0.01
+
+
+def test_colours_of_a_deferred_medium_come_of_what_is_accumulated(rgb, place):
+    """Beside features or alone; those of another medium from its samples."""
+    kinds = []
+    for deferred in (False, True):
+        field = place[1]
+        config = replace(field.config, deferred=deferred)
+        medium = FieldMedium(RadianceField(config, field.box, field.grid, field.density_net, field.color_net))
+        ray = medium.local(rgb.Point3f(0.1, -0.2, -3), rgb.Vector3f(*map(float, D)))
+        one, both = color_painter(medium, rgb.Color3f), color_painter(medium, rgb.Color3f, features=True)
+        kinds.append(type(one))
+        found = []
+        for painter in (one, both):
+            r = march(medium, ray, ray.t_near, ray.t_far, True, MarchSettings(1 / 64, color_cutoff=0.0), color=painter)
+            found.append(np.array(painter.color(medium, r.color, r.opacity, ray, rgb.Bool(True))).ravel())
+            hidden = painter.color(medium, r.color, r.opacity, ray, rgb.Bool(False))
+            assert not deferred or not np.array(hidden).any()
+        sums = both.features(r.color)
+        assert len(sums) == 3 and np.allclose(found[0], found[1], atol=1e-6) and found[0].max() > 0.01
+        if deferred:
+            means = mean_features(sums, r.opacity)
+            want = np.array(r.opacity * medium.field.color(means, ray.w)).ravel()
+            assert np.allclose(found[0], want, atol=1e-6)
+    assert kinds == [ColorPainter, FeaturePainter]
+    assert FeaturePainter(medium).color(medium, r.color, r.opacity, ray, True) is None

@@ -19,6 +19,7 @@ from typing import Any
 import drjit as dr
 
 from nerg_mi.maths.color import composite_to_linear
+from nerg_mi.transport.features import color_painter
 from nerg_mi.transport.observer import viewpoint
 from nerg_mi.transport.observer.visibility import visibility
 from nerg_mi.transport.place import Place
@@ -66,26 +67,30 @@ def _integrator_class(variant: str):
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             like, names = self._like, self._like.aovs
-            color = None
+            painter, active = None, mi.Bool(active)
             if like.radiance and like.medium.has_color:
-                color = mi.Spectrum if like.medium.color_space == "spectrum" else mi.Color3f
+                spectral = like.medium.color_space == "spectrum"
+                painter = color_painter(like.medium, mi.Spectrum if spectral else mi.Color3f)
             local = like.medium.local(ray.o, ray.d)
             t0, t1 = dr.maximum(local.t_near, 0), dr.minimum(local.t_far, ray.maxt)
-            alpha, depth, total, n = self._march(local, t0, t1, mi.Bool(active), color)
+            alpha, depth, total, n = self._march(local, t0, t1, active, painter)
             surface = alpha >= like.observer_settings.surface_opacity
             out = {
                 "depth": depth,
                 "opacity": alpha,
                 "density_evals": n,
-                "color_evals": mi.Float(0) if color is None else n,
+                "color_evals": mi.Float(0) if painter is None else n,
             }
+            if painter is not None and like.medium.deferred:
+                out["color_evals"] = dr.select(alpha > 0, mi.Float(1), 0)
             if {"visibility", "gaze"} & set(names):
                 out["density_evals"] = n + self._look(ray.o + ray.d * depth, surface, out, "gaze" in names)
             L = mi.Spectrum(0)
             if like.radiance:
                 L = (1 - alpha) * like.background
-                if color is not None:
-                    L += composite_to_linear(total, alpha, like.medium.color_space)
+                if painter is not None:
+                    color = painter.color(like.medium, total, alpha, local, active)
+                    L += composite_to_linear(color, alpha, like.medium.color_space)
             return L, alpha > 0, [out[name] for name in names]
 
         def _look(self, p_d, surface, out, gaze):
@@ -115,10 +120,10 @@ def _whole_cells(occupancy: Any) -> Any:
     return None if occupancy is None else occupancy.coarse
 
 
-def march(medium, ray, t0, t1, active, color, *, steps, shortest, longest, dt_gamma):
-    """``(opacity, depth, weighted colour sum, samples)`` of ``ray`` (`LocalRay`) between ``t0`` and ``t1``.
+def march(medium, ray, t0, t1, active, painter, *, steps, shortest, longest, dt_gamma):
+    """``(opacity, depth, sum of what samples contribute, samples)`` of ``ray`` (`LocalRay`) between ``t0`` and ``t1``.
 
-    ``color``: array type of the medium's colour, or None for a density-only pass.
+    ``painter``: what samples contribute (``media.painting.Painter``), or None for a density-only pass.
     """
     Float = type(ray.t_near)
     grid = _whole_cells(medium.occupancy)
@@ -144,14 +149,14 @@ def march(medium, ray, t0, t1, active, color, *, steps, shortest, longest, dt_ga
         full = active & (t < t1)
         dt = length(t)
         p = ray.o + ray.d * t
-        if color is None:
+        if painter is None:
             sigma, features = medium.density(p, full), None
         else:
             sigma, features = medium.density_features(p, full)
         weight = dr.select(full, (1 - dr.exp(-sigma * dt)) * transmittance, 0)
         moment = moment + weight * (t + dt)
-        if color is not None:
-            total = total + weight * color(medium.color(features, p, ray.w, full))
+        if painter is not None:
+            total = total + weight * painter.paint(medium, features, p, ray.w, full)
         # The kernels test the transmittance in front of the sample, so that one more is taken.
         more = transmittance >= STOP
         transmittance, n = transmittance - weight, n + dr.select(full, 1, 0)
@@ -163,7 +168,7 @@ def march(medium, ray, t0, t1, active, color, *, steps, shortest, longest, dt_ga
         Float(t0),
         Float(1),
         Float(0),
-        None if color is None else dr.zeros(color),
+        None if painter is None else painter.zero(),
         Float(0),
     )
     _, _, transmittance, moment, total, n = dr.while_loop(start, lambda active, *_: active, body, label="paper march")

@@ -24,9 +24,10 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
-from nerg_mi.field.radiance import assign, sigmoid
+from nerg_mi.field.radiance import assign
 from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.maths.elementary import sigmoid
 
 from .basis import Basis
 from .product import VARIANTS

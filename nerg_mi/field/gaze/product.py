@@ -23,9 +23,9 @@ from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.encoding.protocol import Encoding, EncodingConfig
 from nerg_mi.field.encoding.registry import encoding_config, random_encoding
 from nerg_mi.field.mlp import MLP
-from nerg_mi.field.radiance import assign, sigmoid
+from nerg_mi.field.radiance import assign
 from nerg_mi.maths.contraction import AnyBox
-from nerg_mi.maths.elementary import log1p
+from nerg_mi.maths.elementary import log1p, sigmoid
 
 from .basis import Basis
 from .protocol import Arrays

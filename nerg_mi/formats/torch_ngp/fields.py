@@ -159,6 +159,7 @@ def torch_ngp_state(field: RadianceField) -> dict[str, np.ndarray]:
                 (c.width, c.density_hidden, c.color_hidden, c.geometry, c.sh_degree) == (64, 1, 2, 15, 4),
                 "its networks must be 64 wide (paper size)",
             ),
+            (not c.deferred, "torch-ngp asks the colour network at every sample, and its own once a ray"),
             (c.density_scale == 1, f"its density scale must be 1, not {c.density_scale:g}"),
         )
         if not fits

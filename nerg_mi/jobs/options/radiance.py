@@ -27,6 +27,7 @@ class RadianceOptions(PhotoOptions):
     """How a radiance field is trained."""
 
     size: str = option("small", "Size of the field: small, medium or paper.")
+    deferred: bool = option(False, "Ask the colour network once a ray, not at every sample: faster frames.")
     downscale: float | None = option(None, "In place of a width: divide the pictures' size by this.")
     minutes: float | None = option(None, "Train for this long. Default: 5.")
     steps: int | None = option(None, "Or: train for so many steps.")

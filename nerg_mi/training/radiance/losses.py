@@ -106,18 +106,18 @@ class _Spread(dr.CustomOp):
         return "distortion of a ray"
 
 
-def composite(sigma: Float, rgb: list, samples: Samples) -> tuple[Float, Float, list[Float], Float]:
-    """Weights, optical depths, colour (3 Floats) and opacity of every ray.
+def composite(sigma: Float, parts: list, samples: Samples) -> tuple[Float, Float, list[Float], Float]:
+    """Weights, optical depths, sums of the ``parts`` of samples (colours, as a rule) and opacity of every ray.
 
-    Of thinned samples the opacity is that of all, and the colour their mean times it: both without the noise of the
+    Of thinned samples the opacity is that of all, and a sum their mean times it: both without the noise of the
     sums of weights. Derivatives are those of the plain sums, which are right on average.
     """
     s, thinned = samples.segments, samples.thinned
     tau = dr.select(s.active, sigma * samples.length, 0)
     weight = weights(tau, s, thinned)
-    color, opacity = [ray_sum(weight * c, s) for c in rgb], ray_sum(weight, s)
+    sums, opacity = [ray_sum(weight * x, s) for x in parts], ray_sum(weight, s)
     if thinned is not None:
         scale = dr.detach(thinned.opacity / dr.maximum(opacity, 1e-6))
-        color = [dr.replace_grad(c * scale, c) for c in color]
+        sums = [dr.replace_grad(x * scale, x) for x in sums]
         opacity = dr.replace_grad(thinned.opacity, opacity)
-    return weight, tau, color, opacity
+    return weight, tau, sums, opacity

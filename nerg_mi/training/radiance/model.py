@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import drjit as dr
 
+from nerg_mi.field.color_head import mean_features, network_color, network_inputs, point_features
 from nerg_mi.field.encoding.harmonics import encode_direction
 from nerg_mi.field.encoding.registry import encoding_of
 from nerg_mi.field.mlp import MLP
-from nerg_mi.field.radiance import RadianceConfig, density_from_log, sigmoid
+from nerg_mi.field.radiance import RadianceConfig, density_from_log
 from nerg_mi.maths.contraction import AnyBox
 
 
@@ -31,8 +32,9 @@ def unstack(x, ns) -> list:
     ]
 
 
-def density_color(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, ns, features: list | None = None):
-    """Density (1/unit) and colour (list of 3 Floats in 0..1) at world points ``p`` seen along ``d``.
+def density_summand(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, ns, features: list | None = None):
+    """Density (1/unit) at world points ``p`` seen along ``d``, and what a ray composites of them (list of Floats):
+    colour (3 in 0..1), or of a deferred field the features that `ray_color` makes colour of.
 
     The same maths as ``RadianceField.density_features`` and ``color`` on ``parameters`` spelt as the field spells them;
     points must lie in ``box``. Gradients reach every entry of ``parameters``. ``features``: what the grid returns at
@@ -40,12 +42,26 @@ def density_color(config: RadianceConfig, box: AnyBox, parameters: dict, p, d, n
     """
     h = unstack(_net(parameters, "density_net").tensor(_features(config, box, parameters, p, ns, features)), ns)
     sigma = box.density_along(density_from_log(h[0], config.density_scale), p)
-    c = _net(parameters, "color_net").tensor(stack(encode_direction(d, config.sh_degree) + h[1:], ns))
-    return sigma, [sigmoid(x) for x in unstack(c, ns)]
+    features = point_features(h[1:], config.deferred)
+    return sigma, features if config.deferred else _color(config, parameters, features, d, ns)
+
+
+def ray_color(config: RadianceConfig, parameters: dict, sums: list, opacity, d, ns) -> list:
+    """Colour (3 Floats, times opacity) of rays along ``d`` that composited ``sums`` of what `density_summand` returns,
+    with this ``opacity``."""
+    if not config.deferred:
+        return sums
+    return [opacity * c for c in _color(config, parameters, mean_features(sums, opacity), d, ns)]
+
+
+def _color(config: RadianceConfig, parameters: dict, features: list, d, ns) -> list:
+    given = network_inputs(features, config.deferred)
+    c = _net(parameters, "color_net").tensor(stack(encode_direction(d, config.sh_degree) + given, ns))
+    return network_color(unstack(c, ns), given, config.deferred)
 
 
 def density(config: RadianceConfig, box: AnyBox, parameters: dict, p, ns):
-    """Density (1/unit) alone, at world points ``p`` in ``box``; see `density_color`."""
+    """Density (1/unit) alone, at world points ``p`` in ``box``; see `density_summand`."""
     head = _head(parameters)
     log_density = head.tensor(_features(config, box, parameters, p, ns)).array
     return box.density_along(density_from_log(log_density, config.density_scale), p)

@@ -9,6 +9,7 @@ import numpy as np
 
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.images import View
+from nerg_mi.field.color_head import mean_features
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.transport.march.quadrature import mean_depth_share
 
@@ -70,7 +71,9 @@ def _march(field, occupied, table, center, d, near: float, stop: float, ns):
     if samples is None:
         return np.zeros((count, 3)), np.zeros(count), np.zeros(count)
     sigma, features = field.density_features(samples.p)
-    rgb = field.color(features, dr.gather(ns.Array3f, direction, samples.ray))
-    weight, tau, color, opacity = composite(sigma, list(rgb), samples)
+    deferred = field.config.deferred
+    parts = features if deferred else list(field.color(features, dr.gather(ns.Array3f, direction, samples.ray)))
+    weight, tau, sums, opacity = composite(sigma, parts, samples)
+    color = [opacity * c for c in field.color(mean_features(sums, opacity), direction)] if deferred else sums
     moment = ray_sum(weight * (samples.t + samples.length * mean_depth_share(tau)), samples.segments)
     return np.stack([c.numpy() for c in color], axis=1), opacity.numpy(), moment.numpy()

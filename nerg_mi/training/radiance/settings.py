@@ -15,9 +15,10 @@ from nerg_mi.maths.contraction import AnyBox
 _SIZES = {"small": (8, 16, 32, 512, 32, 1), "medium": (8, 18, 32, 512, 32, 1), "paper": (16, 19, 16, 2048, 64, 2)}
 
 
-def sized_config(size: str, box: AnyBox) -> RadianceConfig:
+def sized_config(size: str, box: AnyBox, deferred: bool = False) -> RadianceConfig:
     """Architecture of a ``size`` for a scene box: an untrained field absorbs about 1 - 1/e across it. Of a contracted
-    one, whose inner cube takes half of each edge of the grid, it resolves that as it would a box."""
+    one, whose inner cube takes half of each edge of the grid, it resolves that as it would a box. ``deferred``: whether
+    the colour network is asked once a ray."""
     if size not in _SIZES:
         raise NergError(f'size must be one of {", ".join(_SIZES)}, got "{size}"')
     levels, rows, base, finest, width, color_hidden = _SIZES[size]
@@ -28,6 +29,7 @@ def sized_config(size: str, box: AnyBox) -> RadianceConfig:
         width=width,
         color_hidden=color_hidden,
         density_scale=1 / box.side,
+        deferred=deferred,
     )
 
 

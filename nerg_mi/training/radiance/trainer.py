@@ -27,7 +27,7 @@ from nerg_mi.training.common.step_clock import StepClock
 from .compositing import damp_near, weights
 from .density_grid import DensityGrid
 from .losses import color_loss, composite, depth_loss, distortion_loss, feature_decay
-from .model import density, density_color, density_of
+from .model import density, density_of, density_summand, ray_color
 from .pace import adapted_rays, affordable_rays, refined
 from .photo_colors import PHOTOS, PhotoColors
 from .pixels import PixelBank
@@ -226,15 +226,16 @@ class RadianceTrainer:
         s, ns, misplaced = self.settings, self.ns, None
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
         parameters = self._parameters()
-        sigma, rgb = density_color(self.config, self.box, parameters, samples.p, d, ns, samples.features)
+        sigma, parts = density_summand(self.config, self.box, parameters, samples.p, d, ns, samples.features)
         if s.reach > 0:
             # Never 0, and never left out: that would compile other kernels in the middle of the run.
             reach = max(s.damped_within(self.progress), 1e-6) * self.box.side
-            sigma, *rgb = damp_near([sigma, *rgb], samples.t, dr.opaque(ns.Float, reach))
+            sigma, *parts = damp_near([sigma, *parts], samples.t, dr.opaque(ns.Float, reach))
         # Now: each sum along the rays would evaluate the networks again.
-        dr.eval(sigma, rgb)
+        dr.eval(sigma, parts)
         self.clock.count(s.batch)
-        weight, tau, color, opacity = composite(sigma, rgb, samples)
+        weight, tau, sums, opacity = composite(sigma, parts, samples)
+        color = ray_color(self.config, parameters, sums, opacity, pixels.d, ns)
         total = 0
         if self.photos is not None:
             changes = self.photos.changes(self.optimiser[PHOTOS])

@@ -33,6 +33,10 @@ class FieldMedium:
         self.color_space = field.color_space
 
     @property
+    def deferred(self) -> bool:
+        return self.field.config.deferred
+
+    @property
     def occupancy(self) -> Occupancy | None:
         """The field's own, which changes with its weights."""
         return self.field.occupancy

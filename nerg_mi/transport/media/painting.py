@@ -6,6 +6,7 @@ from typing import Protocol
 
 from nerg_mi.maths.types import Bool, Color, Float, Point3f, Vector3f
 
+from .local_ray import LocalRay
 from .protocol import Medium
 
 
@@ -25,9 +26,14 @@ class Painter(Protocol):
         """
         ...
 
+    def color(self, medium: Medium, sums: Color, opacity: Float, ray: LocalRay, active: Bool) -> Color | None:
+        """Colour, times ``opacity``, of rays that gathered ``sums``; None where no colour is gathered."""
+        ...
+
 
 class ColorPainter:
-    """The medium's own colour, as an ``array_type`` such as ``Color3f``; in the medium's ``color_space``."""
+    """The medium's own colour, as an ``array_type`` such as ``Color3f``; in the medium's ``color_space``. Not for a
+    medium that is ``deferred``: see ``features.color_painter``."""
 
     def __init__(self, array_type: type):
         self.array_type = array_type
@@ -37,3 +43,6 @@ class ColorPainter:
 
     def paint(self, medium: Medium, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         return self.array_type(medium.color(features, p, w, active))
+
+    def color(self, medium: Medium, sums: Color, opacity: Float, ray: LocalRay, active: Bool) -> Color:
+        return sums

@@ -55,6 +55,11 @@ class Medium(Protocol):
         ...
 
     @property
+    def deferred(self) -> bool:
+        """Whether a ray's colour is that of its samples' mean features, rather than the mean of their colours."""
+        ...
+
+    @property
     def color_space(self) -> str:
         """What colours are: ``srgb``, ``linear``, or ``spectrum``, a linear spectrum of the variant in use."""
         ...
@@ -135,7 +140,8 @@ class Medium(Protocol):
 
     def color(self, features: list[Float], p: Point3f, w: Vector3f, active: Bool) -> Color:
         """Colour in ``color_space`` at local points ``p`` in the unit local direction ``w`` of the ray. Only to be
-        called where ``has_color``. ``features``: of the points, or the index of the hit alone in a medium of hits."""
+        called where ``has_color``. ``features``: of the points, or the index of the hit alone in a medium of hits; in
+        a ``deferred`` one the mean along a ray, which may have been gathered anywhere on it."""
         ...
 
     def background(self, o: Point3f, d: Vector3f) -> Color | None:

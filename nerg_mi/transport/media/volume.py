@@ -43,7 +43,7 @@ class VolumeMedium:
         # Those of the variant in use: another one may be chosen later on.
         self._interaction, self._ns = mi.Interaction3f, namespace(mi.Float)
         self._density, self._color = density, color
-        self.has_color = color is not None
+        self.has_color, self.deferred = color is not None, False
         box = density.bbox()
         self._lower, self._upper = np.array(box.min, float), np.array(box.max, float)
         if not np.all(np.isfinite(self._lower) & np.isfinite(self._upper)) or np.any(self._upper <= self._lower):

@@ -15,6 +15,8 @@ from nerg_mi.evaluation.study import scenes as study_scenes
 from nerg_mi.evaluation.study.subject import open_subject
 from nerg_mi.field.occupancy import OccupancyGrid
 from nerg_mi.transport.media.local_ray import LocalRay
+from tests.plugins import fields
+from tests.plugins.scenes import camera
 from tests.reference import march_numpy
 
 
@@ -51,6 +53,22 @@ def test_the_picture_tends_to_the_true_one_and_is_black_without_radiance(seen):
     assert known.color.max() > 0.5 and off[1] < off[0] / 4 < 0.01
     dark = seen("depth,opacity", radiance=False, steps=128)
     assert (dark["color"] == 0).all() and dark["opacity"].max() > 0.9
+
+
+def test_a_deferred_field_is_asked_for_colour_once_a_ray(rgb, tmp_path):
+    """And its picture tends to that of ``nerg``."""
+    fields.radiance(tmp_path / "f.safetensors", deferred=True)
+    field = {"type": "nerf", "filename": str(tmp_path / "f.safetensors")}
+    made = rgb.load_dict({"type": "nerg", "field": field, "aovs": "depth,opacity,color_evals", "step": 2e-3})
+    scene = rgb.load_dict({"type": "scene", "sensor": camera(rgb, size=8)})
+    known = np.array(rgb.render(scene, integrator=made, spp=1, seed=0))
+    off = []
+    for steps in (64, 1024):
+        paper = study_paper.as_in_the_paper(made, scene.sensors()[0], 0.01, steps)
+        seen = np.array(rgb.render(scene, integrator=paper, spp=1, seed=0))
+        off.append(np.abs(seen - known)[..., :3].mean())
+        assert np.array_equal(seen[..., 5], seen[..., 4] > 0)
+    assert known[..., :3].max() > 0.2 and off[1] < off[0] / 4 < 0.01
 
 
 @pytest.mark.parametrize("dt_gamma", [0.0, 0.05])

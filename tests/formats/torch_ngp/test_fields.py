@@ -160,3 +160,10 @@ def test11_fields_without_a_torch_ngp_form(tmp_path):
     with pytest.raises(ValueError, match="no torch-ngp form: its unit cube must be .*; its grid .*; its networks"):
         write_torch_ngp(field, tmp_path / "x.pth")
     assert not list(tmp_path.iterdir())
+
+
+def test12_a_deferred_field_has_none(tmp_path):
+    field = RadianceField.random(RadianceConfig(HashGridConfig(), deferred=True), Box((-1, -1, -1), (1, 1, 1)), ns)
+    with pytest.raises(ValueError, match="no torch-ngp form: torch-ngp asks the colour network at every sample"):
+        write_torch_ngp(field, tmp_path / "x.pth")
+    assert not list(tmp_path.iterdir())

@@ -1,12 +1,14 @@
 """The forward pass that trains: what was looked up already changes no value and no derivative, and heads are the
 field's."""
 
+from dataclasses import replace
+
 import drjit as dr
 import drjit.llvm.ad as ns
 import numpy as np
 
 from nerg_mi.field.radiance import RadianceField
-from nerg_mi.training.radiance.model import density, density_color, density_of, stack, unstack
+from nerg_mi.training.radiance.model import density, density_of, density_summand, ray_color, stack, unstack
 
 from .ball import BOX, TINY
 
@@ -29,7 +31,7 @@ def test_known_features_change_no_value_and_no_derivative():
     for features in (None, known):
         parameters = {k: type(v)(v) for k, v in f.parameters().items()}
         dr.enable_grad(parameters)
-        sigma, rgb = density_color(TINY, BOX, parameters, p, d, ns, features)
+        sigma, rgb = density_summand(TINY, BOX, parameters, p, d, ns, features)
         dr.backward(dr.sum(sigma + rgb[0] - 2 * rgb[1] * rgb[2]))
         found.append([dr.detach(sigma).numpy()] + [dr.grad(v).numpy() for v in parameters.values()])
     for a, b in zip(*found):
@@ -61,7 +63,20 @@ def test_tensor_products_equal_the_fields_own_evaluation():
     field.set_parameters({"grid.table": ns.Float(rng.normal(size=len(field.grid.table)).astype(np.float32))})
     p = ns.Array3f(rng.uniform(-0.99, 0.99, (3, 200)).astype(np.float32))
     d = dr.normalize(ns.Array3f(rng.normal(size=(3, 200)).astype(np.float32)))
-    sigma, rgb = density_color(TINY, BOX, field.parameters(), p, d, ns)
+    sigma, rgb = density_summand(TINY, BOX, field.parameters(), p, d, ns)
     expected, features = field.density_features(p)
     assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4)
     assert np.allclose(np.array([c.numpy() for c in rgb]), field.color(features, d).numpy(), atol=1e-5)
+
+
+def test_a_deferred_field_composites_features_and_colours_rays():
+    config, (p, d) = replace(TINY, deferred=True), points()
+    made = RadianceField.random(config, BOX, ns, 0)
+    sigma, parts = density_summand(config, BOX, made.parameters(), p, d, ns)
+    expected, features = made.density_features(p)
+    assert np.allclose(sigma.numpy(), expected.numpy(), rtol=1e-4) and len(parts) == TINY.geometry
+    assert np.allclose([x.numpy() for x in parts], [x.numpy() for x in features], atol=1e-6)
+    opacity = ns.Float(np.linspace(0, 1, 40).astype(np.float32))
+    rgb = ray_color(config, made.parameters(), [opacity * f for f in features], opacity, d, ns)
+    assert np.allclose([c.numpy() for c in rgb], opacity.numpy() * made.color(features, d).numpy(), atol=1e-5)
+    assert ray_color(TINY, {}, parts, opacity, d, ns) is parts

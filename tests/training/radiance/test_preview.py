@@ -8,6 +8,7 @@ import pytest
 from nerg_mi.capture.cameras import Camera, pixel_directions
 from nerg_mi.capture.images import View
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.field.radiance import RadianceConfig
 from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance import preview
 from nerg_mi.training.radiance.preview import render_view
@@ -20,7 +21,7 @@ STEP, NEAR = 0.1, 0.3
 class Lump:
     """A soft ball in a box, brighter to the right, redder to the camera."""
 
-    box, ns = Box((-1, -1, -1), (1, 1, 1)), ns
+    box, ns, config = Box((-1, -1, -1), (1, 1, 1)), ns, RadianceConfig()
 
     def density(self, p, active=True):
         return dr.select(active, 20 * dr.exp(-12 * dr.squared_norm(p)), 0)
@@ -68,6 +69,22 @@ def test_pictures(every, chunk, monkeypatch):
     assert seen.color.shape == color.shape and np.allclose(seen.color, color, atol=2e-5)
     assert np.allclose(seen.opacity, opacity, atol=2e-5) and 0.8 < opacity.max()
     assert np.allclose(seen.depth[opacity > 0.01], depth[opacity > 0.01], rtol=1e-4)
+
+
+def test_a_deferred_field_has_the_colour_of_its_mean_features():
+    """Which for one that is linear in them is the mean of colours."""
+    lump = Lump()
+    lump.config = RadianceConfig(deferred=True)
+    table, anywhere = StepTable(ns, 0.0, 4.4, STEP, 0.0), lambda p, active: active
+    seen = render_view(lump, anywhere, table, view(), NEAR, stop=0.0)
+    assert np.allclose(seen.color, expected()[0], atol=2e-5)
+    lump.color = lambda features, d: ns.Array3f(dr.square(features[0]))
+    squares = render_view(lump, lambda p, a: a, StepTable(ns, 0.0, 4.4, STEP, 0.0), view(), NEAR, stop=0.0).color[
+        ..., 0
+    ]
+    opacity = expected()[1]
+    mean = (expected()[0][..., 0] - 0.5 * opacity) / 0.4 / np.where(opacity > 0, opacity, 1)
+    assert np.allclose(squares, opacity * mean**2, atol=2e-5)
 
 
 def test_a_background_shows_through():

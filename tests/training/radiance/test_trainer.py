@@ -10,14 +10,17 @@ import pytest
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.maths.box import Box
 from nerg_mi.training.radiance.compositing import damp_near, ray_sum
+from nerg_mi.training.radiance.held_out import measure
 from nerg_mi.training.radiance.losses import color_loss, composite, depth_loss, feature_decay
-from nerg_mi.training.radiance.model import density_color
+from nerg_mi.training.radiance.model import density_summand, ray_color
 from nerg_mi.training.radiance.pixels import PixelBank
 from nerg_mi.training.radiance.preview import render_view
 from nerg_mi.training.radiance.sampling import StepTable, Thinning, rays_in_box, visible_samples
 from nerg_mi.training.radiance.trainer import RadianceTrainer
 
 from .ball import BOX, TINY, settings
+
+DEFERRED = replace(TINY, deferred=True)
 
 
 def test_equal_seeds_give_equal_fields_to_rounding(dataset):
@@ -68,10 +71,11 @@ def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
         assert np.mean(np.abs(with_grid.color - without.color)) < 0.02
 
 
-def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
+@pytest.mark.parametrize("config", [TINY, DEFERRED])
+def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset, config):
     """Fixed samples, all loss terms, a direction through all weights: central differences to 1 %."""
     rng = np.random.default_rng(6)
-    field = RadianceField.random(TINY, BOX, ns, 0)
+    field = RadianceField.random(config, BOX, ns, 0)
     table = rng.normal(size=len(field.grid.table)).astype(np.float32)
     field.set_parameters({"grid.table": ns.Float(table)})
     pixels = PixelBank(ns, dataset.train).batch(ns.UInt32(rng.integers(0, 24 * 24, 64).astype(np.uint32)))
@@ -87,8 +91,9 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
 
     def loss(parameters):
         d = dr.gather(ns.Array3f, pixels.d, samples.ray)
-        sigma, rgb = density_color(TINY, BOX, parameters, samples.p, d, ns)
-        weight, tau, color, opacity = composite(sigma, rgb, samples)
+        sigma, parts = density_summand(config, BOX, parameters, samples.p, d, ns)
+        weight, tau, sums, opacity = composite(sigma, parts, samples)
+        color = ray_color(config, parameters, sums, opacity, pixels.d, ns)
         terms = color_loss(color, opacity, pixels, background, 0.1)
         terms += 0.1 * depth_loss(weight, tau, samples, pixels.depth, 0.1, 0.1)
         return dr.sum(ns.Float64(terms))
@@ -104,6 +109,19 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset):
     h = 3e-4
     up, down = (loss({k: v + s * h * direction[k] for k, v in start.items()}).numpy()[0] for s in (1, -1))
     assert slope == pytest.approx((up - down) / (2 * h), rel=0.01)
+
+
+def test_a_deferred_field_learns_the_same_pictures(dataset):
+    """As well as one that is asked at every sample; it is what is kept, looked at and rendered."""
+    errors = []
+    for config in (TINY, DEFERRED):
+        trainer = RadianceTrainer(dataset.train, BOX, config, settings(steps=150), ns)
+        while trainer.progress < 1:
+            trainer.step()
+        field = trainer.field()
+        assert field.config == config
+        errors.append(measure(trainer, dataset.held_out, field=field).mean)
+    assert min(errors) > 22 and errors[1] > errors[0] - 1.5, errors
 
 
 def test_thinned_samples_stand_for_all():

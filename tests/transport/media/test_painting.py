@@ -21,3 +21,4 @@ def test01_the_mediums_colour(rgb, kind):
     assert type(found) is type(painter.zero()) is array_type
     assert np.allclose(np.array(found).ravel(), [0.2, 0.5, 0.8], atol=1e-6)
     assert not np.array(painter.zero()).any()
+    assert painter.color(medium, found, rgb.Float(0.5), medium.local(p, w), rgb.Bool(True)) is found

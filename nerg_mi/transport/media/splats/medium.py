@@ -30,6 +30,7 @@ class SplatMedium:
     """
 
     has_color = True
+    deferred = False
     feature_count = 0
     growth = 0.0
     occupancy = None
