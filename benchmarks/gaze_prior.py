@@ -21,7 +21,7 @@ from output import write_rows
 from place_rays import asked_places, makers, parse, place_parser
 from prior_cases import Fold, PriorPlace, prior_place
 from prior_features import FEATURES
-from prior_law import LOG_UNIFORM, basis, blind, fit, normalised
+from prior_law import LOG_UNIFORM, basis, blind, concentration, fit, normalised
 from prior_scores import Scored, summarise
 
 import numpy as np
@@ -72,13 +72,9 @@ class Study:
         return self._hats[(count, *key)]
 
     def forward(self, name: str) -> float | None:
-        """Concentration of gaze about the head in the other places: that of greatest likelihood (Banerjee et al. 2005),
-        nearly."""
+        """Concentration of gaze about the head in the other places."""
         means = [p.ahead for n, p in self.places.items() if n != name and np.isfinite(p.ahead)]
-        if not means:
-            return None
-        mean = float(np.mean(means))
-        return mean * (3 - mean**2) / (1 - mean**2)
+        return concentration(float(np.mean(means))) if means else None
 
     def prior(self, name: str):
         """The log of what `training.gaze.prior` makes of the rays of the other real places, in directions (..., 3)."""

@@ -146,10 +146,12 @@ def _fold(scored, pool, place, seed: int) -> Fold:
         maps = DistanceMaps(place, test.centres)
         features, ray_features, known = maps.features(test.directions), maps.features(at), float(maps.known.mean())
     probe_features = features_at(place, probes.centres, probes.directions)
-    return Fold(test, features, at, _ahead(scored, at), ray_features, known, away, probes, probe_features, place)
+    return Fold(
+        test, features, at, cosines_to_heads(scored, at), ray_features, known, away, probes, probe_features, place
+    )
 
 
-def _ahead(rays, at: np.ndarray) -> np.ndarray | None:
+def cosines_to_heads(rays, at: np.ndarray) -> np.ndarray | None:
     """Cosines (P, K) between directions ``at`` (P, K, 3), which are some of the rays', and where the heads pointed."""
     from scipy.spatial import KDTree
 

@@ -29,6 +29,12 @@ _ROUNDS = 60
 _MOST = 1500
 
 
+def concentration(mean: float) -> float:
+    """κ of the von Mises-Fisher density whose directions have this ``mean`` cosine to its axis, nearly that of greatest
+    likelihood (Banerjee et al. 2005, eq. 4.4)."""
+    return mean * (3 - mean**2) / (1 - mean**2)
+
+
 def basis(features: np.ndarray, count: int) -> np.ndarray:
     """Values (..., B) of the hat functions of the first ``count`` of ``features`` (..., F), clipped to their knots."""
     out = []

@@ -66,8 +66,8 @@ def summarise(name: str, found: Sequence[Scored], seed: int = 0) -> list[dict]:
     rng = np.random.default_rng(seed)
     draws = [np.ones(len(persons), int)]
     draws += [rng.multinomial(len(persons), np.full(len(persons), 1 / len(persons))) for _ in range(_RESAMPLES)]
-    truths = {k: _truth(t, np.ones(len(t.persons))) for k, t in tests.items()}
-    bits = {id(s): np.array([_bits(s, times, persons) for times in draws]) for s in found}
+    truths = {k: truth_of(t, np.ones(len(t.persons))) for k, t in tests.items()}
+    bits = {id(s): np.array([bits_of(s, times, persons) for times in draws]) for s in found}
     rows = []
     groups = list(dict.fromkeys((s.people, s.method) for s in found))
     for people, method in sorted(groups, key=lambda g: g[0]):
@@ -79,7 +79,7 @@ def summarise(name: str, found: Sequence[Scored], seed: int = 0) -> list[dict]:
             firsts = {s.fold: s for s in reversed(base)}
             base = [firsts[s.fold] for s in own]
         less = value - np.nanmean([bits[id(s)] for s in base], axis=0) if base else np.full(len(value), np.nan)
-        maps = np.mean([_maps(s, *truths[s.fold]) for s in own], axis=0)
+        maps = np.mean([maps_of(s, *truths[s.fold]) for s in own], axis=0)
         row = {"place": name, "people": people, "method": method, "KLD": maps[0], "CC": maps[1], "bits": value[0]}
         row |= {"bits.low": np.nanquantile(value[1:], 0.025), "bits.high": np.nanquantile(value[1:], 0.975)}
         row["less"] = less[0]
@@ -88,22 +88,29 @@ def summarise(name: str, found: Sequence[Scored], seed: int = 0) -> list[dict]:
     return rows
 
 
-def _truth(test: Any, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """``(share of each person (P, N), negative entropy (P,), norm of the deviation (P,))`` of the truth."""
-    share = test.counts * times
+def truth_of(
+    test: Any, times: np.ndarray, here: np.ndarray | slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """``(share of each person (P, N), negative entropy (P,), norm of the deviation (P,))`` of the truth at the
+    positions ``here``, where each person counts so many ``times`` (N,)."""
+    share = test.counts[here] * times
     share = share / share.sum(axis=1, keepdims=True)
-    parts = test.parts / np.maximum(test.parts.sum(axis=2, keepdims=True), 1e-30)
+    parts = test.parts[here]
+    parts = parts / np.maximum(parts.sum(axis=2, keepdims=True), 1e-30)
     p = np.einsum("pn,pnd->pd", share, parts)
     entropy = (p * np.log(np.maximum(p, _LEAST))).sum(axis=1)
     return share, entropy, np.linalg.norm(p - p.mean(axis=1, keepdims=True), axis=1)
 
 
-def _maps(s: Scored, share: np.ndarray, entropy: np.ndarray, norm: np.ndarray) -> tuple[float, float]:
-    kld = entropy - (share * s.cross).sum(axis=1)
-    return float(kld.mean()), float(((share * s.product).sum(axis=1) / norm).mean())
+def maps_of(
+    s: Scored, share: np.ndarray, entropy: np.ndarray, norm: np.ndarray, here: np.ndarray | slice = slice(None)
+) -> tuple[float, float]:
+    """KLD (nats) and CC, means over the positions ``here``, whose truth is that of `truth_of`."""
+    kld = entropy - (share * s.cross[here]).sum(axis=1)
+    return float(kld.mean()), float(((share * s.product[here]).sum(axis=1) / norm).mean())
 
 
-def _bits(s: Scored, times: np.ndarray, persons: list[str]) -> float:
+def bits_of(s: Scored, times: np.ndarray, persons: list[str]) -> float:
     """Mean over rays, each as often as its person; NaN where nobody is left."""
     own = times[np.searchsorted(persons, s.test.persons)]
     weight = own[s.test.who[:, : s.bits.shape[1]]]

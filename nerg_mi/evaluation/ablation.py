@@ -63,6 +63,8 @@ class Variant:
     begin: bool = False
     # and stays so.
     frozen: bool = False
+    # What it is trained on (`training.gaze.settings.LOSSES`); "": the recipe's.
+    loss: str = ""
 
     def file_name(self, seed: int) -> str:
         """Name of the checkpoint of its training with a ``seed``."""
@@ -70,11 +72,13 @@ class Variant:
 
 
 def all_variants(radiance: bool, recipes: Sequence[str] = ("default", "paper")) -> list[Variant]:
-    """Of each of ``recipes`` the three variants and, where there is a ``radiance`` field and the recipe takes them, the
-    semantic ones and the two initialisations."""
+    """Of each of ``recipes`` the three variants, the product on each other loss that the recipe may be trained on and,
+    where there is a ``radiance`` field and the recipe takes them, the semantic ones and the two initialisations."""
     out = []
     for recipe in map(gaze_recipe, recipes):
         out += [Variant(name=name, recipe=recipe.name, gaze=name) for name in ("emit", "capture", "emit_capture")]
+        own = recipe.gaze_settings().loss
+        out += [Variant(name=f"loss {loss}", recipe=recipe.name, loss=loss) for loss in recipe.losses if loss != own]
         if radiance and "semantic" in recipe.takes:
             out += [
                 Variant(name=f"semantic {kind}{', own too' * own}", recipe=recipe.name, semantic=kind, semantic_own=own)

@@ -68,7 +68,8 @@ def ablate(
     if options.cameras:
         folder = output if options.field is None else Path(options.field).parent
         timer = frame_timer(bench.place, bench.centres, folder, options.cameras, width, height)
-    due = [(v, seed) for v in variants for seed in range(options.seeds if gaze_recipe(v.recipe).quick else 1)]
+    seeds = lambda v: range(options.first, options.first + (options.seeds if gaze_recipe(v.recipe).quick else 1))
+    due = [(v, seed) for v in variants for seed in seeds(v)]
     rows = []
     for (variant, seed), row in zip(due, _rows(due, bench, data, reporter)):
         if timer is not None:

@@ -51,7 +51,9 @@ def bench_of(data: Rays, options: AblationOptions, folder: Path, ns: ModuleType,
     """What all variants have in common that are trained on some of the rays ``data`` and scored on the others; a place
     of hit points is written into ``folder``."""
     truth = law_of(options.law) if options.law else None
-    _, account = hold_out(data, options.radius, options.zones, options.positions, 0, options.min_rays, options.people)
+    _, account = hold_out(
+        data, options.radius, options.zones, options.positions, options.first, options.min_rays, options.people
+    )
     train, scored, centres = held_out_rays(data, account, "both" if options.people else "pos")
     place = make_place(options, train, (), folder / "place.vol", ns, reporter=reporter)
     # Bad places are part of what may be compared: it is told, and no more.
@@ -77,6 +79,7 @@ def plan_of(variant: Variant, seed: int, bench: Bench) -> GazePlan:
             semantic_own=variant.semantic_own,
             begin="field" if variant.begin else "random",
             freeze=variant.frozen,
+            loss=variant.loss or None,
             steps=(options.default_steps if quick else options.steps) or None,
             probes=options.probes or None,
             refit=options.refit or quick,

@@ -31,7 +31,7 @@ from .reporter import SILENT, Reporter
 _FIELD, _ROW = "gaze.safetensors", "row.json"
 _RAYS = "of-the-job/rays.npz"
 _OF_TRAINING = ("geometry", "steps", "default_steps", "probes", "zones", "positions", "people", "radius", "kappa")
-_OF_TRAINING += ("min_rays", "law", "refit", "mode")
+_OF_TRAINING += ("first", "min_rays", "law", "refit", "mode")
 
 _last: dict[str, tuple[Bench, TemporaryDirectory]] = {}
 

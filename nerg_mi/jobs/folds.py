@@ -41,7 +41,7 @@ FIELD, SCORED = "gaze.safetensors", "scores.json"
 
 _LEVELS = tuple(level_name(level) for level in LEVELS)
 _RAYS = "of-the-job/rays.npz"
-_TRAINING = ("recipe", "variant", "radius", "probes", "steps", "mix_folds", "mix_kappa", "mode")
+_TRAINING = ("recipe", "variant", "radius", "probes", "steps", "mix_folds", "mix_kappa", "ensemble", "mode")
 _SCORING = ("kappa", "directions", "min_rays", "mode")
 
 

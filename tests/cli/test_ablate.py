@@ -24,6 +24,7 @@ ASKED = {
     "positions": 8,
     "people": 0.25,
     "radius": 0.5,
+    "first": 4,
     "kappa": 9.0,
     "min_rays": 3,
     "law": "a:B",

@@ -42,14 +42,19 @@ def test_variants():
     names = [(v.recipe, v.name) for v in all_variants(True)]
     assert [n for r, n in names if r == "default"] == ["emit", "capture", "emit_capture"]
     paper = [n for r, n in names if r == "paper"]
-    assert len(paper) == 9 and sum("semantic" in n for n in paper) == 4 and "begins as the field, frozen" in paper
-    assert len(all_variants(False)) == 6 and len(all_variants(True, ("small",))) == 9
+    assert (
+        len(paper) == 10
+        and "loss code" in paper
+        and sum("semantic" in n for n in paper) == 4
+        and "begins as the field, frozen" in paper
+    )
+    assert len(all_variants(False)) == 7 and len(all_variants(True, ("small",))) == 10
 
 
 def test_each_has_a_file_of_its_own():
     variants = all_variants(True, ("small", "paper"))
     names = {v.file_name(seed) for v in variants for seed in (0, 1)}
-    assert len(names) == 36 and "paper_begins_as_the_field_frozen_0.safetensors" in names
+    assert len(names) == 40 and "paper_begins_as_the_field_frozen_0.safetensors" in names
 
 
 def test_losses_are_related_to_those_of_the_whole_field():

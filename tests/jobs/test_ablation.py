@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.evaluation import ablation
 from nerg_mi.jobs import ablation_bench
 from nerg_mi.jobs.ablation import ablate
 from nerg_mi.jobs.options.ablation import AblationOptions
@@ -81,7 +82,7 @@ def test_splats_have_no_features_of_a_radiance_field(tmp_path):
     given = replace(
         OPTIONS, geometry=None, field=tmp_path / "place.ply", recipes="small", variant=("semantic snapshot",)
     )
-    with pytest.raises(NergError, match="emit_capture here, got"):
+    with pytest.raises(NergError, match="loss code here, got"):
         ablate(crowd(100), tmp_path / "new", given)
 
 
@@ -104,3 +105,19 @@ def test_only_quick_recipes_are_repeated(tmp_path, monkeypatch, recipe, seeds, s
         s = plan.settings
         assert (s.seed, s.steps, s.refit, plan.config.variant, plan.probes.count) == (seed, steps, refit, "emit", 12)
         assert s.watched_rays == 8
+
+
+def test_another_first_seed_holds_others_out(tmp_path, monkeypatch):
+    made = []
+
+    def kept(row, plan, path, bench):
+        made.append((row["seed"], plan.settings.seed, bench.centres.tobytes()))
+        path.write_bytes(b"")
+        return {**row, "test_KLD": 1.0, "test_CC": 0.5, "train_seconds": 1.0, "test_loss": 1.0, "train_loss": 1.0}
+
+    monkeypatch.setattr(ablation_bench, "_train", kept)
+    monkeypatch.setattr(ablation, "write_ablation", lambda *args: [])
+    for first in (0, 5):
+        ablate(crowd(1000), tmp_path / str(first), replace(OPTIONS, first=first, variant=("emit",), cameras=0))
+    assert [m[:2] for m in made] == [(0, 0), (1, 1), (5, 5), (6, 6)]
+    assert made[0][2] == made[1][2] != made[2][2] == made[3][2]

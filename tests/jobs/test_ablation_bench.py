@@ -26,6 +26,7 @@ def test_a_semantic_variant_is_planned_with_the_features_of_the_place(tmp_path):
         c = plan.config
         assert (c.variant, c.semantic, c.semantic_own) == (variant.gaze, variant.semantic, variant.semantic_own)
         assert (plan.initial is not None, plan.settings.frozen) == (variant.begin, variant.frozen)
+        assert plan.settings.loss == (variant.loss or "paper")
         if variant.semantic or variant.begin:
             assert c.geometry == place.radiance.config.geometry
 

@@ -18,6 +18,7 @@ class AblationOptions(PlaceOptions, PartOptions):
         (), 'Only this one, such as emit_capture or "semantic snapshot"; may be given several times.'
     )
     seeds: int = option(3, "Seeds of the default recipe; the others have one.")
+    first: int = option(0, "Seed of what is held out, and of the first training.", min=0)
     steps: int | None = option(None, "Steps of every recipe but the default one. Default: the recipe's.")
     default_steps: int | None = option(None, "Steps of the default recipe. Default: its own.")
     probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.")

@@ -24,6 +24,9 @@ class FoldOptions(PlaceOptions, PartOptions):
     people: float = option(0.5, "Share of the people who are held out of a fold's training.", min=0.01, max=0.99)
     recipe: str = option("default", "Recipe of the trainings; see docs/gaze-training.md.")
     variant: str = option("emit_capture", "emit, capture or emit_capture.")
+    ensemble: int = option(
+        0, "Members of each fold's field, whose spread is judged as support is. 0: one field.", min=0, max=100
+    )
     align: Path | None = option(None, "JSON file with the 4x4 similarity from the rays' frame to the place's.")
     radius: float | None = option(None, "Radius R of a probe in metres. Default: the recipe's.")
     probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.")
