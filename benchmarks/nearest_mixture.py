@@ -3,8 +3,8 @@
     python benchmarks/nearest_mixture.py [--only office,room] [--folds 1] [--out out/benchmarks/nearest_mixture]
 
 Places are those of `places.py`: half of the people train, the others are scored at 60 positions in three zones. As in
-`training.gaze.mixing`, inner folds choose how much is mixed in of a density that needs no field: the largest share that
-is worse than the best by no more than a standard error. That density is the blind one (kernels of 10, as the recipe has
+`training.gaze.mixing`, inner folds choose how much is mixed in of a density that needs no field, here the largest share
+that is worse than the best by no more than a whole standard error. That density is the blind one (kernels of 10, as the recipe has
 it, or of 20), half of it that of the 4,096 nearest rays (kernels of 20), or as much of these as the folds choose.
 """
 

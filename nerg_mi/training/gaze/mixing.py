@@ -3,10 +3,11 @@
 Where few people were tracked, or hardly moved, a field follows those whom it has seen, and is worse for others than
 where people look wherever they stand. Folds of the training rays tell: in each some people are held out, at places that
 are held out too, and a field is trained on the others. The share of the blind density is that which foretells those who
-were held out best, by a mixture of both densities (stacking, Wolpert 1992; Smyth and Wolpert 1999). Of shares that
-cannot be told apart the largest is taken: the simpler density unless the field is better by a standard error (Breiman
-et al. 1984). Where the field needs none of it in the first folds, the others are left out. The same looks that were
-held out tell which regions of the mixture hold 80 % of the gaze of others.
+were held out best, by a mixture of both densities (stacking, Wolpert 1992; Smyth and Wolpert 1999). Of shares that are
+alike the largest is taken: the simpler density unless the field is better by half a standard error, in place of the
+whole one of Breiman et al. (1984), which costs places that are sure of their field. Where the field needs none of it in
+the first folds, the others are left out. The same looks that were held out tell which regions of the mixture hold 80 %
+of the gaze of others.
 """
 
 from __future__ import annotations
@@ -44,6 +45,8 @@ _ZONES, _POSITIONS, _RAYS, _DIRECTIONS = 3, 48, 16, 1024
 # Folds after which a field that needs no more than the least share in any is believed; probes of a fold at most, and
 # its steps as a share of the training's: both end alike for this question.
 _ENOUGH, _PROBES, _STEPS = 2, 512, 0.5
+# Standard errors by which a share may be worse than the best.
+_DOUBT = 0.5
 # Of a density (1/sr), so that its logarithm is finite.
 _LEAST = 1e-9
 
@@ -200,10 +203,10 @@ def _regions(judgements: Sequence[_Judgement], mix: float) -> dict[str, float]:
 
 
 def _choose(curves: np.ndarray) -> MixChoice:
-    """The largest of `SHARES` that is worse than the best by no more than a standard error over folds (F, S)."""
+    """The largest of `SHARES` that is worse than the best by no more than half a standard error over folds (F, S)."""
     mean, count = curves.mean(axis=0), len(curves)
     best = int(mean.argmin())
     more = curves - curves[:, best : best + 1]
     error = more.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.zeros(len(SHARES))
-    chosen = int(np.flatnonzero(more.mean(axis=0) <= error)[-1])
+    chosen = int(np.flatnonzero(more.mean(axis=0) <= _DOUBT * error)[-1])
     return MixChoice(float(SHARES[chosen]), count, float(mean[chosen]), float(mean[0]), float(mean[-1]))
