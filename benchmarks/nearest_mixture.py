@@ -4,8 +4,9 @@
 
 Places are those of `places.py`: half of the people train, the others are scored at 60 positions in three zones. As in
 `training.gaze.mixing`, inner folds choose how much is mixed in of a density that needs no field, here the largest share
-that is worse than the best by no more than a whole standard error. That density is the blind one (kernels of 10, as the recipe has
-it, or of 20), half of it that of the 4,096 nearest rays (kernels of 20), or as much of these as the folds choose.
+that is worse than the best by no more than a whole standard error. That density is the blind one (kernels of 10, as the
+recipe has it, or of 20), half of it that of the 4,096 nearest rays (kernels of 20), or as much of these as the folds
+choose.
 """
 
 from __future__ import annotations
