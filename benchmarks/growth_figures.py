@@ -54,7 +54,7 @@ def growth_figure(curves: Sequence[Mapping]):
 def roofline_figure(peak: float, bandwidths: Mapping[str, float], intensity: float, found: Mapping[str, float]):
     """The roofs of a machine of ``peak`` GFLOP/s and ``bandwidths`` (GB/s by name), and the GFLOP/s ``found`` by name
     at ``intensity`` (operations a byte)."""
-    figure = new_page(520, 340)
+    figure = new_page(700, 340)
     axes = figure.subplots()
     x = np.geomspace(0.1, 100, 200)
     for k, (name, rate) in enumerate(bandwidths.items()):
@@ -69,6 +69,7 @@ def roofline_figure(peak: float, bandwidths: Mapping[str, float], intensity: flo
     axes.set_ylabel("GFLOP/s", fontsize=8, color=INK)
     axes.set_title("An evaluation of density under the roof of the machine", fontsize=9, color=INK)
     axes.tick_params(labelsize=7, colors=INK, length=2)
-    axes.legend(fontsize=7, frameon=False)
+    # Beside the axes: where the markers are depends on the machine.
+    axes.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.01, 0.5))
     figure.tight_layout()
     return figure
