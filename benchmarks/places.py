@@ -1,7 +1,7 @@
 """One protocol for gaze in many places: where is a field better than what knows less, and where is it worse?
 
     python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--mix-kappa K]
-        [--recipe default] [--variant emit_capture] [--against FOLDS.csv] [--out out/benchmarks/places]
+        [--recipe default] [--variant VARIANT] [--against FOLDS.csv] [--out out/benchmarks/places]
 
 Real people in a supermarket (surfaces from their hit points) and in three scenes of EyeNavGS (no geometry), the demo
 store's shoppers among its field, and four generated places with laws of their own (`generated_places.py`), among their
@@ -29,7 +29,7 @@ SCORES = {"KLD": False, "CC": True, "bits": True}
 def main(argv=None) -> None:
     parser = place_parser(__doc__, "places", folds=4)
     parser.add_argument("--recipe", default="default")
-    parser.add_argument("--variant", default="emit_capture", help="emit, capture or emit_capture")
+    parser.add_argument("--variant", help="emit, capture or emit_capture. Default: the recipe's.")
     parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
     parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
     parser.add_argument("--mix-kappa", type=float, help="Default: the recipe's.")

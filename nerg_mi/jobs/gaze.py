@@ -92,6 +92,8 @@ def train_gaze(
     about |= place.about
     reporter.progress(0.0, "placing probes and tracing their depths")
     plan = plan_gaze(options, place, views_alone=supervision.rays is None)
+    if place.kind == "none" and options.variant is None:
+        reporter.message("no surfaces are known: capture alone is trained, where people look from each position")
     if plan.initial and options.field is not None:
         about["begins_as"] = Path(options.field).name
     result = train_planned(

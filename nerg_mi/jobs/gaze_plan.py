@@ -8,7 +8,7 @@ from typing import Any
 from nerg_mi.errors import NergError, chosen
 from nerg_mi.training.gaze.blind import check_kernels
 from nerg_mi.training.gaze.plan import GazePlan
-from nerg_mi.training.gaze.recipes import FieldChoices, Recipe, gaze_recipe
+from nerg_mi.training.gaze.recipes import FieldChoices, Recipe, default_variant, gaze_recipe
 from nerg_mi.training.gaze.settings import ProbeSettings
 from nerg_mi.training.gaze.targets import TargetNeeds
 from nerg_mi.training.geometry.places import GazePlace
@@ -101,7 +101,7 @@ def _named(options: GazeOptions) -> str:
 
 def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldChoices:
     return FieldChoices(
-        variant=options.variant,
+        variant=options.variant or default_variant(kind),
         activation=options.activation,
         size=options.size,
         # Views alone do not say how much is looked altogether.

@@ -74,8 +74,9 @@ def test_a_job_returns_the_field_and_says_how_it_went(rays):
     assert heard.shares[-1] == 1 and heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
     assert heard.texts[-1] == "folds: step 2" and about["mix"]["folds"] == 1
     told = [m.split(";")[0].split(":")[0] for m in heard.messages]
-    assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "held out in 1 fold"]
-    assert told[3] == f"regions of {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs"
+    assert told[0] == "no surfaces are known" and result.field.config.variant == "capture"
+    assert told[1:4] == [f"{about['probes_made']} probes", "3 steps", "held out in 1 fold"]
+    assert told[4] == f"regions of {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs"
 
 
 def test_a_job_writes_what_the_command_writes(rays, tmp_path, capsys):

@@ -23,7 +23,9 @@ class FoldOptions(PlaceOptions, PartOptions):
     positions: int = option(60, "Test positions in them.", min=1)
     people: float = option(0.5, "Share of the people who are held out of a fold's training.", min=0.01, max=0.99)
     recipe: str = option("default", "Recipe of the trainings; see docs/gaze-training.md.")
-    variant: str = option("emit_capture", "emit, capture or emit_capture.")
+    variant: str | None = option(
+        None, "emit, capture or emit_capture. Default: emit_capture, and capture without any geometry."
+    )
     ensemble: int = option(
         0, "Members of each fold's field, whose spread is judged as support is. 0: one field.", min=0, max=100
     )

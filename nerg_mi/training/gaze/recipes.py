@@ -29,7 +29,7 @@ DEFAULT = "default"
 class FieldChoices:
     """What of a gaze field is chosen besides its recipe, which heeds the variant, the place and what it ``takes``."""
 
-    # "emit", "capture" or "emit_capture".
+    # "emit", "capture" or "emit_capture"; see `default_variant`.
     variant: str = "emit_capture"
     # Of the emit head (`field.gaze.product.ACTIVATIONS`); None: the recipe's.
     activation: str | None = None
@@ -88,7 +88,7 @@ class Recipe:
         field. ``views_alone``: there are no rays. Raises `NergError` where the place has no surfaces, or is no radiance
         field, and such a one is needed.
         """
-        choices = replace(choices or FieldChoices(), place=place.kind)
+        choices = replace(choices or FieldChoices(variant=default_variant(place.kind)), place=place.kind)
         config, initial = self.config(choices), None
         if begin or choices.semantic:
             option = "--begin field" if begin else "--semantic"
@@ -140,6 +140,12 @@ def _log_density(choices: FieldChoices) -> LogGazeConfig:
         mix=0.05,
         **surroundings(choices.place),
     )
+
+
+def default_variant(place: str) -> str:
+    """The factors of a field in a kind of ``place``: both, or capture alone where no surfaces are known, since emit
+    would learn of things that are not there."""
+    return "capture" if place == "none" else "emit_capture"
 
 
 class Surroundings(TypedDict):

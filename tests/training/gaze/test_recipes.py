@@ -53,6 +53,13 @@ def test_a_log_density_is_told_of_its_place():
         gaze_recipe("small").plan(NOWHERE)
 
 
+def test_without_surfaces_capture_is_trained_alone_unless_told_otherwise():
+    variant = lambda place, *choices: gaze_recipe().plan(place, *choices).config.variant
+    assert [variant(place) for place in (SCENE, HITS, NOWHERE)] == ["emit_capture", "emit_capture", "capture"]
+    assert [variant(NOWHERE, FieldChoices(variant=v)) for v in ("emit_capture", "emit")] == ["emit_capture", "emit"]
+    assert gaze_recipe("small").plan(SCENE).config.variant == "emit_capture"
+
+
 def test_what_is_chosen_arrives():
     choices = FieldChoices(activation="exp", size="small", normalized=True)
     config = gaze_recipe("paper").plan(SCENE, choices).config
