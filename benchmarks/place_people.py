@@ -38,7 +38,6 @@ def main(argv=None) -> None:
     for name, make in asked_places(args).items():
         rows.append(measure(name, make, args, ns))
         write_rows(args.out / "people.csv", rows)
-        print(rows[-1], flush=True)
     told = lambda r, s: f"{r[f'{s} less']:+.3f} ± {r[f'{s} reach']:.3f}"
     table = [
         (r["place"], r["people"], *(cell for s in SCORES for cell in (f"{r[s]:.3f}", told(r, s))))
