@@ -130,6 +130,8 @@ def test_output(case, inputs, tmp_path, capsys, monkeypatch, rgb):
             code, said = nerg(capsys, *case.arguments(inputs, out))
         assert told_in_a_sentence(code, said) and "largest size" in said, said
         found = files(out)
+        # What a training has come to is kept where its state is small enough, and said.
+        assert (found.pop("a.run", None) is not None) == ("the training is kept" in said)
         assert set(found) == set(case.files), "a leftover, or a loss"
         assert all(content == b"old" or limit >= len(content) > 3 for content in found.values())
         assert any(content == b"old" for content in found.values())
