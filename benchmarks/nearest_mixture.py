@@ -3,8 +3,8 @@
     python benchmarks/nearest_mixture.py [--only office,room] [--folds 1] [--out out/benchmarks/nearest_mixture]
 
 Places are those of `places.py`: half of the people train, the others are scored at 60 positions in three zones. As in
-`training.gaze.mixing`, inner folds choose how much is mixed in of a density that needs no field, here the largest share
-that is worse than the best by no more than a whole standard error. That density is the blind one (kernels of 10, as the
+`training.gaze.mixing`, inner folds choose how much is mixed in of a density that needs no field, the largest share
+that is worse than the best by no more than half a standard error. That density is the blind one (kernels of 10, as the
 recipe has it, or of 20), half of it that of the 4,096 nearest rays (kernels of 20), or as much of these as the folds
 choose.
 """
@@ -140,12 +140,14 @@ def inner_curves(rays, place, plan, ns) -> dict[str, np.ndarray]:
 
 def chosen(curves: np.ndarray, parts: tuple[float, ...]) -> tuple[float, float]:
     """Share and part of the nearest rays: of those that are worse than the best of ``curves`` (F, parts, shares) by no
-    more than a standard error the largest share, and of these the smallest part."""
+    more than half a standard error the largest share, and of these the smallest part."""
+    from nerg_mi.training.gaze.mixing import DOUBT
+
     flat = curves.reshape(len(curves), -1)
     mean = flat.mean(axis=0)
     more = flat - flat[:, [int(mean.argmin())]]
     error = more.std(axis=0, ddof=1) / np.sqrt(len(flat)) if len(flat) > 1 else np.zeros(len(mean))
-    kept = np.flatnonzero(more.mean(axis=0) <= error)
+    kept = np.flatnonzero(more.mean(axis=0) <= DOUBT * error)
     found = max((SHARES[k % len(SHARES)], -parts[k // len(SHARES)]) for k in kept.tolist())
     return float(found[0]), float(-found[1])
 

@@ -1,12 +1,12 @@
 """Would a share of the blind density that falls with support be better than one share a place?
 
-    python benchmarks/support_mixture.py [--only room,truck] [--folds 3] [--out out/benchmarks/places-before]
+    python benchmarks/support_mixture.py [--only room,truck] [--folds 3] [--out out/benchmarks/support_mixture]
 
-Places, folds and people are those of `places.py` with `--mix-folds 0`, whose kept fields are read where they are in the
-same folder. The people who are held out are scored at new positions, where there is next to no support, and where
-others stood, where there is; for every share of the blind density that a training tries. "One share" is the best of
-all positions of a fold together, "by support" the best at new positions and the best at the others, each chosen by the
-very people who are scored: more than a rule that has to choose by others could gain.
+Places, folds and people are those of `places.py`, fields those of the recipe before a share is chosen; a field that is
+kept in the same folder is read. The people who are held out are scored at new positions, where there is next to no
+support, and where others stood, where there is; for every share of the blind density that a training tries. "One share"
+is the best of all positions of a fold together, "by support" the best at new positions and the best at the others, each
+chosen by the very people who are scored: more than a rule that has to choose by others could gain.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SPLITS = {"both": "new positions", "people": "where others stood"}
 def main(argv=None) -> None:
     from nerg_mi.jobs.backend import select_backend
 
-    args, rows = parse(place_parser(__doc__, "places-before", folds=3), argv), []
+    args, rows = parse(place_parser(__doc__, "support_mixture", folds=3), argv), []
     ns = select_backend("llvm_ad_rgb", args.threads)
     for name, make in asked_places(args).items():
         for fold in fold_fields(*write_place(name, make, args), args, ns, mix_folds=0):
