@@ -20,7 +20,6 @@ from place_rays import asked_places, parse, place_parser, write_place
 
 import numpy as np
 
-SHARES = np.linspace(0.05, 1.0, 20)
 BLIND, WIDE, NEAREST = "blind, kappa 20", "blind, kappa 10", "4,096 nearest rays"
 # By name, the densities that are mixed: parts of the nearest rays that may be chosen, and the blind density beside.
 RULES = {
@@ -108,7 +107,7 @@ def inner_curves(rays, place, plan, ns) -> dict[str, np.ndarray]:
     from nerg_mi.errors import NergError
     from nerg_mi.evaluation.saliency import kld
     from nerg_mi.training.gaze.likelihood import LikelihoodTrainer, heads_box
-    from nerg_mi.training.gaze.mixing import inner_folds
+    from nerg_mi.training.gaze.mixing import SHARES, inner_folds
     from nerg_mi.training.gaze.ray_targets import targets_of_rays
     from nerg_mi.training.gaze.targets import TargetNeeds
 
@@ -141,13 +140,9 @@ def inner_curves(rays, place, plan, ns) -> dict[str, np.ndarray]:
 def chosen(curves: np.ndarray, parts: tuple[float, ...]) -> tuple[float, float]:
     """Share and part of the nearest rays: of those that are worse than the best of ``curves`` (F, parts, shares) by no
     more than half a standard error the largest share, and of these the smallest part."""
-    from nerg_mi.training.gaze.mixing import DOUBT
+    from nerg_mi.training.gaze.mixing import SHARES, nearly_best
 
-    flat = curves.reshape(len(curves), -1)
-    mean = flat.mean(axis=0)
-    more = flat - flat[:, [int(mean.argmin())]]
-    error = more.std(axis=0, ddof=1) / np.sqrt(len(flat)) if len(flat) > 1 else np.zeros(len(mean))
-    kept = np.flatnonzero(more.mean(axis=0) <= DOUBT * error)
+    kept = nearly_best(curves.reshape(len(curves), -1))
     found = max((SHARES[k % len(SHARES)], -parts[k // len(SHARES)]) for k in kept.tolist())
     return float(found[0]), float(-found[1])
 

@@ -6,8 +6,8 @@ An ablation (`nerg ablate`) a fold, each with other people (half), other positio
 held out or begun with. A table a place has a row a recipe and variant: means over folds of the paper's loss,
 KLD + (1 - CC) + MAE, on positions of the training and by how much it rises to held-out ones, and of held-out KLD and
 CC; `less` is a variant less the product of emit and capture of the same recipe, fold by fold, with 95 % of Student's t.
-The last table has the CC of all places, a row a place and recipe: of the product, and of the variants less it. Rows are
-kept, and trained once.
+The last table has the CC of all places, a row a place and recipe: of the product, of the variants less it, and the
+median of the seconds that the product was trained for. Rows are kept, and trained once.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ def main(argv=None) -> None:
         heads = ("recipe", "variant", "loss, training", "rises by", "KLD", "less", "CC", "less")
         print_table(f"The paper's variants: {name}", heads, summarise(own))
         write_rows(args.out / "folds.csv", each)
-    print_table("CC in all places", ("place", "recipe", "product", *(f"{v} less it" for v in ORDER)), order(each))
+    heads = ("place", "recipe", "product", *(f"{v} less it" for v in ORDER), "s")
+    print_table("CC in all places", heads, order(each))
 
 
 def summarise(rows: list[dict]) -> list[list[str]]:
@@ -80,13 +81,15 @@ def summarise(rows: list[dict]) -> list[list[str]]:
 
 
 def order(rows: list[dict]) -> list[list[str]]:
-    """CC of the product in each place, and by how much the variants of `ORDER` are above it."""
+    """CC of the product in each place, by how much the variants of `ORDER` are above it, and seconds of training."""
     out = []
     for place, recipe in dict.fromkeys((r["place"], r["recipe"]) for r in rows):
         own = [r for r in rows if r["place"] == place]
-        whole = [r["test_CC"] for r in own if (r["recipe"], r["variant"]) == (recipe, WHOLE)]
-        above = [less(own, recipe, variant, "test_CC") for variant in ORDER]
-        out.append([place, recipe, f"{np.mean(whole):.3f}" if whole else "", *map(told, above)])
+        whole = [r for r in own if (r["recipe"], r["variant"]) == (recipe, WHOLE)]
+        cc = f"{np.mean([r['test_CC'] for r in whole]):.3f}" if whole else ""
+        seconds = f"{np.median([r['train_seconds'] for r in whole]):.0f}" if whole else ""
+        above = (told(less(own, recipe, variant, "test_CC")) for variant in ORDER)
+        out.append([place, recipe, cc, *above, seconds])
     return out
 
 

@@ -40,13 +40,13 @@ SHARES = np.linspace(0.05, 1.0, 20)
 """Shares of the blind density that are tried: never none, so that no density is zero."""
 MINUTES = 0.5
 """Share of the minutes of a training that the folds take."""
-DOUBT = 0.5
-"""Standard errors by which the share that is chosen may be worse than the best."""
 # Zones, positions in all of them and rays at each, of what a fold holds out; and directions that it is judged in.
 _ZONES, _POSITIONS, _RAYS, _DIRECTIONS = 3, 48, 16, 1024
 # Folds after which a field that needs no more than the least share in any is believed; probes of a fold at most, and
 # its steps as a share of the training's: both end alike for this question.
 _ENOUGH, _PROBES, _STEPS = 2, 512, 0.5
+# Standard errors by which a share may be worse than the best.
+_DOUBT = 0.5
 # Of a density (1/sr), so that its logarithm is finite.
 _LEAST = 1e-9
 
@@ -202,11 +202,15 @@ def _regions(judgements: Sequence[_Judgement], mix: float) -> dict[str, float]:
     return calibrated_levels(np.concatenate(levels), np.concatenate(weights))
 
 
+def nearly_best(curves: np.ndarray) -> np.ndarray:
+    """Indices of the columns of ``curves`` (F, S), a row a fold, that are worse than the one of the least mean by no
+    more than half a standard error over folds."""
+    more = curves - curves[:, [int(curves.mean(axis=0).argmin())]]
+    error = more.std(axis=0, ddof=1) / np.sqrt(len(curves)) if len(curves) > 1 else np.zeros(curves.shape[1])
+    return np.flatnonzero(more.mean(axis=0) <= _DOUBT * error)
+
+
 def _choose(curves: np.ndarray) -> MixChoice:
-    """The largest of `SHARES` that is worse than the best by no more than half a standard error over folds (F, S)."""
-    mean, count = curves.mean(axis=0), len(curves)
-    best = int(mean.argmin())
-    more = curves - curves[:, best : best + 1]
-    error = more.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.zeros(len(SHARES))
-    chosen = int(np.flatnonzero(more.mean(axis=0) <= DOUBT * error)[-1])
-    return MixChoice(float(SHARES[chosen]), count, float(mean[chosen]), float(mean[0]), float(mean[-1]))
+    """The largest of `SHARES` that is nearly the best over folds (F, S)."""
+    mean, chosen = curves.mean(axis=0), int(nearly_best(curves)[-1])
+    return MixChoice(float(SHARES[chosen]), len(curves), float(mean[chosen]), float(mean[0]), float(mean[-1]))
