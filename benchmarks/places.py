@@ -1,7 +1,7 @@
 """One protocol for gaze in many places: where is a field better than what knows less, and where is it worse?
 
     python benchmarks/places.py [--only room,office] [--folds 4] [--first 0] [--mix-folds N] [--mix-kappa K]
-        [--recipe default] [--variant VARIANT] [--against FOLDS.csv] [--out out/benchmarks/places]
+        [--recipe default] [--variant VARIANT] [--no-surfaces] [--against FOLDS.csv] [--out out/benchmarks/places]
 
 Real people in a supermarket (surfaces from their hit points) and in three scenes of EyeNavGS (no geometry), the demo
 store's shoppers among its field, and four generated places with laws of their own (`generated_places.py`), among their
@@ -10,7 +10,8 @@ trained on within 2R of. Beside the field: uniform, position-blind, nearest prob
 half of those who are scored foretells the other. `rank` is among the methods that are no split half; `less` is the
 field less the best of the others, fold by fold, with 95 % of Student's t; `way` is how far the field goes from the
 blind density to the split half in CC, where that is better than blind. `--mix-folds 0` is a field without a chosen
-share of the blind density. `--against` prints the field less that of another run, fold by fold, from its folds.csv.
+share of the blind density, `--no-surfaces` one that is told of no surfaces, where they are known, too. `--against`
+prints the field less that of another run, fold by fold, from its folds.csv.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ def main(argv=None) -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first fold")
     parser.add_argument("--mix-folds", type=int, help="Default: the recipe's.")
     parser.add_argument("--mix-kappa", type=float, help="Default: the recipe's.")
+    parser.add_argument("--no-surfaces", action="store_true", help="as if no place had known surfaces")
     parser.add_argument("--against", type=Path, help="folds.csv of a run whose field this one is compared with")
     args = parse(parser, argv)
     if args.against is not None and not args.against.is_file():
@@ -58,7 +60,7 @@ def score(name: str, make: Make, args: argparse.Namespace) -> list[dict]:
     select_backend("llvm_ad_rgb", args.threads)
     folder, rays, where = write_place(name, make, args)
     options = FoldOptions(
-        **where,
+        **({"geometry": "none"} if args.no_surfaces else where),
         recipe=args.recipe,
         variant=args.variant,
         folds=args.folds,
