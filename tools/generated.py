@@ -59,7 +59,7 @@ def recipes() -> str:
         values = [getattr(recipe, made)() for recipe in found]
         names = dict.fromkeys(name for recipe in found for name in getattr(recipe, given))
         rows += [(f"{prefix}`{name}`", *(_shown(getattr(v, name)) for v in values)) for name in names]
-    configs = [_flat(recipe.config(FieldChoices())) for recipe in found]
+    configs = [_flat(recipe.architectures(FieldChoices())[0]) for recipe in found]
     names = dict.fromkeys(name for config in configs for name in config)
     rows += [(f"field: `{name}`", *(_shown(c.get(name)) for c in configs)) for name in names]
     return table(("", *(f"`{recipe.name}`" for recipe in found)), rows)

@@ -23,6 +23,7 @@ from nerg_mi.rays.rays import Rays
 from nerg_mi.training.gaze import run
 from nerg_mi.training.gaze.ensemble import train_ensemble
 from nerg_mi.training.gaze.fit import GazeProgress
+from nerg_mi.training.gaze.mixing import mixes
 from nerg_mi.training.gaze.plan import GazePlan
 from nerg_mi.training.gaze.settings import ProbeSettings
 from nerg_mi.training.gaze.splits import far_views, hold_out
@@ -93,7 +94,9 @@ def train_gaze(
     reporter.progress(0.0, "placing probes and tracing their depths")
     plan = plan_gaze(options, place, views_alone=supervision.rays is None)
     if place.kind == "none" and options.variant is None:
-        reporter.message("no surfaces are known: capture alone is trained, where people look from each position")
+        choose = plan.alternatives and mixes(plan) and supervision.rays is not None
+        how = "folds choose between capture alone and emit x capture" if choose else "capture alone is trained"
+        reporter.message(f"no surfaces are known: {how}")
     if plan.initial and options.field is not None:
         about["begins_as"] = Path(options.field).name
     result = train_planned(
@@ -236,6 +239,9 @@ def _tell(result: GazeResult, reporter: Reporter) -> None:
     )
     if "mix" in about:
         m = about["mix"]
+        if m["variant"]:
+            klds = ", ".join(f"{kld:.3f} of {name}" for name, kld in m["variants"].items())
+            reporter.message(f"held-out KLD {klds}: {m['variant']} is trained")
         if m["folds"]:
             folds = f"{m['folds']} fold{'' if m['folds'] == 1 else 's'}"
             reporter.message(

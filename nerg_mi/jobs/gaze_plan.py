@@ -8,7 +8,7 @@ from typing import Any
 from nerg_mi.errors import NergError, chosen
 from nerg_mi.training.gaze.blind import check_kernels
 from nerg_mi.training.gaze.plan import GazePlan
-from nerg_mi.training.gaze.recipes import FieldChoices, Recipe, default_variant, gaze_recipe
+from nerg_mi.training.gaze.recipes import FieldChoices, Recipe, gaze_recipe
 from nerg_mi.training.gaze.settings import ProbeSettings
 from nerg_mi.training.gaze.targets import TargetNeeds
 from nerg_mi.training.geometry.places import GazePlace
@@ -39,7 +39,7 @@ def check_plan(options: GazeOptions, views_alone: bool = False) -> ProbeSettings
     recipe = gaze_recipe(options.recipe)
     _check(options, recipe, views_alone)
     with chosen(_named(options)):
-        config = recipe.config(_choices(options, place_kind(options), views_alone))
+        config = recipe.architectures(_choices(options, place_kind(options), views_alone))[0]
     recipe.gaze_settings(_settings(options), views_alone)
     probes = recipe.probe_settings(_probes(options))
     if rows := TargetNeeds.of(config).blind_rows:
@@ -101,7 +101,7 @@ def _named(options: GazeOptions) -> str:
 
 def _choices(options: GazeOptions, kind: str, views_alone: bool) -> FieldChoices:
     return FieldChoices(
-        variant=options.variant or default_variant(kind),
+        variant=options.variant or "",
         activation=options.activation,
         size=options.size,
         # Views alone do not say how much is looked altogether.

@@ -58,13 +58,20 @@ WARM_UP = 5
 
 
 def test_a_gaze_training_keeps_its_state_and_its_result(inputs, tmp_path):
-    line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {ENDLESS}"
+    line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} --variant capture {ENDLESS}"
     done = interrupted("training.gaze.likelihood.LikelihoodTrainer.step", 4, *line.split())
     assert done.returncode == 130 and "go on with --resume" in done.stderr, done.stderr
     assert sorted(os.listdir(tmp_path)) == ["a.run", "a.safetensors"]
     # The step during which it came is finished.
     assert read_checkpoint(tmp_path / "a.run", "gaze run")[1]["steps"] == 4
     assert read_checkpoint(tmp_path / "a.safetensors", "gaze")[1]["provenance"]["interrupted"]
+
+
+def test_a_gaze_training_whose_variant_is_not_chosen_yet_says_that_nothing_was_kept(inputs, tmp_path):
+    line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {ENDLESS}"
+    done = interrupted("training.gaze.likelihood.LikelihoodTrainer.step", 4, *line.split())
+    assert done.returncode == 130 and "nothing was kept" in done.stderr and "--resume" not in done.stderr, done.stderr
+    assert not os.listdir(tmp_path)
 
 
 def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
@@ -77,7 +84,7 @@ def test_a_radiance_training_keeps_its_state_and_its_result(inputs, tmp_path):
 
 
 def test_an_ensemble_keeps_its_members_and_its_state(inputs, tmp_path):
-    some = "--steps 3 --ensemble 2 --save-every 0"
+    some = "--variant capture --steps 3 --ensemble 2 --save-every 0"
     line = f"train gaze {inputs}/rays.npz -o {tmp_path}/a.safetensors {GAZE} {some}"
     done = interrupted("training.gaze.likelihood.LikelihoodTrainer.step", 5, *line.split())
     assert done.returncode == 130 and "member 2 of 2; go on with --resume" in done.stderr, done.stderr

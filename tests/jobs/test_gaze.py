@@ -66,7 +66,7 @@ def arrays(field):
 def test_a_job_returns_the_field_and_says_how_it_went(rays):
     """Of rays in memory, without any file."""
     heard = Listener()
-    result = train_gaze(rays, options=QUICK, reporter=heard)
+    result = train_gaze(rays, options=replace(QUICK, variant="capture"), reporter=heard)
     assert result.output is None and not result.interrupted and result.field.config.geometry == "none"
     about = result.provenance
     assert about["recipe"] == "default" and about["steps"] == 3 and about["geometry"] == "none"
@@ -74,9 +74,26 @@ def test_a_job_returns_the_field_and_says_how_it_went(rays):
     assert heard.shares[-1] == 1 and heard.texts[0].startswith("placing probes") and "fit: step 3" in heard.texts
     assert heard.texts[-1] == "folds: step 2" and about["mix"]["folds"] == 1
     told = [m.split(";")[0].split(":")[0] for m in heard.messages]
-    assert told[0] == "no surfaces are known" and result.field.config.variant == "capture"
-    assert told[1:4] == [f"{about['probes_made']} probes", "3 steps", "held out in 1 fold"]
-    assert told[4] == f"regions of {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs"
+    assert told[:3] == [f"{about['probes_made']} probes", "3 steps", "held out in 1 fold"]
+    assert told[3] == f"regions of {100 * about['mix']['regions']['80%']:.0f} % of the field's gaze held 80 % of theirs"
+
+
+def test_folds_choose_the_variant_where_no_surfaces_are_known(rays):
+    """Before the fit; what they chose is told, and is what was trained."""
+    heard = Listener()
+    result = train_gaze(rays, options=QUICK, reporter=heard)
+    mix = result.provenance["mix"]
+    assert set(mix["variants"]) == {"capture", "emit_capture"} and mix["variant"] == result.field.config.variant
+    assert mix["mix"] == result.field.config.mix
+    order = [text.split(":")[0] for text in heard.texts if "fold" in text or "fit" in text]
+    assert list(dict.fromkeys(order))[-1] == "fit" and order[0].startswith("fold 1 of capture")
+    assert heard.messages[0].startswith("no surfaces are known: folds choose")
+    assert any(m.endswith(f"{mix['variant']} is trained") for m in heard.messages)
+    # Without folds nothing chooses.
+    heard = Listener()
+    result = train_gaze(rays, options=replace(QUICK, mix_folds=0), reporter=heard)
+    assert result.field.config.variant == "capture" and "mix" not in result.provenance
+    assert heard.messages[0] == "no surfaces are known: capture alone is trained"
 
 
 def test_a_job_writes_what_the_command_writes(rays, tmp_path, capsys):
@@ -201,7 +218,7 @@ def test_positions_and_people_are_held_out_and_told(tmp_path):
 
 def test_an_interrupted_job_returns_what_there_is_or_says_how_to_go_on(rays, tmp_path):
     """Without a file it is all that can be had; with one, a script must not go on as if it were done."""
-    options = replace(QUICK, steps=8, fresh=True, threads=1)
+    options = replace(QUICK, steps=8, fresh=True, threads=1, variant="capture")
     result = train_gaze(rays, options=options, reporter=Listener(0.5))
     assert result.interrupted and result.provenance["steps"] == 4
     out = tmp_path / "gaze.safetensors"

@@ -48,7 +48,7 @@ class GazeOptions(PlaceOptions):
     directions: int | None = option(None, "Directions of a probe.")
     fresh: bool = option(False, "Draw the directions anew for every epoch, not once a probe.", "--fresh-directions")
     variant: str | None = option(
-        None, "emit, capture or emit_capture. Default: emit_capture, and capture without any geometry."
+        None, "emit, capture or emit_capture. Default: emit_capture; without any geometry folds choose it or capture."
     )
     activation: str | None = option(None, "Of the emit head of small and paper: softplus, exp or linear.")
     size: str | None = option(None, "Of the field of small and paper: small or paper.")

@@ -34,8 +34,9 @@ from .plan import GazePlan
 from .run import train_gaze
 from .settings import GazeSettings
 from .state import KIND as RUN
-from .state import StateSettings
+from .state import StateSettings, kept_identity
 from .supervision import Supervision
+from .variants import CHOICE, choose_variant
 
 FEW = 5
 """Blocks that a resample needs at least; people are the blocks where there are as many of them."""
@@ -117,14 +118,18 @@ def train_ensemble(
     kind, path = _kind(members, supervision, plan), state.path
     # Folds of resamples would have a person on both sides: the share of the blind density is chosen once, on the rays.
     mixed = mixes(plan) and supervision.rays is not None
-    whole, plan = plan, plan.with_settings(mix_folds=0)
-    if plan.settings.minutes is not None:
-        share = 1 - MINUTES if mixed else 1.0
-        plan = plan.with_settings(minutes=share * plan.settings.minutes / members)
     parts = [path and path.with_name(f"{path.stem}.member{k}.safetensors") for k in range(members)]
     is_file = lambda file: file is not None and file.is_file()
     if state.resume and not any(map(is_file, (path, *parts))):
         raise NergError(f'there is nothing to resume: "{path}" does not exist; leave out --resume to start')
+    tell = tell or (lambda progress: None)
+    plan, choice = choose_variant(supervision, place, plan, ns, tell, _kept(state, parts, ns))
+    if choice is not None:
+        state = replace(state, about={**state.about, CHOICE: choice.to_dict()})
+    whole, plan = plan, plan.with_settings(mix_folds=0)
+    if plan.settings.minutes is not None:
+        share = 1 - MINUTES if mixed else 1.0
+        plan = plan.with_settings(minutes=share * plan.settings.minutes / members)
     fields, each = [], []
     for k, part in enumerate(parts):
         own = replace(state, about={**state.about, "member": [k, members]})
@@ -140,7 +145,7 @@ def train_ensemble(
                 member_plan,
                 ns,
                 state=replace(own, resume=state.resume and is_file(path)),
-                tell=tell and _of_member(tell, k, members),
+                tell=_of_member(tell, k, members),
                 write=None if part is None else _writer(part, identity),
             )
             if provenance["interrupted"]:
@@ -148,9 +153,9 @@ def train_ensemble(
                 raise KeyboardInterrupt(f"interrupted while training member {k + 1} of {members}; {kept}")
         fields.append(field)
         each.append(provenance)
-    choice = None
-    if mixed:
-        choice = choose_mix(supervision, place, whole, ns, tell or (lambda progress: None))
+    if mixed and choice is None:
+        choice = choose_mix(supervision, place, whole, ns, tell)
+    if choice is not None:
         for field in fields:
             give_mix(field, choice.mix)
     ensemble = GazeEnsemble(fields, supervision.support(plan.probes.radius, place))
@@ -164,6 +169,14 @@ def train_ensemble(
             if part is not None:
                 part.unlink(missing_ok=True)
     return TrainedEnsemble(ensemble, provenance)
+
+
+def _kept(state: StateSettings, parts: list[Path | None], ns: ModuleType) -> dict | None:
+    """What an ensemble that is gone on with has been started as, by the first of its files; None where it starts
+    anew."""
+    if not state.resume or (state.path is not None and state.path.is_file()):
+        return kept_identity(state)
+    return next((load_gaze(p, ns)[1]["provenance"]["about"] for p in parts if p is not None and p.is_file()), None)
 
 
 def _kind(members: int, supervision: Supervision, plan: GazePlan) -> str:

@@ -67,12 +67,22 @@ class MixChoice:
     kld_blind: float | None = None
     # Shares that are to be asked for so that regions hold those of ``density.regions.LEVELS``, by their names.
     regions: dict[str, float] | None = None
+    # Of several variants (``variants.choose_variant``) the one that was chosen, and the KLD of each, with its share, in
+    # the folds that all have.
+    variant: str | None = None
+    variants: dict[str, float] | None = None
 
     def to_dict(self) -> dict:
         """As JSON, for the provenance."""
-        regions = None if self.regions is None else {k: round(v, 4) for k, v in self.regions.items()}
-        rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(self).items()}
-        return {**rounded, "regions": regions}
+        return {k: _rounded(v) for k, v in asdict(self).items()}
+
+    @staticmethod
+    def of(found: dict) -> MixChoice:
+        """The one of which `to_dict` was kept. Raises ``TypeError`` and ``ValueError`` for what is none."""
+        choice = MixChoice(**found)
+        if not 0 <= choice.mix <= 1:
+            raise ValueError(f'the share "mix" must be from 0 to 1, got {choice.mix}')
+        return choice
 
 
 def mixes(plan: GazePlan) -> bool:
@@ -89,7 +99,44 @@ def choose_mix(
     supervision: Supervision, place: GazePlace, plan: GazePlan, ns: ModuleType, tell: Listener = lambda progress: None
 ) -> MixChoice:
     """The share of the blind density for a field that ``plan`` trains on ``supervision``, which has rays, in ``place``:
-    that of the plan where no fold has people and positions enough to be judged by.
+    that of the plan where no fold has people and positions enough to be judged by. See `judge_folds`."""
+    return judge_folds(supervision, place, plan, ns, tell).choose()
+
+
+class _Judgement(NamedTuple):
+    """What a fold tells of regions: densities (P, D) of the field and of the blind density, and the directions (n,)
+    that the rays of those who are held out are nearest to, probe after probe by ``offsets`` (P + 1,)."""
+
+    field: np.ndarray
+    blind: np.ndarray
+    bins: np.ndarray
+    offsets: np.ndarray
+
+
+@dataclass(frozen=True)
+class JudgedFolds:
+    """What folds tell of one architecture."""
+
+    # The share that it has of itself.
+    mix: float
+    # KLD (F, S) in each fold with each of ``SHARES``.
+    curves: np.ndarray
+    # Of each fold.
+    judgements: list[_Judgement]
+
+    def choose(self) -> MixChoice:
+        """The share that it is given: its own where there is no fold."""
+        if not len(self.curves):
+            return MixChoice(self.mix, 0)
+        choice = _choose(self.curves)
+        return replace(choice, regions=_regions(self.judgements, choice.mix))
+
+
+def judge_folds(
+    supervision: Supervision, place: GazePlace, plan: GazePlan, ns: ModuleType, tell: Listener = lambda progress: None
+) -> JudgedFolds:
+    """How well fields that ``plan`` trains on ``supervision``, which has rays, in ``place`` foretell people and
+    positions that are held out, with each share of the blind density.
 
     ``tell`` is told how it goes. Raises ``KeyboardInterrupt`` after Ctrl-C, or where ``tell`` does. The place is that
     of all rays in each fold: one of hit points knows the surfaces that those who are held out have met, not who looked
@@ -127,20 +174,7 @@ def choose_mix(
         if len(curves) == _ENOUGH and all(int(np.argmin(curve)) == 0 for curve in curves):
             break
     tell(GazeProgress("folds", 1.0, settings.steps or 0, 0.0, None))
-    if not curves:
-        return MixChoice(config.mix, 0)
-    choice = _choose(np.array(curves))
-    return replace(choice, regions=_regions(judgements, choice.mix))
-
-
-class _Judgement(NamedTuple):
-    """What a fold tells of regions: densities (P, D) of the field and of the blind density, and the directions (n,)
-    that the rays of those who are held out are nearest to, probe after probe by ``offsets`` (P + 1,)."""
-
-    field: np.ndarray
-    blind: np.ndarray
-    bins: np.ndarray
-    offsets: np.ndarray
+    return JudgedFolds(config.mix, np.array(curves), judgements)
 
 
 def inner_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.ndarray]]:
@@ -174,6 +208,13 @@ def inner_folds(rays: Rays, plan: GazePlan) -> Iterator[tuple[Rays, Rays, np.nda
             learn &= ~mask
         if learn.any():
             yield rays.select(learn), held, split.test_centres
+
+
+def _rounded(value):
+    """``value`` with its numbers to four digits."""
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return round(value, 4) if isinstance(value, float) else value
 
 
 def _kld(truth: np.ndarray, density: np.ndarray) -> float:

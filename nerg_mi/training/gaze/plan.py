@@ -20,6 +20,8 @@ class GazePlan:
 
     # Architecture of the field.
     config: GazeFieldConfig
+    # Others that folds may choose in its place (`variants.choose_variant`).
+    alternatives: tuple[GazeFieldConfig, ...] = ()
     # How weights are moved, and for how long.
     settings: GazeSettings
     # How rays become probes.

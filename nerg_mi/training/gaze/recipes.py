@@ -29,8 +29,8 @@ DEFAULT = "default"
 class FieldChoices:
     """What of a gaze field is chosen besides its recipe, which heeds the variant, the place and what it ``takes``."""
 
-    # "emit", "capture" or "emit_capture"; see `default_variant`.
-    variant: str = "emit_capture"
+    # "emit", "capture" or "emit_capture"; "": one of `default_variants`.
+    variant: str = ""
     # Of the emit head (`field.gaze.product.ACTIVATIONS`); None: the recipe's.
     activation: str | None = None
     # Of the networks (`sizes.SIZES`); None: the recipe's.
@@ -53,7 +53,8 @@ class Recipe:
     name: str
     # What it is, in a clause.
     summary: str
-    # Makes the architecture of what is chosen. Raises `NergError` for a place that such a field cannot be trained in.
+    # Makes the architecture of what is chosen, a variant among it. Raises `NergError` for a place that such a field
+    # cannot be trained in.
     config: Callable[[FieldChoices], GazeFieldConfig]
     # Moves the weights of such a field.
     trainer: type[GazeTrainer]
@@ -88,8 +89,8 @@ class Recipe:
         field. ``views_alone``: there are no rays. Raises `NergError` where the place has no surfaces, or is no radiance
         field, and such a one is needed.
         """
-        choices = replace(choices or FieldChoices(variant=default_variant(place.kind)), place=place.kind)
-        config, initial = self.config(choices), None
+        choices = replace(choices or FieldChoices(), place=place.kind)
+        (config, *alternatives), initial = self.architectures(choices), None
         if begin or choices.semantic:
             option = "--begin field" if begin else "--semantic"
             if place.radiance is None:
@@ -103,11 +104,18 @@ class Recipe:
                 config = replace(config, geometry=place.radiance.config.geometry)
         return GazePlan(
             config=config,
+            alternatives=tuple(alternatives),
             settings=self.gaze_settings(settings, views_alone),
             probes=self.probe_settings(probes),
             trainer=self.trainer,
             initial=initial,
         )
+
+    def architectures(self, choices: FieldChoices) -> tuple[GazeFieldConfig, ...]:
+        """That of ``choices``; without a variant those of `default_variants`, the one that is taken where nothing
+        chooses first. Raises as ``config`` does."""
+        variants = (choices.variant,) if choices.variant else default_variants(choices.place)
+        return tuple(self.config(replace(choices, variant=variant)) for variant in variants)
 
     def gaze_settings(self, given: Mapping[str, Any] | None = None, views_alone: bool = False) -> GazeSettings:
         """The recipe's settings with those that are ``given`` in their place; see `plan`."""
@@ -142,10 +150,10 @@ def _log_density(choices: FieldChoices) -> LogGazeConfig:
     )
 
 
-def default_variant(place: str) -> str:
-    """The factors of a field in a kind of ``place``: both, or capture alone where no surfaces are known, since emit
-    would learn of things that are not there."""
-    return "capture" if place == "none" else "emit_capture"
+def default_variants(place: str) -> tuple[str, ...]:
+    """The factors of a field in a kind of ``place``: both. Where no surfaces are known, emit learns of things that are
+    not there: capture alone, unless folds find both better."""
+    return ("capture", "emit_capture") if place == "none" else ("emit_capture",)
 
 
 class Surroundings(TypedDict):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from types import ModuleType
 from typing import NamedTuple
 
@@ -23,9 +24,10 @@ from .mixing import MINUTES, choose_mix, give_mix, mixes
 from .plan import GazePlan, alignment
 from .ray_targets import targets_of_rays
 from .splits import split_validation
-from .state import GazeRunFile, StateSettings
+from .state import GazeRunFile, StateSettings, kept_identity
 from .supervision import Supervision
 from .targets import TargetNeeds, Targets, concatenate
+from .variants import CHOICE, choose_variant
 from .view_targets import targets_of_views
 
 
@@ -51,16 +53,22 @@ def train_gaze(
     Some zones of positions are held out, purged by 2R, and watched: the weights that score best there count (the loss
     that is trained), and the run ends when they get no better. With ``refit`` a second fit then uses everything for as
     many steps; the scores stay those of the first. Where there are rays, and ``plan.settings.mix_folds`` asks for them,
-    folds of people and positions then choose a log density's share of the blind density (``mixing``). Ctrl-C ends the
-    run after the step at hand, with what it has come to. Raises `NergError` when the rays make no probe.
+    folds of people and positions then choose a log density's share of the blind density (``mixing``); of several
+    architectures they choose one before (``variants``). Ctrl-C ends the run after the step at hand, with what it has
+    come to; before the first fit it raises ``KeyboardInterrupt``. Raises `NergError` when the rays make no probe.
 
     ``state``: where the state of the run is kept, and whether to go on from it. ``tell``: is told how the run goes.
     ``write``: is given the result, which it puts into a file. Once it has done so, the state of a run that is done is
     removed; if it raises, the state is that of the end. Without it the state stays.
     """
     tell, state, started = tell or (lambda progress: None), state or StateSettings(), time.perf_counter()
+    plan, choice = choose_variant(supervision, place, plan, ns, tell, kept_identity(state))
+    if choice is not None:
+        state = replace(state, about={**state.about, CHOICE: choice.to_dict()})
     settings, needs = plan.settings, TargetNeeds.of(plan.config)
     file = GazeRunFile(state.path, plan.identity(supervision, place, state), state.every, state.resume)
+    file.seconds += time.perf_counter() - started
+    started = time.perf_counter()
     tell(GazeProgress("probes", 0.0, 0, 0.0, None))
     split, watched = split_validation(supervision, place, settings, plan.probes), None
     if split.watched is not None:
@@ -82,8 +90,8 @@ def train_gaze(
             used, targets = supervision, make_targets(supervision, place, plan, needs, settings.seed)
     last = fit_again(targets, first, place.box, plan, ns, file, tell) if again else first
     trainer = last.trainer
-    interrupted, choice = first.interrupted or last.interrupted, None
-    if mixed and not interrupted:
+    interrupted = first.interrupted or last.interrupted
+    if mixed and choice is None and not interrupted:
         try:
             choice = choose_mix(supervision, place, plan, ns, tell)
         except KeyboardInterrupt:

@@ -38,6 +38,25 @@ class StateSettings:
     about: dict = field(default_factory=dict)
 
 
+def kept_identity(state: StateSettings) -> dict | None:
+    """What the run that ``state`` goes on with has been started as (`GazePlan.identity`); None where it starts anew.
+    Raises `NergError` where nothing was kept, and for a damaged file."""
+    if not state.resume:
+        return None
+    path = _kept_file(state.path)
+    with restoring(path):
+        about = read_checkpoint(path, KIND)[1]["about"]
+        if not isinstance(about, dict):
+            raise TypeError("it does not say what it was started as")
+    return about
+
+
+def _kept_file(path: Path | None) -> Path:
+    if path is None or not path.is_file():
+        raise NergError(f'there is nothing to resume: "{path}" does not exist; leave out --resume to start')
+    return path
+
+
 class GazeRunFile:
     """State of one training, kept in ``path`` (None: not at all) every ``every`` seconds.
 
@@ -51,8 +70,7 @@ class GazeRunFile:
         self.stage, self.found, self.seconds, self._tensors = None, {}, 0.0, {}
         self._started = self._kept = time.perf_counter()
         if resume:
-            if path is None or not path.is_file():
-                raise NergError(f'there is nothing to resume: "{path}" does not exist; leave out --resume to start')
+            path = _kept_file(path)
             self._tensors, self._meta = read_checkpoint(path, KIND)
             with restoring(path):
                 require_same(path, self._meta["about"], about)

@@ -53,11 +53,16 @@ def test_a_log_density_is_told_of_its_place():
         gaze_recipe("small").plan(NOWHERE)
 
 
-def test_without_surfaces_capture_is_trained_alone_unless_told_otherwise():
-    variant = lambda place, *choices: gaze_recipe().plan(place, *choices).config.variant
-    assert [variant(place) for place in (SCENE, HITS, NOWHERE)] == ["emit_capture", "emit_capture", "capture"]
-    assert [variant(NOWHERE, FieldChoices(variant=v)) for v in ("emit_capture", "emit")] == ["emit_capture", "emit"]
-    assert gaze_recipe("small").plan(SCENE).config.variant == "emit_capture"
+def test_without_surfaces_folds_choose_between_capture_and_both_unless_told_otherwise():
+    def variants(place, *choices, recipe="default"):
+        plan = gaze_recipe(recipe).plan(place, *choices)
+        return [c.variant for c in (plan.config, *plan.alternatives)]
+
+    assert [variants(place) for place in (SCENE, HITS)] == [["emit_capture"]] * 2
+    assert variants(NOWHERE) == ["capture", "emit_capture"]
+    for v in ("emit_capture", "emit", "capture"):
+        assert variants(NOWHERE, FieldChoices(variant=v)) == [v]
+    assert variants(SCENE, recipe="small") == ["emit_capture"]
 
 
 def test_what_is_chosen_arrives():
