@@ -15,14 +15,13 @@
 #   make coverage  all tests, and which branches of the package they reach
 #   make fuzz      damage what every reader reads, 20,000 times, and count what comes of it (some ten minutes)
 #   make mutants   judge the tests by 400 small mistakes in the source, resuming where it stopped (about an hour at first)
-#   make mendings  bring faults of the past back, one at a time: the tests that look for each must fail (a quarter of an hour)
 #   make faults    kill commands at moments spread over their run, fill disks, forbid folders: nothing may be lost
 #   make soak      thousands of frames and steps: memory may not grow
 #   make bench     frames, stages, evaluations, growth and memory beside peers (under ten minutes); ARGS=--long for more
 #   make bench-gpu the same on a CUDA device, where there is one
 #   make packages  build the packages, install and try them with every Python that is here
 #
-# The last nine print tables; ARGS="--update docs/trust.md" puts them there, and of bench ARGS="--page docs/performance.md". Set-up is done once: the second run of any of
+# The last eight print tables; ARGS="--update docs/trust.md" puts them there, and of bench ARGS="--page docs/performance.md". Set-up is done once: the second run of any of
 # these only does its own work.
 
 PYTHON ?= python3
@@ -34,12 +33,12 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
-.PHONY: demo test check lint types format docs manual onecore coverage fuzz mutants mendings faults soak packages bench bench-gpu setup
+.PHONY: demo test check lint types format docs manual onecore coverage fuzz mutants faults soak packages bench bench-gpu setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
 
-test check onecore coverage fuzz mutants mendings faults soak packages: EXTRAS = test
+test check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
 
 test: setup
 	$(PYTEST) $(ARGS)
@@ -79,7 +78,7 @@ onecore: setup
 coverage: setup
 	$(RUN) -m tools.branches $(ARGS)
 
-fuzz mutants mendings faults soak packages: setup
+fuzz mutants faults soak packages: setup
 	$(RUN) -m tools.$@ $(ARGS)
 
 bench: setup
