@@ -23,6 +23,20 @@ constexpr long CHUNK = 64 * BLOCK;
 typedef float Floats __attribute__((vector_size(64)));
 typedef uint32_t Words __attribute__((vector_size(64)));
 
+// A vector that fills one register, and the letter by which inline assembly names such a register.
+#if defined __AVX512F__
+typedef Floats Register;
+#elif defined __AVX__
+typedef float Register __attribute__((vector_size(32)));
+#else
+typedef float Register __attribute__((vector_size(16)));
+#endif
+#ifdef __aarch64__
+#define IN_REGISTER "+w"
+#else
+#define IN_REGISTER "+v"
+#endif
+
 struct Field {
     const float *table, *hidden, *head;  // rows of two features; (width, inputs); (width,)
     const float *scales;                 // of each level
@@ -230,13 +244,12 @@ int network(const Network *n, const float *in, float *out, int64_t count, int th
 float peak_products(int64_t rounds, int threads) {
     std::vector<float> found(threads);
     on_threads(threads, [&](int thread) {
-        Floats sums[12];
-        for (int k = 0; k < 12; ++k) sums[k] = all(1e-3f * (k + thread));
-        Floats a = all(0.999999f), b = all(1e-7f);
-        for (int64_t round = 0; round < rounds; ++round) {
+        Register sums[12], a = 0.999999f - (Register){}, b = 1e-7f - (Register){};
+        for (int k = 0; k < 12; ++k) sums[k] = 1e-3f * (k + thread) - (Register){};
+        for (int64_t round = 0; round < rounds * int64_t(sizeof(Floats) / sizeof(Register)); ++round) {
 #pragma GCC unroll 12
             for (int k = 0; k < 12; ++k) sums[k] = sums[k] * a + b;
-            asm volatile("" : "+v"(a), "+v"(b));  // so that rounds are not drawn together
+            asm volatile("" : IN_REGISTER(a), IN_REGISTER(b));  // so that rounds are not merged
         }
         for (int k = 0; k < 12; ++k) found[thread] += sums[k][0];
     });

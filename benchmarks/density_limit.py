@@ -26,7 +26,7 @@ from timing import in_turns, median, spread
 import numpy as np
 
 SOURCE = Path(__file__).with_name("density_limit.cpp")
-FLAGS = ("-O3", "-march=native", "-ffast-math", "-fPIC", "-pthread")
+FLAGS = ("-O3", "-ffast-math", "-fPIC", "-pthread")
 # Without -ffast-math, which links code that makes the whole process take its smallest numbers for 0: SciPy's trees do
 # not end then.
 LINKING = ("-shared", "-fPIC", "-pthread")
@@ -52,10 +52,13 @@ def compiler() -> str | None:
     return next(filter(None, map(shutil.which, ("g++", "clang++"))), None)
 
 
-def build(folder: Path) -> ctypes.CDLL:
-    """The program, built in ``folder``. Raises ``RuntimeError`` with what the compiler says where it does not."""
+def build(folder: Path, target: str = "native") -> ctypes.CDLL:
+    """Compile the program in ``folder`` for a processor (``target`` of ``-march``) and load it.
+
+    Raises ``RuntimeError`` with the compiler's message where it fails.
+    """
     path, part = folder / "density_limit.so", folder / "density_limit.o"
-    for options in ((*FLAGS, "-c", SOURCE, "-o", part), (*LINKING, part, "-o", path)):
+    for options in ((*FLAGS, f"-march={target}", "-c", SOURCE, "-o", part), (*LINKING, part, "-o", path)):
         done = subprocess.run([compiler() or "g++", *options], capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"{SOURCE.name} was not compiled: {done.stderr.strip()}")

@@ -2,6 +2,7 @@
 which are compared do the same work."""
 
 import importlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,6 +40,12 @@ def test02_work_of_an_evaluation(benchmark):
     assert (work.loads, work.bytes) == (8, 8 * 8 + 16) and work.flops == 6 + blend + network + 11
 
 
+def processor_flags() -> list[str]:
+    """Instruction sets of this processor, by Linux; none where another system runs."""
+    description = Path("/proc/cpuinfo")
+    return description.read_text().split() if description.is_file() else []
+
+
 @pytest.fixture(scope="module")
 def small():
     """A field of dense and hashed levels, its densities far from one another."""
@@ -57,12 +64,15 @@ def small():
     return field
 
 
-def test03_the_hand_written_density_is_ours(benchmark, small, tmp_path):
+@pytest.mark.parametrize("target", ["native", "x86-64-v3"])  # the second has AVX2 and no AVX-512
+def test03_the_hand_written_density_is_ours(benchmark, small, tmp_path, target):
     limit = benchmark("density_limit")
+    if target != "native" and "avx2" not in processor_flags():
+        pytest.skip("this processor has no AVX2")
     if limit.compiler() is None:
         pytest.skip("no C++ compiler")
     p = limit.random_points(small, 1024)
-    with_hand = limit.Limit(small, limit.build(tmp_path), threads=2)
+    with_hand = limit.Limit(small, limit.build(tmp_path, target), threads=2)
     # All others in this process still have their smallest numbers.
     assert (np.full(4, 1e-310) * 0.5).min() > 0
     ours = np.array(limit.ours(small, p)())
