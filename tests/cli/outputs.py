@@ -12,6 +12,7 @@ import numpy as np
 
 from nerg_mi.files.exr import write_exr
 from nerg_mi.formats.ply import write_columns
+from nerg_mi.jobs.counting.writing import has_parquet
 from nerg_mi.rays.rays import Rays
 from tests.evaluation.gaze.test_evaluation import crowd
 from tests.figures.standins import write_standins
@@ -33,8 +34,10 @@ ABLATION = (
     "default_emit_capture_0.safetensors default_emit_capture_0.json"
 )
 EVALUATION = "gaze.md gaze.csv persons.csv gaze.json positions.csv positions.png"
-STATS = "things.csv things.md things.parquet moves.csv moves.md moves.parquet durations.csv durations.md "
-STATS += "durations.parquet people.csv people.md people.parquet things.png moves.png about.json"
+STATS = "things.csv things.md moves.csv moves.md durations.csv durations.md people.csv people.md things.png moves.png "
+STATS += "about.json"
+if has_parquet():
+    STATS += " things.parquet moves.parquet durations.parquet people.parquet"
 GAZE = "--radius 0.6 --probes 8 --steps 2 --directions 64 --zones 0 --min-rays 8 --seed 1"
 
 
