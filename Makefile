@@ -1,7 +1,8 @@
-# Two commands on a fresh clone (Debian or Ubuntu, Python 3.10 or newer):
+# Commands on a fresh clone (Debian or Ubuntu, Python 3.10 or newer):
 #
 #   make demo      set up, render the demo place into out/demo
 #   make test      set up with the test extras, run the tests; ARGS="-k panorama" chooses among them, JOBS=0 runs them in one process
+#   make test-all  the same, and the tests marked "nightly": long trainings, whole demos, kills and leaks
 #
 # While working, and before a release:
 #
@@ -33,14 +34,17 @@ PYTEST = $(RUN) -m pytest -n $(JOBS) --maxprocesses 4 --dist loadfile
 ONE_CORE = tests/cli/test_render.py tests/cli/test_demo.py tests/cli/test_interrupts.py tests/files/test_exr.py tests/files/test_png.py \
 	tests/test_interruption.py tests/renders
 
-.PHONY: demo test check lint types format docs manual onecore coverage fuzz mutants faults soak packages bench bench-gpu setup
+.PHONY: demo test test-all check lint types format docs manual onecore coverage fuzz mutants faults soak packages bench bench-gpu setup
 
 demo: setup
 	.venv/bin/nerg demo --out out/demo
 
-test check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
+test test-all check onecore coverage fuzz mutants faults soak packages: EXTRAS = test
 
 test: setup
+	$(PYTEST) -m "not nightly" $(ARGS)
+
+test-all: setup
 	$(PYTEST) $(ARGS)
 
 bench bench-gpu: EXTRAS = torch
@@ -69,7 +73,7 @@ manual: setup
 	$(RUN) -m tools.site $(ARGS)
 
 check: setup
-	$(PYTEST) -q -m "not slow" $(ARGS)
+	$(PYTEST) -q -m "not slow and not nightly" $(ARGS)
 
 onecore: setup
 	@if command -v taskset > /dev/null; then taskset -c 0 $(RUN) -m pytest -q $(ONE_CORE) $(ARGS); \

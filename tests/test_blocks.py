@@ -206,6 +206,7 @@ def test08_datasets(tmp_path, monkeypatch):
     assert len(names["rays"]) > 0 and set(np.array(names["rays"].persons)[names["rays"].person]) == {"p0_1"}
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test09_from_recordings(rgb, place, monkeypatch):
     """The block of trainings, whose inputs are a table of four people and photos of the store, with fewer steps."""

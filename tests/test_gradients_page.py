@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from nerg_mi.jobs import demo
 from tests.figures.standins import write_standins
@@ -13,6 +14,7 @@ from tests.figures.standins import write_standins
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "gradients.md"
 
 
+@pytest.mark.nightly
 def test01_blocks(rgb, tmp_path, monkeypatch):
     store = tmp_path / "scenes" / "store"
     store.mkdir(parents=True)

@@ -39,6 +39,7 @@ def test01_the_page_leads_from_a_recording_to_a_picture():
     assert set(SMALLER) <= set(done)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test02_its_commands_run(rgb, tmp_path, monkeypatch, capsys):
     from nerg_mi.scenes.store import layout, shoppers, twin

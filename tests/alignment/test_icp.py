@@ -15,6 +15,7 @@ def quiet(share, text):
     assert 0 <= share <= 1 and text
 
 
+@pytest.mark.nightly
 def test_a_twin_in_millimetres_is_placed_and_a_mirrored_one_named():
     truth = rooms.similarity(np.random.default_rng(1), upright=True, scale=0.001)
     twin = rooms.carried(np.linalg.inv(truth), rooms.traces(9000).end)

@@ -17,6 +17,7 @@ def quiet(share, text):
     assert 0 <= share <= 1 and text
 
 
+@pytest.mark.nightly
 def test_the_tracking_alone_finds_its_place_and_a_mirrored_one_is_named():
     truth = rooms.similarity(np.random.default_rng(7), upright=True)
     target = Target(traces=rooms.traces(25_000).moved(truth))

@@ -82,6 +82,7 @@ def test01_writes_and_names_everything(rgb, standins, tmp_path, capsys):
         assert hashlib.sha256((out / name).read_bytes()).hexdigest() == digest
 
 
+@pytest.mark.nightly
 def test02_equal_seeds_equal_files(rgb, standins, tmp_path):
     def outputs(name, seed):
         options = demo.DemoOptions(defaults=standins, seed=seed, mode="llvm_ad_rgb", width=36, spp=1)

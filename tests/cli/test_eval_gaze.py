@@ -42,6 +42,7 @@ def test_the_job_is_given_what_was_asked_for(monkeypatch, capsys):
     assert said.rstrip().endswith("wrote a.eval/gaze.md")
 
 
+@pytest.mark.nightly
 def test_a_field_is_scored_as_it_was_trained(tmp_path, capsys):
     crowd().save(tmp_path / "rays.npz")
     gaze = tmp_path / "gaze.safetensors"

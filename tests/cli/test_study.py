@@ -9,6 +9,7 @@ from nerg_mi.cli import main
 from nerg_mi.evaluation.study.measure import COLUMNS
 
 
+@pytest.mark.nightly
 def test_quick_run_of_the_command(tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         main("study slab --quick --width 24 --height 16 -m llvm_ad_rgb --out".split() + [str(tmp_path / "new")])

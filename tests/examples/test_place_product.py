@@ -15,6 +15,7 @@ def shelf_run(tmp_path_factory):
     return place_product.main(["--quick", "--out", str(out)]), out
 
 
+@pytest.mark.nightly
 def test01_the_box_climbs_to_where_the_sweep_says(shelf_run):
     found, out = shelf_run
     at, values = found["sweep"]

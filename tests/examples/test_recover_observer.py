@@ -1,6 +1,7 @@
 """Recovering an observer, at sizes that take seconds: what is found, not what is printed."""
 
 import numpy as np
+import pytest
 
 from examples import recover_observer as example
 
@@ -30,6 +31,7 @@ def test02_a_step_solves_a_linear_problem_and_leaves_edges_out():
     assert np.linalg.norm(far) <= example.LONGEST * 1.0001
 
 
+@pytest.mark.nightly
 def test03_an_observer_is_found_again(rgb):
     pictures, truth = example.Pictures((24, 16), cameras=example.CAMERAS[2:3]), np.array([4.4, 2.8, 1.6])
     start = truth + (0.1, 0.2, 0.05)

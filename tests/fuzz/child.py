@@ -21,7 +21,7 @@ ROOM = 1 << 30
 """So much more memory may a case take, in bytes."""
 
 SECONDS = 5.0
-"""So much time of the processor."""
+"""So much time of the processor, for a file; a command has four times as much."""
 
 _FORBIDDEN = (
     "os.system",
@@ -115,11 +115,14 @@ def _memory(name: str) -> int:
 
 
 def _files(folder: Path) -> set:
-    return {(str(p.relative_to(folder)), p.stat().st_size) for p in folder.rglob("*")}
+    return {(str(p.relative_to(folder)), p.lstat().st_size) for p in folder.rglob("*")}
 
 
-def attempt(reader, folder: Path) -> dict:
-    """What comes of reading ``folder``: ``outcome`` is result, refusal, or one of the breaches of the contract."""
+def attempt(reader, folder: Path, special: str = "") -> dict:
+    """What comes of reading ``folder``: ``outcome`` is result, refusal, or one of the breaches of the contract.
+
+    A file of 64 GB (``special`` "sparse") may be refused for its size alone.
+    """
     global watched  # noqa: PLW0603 (an audit hook stays for good, and looks at this to know when it counts)
     from nerg_mi.errors import NergError
 
@@ -127,7 +130,7 @@ def attempt(reader, folder: Path) -> dict:
     before = _files(folder)
     Path("/proc/self/clear_refs").write_text("5")
     memory, start, outcome, said = _memory("VmRSS"), time.thread_time(), "result", ""
-    watched = True
+    watched = not reader.is_command
     try:
         reader.read(folder)
     except NergError as error:
@@ -139,15 +142,35 @@ def attempt(reader, folder: Path) -> dict:
     seconds, taken = time.thread_time() - start, _memory("VmHWM") - memory
     if violations:
         outcome, said = "executed", "; ".join(violations)
-    elif _files(folder) != before:
+    elif not reader.is_command and _files(folder) != before:
         outcome, said = "left a file", str(_files(folder) ^ before)
-    elif taken > ROOM or "needs more memory than there is" in said:
+    elif taken > ROOM or ("needs more memory than there is" in said and special != "sparse"):
         outcome, said = "memory", f"{taken >> 20} MB; {said}"
-    elif seconds > SECONDS:
+    elif seconds > SECONDS * (4 if reader.is_command else 1):
         outcome, said = "slow", f"{seconds:.1f} s; {said}"
     elif outcome == "refusal" and not (said.isprintable() and 10 < len(said) < 1500):
         outcome = "no sentence"
     return {"outcome": outcome, "said": said[:600], "seconds": seconds, "memory": taken}
+
+
+def place(file: Path, special: str, data: bytes) -> None:
+    """Put ``data`` at ``file``, or what is no regular file (see `watch.SPECIAL`)."""
+    match special:
+        case "":
+            file.write_bytes(data)
+        case "fifo":
+            os.mkfifo(file)
+        case "folder":
+            file.mkdir()
+        case "missing":
+            file.symlink_to(file.with_name("no-such-file"))
+        case "loop":
+            file.symlink_to(file.name)
+        case "sparse":
+            with file.open("wb") as out:
+                out.truncate(64 << 30)
+        case device:
+            file.symlink_to(device)
 
 
 def main() -> None:
@@ -169,8 +192,10 @@ def main() -> None:
         folder = room / case["reader"]
         file = folder / case["target"]
         whole = file.read_bytes()
-        file.write_bytes(base64.b64decode(case["data"]))
-        report = attempt(readers[case["reader"]], folder)
+        file.unlink()
+        place(file, case["special"], base64.b64decode(case["data"]))
+        report = attempt(readers[case["reader"]], folder, case["special"])
+        file.rmdir() if file.is_dir() and not file.is_symlink() else file.unlink()
         file.write_bytes(whole)
         print(json.dumps(report), file=out)
 

@@ -15,7 +15,7 @@ class Reader:
     ``targets``: the files in it that are damaged, by name, each with the kinds of structure that damage may keep, of
     "json", "text", "zip", "gzip", "npy", "safetensors", "png", "boxes" (of MP4); bytes are damaged in any case. Both
     functions import what they need themselves. ``needs``: a package that may be missing, without which there is no
-    such reader.
+    such reader. ``is_command``: it runs a command, which may write files and load what it needs.
     """
 
     name: str
@@ -23,6 +23,7 @@ class Reader:
     targets: dict[str, tuple[str, ...]]
     read: Callable[[Path], object]
     needs: str | None = None
+    is_command: bool = False
 
     @property
     def installed(self) -> bool:

@@ -12,8 +12,8 @@ CORPUS = Path(__file__).with_name("corpus")
 
 
 def kept(case: Case) -> str:
-    """Name of the file in the corpus that holds ``case``."""
-    return f"{_prefix(case.reader, case.target)}-{hashlib.sha256(case.data).hexdigest()[:12]}"
+    """Name of the file in the corpus that holds ``case``; of one without data, what stands in its place."""
+    return f"{_prefix(case.reader, case.target)}-{case.special or hashlib.sha256(case.data).hexdigest()[:12]}"
 
 
 def _prefix(reader: str, target: str) -> str:

@@ -46,6 +46,7 @@ def test_cases_that_once_failed(inputs):
     assert len(cases) > 40 and breaches(cases, inputs) == []
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_contract_is_seen_to_be_broken(tmp_path):
     """The watch itself: a crash, a file left behind, something run, memory, a foreign exception."""

@@ -19,13 +19,18 @@ BREACHES = ("other exception", "crash", "hang", "executed", "left a file", "memo
 _PATIENCE = 60.0
 
 
+SPECIAL = ("fifo", "/dev/zero", "/dev/null", "folder", "missing", "loop", "sparse")
+"""What may stand at a path in place of a regular file: itself, or a link to it."""
+
+
 @dataclass(frozen=True)
 class Case:
-    """``data``: the bytes of the file ``target`` of the reader ``reader``."""
+    """``data``: the bytes of the file ``target`` of the reader ``reader``, or ``special``: one of `SPECIAL` instead."""
 
     reader: str
     target: str
     data: bytes
+    special: str = ""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,8 @@ class Child:
 
     def run(self, case: Case) -> Report:
         """The outcome of ``case``; after a crash or a hang the child is of no more use."""
-        document = {"reader": case.reader, "target": case.target, "data": base64.b64encode(case.data).decode()}
+        document = {"reader": case.reader, "target": case.target, "special": case.special}
+        document["data"] = base64.b64encode(case.data).decode()
         try:
             self._process.stdin.write(json.dumps(document).encode() + b"\n")
             self._process.stdin.flush()

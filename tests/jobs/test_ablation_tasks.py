@@ -30,6 +30,7 @@ def trained(monkeypatch):
     return found
 
 
+@pytest.mark.nightly
 def test_a_training_elsewhere_scores_as_one_here_and_is_kept(tmp_path, rgb, trained):
     rays = crowd(3000)
     elsewhere = ablate(rays, tmp_path / "a", replace(ONE, scheduler="local:1"))

@@ -1,10 +1,13 @@
 """The demo as a job: its stages, and its result. `tests/cli/test_demo` looks at the pictures."""
 
+import pytest
+
 from nerg_mi.jobs.demo import STAGES, DemoOptions, make_demo
 from tests.figures.standins import write_standins
 from tests.jobs.recorder import Recorder
 
 
+@pytest.mark.nightly
 def test_every_stage_is_told_and_every_file_is_there(tmp_path):
     told = Recorder()
     options = DemoOptions(defaults=write_standins(tmp_path), width=24, spp=1, mode="llvm_ad_rgb")

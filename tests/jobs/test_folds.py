@@ -102,6 +102,7 @@ def test_what_is_plainly_wrong(tmp_path):
         evaluate_folds(crowd(300), tmp_path / "out", FoldOptions(**SMALL | {"geometry": None}))
 
 
+@pytest.mark.nightly
 def test_the_spread_of_an_ensemble_is_judged_as_support_is(tmp_path):
     found = evaluate_folds(crowd(3000), tmp_path / "out", FoldOptions(**SMALL | {"ensemble": 2, "splits": "both"}))
     assert {(row["signal"], row["error"]) for row in found.uncertainty} >= {("support", "KLD"), ("spread", "KLD")}

@@ -56,6 +56,7 @@ def test_the_header_says_what_the_gaze_rests_on(tmp_path):
     assert "nerg render" in text["Comment"] and "kde.basis" not in text
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_long_renders_are_prepared_and_the_same_to_the_byte(tmp_path, monkeypatch):
     options = PictureOptions(defaults={"width": "24", "height": "16"}, spp=2, mode="llvm_ad_rgb")

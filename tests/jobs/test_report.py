@@ -74,6 +74,7 @@ def test_everything_of_a_folder(run, tmp_path):
     assert found.made.encode("latin-1") in found.pictures["own"].png and 'name="provenance"' in text
 
 
+@pytest.mark.nightly
 def test_equal_files_make_an_equal_report(run, tmp_path):
     files = [run / "gaze.safetensors", run / "rays.npz", run / "gaze.eval"]
     one = make_report(files, tmp_path / "a.html", SMALL).path.read_bytes()

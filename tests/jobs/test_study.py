@@ -1,9 +1,12 @@
 """The study as a job: which settings it takes, and what it tells meanwhile."""
 
+import pytest
+
 from nerg_mi.jobs.study import StudyOptions, run_study
 from tests.jobs.recorder import Recorder
 
 
+@pytest.mark.nightly
 def test_only_some_settings(tmp_path):
     told = Recorder()
     options = StudyOptions(width=12, height=8, quick=True, only="jitter|paper, 1024 steps$", mode="llvm_ad_rgb")

@@ -11,6 +11,7 @@ from .scenes import GAZE, camera, constant, observer_at
 EYES = ((-2.0, 0.3, -2.0), (0.0, 0.0, -1.0), (0.1, 0.2, 0.3), (0.0, 0.9, -0.3), (0.5, 0.4, -3.0))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "visibility, depth, eyes", [("depth", "median", EYES), ("transmittance", "expected", EYES[2::2])]
 )

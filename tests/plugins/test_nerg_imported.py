@@ -49,6 +49,7 @@ def smooth(state, finest):
         state["encoder.embeddings"][where[level] : where[level + 1]] *= (16 / finest) ** (level / (levels - 1))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("bound, aligned", [(2, True), (5, False)])
 def test01_a_picture_of_a_checkpoint(rgb, tmp_path, bound, aligned):
     rng = np.random.default_rng(bound)

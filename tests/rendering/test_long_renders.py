@@ -14,6 +14,7 @@ def networks(scene):
     return [net for field in fields_of(scene.integrator()) for net in field.mlps]
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("samples", "prepared"), [(SAMPLES - 1, False), (SAMPLES, True)])
 def test01_long_ones_are_prepared_and_show_the_same_to_the_bit(rgb, samples, prepared):
     plain, scene = load_scene(store_scene(), SMALL), load_scene(store_scene(), SMALL)

@@ -122,6 +122,7 @@ def test_pinhole_projects_its_own_directions():
     assert 2 * np.degrees(np.arctan(8 / camera.focal)) == pytest.approx(camera.fov_x)
 
 
+@pytest.mark.nightly
 def test_views_agree_with_each_other(store, tmp_path):
     """A pixel moved into another view by its depth meets its own colour there: poses, depth and pictures are one
     frame."""
@@ -179,6 +180,7 @@ def test_law_depends_on_position_and_hides_what_is_hidden(law):
     assert np.allclose(law.density([(4.0, 3.0, 5.0)], z)[0], attention_law.band_density(z[:, 2]))
 
 
+@pytest.mark.nightly
 def test_law_sample_follows_density(law):
     """Draws counted in the cells around 192 directions agree with the density integrated over the same cells."""
     centres, fine = equal_area(192), equal_area(60000)

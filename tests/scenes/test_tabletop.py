@@ -120,6 +120,7 @@ def nearest(origin, direction, triangles):
     return t[hit].min() if hit.any() else 0.0
 
 
+@pytest.mark.nightly
 def test_depth_is_that_of_the_triangles(place, capture):
     triangles = place.triangles
     for photo in capture[1][:3]:

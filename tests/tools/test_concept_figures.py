@@ -9,6 +9,7 @@ import pytest
 from tests.conftest import ROOT
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_they_are_drawn_and_stand_on_the_page(rgb, tmp_path):
     from tools.concept_figures import draw

@@ -29,6 +29,7 @@ print(json.dumps([tally.__dict__, *faults.refusals(work, inputs, sys.argv[2])]))
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["rays import", "rays filter, in place"])
 def test_kills_and_refusals_lose_nothing(name):

@@ -5,9 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from tests.conftest import ROOT
 
 
+@pytest.mark.nightly
 def test_a_row_for_each_command(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# A page\n\n## Millions of rays\n\nSome words.\n")

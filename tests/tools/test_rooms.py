@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.conftest import ROOT
 from tools import rooms
 from tools.imports import modules
@@ -29,6 +31,7 @@ def test_scripts_are_scripts():
         assert '__name__ == "__main__"' in modules()[name].read_text(encoding="utf-8")
 
 
+@pytest.mark.nightly
 def test_a_dot_for_each_pair():
     drawn = rooms.draw()
     assert drawn.count("<circle") == len(rooms.arrows()) + 2

@@ -7,6 +7,7 @@ import pytest
 from tools import sizes
 
 
+@pytest.mark.nightly
 def test_a_smaller_budget_means_more_bands():
     one, many = (sizes.measure(48, 32, memory) for memory in (1.0, 1e-3))
     assert one["bands"] == 1 and many["bands"] == 32

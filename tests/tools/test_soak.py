@@ -28,6 +28,7 @@ print("\\n" + json.dumps([asdict(sound), asdict(leaking)]))
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "part, count, bound",

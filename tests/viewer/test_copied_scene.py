@@ -17,6 +17,7 @@ VIEW = View.of((6.9, 3.0, 2.0), (4.8, 4.2, 1.0), (0, 0, 1), 0.9, 1.5)
 EYE = np.array([4.6, 3.1, 1.6])
 
 
+@pytest.mark.nightly
 def test01_pictures_are_alike(store, tmp_path):
     shown = Shown(VIEW, EYE, ("depth", "opacity", "gaze"), 96, 16, 0.05)
     path = tmp_path / "elsewhere" / "view.xml"

@@ -77,6 +77,7 @@ def test02_the_integral_is_that_of_exact_geometry(rgb, tmp_path, kind):
     assert float(observed.integrals(rgb.Point3f(*eye.tolist()))[0][0]) == pytest.approx(expected, rel=3e-3)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("shapes", [True, False], ids=["shapes", "medium"])
 def test03_the_study_of_a_default_recipe(rgb, tmp_path, shapes):
     path = scene(tmp_path, "default recipe", shapes)

@@ -89,6 +89,7 @@ def test03_the_integrator_agrees_with_the_reference(rgb, scene, falloff, visibil
         assert np.mean(shown != visible) < 0.02 and 0.1 < visible[np.isfinite(distance)].mean() < 0.95
 
 
+@pytest.mark.nightly
 def test04_quick_run(tmp_path, scene, capsys):
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as end:

@@ -35,6 +35,7 @@ def test_a_field_is_cut_off_elsewhere_and_else_the_same(subject):
     assert splats.cut_off({"stop": 0.5}) == {"stop": 0.5}
 
 
+@pytest.mark.nightly
 def test_settings_that_gaussians_know_buy_error_with_time(subject):
     rows = [r for r in settings(subject) if r.group in ("default", "stop", "extent")]
     assert {r.group for r in settings(subject)} >= {"stop", "extent", "depth", "visibility", "together"}

@@ -33,6 +33,7 @@ def scene(tmp_path, rgb, monkeypatch):
     )
 
 
+@pytest.mark.nightly
 def test01_two_processes_give_the_sums_of_one_and_what_is_kept_is_not_made_again(scene, tmp_path):
     groups = [falling(500, 0.5), crowd(2)]
     whole = sums_in_one_go(scene, groups, Recorder(), splat_chunk)

@@ -58,6 +58,7 @@ def made(told):
     return [last - first for _, first, last in found]
 
 
+@pytest.mark.nightly
 def test_two_processes_give_the_tables_of_one(place):
     (place / "poster.obj").write_text("v 5 1 1\nv 5 2 1\nv 5 1 2\nf 1 2 3\n")
     changes = {"move": [{"shape": "stand", "by": [0, 1.9, 0]}], "add": [{"name": "poster", "mesh": "poster.obj"}]}

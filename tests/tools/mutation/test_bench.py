@@ -8,6 +8,7 @@ from tests.conftest import ROOT
 from tools.mutation import bench
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_mistake_is_made_in_the_copy_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "BUILD", tmp_path)

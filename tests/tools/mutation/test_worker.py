@@ -6,9 +6,12 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 from tests.conftest import ROOT
 
 
+@pytest.mark.nightly
 def test_a_trial_runs_on_its_own_tree_and_says_what_failed(tmp_path):
     """Pass, failure, hang and the end of the process, and a module that comes from elsewhere."""
     (tmp_path / "test_a.py").write_text(

@@ -51,6 +51,7 @@ def test01_the_first_counts_unless_another_is_better_by_half_a_standard_error():
     assert found.config == CAPTURE and choice == MixChoice(0.1, 0)
 
 
+@pytest.mark.nightly
 def test02_what_foretells_those_who_are_held_out_is_trained(rgb):
     """A direction that all people share wherever they stand is in the blind density; one point that all look at, in
     the middle of a floor, needs emit where capture has one harmonic."""

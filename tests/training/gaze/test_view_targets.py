@@ -84,6 +84,7 @@ def test_the_losses_of_a_density_do_not_see_its_scale_through_views():
     assert of(sphere, 0.7).mae > 2 * of(sphere, 0.1).mae
 
 
+@pytest.mark.nightly
 def test_a_law_is_learnt_from_views_alone_and_holds_around():
     settings = GazeSettings(
         steps=120,

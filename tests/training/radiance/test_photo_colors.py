@@ -71,6 +71,7 @@ def test_derivatives_are_those_of_the_formula():
         assert gradient[k] == pytest.approx(value(given + step)[0] - value(given - step)[0], abs=2e-4)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_exposures_are_found():
     """Of photos that show the same, so that nothing else can explain how they differ."""

@@ -53,6 +53,7 @@ def test_what_is_kept_is_the_average_of_every_fourth_steps_weights(dataset, aver
     assert average == 0 or np.abs(expected["density_net.0"] - trainer.optimiser["density_net.0"].numpy()).max() > 1e-4
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_stored_occupancy_leaves_nothing_out_that_shows(dataset):
     """Held-out views through the occupied cells and through the whole box; free space is empty."""
@@ -111,6 +112,7 @@ def test_gradient_of_the_whole_loss_agrees_with_finite_differences(dataset, conf
     assert slope == pytest.approx((up - down) / (2 * h), rel=0.01)
 
 
+@pytest.mark.nightly
 def test_a_deferred_field_learns_the_same_pictures(dataset):
     """As well as one that is asked at every sample; it is what is kept, looked at and rendered."""
     errors = []

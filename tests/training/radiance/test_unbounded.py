@@ -50,6 +50,7 @@ def trained():
     return field, measure(trainer, views[:4], 1, field).mean, trainer
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_what_is_far_is_learnt_as_well(trained):
     assert trained[1] > 17

@@ -90,6 +90,7 @@ def test_gradients_of_rays(rgb, case, mode):
     assert np.isclose(found, (ends[0] - ends[1]) / (2 * STEP), rtol=1e-3)
 
 
+@pytest.mark.nightly
 def test_memory_does_not_grow_with_hits(rgb):
     medium, count = medium_of(stack(np.arange(1, 151) * 0.5, np.full(150, 0.01))), 1 << 13
 
