@@ -117,9 +117,10 @@ def _make_glb(folder: Path) -> None:
 
 
 def _read_glb(folder: Path) -> object:
+    from nerg_mi.files.bounded import read_bytes
     from nerg_mi.formats.gltf import parse_glb, read_glb
 
-    whole, text = (folder / "a.glb").read_bytes(), (folder / "document.json").read_bytes()
+    whole, text = read_bytes(folder / "a.glb"), read_bytes(folder / "document.json")
     data = np.array(_CORNERS, "<f4").tobytes() + np.array([0, 1, 2], "<u4").tobytes()
     head = struct.pack("<IIIII", 0x46546C67, 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
     made = head + text + struct.pack("<II", len(data), 0x004E4942) + data

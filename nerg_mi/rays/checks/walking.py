@@ -132,4 +132,5 @@ def _lag(t: np.ndarray, starts: np.ndarray) -> int:
     step = np.diff(t)
     step[starts[1:-1] - 1] = np.inf
     step = step[(step > 0) & (step <= 1.0)]
-    return max(1, round(0.5 / np.median(step))) if step.size else 1
+    # Times may lie so close together that the quotient is no index.
+    return max(1, round(min(0.5 / np.median(step), len(t)))) if step.size else 1
