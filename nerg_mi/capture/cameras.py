@@ -16,7 +16,7 @@ from . import lens
 from .intrinsics import Intrinsics
 
 # OpenGL cameras look along -z with x to the right, Mitsuba's along +z with x to the left.
-_OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
+OPENGL_FROM_MITSUBA = np.diag([-1.0, 1.0, -1.0, 1.0])
 # OpenCV's cameras look along +z with y down.
 _OPENGL_FROM_OPENCV = np.array([1.0, -1.0, -1.0])
 _WIDEST = float(np.tan(np.radians(85)))
@@ -98,7 +98,7 @@ def sensor_dict(camera: Camera) -> dict:
         )
     return {
         "type": "perspective",
-        "to_world": mi.ScalarTransform4f((camera.to_world @ _OPENGL_FROM_MITSUBA).tolist()),
+        "to_world": mi.ScalarTransform4f((camera.to_world @ OPENGL_FROM_MITSUBA).tolist()),
         "fov": float(np.degrees(2 * np.arctan(i.width / (2 * i.fx)))),
         "fov_axis": "x",
         # Mitsuba counts the offset from the principal point to the film's centre.

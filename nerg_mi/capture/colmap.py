@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,9 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError, sentence
-from nerg_mi.files.bounded import plain, read_bytes
+from nerg_mi.files.bounded import plain, read_bytes, size_of
 
-from .posed import FARTHEST, Frame, MaskFile, PosedImages, Unused, inside, settled
+from .posed import FARTHEST, FileFinder, Frame, MaskFile, PosedImages, Unused, settled
 
 # COLMAP's numbers of its camera models, and how many parameters each has.
 _MODELS = {
@@ -52,6 +53,8 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _MIN_TRACK, _MAX_ERROR = 3, 4.0
 # Characters of a line that is split into words; those of observations, which are longer, are skipped.
 _LONGEST = 1 << 20
+# Bytes of a text file in which its comments state how many records it has.
+_HEADER = 1 << 12
 
 
 @dataclass(frozen=True)
@@ -101,8 +104,9 @@ def read_colmap(
     """Read the model in ``folder``; its image names are relative to ``images``, its masks' to ``masks`` (``NAME.png``).
 
     Images and masks that lie outside of the capture, the folder that holds ``images``, links followed, are not used
-    unless ``allow_outside``. In COLMAP's own world. Frames that cannot be used are listed; `NergError` names file and
-    record for what cannot be parsed, and when no frame can be used.
+    unless ``allow_outside``. In COLMAP's own world. Frames that cannot be used are listed; a text file that states
+    another number of records than it has is noted. `NergError` names file and record for what cannot be parsed, and
+    when no frame can be used.
     """
     folder, images = Path(folder), Path(images)
     files, raw = _open(folder)
@@ -110,20 +114,36 @@ def read_colmap(
     cameras = (_cameras_bin if binary else _cameras_txt)(files["cameras"], raw["cameras"])
     poses = (_images_bin if binary else _images_txt)(files["images"], raw["images"])
     frames, unused = [], []
-    root = None if allow_outside else images.parent
+    limit = None if allow_outside else images.parent
+    finder, mask_finder = FileFinder(images, limit), None if masks is None else FileFinder(Path(masks), limit)
+    listed = set()
     for name, camera, q, t in poses:
         try:
-            frames.append(_frame(name, cameras.get(camera), camera, q, t, images, masks, root))
+            image = finder.find(name, "image")
+            listed.add(image)
+            frames.append(_frame(name, cameras.get(camera), camera, q, t, image, mask_finder))
         except (ValueError, OverflowError, OSError) as e:
             # A name may be longer than the system allows, or hold what no name can.
             unused.append(Unused(name, sentence(e)))
     frames, unused = settled(files["images"], frames, unused)
-    points = None
+    counts, points = {"cameras": len(cameras), "images": len(poses)}, None
+    digest = _digest(raw)
     if "points3D" in files:
-        points = (_points_bin if binary else _points_txt)(
-            files["points3D"], read_bytes(files["points3D"], "COLMAP file")
-        )
-    return PosedImages(files["images"], frames, unused, None, _digest(raw), points=points)
+        raw["points3D"] = read_bytes(files["points3D"], "COLMAP file")
+        table = (_points_bin if binary else _points_txt)(files["points3D"], raw["points3D"])
+        counts["points3D"], points = len(table), _trusted(table)
+    notes = [] if binary else [n for k, c in counts.items() for n in _count_notes(files[k], raw[k], c)]
+    return PosedImages(files["images"], frames, unused, None, digest, notes, points, images.parent, frozenset(listed))
+
+
+def count_images(folder: Path) -> int:
+    """Number of images of the model in ``folder``, as a binary file states it."""
+    path = _require_model(folder)["images"]
+    if path.suffix == ".txt":
+        return len(_images_txt(path, read_bytes(path, "COLMAP file")))
+    size_of(path, "COLMAP file")
+    with open(path, "rb") as file:
+        return int.from_bytes(file.read(8), "little")
 
 
 def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.ndarray]]]:
@@ -142,11 +162,16 @@ def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.
     return path, _digest(raw), found
 
 
-def _open(folder: Path) -> tuple[dict[str, Path], dict[str, bytes]]:
-    """Files of the model in ``folder``, and the bytes of its cameras and images; `MissingFile` where there is none."""
+def _require_model(folder: Path) -> dict[str, Path]:
     files = model_files(folder)
     if files is None:
         raise MissingFile(f'"{folder}" holds no COLMAP model: neither cameras.bin and images.bin nor their .txt')
+    return files
+
+
+def _open(folder: Path) -> tuple[dict[str, Path], dict[str, bytes]]:
+    """Files of the model in ``folder``, and the bytes of its cameras and images; `MissingFile` where there is none."""
+    files = _require_model(folder)
     # Both are digested as well, and images.bin may have gigabytes of observations.
     return files, {name: read_bytes(files[name], "COLMAP file") for name in ("cameras", "images")}
 
@@ -155,20 +180,20 @@ def _digest(raw: dict[str, bytes]) -> str:
     return hashlib.sha256(b"".join(hashlib.sha256(raw[name]).digest() for name in ("cameras", "images"))).hexdigest()
 
 
-def _frame(name: str, camera: _Camera | None, number: int, q, t, images: Path, masks, root: Path | None) -> Frame:
+def _frame(name: str, camera: _Camera | None, number: int, q, t, image: Path, masks: FileFinder | None) -> Frame:
     if camera is None:
         raise NergError(f"the model has no camera {number}")
-    if not inside(root, images / name, "image").is_file():
-        raise NergError(f'its image "{plain(images / name)}" does not exist')
+    if not image.is_file():
+        raise NergError(f'its image "{plain(image)}" does not exist')
     lens, mask = camera.lens(), None
     if masks is not None:
         # COLMAP appends the suffix; others replace it.
-        names = Path(masks) / f"{name}.png", (Path(masks) / name).with_suffix(".png")
-        found = [p for p in names if inside(root, p, "mask").is_file()]
-        if not found:
-            raise NergError(f'its mask "{plain(names[0])}" does not exist')
-        mask = MaskFile(found[0])
-    return Frame(name, images / name, _to_world(q, t), lens, mask=mask)
+        paths = [masks.find(n, "mask") for n in (f"{name}.png", str(Path(name).with_suffix(".png")))]
+        existing = [p for p in paths if p.is_file()]
+        if not existing:
+            raise NergError(f'its mask "{plain(paths[0])}" does not exist')
+        mask = MaskFile(existing[0])
+    return Frame(name, image, _to_world(q, t), lens, mask=mask, ignores_exif=True)
 
 
 def _to_world(q, t) -> np.ndarray:
@@ -206,6 +231,14 @@ class _Reader:
         self.need(size, what)
         self.at += size
 
+    def end(self, count: int) -> None:
+        """`NergError` where anything follows the ``count`` records that the header states."""
+        if self.at < len(self.data):
+            raise NergError(
+                f'"{self.path}" has {len(self.data) - self.at:,} more bytes than the {count:,} records that its header '
+                "states; copy it again"
+            )
+
     def name(self, what: str) -> str:
         end = self.data.find(b"\0", self.at)
         if end < 0:
@@ -225,6 +258,7 @@ def _cameras_bin(path: Path, raw: bytes) -> dict[int, _Camera]:
             )
         name, count = _MODELS[model]
         out[number] = _Camera(name, width, height, r.take(f"{count}d", f"camera record {k + 1}"))
+    r.end(len(out))
     return out
 
 
@@ -237,6 +271,7 @@ def _images_bin(path: Path, raw: bytes) -> list[tuple]:
         # Per observation: x, y as doubles and the number of its point.
         r.skip(24 * r.take("Q", what)[0], what)
         out.append((name, values[8], values[1:5], values[5:8]))
+    r.end(len(out))
     return out
 
 
@@ -247,7 +282,8 @@ def _points_bin(path: Path, raw: bytes) -> np.ndarray:
         values = r.take("Q3d3BdQ", what)
         r.skip(8 * values[8], what)
         out.append((*values[1:4], values[7], values[8]))
-    return _trusted(out, path)
+    r.end(len(out))
+    return _point_table(out)
 
 
 def _lines(raw: bytes) -> Iterator[tuple[int, str]]:
@@ -271,6 +307,14 @@ def _rows(path: Path, raw: bytes) -> Iterator[tuple[int, list[str]]]:
             yield number, line.split()
 
 
+def _count_notes(path: Path, raw: bytes, count: int) -> list[str]:
+    """A sentence, where the header of a text file states another number than the ``count`` of its records."""
+    stated = re.search(rb"^#\s*Number of [a-z]+: *(\d+)", raw[:_HEADER], re.MULTILINE)
+    if stated is None or int(stated[1]) == count:
+        return []
+    return [f'"{path}" has {count:,} records, but its header states {int(stated[1]):,}; copy it again if it was cut']
+
+
 def _cameras_txt(path: Path, raw: bytes) -> dict[int, _Camera]:
     out = {}
     for number, words in _rows(path, raw):
@@ -282,14 +326,12 @@ def _cameras_txt(path: Path, raw: bytes) -> dict[int, _Camera]:
 
 
 def _images_txt(path: Path, raw: bytes) -> list[tuple]:
-    out, observations = [], False
+    out, after_image = [], False
     for number, line in _lines(raw):
-        # Every second line lists observations, and may be empty.
-        if observations:
-            observations = False
-            continue
         words = line[:_LONGEST].split()
-        if not words:
+        # The line after an image's lists its observations; it may be empty, and some writers leave it out.
+        if not words or (after_image and (len(line) > _LONGEST or _are_observations(words))):
+            after_image = False
             continue
         try:
             q, t = tuple(map(float, words[1:5])), tuple(map(float, words[5:8]))
@@ -298,8 +340,16 @@ def _images_txt(path: Path, raw: bytes) -> list[tuple]:
                 raise ValueError
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"') from e
-        observations = True
+        after_image = True
     return out
+
+
+def _are_observations(words: list[str]) -> bool:
+    """Whether ``words`` are triples of X, Y and POINT3D_ID; an image's line ends with its name."""
+    try:
+        return len(words) % 3 == 0 and int(words[-1]) >= -1
+    except ValueError:
+        return False
 
 
 def _points_txt(path: Path, raw: bytes) -> np.ndarray:
@@ -309,10 +359,14 @@ def _points_txt(path: Path, raw: bytes) -> np.ndarray:
             out.append((*map(float, words[1:4]), float(words[7]), (len(words) - 8) // 2))
         except (ValueError, IndexError) as e:
             raise NergError(f'line {number} of "{path}" is not "POINT3D_ID X Y Z R G B ERROR TRACK"') from e
-    return _trusted(out, path)
+    return _point_table(out)
 
 
-def _trusted(rows: list[tuple], path: Path) -> np.ndarray:
-    table = np.array(rows, np.float64).reshape(-1, 5)
+def _point_table(rows: list[tuple]) -> np.ndarray:
+    """Position, reprojection error and length of the track of each point (N, 5)."""
+    return np.array(rows, np.float64).reshape(-1, 5)
+
+
+def _trusted(table: np.ndarray) -> np.ndarray:
     good = np.all(np.abs(table) <= FARTHEST, axis=1) & (table[:, 3] <= _MAX_ERROR) & (table[:, 4] >= _MIN_TRACK)
     return table[good, :3]

@@ -9,10 +9,11 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
 
-from .colmap import model_files, read_image_poses
+from .colmap import count_images, model_files, read_image_poses
+from .posed import name_some
 from .transforms import read_frame_poses
 
-_MODELS = ("", "sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+_MODELS = ("", "sparse", "colmap/sparse")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +27,8 @@ class NamedPoses:
 
 
 def find_source(dataset: str | Path) -> Path:
-    """The transforms file of ``dataset``, or the folder of its COLMAP model. ``dataset``: a folder, or that file
-    itself."""
+    """The transforms file of ``dataset``, or the folder of its COLMAP model, of several the one with the most images.
+    ``dataset``: a folder, or that file itself."""
     dataset = Path(dataset)
     if dataset.is_file():
         # A file of a COLMAP model stands for the model.
@@ -36,12 +37,31 @@ def find_source(dataset: str | Path) -> Path:
         if (dataset / name).is_file():
             return dataset / name
     for name in _MODELS:
-        if model_files(dataset / name) is not None:
-            return dataset / name
+        models = _list_models(dataset / name)
+        if models:
+            return models[0] if len(models) == 1 else max(models, key=count_images)
     raise MissingFile(
         f'"{dataset}" holds neither transforms.json nor transforms_train.json nor a COLMAP model '
         "(sparse/0/cameras.bin); name the folder of a posed image set"
     )
+
+
+def _list_models(folder: Path) -> list[Path]:
+    """COLMAP's models of one reconstruction: in the numbered folders of ``folder``, and ``folder`` itself."""
+    numbered = sorted((p for p in folder.glob("*") if p.name.isdecimal()), key=lambda p: int(p.name))
+    return [p for p in (*numbered, folder) if model_files(p) is not None]
+
+
+def describe_other_models(model: Path) -> list[str]:
+    """A sentence on the models of the same reconstruction that are not used where the COLMAP ``model`` is."""
+    models = _list_models(model.parent if model.name.isdecimal() else model)
+    others = [p for p in models if p.resolve() != model.resolve()]
+    if not others:
+        return []
+    describe = lambda p: f'"{p.name}" ({count_images(p):,} images)'
+    return [
+        f"of {len(models)} COLMAP models {describe(model)} is used, and not {name_some(describe(p) for p in others)}"
+    ]
 
 
 def read_named_poses(source: str | Path) -> NamedPoses:

@@ -7,8 +7,10 @@ coordinates and units; readers do not re-centre, scale or turn them.
 from __future__ import annotations
 
 import os
+import unicodedata
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
@@ -60,6 +62,62 @@ def inside(root: Path | None, path: Path, what: str) -> Path:
     return path
 
 
+def fold_name(name: str) -> str:
+    """``name`` of a file, equal for all spellings of it by different systems: separators, composition and case."""
+    return unicodedata.normalize("NFC", str(PurePosixPath(name.replace("\\", "/")))).casefold()
+
+
+class FileFinder:
+    """Finds files below ``folder`` by names that another system may have spelled otherwise: with backslashes, in
+    another Unicode normal form, or in another case. ``root``: below which files must lie, see `inside`."""
+
+    def __init__(self, folder: Path, root: Path | None):
+        self.folder, self.root = folder, root
+        self._listed: dict[Path, dict[str, list[str]]] = {}
+
+    def find(self, name: str, what: str) -> Path:
+        """The file ``name``; as it is spelled, where there is none.
+
+        Raises `NergError` for one outside of the root, and where several files differ from ``name`` by case alone.
+        """
+        path = inside(self.root, self.folder / name, what)
+        if path.is_file():
+            return path
+        slashes = name.replace("\\", "/")
+        inside(self.root, self.folder / slashes, what)
+        match = self._match(PurePosixPath(slashes), what)
+        return path if match is None else inside(self.root, match, what)
+
+    def _match(self, name: PurePosixPath, what: str) -> Path | None:
+        path = self.folder
+        for part in () if name.is_absolute() or ".." in name.parts else name.parts:
+            if not (path / part).exists():
+                names = self._names(path).get(fold_name(part), [])
+                if len(names) > 1:
+                    raise NergError(
+                        f'its {what} "{plain(part)}" may be each of {name_some(names)}; spell it as the file is'
+                    )
+                if not names:
+                    return None
+                part = names[0]
+            path = path / part
+        return path if path.is_file() else None
+
+    def _names(self, folder: Path) -> dict[str, list[str]]:
+        if folder not in self._listed:
+            names = self._listed[folder] = {}
+            for entry in sorted(os.listdir(folder)) if folder.is_dir() else ():
+                names.setdefault(fold_name(entry), []).append(entry)
+        return self._listed[folder]
+
+
+def name_some(names: Iterable[object], most: int = 5) -> str:
+    """The first ``most`` of ``names`` for a message, and how many more there are."""
+    names = [plain(name, 80) for name in names]
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 @dataclass(frozen=True)
 class DepthFile:
     """``unit``: scene units of one unit of the file; ``along_axis``: distances along the viewing axis (z) rather than
@@ -81,7 +139,8 @@ class MaskFile:
 @dataclass(frozen=True)
 class Frame:
     """One posed image. ``name``: its path as the file spells it; ``to_world``: (4, 4) OpenGL camera-to-world;
-    ``lens``: its camera keys, see `LENS_KEYS`."""
+    ``lens``: its camera keys, see `LENS_KEYS`; ``ignores_exif``: both are of the pixels as they are stored, whatever
+    the EXIF orientation."""
 
     name: str
     image: Path
@@ -89,6 +148,12 @@ class Frame:
     lens: dict
     depth: DepthFile | None = None
     mask: MaskFile | None = None
+    ignores_exif: bool = False
+
+    def has_shape(self, width: int, height: int) -> bool:
+        """Whether the camera is of an image of ``width`` x ``height`` pixels, or of its shape, to a hundredth."""
+        w, h = self.lens.get("w", width), self.lens.get("h", height)
+        return w > 0 and h > 0 and abs(w * height - h * width) <= 0.01 * h * width
 
     def intrinsics(self, width: int, height: int) -> Intrinsics:
         """Intrinsics for this frame's image, whose file has ``width`` x ``height`` pixels.
@@ -98,10 +163,12 @@ class Frame:
         """
         lens = self.lens
         w, h = lens.get("w", width), lens.get("h", height)
-        if not (w > 0 and h > 0) or abs(w * height - h * width) > 0.01 * h * width:
+        if not self.has_shape(width, height):
+            remedy = 'correct width and height ("w" and "h"), or the image'
+            if self.has_shape(height, width):
+                remedy = "turn the pixels as the camera was held; other numbers would turn its rays"
             raise NergError(
-                f'the image "{self.image}" has {width} x {height} pixels but its camera says {w:g} x {h:g}; '
-                'correct width and height ("w" and "h"), or the image'
+                f'the image "{self.image}" has {width} x {height} pixels but its camera says {w:g} x {h:g}; {remedy}'
             )
         fx, fy = lens.get("fl_x"), lens.get("fl_y")
         if fx is None and "camera_angle_x" in lens:
@@ -159,6 +226,10 @@ class PosedImages:
     notes: list[str] = field(default_factory=list)
     # (N, 3) on surfaces, or None.
     points: np.ndarray | None = None
+    # The data set's folder.
+    root: Path = Path()
+    # Image files that the file lists, whether or not their frames can be used.
+    images: frozenset[Path] = frozenset()
     # Names of the frames that the file itself holds out, or None.
     held_out: list[str] | None = None
     # Names of the frames that it sets apart from both.

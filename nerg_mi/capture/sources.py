@@ -8,15 +8,18 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.files.bounded import plain
 
 from .colmap import read_colmap
 from .images import split_holdout
-from .named_poses import find_source
-from .posed import Frame, PosedImages, Unused
+from .named_poses import describe_other_models, find_source
+from .posed import Frame, PosedImages, Unused, name_some
 from .transforms import read_dataparser, read_transforms
 from .upright import Up, find_up, turn_to_z
 
 COORDINATES = ("file", "upright", "original")
+# Of files that are taken for photos, in small letters.
+_PHOTOS = (".png", ".jpg", ".jpeg", ".exr")
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,8 @@ def read_posed(source: Path, allow_outside: bool = False) -> PosedImages:
             f'there is no folder "images" beside or above the COLMAP model "{source}"; put the photos there'
         )
     masks = images.with_name("masks")
-    return read_colmap(source, images, masks if masks.is_dir() else None, allow_outside)
+    posed = read_colmap(source, images, masks if masks.is_dir() else None, allow_outside)
+    return replace(posed, notes=[*posed.notes, *describe_other_models(source)])
 
 
 def read_split(
@@ -63,6 +67,7 @@ def read_split(
     """
     source = find_source(dataset)
     posed = read_posed(source, allow_outside)
+    whole = posed
     similarity = _similarity(posed, coordinates, scale)
     posed = posed.moved(similarity)
     if posed.spare:
@@ -73,8 +78,10 @@ def read_split(
             notes=[*posed.notes, f"{len(spare)} frames are in no training or test list of {posed.path.name}"],
         )
     other = _test_file(source) if holdout is None else None
-    if other is not None:
-        test = read_transforms(other, allow_outside).moved(similarity)
+    test = None if other is None else read_transforms(other, allow_outside)
+    posed = replace(posed, notes=[*posed.notes, *_describe_leftovers([whole, *([] if test is None else [test])])])
+    if test is not None and other is not None:
+        test = test.moved(similarity)
         hidden = {f.image.resolve() for f in test.frames}
         both = [f for f in posed.frames if f.image.resolve() in hidden]
         train = [f for f in posed.frames if f.image.resolve() not in hidden]
@@ -102,6 +109,36 @@ def up_of(posed: PosedImages) -> Up:
     """Up, as the cameras of ``posed`` are held and as its points lie."""
     points = np.zeros((0, 3)) if posed.points is None else posed.points
     return find_up(np.stack([f.to_world for f in posed.frames]), points)
+
+
+def _describe_leftovers(sets: list[PosedImages]) -> list[str]:
+    """What lies in the folder of a data set, described by the files of ``sets``, and is not used: photos beside those
+    that the files list, and what else the folder holds."""
+    listed = {p.resolve() for posed in sets for p in posed.images}
+    used = {p for posed in sets for f in posed.frames for p in (f.image, *(x.path for x in (f.depth, f.mask) if x))}
+    folders = {p.parent for posed in sets for p in posed.images}
+    other = {p.resolve() for p in used} - listed
+    photos = {
+        p
+        for folder in folders
+        if folder.is_dir()
+        for p in folder.iterdir()
+        if p.suffix.lower() in _PHOTOS and not p.name.startswith((".", "dynamic_mask_"))
+    }
+    stray = sorted(p for p in photos if p.resolve() not in listed | other)
+    notes = []
+    if stray:
+        notes.append(
+            f"{len(stray)} of {len(photos)} photos have no pose in {sets[0].path.name} and are not used: "
+            f"{name_some(p.name for p in stray)}"
+        )
+    root = sets[0].root
+    used |= {posed.path for posed in sets}
+    rest = {p.name for p in root.iterdir() if not p.name.startswith(".")}
+    rest -= {p.relative_to(root).parts[0] for p in used if p.is_relative_to(root)} | {p.name for p in stray}
+    if rest:
+        notes.append(f'not used of "{plain(root.resolve().name)}": {name_some(sorted(rest))}')
+    return notes
 
 
 def _test_file(source: Path) -> Path | None:

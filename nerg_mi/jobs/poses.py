@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.capture.colmap import read_colmap
-from nerg_mi.capture.posed import Unused
+from nerg_mi.capture.posed import Unused, name_some
 from nerg_mi.capture.structure.photos import copy_photos, list_photos
 from nerg_mi.capture.structure.pictures import Folders, Picture
 from nerg_mi.capture.structure.reconstruction import Reconstruction, Settings, check_installed, reconstruct
 from nerg_mi.capture.structure.video import copy_frames
-from nerg_mi.errors import NergError, plain
+from nerg_mi.errors import NergError
 from nerg_mi.figures.camera_figures import camera_figure
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.figures.saving import save
@@ -34,7 +34,6 @@ _ADVICE = (
     "take more of them, each sharing more than half of what it shows with its neighbours, sharp, from places some "
     "steps apart (not by turning on the spot), of things that do not move, shine or look all alike"
 )
-_NAMED = 12
 
 
 @dataclass(frozen=True)
@@ -164,7 +163,7 @@ def _tell_result(result: PosesResult, found: Reconstruction, options: PoseOption
         f"{result.error:.2f} pixels, at a longer side of {options.size} at most"
     )
     if result.unregistered:
-        reporter.message(f"without a pose: {_names(result.unregistered)}")
+        reporter.message(f"without a pose: {name_some(result.unregistered)}")
     if found.up is None:
         reporter.message("up was not looked for")
     else:
@@ -179,15 +178,10 @@ def _tell_result(result: PosesResult, found: Reconstruction, options: PoseOption
     if others:
         reporter.warn(
             f"the pictures fall into parts that nothing connects; the largest was kept, another has {len(others[0])} "
-            f"({_names(others[0])}); take pictures between them"
+            f"({name_some(others[0])}); take pictures between them"
         )
     if 2 * len(result.registered) < count:
         reporter.warn(f"less than half of the pictures have a pose; {_ADVICE}")
     reporter.message(
         f"wrote {result.output} (poses.png shows it); next: nerg train radiance {result.output} -o FIELD.safetensors"
     )
-
-
-def _names(names: list[str]) -> str:
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return ", ".join(plain(n, 80) for n in names[:_NAMED]) + more

@@ -100,6 +100,8 @@ def transforms(camera: cameras.Pinhole, layout: Layout, frames: list) -> dict:
         "k2": 0.0,
         "p1": 0.0,
         "p2": 0.0,
+        "depth_unit_scale_factor": 1.0,
+        "is_euclidean_depth": True,
         "aabb": layout.aabb.tolist(),
         "frames": frames,
     }

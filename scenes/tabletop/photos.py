@@ -113,5 +113,6 @@ def write_photos(photos: list[Photo], folder: str | Path) -> Path:
         lens = {"w": i.width, "h": i.height, "fl_x": i.fx, "fl_y": i.fy, "cx": i.cx, "cy": i.cy}
         files = {"file_path": f"images/{photo.name}", "depth_file_path": depth}
         frames.append(files | lens | {"transform_matrix": photo.camera.to_world.tolist()})
-    write_json(folder / DEPTH_FILE, {"camera_model": "OPENCV", "frames": frames})
+    about = {"camera_model": "OPENCV", "depth_unit_scale_factor": 1.0, "is_euclidean_depth": True}
+    write_json(folder / DEPTH_FILE, about | {"frames": frames})
     return folder / DEPTH_FILE

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.capture.colmap import model_files, read_colmap
+from nerg_mi.capture.colmap import model_files, read_colmap, read_image_poses
 from nerg_mi.errors import NergError
 
 # COLMAP's camera models: number, name, parameters.
@@ -243,3 +243,71 @@ def test_observations_may_stand_on_a_long_line_and_nothing_else(tmp_path):
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 40 30 " + "1 " * 700_000)
     with pytest.raises(NergError, match="line 1 .*cameras.txt.* characters"):
         read_colmap(tmp_path, tmp_path / "images")
+
+
+def images_text(observations):
+    """Ten images; ``observations(k)``: what follows the line of the k-th, a list of lines."""
+    rotations, translations = poses(len(NAMES))
+    show = lambda values: " ".join(repr(float(v)) for v in values)
+    lines = []
+    for k, name in enumerate(NAMES):
+        lines += [f"{k + 1} {show(quaternion(rotations[k]))} {show(translations[k])} {k + 1} {name}", *observations(k)]
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    "observations",
+    [
+        lambda k: [],
+        lambda k: [""],
+        lambda k: ["1.5 2.5 -1 3.5 4.5 7 5 6 8"],
+        lambda k: [["1.5 2.5 -1"], [], ["", ""]][k % 3],
+        lambda k: ["1 2 -1 3 4 -1 5 6 -1 7 8 -1", ""],
+    ],
+    ids=["none", "blank", "observations", "mixed", "whole-numbers"],
+)
+def test_text_with_and_without_lines_of_observations(tmp_path, observations):
+    write_txt(tmp_path, NAMES)
+    expected = read_image_poses(tmp_path)[2]
+    (tmp_path / "images.txt").write_text(images_text(observations))
+    listed = read_image_poses(tmp_path)[2]
+    assert [name for name, _ in listed] == NAMES
+    assert np.array_equal([p for _, p in listed], [p for _, p in expected])
+
+
+def test_names_that_are_numbers_are_no_observations(tmp_path):
+    write_txt(tmp_path, ["0001", "0002", "0003"])
+    text = (tmp_path / "images.txt").read_text().splitlines()
+    (tmp_path / "images.txt").write_text("\n".join(line for line in text if "-1" not in line or "000" in line))
+    assert [name for name, _ in read_image_poses(tmp_path)[2]] == ["0001", "0002", "0003"]
+
+
+def test_a_line_that_is_neither_is_refused(tmp_path):
+    write_txt(tmp_path, NAMES)
+    (tmp_path / "images.txt").write_text(images_text(lambda k: ["1.5 2.5 -1 3.5"]))
+    with pytest.raises(NergError, match="line 2 of"):
+        read_image_poses(tmp_path)
+
+
+@pytest.mark.parametrize("name, what", [("cameras", "cameras"), ("images", "images"), ("points3D", "points")])
+def test_a_text_file_with_another_count_than_its_header_is_noted(tmp_path, name, what):
+    (tmp_path / "a.png").write_bytes(b"")
+    write_txt(tmp_path, ["a.png"], {1: CAMERAS[1]})
+    path, counts = tmp_path / f"{name}.txt", {"cameras": 1, "images": 1, "points3D": len(POINTS)}
+    text = path.read_text()
+    path.write_text(f"# Number of {what}: {counts[name]}, mean observations: 2\n{text}")
+    assert read_colmap(tmp_path, tmp_path).notes == []
+    path.write_text(f"# Number of {what}: 24, mean observations: 2\n{text}")
+    (note,) = read_colmap(tmp_path, tmp_path).notes
+    assert f"{name}.txt" in note and f"has {counts[name]} records" in note and "states 24" in note
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_binary_file_with_more_than_its_header_states_is_refused(tmp_path, name):
+    (tmp_path / "a.png").write_bytes(b"")
+    write_bin(tmp_path, ["a.png", "b.png"])
+    path = tmp_path / f"{name}.bin"
+    raw = path.read_bytes()
+    path.write_bytes(struct.pack("<Q", struct.unpack("<Q", raw[:8])[0] - 1) + raw[8:])
+    with pytest.raises(NergError, match=f"{name}.bin.* more bytes than the"):
+        read_colmap(tmp_path, tmp_path)

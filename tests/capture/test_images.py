@@ -9,6 +9,7 @@ from nerg_mi.capture.images import load_usable, load_view, split_holdout
 from nerg_mi.capture.reading import read_image
 from nerg_mi.capture.transforms import read_transforms
 from nerg_mi.files.exr import write_bitmap_exr
+from tests.capture.written_sets import METRES_ALONG_RAYS
 
 
 @pytest.fixture
@@ -26,7 +27,14 @@ def dataset(tmp_path, rgb):
             {"file_path": f"{k:02d}.png", "transform_matrix": pose.tolist(), "depth_file_path": f"{k:02d}.npy"}
         )
         pictures.append(picture)
-    content = {"w": 12.0, "h": 8.0, "fl_x": 10.0, "aabb": [[0, 0, 0], [8, 4, 2]], "frames": frames[::-1]}
+    content = {
+        "w": 12.0,
+        "h": 8.0,
+        "fl_x": 10.0,
+        **METRES_ALONG_RAYS,
+        "aabb": [[0, 0, 0], [8, 4, 2]],
+        "frames": frames[::-1],
+    }
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     return tmp_path, np.array(pictures)
 

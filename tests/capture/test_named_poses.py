@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.capture.named_poses import read_named_poses
+from nerg_mi.capture.named_poses import describe_other_models, find_source, read_named_poses
 from nerg_mi.capture.transforms import read_transforms
 from nerg_mi.errors import NergError
 
@@ -78,3 +78,27 @@ def test_a_model_whose_quaternion_is_zero(tmp_path):
     (folder / "images.txt").write_text("1 0 0 0 0 0 0 0 1 a.jpg\n\n")
     with pytest.raises(NergError, match='image "a.jpg" of .*its quaternion is zero'):
         read_named_poses(folder)
+
+
+@pytest.mark.parametrize("base", ["sparse", "colmap/sparse", "."])
+@pytest.mark.parametrize("counts", [{"0": 2, "1": 5}, {"0": 5, "1": 2}, {"0": 1, "2": 3, "10": 4}, {"0": 3, ".": 3}])
+def test_of_several_models_the_largest_is_taken(tmp_path, base, counts):
+    for name, count in counts.items():
+        write_colmap(tmp_path / base / name, some_poses(count))
+    best = max(counts, key=lambda name: counts[name])
+    assert find_source(tmp_path).resolve() == (tmp_path / base / best).resolve()
+    (note,) = describe_other_models(tmp_path / base / best)
+    assert f"of {len(counts)} COLMAP models" in note and f"({max(counts.values())} images) is used" in note
+
+
+def test_binary_models_are_counted_by_their_header(tmp_path):
+    for name, count in (("0", 2), ("1", 24)):
+        (tmp_path / "sparse" / name).mkdir(parents=True)
+        for file in ("cameras.bin", "images.bin"):
+            (tmp_path / "sparse" / name / file).write_bytes(count.to_bytes(8, "little"))
+    assert find_source(tmp_path).name == "1"
+    assert describe_other_models(tmp_path / "sparse/0")[0].endswith('"0" (2 images) is used, and not "1" (24 images)')
+
+
+def test_a_single_model_needs_no_note(tmp_path):
+    assert describe_other_models(write_colmap(tmp_path / "sparse/0", some_poses(2))) == []

@@ -1,6 +1,7 @@
 """Which frames of a data set are held out, and the coordinates that are asked for."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -9,8 +10,22 @@ from scipy.spatial.transform import Rotation
 from nerg_mi.capture.cameras import pixel_directions
 from nerg_mi.capture.dataset import open_dataset
 from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.capture.sources import read_split
 from nerg_mi.errors import NergError
-from tests.capture.written_sets import OPENCV, H, W, cameras, expected_rays, nerfstudio, opengl, picture, rewrite
+from tests.capture.written_sets import (
+    OPENCV,
+    H,
+    W,
+    cameras,
+    colmap_bin,
+    colmap_txt,
+    expected_rays,
+    instant_ngp,
+    nerfstudio,
+    opengl,
+    picture,
+    rewrite,
+)
 
 
 def test_blender_style_folders_keep_their_split(tmp_path, rgb):
@@ -129,3 +144,34 @@ def test_held_out_frames_of_a_file_of_their_own_are_turned_alike(ring):
     assert len(data.held_out) == 3
     for view in [*data.train, *data.held_out]:
         assert np.allclose(view.camera.to_world, everywhere[view.name], atol=1e-6)
+
+
+@pytest.mark.parametrize("write", [instant_ngp, colmap_bin, colmap_txt])
+def test_what_a_capture_holds_and_is_not_used_is_named_once(tmp_path, rgb, write):
+    """Photos without a pose, counted; other files and folders of the capture; not those that are used."""
+    write(tmp_path, rgb, OPENCV)
+    assert read_split(tmp_path).posed.notes == []
+    for name in ("images/new.png", "images/other.JPG", "images/notes.txt", "images/.hidden.png", "mesh.ply", ".cache"):
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "images_2").mkdir()
+    stray, rest = read_split(tmp_path).posed.notes
+    assert stray.startswith("2 of 11 photos have no pose") and stray.endswith("new.png, other.JPG")
+    assert rest == f'not used of "{tmp_path.name}": images_2, mesh.ply'
+
+
+def test_files_of_frames_and_of_held_out_frames_are_no_leftovers(ring):
+    content = json.loads((ring / "transforms.json").read_text())
+    frames = content["frames"]
+    for k, f in enumerate(frames):
+        f["mask_path"], f["depth_file_path"] = f"images/mask_{k}.png", f"images/depth_{k}.png"
+        for key in ("mask_path", "depth_file_path"):
+            (ring / f[key]).write_bytes(b"")
+    (ring / "transforms.json").write_text(json.dumps({**content, "frames": frames[:6]}))
+    (ring / "transforms_test.json").write_text(json.dumps({**content, "frames": frames[6:]}))
+    assert read_split(ring).posed.notes == []
+
+
+def test_models_that_are_not_used_are_named(tmp_path, rgb):
+    colmap_bin(tmp_path, rgb, OPENCV)
+    shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
+    assert any("of 2 COLMAP models" in note for note in read_split(tmp_path).posed.notes)

@@ -1,12 +1,13 @@
 """Reading transforms files: what is understood, what is listed, what is refused."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nerg_mi.capture.posed import DepthFile, MaskFile
-from nerg_mi.capture.transforms import read_dataparser, read_transforms
+from nerg_mi.capture.transforms import read_dataparser, read_frame_poses, read_transforms
 from nerg_mi.errors import NergError
 from tests.capture.written_sets import POSE, frame
 
@@ -69,8 +70,14 @@ def test_units_and_kinds_of_depth(write):
     assert depth("d.png") == DepthFile(folder / "d.png", 1e-3, True)
     assert depth("d.png", "depth_path", integer_depth_scale=0.01) == DepthFile(folder / "d.png", 0.01, True)
     assert depth("d.png", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
-    assert depth("d.npy") == DepthFile(folder / "d.npy", 1.0, False)
-    assert depth("d.exr", is_euclidean_depth=False) == DepthFile(folder / "d.exr", 1.0, True)
+    # As nerfstudio reads them: steps of a millimetre along the axis, whatever the kind of file; EXR as Record3D's.
+    assert depth("d.npy") == DepthFile(folder / "d.npy", 1e-3, True)
+    assert depth("d.npy", depth_unit_scale_factor=1.0) == DepthFile(folder / "d.npy", 1.0, True)
+    assert depth("d.npy", depth_unit_scale_factor=0.5, applied_scale=2.0).unit == pytest.approx(1.0)
+    assert depth("d.exr") == DepthFile(folder / "d.exr", 1.0, True)
+    assert depth("d.exr", applied_scale=2.0, is_euclidean_depth=True) == DepthFile(folder / "d.exr", 2.0, False)
+    assert depth("d.exr", depth_unit_scale_factor=1e-3).unit == 1e-3
+    assert depth("d.png", enable_depth_loading=False) is None
 
 
 def test_frames_that_cannot_be_used_are_listed_with_reasons(write):
@@ -292,3 +299,129 @@ def test_a_file_nested_deep_is_refused(tmp_path):
     (tmp_path / "transforms.json").write_text('{"frames": ' + "[" * 200_000)
     with pytest.raises(NergError, match="transforms.json.*nested"):
         read_transforms(tmp_path / "transforms.json")
+
+
+@pytest.mark.parametrize("keys", [{"from_mitsuba": True}, {"from_mitsuba": 1}, {"normal_mts_args": "-D x=1"}])
+def test_cameras_of_mitsuba_are_turned(write, keys):
+    """They look along +z with x to the left; positions stay, as in instant-ngp's nerf_matrix_to_ngp."""
+    pose = np.array([[0.0, 0, 1, 3], [1, 0, 0, 4], [0, 1, 0, 5], [0, 0, 0, 1]])
+    path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png", transform_matrix=pose.tolist())]})
+    expected = pose * [-1, 1, -1, 1]
+    assert np.allclose(read_transforms(path).frames[0].to_world, expected)
+    assert np.allclose(read_frame_poses(path)[1][0][1], expected)
+
+
+@pytest.mark.parametrize("keys", [{}, {"from_mitsuba": False}, {"from_mitsuba": None}, {"from_na": False}])
+def test_other_cameras_are_not(write, keys):
+    assert np.array_equal(
+        read_transforms(write({"fl_x": 1.0, **keys, "frames": [frame("a.png")]})).frames[0].to_world, np.eye(4)
+    )
+
+
+CHANGES = [
+    {"from_na": True},
+    {"camera_convention": "opencv"},
+    {"coordinate_system": "OPENCV"},
+    {"handedness": "left"},
+    {"is_w2c": True},
+    {"rolling_shutter": [0, 0, 1, 0]},
+    {"white_transparent": True},
+    {"skew": 0.1},
+    {"distortion": [0.1, 0]},
+    {"fisheye_crop_radius": 300},
+    {"latlong": True},
+]
+
+
+@pytest.mark.parametrize("keys", CHANGES, ids=lambda k: next(iter(k)))
+def test_an_unknown_key_that_changes_meaning_is_refused(write, keys):
+    """With the file's name where it stands for all frames, and costing the frame where it stands in one."""
+    key = next(iter(keys))
+    path = write({"fl_x": 1.0, **keys, "frames": [frame("a.png")]})
+    with pytest.raises(NergError, match=f'transforms.json.*"{key}"'):
+        read_transforms(path)
+    with pytest.raises(NergError, match=f'"{key}"'):
+        read_frame_poses(path)
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", **keys), frame("b.png")]}))
+    assert [f.name for f in t.frames] == ["b.png"] and f'"{key}"' in t.unused[0].reason
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {
+            "camera_convention": "OpenGL",
+            "is_w2c": False,
+            "rolling_shutter": [0, 0, 0, 0],
+            "skew": 0.0,
+            "depth_type": "z",
+        },
+        {"transform_matrix_start": POSE, "transform_matrix_end": POSE},
+        {"aabb_scale": 16, "scale": 0.3, "offset": [0, 0, 0], "sharpness": 9.0, "colmap_im_id": 7, "rotation": 0.1},
+    ],
+)
+def test_keys_that_change_nothing_are_read_over(write, keys):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png", **keys)]}))
+    assert np.array_equal(t.frames[0].to_world, np.eye(4)) and "a.png" in t.frames[0].name
+
+
+def test_unknown_keys_of_depth_are_refused_where_there_is_depth(write):
+    content = {"fl_x": 1.0, "depth_scale": 4000, "frames": [frame("a.png", depth_file_path="b.png")]}
+    with pytest.raises(NergError, match='"depth_scale".*depth_unit_scale_factor'):
+        read_transforms(write(content))
+
+
+def test_keys_that_are_not_used_are_named_once(write):
+    frames = [frame(n, time=0.5, sharpness=3.0) for n in ("a.png", "b.png")]
+    t = read_transforms(write({"fl_x": 1.0, "aabb_scale": 4, "ply_file_path": "sparse_pc.ply", "frames": frames}))
+    assert t.notes == ["keys of transforms.json that are not used: ply_file_path, time"]
+
+
+@pytest.mark.parametrize("key", ["from_mitsuba", "is_fisheye", "is_equirectangular", "is_euclidean_depth"])
+def test_flags_are_true_or_false(write, key):
+    t = read_transforms(
+        write({"fl_x": 1.0, "frames": [frame("a.png", depth_path="a.png", **{key: "false"}), frame("b.png")]})
+    )
+    assert f'"{key}" must be true or false' in t.unused[0].reason
+
+
+def test_other_spellings_of_a_lens(write):
+    """instant-ngp's angles in degrees, nerfstudio's list of coefficients."""
+    i = read_transforms(write({"x_fov": 90.0, "frames": [frame("a.png")]})).frames[0].intrinsics(8, 8)
+    assert (i.fx, i.fy) == pytest.approx((4.0, 4.0))
+    keys = {"fl_x": 3.0, "k1": 9.0, "distortion_params": [0.1, 0.2, 0.3, 0, 0.5, 0.6]}
+    i = read_transforms(write({**keys, "frames": [frame("a.png")]})).frames[0].intrinsics(8, 8)
+    assert (i.k1, i.k2, i.k3, i.p1, i.p2) == (0.1, 0.2, 0.3, 0.5, 0.6)
+
+
+@pytest.mark.parametrize(
+    "listed, stored",
+    [
+        ("images\\a.png", "images/a.png"),
+        (".\\images\\a.png", "images/a.png"),
+        ("images/K\u00fcche.png", "images/Ku\u0308che.png"),
+        ("images/Ku\u0308che.png", "images/K\u00fcche.png"),
+        ("Images/A.PNG", "images/a.png"),
+        ("images/a.jpg", "images/a.JPG"),
+        ("IMAGES\\K\u00dcCHE", "images/Ku\u0308che.png"),
+    ],
+)
+def test_names_spelled_by_another_system_are_found(write, listed, stored):
+    """Of images, masks, depth files and lists of names."""
+    keys = {"mask_path": listed, "depth_file_path": listed} if Path(listed).suffix else {}
+    frames = [frame(listed, **keys), frame("b.png")]
+    t = read_transforms(write({"fl_x": 1.0, "frames": frames, "test_filenames": [stored]}, [stored, "b.png"]))
+    found = next(f for f in t.frames if f.name == listed)
+    assert found.image.samefile(found.image.parent / Path(stored).name) and found.image.name == Path(stored).name
+    if keys:
+        assert found.mask.path == found.depth.path == found.image and t.held_out == [listed]
+
+
+def test_names_that_two_files_fit_are_refused(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("A.png"), frame("b.png")]}, ["a.png", "a.PNG", "b.png"]))
+    assert "a.PNG, a.png" in t.unused[0].reason
+
+
+def test_backslashes_lead_nowhere_that_slashes_do_not(write):
+    t = read_transforms(write({"fl_x": 1.0, "frames": [frame("a.png"), frame("..\\..\\etc\\hostname")]}))
+    assert "outside of the data set's folder" in t.unused[0].reason

@@ -15,6 +15,8 @@ W, H = 14, 10
 OPENCV = Intrinsics(W, H, 12.0, 12.5, 6.6, 5.3, 0.05, -0.02, 0.003, -0.002)
 FISHEYE = Intrinsics(W, H, 9.0, 9.5, 6.6, 5.3, 0.03, -0.01, k3=0.002, k4=-3e-4, fisheye=True)
 COUNT = 9
+# Keys of a transforms file, without which NPY counts millimetres along the axis.
+METRES_ALONG_RAYS = {"depth_unit_scale_factor": 1.0, "is_euclidean_depth": True}
 
 
 def cameras():

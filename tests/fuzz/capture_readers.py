@@ -46,6 +46,7 @@ def _make_transforms(folder: Path) -> None:
         "w": 8,
         "h": 6,
         "fl_x": 9.0,
+        "depth_unit_scale_factor": 1.0,
         "cx": 4.0,
         "cy": 3.0,
         "aabb": [[-2, -2, -2], [2, 2, 2]],
