@@ -11,7 +11,7 @@ from nerg_mi.errors import NergError
 from . import lens
 from .cameras import Camera, pixel_directions, pixel_grid, view_tangents
 from .posed import DepthFile, Frame, Unused
-from .reading import read_depth, read_image, read_mask
+from .reading import read_depth, read_mask, read_photo
 from .resize import all_used, area_average, nearest
 
 
@@ -21,7 +21,8 @@ class View:
 
     ``pixels``: (h, w, 3) or (h, w, 4), sRGB as stored, alpha straight (not premultiplied): uint8, uint16 or floats in
     0..1; ``depth``: (h, w) float32 distance along each pixel's ray in scene units, 0 where unknown, or None;
-    ``mask``: (h, w) bool, the pixels that count, or None for all.
+    ``mask``: (h, w) bool, the pixels that count, or None for all; ``left_out``: fraction of the pixels that the mask's
+    file leaves out, None without such a file.
     """
 
     name: str
@@ -29,6 +30,7 @@ class View:
     pixels: np.ndarray
     depth: np.ndarray | None = None
     mask: np.ndarray | None = None
+    left_out: float | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -99,7 +101,7 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
     on in the mask. ``depth``: read depth files. `NergError` names the file that cannot be used.
     """
     check_size(width, downscale)
-    pixels = read_image(frame.image)
+    pixels = read_photo(frame)
     h, w = pixels.shape[:2]
     stated = frame.intrinsics(w, h)
     factor = w / width if width is not None else downscale or 1.0
@@ -110,6 +112,7 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
     # Every pixel must have a ray; lenses fold over at the borders first.
     view_tangents(intrinsics)
     mask = None if frame.mask is None else all_used(read_mask(frame.mask, (h, w)), *size)
+    left_out = None if mask is None else 1 - float(mask.mean())
     if intrinsics.fisheye:
         shown = np.linalg.norm(pixel_grid(intrinsics), axis=-1) < lens.fisheye_limit(intrinsics)[1]
         mask = mask if shown.all() else shown if mask is None else mask & shown
@@ -121,7 +124,7 @@ def load_view(frame: Frame, width: int | None = None, downscale: float | None = 
     if pixels.dtype == np.float32:
         # 16 bits tell more than the photo and take half the room.
         pixels = np.round(pixels * 65535).astype(np.uint16)
-    return View(frame.name, Camera(intrinsics, frame.to_world), pixels, distance, mask)
+    return View(frame.name, Camera(intrinsics, frame.to_world), pixels, distance, mask, left_out)
 
 
 def _as_floats(pixels: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""Pictures, depth and masks from files."""
+"""Pictures, depth and masks from files, and photos as their cameras describe them."""
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,19 @@ from nerg_mi.files.image_header import check_image
 from nerg_mi.files.npy import read_npy
 from nerg_mi.maths.color import encode_srgb
 
-from .posed import DepthFile, MaskFile
+from .posed import DepthFile, Frame, MaskFile, name_some
+
+_ORIENTATION = 0x0112
+# EXIF orientation -> what makes stored pixels (h, w, c) upright.
+_TURNS = {
+    2: np.fliplr,
+    3: lambda p: np.rot90(p, 2),
+    4: np.flipud,
+    5: lambda p: p.swapaxes(0, 1),
+    6: lambda p: np.rot90(p, -1),
+    7: lambda p: np.rot90(p, 2).swapaxes(0, 1),
+    8: np.rot90,
+}
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -54,6 +67,46 @@ def read_image(path: str | Path) -> np.ndarray:
         raise NergError(f'the image "{path}" holds values that are not finite; make it again')
     out[..., :3] = encode_srgb(np.clip(out[..., :3], 0, 1))
     return np.clip(out, 0, 1)
+
+
+def read_photo(frame: Frame) -> np.ndarray:
+    """The pixels of `read_image` as the camera of ``frame`` describes them.
+
+    A photo whose EXIF orientation says that it is to be turned is turned where the camera's width and height are those
+    of the turned picture, and stays where they are those of the stored one. Where they fit both, poses of COLMAP are of
+    the stored pixels, since it does not read that note; `NergError` for others, of which nothing tells.
+    """
+    pixels, orientation = read_image(frame.image), _read_orientation(frame.image)
+    if orientation == 1:
+        return pixels
+    upright = _TURNS[orientation](pixels)
+    fits_stored, fits_upright = (frame.has_shape(p.shape[1], p.shape[0]) for p in (pixels, upright))
+    if fits_stored and fits_upright and not frame.ignores_exif:
+        raise NergError(
+            f'the photo "{frame.image}" is to be turned by its EXIF orientation ({orientation}), and nothing tells '
+            "whether its pose and its lens are of the stored or of the turned picture; store it turned, or remove the "
+            "note where they are of the stored one (exiftool -Orientation= FILE)"
+        )
+    return np.ascontiguousarray(upright) if fits_upright and not fits_stored else pixels
+
+
+def _read_orientation(path: Path) -> int:
+    """EXIF orientation of a JPEG or PNG file, from 1 (as stored) to 8; 1 where it has none."""
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
+
+    kinds = {b"\xff\xd8": JpegImageFile, b"\x89P": PngImageFile}
+    with warnings.catch_warnings(), open(path, "rb") as file:
+        warnings.simplefilter("ignore")
+        kind = kinds.get(file.read(2))
+        file.seek(0)
+        try:
+            image = None if kind is None else kind(file)
+            # Without the condition, Pillow decodes a PNG to look for notes behind its pixels.
+            value = 1 if image is None or "exif" not in image.info else image.getexif().get(_ORIENTATION, 1)
+        except Exception:  # Pillow raises many kinds on damaged notes, without which a photo is as good
+            return 1
+    return value if value in _TURNS else 1
 
 
 def open_bitmap(path: str | Path, what: str):
@@ -103,17 +156,16 @@ def _layer(bitmap, path):
 
 
 def read_depth(source: DepthFile) -> np.ndarray:
-    """The values (h, w) of ``.npy``, ``.exr`` (first channel) or 16-bit ``.png`` in scene units, float32; 0:
-    unknown."""
+    """The values (h, w) of ``.npy``, ``.exr`` or 16-bit ``.png`` in scene units, float32; 0: unknown."""
     path, suffix = source.path, source.path.suffix.lower()
     if suffix == ".npy":
         out = read_npy(path, "depth file")
-    elif suffix in (".exr", ".png"):
+    elif suffix == ".exr":
+        out = _depth_channel(read_exr(path, "depth file"), path)
+    elif suffix == ".png":
         out = np.array(open_bitmap(path, "depth file"))
-        if suffix == ".png" and out.dtype != np.uint16:
+        if out.dtype != np.uint16:
             raise NergError(f'the depth file "{path}" must be a 16-bit PNG, but has {out.dtype.itemsize * 8} bits')
-        if out.ndim == 3 and (suffix == ".exr" or out.shape[2] == 1):
-            out = out[..., 0]
     else:
         raise NergError(f'the depth file "{path}" must be .npy, .exr or a 16-bit .png')
     if out.ndim == 3 and out.shape[2] == 1:
@@ -136,6 +188,33 @@ def read_mask(source: MaskFile, shape: tuple[int, int]) -> np.ndarray:
             f'the mask "{source.path}" has {out.shape[1]} x {out.shape[0]} pixels, but its image '
             f"{shape[1]} x {shape[0]}"
         )
-    # An alpha channel says nothing here; as in nerfstudio and instant-ngp, whatever is not black is white.
-    white = np.any((out[..., :1] if out.shape[2] <= 2 else out[..., :3]) != 0, axis=2)
+    colors = out[..., :1] if out.shape[2] <= 2 else out[..., :3]
+    white = _is_white(colors).any(axis=2)
+    if out.shape[2] in (2, 4):
+        opaque = _is_white(out[..., -1])
+        # A stencil of one colour, black as well, says by its alpha alone what is used.
+        is_stencil = white.all() or (not white.any() and not opaque.all())
+        white = opaque if is_stencil else white & opaque
     return ~white if source.hides else white
+
+
+def _is_white(values: np.ndarray) -> np.ndarray:
+    """Which ``values`` are above half of white: JPEG makes black values of 1 to 3."""
+    if not np.issubdtype(values.dtype, np.integer):
+        return values > 0.5
+    # Labels of 0 and 1 are no shades of black, nor are 8-bit values in 16 bits.
+    white = next(w for w in (1, 255, np.iinfo(values.dtype).max) if values.max(initial=0) <= w)
+    return values > 0.5 * white
+
+
+def _depth_channel(channels: dict[str, np.ndarray], path: Path) -> np.ndarray:
+    """The depth among the ``channels`` of an EXR: the only one, the one of that name, or grey as R, G and B."""
+    names = list(channels)
+    named = [n for n in names if "depth" in n.lower() or n.rpartition(".")[2].lower() == "z"]
+    if len(names) == 1 or len(named) == 1:
+        return channels[named[0] if named else names[0]]
+    if {"R", "G", "B"} <= set(names) and all(np.array_equal(channels["R"], channels[n], True) for n in "GB"):
+        return channels["R"]
+    raise NergError(
+        f'the depth file "{path}" has the channels {name_some(names)}; save it with one channel, or call one of them Z'
+    )

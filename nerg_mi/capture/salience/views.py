@@ -17,7 +17,7 @@ from nerg_mi.capture.cameras import Camera
 from nerg_mi.capture.intrinsics import Intrinsics
 from nerg_mi.capture.named_poses import find_source
 from nerg_mi.capture.posed import Frame, MaskFile, inside
-from nerg_mi.capture.reading import open_bitmap, read_image, read_mask
+from nerg_mi.capture.reading import open_bitmap, read_mask, read_photo
 from nerg_mi.capture.resize import all_used, nearest, overlap
 from nerg_mi.capture.sources import read_posed
 from nerg_mi.errors import MissingFile, NergError
@@ -97,7 +97,7 @@ class SalienceView:
 @dataclass(frozen=True)
 class SalienceSet:
     """``views``; ``missing``: names of the frames without an image; ``stray``: files that belong to no frame;
-    ``unused``: sentences on frames that the posed set itself cannot use; ``about``: for provenance (JSON)."""
+    ``unused``: sentences on what of the posed set is not used; ``about``: for provenance (JSON)."""
 
     views: list[SalienceView]
     missing: list[str]
@@ -154,7 +154,7 @@ def open_salience(
         "used": len(views),
         "missing": len(missing),
     }
-    return SalienceSet(views, missing, stray, [str(u) for u in posed.unused], about)
+    return SalienceSet(views, missing, stray, [*map(str, posed.unused), *posed.notes], about)
 
 
 def read_salience(path: str | Path) -> np.ndarray:
@@ -235,7 +235,7 @@ def _files(folder: Path, frames: list[Frame], allow_outside: bool) -> tuple[dict
 
 def _view(frame: Frame, path: Path | None, model, per: str) -> SalienceView:
     if path is None:
-        photo = read_image(frame.image)
+        photo = read_photo(frame)
         size = photo.shape[1::-1]
         try:
             values = model(_opaque(photo))
@@ -254,7 +254,7 @@ def _view(frame: Frame, path: Path | None, model, per: str) -> SalienceView:
     intrinsics = frame.intrinsics(*size).resized(w, h)
     solid = pixel_solid_angles(intrinsics)
     if frame.mask is not None:
-        solid = np.where(_unmasked(frame.mask, frame.image, intrinsics), solid, 0)
+        solid = np.where(_unmasked(frame, frame.mask, intrinsics), solid, 0)
     share = np.where(solid > 0, values, 0) if per == "pixel" else values * solid
     if not share.sum() > 0:
         raise NergError(
@@ -275,12 +275,12 @@ def _photo_size(frame: Frame) -> tuple[int, int]:
     """Width and height: what the camera says, or else the file."""
     if "w" in frame.lens and "h" in frame.lens:
         return round(frame.lens["w"]), round(frame.lens["h"])
-    return read_image(frame.image).shape[1::-1]
+    return read_photo(frame).shape[1::-1]
 
 
-def _unmasked(file: MaskFile, photo: Path, intrinsics: Intrinsics) -> np.ndarray:
-    """Which pixels of a map are known altogether, by the mask of its ``photo``."""
-    mask = read_mask(file, read_image(photo).shape[:2])
+def _unmasked(frame: Frame, file: MaskFile, intrinsics: Intrinsics) -> np.ndarray:
+    """Which pixels of a map are known altogether, by the mask ``file`` of its ``frame``."""
+    mask = read_mask(file, read_photo(frame).shape[:2])
     width, height = min(intrinsics.width, mask.shape[1]), min(intrinsics.height, mask.shape[0])
     used = all_used(mask, width, height)
     # A map that is finer than its mask takes the nearest.

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from nerg_mi.capture.images import read_image
 from nerg_mi.capture.posed import Frame, PosedImages
+from nerg_mi.capture.reading import read_photo
 from nerg_mi.capture.sources import find_source, read_posed
 from nerg_mi.errors import NergError, plain
 from nerg_mi.rendering.scene_parts import Eye, Lens
@@ -64,14 +64,14 @@ def _camera(frame: Frame) -> PhotoCamera:
 
 
 def _size(frame: Frame) -> tuple[int, int]:
-    height, width = read_image(frame.image).shape[:2]
+    height, width = read_photo(frame).shape[:2]
     return width, height
 
 
 def _frame(posed: PosedImages, photo: str) -> Frame:
     frames = posed.frames
     for f in frames:
-        if photo in (f.name, Path(f.name).name, Path(f.name).stem):
+        if photo in (f.name, f.image.name, f.image.stem):
             return f
     if photo.isdecimal() and int(photo) < len(frames):
         return frames[int(photo)]
