@@ -1,5 +1,5 @@
-"""What cameras looked at: the box around it, from points on its surfaces or from the cameras alone, and whether the
-place ends there."""
+"""What cameras looked at: the box around it, from points on its surfaces or from the cameras alone, whether the
+place ends there, and whether depth fits the cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from nerg_mi.maths.contraction import AnyBox, ContractedBox
 from nerg_mi.maths.ray_box import box_interval
 
 from . import lens
-from .cameras import Camera, project
+from .cameras import Camera, pixel_directions, project
 
 # Cameras whose axes miss their common point by less than this look at one thing.
 _CONVERGING = np.radians(30)
@@ -32,6 +32,14 @@ _BEYOND = 0.02
 _CORE, _MOST_LARGER, _LEAST_SMALLER = 0.9, 4.0, 2.5
 # So many times larger may a box get that is to hold the cameras as well as the points.
 _FAR_OUTSIDE = 2.0
+# Of the cameras' extent, so many times as far may the median depth be.
+_FARTHEST_DEPTH = 100
+# Factors by which wrong units put depth too far or too near: of millimetres, centimetres, fifths of a millimetre.
+_WRONG_UNITS = (1e-3, 1e-2, 0.1, 0.2, 5.0, 10.0, 100.0, 1e3)
+# Views that are compared, and points of each.
+_COMPARED, _COMPARED_POINTS = 16, 100
+# Points agree where their distances differ by at most this; another unit is right where so many more of them agree.
+_AGREEING, _MORE = 0.05, 0.2
 
 
 @dataclass(frozen=True)
@@ -192,3 +200,51 @@ def _sees(camera: Camera, points: np.ndarray) -> bool:
     at, shown = project(points, camera)
     i = camera.intrinsics
     return bool(np.any(shown & np.all((at >= 0) & (at <= [i.width, i.height]), axis=1)))
+
+
+def explain_wrong_depth(cameras: list[Camera], depths: list[np.ndarray]) -> str | None:
+    """Why ``depths`` (h, w), distances along the rays of ``cameras``, are in other units than these; None where they
+    may be in the same.
+
+    In the right unit views agree on where a point is. In much too large a unit all of them are at one place, compared
+    with their depth, so that what merely looks alike agrees in every larger unit as well: that is no evidence.
+    """
+    picked = np.unique(np.linspace(0, len(cameras) - 1, _COMPARED).astype(int))
+    views = [(cameras[k], depths[k]) for k in picked]
+    now = _agreement(views, 1.0)
+    if now <= 1 - _MORE:
+        best, factor = max((_agreement(views, f), f) for f in _WRONG_UNITS)
+        if best >= _MORE + max(now, _agreement(views, 10 * factor)):
+            return (
+                f"{best:.0%} of its points agree with the depth of other views if it is multiplied by {factor:g}, and "
+                f"{now:.0%} as it is"
+            )
+    extent = float(np.linalg.norm(np.ptp([c.center for c in cameras], axis=0)))
+    median = float(np.median([np.median(d[d > 0]) for d in depths if (d > 0).any()] or [0.0]))
+    if extent > 0 and median > _FARTHEST_DEPTH * extent:
+        return f"its median is {median:.3g} units, and the cameras spread over {extent:.3g}"
+    return None
+
+
+def _agreement(views: list[tuple[Camera, np.ndarray]], factor: float) -> float:
+    """Of the points that one of ``views`` sees by its depth times ``factor``, and that are within the picture of
+    another, the fraction that lies where this sees something by its own."""
+    points = [depth_points(camera, factor * depth, _COMPARED_POINTS) for camera, depth in views]
+    count = agreeing = 0
+    for k, (camera, depth) in enumerate(views):
+        others = np.concatenate([np.zeros((0, 3)), *points[:k], *points[k + 1 :]])
+        at, shown = project(others, camera)
+        shown &= np.all((at >= 0) & (at < depth.shape[::-1]), axis=1)
+        x, y = at[shown].astype(int).T
+        seen, expected = factor * depth[y, x], np.linalg.norm(others[shown] - camera.center, axis=1)
+        count += int((seen > 0).sum())
+        agreeing += int(np.sum((seen > 0) & (np.abs(seen - expected) <= _AGREEING * expected)))
+    return agreeing / count if count else 0.0
+
+
+def depth_points(camera: Camera, depth: np.ndarray, most: int) -> np.ndarray:
+    """World points (N, 3) that ``camera`` sees by its ``depth`` (h, w), some ``most`` evenly over its pixels."""
+    step = max(1, int(np.sqrt(depth.size / most)))
+    t = depth[::step, ::step]
+    d = pixel_directions(camera.intrinsics)[::step, ::step][t > 0] @ camera.to_world[:3, :3].T
+    return camera.center + d * t[t > 0][:, None]

@@ -11,8 +11,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.contraction import AnyBox, ContractedBox
 
-from .bounds import Extent, place_extent, unmatched
-from .cameras import pixel_directions
+from .bounds import Extent, depth_points, explain_wrong_depth, place_extent, unmatched
 from .images import View, load_usable
 from .posed import PosedImages, Unused
 from .sources import read_split, up_of
@@ -88,7 +87,9 @@ def open_dataset(
             f'none of the {len(bad)} training frames of "{split.posed.path}" can be used; the first, '
             f'"{bad[0].name}": {bad[0].reason}'
         )
+    _check_depth(split.posed, train)
     held_out, bad_held = load_usable(split.held_out, width, downscale, depth)
+    masks = _describe_masks([*train, *held_out])
     extent = _extent(split.posed, train, aabb, unbounded)
     alone = unmatched([v.camera for v in train], extent.box) if len(train) > 1 else []
     if len(alone) == len(train):
@@ -118,7 +119,30 @@ def open_dataset(
         source["up"] = [round(float(x), 6) for x in up.direction]
     kind = f"{_KINDS[extent.kind]}: {extent.why}"
     unit = _unit(split.posed, train, extent.box.core, scale)
-    return Dataset(train, held_out, extent.box, extent.how, unused, source, split.posed.notes, unit, kind, _up(up))
+    return Dataset(
+        train, held_out, extent.box, extent.how, unused, source, [*split.posed.notes, *masks], unit, kind, _up(up)
+    )
+
+
+def _check_depth(posed: PosedImages, views: list[View]) -> None:
+    """Raise `NergError` for depth in other units than the cameras'."""
+    views = [v for v in views if v.depth is not None]
+    reason = explain_wrong_depth([v.camera for v in views], [v.depth for v in views]) if views else None
+    if reason is not None:
+        raise NergError(
+            f'the depth of "{posed.path}" does not fit its cameras: {reason}; correct "depth_unit_scale_factor", the '
+            "metres of one step of its depth files (default: 0.001, of EXR 1), or leave depth out with --no-depth"
+        )
+
+
+def _describe_masks(views: list[View]) -> list[str]:
+    """A sentence on what the masks of ``views`` leave out, where there are any."""
+    fractions = [v.left_out for v in views if v.left_out is not None]
+    if not fractions:
+        return []
+    if not any(fractions):
+        return [f"the masks of all {len(fractions)} frames that have one leave out nothing: are black and white right?"]
+    return [f"masks leave out {np.mean(fractions):.1%} of the pixels of {len(fractions)} frames"]
 
 
 def _extent(posed: PosedImages, views: list[View], aabb, unbounded: bool | None) -> Extent:
@@ -154,13 +178,7 @@ def _depth_points(views: list[View]) -> np.ndarray | None:
     depths = [v.depth for v in views if v.depth is not None]
     if len(depths) < len(views):
         return None
-    points = []
-    for view, depth in zip(views, depths):
-        step = max(1, int(np.sqrt(depth.size / _DEPTH_POINTS)))
-        t = depth[::step, ::step]
-        d = pixel_directions(view.camera.intrinsics)[::step, ::step][t > 0] @ view.camera.to_world[:3, :3].T
-        points.append(view.camera.center + d * t[t > 0][:, None])
-    return np.concatenate(points)
+    return np.concatenate([depth_points(v.camera, t, _DEPTH_POINTS) for v, t in zip(views, depths)])
 
 
 def _corners(box: AnyBox) -> str:
@@ -189,6 +207,6 @@ def _unit(posed: PosedImages, views: list[View], box: AnyBox, scale: float) -> s
     extent = f"the box measures {size} units, the cameras spread over {spread}"
     if scale != 1:
         return f"{extent}; a unit of the data set counts {scale:g}"
-    if any(f.depth is not None and f.depth.along_axis and f.depth.path.suffix.lower() == ".png" for f in posed.frames):
-        return f"{extent}; a unit is a metre if the depth files count millimetres"
+    if any(f.depth is not None for f in posed.frames):
+        return f"{extent}; a unit is a metre if the depth files, by their scale factor, are in metres"
     return f"{extent}; if a unit is not a metre, give its length in metres with --scale"

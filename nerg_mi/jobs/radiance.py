@@ -181,11 +181,13 @@ def evaluate_radiance(
         options.width or trained_width,
         None,
         None,
-        True,
+        options.depth,
         options.scale,
         options.coordinates,
         options.allow_outside,
     )
+    for line in (*data.unused, *data.notes):
+        reporter.message(str(line))
     if not options.train:
         _refuse_trained(field, about, data)
     views = data.train if options.train else data.held_out

@@ -6,11 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from nerg_mi.capture.cameras import pixel_directions
+from nerg_mi.capture.bounds import explain_wrong_depth
+from nerg_mi.capture.cameras import Camera, pixel_directions
 from nerg_mi.capture.dataset import open_dataset
+from nerg_mi.capture.intrinsics import Intrinsics
+from nerg_mi.errors import NergError
 from tests.capture.written_sets import (
     COUNT,
     FISHEYE,
+    METRES_ALONG_RAYS,
     OPENCV,
     H,
     W,
@@ -21,6 +25,7 @@ from tests.capture.written_sets import (
     instant_ngp,
     lens_keys,
     nerfstudio,
+    opengl,
     picture,
     rewrite,
 )
@@ -133,7 +138,7 @@ def test_box_unit_and_scale(ring):
 def test_depth_finds_the_box(ring):
     """A wall 2 units from every camera along each ray: the points are where the depth says."""
     np.save(ring / "d.npy", np.full((H, W), 2.0, np.float32))
-    rewrite(ring, lambda c: [f.update(depth_file_path="d.npy") for f in c["frames"]])
+    rewrite(ring, lambda c: [f.update(METRES_ALONG_RAYS, depth_file_path="d.npy") for f in c["frames"]])
     data = open_dataset(ring, holdout=0)
     points = np.concatenate([(o + 2 * d).reshape(-1, 3) for o, d in (expected_rays(OPENCV, p) for p in cameras())])
     lower, upper = np.quantile(points, [0.0005, 0.9995], axis=0)
@@ -158,3 +163,71 @@ def test_the_fox_has_the_rays_that_it_always_had(recorded):
             ray = opencv.undistort(u, v, content["fl_x"], content["fl_y"], content["cx"] - 0.5, content["cy"] - 0.5, k)
             ray = frames[view.name][:3, :3] @ (ray * [1, -1, -1])
             assert np.allclose(d[row, column], ray / np.linalg.norm(ray), atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def seen_by_depth():
+    """Cameras and depth (distances along rays, metres) of a room of 4 x 3 x 2.5 m that they walk about in."""
+    seen = []
+    for k in range(12):
+        a = 2 * np.pi * k / 12
+        z = np.array([-np.cos(a), -np.sin(a), -0.1])
+        z /= np.linalg.norm(z)
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        pose = np.column_stack([np.stack([x, np.cross(z, x), z], axis=1), [2 + np.cos(a), 1.5 + 0.7 * np.sin(a), 1.2]])
+        camera = Camera(Intrinsics(24, 18, 15.0, 15.0, 12.0, 9.0), opengl(pose))
+        d = pixel_directions(camera.intrinsics) @ camera.to_world[:3, :3].T
+        with np.errstate(divide="ignore"):
+            walls = np.maximum((0 - camera.center) / d, ([4, 3, 2.5] - camera.center) / d)
+        seen.append((camera, walls.min(axis=-1)))
+    return seen
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.05, 1.5, 0.7])
+def test_depth_that_fits_its_cameras(seen_by_depth, factor):
+    assert explain_wrong_depth([c for c, _ in seen_by_depth], [factor * d for _, d in seen_by_depth]) is None
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e-2, 0.1, 0.2, 5.0, 100.0, 1e3])
+def test_depth_in_other_units_than_the_cameras_is_explained(seen_by_depth, factor):
+    reason = explain_wrong_depth([c for c, _ in seen_by_depth], [factor * d for _, d in seen_by_depth])
+    assert reason is not None and f"multiplied by {1 / factor:g}, " in reason
+
+
+def test_depth_that_all_views_have_alike_is_no_evidence(seen_by_depth):
+    """It agrees in any unit that makes the cameras' distances small."""
+    same = [np.full_like(d, 0.1) for _, d in seen_by_depth]
+    assert explain_wrong_depth([c for c, _ in seen_by_depth], same) is None
+    far = [np.full_like(d, 1000.0) for _, d in seen_by_depth]
+    assert "median is 1e+03 units" in explain_wrong_depth([c for c, _ in seen_by_depth], far)
+
+
+def test_depth_far_outside_of_the_cameras_is_refused(ring):
+    np.save(ring / "d.npy", np.full((H, W), 2000.0, np.float32))
+    rewrite(ring, lambda c: [f.update(depth_file_path="d.npy") for f in c["frames"]])
+    assert np.allclose(np.median(open_dataset(ring).train[0].depth), 2.0, rtol=0.2)
+    rewrite(ring, lambda c: c.update(depth_unit_scale_factor=1.0))
+    with pytest.raises(NergError, match="does not fit its cameras.*depth_unit_scale_factor.*--no-depth"):
+        open_dataset(ring)
+    assert open_dataset(ring, depth=False).train
+
+
+@pytest.mark.parametrize("lens", [OPENCV, FISHEYE], ids=["opencv", "fisheye"])
+def test_what_masks_leave_out_is_said(tmp_path, rgb, lens):
+    """Where it is nothing as well, which a fisheye's dark corners do not hide."""
+    instant_ngp(tmp_path, rgb, lens)
+    rewrite(tmp_path, lambda c: [f.update(mask_path="mask.png") for f in c["frames"]])
+    mask = np.full((H, W), 255, np.uint8)
+    rgb.Bitmap(mask).write(str(tmp_path / "mask.png"))
+    assert f"the masks of all {COUNT} frames that have one leave out nothing" in open_dataset(tmp_path).notes[-1]
+    mask[:, : W // 2] = 0
+    rgb.Bitmap(mask).write(str(tmp_path / "mask.png"))
+    assert open_dataset(tmp_path).notes[-1] == f"masks leave out 50.0% of the pixels of {COUNT} frames"
+
+
+def test_a_turned_photo_costs_its_frame_by_that_reason(ring, rgb):
+    """Swapping width and height would train on turned rays."""
+    rgb.Bitmap(np.ascontiguousarray(np.rot90(picture(0)))).write(str(ring / "images/0.png"))
+    data = open_dataset(ring, holdout=0)
+    assert len(data.train) == COUNT - 1 and "turn the pixels as the camera was held" in data.unused[0].reason

@@ -19,6 +19,7 @@ class PhotoOptions:
         "file",
         "Of the field: file, upright (+z up), original (applied_transform undone), a dataparser_transforms.json.",
     )
+    depth: bool = option(True, "Use the data set's depth, where it has any.")
     allow_outside: bool = option(False, "Read files outside of the data set's folder too, where it names them.")
 
 
@@ -42,7 +43,6 @@ class RadianceOptions(PhotoOptions):
     seed: int = option(0, "Seed of the weights, rays and jitter.")
     threads: int | None = option(None, "CPU threads. Default: all.")
     half: bool = option(False, "Store the weights in fp16.")
-    depth: bool = option(True, "Supervise with the data set's depth, where it has any.")
     depth_weight: float | None = option(None, "Weight of the depth's loss.")
     distortion_weight: float = option(0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.")
     photo_colors: bool = option(True, "Learn the exposure and white balance of each photo.")
