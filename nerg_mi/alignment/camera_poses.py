@@ -34,6 +34,7 @@ class Cameras:
     tracking: np.ndarray
     place: np.ndarray
     source: str = "the cameras"
+    notes: tuple[str, ...] = ()  # on what of the models is not used
 
     kind = "cameras"
 
@@ -66,8 +67,9 @@ class Cameras:
         off = errors(matrix, x, y)
         inliers = (off <= 5 * np.median(off) + 1e-9 * size) & (angle <= 5 * np.median(angle) + 1e-6)
         notes = [
+            *self.notes,
             f"{len(a)} cameras in common, {int(inliers.sum())} agree: off by {100 * np.median(off):.2g} cm and "
-            f"{np.median(angle):.2g} degrees (median)"
+            f"{np.median(angle):.2g} degrees (median)",
         ]
         mirrored = None
         flipped = move(MIRROR, x)
@@ -136,7 +138,8 @@ def read_cameras(tracking: Path, place: Path) -> Cameras:
         common = sorted(set(tables[0]) & set(tables[1]))
         if len(common) >= 2:
             a, b = (np.stack([t[name] for name in common]) for t in tables)
-            return Cameras(a, b, f'the cameras of "{tracking}" and "{place}"')
+            notes = tuple(note for model in models for note in (*map(str, model.unused), *model.notes))
+            return Cameras(a, b, f'the cameras of "{tracking}" and "{place}"', notes)
     raise NergError(
         f'"{tracking}" and "{place}" have no two pictures of the same name; give two models of the same pictures'
     )

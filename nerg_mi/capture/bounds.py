@@ -202,15 +202,14 @@ def _sees(camera: Camera, points: np.ndarray) -> bool:
     return bool(np.any(shown & np.all((at >= 0) & (at <= [i.width, i.height]), axis=1)))
 
 
-def explain_wrong_depth(cameras: list[Camera], depths: list[np.ndarray]) -> str | None:
-    """Why ``depths`` (h, w), distances along the rays of ``cameras``, are in other units than these; None where they
-    may be in the same.
+def explain_wrong_depth(seen: list[tuple[Camera, np.ndarray]]) -> str | None:
+    """Why depth is in other units than its camera; None where it may be in the same. ``seen``: cameras, each with its
+    depth (h, w), distances along its rays.
 
     In the right unit views agree on where a point is. In much too large a unit all of them are at one place, compared
     with their depth, so that what merely looks alike agrees in every larger unit as well: that is no evidence.
     """
-    picked = np.unique(np.linspace(0, len(cameras) - 1, _COMPARED).astype(int))
-    views = [(cameras[k], depths[k]) for k in picked]
+    views = [seen[k] for k in np.unique(np.linspace(0, len(seen) - 1, _COMPARED).astype(int))]
     now = _agreement(views, 1.0)
     if now <= 1 - _MORE:
         best, factor = max((_agreement(views, f), f) for f in _WRONG_UNITS)
@@ -219,8 +218,8 @@ def explain_wrong_depth(cameras: list[Camera], depths: list[np.ndarray]) -> str 
                 f"{best:.0%} of its points agree with the depth of other views if it is multiplied by {factor:g}, and "
                 f"{now:.0%} as it is"
             )
-    extent = float(np.linalg.norm(np.ptp([c.center for c in cameras], axis=0)))
-    median = float(np.median([np.median(d[d > 0]) for d in depths if (d > 0).any()] or [0.0]))
+    extent = float(np.linalg.norm(np.ptp([c.center for c, _ in seen], axis=0)))
+    median = float(np.median([np.median(d[d > 0]) for _, d in seen if (d > 0).any()] or [0.0]))
     if extent > 0 and median > _FARTHEST_DEPTH * extent:
         return f"its median is {median:.3g} units, and the cameras spread over {extent:.3g}"
     return None

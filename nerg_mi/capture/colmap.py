@@ -133,7 +133,10 @@ def read_colmap(
         table = (_points_bin if binary else _points_txt)(files["points3D"], raw["points3D"])
         counts["points3D"], points = len(table), _trusted(table)
     notes = [] if binary else [n for k, c in counts.items() for n in _count_notes(files[k], raw[k], c)]
-    return PosedImages(files["images"], frames, unused, None, digest, notes, points, images.parent, frozenset(listed))
+    folders = frozenset([images, *(p for p in images.rglob("*") if p.is_dir())])
+    return PosedImages(
+        files["images"], frames, unused, None, digest, notes, points, images.parent, folders, frozenset(listed)
+    )
 
 
 def count_images(folder: Path) -> int:
@@ -146,9 +149,10 @@ def count_images(folder: Path) -> int:
         return int.from_bytes(file.read(8), "little")
 
 
-def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.ndarray]]]:
+def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.ndarray]], list[str]]:
     """Of the model in ``folder``, whose images need not be there: its file of images, the model's SHA-256 as
-    `PosedImages` has it, and of each image its name and its OpenGL camera-to-world pose (4, 4).
+    `PosedImages` has it, of each image its name and its OpenGL camera-to-world pose (4, 4), and a sentence where a text
+    file states another number of images.
 
     `NergError` names file and record for what cannot be parsed.
     """
@@ -159,7 +163,8 @@ def read_image_poses(folder: str | Path) -> tuple[Path, str, list[tuple[str, np.
             found.append((name, _to_world(q, t)))
         except NergError as error:
             raise NergError(f'image "{plain(name)}" of "{path}": {error}; copy the model again') from error
-    return path, _digest(raw), found
+    notes = _count_notes(path, raw["images"], len(found)) if path.suffix == ".txt" else []
+    return path, _digest(raw), found, notes
 
 
 def _require_model(folder: Path) -> dict[str, Path]:

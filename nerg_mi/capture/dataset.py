@@ -126,8 +126,8 @@ def open_dataset(
 
 def _check_depth(posed: PosedImages, views: list[View]) -> None:
     """Raise `NergError` for depth in other units than the cameras'."""
-    views = [v for v in views if v.depth is not None]
-    reason = explain_wrong_depth([v.camera for v in views], [v.depth for v in views]) if views else None
+    seen = [(v.camera, v.depth) for v in views if v.depth is not None]
+    reason = explain_wrong_depth(seen) if seen else None
     if reason is not None:
         raise NergError(
             f'the depth of "{posed.path}" does not fit its cameras: {reason}; correct "depth_unit_scale_factor", the '

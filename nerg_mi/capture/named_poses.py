@@ -24,6 +24,7 @@ class NamedPoses:
     sha256: str  # of the set, as the provenance of what is trained on it has it
     names: list[str]
     to_world: np.ndarray  # (N, 4, 4) rigid OpenGL camera-to-world: x right, y up, z back
+    notes: list[str]  # sentences on what of a COLMAP model contradicts itself, and on models that are not used
 
 
 def find_source(dataset: str | Path) -> Path:
@@ -71,9 +72,10 @@ def read_named_poses(source: str | Path) -> NamedPoses:
     """
     source = Path(source)
     if source.is_dir() and model_files(source) is not None:
-        path, sha256, listed = read_image_poses(source)
+        path, sha256, listed, notes = read_image_poses(source)
+        notes += describe_other_models(source)
     else:
-        path, (sha256, listed) = source, read_frame_poses(source)
+        path, (sha256, listed), notes = source, read_frame_poses(source), []
     if not listed:
         raise NergError(f'"{path}" lists no images; name the file of a posed image set')
-    return NamedPoses(path, sha256, [name for name, _ in listed], np.stack([pose for _, pose in listed]))
+    return NamedPoses(path, sha256, [name for name, _ in listed], np.stack([pose for _, pose in listed]), notes)

@@ -226,8 +226,9 @@ class PosedImages:
     notes: list[str] = field(default_factory=list)
     # (N, 3) on surfaces, or None.
     points: np.ndarray | None = None
-    # The data set's folder.
+    # The data set's folder, and those of its photos.
     root: Path = Path()
+    folders: frozenset[Path] = frozenset()
     # Image files that the file lists, whether or not their frames can be used.
     images: frozenset[Path] = frozenset()
     # Names of the frames that the file itself holds out, or None.

@@ -192,10 +192,10 @@ def read_mask(source: MaskFile, shape: tuple[int, int]) -> np.ndarray:
     white = _is_white(colors).any(axis=2)
     if out.shape[2] in (2, 4):
         opaque = _is_white(out[..., -1])
-        # A stencil of one colour, black as well, says by its alpha alone what is used.
-        is_stencil = white.all() or (not white.any() and not opaque.all())
+        # A black stencil says by its alpha alone what is used.
+        is_stencil = not white.any() and not opaque.all()
         white = opaque if is_stencil else white & opaque
-    return ~white if source.hides else white
+    return np.asarray(~white if source.hides else white)
 
 
 def _is_white(values: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ from .upright import Up, find_up, turn_to_z
 COORDINATES = ("file", "upright", "original")
 # Of files that are taken for photos, in small letters.
 _PHOTOS = (".png", ".jpg", ".jpeg", ".exr")
+# What trainings write, into a capture's folder as well.
+_WRITTEN = (".safetensors", ".run", ".preview.png")
 
 
 @dataclass(frozen=True)
@@ -114,30 +117,28 @@ def up_of(posed: PosedImages) -> Up:
 def _describe_leftovers(sets: list[PosedImages]) -> list[str]:
     """What lies in the folder of a data set, described by the files of ``sets``, and is not used: photos beside those
     that the files list, and what else the folder holds."""
-    listed = {p.resolve() for posed in sets for p in posed.images}
-    used = {p for posed in sets for f in posed.frames for p in (f.image, *(x.path for x in (f.depth, f.mask) if x))}
-    folders = {p.parent for posed in sets for p in posed.images}
-    other = {p.resolve() for p in used} - listed
+    resolve = cache(Path.resolve)
+    locate = lambda path: resolve(path.parent) / path.name
+    listed = {locate(p) for posed in sets for p in posed.images}
+    others = {locate(x.path) for posed in sets for f in posed.frames for x in (f.depth, f.mask) if x is not None}
     photos = {
         p
-        for folder in folders
-        if folder.is_dir()
+        for folder in {resolve(folder) for posed in sets for folder in posed.folders if folder.is_dir()}
         for p in folder.iterdir()
         if p.suffix.lower() in _PHOTOS and not p.name.startswith((".", "dynamic_mask_"))
-    }
-    stray = sorted(p for p in photos if p.resolve() not in listed | other)
-    notes = []
+    } - others
+    stray, notes = sorted(photos - listed), []
     if stray:
         notes.append(
             f"{len(stray)} of {len(photos)} photos have no pose in {sets[0].path.name} and are not used: "
             f"{name_some(p.name for p in stray)}"
         )
-    root = sets[0].root
-    used |= {posed.path for posed in sets}
-    rest = {p.name for p in root.iterdir() if not p.name.startswith(".")}
-    rest -= {p.relative_to(root).parts[0] for p in used if p.is_relative_to(root)} | {p.name for p in stray}
+    root = sets[0].root.resolve()
+    used = {*listed, *others, *stray, *(locate(posed.path) for posed in sets)}
+    used = {p.relative_to(root).parts[0] for p in used if p.is_relative_to(root)}
+    rest = {p.name for p in root.iterdir() if not (p.name.startswith(".") or p.name.endswith(_WRITTEN))} - used
     if rest:
-        notes.append(f'not used of "{plain(root.resolve().name)}": {name_some(sorted(rest))}')
+        notes.append(f'not used of "{plain(root.name)}": {name_some(sorted(rest))}')
     return notes
 
 

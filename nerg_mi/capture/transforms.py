@@ -128,6 +128,7 @@ def read_transforms(path: str | Path, allow_outside: bool = False) -> PosedImage
         hashlib.sha256(raw).hexdigest(),
         notes,
         root=path.parent,
+        folders=frozenset(p.parent for p in listed),
         images=frozenset(listed),
         held_out=held_out,
         spare=spare,

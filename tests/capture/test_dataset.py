@@ -186,21 +186,19 @@ def seen_by_depth():
 
 @pytest.mark.parametrize("factor", [1.0, 1.05, 1.5, 0.7])
 def test_depth_that_fits_its_cameras(seen_by_depth, factor):
-    assert explain_wrong_depth([c for c, _ in seen_by_depth], [factor * d for _, d in seen_by_depth]) is None
+    assert explain_wrong_depth([(c, factor * d) for c, d in seen_by_depth]) is None
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e-2, 0.1, 0.2, 5.0, 100.0, 1e3])
 def test_depth_in_other_units_than_the_cameras_is_explained(seen_by_depth, factor):
-    reason = explain_wrong_depth([c for c, _ in seen_by_depth], [factor * d for _, d in seen_by_depth])
+    reason = explain_wrong_depth([(c, factor * d) for c, d in seen_by_depth])
     assert reason is not None and f"multiplied by {1 / factor:g}, " in reason
 
 
 def test_depth_that_all_views_have_alike_is_no_evidence(seen_by_depth):
     """It agrees in any unit that makes the cameras' distances small."""
-    same = [np.full_like(d, 0.1) for _, d in seen_by_depth]
-    assert explain_wrong_depth([c for c, _ in seen_by_depth], same) is None
-    far = [np.full_like(d, 1000.0) for _, d in seen_by_depth]
-    assert "median is 1e+03 units" in explain_wrong_depth([c for c, _ in seen_by_depth], far)
+    assert explain_wrong_depth([(c, np.full_like(d, 0.1)) for c, d in seen_by_depth]) is None
+    assert "median is 1e+03 units" in explain_wrong_depth([(c, np.full_like(d, 1000.0)) for c, d in seen_by_depth])
 
 
 def test_depth_far_outside_of_the_cameras_is_refused(ring):

@@ -102,3 +102,12 @@ def test_binary_models_are_counted_by_their_header(tmp_path):
 
 def test_a_single_model_needs_no_note(tmp_path):
     assert describe_other_models(write_colmap(tmp_path / "sparse/0", some_poses(2))) == []
+
+
+def test_notes_on_a_model_come_with_its_poses(tmp_path):
+    for name, count in (("0", 2), ("1", 4)):
+        write_colmap(tmp_path / "sparse" / name, some_poses(count))
+    images = tmp_path / "sparse/1/images.txt"
+    images.write_text("# Number of images: 24, mean observations per image: 0\n" + images.read_text())
+    few, other = read_named_poses(find_source(tmp_path)).notes
+    assert "has 4 records, but its header states 24" in few and '"1" (4 images) is used' in other

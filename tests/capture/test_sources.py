@@ -147,13 +147,15 @@ def test_held_out_frames_of_a_file_of_their_own_are_turned_alike(ring):
 
 
 @pytest.mark.parametrize("write", [instant_ngp, colmap_bin, colmap_txt])
-def test_what_a_capture_holds_and_is_not_used_is_named_once(tmp_path, rgb, write):
+def test_what_a_capture_holds_and_is_not_used_is_named_once(tmp_path, rgb, monkeypatch, write):
     """Photos without a pose, counted; other files and folders of the capture; not those that are used."""
     write(tmp_path, rgb, OPENCV)
     assert read_split(tmp_path).posed.notes == []
     for name in ("images/new.png", "images/other.JPG", "images/notes.txt", "images/.hidden.png", "mesh.ply", ".cache"):
         (tmp_path / name).write_bytes(b"")
     (tmp_path / "images_2").mkdir()
+    monkeypatch.chdir(tmp_path.parent)
+    assert read_split(tmp_path.name).posed.notes == read_split(tmp_path).posed.notes
     stray, rest = read_split(tmp_path).posed.notes
     assert stray.startswith("2 of 11 photos have no pose") and stray.endswith("new.png, other.JPG")
     assert rest == f'not used of "{tmp_path.name}": images_2, mesh.ply'
@@ -175,3 +177,15 @@ def test_models_that_are_not_used_are_named(tmp_path, rgb):
     colmap_bin(tmp_path, rgb, OPENCV)
     shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
     assert any("of 2 COLMAP models" in note for note in read_split(tmp_path).posed.notes)
+
+
+def test_photos_of_another_camera_without_any_pose_are_counted(tmp_path, rgb):
+    """COLMAP keeps the photos of each camera in a folder of its own."""
+    colmap_bin(tmp_path, rgb, OPENCV)
+    (tmp_path / "images/right").mkdir()
+    for k in range(9):
+        (tmp_path / f"images/right/{k}.jpg").write_bytes(b"")
+    (note,) = read_split(tmp_path).posed.notes
+    assert note.startswith("9 of 18 photos have no pose") and note.endswith(
+        "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg and 4 more"
+    )

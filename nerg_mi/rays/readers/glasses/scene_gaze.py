@@ -184,6 +184,8 @@ def _of_model(
     assert options.poses is not None
     model = read_named_poses(find_source(options.poses))
     builder.source(model.path)
+    for note in model.notes:
+        builder.complain(note)
     if options.frames is None:
         raise NergError(
             f'which images of "{model.path}" are frames of the video, and when they were taken, has to be said, such '
