@@ -209,7 +209,8 @@ def explain_wrong_depth(seen: list[tuple[Camera, np.ndarray]]) -> str | None:
     In the right unit views agree on where a point is. In much too large a unit all of them are at one place, compared
     with their depth, so that what merely looks alike agrees in every larger unit as well: that is no evidence.
     """
-    views = [seen[k] for k in np.unique(np.linspace(0, len(seen) - 1, _COMPARED).astype(int))]
+    picked = [seen[k] for k in np.unique(np.linspace(0, len(seen) - 1, _COMPARED).astype(int))]
+    views = [(c, d, depth_points(c, d, _COMPARED_POINTS) - c.center) for c, d in picked]
     now = _agreement(views, 1.0)
     if now <= 1 - _MORE:
         best, factor = max((_agreement(views, f), f) for f in _WRONG_UNITS)
@@ -225,12 +226,13 @@ def explain_wrong_depth(seen: list[tuple[Camera, np.ndarray]]) -> str | None:
     return None
 
 
-def _agreement(views: list[tuple[Camera, np.ndarray]], factor: float) -> float:
+def _agreement(views: list[tuple[Camera, np.ndarray, np.ndarray]], factor: float) -> float:
     """Of the points that one of ``views`` sees by its depth times ``factor``, and that are within the picture of
-    another, the fraction that lies where this sees something by its own."""
-    points = [depth_points(camera, factor * depth, _COMPARED_POINTS) for camera, depth in views]
+    another, the fraction that lies where this sees something by its own. Of each view: camera, depth (h, w), and
+    points (N, 3) that it sees, from its centre."""
+    points = [camera.center + factor * offset for camera, _, offset in views]
     count = agreeing = 0
-    for k, (camera, depth) in enumerate(views):
+    for k, (camera, depth, _) in enumerate(views):
         others = np.concatenate([np.zeros((0, 3)), *points[:k], *points[k + 1 :]])
         at, shown = project(others, camera)
         shown &= np.all((at >= 0) & (at < depth.shape[::-1]), axis=1)

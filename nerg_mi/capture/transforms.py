@@ -204,11 +204,16 @@ def _unread_keys(entry: dict, with_depth: bool) -> set[str]:
             if re.search(pattern, key.casefold()) and (with_depth or pattern != _DEPTH_MEANING):
                 value = entry[key]
                 same = str(value).casefold() in _SAME_MEANING or value == entry.get("transform_matrix", [])
-                if not same and np.any(np.asarray(value, object)):
+                if not (same or _is_off(value)):
                     raise NergError(
                         f'the key "{plain(key, 60)}" with the value {plain(value, 60)} is not read: {remedy}'
                     )
     return {k for k in unread if not k.startswith("ftheta")}
+
+
+def _is_off(value: object) -> bool:
+    """Whether ``value``, of JSON, is nothing, false or zero, or holds nothing else."""
+    return all(map(_is_off, value)) if isinstance(value, list) else not value
 
 
 def _pose(data: dict) -> np.ndarray:
