@@ -74,7 +74,7 @@ def read_photo(frame: Frame) -> np.ndarray:
 
     A photo whose EXIF orientation says that it is to be turned is turned where the camera's width and height are those
     of the turned picture, and stays where they are those of the stored one. Where they fit both, poses of COLMAP are of
-    the stored pixels, since it does not read that note; `NergError` for others, of which nothing tells.
+    the stored pixels, since it does not read the orientation; `NergError` for other frames, which are ambiguous.
     """
     pixels, orientation = read_image(frame.image), _read_orientation(frame.image)
     if orientation == 1:
