@@ -45,7 +45,7 @@ def read_semidense(
             values = _convert(path, kept, columns)
             well = np.flatnonzero((values[:, 3] <= inv_dist_std) & (values[:, 4] <= dist_std))
             well = well[np.isfinite(values[well, :3]).all(axis=1)]
-            names = np.array([kept[i][1].split(",")[columns[0]].strip() for i in well.tolist()], dtype=object)
+            names = np.array([kept[i][1].split(",")[columns[1]].strip() for i in well.tolist()], dtype=object)
             for name in set(names.tolist()):
                 found[name].append(values[well[names == name], :3].astype(np.float32))
             if len(found) > _WORLDS:
@@ -63,7 +63,7 @@ def read_semidense(
 
 
 def _columns(path: str | os.PathLike, header: str) -> tuple[int, ...]:
-    """Where in a line the world stands, and the numbers."""
+    """How many cells a line has, and where in it the world stands, and the numbers."""
     names = [name.strip() for name in header.lstrip("\ufeff").split(",")]
     missing = [name for name in (_WORLD, *_NUMBERS) if name not in names]
     if missing:
@@ -72,7 +72,7 @@ def _columns(path: str | os.PathLike, header: str) -> tuple[int, ...]:
             f'"{path}" has no column {", ".join(missing)}; its columns are {there}; give semidense_points.csv.gz of an '
             "Aria recording"
         )
-    return tuple(names.index(name) for name in (_WORLD, *_NUMBERS))
+    return len(names), *(names.index(name) for name in (_WORLD, *_NUMBERS))
 
 
 def _convert(path: str | os.PathLike, lines: Sequence[tuple[int, str]], columns: tuple[int, ...]) -> np.ndarray:
@@ -80,10 +80,12 @@ def _convert(path: str | os.PathLike, lines: Sequence[tuple[int, str]], columns:
     rows = []
     for number, line in lines:
         cells = line.split(",")
+        if len(cells) != columns[0]:
+            raise NergError(
+                f'"{path}", line {number}: {len(cells)} cells, the header has {columns[0]}; copy the file again'
+            )
         try:
-            rows.append([float(cells[i]) for i in columns[1:]])
-        except (IndexError, ValueError):
+            rows.append([float(cells[i]) for i in columns[2:]])
+        except ValueError:
             raise NergError(f'"{path}", line {number}: {plain(line, 60)!r} is no point; copy the file again') from None
-        if len(cells) <= columns[0]:
-            raise NergError(f'"{path}", line {number}: {plain(line, 60)!r} names no world; copy the file again')
     return np.array(rows)

@@ -93,3 +93,10 @@ def test_empty_cells_are_no_coordinates(tmp_path):
     (tmp_path / "a.csv").write_text(HEAD + "a,1,2,3,4,5,\nb,0,0,0,0,0,0\nc,1,0,0,1,0,0\n")
     with pytest.raises(NergError, match="not a finite number"):
         read_pairs(tmp_path / "a.csv").fit(FREE, quiet)
+
+
+def test_rows_that_do_not_match_the_header_are_refused(tmp_path):
+    path = tmp_path / "pairs.csv"
+    path.write_text("x,y,z,place_x,place_y,place_z\n0,5,1,5,0,1,1,2,3\n")
+    with pytest.raises(NergError, match="line 2: 9 cells, the header has 6; are these decimal commas"):
+        read_pairs(path)

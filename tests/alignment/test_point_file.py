@@ -56,3 +56,9 @@ def test_arrays_of_another_shape_are_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((3, 2)))
     with pytest.raises(NergError, match=r"shape \(3, 2\)"):
         read_surface(tmp_path / "a.npy")
+
+
+def test_rows_that_do_not_match_the_header_are_refused(tmp_path):
+    (tmp_path / "points.csv").write_text("x,y,z\n1,2,3\n1,2,3,4,5\n")
+    with pytest.raises(NergError, match="line 3: 5 cells, the header has 3"):
+        read_surface(tmp_path / "points.csv")

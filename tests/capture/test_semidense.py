@@ -38,11 +38,15 @@ def test_points_of_one_world_that_are_known_well(tmp_path, monkeypatch):
 
 
 def test_what_is_no_file_of_points(tmp_path):
-    for row, why in (("1,a,1,2", "line 2: '1,a,1,2"), ("1,a,x,2,3,0,0", "is no point")):
+    for row, why in (
+        ("1,a,1,2", "line 2: 4 cells, the header has 7"),
+        ("1,a,1,2,3,0,0,0,0", "line 2: 9 cells, the header has 7"),
+        ("1,a,x,2,3,0,0", "is no point"),
+    ):
         with pytest.raises(ValueError, match=why):
             read_semidense(write(tmp_path / "p.csv.gz", row))
     (tmp_path / "p.csv").write_text("px_world,py_world,pz_world,inv_dist_std,dist_std,graph_uid\n1,2,3,0,0\n")
-    with pytest.raises(ValueError, match="names no world"):
+    with pytest.raises(ValueError, match="5 cells, the header has 6"):
         read_semidense(tmp_path / "p.csv")
     (tmp_path / "p.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ValueError, match="has no column graph_uid, px_world"):

@@ -114,7 +114,7 @@ class RaysBuilder:
                 f"{100 * BAD_LINES:g} % that --skip-bad-lines leaves out (the first is {self._first_bad})"
             )
         if bad:
-            self._drop("the line is cut off or holds a cell that is no number", np.array(self._bad))
+            self._drop("the line is cut off, has cells too many, or holds one that is no number", np.array(self._bad))
             self._rows_read += bad
         self._lines, self._bad, self._first_bad = 0, [], ""
 

@@ -86,12 +86,22 @@ class ColumnMap:
             raise NergError(
                 "column map: eye is in the head's frame and needs a pose; add one (xyzw, wxyz, ypr or matrix)"
             )
-
         if self.head is not None and (poses or not (self.direction or self.angles)):
             raise NergError(
                 "column map: head says where the head points while direction is in the table's frame; leave out "
                 + (" or ".join(["head", *poses]) if poses else "head, or add direction")
             )
+
+        names = [name for field in fields(self) for name in self._columns_of(field.name)]
+        repeated = next((name for name in names if names.count(name) > 1), None)
+        if repeated is not None:
+            raise NergError(f"column map: the column {repeated!r} has two roles; name another one for each of them")
+
+    def _columns_of(self, field: str) -> tuple[str, ...]:
+        """The names of a field's columns, without the signs of angles."""
+        value = getattr(self, field) or ()
+        names = (value,) if isinstance(value, str) else value
+        return tuple(name.removeprefix("-") for name in names) if field in ANGLES else names
 
     @property
     def pose(self) -> str | None:

@@ -44,6 +44,7 @@ class _Layout:
     time: int | None  # cell of the seconds
     step: float  # seconds from sample to sample, where no cell tells
     start: float  # seconds of the first
+    width: int  # cells of a line
 
 
 def iterate_gaze_vectors(path: Path, on_bad: OnBadLine | None = None) -> Iterator[GazeVectors]:
@@ -61,10 +62,12 @@ def iterate_gaze_vectors(path: Path, on_bad: OnBadLine | None = None) -> Iterato
                     continue
                 try:
                     cells = _cells(line)
+                    if not layout.width <= len(cells) <= layout.width + (not cells[-1]):
+                        raise ValueError(f"{len(cells)} cells, not {layout.width}")
                     time = layout.start + sample * layout.step if layout.time is None else _number(cells[layout.time])
                     found.append((time, [_number(cells[i]) for i in layout.cells], sample, number))
-                except (ValueError, IndexError):
-                    why = f": {plain(line, 60)!r} is no sample; mend or remove the line"
+                except ValueError as error:
+                    why = f": {plain(line, 60)!r} is no sample ({plain(error)}); correct or remove the line"
                     if on_bad is None:
                         raise NergError(
                             f"{path}, line {number}{why}, or leave such lines out with --skip-bad-lines"
@@ -88,13 +91,15 @@ def _read_layout(path: Path) -> _Layout:
         where = [next((i for i, name in enumerate(names) if name.endswith(wanted)), None) for wanted in _COLUMNS]
         if all(i is not None for i in where):
             time = names.index("time") if "time" in names else None
-            return _layout(path, number + 1, tuple(i for i in where if i is not None), time, about)
+            return _layout(
+                path, number + 1, tuple(i for i in where if i is not None), time, about, len(cells) - (not cells[-1])
+            )
         if re.match(r"[A-Za-z_]", cells[0]) and cells[0].lower() not in _MISSING:
             about[cells[0].upper()] = cells[1] if len(cells) > 1 else ""
         elif len(cells) in (6, 8):
             # Without names: six numbers, or a sample's number and its time before them.
             time = 1 if len(cells) == 8 else None
-            return _layout(path, number, tuple(range(len(cells) - 6, len(cells))), time, about)
+            return _layout(path, number, tuple(range(len(cells) - 6, len(cells))), time, about, len(cells))
         elif line.strip():
             break
     raise NergError(
@@ -103,9 +108,11 @@ def _read_layout(path: Path) -> _Layout:
     )
 
 
-def _layout(path: Path, first: int, cells: tuple[int, ...], time: int | None, about: dict[str, str]) -> _Layout:
+def _layout(
+    path: Path, first: int, cells: tuple[int, ...], time: int | None, about: dict[str, str], width: int
+) -> _Layout:
     if time is not None:
-        return _Layout(first, cells, time, 0.0, 0.0)
+        return _Layout(first, cells, time, 0.0, 0.0, width)
     try:
         rate, offset = float(about.get("FREQUENCY", "")), float(about.get("START_OFFSET", "") or 0)
     except ValueError:
@@ -115,7 +122,7 @@ def _layout(path: Path, first: int, cells: tuple[int, ...], time: int | None, ab
             f"{path} tells no time: neither a column Time nor a FREQUENCY in its header; export it from QTM with "
             "its header"
         )
-    return _Layout(first, cells, None, 1 / rate, -offset)
+    return _Layout(first, cells, None, 1 / rate, -offset, width)
 
 
 def _cells(line: str) -> list[str]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
 
@@ -15,6 +16,8 @@ from nerg_mi.files.bounded import plain, reading, size_of
 from nerg_mi.files.inflating import inflated_limit
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
 from nerg_mi.rays.io import pyarrow_modules
+
+from .clock_times import clock_seconds
 
 BLOCK = 1 << 16  # rows converted at a time: memory stays bounded
 
@@ -31,6 +34,11 @@ _TEXT_BLOCK = 1 << 26
 _ROW_BYTES = 32
 
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
+
+_DECIMAL = re.compile(r"\s*[+-]?\d*([.,])\d*([eE][+-]?\d+)?\s*")
+
+# Two cells that a decimal comma may have made of one number, or of a time.
+_WHOLE, _FRACTION = re.compile(r"(^|[+:-])\d+$"), re.compile(r"\d+([eE][+-]?\d+)?")
 
 
 class TableBlock(NamedTuple):
@@ -56,56 +64,118 @@ def iterate_table(
     texts: Sequence[str] = (),
     header: Sequence[str] | None = None,
     on_bad: OnBadLine | None = None,
+    *,
+    first_line: int = 1,
+    clocks: Mapping[str, float] | None = None,
 ) -> Iterator[TableBlock]:
     """Yield named columns of a table in blocks of at most ``BLOCK`` rows.
 
-    The separator (comma, semicolon or tab) is taken from the header. Cells
-    that are empty or say nan, na, null or none are NaN. ``header``: the names
-    of the columns of a CSV whose first line is none. Raises `NergError`
-    for a damaged file, a missing column (naming those there are), and, unless ``on_bad`` is given, a row with too few
-    cells or a cell that is no number (naming its line); ``on_bad`` is told of such lines, which are left out. Where
-    pyarrow is installed it converts the cells, to the same numbers.
+    The separator (comma, semicolon or tab) is taken from the header, and the decimal sign (point or comma) from the
+    first number that has one. Cells that are empty or say nan, na, null or none are NaN.
+
+    Parameters
+    ----------
+    header
+        The names of the columns of a CSV whose ``first_line`` is none.
+    on_bad
+        Called with each line that cannot be read, which is left out. Without it such a line raises.
+    clocks
+        Those of ``numbers`` whose cells may be times such as ``2024-05-01T12:00:00`` or ``12:00:00.25``
+        (`clock_seconds`), with the seconds of the unit in which they are returned, and in which plain numbers count.
+
+    Raises
+    ------
+    NergError
+        For a damaged file, a missing or repeated column, a column that is requested twice, and, without ``on_bad``, a
+        row with more or fewer cells than the header (a single separator at its end aside) or a cell that is no number,
+        naming the line. Where pyarrow is installed it converts the cells, to the same numbers.
     """
     if str(path).lower().endswith(".parquet"):
-        yield from _iterate_parquet(path, numbers, texts)
+        yield from _iterate_parquet(path, numbers, texts, clocks or {})
         return
     count, layout, convert = 0, None, None
     for raw in line_blocks(path, "table", BLOCK):
-        if layout is None:
+        skip = max(0, first_line - 1 - count)
+        raw, count = raw[skip:], count + min(skip, len(raw))
+        if layout is None and raw:
             columns, separator = (list(header), ",") if header is not None else _header(path, raw[0])
             if header is None:
-                raw, count = raw[1:], 1
+                raw, count = raw[1:], count + 1
             layout = _layout(path, separator, columns, numbers, texts)
-            convert = _fast_reader(layout)
         blank = [line.isspace() for line in raw]
         lines = count + 1 + np.flatnonzero(~np.array(blank, dtype=bool))
-        kept = raw if len(lines) == len(raw) else [line for line, gone in zip(raw, blank) if not gone]
+        rows = raw if len(lines) == len(raw) else [line for line, gone in zip(raw, blank) if not gone]
         count += len(raw)
-        if kept:
-            found = convert(kept) if convert else None
-            block = TableBlock(*found, lines) if found else _convert(path, kept, lines, layout, on_bad)
+        if rows and layout is not None:
+            if convert is None:
+                layout = _with_spelling(layout, rows, clocks or {})
+                convert = _fast_reader(layout) or (lambda rows: None)
+            values = convert(rows)
+            block = TableBlock(*values, lines) if values else _convert(path, rows, lines, layout, on_bad)
             if len(block.lines):
                 yield block
     if layout is None and header is None:
-        _require(path, [*numbers, *texts], [])
+        check_columns(path, [*numbers, *texts], [])
 
 
 class _Layout(NamedTuple):
-    """Where in the lines of a CSV the wanted cells stand."""
+    """Where in the lines of a CSV the wanted cells stand, and how they are written."""
 
     separator: str
     columns: list[str]  # of the file
     number_at: list[int]  # places among them of the columns of numbers
     text_at: list[int]  # and of texts
+    decimal: str  # sign: point or comma
+    clocks: dict[int, tuple[float, bool]]  # places of times as text: seconds of a unit, and whether with a date
+    row_cells: int  # of the first row
+
+    @property
+    def width(self) -> int:
+        """Cells of a row without the empty one after a separator at its end."""
+        return len(self.columns) - (len(self.columns) > 1 and not self.columns[-1])
+
+    def accepts(self, cells: int, last: str) -> bool:
+        """Whether a row of so many cells, the last of which is ``last``, is one of the header's."""
+        return cells in (self.width, len(self.columns)) or (cells == self.width + 1 and not last.strip())
 
 
 def _layout(
     path: str | os.PathLike, separator: str, columns: list[str], numbers: Sequence[str], texts: Sequence[str]
 ) -> _Layout:
-    """Of columns with the same name the first is meant. Raises `NergError` where one is missing."""
-    _require(path, [*numbers, *texts], columns)
-    where = {c: i for i, c in reversed(list(enumerate(columns)))}
-    return _Layout(separator, columns, [where[c] for c in numbers], [where[c] for c in texts])
+    """Raises `NergError` where a column is missing or repeated."""
+    check_columns(path, [*numbers, *texts], columns)
+    where = {c: i for i, c in enumerate(columns)}
+    return _Layout(separator, columns, [where[c] for c in numbers], [where[c] for c in texts], ".", {}, len(columns))
+
+
+def _with_spelling(layout: _Layout, rows: list[str], clocks: Mapping[str, float]) -> _Layout:
+    """The layout with what the first ``rows`` tell of how numbers and times are written."""
+    ticks = {layout.columns.index(name): tick for name, tick in clocks.items() if name in layout.columns}
+    times: dict[int, tuple[float, bool]] = {}
+    waiting, decimal, row_cells = set(ticks), "", 0
+    for row in rows:
+        cells = _split(row, layout.separator) or []
+        row_cells = row_cells or len(cells)
+        if not layout.accepts(len(cells), cells[-1] if cells else ""):
+            continue
+        for k in [k for k in waiting if cells[k].strip().lower() not in _MISSING]:
+            waiting.remove(k)
+            time = clock_seconds(cells[k])
+            if time is not None:
+                times[k] = ticks[k], time[1]
+        signs = (match[1] for k in layout.number_at if k not in times and (match := _DECIMAL.fullmatch(cells[k])))
+        decimal = decimal or next(signs, "")
+        if decimal and not waiting:
+            break
+    return layout._replace(decimal=decimal or ".", clocks=times, row_cells=row_cells)
+
+
+def _split(row: str, separator: str) -> list[str] | None:
+    """The cells of a line; None where quotes or lengths forbid."""
+    try:
+        return next(csv.reader([row], delimiter=separator), [])
+    except csv.Error:
+        return None
 
 
 def _header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
@@ -131,19 +201,26 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
         from pyarrow import csv as pc
     except ImportError:
         return None
-    separator, columns, number_at, text_at = layout
-    if set(number_at) & set(text_at):  # one column, wanted as both
+    separator, number_at, text_at, words = layout.separator, layout.number_at, layout.text_at, set(layout.text_at)
+    words |= set(layout.clocks)
+    names = [str(i) for i in range(layout.row_cells)]
+    if not layout.width <= len(names) <= layout.width + 1:
         return None
-    # By place, not by name: names may be given twice.
-    names = [str(i) for i in range(len(columns))]
+    # A row may end in a separator; nothing may stand after it unless the header names it.
+    spare = [names[-1]] if len(names) > len(layout.columns) else []
     options = dict(
         read_options=pc.ReadOptions(column_names=names),
         parse_options=pc.ParseOptions(delimiter=separator, ignore_empty_lines=False),
         convert_options=pc.ConvertOptions(
-            include_columns=list(dict.fromkeys(names[i] for i in (*number_at, *text_at))),
-            column_types={**{names[i]: pa.string() for i in text_at}, **{names[i]: pa.float64() for i in number_at}},
+            include_columns=[*(names[i] for i in (*number_at, *text_at)), *spare],
+            column_types={
+                **{names[i]: pa.float64() for i in number_at},
+                **{names[i]: pa.string() for i in words},
+                **{name: pa.string() for name in spare},
+            },
             null_values=["", *(spelt for word in _MISSING if word for spelt in (word, word.upper(), word.title()))],
             strings_can_be_null=False,
+            decimal_point=layout.decimal,
         ),
     )
 
@@ -154,24 +231,42 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
             return None
         if table.num_rows != len(rows):  # a quoted cell with a line break
             return None
-        values = (
-            np.stack([table.column(names[i]).to_numpy() for i in number_at], axis=1)
-            if number_at
-            else np.empty((len(rows), 0))
-        )
+        if any(cell.strip() for name in spare for cell in table.column(name).to_pylist()):
+            return None
+        numbers = [
+            _clock_column(table.column(names[i]).to_pylist(), *layout.clocks[i])
+            if i in layout.clocks
+            else table.column(names[i]).to_numpy()
+            for i in number_at
+        ]
+        if any(column is None for column in numbers):
+            return None
+        values = np.stack(numbers, axis=1) if numbers else np.empty((len(rows), 0))
         cells = [table.column(names[i]).to_numpy() for i in text_at]
         if any(len(rows) * max(map(len, column)) > _TEXT_BLOCK for column in cells):
             return None
-        words = [np.char.strip(column.astype(str)) for column in cells]
-        return values, np.stack(words, axis=1) if words else np.empty((len(rows), 0), dtype=str)
+        texts = [np.char.strip(column.astype(str)) for column in cells]
+        return values, np.stack(texts, axis=1) if texts else np.empty((len(rows), 0), dtype=str)
 
     return convert
+
+
+def _clock_column(cells: Sequence[str], tick: float, dated: bool) -> np.ndarray | None:
+    """Times (n,) in units of ``tick`` seconds; None where a cell is none, or differs in whether it has a date."""
+    times = [np.nan if cell.strip().lower() in _MISSING else _clock(cell, tick, dated) for cell in cells]
+    return None if None in times else np.array(times, np.float64)
+
+
+def _clock(cell: str, tick: float, dated: bool) -> float | None:
+    time = clock_seconds(cell)
+    return None if time is None or time[1] != dated else time[0] / tick
 
 
 def _convert(
     path: str | os.PathLike, rows: list[str], lines: np.ndarray, layout: _Layout, on_bad: OnBadLine | None
 ) -> TableBlock:
-    if layout.text_at and len(rows) * max(map(len, rows)) > _TEXT_BLOCK:
+    too_long = layout.text_at and len(rows) * max(map(len, rows)) > _TEXT_BLOCK
+    if too_long or layout.decimal != "." or layout.clocks or not all(_has_all_cells(row, layout) for row in rows):
         return _convert_slowly(path, rows, lines, layout, on_bad)
     # Empty cells are common (a gaze ray that hits nothing) and NumPy's fast reader refuses them, so they are spelt out
     # first.
@@ -191,6 +286,14 @@ def _convert(
     if len(values) != len(rows) or len(words) != len(rows):  # a quote that is never closed joins lines
         return _convert_slowly(path, rows, lines, layout, on_bad)
     return TableBlock(values, words, lines)
+
+
+def _has_all_cells(row: str, layout: _Layout) -> bool:
+    if '"' in row:
+        cells = _split(row, layout.separator) or []
+        return layout.accepts(len(cells), cells[-1] if cells else "")
+    row = row.rstrip("\r\n")
+    return layout.accepts(row.count(layout.separator) + 1, row[row.rfind(layout.separator) + 1 :])
 
 
 def _convert_slowly(
@@ -221,24 +324,59 @@ def _cells(row: str, layout: _Layout) -> tuple[list[str], list[float]] | str:
     try:
         cells = next(csv.reader([row], delimiter=layout.separator), [])
     except csv.Error as error:
-        return f": it cannot be split into cells ({error}); mend or remove the line"
-    if len(cells) <= max([*layout.number_at, *layout.text_at], default=0):
-        return f": {len(cells)} cells, the header has {len(layout.columns)}; mend or remove the line"
+        return f": it cannot be split into cells ({error}); correct or remove the line"
+    if not layout.accepts(len(cells), cells[-1] if cells else ""):
+        return _why_other_width(cells, layout)
     for k in layout.text_at:
         if len(cells[k]) > TEXT_CHARACTERS:
             what = (
                 f"column {plain(layout.columns[k], 40)!r}: more than the {TEXT_CHARACTERS:,} characters that are read"
             )
-            return f", {what}; mend or remove the line"
+            return f", {what}; correct or remove the line"
     numbers = []
     for k in layout.number_at:
         word = cells[k].strip()
-        try:
-            numbers.append(np.nan if word.lower() in _MISSING else float(word))
-        except ValueError:
+        number = np.nan if word.lower() in _MISSING else _number(word, k, layout)
+        if number is None:
             cell = f"column {plain(layout.columns[k], 40)!r}: {plain(word, 60)!r}"
-            return f", {cell} is not a number; mend the cell or the column map"
+            return f", {cell} {_why_no_number(word, k, layout)}"
+        numbers.append(number)
     return cells, numbers
+
+
+def _number(word: str, k: int, layout: _Layout) -> float | None:
+    if k in layout.clocks:
+        return _clock(word, *layout.clocks[k])
+    if layout.decimal == ",":
+        # A point would be another decimal sign, or one between thousands.
+        word = "" if "." in word else word.replace(",", ".", 1)
+    try:
+        return float(word)
+    except ValueError:
+        return None
+
+
+def _why_no_number(word: str, k: int, layout: _Layout) -> str:
+    if k in layout.clocks:
+        return "is no time such as those before it; write all times of the column alike"
+    if any(sign in word for sign in ".," if sign != layout.decimal):
+        sign = {".": "points", ",": "commas"}[layout.decimal]
+        return f"is not a number with the decimal {sign} that the table has; write all numbers alike"
+    return "is not a number; correct the cell or the column map"
+
+
+def _why_other_width(cells: list[str], layout: _Layout) -> str:
+    """What is wrong with a row of more or fewer cells than the header has, and the remedy."""
+    why, pairs, k = f": {len(cells)} cells, the header has {layout.width}", 0, 0
+    while k + 1 < len(cells):
+        pair = bool(_WHOLE.search(cells[k]) and _FRACTION.fullmatch(cells[k + 1]))
+        pairs, k = pairs + pair, k + 1 + pair
+    if layout.separator == "," and 0 < len(cells) - layout.width <= pairs:
+        return (
+            f"{why}; are these decimal commas? They cannot be told from the commas between cells: export the table "
+            "with decimal points, or with semicolons between its cells"
+        )
+    return f"{why}; correct or remove the line"
 
 
 def _parquet(path: str | os.PathLike) -> Any:
@@ -257,18 +395,15 @@ def _parquet(path: str | os.PathLike) -> Any:
     return table
 
 
-def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Sequence[str]) -> Iterator[TableBlock]:
+def _iterate_parquet(
+    path: str | os.PathLike, numbers: Sequence[str], texts: Sequence[str], clocks: Mapping[str, float]
+) -> Iterator[TableBlock]:
     import pyarrow as pa
 
     with _parquet(path) as table:
         names = table.schema_arrow.names
-        _require(path, [*numbers, *texts], names)
-        twice = [c for c in (*numbers, *texts) if names.count(c) > 1]
-        if twice:
-            raise NergError(
-                f'the table "{path}" has several columns called {plain(twice[0], 40)!r}; rename all but one'
-            )
-        first, wanted = 1, list(dict.fromkeys([*numbers, *texts]))
+        check_columns(path, [*numbers, *texts], names)
+        first, wanted = 1, [*numbers, *texts]
         with reading(path, "table", also=(pa.ArrowException,)):
             batches = table.iter_batches(batch_size=BLOCK, columns=wanted)
         while True:
@@ -278,7 +413,7 @@ def _iterate_parquet(path: str | os.PathLike, numbers: Sequence[str], texts: Seq
                     return
                 n = batch.num_rows
                 column = {c: batch.column(batch.schema.get_field_index(c)) for c in wanted}
-                values = [_as_numbers(path, c, column[c]) for c in numbers]
+                values = [_as_numbers(path, c, column[c], clocks.get(c)) for c in numbers]
                 words = [_as_texts(path, c, column[c]) for c in texts]
             yield TableBlock(
                 np.stack(values, axis=1) if values else np.empty((n, 0)),
@@ -298,19 +433,37 @@ def _as_texts(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
     return np.array(words, dtype=str)
 
 
-def _as_numbers(path: str | os.PathLike, name: str, column: Any) -> np.ndarray:
+def _as_numbers(path: str | os.PathLike, name: str, column: Any, tick: float | None) -> np.ndarray:
+    """A column as (n,) float64; one of times in units of ``tick`` seconds."""
     try:
-        return column.to_numpy(zero_copy_only=False).astype(np.float64)
+        values = column.to_numpy(zero_copy_only=False)
+        if tick is not None and values.dtype == object:
+            cells = ["" if cell is None else str(cell) for cell in column.to_pylist()]
+            dated = next((time[1] for cell in cells if (time := clock_seconds(cell))), False)
+            values = _clock_column(cells, tick, dated)
+        elif values.dtype.kind == "M" and tick is not None:
+            since = values.astype("datetime64[ns]").astype(np.int64) * (1e-9 / tick)
+            values = np.where(np.isnat(values), np.nan, since)
+        if values is None or values.dtype.kind == "M":
+            raise TypeError("no numbers")
+        return values.astype(np.float64)
     except (TypeError, ValueError):
         raise NergError(
             f'the column {plain(name, 40)!r} of the table "{path}" holds no numbers; name another one'
         ) from None
 
 
-def _require(path: str | os.PathLike, wanted: list[str], there: list[str]) -> None:
+def check_columns(path: str | os.PathLike, wanted: Sequence[str], there: Sequence[str]) -> None:
+    """Raise `NergError` for a ``wanted`` column that is not ``there``, is there several times, or is wanted twice."""
     missing = [c for c in wanted if c not in there]
     if missing:
         brief = lambda names: ", ".join(plain(c, 40) for c in names[:12]) + (", ..." if len(names) > 12 else "")
         raise NergError(
             f"{path} has no column {brief(missing)}; its columns are {brief(there) or 'none'}; name those by --map"
         )
+    repeated = next((c for c in wanted if there.count(c) > 1), None)
+    if repeated is not None:
+        raise NergError(f'the table "{path}" has several columns called {plain(repeated, 40)!r}; rename all but one')
+    twice = next((c for c in wanted if wanted.count(c) > 1), None)
+    if twice is not None:
+        raise NergError(f"the column {plain(twice, 40)!r} of {path} is used in two roles; name another one in --map")

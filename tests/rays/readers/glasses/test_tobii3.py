@@ -73,7 +73,7 @@ def test_samples_without_gaze_and_lines_that_are_none(tobii):
     assert len(rays) == 1 and dropped(rays) == {
         "there is no gaze": [[2, 2]],
         "gaze lies beyond the scene camera's picture": [[4, 4]],
-        "the line is cut off or holds a cell that is no number": [[6, 6]],
+        "the line is cut off, has cells too many, or holds one that is no number": [[6, 6]],
     }
 
 

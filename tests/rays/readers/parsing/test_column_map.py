@@ -14,7 +14,7 @@ from nerg_mi.rays.readers.parsing.column_map import ColumnMap
         "origin=x,y,z azel=az,-el",
         'origin=x,y,z "yawpitch=-gaze yaw (rad),pitch" xyzw=a,b,c,d eye=e,f,g',
         r'origin=x,y,z direction=a,b,c "t=the \"time\" in \\s"',
-        "origin=x,y,z direction=a,b,c head=qx,qy,qz,qw eyes=a,b,c,d,e,f",
+        "origin=x,y,z direction=a,b,c head=qx,qy,qz,qw eyes=e,f,g,h,i,j",
     ],
 )
 def test_round_trip(text):
@@ -44,6 +44,10 @@ def test_order_of_fields_is_free():
         ("origin=x,y,z direction=a,b,c eye=e,f,g", "needs a pose"),
         ("origin=x,y,z direction=a,b,c xyzw=d,e,f,g head=h,i,j", "leave out head or xyzw"),
         ("origin=x,y,z xyzw=d,e,f,g head=h,i,j", "leave out head"),
+        ("origin=x,y,x direction=a,b,c", "'x' has two roles"),
+        ("origin=x,y,z direction=a,b,z", "'z' has two roles"),
+        ("origin=x,y,z direction=a,b,c t=n person=n", "'n' has two roles"),
+        ("origin=x,y,z azel=-x,el", "'x' has two roles"),
     ],
 )
 def test_refuses(text, message):

@@ -39,9 +39,11 @@ def test_times_that_nothing_tells(tmp_path, rate):
 
 
 def test_bad_lines_count_as_samples(tmp_path):
-    (tmp_path / "a_g.tsv").write_text(HEAD + "1\t2\t3\t4\t5\t6\n1\t2\n1\t2\t3\t4\t5\tx\n1\t2\t3\t4\t5\t6\n")
+    (tmp_path / "a_g.tsv").write_text(
+        HEAD + "1\t2\t3\t4\t5\t6\n1\t2\t3\t4\t5\t6\t7\n1\t2\t3\t4\t5\tx\n1\t2\t3\t4\t5\t6\n"
+    )
     told = []
     (block,) = iterate_gaze_vectors(tmp_path / "a_g.tsv", lambda line, why: told.append(line))
     assert told == [4, 5] and np.allclose(block.times, [-1, -0.7]) and block.samples.tolist() == [0, 3]
-    with pytest.raises(ValueError, match="line 4: '1.2"):
+    with pytest.raises(ValueError, match="line 4: '1.2.*7 cells, not 6"):
         list(iterate_gaze_vectors(tmp_path / "a_g.tsv"))

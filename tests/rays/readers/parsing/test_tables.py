@@ -74,7 +74,7 @@ def test_with_and_without_pyarrow(tmp_path, monkeypatch):
     cells = [[repr(float(v)) for v in row] for row in values]
     cells[3][1], cells[7][0], cells[9][2], cells[11][1] = "", "NaN", "null", "inf"
     path.write_text(
-        "a,who,b,a\n"
+        "a,who,b,c\n"
         + "\n".join(f'{a},"p {i % 3}",{b},{c}' + ("\n" if i == 20 else "") for i, (a, b, c) in enumerate(cells))
     )
     fast = read(path, ["b", "a"], ["who"])
@@ -192,3 +192,119 @@ def test_long_cells_of_parquet(tmp_path):
     pq.write_table(pa.table({"a": [1.0, 2.0], "who": ["ann", "w" * 1001]}), tmp_path / "t.parquet")
     with pytest.raises(NergError, match="'who' .* has cells of more than the 1,000 characters"):
         read(tmp_path / "t.parquet", ["a"], ["who"])
+
+
+ROWS = "a,b,c\n1,2,3\n4,5,6\n"
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize(
+    "text, why",
+    [
+        ("a,b,c\n1,2,3\n4,5\n", "line 3: 2 cells, the header has 3; correct"),
+        ("a,b,c\n1,2,3\n4.5,5.5,6,x\n", "line 3: 4 cells, the header has 3; correct"),
+        ('a,b,c\n"1,2",3\n', "line 2: 2 cells, the header has 3"),  # as many commas as the header
+        ("a,b,c\n1,2,3,\n4,5,6,,\n", "line 3: 5 cells"),
+        ("i,a,b,c\n1,2,3\n", "line 2: 3 cells, the header has 4; correct"),
+        ("a,b,c\n0,5,1,25,-0,1\n", "line 2: 6 cells, the header has 3; are these decimal commas"),
+        ("a,b,c\n0,5,1.5,2.5\n", "line 2: 4 cells, the header has 3; are these decimal commas"),
+        ("a,b,c\n2024-05-01 12:00:00,016,2,3\n", "line 2: 4 cells, the header has 3; are these decimal commas"),
+    ],
+)
+def test_rows_that_do_not_match_the_header_are_refused(tmp_path, monkeypatch, text, why, fast):
+    if not fast:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda layout: None)
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(NergError, match=why):
+        read(tmp_path / "t.csv", ["b"])
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize(
+    "text",
+    [
+        ROWS,
+        ROWS.replace("3\n", "3,\n").replace("6\n", "6,\n"),
+        ROWS.replace("6\n", "6,\n"),
+        ROWS.replace("c\n", "c,\n"),
+        ROWS.replace("\n", ",\n"),
+        ROWS.replace(",", ";").replace("\n", ";\n"),
+        ROWS.replace("a,b,c", "a,b,c,").replace("3\n", "3,9\n").replace("6\n", "6,9\n"),  # an unnamed column
+    ],
+)
+def test_one_separator_may_end_a_row(tmp_path, monkeypatch, text, fast):
+    if not fast:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda layout: None)
+    (tmp_path / "t.csv").write_text(text)
+    (block,) = read(tmp_path / "t.csv", ["c", "a"])
+    assert block.numbers.tolist() == [[3, 1], [6, 4]]
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_decimal_commas_where_commas_do_not_separate(tmp_path, monkeypatch, fast):
+    if not fast:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda layout: None)
+    path = tmp_path / "t.csv"
+    for text in (
+        "a;who;b\n1;Li, A;0,5\n-2,25;bo;1e3\n",
+        "a\twho\tb\n1\tLi, A\t0,5\n-2,25\tbo\t1000,0\n",
+        'a,who,b\n1,"Li, A","0,5"\n"-2,25",bo,1000\n',
+    ):
+        path.write_text(text)
+        (block,) = read(path, ["a", "b"], ["who"])
+        assert block.numbers.tolist() == [[1, 0.5], [-2.25, 1000]] and block.texts[0, 0] == "Li, A"
+    path.write_text("a;b\n1,5;2\n2.5;3\n")
+    with pytest.raises(NergError, match="line 3, column 'a': '2.5' is not a number with the decimal commas"):
+        read(path, ["a"])
+    path.write_text("a;b\n1.5;2\n1,000;3\n")
+    with pytest.raises(NergError, match="line 3, column 'a': '1,000' is not a number with the decimal points"):
+        read(path, ["a"])
+
+
+def test_repeated_columns_and_two_roles_are_refused(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("x,y,x\n1,2,3\n")
+    with pytest.raises(NergError, match="several columns called 'x'"):
+        read(path, ["x"])
+    assert read(path, ["y"])[0].numbers.tolist() == [[2]]
+    with pytest.raises(NergError, match="'y' of .*t.csv is used in two roles"):
+        read(path, ["y"], ["y"])
+
+
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize(
+    "cells, seconds",
+    [
+        (["2024-05-01T12:00:00", "2024-05-01T12:00:00.25"], [1714564800, 1714564800.25]),
+        (["2024-05-01 14:00:00,5+02:00", "2024/05/01 12:00:01Z"], [1714564800.5, 1714564801]),
+        (["12:00:00.1234567", "", "9:00:01"], [43200.1234567, np.nan, 32401]),
+        (["1.5", "2"], [1.5 * 1e-3, 2e-3]),
+    ],
+)
+def test_times_as_text(tmp_path, monkeypatch, cells, seconds, fast):
+    if not fast:
+        monkeypatch.setattr(ray_tables, "_fast_reader", lambda layout: None)
+    (tmp_path / "t.csv").write_text("a\tt\n" + "".join(f"{k}\t{cell}\n" for k, cell in enumerate(cells)))
+    (block,) = iterate_table(tmp_path / "t.csv", ["t", "a"], clocks={"t": 1e-3})
+    assert np.allclose(block.numbers[:, 0] * 1e-3, seconds, rtol=0, atol=5e-7, equal_nan=True)
+    assert block.numbers[:, 1].tolist() == list(range(len(cells)))
+
+
+@pytest.mark.parametrize(
+    "cells", [["12:00:00", "5.5"], ["12:00:00", "2024-05-01 12:00:00"], ["5/1/2024 12:00:00"], ["2024-02-30T00:00:00"]]
+)
+def test_times_that_nothing_orders_are_refused(tmp_path, cells):
+    (tmp_path / "t.csv").write_text("a,t\n" + "".join(f"1,{cell}\n" for cell in cells))
+    with pytest.raises(NergError, match="column 't'.*is (no time|not a number)"):
+        list(iterate_table(tmp_path / "t.csv", ["t", "a"], clocks={"t": 1.0}))
+
+
+def test_times_of_parquet(tmp_path):
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    texts = ["2024-05-01T12:00:00", "2024-05-01T12:00:00.5"]
+    for column in (pa.array(texts), pa.array(np.array(texts, "datetime64[ms]"))):
+        pq.write_table(pa.table({"t": column}), tmp_path / "t.parquet")
+        (block,) = iterate_table(tmp_path / "t.parquet", ["t"], clocks={"t": 0.5})
+        assert np.allclose(block.numbers[:, 0], [2 * 1714564800, 2 * 1714564800 + 1])
+        with pytest.raises(NergError, match="'t' .* holds no numbers"):
+            read(tmp_path / "t.parquet", ["t"])
