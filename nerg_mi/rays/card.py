@@ -29,6 +29,12 @@ def card_lines(rays: Rays, summary: RaysSummary) -> list[tuple[str, str]]:
     for reason, count in s.dropped.items():
         share = 100 * count / max(s.rows_read, 1)
         lines.append(("dropped", f"{count:,} ({share:.1f} %): {reason}; {_dropped_lines(rays, reason)}"))
+    for what, count in rays.metadata.get("missing", {}).items():
+        lines.append(("missing", f"{count:,} {what}"))
+    unused = rays.metadata.get("unused_columns", [])
+    if unused:
+        more = f" and {len(unused) - _PERSONS} more" if len(unused) > _PERSONS else ""
+        lines.append(("not used", f"columns {', '.join(unused[:_PERSONS])}{more}"))
     for step in rays.metadata.get("steps", []):
         name = f"{step['step']} {step.get('side', '')}".strip()
         lines.append(("then", f"{name}: {step['kept']:,} of {step['of']:,} rays kept"))

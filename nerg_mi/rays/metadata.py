@@ -117,6 +117,8 @@ _KNOWN = {
         "list of steps with their counts",
     ),
     "complaints": (_names, "list of sentences"),
+    "unused_columns": (_names, "list of names"),
+    "missing": (lambda v: isinstance(v, dict) and all(map(is_count, v.values())), "list of what is missing and counts"),
     "eye_distance": (
         lambda v: isinstance(v, dict) and all(_number(d) and d >= 0 for d in v.values()),
         "list of persons and their distances in metres",

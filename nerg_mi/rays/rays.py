@@ -44,7 +44,8 @@ class Rays:
     confidence: np.ndarray  # (N,) in [0, 1]
     hit: np.ndarray | None = None  # (N, 3) metres, the point looked at, NaN where unknown
     # frame (units, up, handedness), and of what was imported: source_frame, sources (file name and sha256), transform
-    # (4x4 from the source's frame), rows_read, dropped (reason, count and rows of each source); steps done since then.
+    # (4x4 from the source's frame), rows_read, dropped (reason, count and rows of each source), missing (counts of
+    # hit points that were fill values), unused_columns (names); steps done since then.
     metadata: dict[str, Any] = field(default_factory=lambda: {"frame": dict(FRAME)})
     cohort: np.ndarray | None = None  # (N,) int32 index into cohorts
     cohorts: tuple[str, ...] = ()  # names of groups of people

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from . import clocks, directions, eyes, files, frames, frozen, head, holding, lengths, locked, times
+from . import clocks, directions, eyes, files, frames, frozen, head, holding, lengths, locked, participants, times
 from .figures import Figures
 from .protocol import Check
 
 CHECKS: tuple[Check, ...] = tuple(
-    module.CHECK for module in (files, lengths, eyes, times, clocks, frozen, locked, head, holding, directions, frames)
+    module.CHECK
+    for module in (files, participants, lengths, eyes, times, clocks, frozen, locked, head, holding, directions, frames)
 )
 """What is looked for, in the order of the card."""
 

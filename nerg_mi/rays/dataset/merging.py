@@ -14,7 +14,7 @@ from nerg_mi.rays.rays import FRAME, Rays
 
 from .manifest import Source
 
-_MERGED = ("sources", "dropped", "rows_read", "complaints", "eye_distance")
+_MERGED = ("sources", "dropped", "rows_read", "complaints", "eye_distance", "missing", "unused_columns")
 _EMPTY = np.zeros((0, 3))
 
 
@@ -79,8 +79,12 @@ def merge_metadata(sources: Sequence[Source]) -> dict[str, Any]:
     same = {k: v for k, v in first.items() if k not in _MERGED and all(other.get(k) == v for other in about)}
     eyes = {name: metres for other in about for name, metres in other.get("eye_distance", {}).items()}
     complaints = list(dict.fromkeys(sentence for other in about for sentence in other.get("complaints", [])))
+    missing = merge_counts(other.get("missing", {}) for other in about)
+    unused = list(dict.fromkeys(name for other in about for name in other.get("unused_columns", [])))
     return {
         **same,
+        **({"missing": missing} if missing else {}),
+        **({"unused_columns": unused} if unused else {}),
         **({"complaints": complaints} if complaints else {}),
         **({"eye_distance": eyes} if eyes else {}),
         "frame": first["frame"],

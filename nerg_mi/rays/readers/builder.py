@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,9 @@ from nerg_mi.rays.io import COLUMNS
 from nerg_mi.rays.rays import FRAME, Rays
 
 from .frames import RAYS, Frame
+from .parsing.fill_values import FilledOrigins, fill_values, is_aimed
+from .parsing.tables import TableBlock, iterate_table, table_columns
+from .parsing.validity import looks_like_validity
 
 BAD_LINES = 0.01
 """Share of a file's lines that may be left out since they cannot be read."""
@@ -24,6 +28,8 @@ STREAMED = 1 << 20
 
 NAMED_RUNS = 500_000
 """So many runs of dropped rows are named; of more, as where every other row is a blink, only the number is kept."""
+
+_UNUSED = 256  # columns that are not used and kept by name
 
 _EYES = "eye_distance"  # a column while files are read; of the rays, one number a person in the metadata
 
@@ -77,6 +83,9 @@ class RaysBuilder:
         self._sources: list[dict[str, Any]] = []
         self._dropped: list[dict[str, Any]] = []
         self._rows_read = self._runs = 0
+        self._unused: dict[str, None] = {}
+        self._missing = Counter[str]()
+        self._filled = FilledOrigins(1.0)
         self._skips, self._lines, self._bad, self._first_bad = skip_bad_lines, 0, [], ""
 
     def note(self, **what: Any) -> None:
@@ -88,6 +97,25 @@ class RaysBuilder:
         found = self._notes.setdefault("complaints", [])
         if sentence not in found:
             found.append(sentence)
+
+    def read_table(
+        self,
+        path: Path,
+        numbers: Sequence[str],
+        texts: Sequence[str] = (),
+        *,
+        also_used: Sequence[str] = (),
+        clocks: Mapping[str, float] | None = None,
+    ) -> Iterator[TableBlock]:
+        """Blocks of a table of the present source, as `iterate_table` gives them, with an account of the lines that
+        cannot be read and of the columns that are not used; ``also_used``: those that are read in another way."""
+        used = {*numbers, *texts, *also_used}
+        self.note_unused(name for name in table_columns(path) if name and name not in used)
+        return iterate_table(path, numbers, texts, on_bad=self.on_bad, clocks=clocks)
+
+    def note_unused(self, columns: Iterable[str]) -> None:
+        """Name columns of the files that are not used on the card of the rays."""
+        self._unused.update(dict.fromkeys(columns))
 
     @property
     def on_bad(self) -> OnBadLine | None:
@@ -117,6 +145,12 @@ class RaysBuilder:
             self._drop("the line is cut off, has cells too many, or holds one that is no number", np.array(self._bad))
             self._rows_read += bad
         self._lines, self._bad, self._first_bad = 0, [], ""
+        for code, count in self._filled.undecided.items():
+            self.complain(
+                f"the first {count:,} rows of {self._persons.name(code)} in {self._sources[-1]['file']} have one exact "
+                "fill value as their origin, and were kept; leave them out (nerg rays filter --time)"
+            )
+        self._filled = FilledOrigins(float(np.cbrt(abs(np.linalg.det(self._transform[:3, :3])))))
 
     def source(self, path: Path, name: str | None = None) -> None:
         """Begin a file; only its name (or another one, where files share theirs) is recorded, with its checksum."""
@@ -139,6 +173,8 @@ class RaysBuilder:
         head: np.ndarray | None = None,
         eye_distance: np.ndarray | None = None,
         drop: dict[str, np.ndarray] | None = None,
+        recorded_origin: np.ndarray | None = None,
+        recorded_direction: np.ndarray | None = None,
     ) -> None:
         """Add n rows of the present source.
 
@@ -149,16 +185,22 @@ class RaysBuilder:
         left out where ``direction`` is the head's. ``eye_distance`` (n,): between both eyes, in the same units and
         recorded as the origins are, NaN where one is not seen. ``rows`` (n,): 1-based rows of the
         source. ``drop``: reasons of the recording's own, each with its mask (n,), before those found here: what is NaN
-        or, of a direction, zero. A row counts under the first reason it meets; one without a person's name is dropped,
+        or, of a direction, zero. ``recorded_origin`` and ``recorded_direction`` (n, 3): as the file has them, where
+        ``origin`` and ``direction`` were computed of them: exact fill values such as 0, 0, 0 or -1, -1, -1 are looked
+        for there. A row counts under the first reason it meets; one without a person's name is dropped,
         one without a cohort is of the cohort "unknown".
         """
         n = len(t)
         person = self._persons.codes(person, n)
         length = np.linalg.norm(direction, axis=1)
         confidence = np.ones(n) if confidence is None else np.asarray(confidence, dtype=np.float64)
+        filled_origins = self._filled.find(origin if recorded_origin is None else recorded_origin, person)
+        fill = fill_values(direction if recorded_direction is None else recorded_direction)
         reasons = {
             **(drop or {}),
             "person is missing": person == self._persons.code(""),
+            "origin is a repeated fill value": filled_origins,
+            **{f"direction is the fill value {f:g}, {f:g}, {f:g}": fill == f for f in np.unique(fill[abs(fill) > 0])},
             "time is missing": ~np.isfinite(t),
             "origin is missing": ~np.isfinite(origin).all(axis=1),
             "direction is missing": ~np.isfinite(length),
@@ -183,6 +225,7 @@ class RaysBuilder:
             "confidence": confidence[keep],
         }
         if hit is not None:
+            hit = self._without_filled(hit, origin, direction, keep)
             part["hit"] = hit[keep] @ R.T + shift
         if head is not None:
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -196,6 +239,21 @@ class RaysBuilder:
         self._kept.append(int(keep.sum()))
         if self._on_rays is not None and sum(self._kept) >= STREAMED:
             self._on_rays(self._take({"frame": dict(FRAME)}))
+
+    def _without_filled(
+        self, hit: np.ndarray, origin: np.ndarray, direction: np.ndarray, keep: np.ndarray
+    ) -> np.ndarray:
+        """Hit points (n, 3) with NaN for fill values at which the ray does not point, which are counted."""
+        fill = fill_values(hit)
+        rows = np.flatnonzero(np.isfinite(fill) & keep)
+        rows = rows[~is_aimed(origin[rows], direction[rows], hit[rows])]
+        if not len(rows):
+            return hit
+        for value, count in zip(*np.unique(fill[rows], return_counts=True)):
+            self._missing[f"hit points that are the fill value {value:g}, {value:g}, {value:g}"] += int(count)
+        hit = hit.copy()
+        hit[rows] = np.nan
+        return hit
 
     def _drop(self, reason: str, rows: np.ndarray) -> None:
         name = self._sources[-1]["file"] if self._sources else ""
@@ -220,6 +278,13 @@ class RaysBuilder:
         if not sum(self._kept) and self._on_rays is None:
             why = "; ".join(f"{d['count']} rows: {d['reason']}" for d in self._dropped[:4]) or "the files hold no rows"
             raise NergError(f"no ray is left of {self._rows_read} rows ({why}); check the column map and the preset")
+        doubtful = [name for name in self._unused if looks_like_validity(name)]
+        if doubtful:
+            more = f" and {len(doubtful) - 3} more" if len(doubtful) > 3 else ""
+            self.complain(
+                f"{', '.join(map(repr, doubtful[:3]))}{more} may say by name which rows are valid, and is not used; "
+                "use it with --map and --valid"
+            )
         metadata = {
             "frame": dict(FRAME),
             "transform": self._transform.tolist(),
@@ -227,6 +292,8 @@ class RaysBuilder:
             "sources": self._sources,
             "rows_read": self._rows_read,
             "dropped": self._dropped,
+            **({"missing": dict(self._missing)} if self._missing else {}),
+            **({"unused_columns": list(self._unused)[:_UNUSED]} if self._unused else {}),
             **self._notes,
         }
         return self._take(metadata)
@@ -269,6 +336,9 @@ class _Names:
 
     def code(self, name: str) -> int:
         return self._code.setdefault(name, len(self._code))
+
+    def name(self, code: int) -> str:
+        return list(self._code)[code]
 
     def codes(self, names: Sequence[str] | np.ndarray | str, n: int) -> np.ndarray:
         """Codes (n,) int32 of one name for all or of n names."""

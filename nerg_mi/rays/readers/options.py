@@ -55,6 +55,15 @@ def tick_option() -> Any:
     return option(1.0, "Seconds in one unit of the file's time.")
 
 
+def valid_option() -> Any:
+    """Which values of columns of validity mark valid rows; to be parsed by `parse_valid`."""
+    return option(
+        None,
+        'Columns of validity and the values of rows that are kept, as "gaze_status=2" or "isValid=true,1"; '
+        "none: no column is one.",
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class NoOptions:
     """The options of a reader that has none."""

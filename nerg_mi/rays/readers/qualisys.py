@@ -17,7 +17,6 @@ from .frames import Frame
 from .options import option
 from .parsing.column_finder import ColumnFinder
 from .parsing.gaze_vectors import iterate_gaze_vectors
-from .parsing.tables import iterate_table
 from .protocol import DESCRIPTION
 from .table import person_from_filename
 
@@ -146,7 +145,7 @@ class NeonMocap:
             builder.source(path)
             usual = path.name.startswith("gaze_in_mocap_space")
             person = path.resolve().parent.name if usual else person_from_filename(path)
-            for v, _, lines in iterate_table(path, names, on_bad=builder.on_bad):
+            for v, _, lines in builder.read_table(path, names):
                 lost = np.asarray(np.isnan(v[:, 1:]).any(axis=1))
                 builder.add(
                     v[:, 0] * 1e-9,

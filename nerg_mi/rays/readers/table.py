@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,13 @@ from nerg_mi.errors import NergError
 
 from .builder import RaysBuilder
 from .frames import Frame
-from .options import check_tick, option, tick_option
+from .options import check_tick, option, tick_option, valid_option
 from .parsing import poses
+from .parsing.column_finder import ColumnFinder, is_counter
 from .parsing.column_map import ColumnMap
 from .parsing.tables import TableBlock, iterate_table
+from .parsing.usual_names import PERSONS
+from .parsing.validity import mark_valid, parse_valid, require_valid_values
 from .protocol import RECORDINGS
 
 
@@ -44,10 +48,12 @@ class TableOptions:
     radians: bool = option(False, "Angles of a mapped table are in radians.", recorded=False)
     person_from: str = option("column", "Persons of a mapped table: column or filename.", recorded=False)
     min_confidence: float = option(0.0, "Drop rows below this confidence.")
+    valid: str | None = valid_option()
     tick: float = tick_option()
 
     def __post_init__(self) -> None:
         check_tick(self.tick)
+        parse_valid(self.valid)
         poses.axis(self.looks_along, "forward")
         if self.person_from not in ("column", "filename"):
             raise NergError(f'persons are named by "column" or "filename" (--person-from), not by "{self.person_from}"')
@@ -87,21 +93,27 @@ class Table:
         add_tables(files, options, builder)
 
 
+_VALUES = 1000  # of a column; one of more tells no validity
+
 TABLE = Table()
 READERS = (TABLE,)
 
 
 def add_tables(
-    files: Sequence[Path], options: TableOptions, builder: RaysBuilder, valid: Mapping[str, Sequence[str]] | None = None
+    files: Sequence[Path], options: TableOptions, builder: RaysBuilder, validity: Sequence[str] = ()
 ) -> None:
     """Add the rays of ``files`` to ``builder``, which was given ``options.frame``.
 
-    ``valid``: columns of words with those by which a row is kept (upper and lower case are one). Raises `NergError` for
-    missing columns, and cells that are no numbers.
+    ``validity``: columns of validity whose values speak for themselves; where ``options.valid`` names some, only those
+    are used. Raises `NergError` for missing columns, cells that are no numbers, and values of validity whose meaning is
+    not certain.
     """
     if options.columns is None:
         raise NergError("a table needs a column map; say what its columns are (--map)")
-    rows = _Rows(options.columns, options, valid or {})
+    valid = parse_valid(options.valid)
+    if valid is None:
+        valid = {name: require_valid_values(files[0].name, name, _count_values(files, name)) for name in validity}
+    rows = _Rows(options.columns, options, valid)
     builder.note(columns=str(rows.columns), min_confidence=options.min_confidence, tick=options.tick)
     if rows.columns.pose or rows.columns.angles:
         builder.note(forward=options.looks_along)
@@ -109,6 +121,31 @@ def add_tables(
         builder.note(degrees=not options.radians)
     for path in files:
         rows.add(path, builder)
+
+
+def _count_values(files: Sequence[Path], column: str) -> Counter[str]:
+    """How often each value of a column of texts occurs in all ``files``."""
+    counts = Counter[str]()
+    for path in files:
+        for block in iterate_table(path, (), [column], on_bad=lambda line, why: None):
+            for value, count in zip(*np.unique(block.texts[:, 0], return_counts=True)):
+                counts[str(value)] += int(count)
+            if len(counts) > _VALUES:
+                break
+    return counts
+
+
+def find_person(table: ColumnFinder, builder: RaysBuilder) -> str | None:
+    """The column of participants by its usual names, unless it differs in nearly every row; ``builder`` is told of such
+    a one."""
+    name = table.find(*PERSONS)
+    if name is None or not is_counter(next((b.texts[:, 0] for b in iterate_table(table.path, (), [name])), ())):
+        return name
+    builder.complain(
+        f"{name!r} has another value in nearly every row, as a counter of rows has, and is not taken for participants: "
+        f"each file is one (or name the column yourself: --map person={name})"
+    )
+    return None
 
 
 def person_from_filename(path: Path) -> str:
@@ -135,7 +172,8 @@ class _Rows:
         """Add the rows of ``path``."""
         builder.source(path)
         before = 0
-        for block in iterate_table(path, self.numbers, self.texts, on_bad=builder.on_bad):
+        clocks = {self.columns.t: self.options.tick} if self.columns.t else {}
+        for block in builder.read_table(path, self.numbers, self.texts, clocks=clocks):
             self._add_block(path, block, before, builder)
             before += len(block.lines)
 
@@ -149,10 +187,12 @@ class _Rows:
         t = value[columns.t] if columns.t else np.arange(before, before + n, dtype=np.float64)
         confidence = value[columns.confidence] if columns.confidence else np.ones(n)
         origin, direction, head = self._geometry(vector)
-        drop = {f"confidence below {options.min_confidence:g}": confidence < options.min_confidence}
+        pose = vector(self.pose_columns) if columns.pose == "matrix" else None
+        drop = {} if pose is None else {poses.MIRRORED: poses.is_mirrored(pose)}
+        drop |= {f"confidence below {options.min_confidence:g}": confidence < options.min_confidence}
         for name, words in self.valid.items():
-            known = np.isin(np.char.lower(word[name]), [w.lower() for w in words])
-            drop[f"{name} is not {' or '.join(words)}"] = ~known
+            shown = " or ".join(dict.fromkeys(w.lower() for w in words)) or "valid"
+            drop[f"{name} is not {shown}"] = ~mark_valid(word[name], words)
         builder.add(
             t * options.tick,
             word[self.person] if self.person else person_from_filename(path),
@@ -167,6 +207,8 @@ class _Rows:
             if columns.eyes
             else None,
             drop=drop,
+            recorded_origin=vector(columns.origin) if columns.origin else None,
+            recorded_direction=vector(columns.direction) if columns.direction else None,
         )
 
     def _geometry(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.rays.card import card_lines
 from nerg_mi.rays.rays import FRAME, Rays
 from nerg_mi.rays.readers import builder as builder_module
 from nerg_mi.rays.readers.builder import RaysBuilder
@@ -162,3 +163,65 @@ def test_rays_are_handed_over_as_they_come(monkeypatch):
     assert taken[0].metadata == {"frame": whole.metadata["frame"]}
     none = RaysBuilder(on_rays=taken.append).build()
     assert len(none) == 0 and none.metadata["rows_read"] == 0
+
+
+def test_fill_values_are_missing_data_at_any_share(tmp_path):
+    (tmp_path / "a.csv").write_text("x")
+    n = 100
+    origin = np.stack([0.1 * np.arange(n), np.full(n, 2.0), np.full(n, 1.6)], axis=1)
+    direction = np.tile([0.0, 1.0, 0.0], (n, 1))
+    hit = origin + [0, 3, 0]
+    hit[10:70] = 0
+    hit[70:73] = -1
+    direction[80:90] = -1
+    origin[90:95] = 0
+    # One looks at 0, 0, 0 indeed.
+    direction[20], direction[90:95] = -origin[20], [1, 0, 0]
+    builder = RaysBuilder()
+    builder.source(tmp_path / "a.csv")
+    builder.add(np.arange(n) * 0.1, "ann", origin, direction, rows=np.arange(n), hit=hit)
+    rays = builder.build()
+    assert {d["reason"]: d["count"] for d in rays.metadata["dropped"]} == {
+        "origin is a repeated fill value": 5,
+        "direction is the fill value -1, -1, -1": 10,
+    }
+    assert rays.metadata["missing"] == {
+        "hit points that are the fill value 0, 0, 0": 59,
+        "hit points that are the fill value -1, -1, -1": 3,
+    }
+    assert np.isnan(rays.hit[10:73]).all(axis=1).sum() == 62 and (rays.hit[20] == 0).all()
+    rays.save(tmp_path / "r.npz")
+    assert Rays.load(tmp_path / "r.npz").metadata == rays.metadata
+
+
+def test_fill_values_are_looked_for_in_what_was_recorded(tmp_path):
+    builder = RaysBuilder(UNITY)
+    turned, recorded = np.tile([0.0, 0, 1], (4, 1)), np.tile([-1.0, -1, -1], (4, 1))
+    recorded[0] = [1, 0, 0]
+    place = np.array([[1.0, 1, 1], [0, 0, 0], [0, 0, 0], [2, 1, 1]])
+    builder.add(
+        np.arange(4.0),
+        "ann",
+        place + 0.1,
+        turned,
+        rows=np.arange(4),
+        recorded_origin=place,
+        recorded_direction=recorded,
+    )
+    rays = builder.build()
+    assert len(rays) == 1 and [d["count"] for d in rays.metadata["dropped"]] == [2, 1]
+
+
+def test_unused_columns_are_named_once(tmp_path):
+    builder = RaysBuilder()
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_text("t,x,note,left_valid," + ",".join(f"c{k}" for k in range(20)) + "\n" + "1," * 24)
+        builder.source(tmp_path / name)
+        assert [len(b.lines) for b in builder.read_table(tmp_path / name, ["t"], also_used=["x"])] == [1]
+        add(builder, 2)
+    rays = builder.build()
+    assert rays.metadata["unused_columns"] == ["note", "left_valid", *(f"c{k}" for k in range(20))]
+    (sentence,) = rays.metadata["complaints"]
+    assert sentence.startswith("'left_valid' may say by name which rows are valid")
+    lines = dict(card_lines(rays, summarise(rays)))
+    assert lines["not used"] == "columns note, left_valid, c0, c1, c2, c3, c4, c5 and 14 more"

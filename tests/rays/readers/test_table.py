@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.parsing.column_map import ColumnMap
 from nerg_mi.rays.readers.table import TableOptions, add_tables
-from tests.rays.readers.reading import read
+from tests.rays.readers.reading import dropped, read
 
 
 def read_table(path, columns, **options):
@@ -124,7 +124,7 @@ def test_cohorts_persons_and_validity(tmp_path):
     )
     builder = RaysBuilder()
     columns = ColumnMap.parse("origin=x,y,z direction=a,b,c person=who cohort=group")
-    add_tables([path], TableOptions(columns=columns), builder, {"ok": ["valid"]})
+    add_tables([path], TableOptions(columns=columns), builder, ["ok"])
     rays = builder.build()
     assert rays.persons == ("ann", "bo") and list(rays.person) == [1, 0]
     assert rays.cohorts == ("unknown", "new") and list(rays.cohort) == [1, 0]
@@ -237,3 +237,50 @@ def test_heads_beside_gaze_in_the_world_and_both_eyes(tmp_path, heads, kind):
     rays = read_table(path, columns, up="y", handedness="left", units="cm")
     assert np.allclose(rays.direction, [0, 0.8, 0.6]) and np.allclose(rays.head, turn.apply([0, 0, 1])[:, [0, 2, 1]])
     assert rays.metadata["eye_distance"] == {"a": 0.062}
+
+
+MATRIX = "matrix=" + ",".join("abcdefghijkl")
+
+
+@pytest.mark.parametrize("flip", [np.diag([1, 1, -1.0]), np.diag([-1.0, 1, 1]), -np.eye(3), np.eye(3)[[1, 0, 2]]])
+def test_mirrored_matrices_are_dropped_and_named(tmp_path, heads, flip):
+    origin, turn = heads
+    m = np.concatenate([turn.as_matrix(), origin[:, :, None]], axis=2)
+    m[4, :, :3] = m[4, :, :3] @ flip
+    rays = read_table(write(tmp_path / "m.csv", ",".join("abcdefghijkl"), m.reshape(20, 12)), MATRIX)
+    assert len(rays) == 19 and dropped(rays) == {
+        "the head's matrix is mirrored (its determinant is negative)": [[6, 6]]
+    }
+    m[:, :, :3] = turn.as_matrix() @ flip
+    with pytest.raises(NergError, match="20 rows: the head's matrix is mirrored"):
+        read_table(write(tmp_path / "m.csv", ",".join("abcdefghijkl"), m.reshape(20, 12)), MATRIX)
+
+
+def test_fill_values_in_the_heads_frame(tmp_path, heads):
+    """They are no longer such once the head turns them."""
+    origin, turn = heads
+    gaze = np.tile([0.0, 0, 1], (20, 1))
+    gaze[3:5], gaze[7] = -1, 0
+    path = write(tmp_path / "t.csv", "x,y,z,a,b,c,d,gx,gy,gz", np.hstack([origin + 1, turn.as_quat(), gaze]))
+    rays = read_table(path, "origin=x,y,z xyzw=a,b,c,d direction=gx,gy,gz")
+    assert dropped(rays) == {"direction is the fill value -1, -1, -1": [[5, 6]], "direction is zero": [[9, 9]]}
+
+
+def test_columns_of_validity_of_a_map(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("x,y,z,a,b,c,isValid\n" + "".join(f"{k},0,1.6,1,0,0,{k % 2}\n" for k in range(10)))
+    columns = "origin=x,y,z direction=a,b,c"
+    rays = read_table(path, columns)
+    assert len(rays) == 10 and "'isValid' may say by name which rows are valid" in rays.metadata["complaints"][0]
+    rays = read_table(path, columns, valid="isValid=1")
+    assert len(rays) == 5 and "complaints" not in rays.metadata and "unused_columns" not in rays.metadata
+    with pytest.raises(NergError, match="has no column other"):
+        read_table(path, columns, valid="other=1")
+
+
+@pytest.mark.parametrize("tick", [1.0, 1e-3])
+def test_clock_times_need_no_tick(tmp_path, tick):
+    (tmp_path / "t.csv").write_text("x,y,z,a,b,c,t\n0,0,0,1,0,0,12:00:00.5\n0,0,0,1,0,0,12:00:01\n")
+    assert np.allclose(
+        read_table(tmp_path / "t.csv", "origin=x,y,z direction=a,b,c t=t", tick=tick).t, [43200.5, 43201]
+    )

@@ -10,7 +10,6 @@ import numpy as np
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
 from nerg_mi.rays.readers.options import NoOptions
-from nerg_mi.rays.readers.parsing.tables import iterate_table
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 from nerg_mi.rays.readers.table import person_from_filename
 
@@ -40,7 +39,7 @@ class Arett:
         builder.note(tick=_MILLISECOND)
         for path in files:
             builder.source(path)
-            for block in iterate_table(path, ["eyeDataTimestamp", *_VECTORS], _TRUTHS, on_bad=builder.on_bad):
+            for block in builder.read_table(path, ["eyeDataTimestamp", *_VECTORS], _TRUTHS):
                 v = block.numbers
                 calibrated, seen, met = (np.char.lower(block.texts) == "true").T
                 builder.add(

@@ -108,7 +108,7 @@ def _add(path: Path, setting: SceneSetting, options: EyeNavGSOptions, builder: R
     fault = _fault(path, tolerant=builder.on_bad is not None)
     time = _time(path)
     builder.source(path)
-    for v, paired, lines in _frames(iterate_table(path, [*_COLUMNS, time], on_bad=builder.on_bad)):
+    for v, paired, lines in _frames(builder.read_table(path, [*_COLUMNS, time])):
         eyes = setting.to_area(v[:, :, 1:4].reshape(-1, 3)).reshape(-1, 2, 3)
         sight = poses.rotations_from_quaternions(v[:, :, 8:12].reshape(-1, 4)) @ _FORWARD
         sight = (sight @ setting.upright.T).reshape(-1, 2, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,9 @@ from nerg_mi.rays.readers.options import TickOption, option
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing import usual_names as names
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
-from nerg_mi.rays.readers.parsing.tables import iterate_table
+from nerg_mi.rays.readers.parsing.validity import mark_valid, require_valid_values
 from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import person_from_filename
+from nerg_mi.rays.readers.table import find_person, person_from_filename
 
 _PLACES = (
     *("gaze_pose_position", "eye_gaze_position", "gaze_position", "gaze_pos", "gaze_origin", "pose_position"),
@@ -67,14 +68,14 @@ class OpenXr:
             table = ColumnFinder(path)
             place, turn = table.vector(*_PLACES), table.vector(*_TURNS, axes="xyzw")
             time, flags = table.find(*_TIMES), table.find(*_FLAGS)
-            active, person = table.find(*_ACTIVE), table.find(*names.PERSONS)
+            active, person = table.find(*_ACTIVE), find_person(table, builder)
             if time is None:
                 raise NergError(f"{path} has no time; name its columns with --map")
             builder.source(path)
             numbers = [time, *place, *turn, *([flags] if flags else [])]
             texts = [name for name in (active, person) if name]
             first = None
-            for v, words, lines in iterate_table(path, numbers, texts, on_bad=builder.on_bad):
+            for v, words, lines in builder.read_table(path, numbers, texts, clocks={time: options.tick}):
                 word = dict(zip(texts, words.T))
                 first = v[0, 0] if first is None else first
                 drop = {}
@@ -82,7 +83,9 @@ class OpenXr:
                     known = np.nan_to_num(v[:, 8]).clip(0, 1 << 30).astype(np.int64) & _KNOWN
                     drop["the pose is not valid"] = known != _KNOWN
                 if active:
-                    drop["the gaze is not active"] = ~np.isin(np.char.lower(word[active]), names.VALID)
+                    counts = Counter(word[active].tolist())
+                    values = require_valid_values(path.name, active, counts)
+                    drop["the gaze is not active"] = ~mark_valid(word[active], values)
                 builder.add(
                     (v[:, 0] - first) * options.tick,
                     word[person] if person else person_from_filename(path),

@@ -15,9 +15,8 @@ from nerg_mi.rays.readers.options import TickOption, option
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing import usual_names as names
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
-from nerg_mi.rays.readers.parsing.tables import iterate_table
 from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import person_from_filename
+from nerg_mi.rays.readers.table import find_person, person_from_filename
 
 _POSITION, _ROTATION = ("position", "pos"), ("rotation", "rot", "orientation")
 _ONE = ("eye_gaze_", "eye_", "gaze_pose_", "gaze_", "pose_", "")
@@ -57,7 +56,7 @@ class Quest:
             table = ColumnFinder(path)
             eyes = [_pose(table, _sides(side)) for side in ("left", "right")]
             eyes = [e for e in eyes if e] if all(eyes) else [_needed(table)]
-            rig, time, person = _pose(table, _RIG), table.find(*names.TIMES), table.find(*names.PERSONS)
+            rig, time, person = _pose(table, _RIG), table.find(*names.TIMES), find_person(table, builder)
             each = [table.find(*(f"{b}confidence" for b in _sides(side))) for side in ("left", "right")]
             one = table.find("confidence", "gaze_confidence", "eye_confidence")
             sure = [c for c in each if c] or [c for c in [one] if c]
@@ -65,7 +64,8 @@ class Quest:
                 raise NergError(f"{path} has no time; name its columns with --map")
             builder.source(path)
             numbers = [time, *(name for pose in (*eyes, *([rig] if rig else [])) for name in pose), *sure]
-            for v, words, lines in iterate_table(path, numbers, [person] if person else [], on_bad=builder.on_bad):
+            texts, clocks = [person] if person else [], {time: options.tick}
+            for v, words, lines in builder.read_table(path, numbers, texts, clocks=clocks):
                 found = v[:, 1 : 1 + 7 * (len(eyes) + bool(rig))].reshape(len(v), -1, 7)
                 origin, direction = _ray(found, len(eyes))
                 confidence = v[:, len(numbers) - len(sure) :].min(axis=1) if sure else np.ones(len(v))

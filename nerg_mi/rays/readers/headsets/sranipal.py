@@ -15,9 +15,9 @@ from nerg_mi.rays.readers.options import TickOption, option
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing import usual_names as names
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
-from nerg_mi.rays.readers.parsing.tables import iterate_table
+from nerg_mi.rays.readers.parsing.fill_values import fill_values
 from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import person_from_filename
+from nerg_mi.rays.readers.table import find_person, person_from_filename
 
 _MILLIMETRE = 1e-3
 # The SDK's head frame is right-handed, Unity's is not: SRanipal_Eye.GetGazeRay negates x of both.
@@ -75,13 +75,15 @@ class Sranipal:
 
     def read(self, files: Sequence[Path], options: SranipalOptions, builder: RaysBuilder) -> None:
         for path in files:
-            columns = _find(ColumnFinder(path))
+            table = ColumnFinder(path)
+            columns = _find(table, find_person(table, builder))
             builder.source(path)
             masks = [mask for _, _, mask in columns.eyes if mask]
             numbers = [columns.time, *columns.head, *columns.turn, *masks]
             numbers += [name for origin, direction, _ in columns.eyes for name in (*origin, *direction)]
             texts = [columns.person] if columns.person else []
-            for v, words, lines in iterate_table(path, numbers, texts, on_bad=builder.on_bad):
+            clocks = {columns.time: options.tick}
+            for v, words, lines in builder.read_table(path, numbers, texts, clocks=clocks):
                 value = dict(zip(numbers, v.T))
                 vector = lambda wanted, value=value: np.stack([value[c] for c in wanted], axis=1)
                 origin, direction, seen = _eyes(columns, vector, value)
@@ -93,6 +95,7 @@ class Sranipal:
                     poses.rotate(turn, _TO_UNITY * direction),
                     rows=lines,
                     drop={"no eye is valid": ~seen},
+                    recorded_origin=vector(columns.head),
                 )
 
 
@@ -107,8 +110,8 @@ def _eyes(columns: _Columns, vector, value) -> tuple[np.ndarray, np.ndarray, np.
         good = np.ones(len(o), bool)
         if mask is not None:
             good = (np.nan_to_num(value[mask]).clip(0, 1 << 30).astype(np.int64) & _SEEN) == _SEEN
-        # Eyes that were lost are zeros in older versions.
-        good &= np.abs(d).max(axis=1) > 0
+        # Eyes that were lost are zeros in older versions, and fill values in logs of some projects.
+        good &= np.isnan(fill_values(d))
         found.append(np.where(good[:, None, None], np.stack([o, d], axis=1), np.nan))
         seen.append(good)
     both = [found[0], found[-1]]
@@ -116,7 +119,7 @@ def _eyes(columns: _Columns, vector, value) -> tuple[np.ndarray, np.ndarray, np.
     return origin, direction, np.any(seen, axis=0)
 
 
-def _find(table: ColumnFinder) -> _Columns:
+def _find(table: ColumnFinder, person: str | None) -> _Columns:
     """The columns of a table; `NergError` for those that are missing."""
     eyes = [_eye(table, _COMBINED, "c")]
     if eyes[0] is None:
@@ -129,7 +132,7 @@ def _find(table: ColumnFinder) -> _Columns:
         raise NergError(f"{table.path} has no {lacks}; name its columns with --map, or is it a log of another device?")
     head = table.vector(*names.MORE_HEADS)
     turn = table.vector(*names.MORE_ROTATIONS, axes="xyzw")
-    return _Columns(whole, head, turn, time, table.find(*names.PERSONS))
+    return _Columns(whole, head, turn, time, person)
 
 
 def _eye(

@@ -3,60 +3,78 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
-from nerg_mi.rays.readers.options import TickOption
+from nerg_mi.rays.readers.options import TickOption, valid_option
 from nerg_mi.rays.readers.parsing import usual_names as names
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
 from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.parsing.validity import is_validity, parse_valid
 from nerg_mi.rays.readers.protocol import DESCRIPTION
-from nerg_mi.rays.readers.table import TableOptions, add_tables
+from nerg_mi.rays.readers.table import TableOptions, add_tables, find_person
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnityOptions(TickOption):
+    """What names do not say. Raises `NergError` for a text that names no column with values."""
+
+    valid: str | None = valid_option()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        parse_valid(self.valid)
 
 
 class UnityReader:
     """Tables of Unity's world (y up, left-handed, metres), whose columns are found by name.
 
-    Where there are, ``hit_*`` (or ``gaze_hit_*``, ``hit_point_*``), a time, a person, ``confidence`` and a ``status``
-    (rows that are not valid are dropped) are read too. Without a person the file is the person. ``columns_of``: the
-    columns that say where from and whereto.
+    Where there are, ``hit_*`` (or ``gaze_hit_*``, ``hit_point_*``), a time, a person, ``confidence`` and columns of
+    validity (``status``, ``isValid``, ``GazeValidity``: rows that are not valid are dropped) are read too. Without a
+    person the file is the person. ``columns_of``: the columns that say where from and whereto.
     """
 
     world = "Unity: y up, left, m"
     checked_on = DESCRIPTION
-    Options = TickOption
+    Options = UnityOptions
 
     def __init__(self, name: str, files: str, columns_of: Callable[[ColumnFinder], dict]) -> None:
         self.name, self.files, self._columns_of = name, files, columns_of
 
-    def frame(self, files: Sequence[Path], options: TickOption) -> Frame:
+    def frame(self, files: Sequence[Path], options: UnityOptions) -> Frame:
         return UNITY
 
-    def read(self, files: Sequence[Path], options: TickOption, builder: RaysBuilder) -> None:
+    def read(self, files: Sequence[Path], options: UnityOptions, builder: RaysBuilder) -> None:
         first, *others = (ColumnFinder(path) for path in files)
-        columns = self._map(first)
+        columns = self._map(first, find_person(first, builder))
         for other in others:
             # Tables of one recording have the same columns.
-            if (found := str(self._map(other))) != str(columns):
+            if (found := str(self._map(other, find_person(other, builder)))) != str(columns):
                 raise NergError(
                     f"{other.path} has other columns ({plain(found)}) than {first.path} ({plain(columns)}); "
                     "import them apart, or with one column map (--map)"
                 )
-        status = first.find(*names.STATUS)
         settings = TableOptions(
-            columns=columns, up=UNITY.up, handedness=UNITY.handedness, units=UNITY.units, forward="z", tick=options.tick
+            columns=columns,
+            up=UNITY.up,
+            handedness=UNITY.handedness,
+            units=UNITY.units,
+            forward="z",
+            valid=options.valid,
+            tick=options.tick,
         )
-        add_tables(files, settings, builder, {status: names.VALID} if status else {})
+        add_tables(files, settings, builder, [name for name in first.columns if is_validity(name)])
 
-    def _map(self, table: ColumnFinder) -> ColumnMap:
+    def _map(self, table: ColumnFinder, person: str | None) -> ColumnMap:
         return ColumnMap(
             **self._columns_of(table),
             hit=table.find_vector(*names.HITS),
             t=table.find(*names.TIMES),
-            person=table.find(*names.PERSONS),
+            person=person,
             confidence=table.find("confidence"),
         )
 
@@ -91,7 +109,7 @@ READERS = (
     UnityReader(
         "unity",
         "logs of gaze in the world: `gaze_origin_*`, `gaze_dir_*` (or `gaze_direction_*`, `gaze_forward_*`), if there "
-        "are: `hit_*`, a time, a person, a status",
+        "are: `hit_*`, a time, a person, a validity (`status`, `isValid`)",
         _gaze_in_world,
     ),
     UnityReader(

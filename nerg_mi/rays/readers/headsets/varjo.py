@@ -14,11 +14,11 @@ from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
 from nerg_mi.rays.readers.options import NoOptions
 from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.parsing.tables import iterate_table
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 from nerg_mi.rays.readers.table import person_from_filename
 
 _TICK = 1e-9  # seconds: what CaptureTime counts
+_STATUS = ("INVALID", "0", "ADJUST", "1", "VALID", "2")
 _VECTORS = {"HMDPosition": 3, "HMDRotation": 4, "CombinedGazePosition": 3, "CombinedGazeForward": 3}
 
 
@@ -45,7 +45,7 @@ class Varjo:
         for path in files:
             builder.source(path)
             first = None
-            for block in iterate_table(path, ["CaptureTime"], [*_VECTORS, "GazeStatus"], on_bad=builder.on_bad):
+            for block in builder.read_table(path, ["CaptureTime"], [*_VECTORS, "GazeStatus"]):
                 values, texts, lines = block
                 bad = np.zeros(len(lines), bool)
                 vectors = [
@@ -65,11 +65,25 @@ class Varjo:
                     poses.rotate(turn, forward),
                     rows=lines[~bad],
                     head=turn[:, :, 2],
-                    drop={"GazeStatus is not VALID": np.char.upper(texts[~bad, 4]) != "VALID"},
+                    drop={"GazeStatus is not VALID": ~_is_valid(path, texts[~bad, 4])},
+                    recorded_origin=position,
+                    recorded_direction=forward,
                 )
 
 
 READERS = (Varjo(),)
+
+
+def _is_valid(path: Path, status: np.ndarray) -> np.ndarray:
+    """Whether a GazeStatus (n,) is valid, as a word or as the SDK's code. Raises `NergError` for another value."""
+    status = np.char.upper(status)
+    unknown = ~np.isin(status, [*_STATUS, ""])
+    if unknown.any():
+        raise NergError(
+            f"{path} has the GazeStatus {plain(status[unknown][0], 20)!r}, whose meaning is not certain; it is one of "
+            f"{', '.join(_STATUS)}: correct the cells, or import with --map and --valid"
+        )
+    return np.isin(status, _STATUS[-2:])
 
 
 def _parse_vectors(

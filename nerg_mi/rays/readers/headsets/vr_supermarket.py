@@ -16,7 +16,6 @@ from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
 from nerg_mi.rays.readers.options import option
 from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.parsing.tables import iterate_table
 from nerg_mi.rays.readers.protocol import RECORDINGS
 from nerg_mi.rays.readers.table import person_from_filename
 
@@ -61,7 +60,7 @@ class VrSupermarket:
         for path in files:
             builder.source(path)
             user = re.search(r"user\d+", path.name)
-            for v, _, lines in iterate_table(path, _COLUMNS, on_bad=builder.on_bad):
+            for v, _, lines in builder.read_table(path, _COLUMNS):
                 pose = v[:, :12].reshape(-1, 3, 4)
                 turn, place = pose[:, :, :3], pose[:, :, 3]
                 openness = np.minimum(v[:, 21], v[:, 22])
@@ -74,6 +73,7 @@ class VrSupermarket:
                     confidence=np.clip(openness, 0.0, 1.0),
                     hit=v[:, 18:21],
                     head=-turn[:, :, 2],
+                    recorded_direction=v[:, 12:15],
                     drop={f"an eye is closed (openness at most {least:g})": openness <= least},
                 )
 

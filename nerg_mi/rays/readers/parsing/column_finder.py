@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
 
 from .tables import table_columns
+
+_ENOUGH = 20  # rows that tell a counter from people
 
 
 class ColumnFinder:
@@ -47,6 +52,11 @@ class ColumnFinder:
         """The first of these columns that is there."""
         known = next((known for known in (self._by_name, self._by_words) if any(n in known for n in names)), {})
         return next((known[n] for n in names if n in known), None)
+
+
+def is_counter(values: Sequence[str] | np.ndarray) -> bool:
+    """Whether values (n,) of rows are hardly ever the same, as those of a counter are, and not those of people."""
+    return len(values) >= _ENOUGH and len(np.unique(values)) > 0.5 * len(values)
 
 
 def column_words(column: str) -> str:

@@ -13,6 +13,9 @@ from nerg_mi.errors import NergError
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for i, axis in enumerate("xyz") for sign, s in (("", 1.0), ("-", -1.0))}
 """Unit vectors by name: x, -x, y, -y, z, -z."""
 
+MIRRORED = "the head's matrix is mirrored (its determinant is negative)"
+"""Why a row is dropped."""
+
 
 def axis(name: str, what: str) -> np.ndarray:
     """The unit vector of a name such as ``-z``. Raises `NergError` naming ``what`` for another word."""
@@ -80,16 +83,27 @@ def directions_from_azimuths(
 def rotations_from_matrices(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rotation matrices (N, 3, 3) and origins (N, 3) of head-to-world matrices, given row by row as (N, 12) or (N, 16).
 
-    A uniform scale is taken out. NaN where the upper left part is no rotation times a scale, to 1 %.
+    A uniform scale is taken out. NaN where the upper left part is no rotation times a scale, to 1 %, or is mirrored.
     """
     values = np.asarray(values, dtype=np.float64)
     m = values[:, :12].reshape(-1, 3, 4)
     R, origin = m[:, :, :3].copy(), m[:, :, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
-        R /= np.cbrt(np.abs(np.linalg.det(np.where(np.isfinite(R), R, 0.0))))[:, None, None]
+        # The cube root keeps the sign: a mirrored matrix becomes the rotation that it is times -1, and is left out.
+        R /= np.cbrt(_determinants(values))[:, None, None]
         off = np.abs(np.einsum("nij,nik->njk", R, R) - np.eye(3)).max(axis=(1, 2))
-    R[~(off < 0.01)] = np.nan
+    R[~(off < 0.01) | is_mirrored(values)] = np.nan
     return R, origin
+
+
+def is_mirrored(values: np.ndarray) -> np.ndarray:
+    """Whether head-to-world matrices (N, 12) or (N, 16) have a negative determinant, (N,) bool."""
+    return _determinants(values) < 0
+
+
+def _determinants(values: np.ndarray) -> np.ndarray:
+    R = np.asarray(values, dtype=np.float64)[:, :12].reshape(-1, 3, 4)[:, :, :3]
+    return np.linalg.det(np.where(np.isfinite(R), R, 0.0))
 
 
 def rotate(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -29,7 +29,3 @@ BARE_ROTATIONS = ("rot", "rotation", "quaternion", "quat", "q")
 MORE_HEADS = (*HEADS, "hmd_position", "camera_pos", "camera_position", "cam_pos", "cam_position")
 """Of heads in logs of one headset, where a camera is the head's."""
 MORE_ROTATIONS = (*ROTATIONS, "hmd_rotation", "camera_rot", "camera_rotation", "cam_rot", "cam_rotation")
-
-STATUS = ("status", "gaze_status", "gazestatus", "tracking_state", "gaze_valid", "valid")
-VALID = ("valid", "true", "1", "1.0", "tracked", "tracking", "ok")
-"""Words of a status by which a row is kept."""

@@ -90,3 +90,42 @@ def test_heads_of_bare_names(tmp_path):
     assert np.allclose(rays.direction, [3**0.5 / 2, 0, -0.5]) and np.allclose(rays.origin, [[1, 2, 1.6]])
     path.write_text("t,posX,posY,posZ,rotX,rotY,rotZ\n0,1,1.6,2,30,90,0\n")
     assert np.allclose(read("unity_head", path).direction, rays.direction)
+
+
+HEAD = "time,gaze_origin_x,gaze_origin_y,gaze_origin_z,gaze_dir_x,gaze_dir_y,gaze_dir_z"
+
+
+def log(path, column, values):
+    rows = (f"{0.02 * k},1,1.6,{k / 50},0,0,1,{value}" for k, value in enumerate(values))
+    path.write_text(f"{HEAD},{column}\n" + "\n".join(rows) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    "column, values, kept",
+    [
+        ("gaze_status", [0, 1, 2, 2], [2, 3]),  # Varjo's codes
+        ("isValid", ["True", "False", "true", ""], [0, 2]),
+        ("GazeValidity", [1, 0, 0, 1], [0, 3]),
+        ("gaze_is_valid", ["1.0", "0.0", "1.0", "nan"], [0, 2]),
+    ],
+)
+def test_validity(tmp_path, column, values, kept):
+    rays = read("unity", log(tmp_path / "a.csv", column, values))
+    assert np.allclose(rays.t, 0.02 * np.array(kept)) and sum(map(len, dropped(rays).values())) > 0
+
+
+def test_values_of_validity_are_of_all_files(tmp_path):
+    files = log(tmp_path / "a.csv", "gaze_status", [1, 1]), log(tmp_path / "b.csv", "gaze_status", [1, 2])
+    assert len(read("unity", *files)) == 1
+    with pytest.raises(ValueError, match=r"'gaze_status' holds 1 \(2 rows\), and nothing says"):
+        read("unity", files[0])
+    assert len(read("unity", files[0], valid="gaze_status=1")) == 2 and len(read("unity", files[0], valid="none")) == 2
+
+
+def test_a_counter_is_no_participant(tmp_path):
+    rays = read("unity", log(tmp_path / "ann.csv", "id", range(40)))
+    assert rays.persons == ("ann",) and rays.metadata["unused_columns"] == ["id"]
+    assert "'id' has another value in nearly every row" in rays.metadata["complaints"][0]
+    few = read("unity", log(tmp_path / "ann.csv", "id", [k // 10 for k in range(40)]))
+    assert few.persons == ("0", "1", "2", "3") and "complaints" not in few.metadata

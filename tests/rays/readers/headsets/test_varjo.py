@@ -52,3 +52,19 @@ def test_a_vector_that_is_cut_off(tmp_path):
     path.write_text(head + "".join(row.format(i * 10**7) for i in range(5)) + "50000000;(0, 1.6, 0);(0, 0")
     rays = read("varjo", path, skip_bad_lines=True)
     assert len(rays) == 5 and rays.metadata["dropped"][0]["rows"] == [[7, 7]]
+
+
+@pytest.mark.parametrize("status, kept", [("2", 1), ("1", 0), ("valid", 1), ("3", None), ("Visible", None)])
+def test_codes_of_the_status(tmp_path, status, kept):
+    path = tmp_path / "v.csv"
+    row = "{};(0, 1.6, 0);(0, 0, 0, 1);(0, 0, 0);(0, 0, 1);{}\n"
+    path.write_text(
+        "CaptureTime;HMDPosition;HMDRotation;CombinedGazePosition;CombinedGazeForward;GazeStatus\n"
+        + row.format(0, "VALID")
+        + row.format(10**7, status)
+    )
+    if kept is None:
+        with pytest.raises(ValueError, match=f"GazeStatus '{status.upper()}', whose meaning is not certain"):
+            read("varjo", path)
+    else:
+        assert len(read("varjo", path)) == 1 + kept
