@@ -18,7 +18,7 @@ from nerg_mi.files.tables import write_json
 from nerg_mi.rays import splits
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays
-from nerg_mi.rays.guess.proposal import Proposal, propose_import
+from nerg_mi.rays.guess.proposal import Proposal, propose_imports
 from nerg_mi.rays.io import SUFFIXES
 from nerg_mi.rays.pseudonyms import pseudonymise, read_salt
 from nerg_mi.rays.rays import Rays
@@ -93,13 +93,14 @@ def _to_files(rays: Rays) -> list[list[float]]:
     return (back + 0.0).tolist()
 
 
-def guess_import(file: FileName, reporter: Reporter = SILENT) -> Proposal:
-    """What an unknown tracking file is likely to be, and the command to import it by; nothing is applied or written.
+def guess_imports(files: Sequence[FileName], reporter: Reporter = SILENT) -> list[Proposal]:
+    """What unknown tracking files, or folders of them, are likely to be, and the commands to import them by: one for
+    all that are alike. Nothing is applied or written.
 
     Raises `NergError` for a file that is no table, or is damaged.
     """
-    reporter.progress(0.0, f"reading {Path(file).name}")
-    return propose_import(Path(file))
+    reporter.progress(0.0, f"reading {Path(files[0]).name}")
+    return propose_imports([Path(file) for file in files])
 
 
 def card_of(path: FileName, reporter: Reporter = SILENT) -> list[tuple[str, ImportResult]]:

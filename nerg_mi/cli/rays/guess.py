@@ -11,20 +11,26 @@ from nerg_mi.cli.progress import TerminalReporter
 
 
 def command(
-    file: Annotated[Path, typer.Argument(help="Tracking file, or folder of a recording, that is not known.")],
+    files: Annotated[
+        list[Path], typer.Argument(help="Unknown tracking files, folders of them, or folders of recordings.")
+    ],
 ) -> None:
-    """Propose the preset or the column map of an unknown file: what is sure, what is a guess, what no file says.
+    """Propose the preset or the column map of unknown files: what is sure, what is a guess, what no file says.
 
-    Nothing is imported: the whole command is printed, for you to check and to run.
+    Nothing is imported: the whole command is printed, one for all files that are alike, for you to check and to run.
     """
     from nerg_mi.files.bounded import plain
-    from nerg_mi.jobs.tracking import guess_import
+    from nerg_mi.jobs.tracking import guess_imports
 
     with TerminalReporter() as reporter:
-        found = guess_import(file, reporter)
-    for name, sentences in (("sure", found.sure), ("guess", found.guessed), ("open", found.open)):
-        for sentence in sentences:
-            # Names of columns are no control characters of a terminal.
-            typer.echo(f"{name:6} {plain(sentence, 2000)}")
-    typer.echo("")
-    typer.echo("nothing can be proposed" if found.command is None else plain(found.command, 100_000))
+        proposals = guess_imports(files, reporter)
+    for k, found in enumerate(proposals):
+        if len(proposals) > 1:
+            more = f" and {len(found.paths) - 1} more" if len(found.paths) > 1 else ""
+            typer.echo("\n" * (k > 0) + plain(f"{found.paths[0]}{more}", 2000))
+        for name, sentences in (("sure", found.sure), ("guess", found.guessed), ("open", found.open)):
+            for sentence in sentences:
+                # Names of columns are no control characters of a terminal.
+                typer.echo(f"{name:6} {plain(sentence, 2000)}")
+        typer.echo("")
+        typer.echo("nothing can be proposed" if found.command is None else plain(found.command, 100_000))

@@ -6,6 +6,7 @@ Nothing is applied: the proposal says what is sure, what is a guess and what no 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,8 +14,9 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.parsing import poses
-from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
+from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder, is_counter
 from nerg_mi.rays.readers.parsing.column_map import ColumnMap
+from nerg_mi.rays.readers.parsing.validity import is_validity, valid_values
 
 from . import row_evidence as rows
 from .column_roles import Roles, find_roles, in_degrees, time_unit
@@ -31,10 +33,10 @@ _SCENE = ("neon", "tobii3", "glassestools")
 
 @dataclass
 class Proposal:
-    """How to import ``path``; ``options`` of the command line beside the preset or the map, and sentences on what is
+    """How to import ``paths``; ``options`` of the command line beside the preset or the map, and sentences on what is
     ``sure``, what is ``guessed`` and what is ``open``."""
 
-    path: Path
+    paths: list[Path]
     preset: str | None = None
     columns: ColumnMap | None = None
     options: dict[str, str] = field(default_factory=dict)
@@ -48,11 +50,39 @@ class Proposal:
         if self.preset is None and self.columns is None:
             return None
         what = ["--preset", self.preset] if self.preset else ["--map", str(self.columns)]
-        stem = self.path.resolve().name.split(".")[0] or "rays"
-        words = ["nerg", "rays", "import", str(self.path), "-o", f"{stem}.npz", *what]
+        stem = self.paths[0].resolve().name.split(".")[0] or "rays"
+        words = ["nerg", "rays", "import", *map(str, self.paths), "-o", f"{stem}.npz", *what]
         for flag, value in self.options.items():
             words += [flag, value] if value else [flag]
         return shlex.join(words)
+
+
+_TABLES = (".csv", ".csv.gz", ".tsv", ".txt", ".parquet")
+
+
+def propose_imports(paths: Sequence[str | Path]) -> list[Proposal]:
+    """What tracking files, or folders of recordings, are likely to be: a proposal for all that are imported alike.
+
+    A folder that is no recording stands for the tables in it. Raises `NergError` as `propose_import` does, and for a
+    folder without tables.
+    """
+    out: list[Proposal] = []
+    for path in (file for given in paths for file in _tables_in(Path(given))):
+        found = propose_import(path)
+        how = found.preset, found.columns, found.options
+        alike = next((p for p in out if found.command and (p.preset, p.columns, p.options) == how), None)
+        if alike is None:
+            out.append(found)
+        else:
+            alike.paths += found.paths
+    return out
+
+
+def _tables_in(path: Path) -> list[Path]:
+    """The tables of a folder that is no recording, or the path itself."""
+    if not path.is_dir() or preset_of_files(path) is not None:
+        return [path]
+    return sorted(p for p in path.iterdir() if p.is_file() and p.name.lower().endswith(_TABLES)) or [path]
 
 
 def propose_import(path: str | Path) -> Proposal:
@@ -61,7 +91,7 @@ def propose_import(path: str | Path) -> Proposal:
     Raises `NergError` for a file that is no table, or is damaged.
     """
     path = Path(path)
-    out = Proposal(path)
+    out = Proposal([path])
     found = preset_of_files(path)
     if found is None:
         check_is_table(path)
@@ -110,6 +140,8 @@ def _use_preset(out: Proposal, name: str, why: str) -> None:
 def _use_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     """Fill ``out`` with a column map, as far as there is one."""
     numbers = sample.numbers
+    if sample.repeated:
+        out.open.append(f"several columns are called {', '.join(map(repr, sample.repeated[:8]))}: rename all but one")
     vectors = {s: v for s, v in roles.vectors.items() if all(c in numbers for c in v)}
     quaternions = {
         s: q for s, q in roles.quaternions.items() if all(c in numbers for c in q) and rows.is_unit(sample.vector(q))
@@ -146,6 +178,9 @@ def _use_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
     turns = None
     if matrix is not None:
         turns, _ = poses.rotations_from_matrices(sample.vector(matrix))
+        mirrored = poses.is_mirrored(sample.vector(matrix))
+        if mirrored.any():
+            out.open.append(f"{mirrored.sum():,} of {len(mirrored):,} rows: {poses.MIRRORED}; the import drops them")
     elif turn is not None:
         turns = poses.rotations_from_quaternions(sample.vector(quaternions[turn]))
     gaze = sample.vector(vectors[direction]) if direction else None
@@ -156,7 +191,7 @@ def _use_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
             origin = eye or origin
     chosen: dict = {
         "t": time[0],
-        "person": roles.person,
+        "person": _person(out, sample, roles),
         "confidence": _confidence(roles, sample),
         "hit": vectors[hit] if hit else None,
         "direction": vectors[direction] if direction else None,
@@ -166,6 +201,7 @@ def _use_columns(out: Proposal, sample: TableSample, roles: Roles) -> None:
         "eye": vectors[eye] if turns is not None and local and eye and eye != origin else None,
     }
     _use_angles(out, sample, roles, chosen)
+    _use_validity(out, sample)
     _finish(out, sample, roles, chosen)
 
 
@@ -183,10 +219,13 @@ def _best(stems, score, least: int, but: tuple = (), more=lambda stem: 0) -> str
 
 def _find_time(out: Proposal, sample: TableSample, roles: Roles) -> tuple[str | None, np.ndarray | None]:
     """The column of the time, and its seconds."""
-    name = next((c for c in roles.times if c in sample.numbers), None)
+    name = next((c for c in (*roles.times, *sorted(sample.clocks)) if c in sample.numbers), None)
     if name is None:
         out.open.append("the time: no column is called so; without t= rows are numbered, and --tick is the time of one")
         return None, None
+    if name in sample.clocks:
+        out.sure.append(f"{name!r} holds times of day, or dates with them (in UTC where no offset is written)")
+        return name, sample.numbers[name]
     stated, fits = time_unit(name), rows.find_tick(sample.numbers[name])
     tick = stated or fits
     if stated:
@@ -251,11 +290,14 @@ def _pose_evidence(
         forward = rows.find_forward(turns, where, seconds, up, rows.UNITS[settings["metre"]])
         if forward:
             out.guessed.append(f"heads look along their {forward}: that is where they walk to")
-    usual = up is not None and up.endswith("y")
-    hand = "left" if usual and forward != "-z" else "right"
+    unity = up is not None and up.endswith("y") and forward != "-z"
+    unreal = up is not None and up.endswith("z") and settings["metre"] == "cm"
+    hand = "left" if unity or unreal else "right"
     if up:
         out.options["--hand"] = hand
-        which = "as Unity's worlds with y up are" if hand == "left" else "as most worlds with that axis up are"
+        which = "as most worlds with that axis up are"
+        if hand == "left":
+            which = "as Unity's worlds with y up are" if unity else "as Unreal's worlds (z up, in centimetres) are"
         out.guessed.append(
             f"the world is {hand}-handed, {which}; no row tells: a mirrored place is the sign of the other"
         )
@@ -285,6 +327,32 @@ def _confidence(roles: Roles, sample: TableSample) -> str | None:
     values = sample.numbers[roles.confidence]
     values = values[np.isfinite(values)]
     return roles.confidence if values.size and values.min() >= 0 and values.max() <= 1 else None
+
+
+def _person(out: Proposal, sample: TableSample, roles: Roles) -> str | None:
+    """The column of participants, unless it counts rows."""
+    if roles.person not in sample.columns or not is_counter(sample.texts(roles.person)):
+        return roles.person if roles.person in sample.columns else None
+    out.open.append(f"{roles.person!r} has another value in nearly every row: it counts rows, not participants")
+    return None
+
+
+def _use_validity(out: Proposal, sample: TableSample) -> None:
+    """Columns of validity, and which of their values mark valid rows."""
+    words = []
+    for name in filter(is_validity, sample.columns):
+        values = sorted(set(sample.texts(name).tolist()))
+        valid = valid_values(name, values)
+        if valid is None or any(c in name + "".join(valid) for c in ",="):
+            out.open.append(
+                f"which values of {name!r} mark valid rows (--valid): {', '.join(map(repr, values[:8]))}"
+                f"{', ...' if len(values) > 8 else ''}"
+            )
+        elif valid:
+            out.guessed.append(f"rows are valid where {name!r} is {' or '.join(valid)}")
+            words.append(shlex.quote(name) + "=" + ",".join(map(shlex.quote, valid)))
+    if words:
+        out.options["--valid"] = " ".join(words)
 
 
 def _use_angles(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) -> None:
@@ -333,7 +401,7 @@ def _finish(out: Proposal, sample: TableSample, roles: Roles, chosen: dict) -> N
     if "person" in named:
         out.guessed.append(f"person: {named['person']!r} by its name")
     else:
-        out.open.append("the person: no column is called so, and the file is one")
+        out.open.append("the person: no column names participants, and the file is one")
     used = {name for value in named.values() if not isinstance(value, str) for name in value}
     left = [v[0] for v in (*roles.vectors.values(), *roles.quaternions.values()) if not used & set(v)]
     if left:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rays.guess.proposal import propose_import
+from nerg_mi.rays.guess.proposal import propose_import, propose_imports
 from nerg_mi.rays.rays import Rays
 from tests.cli.rays.running import run
 from tests.rays.guess.tables import FORWARD, N, csv, frame, walk, xyz
@@ -168,3 +168,69 @@ def test_forward_axes_are_those_of_the_frames():
         eye, _, _ = frame(WALK, to)
         moved = np.diff(eye[::25], axis=0)
         assert np.mean(np.sum(head.apply(forward)[::25][:-1] * moved, axis=1)) > 0.3
+
+
+def alike(eye, gaze, **more):
+    return csv(t=WALK.t, **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze), **more)
+
+
+def test_unreal_is_left_handed(tmp_path, monkeypatch):
+    flip = [1, -1, 1]
+    (tmp_path / "log.csv").write_text(alike(100 * WALK.eye * flip, WALK.gaze * flip))
+    rays = imported(tmp_path / "log.csv", monkeypatch)
+    assert np.allclose(rays.origin, WALK.eye, atol=1e-5) and np.allclose(rays.direction, WALK.gaze, atol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["2024-05-01T12:00:{:08.5f}", "12:00:{:08.5f}", "2024/05/01 12:00:{:08.5f}Z"])
+def test_times_as_text(tmp_path, monkeypatch, form):
+    eye, gaze, _ = frame(WALK, "y left")
+    table = {"when": [form.format(t - 100) for t in WALK.t], **xyz("gaze_origin_", eye), **xyz("gaze_dir_", gaze)}
+    (tmp_path / "log.csv").write_text(csv(**table))
+    assert np.allclose(np.diff(imported(tmp_path / "log.csv", monkeypatch).t), 0.02, atol=1e-5)
+    assert "'when' holds times of day" in propose_import(tmp_path / "log.csv").sure[0]
+
+
+def test_a_counter_and_validity(tmp_path, monkeypatch):
+    eye, gaze, _ = frame(WALK, "y left")
+    status = np.arange(N) % 3
+    (tmp_path / "log.csv").write_text(alike(eye, gaze, id=np.arange(N), gaze_status=status, tracking_state=status))
+    proposal = propose_import(tmp_path / "log.csv")
+    assert proposal.columns.person is None and proposal.options["--valid"] == "gaze_status=2"
+    assert any("'id' has another value in nearly every row" in sentence for sentence in proposal.open)
+    assert any("which values of 'tracking_state' mark valid rows" in sentence for sentence in proposal.open)
+    assert len(imported(tmp_path / "log.csv", monkeypatch)) == N // 3
+
+
+def test_decimal_commas(tmp_path, monkeypatch):
+    eye, gaze, _ = frame(WALK, "y left")
+    text = alike(eye, gaze)
+    (tmp_path / "log.csv").write_text(text.replace(",", ";").replace(".", ","))
+    assert np.allclose(imported(tmp_path / "log.csv", monkeypatch).origin, WALK.eye)
+    (tmp_path / "log.csv").write_text(text.replace(".", ","))
+    with pytest.raises(NergError, match="are these decimal commas"):
+        propose_import(tmp_path / "log.csv")
+
+
+def test_repeated_names_and_mirrored_matrices(tmp_path):
+    eye, gaze, head = frame(WALK, "y left")
+    rows = np.concatenate([head.as_matrix() @ np.diag([1, 1, -1.0]), eye[:, :, None]], axis=2).reshape(N, 12)
+    names = {f"m{r}{c}": rows[:, 4 * r + c] for r in range(3) for c in range(4)}
+    (tmp_path / "log.csv").write_text(csv(t=WALK.t, **names, x=eye[:, 0], X=eye[:, 0]).replace(",X", ",x"))
+    found = propose_import(tmp_path / "log.csv").open
+    assert any("1,500 of 1,500 rows: the head's matrix is mirrored" in sentence for sentence in found)
+    assert any("several columns are called 'x'" in sentence for sentence in found)
+
+
+def test_several_files_and_folders(tmp_path):
+    eye, gaze, _ = frame(WALK, "y left")
+    (tmp_path / "data").mkdir()
+    for name in ("a.csv", "data/b.csv", "data/c.csv"):
+        (tmp_path / name).write_text(alike(eye, gaze))
+    (tmp_path / "data" / "d.csv").write_text(alike(100 * WALK.eye, WALK.gaze))
+    (tmp_path / "data" / "notes.md").write_text("no table")
+    metres, centimetres = propose_imports([tmp_path / "a.csv", tmp_path / "data"])
+    assert [p.name for p in metres.paths] == ["a.csv", "b.csv", "c.csv"] and "--units cm" in centimetres.command
+    assert shlex.split(metres.command)[3:6] == [str(p) for p in metres.paths]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(NergError, match="is of no recording"):
+        propose_imports([tmp_path / "empty"])
