@@ -8,10 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from nerg_mi.errors import NergError
+
 from .sheet import INK, PAPER, new_page
 
 _POINTS, _SURFACES = "#2b6cb0", "#b9b4aa"
 _MOST_POINTS = 60_000  # drawn; more of them only hide each other
+_MOST_CELLS = 4_000_000
 _SIDE = 640  # pixels of the plan's longer side
 
 
@@ -20,13 +23,22 @@ def floor_plan(rays, cell: float | None = None, title: str = "Where people stood
     as the scale says.
 
     ``cell``: edge of a cell in metres (default: a fiftieth of the plan's shorter side, 5 cm at least). Short lines show
-    where the people of a coarser cell look on average; the longer, the more they agree.
+    where the people of a coarser cell look on average; the longer, the more they agree. Raises `NergError` for no rays,
+    and for cells that are no length or too many.
     """
     from matplotlib.colors import LogNorm
 
     xy = rays.origin[:, :2]
     low, high = _box(xy)
-    cell = cell or max(0.05, round(float((high - low).min()) / 50, 2))
+    size = high - low
+    cell = max(0.05, round(float(size.min()) / 50, 2)) if cell is None else cell
+    if not 0 < cell < np.inf:
+        raise NergError(f"the edge of a cell is a positive length in metres, got {cell:g} (--cell)")
+    if not np.prod(size / cell + 1) <= _MOST_CELLS:
+        raise NergError(
+            f"a plan of {size[0]:.4g} x {size[1]:.4g} m has more than {_MOST_CELLS:,} cells of {cell:g} m; name "
+            "larger ones (--cell)"
+        )
     edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high)]
     counts, *_ = np.histogram2d(xy[:, 0], xy[:, 1], edges)
     density = np.ma.masked_equal(counts.T / cell**2, 0)
@@ -99,6 +111,8 @@ def _walls(sets) -> np.ndarray | None:
 
 
 def _box(xy: np.ndarray, margin: float = 0.03) -> tuple[np.ndarray, np.ndarray]:
+    if not len(xy):
+        raise NergError("there are no rays to draw; select fewer away")
     low, high = xy.min(axis=0), xy.max(axis=0)
     edge = np.maximum(margin * (high - low).max(), 0.05 if margin else 0.0)
     return low - edge, high + edge

@@ -2,6 +2,8 @@
 
 import pytest
 
+from nerg_mi.errors import NergError
+from nerg_mi.rays.rays import Rays
 from tests.cli.rays.running import run, write_walk
 
 
@@ -15,9 +17,21 @@ def test_refusals(walk, tmp_path):
         (["plot", walk, "-o", tmp_path / "p.jpg"], "end in .png"),
         (["plot", walk, "-o", tmp_path / "p.png", "--kind", "map"], "density or layout"),
         (["plot", walk, "-o", tmp_path / "p.png", "--test", walk], "add --kind layout"),
+        (["plot", walk, "-o", tmp_path / "p.png", "--cell=-1"], "a positive length in metres, got -1"),
+        (["plot", walk, "-o", tmp_path / "p.png", "--cell=0"], "a positive length in metres, got 0"),
+        (["plot", walk, "-o", tmp_path / "p.png", "--cell=nan"], "a positive length in metres, got nan"),
+        (["plot", walk, "-o", tmp_path / "p.png", "--cell=1e-7"], "more than 4,000,000 cells of 1e-07 m"),
     ]:
         done = run(*arguments)
         assert done.exit_code != 0 and message in str(done.exception)
+
+
+@pytest.mark.parametrize("kind", ["density", "layout"])
+def test_no_rays(walk, tmp_path, kind):
+    rays = Rays.load(walk)
+    rays.select(rays.t < rays.t).save(tmp_path / "none.npz")
+    done = run("plot", tmp_path / "none.npz", "-o", tmp_path / "p.png", "--kind", kind)
+    assert isinstance(done.exception, NergError) and "no rays to draw" in str(done.exception)
 
 
 def test_plot_density(walk, tmp_path):
