@@ -217,7 +217,7 @@ INPUTS = {
     "draw surface": {"files"},
     "align": {"rays", "field", "scene", "surface", "pairs", "twin", "cameras", "place_cameras", "start"},
     "rays import": {"files", "salt", "poses", "place"},
-    "rays guess": {"file"},
+    "rays guess": {"files"},
     "rays show": {"rays"},
     "rays filter": {"rays"},
     "rays split": {"rays"},

@@ -99,6 +99,8 @@ def _rows(path: Path, columns: list[str]) -> dict[str, np.ndarray]:
         for row in table:
             if not row:
                 continue
+            if len(row) != len(head):
+                raise ValueError(f"line {table.line_num} has {len(row)} cells, the header {len(head)}")
             if int(row[time]) >= 0:
                 moving.add(row[uid])
                 continue

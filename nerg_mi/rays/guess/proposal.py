@@ -133,6 +133,8 @@ def _use_preset(out: Proposal, name: str, why: str) -> None:
     if name == "neon_mocap":
         out.options["--up"] = "UP"
         out.open.append("the up axis of the motion capture (--up)")
+    if name == "motive":
+        out.open.append("the axis along which the head's rigid body looks (--forward; -z if nothing is said)")
     if name == "skeleton22":
         out.open.append("the unit of the time (--tick); the card tells which would give a device's rate")
 

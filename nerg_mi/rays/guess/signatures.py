@@ -49,6 +49,8 @@ def preset_of_text(path: Path) -> tuple[str, str] | None:
             return "skeleton22", "its lines are id|time|[keypoints]"
         if block[0].startswith("GAZE_VECTOR_NAME\t"):
             return "qualisys", "its first line names a gaze vector"
+        if block[0].lstrip("\ufeff").startswith("Format Version,"):
+            return "motive", "its first line is that of Motive's export"
         break
     return None
 

@@ -105,13 +105,16 @@ class RaysBuilder:
         texts: Sequence[str] = (),
         *,
         also_used: Sequence[str] = (),
+        header: Sequence[str] | None = None,
+        first_line: int = 1,
         clocks: Mapping[str, float] | None = None,
     ) -> Iterator[TableBlock]:
         """Blocks of a table of the present source, as `iterate_table` gives them, with an account of the lines that
         cannot be read and of the columns that are not used; ``also_used``: those that are read in another way."""
         used = {*numbers, *texts, *also_used}
-        self.note_unused(name for name in table_columns(path) if name and name not in used)
-        return iterate_table(path, numbers, texts, on_bad=self.on_bad, clocks=clocks)
+        there = table_columns(path) if header is None else header
+        self.note_unused(name for name in there if name and name not in used)
+        return iterate_table(path, numbers, texts, header, self.on_bad, first_line=first_line, clocks=clocks)
 
     def note_unused(self, columns: Iterable[str]) -> None:
         """Name columns of the files that are not used on the card of the rays."""

@@ -12,7 +12,7 @@ from typing import Any
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import qualisys, skeleton22, table
+from . import motive, qualisys, skeleton22, table
 from .builder import RaysBuilder
 from .glasses import aria, glassestools, neon, pupil, tobii3
 from .headsets import arett, eyenavgs, hololens, openxr, quest, sranipal, unity, varjo, vr_supermarket
@@ -202,6 +202,7 @@ for _module in (
     quest,
     pupil,
     qualisys,
+    motive,
     aria,
     eyenavgs,
     neon,

@@ -145,6 +145,7 @@ EXAMPLES = {
             ).join(["GAZE_VECTOR_NAME\tann\nNO_OF_SAMPLES\t8\nFREQUENCY\t100\nSTART_OFFSET\t0.5\n", ""])
         }
     ),
+    "motive": Example({"ann.csv": headsets.MOTIVE}),
     "neon_mocap": Example(
         {
             "gaze_in_mocap_space.csv": lines(

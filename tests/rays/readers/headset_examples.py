@@ -62,6 +62,21 @@ def quest(t, left, right, turns: tuple[Rotation, Rotation], sure: tuple, rig: tu
     return csv(head, zip(*columns))
 
 
+def motive(t, bodies: dict[str, tuple], units="Meters", rotation="Quaternion", space="Global") -> str:
+    """Bodies by name, each with its places (n, 3) and rotations; a marker and an error are beside each."""
+    axes = [*(("Rotation", a) for a in "XYZW"), *(("Position", a) for a in "XYZ"), ("Mean Marker Error", "")]
+    columns = [("Rigid Body", name, *axis) for name in bodies for axis in axes]
+    columns += [("Rigid Body Marker", f"{name}:Marker1", "Position", a) for name in bodies for a in "XYZ"]
+    kinds, names, whats, letters = zip(*columns)
+    cells = [np.c_[turn.as_quat(), place, np.full(len(t), 1e-4)] for place, turn in bodies.values()]
+    rows = np.hstack([*cells, *(place for place, _ in bodies.values())])
+    about = f"Format Version,1.23,Take Name,T,Rotation Type,{rotation},Length Units,{units},Coordinate Space,{space}"
+    above = [["", "Type", *kinds], ["", "Name", *names], ["", "ID", *["1"] * len(kinds)], ["", "", *whats]]
+    samples = ([k, *row] for k, row in enumerate(np.c_[t, rows].tolist()))
+    head = [about, "", *map(",".join, above), ",".join(["Frame", "Time (Seconds)", *letters])]
+    return csv("\n".join(head), (["" if v != v else v for v in row] for row in samples))
+
+
 _N = 6
 _K = np.arange(_N)
 _EYES = np.c_[0.1 * _K, np.full(_N, 1.6), np.zeros(_N)]
@@ -72,3 +87,4 @@ ARETT = {"ann.csv": arett(_EYES, _AHEAD, _EYES + 2 * _AHEAD, [True] * _N, [True]
 SRANIPAL = {"ann.csv": sranipal(20 * _K, _EYES, _STILL, {"combined": (0 * _EYES, _AHEAD, np.full(_N, 3))})}
 OPENXR = {"ann.csv": openxr(10_000_000 * _K, _EYES, _STILL, np.full(_N, 15), np.ones(_N, int))}
 QUEST = {"ann.csv": quest(0.02 * _K, _EYES, _EYES, (_STILL, _STILL), (np.ones(_N), np.ones(_N)))}
+MOTIVE = motive(0.01 * _K, {"Head": (_EYES, _STILL)})

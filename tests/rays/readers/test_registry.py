@@ -103,7 +103,7 @@ def test_options_of_another_reader():
 
 def test_options_that_several_have(made_up):
     shared = {o.name: o for o in registry.shared_options()}
-    assert shared["up"].help == "Up axis: x, y, z, -x, -y or -z.  [default: z; pupil: y]"
+    assert shared["up"].help == "Up axis: x, y, z, -x, -y or -z.  [default: z; pupil, motive: y]"
     sure = shared["min_confidence"].help
     assert sure.startswith("Drop rows below this confidence.  [default: 0; ") and "pupil: 0.6" in sure
     assert shared["marker"].help == "pupil: Edge of a tracking marker in metres."

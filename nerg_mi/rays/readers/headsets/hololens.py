@@ -44,6 +44,7 @@ class HoloLens:
 
     def read(self, files: Sequence[Path], options: NoOptions, builder: RaysBuilder) -> None:
         builder.note(tick=_TICK)
+        builder.note_unused(["hands"])
         for path in files:
             builder.source(path)
             first = None
