@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nerg_mi.errors import NergError
+from nerg_mi.rays.readers.parsing.column_map import ColumnMap
 from tests.rays.readers.headset_examples import motive
 from tests.rays.readers.reading import dropped, read
 
@@ -59,6 +60,14 @@ def test_which_body_is_the_head(tmp_path):
     path.write_text(motive(T, {"Head": other, "head": other}).replace("head", "Head"))
     with pytest.raises(NergError, match="several columns called 'Head Rigid Body"):
         read("motive", path)
+
+
+@pytest.mark.parametrize(
+    "name, options", [("unity", {}), ("table", {"columns": ColumnMap.parse("origin=X,Y,Z ypr=a,b")})]
+)
+def test_other_readers_name_it(tmp_path, name, options):
+    with pytest.raises(NergError, match="export of OptiTrack's Motive; import it with --preset motive"):
+        read(name, write(tmp_path / "ann.csv"), **options)
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,8 @@ def _split(row: str, separator: str) -> list[str] | None:
 def _header(path: str | os.PathLike, line: str) -> tuple[list[str], str]:
     """Column names and the separator between them."""
     line = line.rstrip("\r\n").lstrip("\ufeff")
+    if line.startswith("Format Version,"):
+        raise NergError(f'"{path}" is an export of OptiTrack\'s Motive; import it with --preset motive')
     separator = max(",;\t", key=line.count)
     if line.count(separator) >= COLUMNS:
         raise NergError(f'the table "{path}" has more than the {COLUMNS:,} columns that are read; give one with fewer')
