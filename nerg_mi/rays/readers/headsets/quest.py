@@ -15,6 +15,7 @@ from nerg_mi.rays.readers.options import TickOption, option
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing import usual_names as names
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
+from nerg_mi.rays.readers.parsing.fill_values import fill_values
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 from nerg_mi.rays.readers.table import find_person, person_from_filename
 
@@ -76,6 +77,7 @@ class Quest:
                     direction,
                     rows=lines,
                     confidence=confidence,
+                    recorded_origin=found[:, : len(eyes), :3].mean(axis=1),
                     drop={f"confidence below {options.min_confidence:g}": confidence < options.min_confidence},
                 )
 
@@ -87,7 +89,11 @@ def _ray(found: np.ndarray, eyes: int) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions (n, 3) of poses (n, P, 7): those of the eyes, and, after them, of the rig."""
     turns = [poses.rotations_from_quaternions(found[:, k, 3:]) for k in range(found.shape[1])]
     looks = np.stack([turn @ poses.axis("z", "forward") for turn in turns[:eyes]], axis=1)
-    origin, direction = found[:, :eyes, :3].mean(axis=1), looks.mean(axis=1)
+    places = found[:, :eyes, :3].copy()
+    # Of two eyes, one at a fill value was lost; both are left to the builder, which knows the other rows.
+    filled = np.isfinite(np.stack([fill_values(places[:, k]) for k in range(eyes)], axis=1))
+    places[filled & ~filled.all(axis=1, keepdims=True)] = np.nan
+    origin, direction = places.mean(axis=1), looks.mean(axis=1)
     if found.shape[1] > eyes:
         origin = found[:, -1, :3] + poses.rotate(turns[-1], origin)
         direction = poses.rotate(turns[-1], direction)

@@ -64,6 +64,8 @@ class VrSupermarket:
                 pose = v[:, :12].reshape(-1, 3, 4)
                 turn, place = pose[:, :, :3], pose[:, :, 3]
                 openness = np.minimum(v[:, 21], v[:, 22])
+                # In the recordings all are mirrored: Unity's world is left-handed, and the camera's frame is not.
+                mirrored = poses.is_mirrored(v[:, :12])
                 builder.add(
                     v[:, 23],
                     user.group() if user else person_from_filename(path),
@@ -74,7 +76,10 @@ class VrSupermarket:
                     hit=v[:, 18:21],
                     head=-turn[:, :, 2],
                     recorded_direction=v[:, 12:15],
-                    drop={f"an eye is closed (openness at most {least:g})": openness <= least},
+                    drop={
+                        f"an eye is closed (openness at most {least:g})": openness <= least,
+                        "the head's matrix is mirrored against those of most rows": mirrored != (mirrored.mean() > 0.5),
+                    },
                 )
 
 

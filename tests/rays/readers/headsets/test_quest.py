@@ -51,3 +51,16 @@ def test_one_pose_of_the_gaze(tmp_path):
     path.write_text("time,gazePosition_x\n")
     with pytest.raises(NergError, match="has no columns"):
         read("quest", path)
+
+
+@pytest.mark.parametrize("rig", [False, True])
+def test_eyes_at_a_fill_value(tmp_path, rig):
+    """Of one eye the row is dropped at once; of both where the person is otherwise elsewhere."""
+    left, right = LEFT + [0, 3, 0], RIGHT + [0, 3, 0]
+    left[2] = left[4] = right[4] = left[6] = right[6] = 0
+    at = (RNG.normal(size=(N, 3)), Rotation.from_quat(RNG.normal(size=(N, 4)))) if rig else None
+    (tmp_path / "a.csv").write_text(quest(0.02 * np.arange(N), left, right, TURNS, (np.ones(N), np.ones(N)), at))
+    assert dropped(read("quest", tmp_path / "a.csv")) == {
+        "origin is a repeated fill value": [[6, 6], [8, 8]],
+        "origin is missing": [[4, 4]],
+    }

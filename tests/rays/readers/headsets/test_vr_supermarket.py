@@ -46,3 +46,19 @@ def test_frame_eyes_and_openness(tmp_path):
         "confidence is missing or outside [0, 1]": [[5, 5]],
     }
     assert len(read("vr_supermarket", path, min_openness=0.4)) == 3
+
+
+def test_single_mirrored_rows_and_fill_values(tmp_path):
+    names = [f"ctw_{i}{j}" for i in range(3) for j in range(4)]
+    names += "ray_x ray_y ray_z eye_x eye_y eye_z xc yc zc opennessl opennessr time".split()
+    rows = []
+    for k in range(6):
+        turn = np.diag([1.0, 1, -1]) if k != 2 else np.eye(3)
+        pose = np.hstack([turn, [[1.0], [1.6], [2.0 + k]]]).ravel()
+        rows.append([*pose, *([-1, -1, -1] if k == 4 else [0, 0, 1]), 0, 0, 0, "", "", "", 1, 1, 0.02 * k])
+    path = tmp_path / "gaze_user7_x.csv"
+    path.write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]) + "\n")
+    assert dropped(read("vr_supermarket", path)) == {
+        "the head's matrix is mirrored against those of most rows": [[4, 4]],
+        "direction is the fill value -1, -1, -1": [[6, 6]],
+    }
