@@ -31,6 +31,8 @@ def card_lines(rays: Rays, summary: RaysSummary) -> list[tuple[str, str]]:
         lines.append(("dropped", f"{count:,} ({share:.1f} %): {reason}; {_dropped_lines(rays, reason)}"))
     for what, count in rays.metadata.get("missing", {}).items():
         lines.append(("missing", f"{count:,} {what}"))
+    if rays.metadata.get("decimal") == ",":
+        lines.append(("numbers", "commas are taken for decimal signs"))
     unused = rays.metadata.get("unused_columns", [])
     if unused:
         more = f" and {len(unused) - _PERSONS} more" if len(unused) > _PERSONS else ""

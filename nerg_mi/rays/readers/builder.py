@@ -114,7 +114,9 @@ class RaysBuilder:
         used = {*numbers, *texts, *also_used}
         there = table_columns(path) if header is None else header
         self.note_unused(name for name in there if name and name not in used)
-        return iterate_table(path, numbers, texts, header, self.on_bad, first_line=first_line, clocks=clocks)
+        commas = lambda: self.note(decimal=",")
+        how = {"first_line": first_line, "clocks": clocks, "on_commas": commas}
+        return iterate_table(path, numbers, texts, header, self.on_bad, **how)
 
     def note_unused(self, columns: Iterable[str]) -> None:
         """Name columns of the files that are not used on the card of the rays."""

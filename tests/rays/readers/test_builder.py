@@ -212,6 +212,18 @@ def test_fill_values_are_looked_for_in_what_was_recorded(tmp_path):
     assert len(rays) == 1 and [d["count"] for d in rays.metadata["dropped"]] == [2, 1]
 
 
+def test_decimal_commas_are_named(tmp_path):
+    for text, expected in (("t;x\n0,5;1\n", {"numbers"}), ("t;x\n0.5;1\n", set())):
+        (tmp_path / "a.csv").write_text(text)
+        builder = RaysBuilder()
+        builder.source(tmp_path / "a.csv")
+        (block,) = builder.read_table(tmp_path / "a.csv", ["t"])
+        assert block.numbers.tolist() == [[0.5]]
+        add(builder, 2)
+        rays = builder.build()
+        assert {"numbers"} & set(dict(card_lines(rays, summarise(rays)))) == expected
+
+
 def test_unused_columns_are_named_once(tmp_path):
     builder = RaysBuilder()
     for name in ("a.csv", "b.csv"):

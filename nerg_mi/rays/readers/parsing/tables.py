@@ -67,6 +67,7 @@ def iterate_table(
     *,
     first_line: int = 1,
     clocks: Mapping[str, float] | None = None,
+    on_commas: Callable[[], None] | None = None,
 ) -> Iterator[TableBlock]:
     """Yield named columns of a table in blocks of at most ``BLOCK`` rows.
 
@@ -82,6 +83,8 @@ def iterate_table(
     clocks
         Those of ``numbers`` whose cells may be times such as ``2024-05-01T12:00:00`` or ``12:00:00.25``
         (`clock_seconds`), with the seconds of the unit in which they are returned, and in which plain numbers count.
+    on_commas
+        Called once where commas are taken for decimal signs.
 
     Raises
     ------
@@ -110,6 +113,8 @@ def iterate_table(
             if convert is None:
                 layout = _with_spelling(layout, rows, clocks or {})
                 convert = _fast_reader(layout) or (lambda rows: None)
+                if on_commas is not None and layout.decimal == ",":
+                    on_commas()
             values = convert(rows)
             block = TableBlock(*values, lines) if values else _convert(path, rows, lines, layout, on_bad)
             if len(block.lines):
@@ -127,7 +132,7 @@ class _Layout(NamedTuple):
     text_at: list[int]  # and of texts
     decimal: str  # sign: point or comma
     clocks: dict[int, tuple[float, bool]]  # places of times as text: seconds of a unit, and whether with a date
-    row_cells: int  # of the first row
+    row_cells: int  # of the first row that is whole
 
     @property
     def width(self) -> int:
@@ -155,9 +160,9 @@ def _with_spelling(layout: _Layout, rows: list[str], clocks: Mapping[str, float]
     waiting, decimal, row_cells = set(ticks), "", 0
     for row in rows:
         cells = _split(row, layout.separator) or []
-        row_cells = row_cells or len(cells)
         if not layout.accepts(len(cells), cells[-1] if cells else ""):
             continue
+        row_cells = row_cells or len(cells)
         for k in [k for k in waiting if cells[k].strip().lower() not in _MISSING]:
             waiting.remove(k)
             time = clock_seconds(cells[k])
@@ -235,14 +240,16 @@ def _fast_reader(layout: _Layout) -> Callable[[list[str]], tuple[np.ndarray, np.
             return None
         if any(cell.strip() for name in spare for cell in table.column(name).to_pylist()):
             return None
-        numbers = [
-            _clock_column(table.column(names[i]).to_pylist(), *layout.clocks[i])
-            if i in layout.clocks
-            else table.column(names[i]).to_numpy()
-            for i in number_at
-        ]
-        if any(column is None for column in numbers):
-            return None
+        numbers = []
+        for i in number_at:
+            column = table.column(names[i])
+            if i in layout.clocks:
+                times = _clock_column(column.to_pylist(), *layout.clocks[i])
+                if times is None:
+                    return None
+                numbers.append(times)
+            else:
+                numbers.append(column.to_numpy())
         values = np.stack(numbers, axis=1) if numbers else np.empty((len(rows), 0))
         cells = [table.column(names[i]).to_numpy() for i in text_at]
         if any(len(rows) * max(map(len, column)) > _TEXT_BLOCK for column in cells):
