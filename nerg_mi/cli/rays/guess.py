@@ -24,13 +24,13 @@ def command(
 
     with TerminalReporter() as reporter:
         proposals = guess_imports(files, reporter)
-    for k, found in enumerate(proposals):
+    for k, proposal in enumerate(proposals):
         if len(proposals) > 1:
-            more = f" and {len(found.paths) - 1} more" if len(found.paths) > 1 else ""
-            typer.echo("\n" * (k > 0) + plain(f"{found.paths[0]}{more}", 2000))
-        for name, sentences in (("sure", found.sure), ("guess", found.guessed), ("open", found.open)):
+            more = f" and {len(proposal.paths) - 1} more" if len(proposal.paths) > 1 else ""
+            typer.echo("\n" * (k > 0) + plain(f"{proposal.paths[0]}{more}", 2000))
+        for name, sentences in (("sure", proposal.sure), ("guess", proposal.guessed), ("open", proposal.open)):
             for sentence in sentences:
                 # Names of columns are no control characters of a terminal.
                 typer.echo(f"{name:6} {plain(sentence, 2000)}")
         typer.echo("")
-        typer.echo("nothing can be proposed" if found.command is None else plain(found.command, 100_000))
+        typer.echo("nothing can be proposed" if proposal.command is None else plain(proposal.command, 100_000))

@@ -67,14 +67,14 @@ def propose_imports(paths: Sequence[str | Path]) -> list[Proposal]:
     folder without tables.
     """
     out: list[Proposal] = []
-    for path in (file for given in paths for file in _tables_in(Path(given))):
-        found = propose_import(path)
-        how = found.preset, found.columns, found.options
-        alike = next((p for p in out if found.command and (p.preset, p.columns, p.options) == how), None)
+    for path in (table for source in paths for table in _tables_in(Path(source))):
+        new = propose_import(path)
+        how = new.preset, new.columns, new.options
+        alike = next((p for p in out if new.command and (p.preset, p.columns, p.options) == how), None)
         if alike is None:
-            out.append(found)
+            out.append(new)
         else:
-            alike.paths += found.paths
+            alike.paths += new.paths
     return out
 
 

@@ -127,16 +127,16 @@ def _read_layout(path: Path) -> _Layout:
             f'{path} is no export of Motive: it needs a first line "Format Version,..." and a line "Frame,Time '
             '(Seconds),..."; export it as CSV with its header'
         )
-    about = dict(zip(rows[0][::2], rows[0][1::2]))
+    metadata = dict(zip(rows[0][::2], rows[0][1::2]))
     for key, needed in (("Rotation Type", "Quaternion"), ("Coordinate Space", "Global")):
-        if about.get(key) != needed:
+        if metadata.get(key) != needed:
             raise NergError(
-                f"{path} has the {key.lower()} {plain(about.get(key, 'none'), 40)!r}; export it again with {needed}"
+                f"{path} has the {key.lower()} {plain(metadata.get(key, 'none'), 40)!r}; export it again with {needed}"
             )
-    units = _UNITS.get(about.get("Length Units", "").lower())
+    units = _UNITS.get(metadata.get("Length Units", "").lower())
     if units is None:
         raise NergError(
-            f"{path} has the length units {plain(about.get('Length Units', 'none'), 40)!r}; export it in meters, "
+            f"{path} has the length units {plain(metadata.get('Length Units', 'none'), 40)!r}; export it in meters, "
             "centimeters or millimeters"
         )
     # Lines that name something of each column, by their second cell; that above the axes has no name.
@@ -150,5 +150,5 @@ def _read_layout(path: Path) -> _Layout:
         columns.append(" ".join(filter(None, (name, kind, what, axis))))
         if kind in ("Rigid Body", "Bone"):
             bodies.setdefault(name, {})[what, axis] = columns[-1]
-    whole = {name: [found[key] for key in _POSE] for name, found in bodies.items() if set(_POSE) <= set(found)}
+    whole = {name: [cells[key] for key in _POSE] for name, cells in bodies.items() if set(_POSE) <= set(cells)}
     return _Layout(columns, whole, units, at + 2)

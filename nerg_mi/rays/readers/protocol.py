@@ -56,7 +56,9 @@ class Reader(Protocol[O]):
         confidences in [0, 1], NaN where something is missing, the 1-based ``rows`` of the file, and reasons of the
         format's own to ``drop`` some. The checks of rays see more where the file has heads (``head``) and both eyes
         (``eye_distance``); where the height 0 of the files is not the floor, ``builder.note(floor="unknown")`` says so.
-        Lines that cannot be read are told to ``builder.on_bad`` where there is one. What
+        Tables are read by ``builder.read_table``, which names the columns that are not used. Where origins or
+        directions are computed, ``recorded_origin`` and ``recorded_direction`` are those of the file, in which fill
+        values are looked for. Lines that cannot be read are told to ``builder.on_bad`` where there is one. What
         else is worth keeping goes into the metadata with ``builder.note``; options are kept there already. Memory stays
         bounded by the blocks. Raises `NergError` for what the user can mend: a missing column or file, a damaged one,
         an option that is needed.

@@ -136,8 +136,8 @@ def _count_values(files: Sequence[Path], column: str) -> Counter[str]:
 
 
 def find_person(table: ColumnFinder, builder: RaysBuilder) -> str | None:
-    """The column of participants by its usual names, unless it differs in nearly every row; ``builder`` is told of such
-    a one."""
+    """The column of participants by its usual names. One that differs in nearly every row is none, and ``builder``
+    reports it."""
     name = table.find(*PERSONS)
     if name is None or not is_counter(next((b.texts[:, 0] for b in iterate_table(table.path, (), [name])), ())):
         return name

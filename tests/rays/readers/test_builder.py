@@ -212,6 +212,17 @@ def test_fill_values_are_looked_for_in_what_was_recorded(tmp_path):
     assert len(rays) == 1 and [d["count"] for d in rays.metadata["dropped"]] == [2, 1]
 
 
+def test_fill_values_before_any_other_place_are_named(tmp_path):
+    (tmp_path / "a.csv").write_text("x")
+    builder = RaysBuilder()
+    builder.source(tmp_path / "a.csv")
+    add(builder, 5)
+    origin = np.array([[1.0, 1, 1.6], [0, 0, 0]])
+    builder.add(np.arange(2.0), "ann", origin, np.ones((2, 3)), rows=np.array([6, 7]))
+    rays = builder.build()
+    assert len(rays) == 6 and "the first 5 rows of ann in a.csv have one exact fill" in rays.metadata["complaints"][0]
+
+
 def test_decimal_commas_are_named(tmp_path):
     for text, expected in (("t;x\n0,5;1\n", {"numbers"}), ("t;x\n0.5;1\n", set())):
         (tmp_path / "a.csv").write_text(text)

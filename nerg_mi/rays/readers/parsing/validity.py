@@ -63,8 +63,8 @@ def valid_values(column: str, values: Iterable[str]) -> list[str] | None:
 def require_valid_values(source: str, column: str, counts: Mapping[str, int]) -> list[str]:
     """As `valid_values`; raises `NergError` naming the values, which occur ``counts`` times, where one has no meaning
     that is certain."""
-    found = valid_values(column, counts)
-    if found is None:
+    valid = valid_values(column, counts)
+    if valid is None:
         some = sorted(counts, key=lambda value: -counts[value])[:_SHOWN]
         shown = ", ".join(f"{plain(value, 20) or 'nothing'} ({counts[value]:,} rows)" for value in some)
         more = f" and {len(counts) - _SHOWN} more" if len(counts) > _SHOWN else ""
@@ -72,7 +72,7 @@ def require_valid_values(source: str, column: str, counts: Mapping[str, int]) ->
             f"{source}: the column {plain(column, 40)!r} holds {shown}{more}, and nothing says which of them mark "
             f'valid rows; name those (--valid "{plain(column, 40)}=VALUE,VALUE"), or use no such column (--valid none)'
         )
-    return found
+    return valid
 
 
 def mark_valid(cells: np.ndarray, values: Iterable[str]) -> np.ndarray:
