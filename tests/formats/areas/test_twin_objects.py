@@ -67,7 +67,7 @@ def test02_categories_and_groups(tmp_path):
         ("3d_bounding_box.csv", "-0.2", "0.9"),
         ("3d_bounding_box.csv", "object_uid", "uid"),
         ("3d_bounding_box.csv", "1,-1,", "1,"),
-        ("3d_bounding_box.csv", "1,-1,", "1,-1,-0.3,"),
+        ("3d_bounding_box.csv", "0,1,-0.1,0.1", "0,1,-0.1,0.1,9"),
         ("scene_objects.csv", f"{HALF},0,{HALF},0", "0,0,0,0"),
         ("scene_objects.csv", ",2,0,3,", ",2,0,1e300,"),
         ("instances.json", '"Chair"', "7"),
