@@ -18,7 +18,8 @@ Gaussian splats (:monosp:`splats`)
 
  * - color_space
    - |string|
-   - What the colours are that their harmonics give: ``srgb``, as photos train them, or ``linear``. (Default: ``srgb``)
+   - What the colours are that their harmonics give: ``srgb``, as photos train them, ``linear``, or what the ``file``
+     says, which only ``.glb`` does: the others are sRGB. (Default: ``file``)
 
  * - extent
    - |float|
@@ -83,11 +84,12 @@ class SplatsVolume(mi.Volume):
     def __init__(self, props, splats=None):
         # ``splats``: Gaussians in memory in place of a file; see ``of``.
         self._similarity = Similarity(transform(props, "to_world"))
-        self.color_space = choice(props, "color_space", "srgb", ("srgb", "linear"))
+        color_space = choice(props, "color_space", "file", ("file", "srgb", "linear"))
         extent = number(props, "extent", 3, low=0.1, high=10)
         self.filename = "" if splats is not None else resolved(text(props, "filename"))
         super().__init__(props)
         self.splats = splats if splats is not None else read_splats(self.filename)
+        self.color_space = self.splats.color_space if color_space == "file" else color_space
         self.arrays = SplatArrays(self.splats, namespace(mi.Float), extent)
 
     @classmethod

@@ -8,11 +8,10 @@ Ray Tracing"). Held as NumPy arrays: what rays meet of them is `nerg_mi.transpor
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.maths.harmonics import C0, DEGREES, rotated_harmonics
 from nerg_mi.maths.similarity import Similarity
 
@@ -24,7 +23,7 @@ _LEAST_OPACITY = 1e-7
 class Splats:
     """N Gaussians, activated: what they mean, not what a training stores. float32, in the file's own frame and units.
 
-    Raises `NergError` for shapes that do not fit, for numbers that are not finite, and for none at all. Rotations are
+    Raises `ValueError` for shapes that do not fit, for numbers that are not finite, and for none at all. Rotations are
     normalised, opacities clipped to [0, 1], scales to at least 1e-9.
     """
 
@@ -41,6 +40,10 @@ class Splats:
     harmonics: np.ndarray
     # Further columns of the file, (N,) each, by name.
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)
+    # Of the colours: "srgb" or "linear".
+    color_space: str = "srgb"
+    # What a reader had to guess, and what the file holds beyond the Gaussians: a sentence each.
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.centers)
@@ -48,23 +51,22 @@ class Splats:
         for name, shape in shapes.items():
             value = np.asarray(getattr(self, name), np.float32)
             if value.shape != (n, *shape):
-                raise NergError(f"the {name} of {n:,} Gaussians have the shape {value.shape}; export the splats again")
+                raise ValueError(f"the {name} of {n:,} Gaussians have the shape {value.shape}")
             object.__setattr__(self, name, value)
         colors = np.asarray(self.harmonics, np.float32)
         if colors.ndim != 3 or len(colors) != n or colors.shape[1] not in DEGREES or colors.shape[2] != 3:
-            raise NergError(
-                f"the harmonics of {n:,} Gaussians have the shape {colors.shape}, which is no degree from 0 to 3; "
-                "export the splats again"
+            raise ValueError(
+                f"the harmonics of {n:,} Gaussians have the shape {colors.shape}, which is no degree from 0 to 3"
             )
         object.__setattr__(self, "harmonics", colors)
         if n == 0:
-            raise NergError("there are no Gaussians in it; export the splats again")
+            raise ValueError("there are no Gaussians in it")
         for name in (*shapes, "harmonics"):
             if not np.isfinite(getattr(self, name)).all():
-                raise NergError(f"some of the {name} of its Gaussians are not finite; remove these in a splat editor")
+                raise ValueError(f"some of the {name} of its Gaussians are not finite (a splat editor removes these)")
         length = np.linalg.norm(self.rotations.astype(np.float64), axis=1, keepdims=True)
         if not (length > 0).all():
-            raise NergError("some of its Gaussians have a rotation of length 0; remove these in a splat editor")
+            raise ValueError("some of its Gaussians have a rotation of length 0 (a splat editor removes these)")
         object.__setattr__(self, "rotations", (self.rotations / length).astype(np.float32))
         object.__setattr__(self, "opacities", np.clip(self.opacities, 0, 1))
         object.__setattr__(self, "scales", np.maximum(self.scales, np.float32(_LEAST_SCALE)))
@@ -85,7 +87,8 @@ class Splats:
         centers = self.centers @ to_world.matrix[:3, :3].T + to_world.matrix[:3, 3]
         rotations = multiply_quaternions(quaternions_of(turn), self.rotations.astype(np.float64))
         colors = rotated_harmonics(self.harmonics, turn)
-        return Splats(centers, self.scales * to_world.scale, rotations, self.opacities, colors, self.extra)
+        scales = self.scales * np.float32(to_world.scale)
+        return replace(self, centers=centers, scales=scales, rotations=rotations, harmonics=colors)
 
     def axes(self) -> np.ndarray:
         """Rotation matrices (N, 3, 3), float64: columns are the Gaussians' own axes."""
@@ -93,27 +96,34 @@ class Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """All Gaussians of ``parts``, without further columns. Raises `NergError` for several degrees of harmonics."""
-    if len({splats.degree for splats in parts}) > 1:
-        raise NergError("its splats have harmonics of several degrees; export them one by one")
-    take = lambda name: np.concatenate([getattr(splats, name) for splats in parts])
-    return Splats(take("centers"), take("scales"), take("rotations"), take("opacities"), take("harmonics"))
+    """All Gaussians of ``parts``, without further columns. Raises `ValueError` for several degrees of harmonics, and
+    for several colour spaces."""
+    if len({(splats.degree, splats.color_space) for splats in parts}) > 1:
+        raise ValueError("its splats have harmonics of several degrees, or several colour spaces")
+    names = ("centers", "scales", "rotations", "opacities", "harmonics")
+    arrays = {name: np.concatenate([getattr(splats, name) for splats in parts]) for name in names}
+    notes = tuple(dict.fromkeys(note for splats in parts for note in splats.notes))
+    return Splats(**arrays, color_space=parts[0].color_space, notes=notes)
 
 
 def from_trained(
-    centers: np.ndarray,
-    log_scales: np.ndarray,
-    rotations: np.ndarray,
-    logits: np.ndarray,
-    harmonics: np.ndarray,
-    extra: Mapping[str, np.ndarray] | None = None,
+    centers: np.ndarray, log_scales: np.ndarray, rotations: np.ndarray, logits: np.ndarray, harmonics: np.ndarray
 ) -> Splats:
     """Splats of what a training stores: logarithms of the scales, logits of the opacities; quaternions w first, of any
     length."""
+    return Splats(centers, scales_of(log_scales), rotations, opacities_of(logits), harmonics)
+
+
+def scales_of(logarithms: np.ndarray) -> np.ndarray:
+    """Scales, float64, of their ``logarithms``."""
     with np.errstate(over="ignore"):
-        scales = np.exp(np.asarray(log_scales, np.float64))
-        opacities = 1 / (1 + np.exp(-np.asarray(logits, np.float64)))
-    return Splats(centers, scales, rotations, opacities, harmonics, extra or {})
+        return np.exp(np.asarray(logarithms, np.float64))
+
+
+def opacities_of(logits: np.ndarray) -> np.ndarray:
+    """Opacities, float64, of their ``logits``."""
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-np.asarray(logits, np.float64)))
 
 
 def logits_of(opacities: np.ndarray) -> np.ndarray:

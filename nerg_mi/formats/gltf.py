@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import is_count, parse_json, read_bytes, reading
 
 BYTES = 1 << 30
@@ -244,5 +243,5 @@ def accessor_values(
 
 def _index(value: object) -> int:
     if not is_count(value):
-        raise NergError("a mesh numbers its parts by what is no whole number; export it again")
+        raise ValueError("it numbers its parts by what is no whole number")
     return int(value)  # pyright: ignore[reportArgumentType] is_count has looked

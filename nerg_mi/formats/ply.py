@@ -1,19 +1,252 @@
-"""Binary PLY files of triangles or points with columns of their own.
+"""PLY files: their tables, whatever the columns, and binary files of triangles or points with columns of their own.
 
-trimesh's writer adds an alpha to colours, which makes of them an attribute of four channels that no Mitsuba texture
-shows, gives points an empty list of faces, and knows no attributes of faces that Mitsuba reads.
+trimesh's reader loses columns (those of faces that it splits, attributes without a meaning for it). Its writer adds an
+alpha to colours, which makes of them an attribute of four channels that no Mitsuba texture shows, gives points an empty
+list of faces, and knows no attributes of faces that Mitsuba reads.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from nerg_mi.files.atomic import write_bytes
 
+HEADER_BYTES = 1 << 20
+"""The header of a file may be so long."""
+
+TEXT_BYTES = 256 << 20
+"""And the rows, where their numbers are text."""
+
 _TYPES = {"<f4": "float", "|u1": "uchar"}
+_KINDS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PlyTable:
+    """An element of ``count`` rows. ``columns``: of each property with one value a row, what gives the values (count,);
+    ``lists``: of each with several, what gives how many they are (count,), and all of them, row after row; ``kinds``:
+    NumPy's types of the values."""
+
+    count: int
+    columns: dict[str, Callable[[], np.ndarray]] = field(default_factory=dict)
+    lists: dict[str, Callable[[], tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
+    kinds: dict[str, np.dtype] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Ply:
+    """``tables`` by the names of their elements, in the order of the file; ``comments``; ``trailing``: whether more
+    follows the rows."""
+
+    tables: dict[str, PlyTable]
+    comments: tuple[str, ...]
+    trailing: bool
+
+
+def parse_ply(raw: np.ndarray) -> Ply:
+    """The file with the bytes ``raw`` (uint8, of a file that is mapped or read).
+
+    Raises `ValueError` for what is no such file or ends before its rows; nothing is allocated by counts that the bytes
+    do not hold. Values of text are float64.
+    """
+    head = bytes(raw[:HEADER_BYTES])
+    end = re.search(rb"(?:^|\n)end_header[ \t]*\r?\n", head)
+    if not head.startswith(b"ply") or end is None:
+        raise ValueError("it has no header of a PLY file")
+    order, elements, comments = _elements(head[: end.start()].decode("latin-1"))
+    source: _Bytes | _Words = _Bytes(raw[end.end() :], order) if order else _Words(raw[end.end() :])
+    tables, at = {}, 0
+    for name, count, properties in elements:
+        if name in tables:
+            raise ValueError(f'it has two elements "{name}"')
+        tables[name], at = source.table(at, name, count, properties)
+    return Ply(tables, comments, at < source.length)
+
+
+# Name, NumPy's type of the values, and of how many they are, in a list.
+_Property = tuple[str, str, str | None]
+
+
+def _elements(head: str) -> tuple[str, list[tuple[str, int, list[_Property]]], tuple[str, ...]]:
+    """Byte order ("" for text), elements and comments."""
+    order, elements, comments = None, [], []
+    for line in head.splitlines()[1:]:
+        words = line.split()
+        if not words or words[0] in ("comment", "obj_info"):
+            comments.append(line.partition(" ")[2].strip())
+        elif words[0] == "format":
+            if words[1] not in (orders := {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}):
+                raise ValueError(f'its format is "{words[1][:40]}"')
+            order = orders[words[1]]
+        elif words[0] == "element":
+            elements.append((words[1], int(words[2]), []))
+            if elements[-1][1] < 0:
+                raise ValueError(f"it has {elements[-1][1]} rows of {words[1]}")
+        elif words[0] == "property":
+            listed = words[1] == "list"
+            name, kind, count = (words[4], words[3], words[2]) if listed else (words[2], words[1], None)
+            for used in (kind, *([count] if count else [])):
+                if used not in _KINDS:
+                    raise ValueError(f'its property {name[:40]} has the type "{used[:40]}"')
+            if any(name == other for other, *_ in elements[-1][2]):
+                raise ValueError(f'it has two properties of the name "{name[:40]}"')
+            elements[-1][2].append((name, _KINDS[kind], _KINDS[count] if count else None))
+        else:
+            raise ValueError(f'its header has a line that begins with "{words[0][:40]}"')
+    if order is None:
+        raise ValueError("its header names no format")
+    return order, elements, tuple(c for c in comments if c)
+
+
+class _Rows:
+    """Where values are in a file: in bytes, or in words."""
+
+    length: int
+
+    def size(self, kind: str) -> int:
+        """How much a value takes."""
+        raise NotImplementedError
+
+    def take(self, positions: np.ndarray, kind: str) -> np.ndarray:
+        """The values at ``positions``."""
+        raise NotImplementedError
+
+    def number(self, position: int, kind: str) -> int:
+        """The whole number at ``position``, of which -1 is nothing that a file can mean."""
+        raise NotImplementedError
+
+    def even(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
+        """What gives field k of ``count`` rows from ``at`` on, which all have fields of these kinds and widths."""
+        raise NotImplementedError
+
+    def table(self, at: int, name: str, count: int, properties: list[_Property]) -> tuple[PlyTable, int]:
+        """The element whose rows begin at ``at``, and where they end."""
+        least = sum(self.size(c or k) for _, k, c in properties)
+        if count * least > self.length - at:
+            raise ValueError(f"it ends before the {count:,} rows of {name} that it announces")
+        kinds = {name: np.dtype(kind) for name, kind, _ in properties}
+        if not (properties and count):
+            none = lambda: np.zeros(0)
+            columns = {n: none for n, _, c in properties if c is None}
+            return PlyTable(count, columns, {n: lambda: (none(), none()) for n, _, c in properties if c}, kinds), at
+        # Most lists are of one length in all rows.
+        lengths, place = [], at
+        for _, kind, counted in properties:
+            lengths.append(self.number(place, counted) if counted and place < self.length else -1)
+            place += self.size(counted or kind) + (max(lengths[-1], 0) * self.size(kind) if counted else 0)
+        if at + count * (place - at) <= self.length and all(n > 0 for n, p in zip(lengths, properties) if p[2]):
+            widths = [w for (_, k, c), n in zip(properties, lengths) for w in ([(c, 1), (k, n)] if c else [(k, 1)])]
+            values = self.even(at, count, widths)
+            columns, lists, even, k = {}, {}, True, 0
+            for (name, _, counted), n in zip(properties, lengths):
+                if counted is None:
+                    columns[name] = partial(values, k)
+                else:
+                    even = even and bool((values(k) == n).all())
+                    lists[name] = lambda k=k: (values(k).astype(np.int64), values(k + 1).reshape(-1))
+                k += 2 if counted else 1
+            if even:
+                return PlyTable(count, columns, lists, kinds), at + count * (place - at)
+        return self._uneven(at, name, count, properties, kinds)
+
+    def _uneven(self, at, name, count, properties: list[_Property], kinds) -> tuple[PlyTable, int]:
+        starts = np.zeros((len(properties), count), np.int64)
+        counts = np.zeros((len(properties), count), np.int64)
+        sizes = [(self.size(kind), counted and self.size(counted), counted) for _, kind, counted in properties]
+        for row in range(count):
+            for k, (size, head, counted) in enumerate(sizes):
+                if counted:
+                    n = self.number(at, counted) if at + head <= self.length else -1
+                    if n < 0:
+                        raise ValueError(f"row {row + 1:,} of {name} ends early, or has a list of less than nothing")
+                    starts[k, row], counts[k, row] = at + head, n
+                    at += head + n * size
+                else:
+                    starts[k, row] = at
+                    at += size
+            if at > self.length:
+                raise ValueError(f"it ends before row {row + 1:,} of {name}")
+
+        def listed(k: int) -> tuple[np.ndarray, np.ndarray]:
+            kind, total = properties[k][1], np.cumsum(counts[k])
+            within = np.arange(total[-1]) - np.repeat(total - counts[k], counts[k])
+            return counts[k], self.take(np.repeat(starts[k], counts[k]) + within * self.size(kind), kind)
+
+        columns = {n: partial(self.take, starts[k], kind) for k, (n, kind, c) in enumerate(properties) if c is None}
+        lists = {n: partial(listed, k) for k, (n, _, c) in enumerate(properties) if c}
+        return PlyTable(count, columns, lists, kinds), at
+
+
+class _Bytes(_Rows):
+    def __init__(self, raw: np.ndarray, order: str):
+        self._raw, self._order, self.length = raw, order, len(raw)
+
+    def size(self, kind: str) -> int:
+        return np.dtype(kind).itemsize
+
+    def take(self, positions: np.ndarray, kind: str) -> np.ndarray:
+        dtype = np.dtype(self._order + kind)
+        data = self._raw[positions[:, None] + np.arange(dtype.itemsize)]
+        return np.ascontiguousarray(data).view(dtype).reshape(-1).astype(kind)
+
+    def number(self, position: int, kind: str) -> int:
+        dtype = np.dtype(self._order + kind)
+        if position + dtype.itemsize > self.length or dtype.kind == "f":
+            return -1
+        return int.from_bytes(
+            self._raw[position : position + dtype.itemsize].tobytes(),
+            "little" if self._order == "<" else "big",
+            signed=dtype.kind == "i",
+        )
+
+    def even(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
+        dtype = np.dtype([(f"{k}", self._order + kind, n) for k, (kind, n) in enumerate(widths)])
+        rows = np.ndarray((count,), dtype, self._raw, at)
+        return lambda k: rows[f"{k}"].reshape(count, -1).squeeze(1 if widths[k][1] == 1 else ()).astype(widths[k][0])
+
+
+class _Words(_Rows):
+    def __init__(self, raw: np.ndarray):
+        if len(raw) > TEXT_BYTES:
+            raise ValueError(f"it is text of more than {TEXT_BYTES:,} bytes")
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)
+            try:
+                self._words = np.fromstring(raw.tobytes(), np.float64, sep=" ")
+            except (DeprecationWarning, ValueError) as error:
+                raise ValueError("its rows hold what is no number") from error
+        self.length = len(self._words)
+
+    def size(self, kind: str) -> int:
+        return 1
+
+    def take(self, positions: np.ndarray, kind: str) -> np.ndarray:
+        return self._words[positions]
+
+    def number(self, position: int, kind: str) -> int:
+        value = self._words[position]
+        return int(value) if np.isfinite(value) and value == np.floor(value) else -1
+
+    def even(self, at: int, count: int, widths: list[tuple[str, int]]) -> Callable[[int], np.ndarray]:
+        ends = np.cumsum([0, *(n for _, n in widths)])
+        rows = self._words[at : at + count * ends[-1]].reshape(count, ends[-1])
+        return lambda k: rows[:, ends[k]] if widths[k][1] == 1 else rows[:, ends[k] : ends[k + 1]]
 
 
 def write_columns(

@@ -82,6 +82,8 @@ def bake_splats(
     select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
     given = read_splats(path)
+    for note in given.notes:
+        reporter.message(f"of {path}: {note}")
     align, tracked, cone = alignment_of(options), rays_of(options, rays), cone_of(options, source)
     of_rays = RaySettings(cone=cone, bundle=options.bundle, seed=options.seed)
     factor = 1.0
@@ -136,10 +138,11 @@ def bake_splats(
 def recolored(splats: Splats, values: np.ndarray, heat: Heat) -> Splats:
     """``splats`` in colours that are the same from everywhere: ``values`` (N,) as ``heat`` over their own, dimmed; the
     values are their column `COLUMN`."""
-    own = decode_srgb(np.clip(0.5 + C0 * splats.harmonics[:, 0].astype(np.float64), 0, 1))
+    own = np.clip(0.5 + C0 * splats.harmonics[:, 0].astype(np.float64), 0, 1)
+    own = decode_srgb(own) if splats.color_space == "srgb" else own
     shown = overlay(own[None], np.asarray(values)[None], heat)[0]
     extra = {**splats.extra, COLUMN: np.asarray(values, np.float32)}
-    return replace(splats, harmonics=harmonics_of(shown), extra=extra)
+    return replace(splats, harmonics=harmonics_of(shown), extra=extra, color_space="srgb")
 
 
 class _Spread:

@@ -51,7 +51,10 @@ def make_place(
     """
     kind = place_kind(options)
     if options.field is not None:
-        return places.place_of_field(Path(options.field), ns)
+        place = places.place_of_field(Path(options.field), ns)
+        for note in place.notes:
+            reporter.message(f"of {options.field}: {note}")
+        return place
     if options.scene is not None:
         return places.place_of_scene(Path(options.scene))
     if kind == "none":

@@ -42,7 +42,8 @@ def test01_each_gaussian_has_what_the_field_says_and_all_else_is_kept(rgb, place
     told = Recorder()
     found = bake(place, reporter=told)
     given, back = read_splats(place / "place.ply"), read_splats(place / "out.ply")
-    assert found.files == (place / "out.ply",) and "30 are looked at by 1 observer;" in told.messages[0]
+    assert found.files == (place / "out.ply",) and "30 are looked at by 1 observer;" in told.messages[1]
+    assert told.messages[0].endswith("place.ply: columns that are not used: label")
     to = given.centers - np.array(OPTIONS["observer"])
     distance = np.linalg.norm(to, axis=1)
     w = to / distance[:, None]

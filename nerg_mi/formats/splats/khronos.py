@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from typing import Any
 
 import numpy as np
 
+from nerg_mi.errors import NergError, plain
 from nerg_mi.field.splats import Splats, joined
 from nerg_mi.files.bounded import JSON_BYTES, read_bytes, reading
 from nerg_mi.formats.gltf import BYTES, accessor_values, instances, read_parts
@@ -15,6 +17,8 @@ from nerg_mi.maths.similarity import Similarity
 EXTENSION = "KHR_gaussian_splatting"
 
 _POINTS = 0
+_COLOR_SPACES = {"srgb_rec709_display": "srgb", "lin_rec709_display": "linear"}
+_SLACK = 1e-4
 
 
 def has_gltf_splats(path: str | os.PathLike) -> bool:
@@ -29,7 +33,7 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
     """All Gaussian splats of the scene in the .glb file ``path``, its nodes applied.
 
     Raises `NergError` for a damaged file, for one without splats or with compressed ones, for nodes that scale
-    unevenly, and for splats that are not all of one degree of harmonics.
+    unevenly, for splats that are not all of one degree of harmonics, and for values beyond what the extension says.
     """
     raw = read_bytes(path, "splat file", BYTES)
     with reading(path, "splat file", "export it again", also=(TypeError, AttributeError)):
@@ -41,13 +45,17 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
                 continue
             if any("compression" in name for name in about.get("extensions", {})):
                 raise ValueError("its splats are compressed; export it without compression")
-            found.append(_splats(document, data, primitive["attributes"]).placed(Similarity(matrix)))
+            try:
+                where = Similarity(matrix)
+            except NergError as error:
+                raise ValueError("its nodes do more than to turn, to move and a uniform scale") from error
+            found.append(_splats(document, data, primitive["attributes"], about).placed(where))
         if not found:
             raise ValueError(f"its scene has no splats of {EXTENSION}")
         return joined(found)
 
 
-def _splats(document: dict[str, Any], data: bytes, attributes: dict[str, Any]) -> Splats:
+def _splats(document: dict[str, Any], data: bytes, attributes: dict[str, Any], about: dict[str, Any]) -> Splats:
     take = lambda name, shape: accessor_values(document, data, attributes[name], shape)
     own = lambda name, shape: take(f"{EXTENSION}:{name}", shape)
     harmonics = []
@@ -58,11 +66,25 @@ def _splats(document: dict[str, Any], data: bytes, attributes: dict[str, Any]) -
         harmonics += [own(name, "VEC3") for name in names]
     if not harmonics:
         raise ValueError("its splats have no colour")
-    xyzw = own("ROTATION", "VEC4")
-    return Splats(
-        take("POSITION", "VEC3"),
-        own("SCALE", "VEC3"),
-        xyzw[:, [3, 0, 1, 2]],
-        own("OPACITY", "SCALAR")[:, 0],
-        np.stack(harmonics, axis=1),
-    )
+    xyzw, scales, opacities = own("ROTATION", "VEC4"), own("SCALE", "VEC3"), own("OPACITY", "SCALAR")[:, 0]
+    kernel, color_space = about.get("kernel", "ellipse"), about.get("colorSpace", "srgb_rec709_display")
+    if kernel != "ellipse":
+        raise ValueError(f'its kernel is "{plain(kernel, 40)}", and "ellipse" is read')
+    if color_space not in _COLOR_SPACES:
+        raise ValueError(f'its colour space is "{plain(color_space, 40)}", and {" and ".join(_COLOR_SPACES)} are read')
+    _check_range("opacities", opacities, 0, 1, "logits")
+    _check_range("scales", scales, 0, np.inf, "logarithms")
+    _check_range("rotations' lengths", np.linalg.norm(xyzw, axis=1), 0.9, 1.1, "quaternions that are not normalised")
+    used = {"POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY"))}
+    unused = [n for n in attributes if n not in used and not re.fullmatch(rf"{EXTENSION}:SH_DEGREE_[0-3]_COEF_\d", n)]
+    notes = (f"attributes that are not used: {plain(', '.join(unused))}",) if unused else ()
+    shapes = take("POSITION", "VEC3"), scales, xyzw[:, [3, 0, 1, 2]], opacities
+    return Splats(*shapes, np.stack(harmonics, axis=1), color_space=_COLOR_SPACES[color_space], notes=notes)
+
+
+def _check_range(name: str, values: np.ndarray, low: float, high: float, otherwise: str) -> None:
+    if not ((values >= low - _SLACK) & (values <= high + _SLACK)).all():
+        raise ValueError(
+            f"its {name} lie in {values.min():.4g} .. {values.max():.4g}, and {EXTENSION} has them in {low:g} .. "
+            f"{high:g}; its writer has stored {otherwise}"
+        )

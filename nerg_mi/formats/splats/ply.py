@@ -1,7 +1,8 @@
 """Gaussian splats as PLY, as 3DGS trainings write them (Kerbl et al. 2023): logarithms of scales, logits of opacities.
 
 Columns are found by name, in any order; normals are left out, other columns kept. Files of 2DGS lack ``scale_2``: their
-Gaussians become a thousandth as thick as they are wide.
+Gaussians become a thousandth as thick as they are wide. Of Mip-Splatting (Yu et al. 2024) the 3D filter is applied.
+Opacities and lengths where logits and logarithms belong are recognised by values that these cannot have.
 """
 
 from __future__ import annotations
@@ -11,64 +12,110 @@ import re
 
 import numpy as np
 
-from nerg_mi.field.splats import Splats, from_trained, logits_of
+from nerg_mi.field.splats import Splats, logits_of, opacities_of, scales_of
 from nerg_mi.files.bounded import read_bytes, reading
-from nerg_mi.formats.ply import write_columns
+from nerg_mi.formats.ply import parse_ply, write_columns
 from nerg_mi.maths.harmonics import DEGREES
 
 BYTES = 8 << 30
 """A file may have so many bytes."""
 
-TEXT_BYTES = 256 << 20
-"""And so many where its numbers are text."""
-
 HEADER_BYTES = 64 << 10
-"""So many of them may be the header."""
+"""So many of them tell splats from meshes."""
 
-_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"),
-    **dict.fromkeys(("int", "int32"), "<i4"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"),
-    **dict.fromkeys(("float", "float32"), "<f4"),
-    **dict.fromkeys(("double", "float64"), "<f8"),
-}
 _CENTER, _SCALE, _ROTATION = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), tuple(f"rot_{i}" for i in range(4))
 _BASE, _NORMAL = tuple(f"f_dc_{i}" for i in range(3)), ("nx", "ny", "nz")
-_THIN = np.log(1e-3)
+_FILTER = "filter_3D"
+_THIN = 1e-3
+
+# From so many Gaussians on the range of a column is evidence.
+_SOME = 64
+_NEIGHBOR, _SAMPLE = 4, 2000
 
 
 def has_splats(path: str | os.PathLike) -> bool:
-    """Whether the header of the PLY file ``path`` names what Gaussian splats have."""
+    """Whether the header of the PLY file ``path`` names what Gaussian splats have: their colours, or their shape."""
     with reading(path, "PLY file"), open(path, "rb") as file:
-        return re.search(rb"^property [a-z0-9]+ f_dc_0\s*$", file.read(HEADER_BYTES), re.MULTILINE) is not None
+        names = re.findall(rb"^property [a-z0-9]+ (\w+)\s*$", file.read(HEADER_BYTES), re.MULTILINE)
+        return b"f_dc_0" in names or {b"opacity", b"scale_0", b"rot_0"} <= set(names)
 
 
 def read_ply_splats(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in the PLY file ``path``; `NergError` for another kind of file, and for a damaged one."""
     raw = read_bytes(path, "splat file", BYTES)
     with reading(path, "splat file", "export it again as a 3DGS .ply"):
-        columns = _columns(raw)
+        tables = parse_ply(np.frombuffer(raw, np.uint8)).tables
+        first = next(iter(tables), "")
+        if first != "vertex":
+            raise ValueError(f'other things ("{first[:40]}") stand before its vertices')
+        if tables["vertex"].lists:
+            raise ValueError("its vertices have properties that are no numbers")
+        columns = {name: values() for name, values in tables["vertex"].columns.items()}
         missing = [name for name in (*_CENTER, "opacity", *_SCALE[:2], *_ROTATION, *_BASE) if name not in columns]
         if "packed_position" in columns:
             raise ValueError("it is a compressed .ply; convert it by: npx @playcanvas/splat-transform in.ply out.ply")
         if missing:
             raise ValueError(f'it lacks the column "{missing[0]}", which Gaussian splats have')
-        if _SCALE[2] not in columns:
-            columns[_SCALE[2]] = np.minimum(columns[_SCALE[0]], columns[_SCALE[1]]) + _THIN
         rest = sorted((int(m[1]), name) for name in columns if (m := re.fullmatch(r"f_rest_(\d{1,3})", name)))
         count = 1 + len(rest) // 3
         if len(rest) % 3 or count not in DEGREES or [i for i, _ in rest] != list(range(len(rest))):
             raise ValueError(f"its {len(rest)} columns f_rest_* are those of no degree from 0 to 3")
-        take = lambda names: np.stack([columns.pop(name) for name in names], axis=-1)
+        take = lambda names: np.stack([columns.pop(name) for name in names if name in columns], axis=-1)
         base = take(_BASE)[:, None]
         # Stored channel by channel.
         more = take([n for _, n in rest]).reshape(len(base), 3, count - 1).swapaxes(1, 2) if rest else base[:, :0]
-        parts = take(_CENTER), take(_SCALE), take(_ROTATION), columns.pop("opacity")
+        centers, rotations, notes = take(_CENTER), take(_ROTATION), []
+        scales, opacities = _activated(centers, take(_SCALE), columns.pop("opacity"), notes)
+        if scales.shape[1] == 2:
+            scales = np.column_stack([scales, _THIN * scales.min(axis=1)])
+        if _FILTER in columns:
+            scales, opacities = _filtered(scales, opacities, columns.pop(_FILTER))
         extra = {name: column for name, column in columns.items() if name not in _NORMAL}
-        return from_trained(*parts, np.concatenate([base, more], axis=1), extra)
+        unused = [*extra, *(f"those of {name}" for name in list(tables)[1:])]
+        if unused:
+            notes.append(f"columns that are not used: {', '.join(unused)}")
+        harmonics = np.concatenate([base, more], axis=1)
+        return Splats(centers, scales, rotations, opacities, harmonics, extra, notes=tuple(notes))
+
+
+def _activated(
+    centers: np.ndarray, scales: np.ndarray, opacities: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scales and opacities of what the columns hold, which ``notes`` say where it is not what trainings write."""
+    if _are_lengths(centers, scales):
+        notes.append(
+            "its scales are lengths and no logarithms, which would be far larger than the Gaussians' distances"
+        )
+    else:
+        scales = scales_of(scales)
+    # As logits, all opacities of a training would lie between 0.5 and 0.73.
+    if len(opacities) >= _SOME and 0 <= opacities.min() < opacities.max() <= 1:
+        notes.append("its opacities are shares from 0 to 1 and no logits, which would reach further")
+    else:
+        opacities = opacities_of(opacities)
+    return scales, opacities
+
+
+def _are_lengths(centers: np.ndarray, scales: np.ndarray) -> bool:
+    """Whether ``scales`` (N, 2 or 3) fit the distances of the ``centers`` as they are, and not at all as logarithms."""
+    if len(centers) < _SOME or not np.isfinite(centers).all() or not (scales >= 0).all():
+        return False
+    from scipy.spatial import KDTree
+
+    some = centers[:: max(len(centers) // _SAMPLE, 1)]
+    distance = float(np.median(KDTree(centers).query(some, k=_NEIGHBOR + 1)[0][:, -1]))
+    usual = np.median(scales.max(axis=1))
+    # Logarithms that all lie in 0..1 are suspicious by themselves: no training leaves all sizes within a factor of 2.7.
+    overlap = 2 if scales.max() <= 1 else 16
+    return bool(distance > 0 and usual < 4 * distance and overlap * distance < scales_of(usual))
+
+
+def _filtered(scales: np.ndarray, opacities: np.ndarray, deviation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussians convolved with one of the standard ``deviation`` (N,), of the same mass along a ray: what a training of
+    Mip-Splatting renders."""
+    squares = np.asarray(scales, np.float64) ** 2
+    widened = squares + np.asarray(deviation, np.float64)[:, None] ** 2
+    return np.sqrt(widened), opacities * np.sqrt(np.prod(squares / widened, axis=1))
 
 
 def write_ply_splats(path: str | os.PathLike, splats: Splats, comments: tuple[str, ...] = ()) -> None:
@@ -84,47 +131,3 @@ def write_ply_splats(path: str | os.PathLike, splats: Splats, comments: tuple[st
     columns |= {name: logs[:, i] for i, name in enumerate(_SCALE)}
     columns |= {name: splats.rotations[:, i] for i, name in enumerate(_ROTATION)}
     write_columns(path, columns | dict(splats.extra), comments=comments)
-
-
-def _columns(raw: bytes) -> dict[str, np.ndarray]:
-    """The vertices' columns by name."""
-    end = re.search(rb"^end_header[ \t]*\r?\n", raw[:HEADER_BYTES], re.MULTILINE)
-    if not raw.startswith(b"ply") or end is None:
-        raise ValueError("it is no PLY file, or its header has no end")
-    lines = [line.split() for line in raw[: end.start()].decode("ascii").splitlines()]
-    style, element, count, types = "", "", -1, []
-    for words in lines:
-        if words[:1] == ["format"] and len(words) == 3:
-            style = words[1]
-        elif words[:1] == ["element"] and len(words) == 3:
-            element = words[1]
-            if element == "vertex":
-                count = int(words[2])
-            elif count < 0:
-                raise ValueError(f'other things ("{element}") stand before its vertices')
-        elif words[:1] == ["property"] and element == "vertex":
-            if len(words) != 3 or words[1] not in _TYPES:
-                raise ValueError("its vertices have properties that are no numbers")
-            types.append((words[2], _TYPES[words[1]]))
-    if count < 0 or not types or len({name for name, _ in types}) < len(types):
-        raise ValueError("it has no vertices, or two columns of one name")
-    data = memoryview(raw)[end.end() :]
-    if style == "ascii":
-        table = _text(bytes(data), count, len(types))
-        return {name: table[:, i] for i, (name, _) in enumerate(types)}
-    if style != "binary_little_endian":
-        raise ValueError(f'its format is "{style}", and "binary_little_endian" or "ascii" is read')
-    rows = np.dtype(types)
-    if count * rows.itemsize > len(data):
-        raise ValueError(f"its header announces {count:,} vertices, and {len(data) // rows.itemsize:,} are there")
-    table = np.frombuffer(data, rows, count)
-    return {name: np.ascontiguousarray(table[name]) for name, _ in types}
-
-
-def _text(data: bytes, count: int, width: int) -> np.ndarray:
-    if len(data) > TEXT_BYTES:
-        raise ValueError(f"it is text of more than {TEXT_BYTES:,} bytes")
-    words = data.split(None, count * width)[: count * width]
-    if len(words) < count * width:
-        raise ValueError(f"its header announces {count:,} vertices, and {len(words) // width:,} are there")
-    return np.array(words, np.float64).reshape(count, width)

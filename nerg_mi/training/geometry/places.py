@@ -53,6 +53,8 @@ class GazePlace:
     align: Similarity = field(default_factory=Similarity)
     # The radiance field that the medium shows, where it is one.
     radiance: RadianceField | None = None
+    # What its file holds that is not used, and what had to be guessed of it: a sentence each.
+    notes: tuple[str, ...] = ()
 
     def points_from_rays(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) of the rays' frame in the field's."""
@@ -84,7 +86,8 @@ def _place_of_splats(path: Path, ns: ModuleType) -> GazePlace:
     lower, upper = np.quantile(splats.centers.astype(np.float64), (_STRAY, 1 - _STRAY), axis=0)
     pad = _AROUND * max(upper - lower) + float(splats.scales.max(axis=1).mean())
     box = Box(tuple(lower - pad), tuple(upper + pad))
-    return GazePlace(SplatMedium(SplatArrays(splats, ns)), box, "field", {"field_file": file_identity(path)})
+    medium, about = SplatMedium(SplatArrays(splats, ns)), {"field_file": file_identity(path)}
+    return GazePlace(medium, box, "field", about, notes=splats.notes)
 
 
 def place_of_scene(path: Path) -> GazePlace:

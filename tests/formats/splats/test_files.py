@@ -3,6 +3,7 @@ import pytest
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.formats.gltf import shown_unlit
+from nerg_mi.formats.ply import write_columns
 from nerg_mi.formats.splats.files import READERS, is_splats, plugin_of_field, read_splats, refuse_others
 from nerg_mi.jobs.scenes.files import kind_of_file
 from nerg_mi.training.geometry.places import place_of_field
@@ -48,3 +49,18 @@ def test_missing_files(tmp_path):
     for suffix in READERS:
         with pytest.raises(MissingFile, match="correct its name"):
             read_splats(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".splat", ".glb"])
+def test_a_reader_names_its_file(tmp_path, suffix):
+    splats = random_splats(degree=0)
+    splats.centers[3] = np.nan
+    WRITERS[suffix](tmp_path / f"a{suffix}", splats)
+    with pytest.raises(NergError, match=rf"a\{suffix}.*centers.*not finite"):
+        read_splats(tmp_path / f"a{suffix}")
+
+
+def test_splats_without_their_colours_are_splats(tmp_path):
+    columns = ("x", "y", "z", "opacity", "scale_0", "rot_0", "red")
+    write_columns(tmp_path / "a.ply", {name: np.zeros(3) for name in columns})
+    assert is_splats(tmp_path / "a.ply")

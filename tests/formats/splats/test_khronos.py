@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.formats.gltf import pack_glb, read_parts
 from nerg_mi.formats.splats.khronos import read_gltf_splats
 from tests.formats.splats.test_ply import equal
 from tests.formats.splats.writers import random_splats, write_khronos
@@ -32,6 +33,9 @@ def test_nodes_are_applied_and_integers_are_shares(tmp_path):
         (b'"KHR_gaussian_splatting:OPACITY"', b'"KHR_gaussian_splatting:OPACITI"', "OPACITY"),
         (b'"KHR_gaussian_splatting:SH_DEGREE_0', b'"KHR_gaussian_splatting:SH_DEGREE_7', "no colour"),
         (b'"kernel": "ellipse"', b'"extensions": {"compression": 1}', "compressed"),
+        (b'"kernel": "ellipse"', b'"kernel": "triangle"', 'kernel is "triangle"'),
+        (b"srgb_rec709", b"rgbb_rec2020", "colour space"),
+        (b'"buffer": 0,', b'"buffer": -1,', "no whole number"),
         (b'"nodes": [{"mesh": 0', b'"nodes": [{"scale": [1, 2, 1], "mesh": 0', "uniform scale"),
     ],
 )
@@ -44,13 +48,11 @@ def test_what_is_not_read_is_one_sentence(tmp_path, old, new, said):
     text += b" " * (-len(text) % 4)
     rest = raw[20 + length :]
     (tmp_path / "a.glb").write_bytes(raw[:12] + len(text).to_bytes(4, "little") + raw[16:20] + text + rest)
-    with pytest.raises(NergError, match=said):
+    with pytest.raises(NergError, match=f"a.glb.*{said}"):
         read_gltf_splats(tmp_path / "a.glb")
 
 
 def test_two_degrees_are_refused(tmp_path):
-    from nerg_mi.formats.gltf import pack_glb, read_parts
-
     write_khronos(tmp_path / "a.glb", random_splats(degree=1))
     document, data = read_parts((tmp_path / "a.glb").read_bytes(), "a.glb")
     first = document["meshes"][0]["primitives"][0]
@@ -59,3 +61,31 @@ def test_two_degrees_are_refused(tmp_path):
     (tmp_path / "a.glb").write_bytes(b"".join(pack_glb(document, data)))
     with pytest.raises(NergError, match="several degrees"):
         read_gltf_splats(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize(
+    "name, change, said",
+    [
+        ("opacities", lambda v: np.log(v / (1 - v)), "opacities.*0 .. 1.*logits"),
+        ("opacities", lambda v: v * 255, "logits"),
+        ("scales", np.log, "scales.*logarithms"),
+        ("rotations", lambda v: 3 * v, "not normalised"),
+    ],
+)
+def test_values_beyond_the_specification_are_refused(tmp_path, name, change, said):
+    splats = random_splats(degree=0)
+    object.__setattr__(splats, name, change(getattr(splats, name)))
+    write_khronos(tmp_path / "a.glb", splats)
+    with pytest.raises(NergError, match=said):
+        read_gltf_splats(tmp_path / "a.glb")
+
+
+def test_the_colour_space_is_the_files_and_other_attributes_are_named(tmp_path):
+    write_khronos(tmp_path / "a.glb", random_splats(degree=0))
+    document, data = read_parts((tmp_path / "a.glb").read_bytes(), "a.glb")
+    primitive = document["meshes"][0]["primitives"][0]
+    primitive["attributes"]["_MARK"] = 0
+    primitive["extensions"]["KHR_gaussian_splatting"]["colorSpace"] = "lin_rec709_display"
+    (tmp_path / "a.glb").write_bytes(b"".join(pack_glb(document, data)))
+    read = read_gltf_splats(tmp_path / "a.glb")
+    assert read.color_space == "linear" and read.notes == ("attributes that are not used: _MARK",)

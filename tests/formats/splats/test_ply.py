@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.splats import Splats
-from nerg_mi.formats.splats import ply
+from nerg_mi.formats import ply as ply_tables
+from nerg_mi.formats.ply import parse_ply, write_columns
 from nerg_mi.formats.splats.ply import read_ply_splats, write_ply_splats
 from tests.formats.splats.writers import random_splats, write_inria
 
@@ -61,9 +64,10 @@ def test_surfels_without_a_third_scale_are_thin(tmp_path):
 BAD = [
     (b"property float opacity", b"property float dullness", "opacity"),
     (b"element vertex 40", b"element vertex 4000000000", "4,000,000,000"),
-    (b"property float x", b"property list uchar int x", "no numbers"),
-    (b"property float x", b"property float y", "one name"),
-    (b"binary_little_endian", b"binary_big_endian", "binary_big_endian"),
+    (b"property float x", b"property list uchar int x", "ends before"),
+    (b"f_dc_0", b"red", "f_dc_0"),
+    (b"property float x", b"property float y", "two properties of the name"),
+    (b"binary_little_endian", b"binary_odd_endian", "binary_odd_endian"),
     (b"property float f_rest_44", b"property float f_rest_45", "f_rest"),
     (b"end_header", b"and_header", "header"),
     (b"property float f_dc_0", b"property float packed_position", "splat-transform"),
@@ -82,10 +86,67 @@ def test_a_damaged_file_is_one_sentence(tmp_path, old, new, said):
 
 def test_text_has_a_limit_of_its_own(tmp_path, monkeypatch):
     write_inria(tmp_path / "a.ply", random_splats(), "ascii")
-    monkeypatch.setattr(ply, "TEXT_BYTES", 100)
+    monkeypatch.setattr(ply_tables, "TEXT_BYTES", 100)
     with pytest.raises(NergError, match="more than 100 bytes"):
         read_ply_splats(tmp_path / "a.ply")
     (tmp_path / "a.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:2000])
     monkeypatch.undo()
-    with pytest.raises(NergError, match="announces 40"):
+    with pytest.raises(NergError, match="the 40 rows of vertex"):
         read_ply_splats(tmp_path / "a.ply")
+
+
+def write_columns_of(path, splats, **columns):
+    """The file of ``splats`` with other ``columns``."""
+    write_ply_splats(path, splats)
+    table = {name: values() for name, values in parse_ply(np.fromfile(path, np.uint8)).tables["vertex"].columns.items()}
+    write_columns(path, table | columns)
+
+
+@pytest.mark.parametrize("size, room", [(0.02, 1), (0.05, 8), (30, 1000)])
+def test_lengths_in_place_of_logarithms_are_recognised(tmp_path, size, room):
+    splats = random_splats(4000, 0, size=size)
+    splats = replace(splats, centers=splats.centers * np.float32([room, room, 0.01 * room]))
+    write_columns_of(tmp_path / "a.ply", splats, **{f"scale_{i}": splats.scales[:, i] for i in range(3)})
+    read = read_ply_splats(tmp_path / "a.ply")
+    assert equal(read, splats) and "lengths" in read.notes[0]
+
+
+@pytest.mark.parametrize("low, high", [(0.001, 0.99), (0, 1), (0.5, 0.7)])
+def test_shares_in_place_of_logits_are_recognised(tmp_path, low, high):
+    splats = replace(random_splats(100, 1), opacities=np.linspace(low, high, 100, dtype=np.float32))
+    write_columns_of(tmp_path / "a.ply", splats, opacity=splats.opacities)
+    read = read_ply_splats(tmp_path / "a.ply")
+    assert equal(read, splats) and "no logits" in read.notes[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda s: replace(s, centers=1000 * s.centers, scales=1000 * s.scales),
+        lambda s: replace(s, scales=np.full_like(s.scales, 1.05), centers=20 * s.centers),
+        lambda s: replace(s, opacities=np.full_like(s.opacities, 0.6)),
+        lambda s: replace(s, opacities=np.geomspace(0.005, 0.7, len(s)).astype(np.float32)),
+    ],
+    ids=["millimetres", "large and alike", "of one opacity", "faint"],
+)
+def test_what_trainings_write_is_not_taken_for_anything_else(tmp_path, change):
+    splats = change(random_splats(300, 0))
+    write_ply_splats(tmp_path / "a.ply", splats)
+    read = read_ply_splats(tmp_path / "a.ply")
+    assert equal(read, splats) and not read.notes
+
+
+def test_the_3d_filter_widens_and_keeps_the_mass(tmp_path):
+    splats, widths = random_splats(50, 2), np.linspace(0, 0.5, 50, dtype=np.float32)
+    write_columns_of(tmp_path / "a.ply", splats, filter_3D=widths)
+    read = read_ply_splats(tmp_path / "a.ply")
+    assert np.allclose(read.scales**2 - splats.scales**2, widths[:, None] ** 2, atol=1e-5)
+    assert np.allclose(read.opacities * read.scales.prod(axis=1), splats.opacities * splats.scales.prod(axis=1))
+    # What is written again has the filter in it, and not twice.
+    write_ply_splats(tmp_path / "b.ply", read)
+    assert equal(read_ply_splats(tmp_path / "b.ply"), read, 1e-5) and not read.extra and not read.notes
+
+
+def test_columns_that_are_not_used_are_named(tmp_path):
+    write_columns_of(tmp_path / "a.ply", random_splats(), motion_0=np.zeros(40), t=np.ones(40))
+    assert read_ply_splats(tmp_path / "a.ply").notes == ("columns that are not used: motion_0, t",)
