@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError, mitsuba_says
+from nerg_mi.formats.meshes import READERS
 from nerg_mi.jobs.reporter import SILENT, Reporter
 
 from . import arrays
@@ -19,7 +20,7 @@ from .arrays import Floats
 from .observed import ObserverOf
 from .queries import given_observers
 from .scene import Scene
-from .shapes import MESHES, box_dict, mesh_dict
+from .shapes import box_dict, mesh_child
 from .variant import active_mitsuba
 
 PIECE = 4
@@ -170,14 +171,14 @@ def _mesh(scene: Scene, surface: Any) -> Any:
     """``surface`` as a Mitsuba mesh."""
     import mitsuba as mi
 
-    if isinstance(surface, str) and Path(surface).suffix.lower() not in MESHES:
+    if isinstance(surface, str) and Path(surface).suffix.lower() not in READERS:
         by_id = {shape.id(): shape for shape in scene.mitsuba.shapes()}
         if surface not in by_id:
             known = f"it has {', '.join(by_id)}" if by_id else "it has none"
             raise NergError(f'the scene has no shape "{surface}"; {known}')
         return by_id[surface]
     if isinstance(surface, (str, os.PathLike)):
-        surface = mesh_dict(surface)
+        surface = mesh_child(surface)
     if isinstance(surface, mi.Object):
         return surface
     if isinstance(surface, Mapping):

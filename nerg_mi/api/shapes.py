@@ -10,25 +10,19 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says
-
-MESHES = {".ply": "ply", ".obj": "obj"}
-"""Suffixes of mesh files, and Mitsuba's plugins that read them."""
+from nerg_mi.formats.meshes import read_mesh_file
 
 
-def mesh_dict(path: str | os.PathLike[str]) -> dict:
-    """The mesh file ``path`` as Mitsuba takes it, in grey and seen from both sides. Raises `NergError` for a file that
-    is missing or damaged."""
-    from nerg_mi.rendering.mesh_file import check_obj, check_ply
+def mesh_child(path: str | os.PathLike[str]) -> Any:
+    """The mesh file ``path`` as a child of a Mitsuba scene, in grey and seen from both sides: a dict, or a mesh of what
+    Mitsuba does not read. Raises `NergError` for a file that is missing or damaged."""
+    from nerg_mi.surfaces.target import mitsuba_mesh
 
-    path = Path(path)
-    kind = MESHES.get(path.suffix.lower())
-    if kind is None:
-        raise NergError(f'"{path}" is no mesh file; give one that ends in {" or ".join(MESHES)}')
-    if not path.is_file():
-        raise NergError(f'there is no mesh file "{path}"; correct its name')
-    (check_ply if kind == "ply" else check_obj)(path)
+    mesh = read_mesh_file(path)
     grey = {"type": "twosided", "bsdf": {"type": "diffuse"}}
-    return {"type": kind, "filename": str(path), "bsdf": grey}
+    if mesh.unreadable:
+        return mitsuba_mesh(mesh.vertices, mesh.faces, Path(path).stem, grey)
+    return {"type": Path(path).suffix.lower()[1:], "filename": str(path), "bsdf": grey}
 
 
 def box_dict(lower: np.ndarray, upper: np.ndarray, turn: np.ndarray | None = None) -> dict:
@@ -56,7 +50,7 @@ def scene_children(shapes: object, name: str = "shape") -> dict[str, Any]:
         return {}
     if isinstance(shapes, (str, os.PathLike)):
         if Path(shapes).suffix.lower() != ".xml":
-            return {name: mesh_dict(shapes)}
+            return {name: mesh_child(shapes)}
         from nerg_mi.rendering.pictures import load_scene
 
         return _of_scene(load_scene(Path(shapes)), name)

@@ -6,11 +6,13 @@ import json
 import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from nerg_mi.files.bounded import is_count, parse_json, read_bytes, reading
+from nerg_mi.errors import plain
+from nerg_mi.files.bounded import is_count, parse_json, reading
 
 BYTES = 1 << 30
 """A file may have so many bytes."""
@@ -28,6 +30,10 @@ _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 _INDICES = {5121: "u1", 5123: "<u2", 5125: "<u4"}
 _FLOATS = {5126: "<f4"}
 _SHARES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}
+_QUANTIZED = _FLOATS | _SHARES
+_QUANTIZATION, _INSTANCING = "KHR_mesh_quantization", "EXT_mesh_gpu_instancing"
+# Beginnings of extensions that change how triangles look, and not where they are.
+_LOOKS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 _TRIANGLES = 4
 
 
@@ -104,42 +110,88 @@ def pack_glb(document: dict[str, Any], data: bytes) -> tuple[bytes, ...]:
     return head, struct.pack("<II", len(text), _JSON), text, struct.pack("<II", len(data), _BINARY), data
 
 
-def read_glb(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """``(vertices (V, 3), faces (F, 3))`` of all triangles of the file's scene, its nodes applied, in glTF's frame:
-    right-handed, y up. Lines, points, materials, skins and morphs are not looked at.
+@dataclass(frozen=True, eq=False)
+class GltfTriangles:
+    """``vertices`` (V, 3) and ``faces`` (F, 3) of all triangles of a file's scene, its nodes applied, in glTF's frame:
+    right-handed, y up. ``colors`` (V, 3), linear in 0..1, of vertices, or None; ``notes`` on what is not used."""
 
-    Raises `NergError` for what is damaged, compressed or beyond this module's limits, and where there is no triangle.
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+
+def parse_glb(raw: bytes, path: str | os.PathLike) -> GltfTriangles:
+    """The triangles in the bytes ``raw`` of the file ``path``.
+
+    Raises `NergError` for what is damaged, compressed, quantised without saying so or beyond this module's limits,
+    for extensions that it requires and that are not read, and where there is no triangle.
     """
-    return parse_glb(read_bytes(path, "mesh", BYTES), path)
-
-
-def parse_glb(raw: bytes, path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """The same of the bytes ``raw`` of the file ``path``."""
     # Whatever stands where another kind of value belongs is the file's mistake.
     with reading(path, "mesh", "export it again", also=(TypeError, AttributeError)):
         document, data = read_parts(raw, path)
-        found = list(instances(document))
+        _check_extensions(document)
+        quantized = _QUANTIZATION in document.get("extensionsUsed", [])
+        found = list(instances(document, *_CORNERS_OF))
         vertices: list[np.ndarray] = []
+        colors: list[np.ndarray | None] = []
         faces: list[np.ndarray] = []
         count = triangles = 0
-        known: dict[tuple[int, int | None], tuple[np.ndarray, np.ndarray]] = {}
+        known: dict[tuple, tuple[np.ndarray, np.ndarray]] = {}
         for primitive, matrix in found:
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
                 raise ValueError("its triangles are compressed (Draco); export it without compression")
-            key = primitive["attributes"]["POSITION"], primitive.get("indices")
+            key = primitive["attributes"]["POSITION"], primitive.get("indices"), primitive.get("mode", _TRIANGLES)
             if key not in known:
-                known[key] = _triangles(document, data, *key)
+                known[key] = _triangles(document, data, *key, _QUANTIZED if quantized else _FLOATS)
             corners, index = known[key]
             triangles += len(index)
             if triangles > TRIANGLES:
                 raise ValueError(f"it has more than the {TRIANGLES:,} triangles that are read")
             vertices.append(corners @ matrix[:3, :3].T + matrix[:3, 3])
+            colors.append(_vertex_colors(document, data, primitive["attributes"], len(corners)))
             # A mirrored instance is seen from its other side.
             faces.append(count + (index if np.linalg.det(matrix[:3, :3]) >= 0 else index[:, ::-1]))
             count += len(corners)
         if not triangles:
             raise ValueError("its scene has no triangles")
-        return np.concatenate(vertices), np.concatenate(faces)
+        whole = None
+        if any(part is not None for part in colors):
+            whole = np.concatenate([np.ones((len(v), 3)) if c is None else c for v, c in zip(vertices, colors)])
+        notes = _unused(document, [primitive for primitive, _ in found])
+        return GltfTriangles(np.concatenate(vertices), np.concatenate(faces), whole, notes)
+
+
+def _check_extensions(document: dict[str, Any]) -> None:
+    """Raise `ValueError` for extensions without which the triangles are others."""
+    for name in document.get("extensionsRequired", []):
+        if name != _QUANTIZATION and not str(name).startswith(_LOOKS):
+            raise ValueError(f'it requires the extension "{plain(name, 60)}", which is not read; export it without it')
+    if any(_INSTANCING in node.get("extensions", {}) for node in document.get("nodes", [])):
+        raise ValueError(f"it has copies of meshes by {_INSTANCING}, which is not read; export it without it")
+
+
+def _unused(document: dict[str, Any], primitives: list[dict[str, Any]]) -> tuple[str, ...]:
+    """A sentence on what there is besides the triangles."""
+    modes = {p.get("mode", _TRIANGLES) for m in document.get("meshes", []) for p in m["primitives"]}
+    parts = (["points"] if 0 in modes else []) + (["lines"] if modes & {1, 2, 3} else [])
+    parts += [name for name in ("materials", "skins", "animations", "cameras") if document.get(name)]
+    parts += ["morph targets"] if any("targets" in p for p in primitives) else []
+    parts += sorted({name for p in primitives for name in p["attributes"]} - {"POSITION", "NORMAL", "COLOR_0"})
+    parts += [str(name) for name in document.get("extensionsUsed", []) if name != _QUANTIZATION]
+    return (f"parts that are not used: {plain(', '.join(parts))}",) if parts else ()
+
+
+def _vertex_colors(document: dict[str, Any], data: bytes, attributes: dict[str, Any], count: int) -> np.ndarray | None:
+    if "COLOR_0" not in attributes:
+        return None
+    shape = document["accessors"][_index(attributes["COLOR_0"])]["type"]
+    if shape not in ("VEC3", "VEC4"):
+        raise ValueError(f'its colours are of the type "{plain(shape, 40)}"')
+    colors = accessor_values(document, data, attributes["COLOR_0"], shape)[:, :3].astype(np.float64)
+    if len(colors) != count or not np.isfinite(colors).all():
+        raise ValueError("its colours are not as many as its vertices, or not finite")
+    return np.clip(colors, 0, 1)
 
 
 def read_parts(raw: bytes, path: str | os.PathLike, what: str = "mesh") -> tuple[dict[str, Any], bytes]:
@@ -163,8 +215,8 @@ def read_parts(raw: bytes, path: str | os.PathLike, what: str = "mesh") -> tuple
     return document, data
 
 
-def instances(document: dict[str, Any], mode: int = _TRIANGLES) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Primitives of ``mode``, and where each stands: the matrix (4, 4) of its node in the scene."""
+def instances(document: dict[str, Any], *modes: int) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Primitives of ``modes``, and where each stands: the matrix (4, 4) of its node in the scene."""
     nodes = document.get("nodes", [])
     scenes = document.get("scenes")
     roots = scenes[_index(document.get("scene", 0))]["nodes"] if scenes else range(len(nodes))
@@ -180,7 +232,7 @@ def instances(document: dict[str, Any], mode: int = _TRIANGLES) -> Iterator[tupl
         waiting += [(_index(k), here, depth + 1) for k in reversed(node.get("children", []))]
         if "mesh" in node:
             for primitive in document["meshes"][_index(node["mesh"])]["primitives"]:
-                if primitive.get("mode", _TRIANGLES) == mode:
+                if primitive.get("mode", _TRIANGLES) in modes:
                     yield primitive, here
 
 
@@ -203,16 +255,37 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
 
 
 def _triangles(
-    document: dict[str, Any], data: bytes, position: object, indices: object
+    document: dict[str, Any], data: bytes, position: object, indices: object, mode: int, kinds: Mapping[int, str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    corners = accessor_values(document, data, position, "VEC3").astype(np.float64)
+    corners = accessor_values(document, data, position, "VEC3", kinds).astype(np.float64)
     if indices is None:
         index = np.arange(len(corners))
     else:
         index = accessor_values(document, data, indices, "SCALAR", _INDICES).reshape(-1).astype(np.int64)
-    if len(index) % 3 or (len(index) and index.max() >= len(corners)):
+    if len(index) and index.max() >= len(corners):
         raise ValueError("its triangles have corners that are none of its vertices")
-    return corners, index.reshape(-1, 3)
+    return corners, index[_CORNERS_OF[mode](len(index))]
+
+
+def _separate(count: int) -> np.ndarray:
+    if count % 3:
+        raise ValueError(f"its triangles have {count:,} corners, no multiple of three")
+    return np.arange(count).reshape(-1, 3)
+
+
+def _strip(count: int) -> np.ndarray:
+    first = np.arange(max(count - 2, 0))
+    # Every other triangle of a strip is turned around.
+    return np.stack([first, first + 1 + first % 2, first + 2 - first % 2], axis=1)
+
+
+def _fan(count: int) -> np.ndarray:
+    second = np.arange(1, max(count - 1, 1))
+    return np.stack([0 * second, second, second + 1], axis=1)
+
+
+_CORNERS_OF = {_TRIANGLES: _separate, 5: _strip, 6: _fan}
+"""How the corners of a primitive, by its mode, make triangles."""
 
 
 def accessor_values(
@@ -221,7 +294,7 @@ def accessor_values(
     """An accessor's values (N, components), as far as the bytes that are there hold them. ``kinds``: NumPy's type of
     each component type that is read. Integers that stand for 0 to 1, or for -1 to 1, become floats."""
     accessor = document["accessors"][_index(number)]
-    shared = bool(accessor.get("normalized")) and kinds is _FLOATS
+    shared = bool(accessor.get("normalized")) and kinds is not _INDICES
     known = _SHARES if shared else kinds
     if accessor["type"] != shape or accessor["componentType"] not in known or "sparse" in accessor:
         raise ValueError(

@@ -172,9 +172,11 @@ class _Rows:
         for row in range(count):
             for k, (size, head, counted) in enumerate(sizes):
                 if counted:
-                    n = self.number(at, counted) if at + head <= self.length else -1
+                    if at + head > self.length:
+                        raise ValueError(f"it ends before row {row + 1:,} of {name}")
+                    n = self.number(at, counted)
                     if n < 0:
-                        raise ValueError(f"row {row + 1:,} of {name} ends early, or has a list of less than nothing")
+                        raise ValueError(f"row {row + 1:,} of {name} has a list of less than nothing")
                     starts[k, row], counts[k, row] = at + head, n
                     at += head + n * size
                 else:

@@ -77,6 +77,8 @@ def write_scene(
     given, rays = replace(given, rays=found.file), found.rays
     given, made = _with_hits(given, rays, output, reporter)
     place = place_of_files(given, output)
+    for note in place.notes:
+        reporter.message(f"of {given.place}: {note}")
     up = _up(given, align, options)
     reporter.progress(0.1, "placing the observer")
     theirs = rays if options.person is None else found.of_person(options.person)

@@ -15,7 +15,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.image_header import check_image
 from nerg_mi.properties import resolved
 
-from .mesh_file import check_obj, check_ply, check_vol
+from .mesh_file import check_mesh, check_points, check_vol
 
 DEPTH = 256
 """Elements may be nested so deep; Mitsuba's parser ends the process at some thousands."""
@@ -38,12 +38,12 @@ PIXELS = 1 << 28
 
 _PICTURES = {".png", ".jpg", ".jpeg", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".bmp"}
 _CHECKS = {
-    "ply": check_ply,
-    "obj": check_obj,
+    "ply": lambda path: check_mesh(path, "ply"),
+    "obj": lambda path: check_mesh(path, "obj"),
     "gridvolume": check_vol,
     "sdfgrid": check_vol,
-    "ellipsoids": lambda path: check_ply(path, faces=False),
-    "ellipsoidsmesh": lambda path: check_ply(path, faces=False),
+    "ellipsoids": check_points,
+    "ellipsoidsmesh": check_points,
 }
 
 

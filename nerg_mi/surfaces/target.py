@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,12 +110,14 @@ class Target:
         return Ends(face, np.where(on_it[:, None], place, 0.0), met & ~on_it)
 
 
-def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str) -> Any:
-    """Triangles as a Mitsuba mesh of the variant in use, with the id ``name``."""
+def mitsuba_mesh(vertices: np.ndarray, faces: np.ndarray, name: str, bsdf: Mapping[str, Any] | None = None) -> Any:
+    """Triangles as a Mitsuba mesh of the variant in use, with the id ``name`` and the ``bsdf`` of a dict."""
     import mitsuba as mi
 
     props = mi.Properties()
     props.set_id(name)
+    if bsdf is not None:
+        props["bsdf"] = mi.load_dict(dict(bsdf))
     mesh: Any = mi.Mesh(name, len(vertices), len(faces), props=props)
     params: Any = mi.traverse(mesh)
     params["vertex_positions"] = np.ravel(vertices).astype(np.float32)

@@ -39,7 +39,7 @@ def test_clouds_tables_and_arrays(tmp_path):
     [
         ("a.txt", b"", "no surface that is read"),
         ("a.ply", b"ply\nno", "no header"),
-        ("a.obj", b"", "the surface"),
+        ("a.obj", b"", "no vertices"),
         ("a.csv", b"x,y,z\n", "no points"),
         ("a.csv", b"a,b\n1,2\n", "x"),
     ],

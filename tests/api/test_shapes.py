@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nerg_mi.api.shapes import box_dict, mesh_dict, scene_children
+from nerg_mi.api.shapes import box_dict, mesh_child, scene_children
 from nerg_mi.errors import NergError
 
 
@@ -33,10 +33,10 @@ def test03_a_box_reaches_from_corner_to_corner(rgb):
 def test04_files_are_looked_at_first(rgb, tmp_path):
     path = tmp_path / "cube.ply"
     rgb.load_dict({"type": "cube"}).write_ply(str(path))
-    assert rgb.load_dict(mesh_dict(path)).face_count() == 12
+    assert rgb.load_dict(mesh_child(path)).face_count() == 12
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(NergError, match="cube.ply"):
-        mesh_dict(path)
+        mesh_child(path)
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")
     with pytest.raises(NergError, match="empty.obj"):
-        mesh_dict(tmp_path / "empty.obj")
+        mesh_child(tmp_path / "empty.obj")

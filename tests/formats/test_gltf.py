@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from nerg_mi.errors import NergError
-from nerg_mi.formats.gltf import pack_glb, read_glb, shown_unlit
+from nerg_mi.formats.gltf import GltfTriangles, pack_glb, parse_glb, shown_unlit
 from tests.surfaces.meshes import box
 
 V, F = box((0, 0, 0), (1, 2, 3))
@@ -17,6 +17,10 @@ V, F = box((0, 0, 0), (1, 2, 3))
 def document_of(raw):
     length = struct.unpack_from("<I", raw, 12)[0]
     return json.loads(raw[20 : 20 + length]), raw[28 + length :]
+
+
+def read_glb(path) -> GltfTriangles:
+    return parse_glb(path.read_bytes(), path)
 
 
 def changed(path, **values):
@@ -47,7 +51,8 @@ def test02_what_trimesh_writes_is_read_with_its_nodes(tmp_path):
         where = trimesh.transformations.rotation_matrix(0.3 + k, (1, 2, 3), (k, 0, 1))
         scene.add_geometry(ball, node_name=str(k), transform=where)
     (tmp_path / "a.glb").write_bytes(scene.export(file_type="glb"))
-    vertices, faces = read_glb(tmp_path / "a.glb")
+    read = read_glb(tmp_path / "a.glb")
+    vertices, faces = read.vertices, read.faces
     whole = scene.to_geometry()
     assert len(faces) == len(whole.faces) == 160
     order = lambda t: t[np.lexsort(np.round(t.reshape(len(t), -1), 4).T)]
@@ -81,9 +86,9 @@ def test03_damaged_files_are_a_sentence(tmp_path, values, said):
 
 
 def test04_mirrored_nodes_turn_their_triangles(tmp_path):
-    vertices, faces = read_glb(changed(tmp_path / "a.glb", nodes=[{"mesh": 0, "scale": [-1, 1, 1]}]))
+    read = read_glb(changed(tmp_path / "a.glb", nodes=[{"mesh": 0, "scale": [-1, 1, 1]}]))
     plain = trimesh.Trimesh(V, F).volume
-    assert np.isclose(trimesh.Trimesh(vertices, faces).volume, plain)
+    assert np.isclose(trimesh.Trimesh(read.vertices, read.faces).volume, plain)
 
 
 @pytest.mark.parametrize("cut", [3, 15, 40, 300])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nerg_mi.errors import NergError
-from nerg_mi.rendering.mesh_file import check_obj, check_ply, check_vol
+from nerg_mi.rendering.mesh_file import check_mesh, check_points, check_vol
 
 CORNERS = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
 
@@ -40,7 +40,7 @@ BIG = struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + b"\x03" + struct.pack(">3i
 )
 def test_whole_meshes_pass_here_and_in_mitsuba(rgb, tmp_path, data):
     (tmp_path / "a.ply").write_bytes(data)
-    check_ply(tmp_path / "a.ply")
+    check_mesh(tmp_path / "a.ply", "ply")
     assert rgb.load_dict({"type": "ply", "filename": str(tmp_path / "a.ply")}).vertex_count() == 3
 
 
@@ -55,6 +55,9 @@ def test_whole_meshes_pass_here_and_in_mitsuba(rgb, tmp_path, data):
         (ply(2000000000, 1, CORNERS + face(0, 1, 2)), "ends before"),
         (ply(3, 2**62, CORNERS + face(0, 1, 2)), "ends before"),
         (ply(3, 2**62, TEXT + b"3 0 1 2\n", "ascii"), "ends before"),
+        (ply(3, 1, CORNERS + face(0, 1)), "fewer than three"),
+        (ply(3, 1, CORNERS + face(0, 1, 2) + b"\n"), "more follows its rows"),
+        (ply(3, 1, struct.pack("<f", np.nan) + CORNERS[4:] + face(0, 1, 2)), "vertex 1 is not finite"),
         (ply(3, 2, TEXT + b"3 0 1 2\n" + b" " * 40, "ascii"), "ends before row 2 of face"),
         (ply(-3, 1, CORNERS), "-3 rows"),
         (ply(4, 1, CORNERS + bytes(12) + face(0, 1, 2, 3)), "three corners"),
@@ -68,21 +71,33 @@ def test_whole_meshes_pass_here_and_in_mitsuba(rgb, tmp_path, data):
 def test_wrong_meshes_are_a_sentence(tmp_path, data, said):
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(NergError, match=said) as error:
-        check_ply(tmp_path / "a.ply")
+        check_mesh(tmp_path / "a.ply", "ply")
     assert "a.ply" in str(error.value) and "\n" not in str(error.value)
 
 
 def test_points_need_no_faces(tmp_path):
     (tmp_path / "a.ply").write_bytes(ply(3, 0, CORNERS))
-    check_ply(tmp_path / "a.ply", faces=False)
+    check_points(tmp_path / "a.ply")
 
 
-def test_obj(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    check_obj(tmp_path / "a.obj")
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    with pytest.raises(NergError, match="no faces"):
-        check_obj(tmp_path / "a.obj")
+@pytest.mark.parametrize(
+    "faces, said",
+    [
+        ("f 1 2 3", None),
+        ("f 1 2 3 4", None),
+        ("", "no faces"),
+        ("f -4 -3 -2", "negative indices"),
+        ("f 1 2 \\\n 3", "go on after"),
+        ("f 1 2 9", "none of its 4 vertices"),
+    ],
+)
+def test_obj(tmp_path, faces, said):
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{faces}\n")
+    if said is None:
+        check_mesh(tmp_path / "a.obj", "obj")
+        return
+    with pytest.raises(NergError, match=f"a.obj.*{said}"):
+        check_mesh(tmp_path / "a.obj", "obj")
 
 
 def vol(*size: int, kind: int = 1, values: int = 8) -> bytes:

@@ -94,10 +94,11 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
     scene = nerg.make_scene(gaze=here / "shoppers.safetensors", shapes=here / "twin.ply", falloff=0.0)
     thing = box((4.4, 4.65, 0.0), (4.9, 5.0, 1.45))
     expected = nerg.attention(scene, [(4.4, 4.65, 0.0), (4.9, 5.0, 1.45)], observers=[eye], divisions=24)
+    from nerg_mi.formats.meshes import read_mesh_file
     from nerg_mi.surfaces.gaze_source import lookers_of_field
-    from nerg_mi.surfaces.reading import read_mesh
 
-    twin = read_mesh(here / "twin.ply")
+    read = read_mesh_file(here / "twin.ply")
+    twin = read.vertices, read.faces
     target = Target(joined(thing), [twin])
     # Looked at as if it stood there: the goods in the box hide it, as they hide the box of `attention`.
     make = lookers_of_field(scene.integrator.gaze, target.place, target.settings)

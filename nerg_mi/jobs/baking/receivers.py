@@ -11,12 +11,13 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import load_radiance
+from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.splats.files import refuse_others
 from nerg_mi.formats.surfaces import mesh as mesh_of_field
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.surfaces.mesh import Mesh, weld
-from nerg_mi.surfaces.reading import Triangles, read_mesh, shape_triangles
+from nerg_mi.surfaces.reading import Triangles, shape_triangles
 from nerg_mi.surfaces.refinement import Refined, refine
 
 FACES = 100_000
@@ -59,7 +60,10 @@ def read_receivers(
         found = {path.stem: (body.vertices, body.faces)}
     else:
         refuse_others(path)
-        found = {path.stem: read_mesh(path)}
+        body = read_mesh_file(path)
+        for note in body.notes:
+            reporter.message(f"of {path}: {note}")
+        found = {path.stem: (body.vertices, body.faces)}
     return _joined(path, found, others, reporter)
 
 

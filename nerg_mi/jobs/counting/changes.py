@@ -24,10 +24,11 @@ import numpy as np
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.bounded import read_json
 from nerg_mi.formats.areas.kinds import Area, Areas, Group, SceneShape
+from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.regions import Entry, Region, check_name, is_number, parse_box
 from nerg_mi.surfaces.target import mitsuba_mesh
 
-from .things import mesh_of_file, scene_of, shape_named, shapes_of
+from .things import scene_of, shape_named, shapes_of
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -228,12 +229,9 @@ def _moved_shape(shape: Any, move: Move) -> Any:
 
 
 def _made(put: Put) -> Any:
-    import mitsuba as mi
-
     if isinstance(put.what, Path):
-        params: Any = mi.traverse(mesh_of_file(put.what))
-        vertices, faces = np.array(params["vertex_positions"]), np.array(params["faces"])
-        return mitsuba_mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3), put.name)
+        mesh = read_mesh_file(put.what)
+        return mitsuba_mesh(mesh.vertices, mesh.faces, put.name)
     corner = lambda *bits: sum(b << k for k, b in enumerate(bits))
     faces = []
     for axis in range(3):

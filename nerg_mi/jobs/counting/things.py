@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from nerg_mi.errors import NergError, mitsuba_says, plain
 from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
+from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.regions import Region
-from nerg_mi.rendering.mesh_file import check_obj, check_ply
 from nerg_mi.statistics.landing import Box, Thing
 from nerg_mi.surfaces.target import mitsuba_mesh
 
@@ -99,27 +98,9 @@ def shape_named(shapes: Mapping[str, Any], name: str) -> Any:
 
 
 def load_mesh(part: MeshPart) -> Any:
-    """The mesh of a part, with its faces alone. Raises `NergError` for a file that is missing or damaged."""
-    import mitsuba as mi
-
-    mesh = mesh_of_file(part.file)
-    if part.faces is None:
-        return mesh
-    params: Any = mi.traverse(mesh)
-    faces = np.array(params["faces"], np.uint32).reshape(-1, 3)
-    chosen = faces[part.chosen(len(faces))]
+    """The mesh of a part, with its faces alone, which are those of the file. Raises `NergError` for a file that is
+    missing or damaged."""
+    mesh = read_mesh_file(part.file)
+    chosen = mesh.faces[part.chosen(int(mesh.polygons.max()) + 1)[mesh.polygons]]
     used, index = np.unique(chosen, return_inverse=True)
-    vertices = np.array(params["vertex_positions"], np.float32).reshape(-1, 3)[used]
-    return mitsuba_mesh(vertices, index.reshape(-1, 3), part.name)
-
-
-def mesh_of_file(path: Path) -> Any:
-    """The mesh in a file. Raises `NergError`."""
-    import mitsuba as mi
-
-    if not path.is_file():
-        raise NergError(f'there is no mesh file "{path}"; correct its name')
-    kind = path.suffix.lower()[1:]
-    (check_ply if kind == "ply" else check_obj)(path)
-    with mitsuba_says():
-        return mi.load_dict({"type": kind, "filename": str(path)})
+    return mitsuba_mesh(mesh.vertices[used], index.reshape(-1, 3), part.name)

@@ -13,12 +13,13 @@ from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.figures.overlay import Heat, top_of
 from nerg_mi.figures.plots import gaze_figure
 from nerg_mi.files.bounded import reading
+from nerg_mi.formats.meshes import read_mesh_file
+from nerg_mi.formats.ply import parse_ply
 from nerg_mi.formats.splats.files import is_splats
 from nerg_mi.jobs.options import option, parse_numbers
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.maths.arrays import vector_of
-from nerg_mi.rendering.mesh_file import check_ply
 from nerg_mi.rendering.pictures import activate
 from nerg_mi.surfaces.mesh import Mesh
 from nerg_mi.surfaces.target import mitsuba_mesh
@@ -97,19 +98,15 @@ def read_baked(path: Path) -> BakedSurface:
         raise NergError(
             f'"{path}" holds Gaussian splats, which show their gaze as they are: nerg scene {path} -o a.xml'
         )
-    check_ply(path)
+    body = read_mesh_file(path)
     with reading(path, "baked surface"):
         with path.open("rb") as file:
             head = file.read(_HEADER).partition(b"end_header")[0].decode("utf-8", "replace").splitlines()
-        import trimesh
-
-        found = trimesh.load(path, process=False)
-        assert isinstance(found, trimesh.Trimesh), "a file of triangles is one mesh"
-        raw = found.metadata["_ply_raw"]["vertex"]["data"]
-        if raw.dtype.names is None or "value" not in raw.dtype.names:
+        columns = parse_ply(np.fromfile(path, np.uint8)).tables["vertex"].columns
+        if "value" not in columns:
             raise NergError(f'the vertices of "{path}" have no property value; give a .ply that "nerg bake" wrote')
-        values = np.asarray(raw["value"], np.float64).reshape(-1)
-        mesh = Mesh(np.asarray(found.vertices, np.float64), np.asarray(found.faces, np.int64))
+        values = columns["value"]().astype(np.float64)
+        mesh = Mesh(body.vertices, body.faces)
     said = {key: rest for key, _, rest in (line.removeprefix("comment ").partition(" ") for line in head)}
     label = said.get("value:", "value")
     try:

@@ -9,6 +9,7 @@ from pathlib import Path
 from nerg_mi.errors import MissingFile, NergError, plain
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import is_field
+from nerg_mi.formats.meshes import READERS
 from nerg_mi.formats.splats.files import is_splats, refuse_others
 from nerg_mi.jobs.gaze_places import align_of_training, file_of_training, place_key
 from nerg_mi.jobs.reporter import Reporter
@@ -16,7 +17,7 @@ from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.dataset.layout import is_dataset
 from nerg_mi.rays.dataset.opening import load_rays
 
-KINDS = {".npz": "rays", ".parquet": "rays", ".ply": "mesh", ".obj": "mesh", ".vol": "hits", ".xml": "scene"}
+KINDS = {".npz": "rays", ".parquet": "rays", **dict.fromkeys(READERS, "mesh"), ".vol": "hits", ".xml": "scene"}
 """Suffixes of what is not a checkpoint, and what they hold."""
 
 _SOME = 4096

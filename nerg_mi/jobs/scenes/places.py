@@ -10,9 +10,10 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import reading
-from nerg_mi.formats.splats.files import plugin_of_field
+from nerg_mi.formats.meshes import GREY, MeshFile, read_mesh_file
+from nerg_mi.formats.splats.files import plugin_of_field, read_splats
 from nerg_mi.formats.volumes import write_volume
-from nerg_mi.rendering.mesh_file import check_obj, check_ply, check_vol
+from nerg_mi.rendering.mesh_file import check_vol, write_mesh
 from nerg_mi.rendering.nested_scene import nested_place
 from nerg_mi.rendering.scene_parts import Place, relative_name
 from nerg_mi.rendering.scene_writer import Comment, Node, element, prop, value_of
@@ -29,24 +30,30 @@ LAMP = 2.5
 class WrittenPlace:
     """A place for a scene file in a folder: ``make(folder, lamps)`` gives its parts, with names of files as that folder
     has them and, where it has no light of its own, with lamps at ``$camera`` and ``$eye`` (names of `<default>`s) of
-    that intensity. ``words``: what it is, for a comment; ``contracted``: whether it has no end; ``files`` written."""
+    that intensity. ``words``: what it is, for a comment; ``contracted``: whether it has no end; ``files`` written;
+    ``notes`` on its file: sentences on what is not used, and on what was guessed."""
 
     make: Callable[[Path, dict[str, float]], Place]
     words: str
     contracted: bool = False
     files: tuple[Path, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def place_of_files(given: GivenFiles, output: Path) -> WrittenPlace:
-    """The place in ``given``; what has to be written for it, the colours of hit points, stands beside ``output``.
+    """The place in ``given``; what has to be written for it stands beside ``output``: the colours of hit points, and a
+    mesh that Mitsuba does not show as it is.
 
     Raises `NergError` for files that cannot be used.
     """
     if given.kind == "field":
         contracted = "reach" in given.field_about.get("box", {})
-        return WrittenPlace(lambda folder, lamps: _field(_file(given), folder), _words(given), contracted)
+        # A file that cannot be used is refused before a scene names it.
+        notes = read_splats(_file(given)).notes if given.splats else ()
+        make = lambda folder, lamps: _field(_file(given), folder)
+        return WrittenPlace(make, _words(given), contracted, notes=notes)
     if given.kind == "mesh":
-        return _mesh(_file(given), _words(given))
+        return _mesh(_file(given), output, _words(given))
     if given.kind == "scene":
         path = _file(given)
         nested_place(path, output.parent)
@@ -83,10 +90,18 @@ def _field(path: Path, folder: Path) -> Place:
     return Place(inside=(volume,), files={"field": _name(path, folder)})
 
 
-def _mesh(path: Path, words: str) -> WrittenPlace:
-    kind = path.suffix.lower().lstrip(".")
-    (check_ply if kind == "ply" else check_obj)(path)
-    color = _mesh_color(path, kind)
+def mesh_of(output: Path) -> Path:
+    """The file of a mesh that Mitsuba does not show as it is, beside the scene file ``output``."""
+    return output.with_name(f"{output.stem}.mesh.ply")
+
+
+def _mesh(path: Path, output: Path, words: str) -> WrittenPlace:
+    mesh, shown = read_mesh_file(path), path
+    if not mesh.is_plain:
+        shown = mesh_of(output)
+        write_mesh(shown, mesh)
+    kind = shown.suffix.lower().lstrip(".")
+    color = _mesh_color(mesh)
     light = element("integrator", prop("integer", "max_depth", 5), type="path")
 
     def make(folder: Path, lamps: dict[str, float]) -> Place:
@@ -99,24 +114,21 @@ def _mesh(path: Path, words: str) -> WrittenPlace:
                 Comment("A mesh brings no light: lamps where the camera and the observer are."),
                 *_lamps(lamps),
             ),
-            files={"place": _name(path, folder)},
+            files={"place": _name(shown, folder)},
             spp=64,
         )
 
-    return WrittenPlace(make, words)
+    return WrittenPlace(make, words, files=() if mesh.is_plain else (shown,), notes=mesh.notes)
 
 
-def _mesh_color(path: Path, kind: str) -> Node:
+def _mesh_color(mesh: MeshFile) -> Node:
     """The mesh's own colours, or grey."""
-    import mitsuba as mi
-
-    params = mi.traverse(mi.load_dict({"type": kind, "filename": str(path)}))
-    for name in ("vertex_color", "face_color"):
-        if name in params:
-            values = np.array(params[name])
-            scale = [prop("float", "scale", f"{1 / 255:.7g}")] if values.size and values.max() > 1 else []
-            return element("texture", prop("string", "name", name), *scale, name="reflectance", type="mesh_attribute")
-    return prop("rgb", "reflectance", 0.5)
+    if mesh.colors is None and mesh.face_colors is None:
+        return prop("rgb", "reflectance", GREY)
+    # What is written has colours in 0..1.
+    scale = [prop("float", "scale", f"{mesh.color_scale:.7g}")] if mesh.is_plain and mesh.color_scale != 1 else []
+    name = "face_color" if mesh.colors is None else "vertex_color"
+    return element("texture", prop("string", "name", name), *scale, name="reflectance", type="mesh_attribute")
 
 
 def _lamps(lamps: dict[str, float]) -> list[Node]:

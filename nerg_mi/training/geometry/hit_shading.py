@@ -24,9 +24,13 @@ def shade_hits(density: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tup
     solid = np.pad(density > 0, [(0, p) for p in pad])
     cells = (shape + pad) // _CELL
     coarse = solid.reshape(cells[0], _CELL, cells[1], _CELL, cells[2], _CELL).mean(axis=(1, 3, 5), dtype=np.float32)
+    # Nothing is beyond a place of one cell: it faces along that axis.
+    thin = [(int(n == 1), int(n == 1)) for n in cells]
+    padded = np.pad(coarse, thin)
     # Sheets have two sides, on which matter changes in opposite ways.
-    slope = [gaussian_filter(np.abs(np.gradient(coarse, axis=axis)), _SMOOTH) for axis in (2, 1, 0)]
-    square = np.stack([s * s for s in slope], axis=-1)
+    slope = [gaussian_filter(np.abs(np.gradient(padded, axis=axis)), _SMOOTH) for axis in (2, 1, 0)]
+    within = tuple(slice(before, before + n) for (before, _), n in zip(thin, cells))
+    square = np.stack([s * s for s in slope], axis=-1)[within]
     total = square.sum(axis=-1)
     grey = np.divide(
         square @ _GREY.astype(np.float32), total, out=np.full_like(total, _GREY.mean()), where=total > 1e-9

@@ -73,7 +73,7 @@ def test04_what_there_is_not(scene, tmp_path):
         shape_named(shapes_of(scene), "x")
     with pytest.raises(NergError, match="give a scene"):
         shape_named(shapes_of(None), "x")
-    with pytest.raises(NergError, match="no mesh file"):
+    with pytest.raises(NergError, match="there is no mesh"):
         things_of([MeshPart("m", tmp_path / "none.ply")], {})
     (tmp_path / "two.obj").write_text(TWO)
     with pytest.raises(NergError, match="face 2"):

@@ -10,6 +10,7 @@ from nerg_mi.formats.volumes import write_volume
 from nerg_mi.jobs.scenes.files import GivenFiles
 from nerg_mi.jobs.scenes.places import colors_of, place_of_files
 from nerg_mi.rendering.scene_writer import document
+from tests.formats.splats.writers import random_splats, write_inria
 
 PLY = """ply
 format ascii 1.0
@@ -53,6 +54,57 @@ def test_colours_of_a_mesh(rgb, tmp_path, kind, values, said):
     assert said in text and ('name="scale"' in text) == (kind == "uchar")
     assert place.files == {"place": "a.ply"} and text.count('<emitter type="point">') == 2
     assert 'value="$eye"' in text and 'value="$camera"' in text
+
+
+@pytest.mark.parametrize(
+    "name, text",
+    [
+        (
+            "a.ply",
+            PLY.format(
+                colors="property uchar red\nproperty uchar green\nproperty uchar blue\nproperty uchar alpha",
+                a="51 102 153 9",
+            ),
+        ),
+        (
+            "a.ply",
+            PLY.format(colors="property float r\nproperty float g\nproperty float b", a="51 102 153").replace(
+                "3 0 1 2", "4 0 1 2 0"
+            ),
+        ),
+        ("a.obj", "".join(f"v {p} 0.2 0.4 0.6\n" for p in ("0 0 0", "1 0 0", "0 1 0")) + "f -3 -2 -1"),
+        ("a.obj", "".join(f"v {p} 51 102 153\n" for p in ("0 0 0", "1 0 0", "0 1 0")) + "f 1 2 \\\n3"),
+    ],
+    ids=["RGBA", "quads", "negative", "continued"],
+)
+def test_a_mesh_that_mitsuba_does_not_show_is_written_again(rgb, tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    written = place_of_files(given(tmp_path / name, "mesh"), tmp_path / "out.xml")
+    place, xml = text_of(tmp_path, tmp_path / name, "mesh")
+    assert written.files == (tmp_path / "out.mesh.ply",) and place.files == {"place": "out.mesh.ply"}
+    assert '"vertex_color"' in xml and 'name="scale"' not in xml and 'type="ply"' in xml
+    params = rgb.traverse(rgb.load_dict({"type": "ply", "filename": str(tmp_path / "out.mesh.ply")}))
+    assert np.allclose(np.array(params["vertex_color"]).reshape(-1, 3), (0.2, 0.4, 0.6))
+    assert np.array(params["faces"])[:3].tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("shape", [(1, 6, 8), (6, 1, 8), (6, 8, 1), (2, 2, 2), (1, 1, 1)])
+def test_hit_points_of_one_cell_are_shaded(tmp_path, shape):
+    write_volume(tmp_path / "a.vol", np.full(shape, 100.0), (0, 0, 0), (1, 1, 1))
+    place_of_files(given(tmp_path / "a.vol", "hits"), tmp_path / "out.xml")
+    colors = np.fromfile(colors_of(tmp_path / "out.xml"), "<f4", offset=48)
+    assert np.isfinite(colors).all() and (colors > 0.1).all()
+    if shape.count(1) == 1:
+        # A sheet faces along the axis in which it has no extent.
+        assert np.allclose(colors, [0.55, 0.16, 0.34][shape.index(1)], atol=0.02)
+
+
+def test_splats_that_cannot_be_read_are_refused_by_their_own_name(tmp_path):
+    splats = random_splats(degree=0)
+    splats.centers[0] = np.nan
+    write_inria(tmp_path / "a.ply", splats)
+    with pytest.raises(NergError, match=r'"[^"]*a\.ply" cannot be read: some of the centers'):
+        place_of_files(given(tmp_path / "a.ply", "field"), tmp_path / "out.xml")
 
 
 def test_hit_points_get_colours_beside_the_scene(rgb, tmp_path):

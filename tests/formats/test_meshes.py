@@ -1,0 +1,257 @@
+"""Meshes of files: what others write is read as it is meant, or refused in a sentence with the file's name."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.formats.gltf import pack_glb, shown_unlit
+from nerg_mi.formats.meshes import read_mesh_file
+from tests.surfaces.meshes import box
+
+V, F = box((0, 0, 0), (4, 3, 2.5))
+QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+TRIANGLES = [[0, 1, 2], [0, 2, 3]]
+
+
+def ply(
+    order: str, vertex: dict[str, str], faces: str, rows: list[tuple], after: list[tuple], more: bytes = b""
+) -> bytes:
+    """A file of ``rows`` (vertices) and ``after`` (faces, lists as tuples), binary in ``order``, or text (""), with the
+    types by name ``vertex``, and ``faces``, lines of the properties of faces."""
+    style = {"": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    names = "".join(f"property {kind} {name}\n" for name, kind in vertex.items())
+    head = f"ply\nformat {style} 1.0\nelement vertex {len(rows)}\n{names}element face {len(after)}\n{faces}end_header\n"
+    if not order:
+        flat = lambda row: [w for v in row for w in ((len(v), *v) if isinstance(v, tuple) else (v,))]
+        return (head + "\n".join(" ".join(map(str, flat(row))) for row in [*rows, *after]) + "\n").encode() + more
+    codes = {"float": "f", "uchar": "B", "ushort": "H"}
+    data = b"".join(struct.pack(order + "".join(codes[k] for k in vertex.values()), *row) for row in rows)
+    for row in after:
+        for value in row:
+            data += (
+                struct.pack(f"{order}B{len(value)}i", len(value), *value)
+                if isinstance(value, tuple)
+                else bytes([value])
+            )
+    return head.encode() + data + more
+
+
+XYZ = dict.fromkeys("xyz", "float")
+CORNERS = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 0, 0)]
+LIST = "property list uchar int vertex_indices\n"
+
+
+@pytest.mark.parametrize("order", ["", "<", ">"])
+@pytest.mark.parametrize(
+    "faces, triangles, polygons",
+    [
+        ([((0, 1, 2, 3),)], TRIANGLES, [0, 0]),
+        ([((0, 1, 2),), ((0, 2, 3),)], TRIANGLES, [0, 1]),
+        (
+            [((1, 4, 2),), ((0, 1, 2, 3),), ((0, 1, 4, 2, 3),)],
+            [[1, 4, 2], *TRIANGLES, [0, 1, 4], [0, 4, 2], [0, 2, 3]],
+            [0, 1, 1, 2, 2, 2],
+        ),
+    ],
+)
+def test_polygons_become_triangles(tmp_path, order, faces, triangles, polygons):
+    (tmp_path / "a.ply").write_bytes(ply(order, XYZ, LIST, CORNERS, faces))
+    mesh = read_mesh_file(tmp_path / "a.ply")
+    assert mesh.vertices.tolist() == np.array(CORNERS).tolist() and mesh.faces.tolist() == triangles
+    assert mesh.polygons.tolist() == polygons and mesh.is_plain == (len(triangles) == len(faces))
+    assert ("split" in "".join(mesh.notes)) == (not mesh.is_plain)
+
+
+@pytest.mark.parametrize("order", ["", "<"])
+@pytest.mark.parametrize(
+    "kind, values, expected",
+    [
+        ("uchar", (51, 0, 255), (0.2, 0, 1)),
+        ("ushort", (65535, 0, 13107), (1, 0, 0.2)),
+        ("float", (0.25, 0.5, 1), (0.25, 0.5, 1)),
+    ],
+)
+@pytest.mark.parametrize("alpha", [False, True])
+def test_colours_of_vertices(tmp_path, order, kind, values, expected, alpha):
+    names = ("red", "green", "blue", *(("alpha",) if alpha else ()))
+    rows = [(*corner, *values, *((values[0],) if alpha else ())) for corner in CORNERS]
+    (tmp_path / "a.ply").write_bytes(ply(order, XYZ | dict.fromkeys(names, kind), LIST, rows, [((0, 1, 2),)]))
+    mesh = read_mesh_file(tmp_path / "a.ply")
+    assert np.allclose(mesh.colors, expected) and np.isclose(mesh.color_scale * values[2], expected[2])
+    assert mesh.is_plain != alpha and (mesh.notes == (("columns of vertex that are not used: alpha",) if alpha else ()))
+
+
+def test_colours_of_faces_go_with_their_triangles(tmp_path):
+    tints = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    faces = [((1, 4, 2), 255, 0, 0), ((0, 1, 2, 3), 0, 255, 51)]
+    (tmp_path / "a.ply").write_bytes(ply("<", XYZ, LIST + tints, CORNERS, faces))
+    assert np.allclose(read_mesh_file(tmp_path / "a.ply").face_colors, [(1, 0, 0), (0, 1, 0.2), (0, 1, 0.2)])
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 0), (float("nan"), 0, 1)])
+def test_what_is_not_used_is_named(tmp_path, normal):
+    vertex = XYZ | dict.fromkeys(("nx", "ny", "nz", "quality"), "float")
+    rows = [(*corner, *normal, 1) for corner in CORNERS]
+    texture = LIST + "property list uchar int texnumbers\n"
+    (tmp_path / "a.ply").write_bytes(ply("", vertex, texture, rows, [((0, 1, 2), (1, 2))], b"\n7 7\n"))
+    mesh = read_mesh_file(tmp_path / "a.ply")
+    for said in ("normals are not used", "vertex that are not used: quality", "face that are not used: texnumbers"):
+        assert said in "; ".join(mesh.notes)
+    assert mesh.normals is None and mesh.misread and mesh.unreadable
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        QUAD + "f 1 2 3 4",
+        QUAD + "f -4 -3 -2 -1",
+        QUAD + "f 1 2 \\\n 3 \\\n4",
+        QUAD + "vt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1\nf -4/-1/-1 -2//-1 4/1",
+        "v 0 0 0\nv 1 0 0 # right\n  v 1 1 0\nf 1 2 3\nv 0 1 0\nf -4 -2 -1\n",
+        "f 1 2 3\nf 1 3 4\n" + QUAD,
+        "# \xe4\no a\nusemtl red\n" + QUAD.replace("0\n", "0 1 0 0\n") + "f 1 2 3 4\r\n",
+    ],
+)
+def test_legal_obj(tmp_path, text):
+    (tmp_path / "a.obj").write_text(text, encoding="latin-1")
+    mesh = read_mesh_file(tmp_path / "a.obj")
+    assert mesh.vertices.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]] and mesh.faces.tolist() == TRIANGLES
+    assert ("usemtl" in "".join(mesh.notes)) == ("usemtl" in text)
+
+
+@pytest.mark.parametrize("lines", [1, 3])
+def test_continued_lines_across_blocks(tmp_path, monkeypatch, lines):
+    monkeypatch.setattr("nerg_mi.formats.meshes._BLOCK", 12 * lines)
+    (tmp_path / "a.obj").write_text(QUAD + "f 1 \\\n2 \\\n3\nf 1 \\\n3 4")
+    assert read_mesh_file(tmp_path / "a.obj").faces.tolist() == TRIANGLES
+
+
+def test_colours_of_an_obj(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0 1 0 0.2 0.4\nf 1 2 3")
+    mesh = read_mesh_file(tmp_path / "a.obj")
+    assert np.allclose(mesh.colors, [(1, 0, 0), (0.5, 0.5, 0.5), (0, 0.2, 0.4)]) and mesh.misread
+    assert mesh.notes == ("1 of its vertices have no colour, and are grey",)
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "vertex 1 is not finite"),
+        ("v 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "vertex 1 has fewer than three coordinates"),
+        (QUAD + "f 1 2 9", "none of its 4 vertices"),
+        (QUAD + "f 1 2 99999999999999999999999", "a.obj"),
+        (QUAD + "f -9 -2 -1", "none of its 4 vertices"),
+        (QUAD + "f 0 1 2", "counted from 1"),
+        (QUAD + "f 1 2", "fewer than three corners"),
+        (QUAD + "f 1/1/1 2/2/1 3/3/1", "texture coordinate 1, of which there are 0"),
+        (QUAD + "vn 0 0 1\nf 1//1 2//2 3//1", "normal 2, of which there are 1"),
+        (QUAD + "f a b c", "a.obj"),
+        ("v 1e999 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "not finite"),
+        ("", "no vertices"),
+    ],
+)
+def test_other_obj_is_a_sentence(tmp_path, text, said):
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(NergError, match=said) as error:
+        read_mesh_file(tmp_path / "a.obj")
+    assert "a.obj" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(NergError, match=r"one that ends in \.ply, \.obj, \.glb"):
+        read_mesh_file(tmp_path / "a.stl")
+    with pytest.raises(MissingFile, match="there is no mesh"):
+        read_mesh_file(tmp_path / "a.glb")
+
+
+def glb(path, attributes, document=None, primitive=None, faces=F):
+    """A file of ``attributes``, whose JSON has other values."""
+    raw = b"".join(shown_unlit([("POSITION", V.astype("<f4"), False), *attributes], faces, up="y"))
+    from nerg_mi.formats.gltf import read_parts
+
+    changed, data = read_parts(raw, path)
+    changed["meshes"][0]["primitives"][0] |= primitive or {}
+    path.write_bytes(b"".join(pack_glb({**changed, **(document or {})}, data)))
+    return read_mesh_file(path)
+
+
+@pytest.mark.parametrize("kind, code", [("u2", 5123), ("i2", 5122), ("u1", 5121), ("i1", 5120)])
+@pytest.mark.parametrize("normalized", [False, True])
+def test_quantised_positions(tmp_path, kind, code, normalized):
+    steps = 80
+    grid = np.rint(V / 4 * steps).astype(f"<{kind}")
+    data = grid.tobytes() + F.astype("<u2").tobytes()
+    scale = 4 / steps * (np.iinfo(kind).max if normalized else 1)
+    document = {
+        "asset": {"version": "2.0"},
+        "extensionsRequired": ["KHR_mesh_quantization"],
+        "extensionsUsed": ["KHR_mesh_quantization"],
+        "nodes": [{"mesh": 0, "scale": [scale] * 3, "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": [{"buffer": 0}, {"buffer": 0, "byteOffset": grid.nbytes}],
+        "accessors": [
+            {"bufferView": 0, "componentType": code, "count": 8, "type": "VEC3", "normalized": normalized},
+            {"bufferView": 1, "componentType": 5123, "count": F.size, "type": "SCALAR"},
+        ],
+    }
+    (tmp_path / "a.glb").write_bytes(b"".join(pack_glb(document, data)))
+    mesh = read_mesh_file(tmp_path / "a.glb")
+    assert np.allclose(mesh.vertices, V, atol=1e-6) and np.array_equal(mesh.faces, F) and not mesh.notes
+    del document["extensionsRequired"], document["extensionsUsed"]
+    (tmp_path / "a.glb").write_bytes(b"".join(pack_glb(document, data)))
+    if not normalized:
+        with pytest.raises(NergError, match="of a kind that is not read"):
+            read_mesh_file(tmp_path / "a.glb")
+
+
+def test_colours_and_unused_parts_of_gltf(tmp_path):
+    colors = np.full((8, 4), 65535, "<u2")
+    colors[:, 1] = 13107
+    mesh = glb(tmp_path / "a.glb", [("COLOR_0", colors, True), ("_MARK", V[:, 0].astype("<f4"), False)])
+    assert np.allclose(mesh.colors, (1, 0.2, 1), atol=1e-4)
+    assert mesh.notes == ("parts that are not used: materials, _MARK, KHR_materials_unlit",)
+
+
+@pytest.mark.parametrize(
+    "mode, expected", [(5, [[0, 1, 2], [1, 3, 2], [2, 3, 7]]), (6, [[0, 1, 2], [0, 2, 3], [0, 3, 7]])]
+)
+def test_strips_and_fans(tmp_path, mode, expected):
+    indices = np.array([[0, 1, 2, 3, 7]])
+    assert glb(tmp_path / "a.glb", [], primitive={"mode": mode}, faces=indices).faces.tolist() == expected
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        {"extensionsRequired": ["EXT_meshopt_compression"]},
+        {"extensionsRequired": ["KHR_draco_mesh_compression"]},
+        {"nodes": [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]},
+    ],
+)
+def test_extensions_that_move_triangles_are_refused(tmp_path, document):
+    with pytest.raises(NergError, match="a.glb.*(EXT|KHR)_.*export it without"):
+        glb(tmp_path / "a.glb", [], document)
+
+
+@pytest.mark.parametrize("offset", [(500_000, 5_600_000, 0), (4_027_000, 307_000, 4_919_000), (0, 0, -30_000)])
+def test_coordinates_of_surveys_are_refused(tmp_path, offset):
+    rows = "".join(f"v {x} {y} {z}\n" for x, y, z in V + offset)
+    (tmp_path / "a.obj").write_text(rows + "f 1 2 3\n")
+    with pytest.raises(
+        NergError, match="a.obj.*single precision has steps of .*; subtract ([-0-9]+),([-0-9]+),([-0-9]+)"
+    ) as error:
+        read_mesh_file(tmp_path / "a.obj")
+    named = [float(v) for v in str(error.value).split("subtract ")[1].split(" ")[0].split(",")]
+    assert np.abs(np.array(named) - offset).max() <= 60
+
+
+@pytest.mark.parametrize("scale, offset", [(1e-4, 0), (1e6, 0), (1000, 20_000), (1, 15_000)])
+def test_other_units_are_read(tmp_path, scale, offset):
+    rows = "".join(f"v {x} {y} {z}\n" for x, y, z in scale * V + offset)
+    (tmp_path / "a.obj").write_text(rows + "f 1 2 3\n")
+    assert np.allclose(read_mesh_file(tmp_path / "a.obj").vertices, scale * V + offset)
