@@ -10,6 +10,7 @@ from nerg_mi.capture.semidense import read_semidense
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.npy import read_npy
 from nerg_mi.formats.meshes import READERS, read_mesh_file
+from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 
 SUFFIXES = (*READERS, ".csv", ".csv.gz", ".npy")
@@ -36,6 +37,7 @@ def read_surface(path: Path, count: int = POINTS) -> np.ndarray:
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         raise NergError(f'the surface "{path}" has no points; export it again')
+    check_near_origin(points, f'the surface "{path}"')
     rng = np.random.default_rng(0)
     return points if len(points) <= count else points[np.sort(rng.permutation(len(points))[:count])]
 

@@ -70,13 +70,13 @@ def attention(
 ) -> Attention:
     """How much of their gaze observers give a thing, and where on it.
 
-    ``surface``: a box, as its lower and upper corner (2, 3); the id of a mesh of the scene; a mesh file (.ply, .obj);
-    a dict for ``mi.load_dict``, or a Mitsuba mesh. One that is not of the scene is looked at as if it stood there: the
-    scene hides it, and it hides nothing but its own back. ``observers`` (M, 3), or None for the scene's own.
+    ``surface``: a box, as its lower and upper corner (2, 3); the id of a mesh of the scene; a mesh file (.ply, .obj,
+    .glb); a dict for ``mi.load_dict``, or a Mitsuba mesh. One that is not of the scene is looked at as if it stood
+    there: the scene hides it, and it hides nothing but its own back. ``observers`` (M, 3), or None for the scene's own.
     ``divisions``: each triangle is cut into so many parts a side, whose centres stand for them; None: so many that
     pieces are no longer than a quarter of the distance to the nearest observer, which is right to some thousandths, and
-    32 at most. ``two_sided``: count both sides of an open surface; otherwise the one
-    whose vertices run counter-clockwise. Raises `NergError`.
+    32 at most. ``two_sided``: count both sides of an open surface; otherwise the one whose vertices run
+    counter-clockwise. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files

@@ -115,7 +115,8 @@ class Scene:
         import mitsuba as mi
 
         if isinstance(camera, Camera):
-            return mi.load_dict(camera.to_dict())
+            with mitsuba_says():
+                return mi.load_dict(camera.to_dict())
         if isinstance(camera, mi.Sensor):
             return camera
         if not (camera is None or isinstance(camera, (int, np.integer))):
@@ -153,9 +154,9 @@ def make_scene(
 ) -> Scene:
     """A scene of a trained place, a gaze field, or shapes, without writing XML.
 
-    ``field``, ``gaze``: what `load_field`, `load_gaze` or a training gave, or the name of a checkpoint; a place may
-    be Gaussian splats, too: a file of them, or what `nerg_mi.formats.splats.files.read_splats` gave. ``shapes``:
-    what stands in the field, or is all there is: a mesh file (.ply, .obj), a scene file, a dict for ``mi.load_dict``,
+    ``field``, ``gaze``: what `load_field`, `load_gaze` or a training gave, or the name of a checkpoint; a place may be
+    Gaussian splats, too: a file of them, or what `nerg_mi.formats.splats.files.read_splats` gave. ``shapes``: what
+    stands in the field, or is all there is: a mesh file (.ply, .obj, .glb), a scene file, a dict for ``mi.load_dict``,
     a Mitsuba scene or shape, or several of these in a list or a dict by name. ``camera``: a `Camera`, or a sensor as
     Mitsuba takes it. ``observer``: position (3,) of the one whose gaze it is; without it the camera is the observer.
     ``to_world``: (4, 4) rotation, uniform scale and translation that place both fields in the scene. ``settings``:

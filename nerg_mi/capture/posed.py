@@ -16,6 +16,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
+from nerg_mi.maths.coordinates import check_near_origin
 
 from .intrinsics import Intrinsics
 
@@ -307,11 +308,13 @@ def rigid_pose(matrix: object) -> np.ndarray:
 
 
 def settled(path: Path, frames: list[Frame], unused: list[Unused]) -> tuple[list[Frame], list[Unused]]:
-    """Both in order of their names, each image file counting once. Raises `NergError` where no frame is left."""
+    """Both in order of their names, each image file counting once. Raises `NergError` where no frame is left, and for
+    cameras too far from the origin for single precision."""
     frames, repeated = drop_repeated(sorted(frames, key=lambda f: f.name))
     unused = sorted(unused + repeated, key=lambda u: u.name)
     if not frames:
         raise _none_usable(path, unused)
+    check_near_origin(np.array([frame.to_world[:3, 3] for frame in frames]), f'the cameras of "{path}"')
     return frames, unused
 
 

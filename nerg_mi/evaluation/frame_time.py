@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.errors import mitsuba_says
 from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.training.geometry.hit_geometry import volume_dict
 from nerg_mi.training.geometry.places import GazePlace
@@ -39,7 +40,8 @@ def frame_timer(
     def render(checkpoint: Path) -> float:
         integrator = {"type": "nerg", "aovs": "gaze", "radiance": False, **_medium(place, folder)}
         integrator["gaze"] = {"type": "gazefield", "filename": str(checkpoint)}
-        scene = mi.load_dict({"type": "scene", "integrator": integrator, **_shapes(place)})
+        with mitsuba_says():
+            scene = mi.load_dict({"type": "scene", "integrator": integrator, **_shapes(place)})
         times = []
         for eye, angle in [(eyes[0], angles[0]), *zip(eyes, angles)]:
             target = eye + (np.cos(angle), np.sin(angle), -0.1)

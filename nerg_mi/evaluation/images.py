@@ -16,7 +16,7 @@ import numpy as np
 from nerg_mi.capture.cameras import Camera, pixel_directions, sensor_dict
 from nerg_mi.capture.images import View
 from nerg_mi.capture.undistort import pinhole, through_lens
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures.provenance import provenance
 from nerg_mi.figures.tonemap import srgb, write_png
 from nerg_mi.files.atomic import make_folder
@@ -99,16 +99,9 @@ class Renderer:
         import mitsuba as mi
 
         self.spp = spp
-        self.scene = mi.load_dict(
-            {
-                "type": "scene",
-                "integrator": {
-                    "type": "nerg",
-                    "field": {"type": "nerf", "filename": str(field)},
-                    "aovs": "depth,opacity",
-                },
-            }
-        )
+        integrator = {"type": "nerg", "field": {"type": "nerf", "filename": str(field)}, "aovs": "depth,opacity"}
+        with mitsuba_says():
+            self.scene = mi.load_dict({"type": "scene", "integrator": integrator})
 
     def __call__(self, camera: Camera, seed: int = 0) -> Rendered:
         """``camera``'s picture, ``spp`` rays a pixel."""
@@ -120,7 +113,8 @@ class Renderer:
         source = camera if plain else pinhole(camera)
         about = sensor_dict(source)
         about["sampler"] = {"type": "multijitter", "sample_count": self.spp}
-        sensor = mi.load_dict(about)
+        with mitsuba_says():
+            sensor = mi.load_dict(about)
         params = mi.traverse(sensor)
         to_world: Any = params["to_world"]
         # As a literal every pose would compile kernels of its own.

@@ -53,11 +53,11 @@ def write_scene(
 ) -> SceneResult:
     """Write the scene file ``output`` (.xml) of a place, a gaze field or rays, of which ``files`` are, in any order.
 
-    A place is a radiance field, a mesh (.ply, .obj), a scene (.xml) or hit points (.vol); of a gaze field without one
-    it is what that was trained in, found beside it. The scene has the sensors and the `<default>`s of the demo store's:
-    sensor 0 is a camera, 1 the observer's own view, 2 all that the observer could turn to. Names of files are relative
-    to the scene's folder where that is possible. Of a dataset of rays a million at most, a fair sample, are written
-    beside the scene. Raises `NergError` for what the user can mend.
+    A place is a radiance field, a mesh (.ply, .obj, .glb), a scene (.xml) or hit points (.vol); of a gaze field without
+    one it is what that was trained in, found beside it. The scene has the sensors and the `<default>`s of the demo
+    store's: sensor 0 is a camera, 1 the observer's own view, 2 all that the observer could turn to. Names of files are
+    relative to the scene's folder where that is possible. Of a dataset of rays a million at most, a fair sample, are
+    written beside the scene. Raises `NergError` for what the user can mend.
     """
     options, output = options or SceneOptions(), Path(output)
     check_writable(output, ".xml")

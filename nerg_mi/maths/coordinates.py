@@ -13,9 +13,10 @@ _WIDTHS = 10
 _SAMPLE, _STRAY = 100_000, 0.01
 
 
-def check_near_origin(points: np.ndarray, what: str) -> None:
+def check_near_origin(points: np.ndarray, what: str, to_file: np.ndarray | None = None) -> None:
     """Raise `NergError`, which names the offset to subtract, for ``points`` (N, 3) beyond `FAR` of the origin and
-    `_WIDTHS` times as far from it as they are wide, as those of surveys are (UTM, ECEF). ``what``: whose they are."""
+    `_WIDTHS` times as far from it as they are wide, as those of surveys are (UTM, ECEF). ``what``: whose they are;
+    ``to_file``: (4, 4), from their coordinates to those of the file, in which the offset is named."""
     points = points[:: max(len(points) // _SAMPLE, 1)]
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -24,9 +25,10 @@ def check_near_origin(points: np.ndarray, what: str) -> None:
     center, width = (lower + upper) / 2, float((upper - lower).max())
     far = float(np.abs(center).max())
     if far > max(FAR, _WIDTHS * width):
+        center = center if to_file is None else to_file[:3, :3] @ center + to_file[:3, 3]
         offset = ",".join(f"{v:.0f}" for v in np.round(center, -2) + 0.0)
         raise NergError(
-            f"{what} is {far:,.0f} units away from the origin of its coordinates, where single precision has steps of "
+            f"{what} lies {far:,.0f} units from the origin of its coordinates, where single precision has steps of "
             f"{np.spacing(np.float32(far)):.2g}; subtract {offset} from it and from all that shares its coordinates "
-            "(rays, cameras, other places)"
+            "(places, rays, cameras)"
         )

@@ -93,7 +93,7 @@ def test05_both_sides_of_an_open_surface(empty, rgb):
     "surface, said",
     [
         ("nothing", 'the scene has no shape "nothing"; it has shape'),
-        ("nothing.ply", 'there is no mesh file "nothing.ply"'),
+        ("nothing.ply", 'there is no mesh "nothing.ply"'),
         ([(0, 0, 0), (1, 1, -1)], "a box is a lower corner and an upper one"),
         ([(0, 0, 0)], "a box is a lower corner and an upper one"),
         ({"type": "sphere"}, "is not a mesh; attention is received by meshes"),

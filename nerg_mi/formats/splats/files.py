@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nerg_mi.errors import NergError
 from nerg_mi.field.splats import Splats
+from nerg_mi.maths.coordinates import check_near_origin
 
 from .antimatter import read_splat
 from .khronos import has_gltf_splats, read_gltf_splats
@@ -48,7 +49,8 @@ def refuse_others(path: str | os.PathLike) -> None:
 def read_splats(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in ``path``, in the file's own frame and units.
 
-    Raises `NergError` for a file that is missing, damaged, of another format, or larger than is read.
+    Raises `NergError` for a file that is missing, damaged, of another format, or larger than is read, and for
+    coordinates too far from the origin for single precision.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in READERS:
@@ -56,4 +58,6 @@ def read_splats(path: str | os.PathLike) -> Splats:
         hint = f'npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
         other = f"; convert it: {hint}" if suffix in _AMONG_OTHERS else ""
         raise NergError(f'"{path}" is no file of Gaussian splats, which are read from {known}{other}')
-    return READERS[suffix](path)
+    splats = READERS[suffix](path)
+    check_near_origin(splats.centers, f'the splat file "{path}"')
+    return splats

@@ -15,7 +15,7 @@ class AlignOptions:
     field: Path | None = option(None, "The place: a radiance field, or Gaussian splats.")
     scene: Path | None = option(None, "Or: a Mitsuba scene.")
     surface: Path | None = option(
-        None, "Or: a mesh or points on surfaces (.ply, .obj, .npy, .csv of x,y,z or of Aria)."
+        None, "Or: a mesh or points on surfaces (.ply, .obj, .glb, .npy, .csv of x,y,z or of Aria)."
     )
     pairs: Path | None = option(
         None, "Evidence: picked points, CSV of x,y,z,place_x,place_y,place_z (three or more), or JSON."

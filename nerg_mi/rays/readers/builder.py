@@ -12,6 +12,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.line_blocks import OnBadLine
+from nerg_mi.maths.coordinates import check_near_origin
 from nerg_mi.rays.io import COLUMNS
 from nerg_mi.rays.rays import FRAME, Rays
 
@@ -317,6 +318,7 @@ class RaysBuilder:
             columns["cohort"], cohorts = self._cohorts.sorted(columns["cohort"])
             cohorts = tuple(c or "unknown" for c in cohorts)
         self._parts, self._kept = [], []
+        check_near_origin(columns["origin"], "what is tracked", np.linalg.inv(self._transform))
         return Rays(**columns, persons=persons, cohorts=cohorts, metadata=metadata)
 
     def _column(self, name: str) -> np.ndarray:

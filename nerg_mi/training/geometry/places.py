@@ -8,7 +8,7 @@ from types import ModuleType
 
 import numpy as np
 
-from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.errors import MissingFile, NergError, mitsuba_says
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_radiance
@@ -137,7 +137,8 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
     # Mitsuba makes some box of any six numbers.
     if not (np.isfinite(box).all() and (box[:3] < box[3:]).all()):
         raise NergError(f'the place of hit points "{path}" has no box with a lower and an upper corner; make it anew')
-    medium = VolumeMedium(mi.load_dict(volume_dict(path)))
+    with mitsuba_says():
+        medium = VolumeMedium(mi.load_dict(volume_dict(path)))
     lower, upper = medium.bounds()
     return GazePlace(
         medium,
