@@ -92,6 +92,11 @@ def mitsuba_says() -> Iterator[None]:
             raise
         # Mitsuba quotes the files that it cannot read.
         raise NergError(plain(sentence(error), 1000)) from error
+    except UnicodeDecodeError as error:
+        # And what it quotes may be no text.
+        raise NergError(
+            "a mesh or another file of the scene is damaged: it holds what is no text; make it anew"
+        ) from error
 
 
 def sentence(error: BaseException) -> str:

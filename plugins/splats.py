@@ -89,6 +89,8 @@ class SplatsVolume(mi.Volume):
         self.filename = "" if splats is not None else resolved(text(props, "filename"))
         super().__init__(props)
         self.splats = splats if splats is not None else read_splats(self.filename)
+        for guess in self.splats.guesses:
+            mi.Log(mi.LogLevel.Warn, f"{self.filename}: {guess}")
         self.color_space = self.splats.color_space if color_space == "file" else color_space
         self.arrays = SplatArrays(self.splats, namespace(mi.Float), extent)
 

@@ -63,6 +63,11 @@ def test_what_mitsuba_wraps_is_said_with_its_place():
     assert "Traceback" not in words and "\n" not in words and "NergError" not in words
 
 
+def test_what_mitsuba_quotes_may_be_no_text():
+    with pytest.raises(NergError, match="is damaged"), errors.mitsuba_says():
+        b"\xfe".decode()
+
+
 def test_a_mistake_in_a_plugin_is_none_of_the_scene():
     with pytest.raises(RuntimeError) as said:
         with errors.mitsuba_says():

@@ -42,7 +42,8 @@ class Splats:
     extra: Mapping[str, np.ndarray] = field(default_factory=dict)
     # Of the colours: "srgb" or "linear".
     color_space: str = "srgb"
-    # What a reader had to guess, and what the file holds beyond the Gaussians: a sentence each.
+    # What a reader had to guess, and what the file holds that is not used: a sentence each.
+    guesses: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -19,7 +19,7 @@ from nerg_mi.maths.coordinates import check_near_origin
 
 from .gltf import BYTES as GLTF_BYTES
 from .gltf import parse_glb
-from .ply import PlyTable, parse_ply
+from .ply import PlyTable, parse_numbers, parse_ply
 
 BYTES = 64 << 30
 """A file may have so many bytes."""
@@ -36,6 +36,7 @@ _COLORS = (("red", "green", "blue", "alpha"), ("r", "g", "b", "a"))
 _CORNERS = ("vertex_index", "vertex_indices")
 _OBJ_USED = {b"v", b"vn", b"f", b"g", b"o", b"s"}
 _OBJ_LINE = 1000
+_BAD_NORMALS = "some of its normals are 0 or not finite"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,8 @@ class MeshFile:
     ``vertices`` (V, 3) float64, ``faces`` (F, 3) int64; ``polygons`` (F,): of which face of the file each is a part;
     ``normals`` (V, 3), ``colors`` (V, 3), ``face_colors`` (F, 3) in 0..1, or None; ``color_scale``: what the file's own
     numbers of colours are multiplied by. ``notes``: sentences on what is not used, or was guessed. ``unreadable``: why
-    Mitsuba does not read the file as it is, or ""; ``misread``: whether it does without its colours or normals.
+    Mitsuba does not read the file as it is, or ""; ``hides_colors``: whether it does without its colours, of
+    which an alpha makes what no texture of Mitsuba shows.
     """
 
     vertices: np.ndarray
@@ -57,12 +59,12 @@ class MeshFile:
     color_scale: float = 1.0
     notes: tuple[str, ...] = ()
     unreadable: str = ""
-    misread: bool = False
+    hides_colors: bool = False
 
     @property
     def is_plain(self) -> bool:
         """Whether Mitsuba shows the file as it is."""
-        return not (self.unreadable or self.misread)
+        return not (self.unreadable or self.hides_colors)
 
 
 def read_mesh_file(path: str | os.PathLike, points: bool = False, suffix: str | None = None) -> MeshFile:
@@ -75,7 +77,7 @@ def read_mesh_file(path: str | os.PathLike, points: bool = False, suffix: str | 
     if suffix not in READERS:
         raise NergError(f'"{path}" is no mesh that is read; give one that ends in {", ".join(READERS)}')
     # Whatever stands where another kind of value belongs is the file's mistake.
-    with reading(path, "mesh", "export it again", also=(TypeError, AttributeError)):
+    with reading(path, "mesh", "export it again", also=(TypeError, AttributeError)), np.errstate(all="ignore"):
         mesh = READERS[suffix](path)
         if not len(mesh.vertices):
             raise ValueError("it has no vertices")
@@ -120,7 +122,7 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     if face.count and names is None:
         raise ValueError("its faces have no property vertex_index or vertex_indices")
     counts, corners = face.lists[names]() if names else (np.zeros(0, np.int64), np.zeros(0))
-    if corners.dtype.kind == "f" and (corners != np.floor(corners)).any():
+    if corners.dtype.kind == "f" and not ((corners == np.floor(corners)) & np.isfinite(corners)).all():
         raise ValueError("the corners of its faces are no whole numbers")
     faces, polygons = _split(counts, corners.astype(np.int64))
     missing = [name for name in _CENTER if vertex.count and name not in vertex.columns]
@@ -140,7 +142,7 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
         length = np.linalg.norm(normals, axis=1)
         if not (np.isfinite(length).all() and (length > 0).all()):
             normals = None
-            notes.append("its normals are not used: some are 0 or not finite")
+            notes.append(f"its normals are not used: {_BAD_NORMALS}")
     for name, table in ply.tables.items():
         unused = [n for n in (*table.columns, *table.lists) if n not in used.get(name, ())]
         if unused and table.count:
@@ -154,12 +156,13 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
         unreadable = "it has faces of more than three corners"
     elif ply.trailing:
         unreadable = "more follows its rows"
+    elif "nx" in vertex.columns and normals is None:
+        # Whatever has such a normal is black.
+        unreadable = _BAD_NORMALS
     elif len(face.lists) > 1 or any(t.lists for n, t in ply.tables.items() if n != "face"):
         # Each of them is taken for three values.
         unreadable = "it has other lists than the corners of its faces"
-    # An alpha makes a colour of four channels, which no texture of Mitsuba shows.
-    misread = any({"alpha", "a"} & set(ply.tables[name].columns) for name in found)
-    misread = misread or ("nx" in vertex.columns and normals is None)
+    hides_colors = any({"alpha", "a"} & set(ply.tables[name].columns) for name in found)
     return MeshFile(
         vertices,
         faces,
@@ -170,7 +173,7 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
         scales.get("vertex", scales.get("face", 1.0)),
         tuple(notes),
         unreadable,
-        misread,
+        hides_colors,
     )
 
 
@@ -178,76 +181,107 @@ class _Obj:
     """The statements of an OBJ file."""
 
     def __init__(self) -> None:
-        self.vertices: list[list[bytes]] = []
-        self.normals: list[list[bytes]] = []
-        self.textures = 0
+        self.count = self.normals = self.textures = 0
+        self.vertices: list[np.ndarray] = []
+        # By the number of the vertex: what follows its coordinates.
+        self.rest: dict[int, list[bytes]] = {}
         self.corners: list[np.ndarray] = []
         self.counts: list[int] = []
         self.other: dict[bytes, None] = {}
         self.unreadable = ""
-        # Tokens of the faces of this block, and vertices that precede each face.
-        self._faces: list[list[bytes]] = []
-        self._before: list[int] = []
 
     def read(self, lines: list[bytes]) -> None:
+        """Whole lines, without their ends."""
+        vertices: list[bytes] = []
+        normals: list[bytes] = []
+        tokens: list[bytes] = []
+        counts: list[int] = []
+        before: list[int] = []
         for line in lines:
-            if len(line) > _OBJ_LINE:
-                self.unreadable = f"it has lines of more than {_OBJ_LINE:,} characters"
-            words = line.partition(b"#")[0].split()
+            words = line.split()
+            if b"#" in line:
+                words = line.partition(b"#")[0].split()
             if not words:
                 continue
             kind = words[0]
             if kind == b"v":
-                if len(words) < 4:
-                    raise ValueError(f"vertex {len(self.vertices) + 1:,} has fewer than three coordinates")
-                self.vertices.append(words[1:])
+                vertices += words[1:4]
+                if len(words) != 4:
+                    if len(words) < 4:
+                        raise ValueError(f"vertex {self.count + 1:,} has fewer than three coordinates")
+                    self.rest[self.count] = words[4:]
+                self.count += 1
             elif kind == b"f":
-                self._faces.append(words[1:])
-                self._before.append(len(self.vertices))
+                tokens += words[1:]
+                counts.append(len(words) - 1)
+                before.append(self.count)
             elif kind == b"vn":
-                self.normals.append(words[1:])
+                normals += words[1:4]
+                self.normals += 1
             elif kind == b"vt":
                 self.textures += 1
                 if len(words) < 3:
                     self.unreadable = "it has texture coordinates of one number"
             if kind not in _OBJ_USED:
                 self.other[kind] = None
-        self._take_faces()
+            if len(line) > _OBJ_LINE:
+                self.unreadable = f"it has lines of more than {_OBJ_LINE:,} characters"
+        self.vertices.append(parse_numbers(b" ".join(vertices)).reshape(-1, 3))
+        directions = np.linalg.norm(parse_numbers(b" ".join(normals)).reshape(-1, 3), axis=1)
+        if not (np.isfinite(directions).all() and (directions > 0).all()):
+            self.unreadable = _BAD_NORMALS
+        if tokens:
+            self.corners.append(self._corners(tokens, np.repeat(before, counts)))
+            self.counts += counts
 
-    def _take_faces(self) -> None:
-        if not self._faces:
-            return
-        counts = [len(face) for face in self._faces]
-        tokens = [token for face in self._faces for token in face]
-        before = np.repeat(self._before, counts)
-        parts = [token.split(b"/") for token in tokens]
-        index = np.array([part[0] for part in parts]).astype(np.int64)
-        for k, count, what in ((1, self.textures, "texture coordinate"), (2, len(self.normals), "normal")):
-            named = [int(part[k]) for part in parts if len(part) > k and part[k]]
-            wrong = next((n for n in named if not 1 <= abs(n) <= count), None)
-            if wrong is not None:
-                raise ValueError(f"a face names {what} {wrong}, of which there are {count:,} before it")
-            if any(n < 0 for n in named):
+    def _corners(self, tokens: list[bytes], before: np.ndarray) -> np.ndarray:
+        """Vertices, from 0 on, that ``tokens`` (N,) of faces name, of which ``before`` (N,) precede the face; -1 where
+        there is none."""
+        for k, named in enumerate(_parts(tokens)):
+            name = ("vertex", "texture coordinate", "normal")[k]
+            count = (self.count, self.textures, self.normals)[k]
+            if (named < 0).any():
                 self.unreadable = "it has negative indices"
-        if (index == 0).any():
-            raise ValueError("a face names vertex 0, and they are counted from 1")
-        if (index < 0).any():
-            self.unreadable = "it has negative indices"
-        elif (index > before).any():
+            if k == 0:
+                index = named
+                if (index == 0).any():
+                    raise ValueError("a face names vertex 0, and they are counted from 1")
+            elif (np.abs(named) > count).any():
+                wrong = named[np.abs(named) > count][0]
+                raise ValueError(f"a face names {name} {wrong}, of which there are {count:,} before it")
+        if (index > before).any():
             self.unreadable = "its faces name vertices that come later"
         # Negative ones count from the last vertex before the face.
-        self.corners.append(np.where(index > 0, index - 1, np.where(-index <= before, before + index, -1)))
-        self.counts += counts
-        self._faces, self._before = [], []
+        return np.where(index > 0, index - 1, np.where(-index <= before, before + index, -1))
+
+
+def _parts(tokens: list[bytes]) -> list[np.ndarray]:
+    """The numbers between the slashes of each of ``tokens`` (N,), up to three (N,); 0 where there is none."""
+    joined = b" ".join(tokens)
+    if b"/" not in joined:
+        return [parse_numbers(joined, np.int64)]
+    # Most files have one form in all faces.
+    width = tokens[0].count(b"/") + 1
+    if width <= 3 and all(token.count(b"/") == width - 1 for token in tokens):
+        numbers = parse_numbers(joined.replace(b"//", b"/0/").replace(b"/", b" "), np.int64)
+        if len(numbers) == width * len(tokens):
+            return list(numbers.reshape(-1, width).T)
+    table = np.zeros((len(tokens), 3), np.int64)
+    for row, token in zip(table, tokens):
+        parts = token.split(b"/")
+        if len(parts) > 3:
+            raise ValueError(f'a corner of a face is "{plain(token.decode("latin-1"), 40)}"')
+        row[: len(parts)] = [int(part or 0) for part in parts]
+    return list(table.T)
 
 
 def _read_obj(path: str | os.PathLike) -> MeshFile:
     size_of(path, "mesh", TEXT_BYTES)
     obj, rest = _Obj(), b""
     with open(path, "rb") as file:
-        while lines := file.readlines(_BLOCK):
-            lines = [line.rstrip() for line in lines]
-            if any(line.endswith(b"\\") for line in lines):
+        while block := file.readlines(_BLOCK):
+            lines = [line.rstrip() for line in block]
+            if rest or any(line.endswith(b"\\") for line in lines):
                 obj.unreadable = "it has lines that go on after a \\"
                 whole: list[bytes] = []
                 for line in lines:
@@ -258,32 +292,35 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
                         whole.append(rest)
                         rest = b""
                 lines = whole
-            elif rest:
-                lines[0], rest = rest + lines[0], b""
             obj.read(lines)
     obj.read([rest])
-    vertices = np.array([v[:3] for v in obj.vertices]).astype(np.float64) if obj.vertices else np.zeros((0, 3))
-    corners = np.concatenate(obj.corners) if obj.corners else np.zeros(0, np.int64)
-    faces, polygons = _split(np.array(obj.counts, np.int64), corners)
+    faces, polygons = _split(np.array(obj.counts, np.int64), np.concatenate([*obj.corners, np.zeros(0, np.int64)]))
     notes, colors, scale = [], None, 1.0
     # After the coordinates a weight, a colour, or both.
-    if any(len(v) >= 6 for v in obj.vertices):
-        bare = np.array([len(v) < 6 for v in obj.vertices])
-        triples = [(b"0",) * 3 if len(v) < 6 else v[4:7] if len(v) == 7 else v[3:6] for v in obj.vertices]
-        colors, scale = _unit_colors(list(np.array(triples).astype(np.float64).T), np.dtype(np.float64))
-        colors[bare] = GREY
-        notes += [f"{bare.sum():,} of its vertices have no colour, and are grey"] if bare.any() else []
+    tints = {k: words[-3:] if len(words) == 4 else words[:3] for k, words in obj.rest.items() if len(words) >= 3}
+    if tints:
+        values = parse_numbers(b" ".join(word for words in tints.values() for word in words)).reshape(-1, 3)
+        colors = np.full((obj.count, 3), GREY)
+        colors[list(tints)], scale = _unit_colors(list(values.T), values.dtype)
+        if len(tints) < obj.count:
+            notes.append(f"{obj.count - len(tints):,} of its vertices have no colour, and are grey")
+    if any(len(words) < 3 for words in obj.rest.values()):
+        notes.append("weights of its vertices are not used")
     if obj.other:
         names = ", ".join(name.decode("latin-1") for name in obj.other)
         notes.append(f"statements that are not used: {plain(names)}")
-    unreadable = obj.unreadable
-    if obj.normals and not unreadable:
-        directions = np.array([n[:3] for n in obj.normals]).astype(np.float64)
-        length = np.linalg.norm(directions, axis=1)
-        if not (np.isfinite(length).all() and (length > 0).all()):
-            unreadable = "some of its normals are 0 or not finite"
+    vertices = np.concatenate(obj.vertices)
     return MeshFile(
-        vertices, faces, polygons, None, colors, None, scale, tuple(notes), unreadable, misread=colors is not None
+        vertices,
+        faces,
+        polygons,
+        None,
+        colors,
+        None,
+        scale,
+        tuple(notes),
+        obj.unreadable,
+        hides_colors=colors is not None,
     )
 
 

@@ -79,6 +79,16 @@ def parse_ply(raw: np.ndarray) -> Ply:
     return Ply(tables, comments, at < source.length)
 
 
+def parse_numbers(text: bytes, dtype: type = np.float64) -> np.ndarray:
+    """The numbers in ``text``, between spaces and ends of lines. Raises `ValueError` for what is none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromstring(text, dtype, sep=" ") if text.strip() else np.zeros(0, dtype)
+        except (DeprecationWarning, ValueError) as error:
+            raise ValueError("it has words where numbers belong") from error
+
+
 # Name, NumPy's type of the values, and of how many they are, in a list.
 _Property = tuple[str, str, str | None]
 
@@ -226,13 +236,8 @@ class _Bytes(_Rows):
 class _Words(_Rows):
     def __init__(self, raw: np.ndarray):
         if len(raw) > TEXT_BYTES:
-            raise ValueError(f"it is text of more than {TEXT_BYTES:,} bytes")
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)
-            try:
-                self._words = np.fromstring(raw.tobytes(), np.float64, sep=" ")
-            except (DeprecationWarning, ValueError) as error:
-                raise ValueError("its rows hold what is no number") from error
+            raise ValueError(f"it is text of more than {TEXT_BYTES:,} bytes, and larger files are read as binary")
+        self._words = parse_numbers(raw.tobytes())
         self.length = len(self._words)
 
     def size(self, kind: str) -> int:

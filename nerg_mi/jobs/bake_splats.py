@@ -82,7 +82,7 @@ def bake_splats(
     select_backend(options.mode, options.threads)
     reporter.progress(0.0, "reading")
     given = read_splats(path)
-    for note in given.notes:
+    for note in (*given.guesses, *given.notes):
         reporter.message(f"of {path}: {note}")
     align, tracked, cone = alignment_of(options), rays_of(options, rays), cone_of(options, source)
     of_rays = RaySettings(cone=cone, bundle=options.bundle, seed=options.seed)

@@ -15,14 +15,17 @@ from nerg_mi.formats.meshes import MeshFile, read_mesh_file
 from nerg_mi.formats.ply import parse_ply, write_columns
 
 
-def check_mesh(path: str | os.PathLike, kind: str) -> None:
+def check_mesh(path: str | os.PathLike, kind: str, colored: bool = False) -> None:
     """Raise `NergError` for a file that Mitsuba's plugin ``kind`` ("ply", "obj") does not read as a mesh, or not as the
-    one that it is."""
+    one that it is; ``colored``: whether a texture is to show its colours."""
     mesh = read_mesh_file(path, suffix=f".{kind}")
-    if mesh.unreadable:
+    reason = mesh.unreadable or (
+        "an alpha, or their format, hides its colours" if colored and mesh.hides_colors else ""
+    )
+    if reason:
         raise NergError(
-            f'Mitsuba does not read the mesh "{path}": {mesh.unreadable}; export it as triangles, or take what "nerg '
-            f'scene {path} -o scene.xml" makes of it'
+            f'Mitsuba does not read the mesh "{path}" as it is meant: {reason}; export it otherwise, or take what '
+            f'"nerg scene {path} -o scene.xml" makes of it'
         )
 
 

@@ -37,14 +37,7 @@ PIXELS = 1 << 28
 """A picture may have so many pixels: 16384 x 16384."""
 
 _PICTURES = {".png", ".jpg", ".jpeg", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".bmp"}
-_CHECKS = {
-    "ply": lambda path: check_mesh(path, "ply"),
-    "obj": lambda path: check_mesh(path, "obj"),
-    "gridvolume": check_vol,
-    "sdfgrid": check_vol,
-    "ellipsoids": check_points,
-    "ellipsoidsmesh": check_points,
-}
+_CHECKS = {"gridvolume": check_vol, "sdfgrid": check_vol, "ellipsoids": check_points, "ellipsoidsmesh": check_points}
 
 
 def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None) -> None:
@@ -53,7 +46,7 @@ def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None
     What is missing or unknown is left to Mitsuba, which says so. Raises `NergError`.
     """
     path = Path(path)
-    _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).read(path, 0, ())
+    _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()}).read_whole(path)
 
 
 def files_of_scene(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
@@ -61,7 +54,7 @@ def files_of_scene(path: str | Path, defaults: Mapping[str, str] | None = None) 
     textures; ``defaults`` and errors as of `check_scene_file`."""
     path = Path(path)
     reader = _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()})
-    reader.read(path, 0, ())
+    reader.read_whole(path)
     return list(dict.fromkeys([path, *reader.files]))
 
 
@@ -89,6 +82,14 @@ class _Scene:
         self._given = set(defaults)
         self._elements = self._bytes = 0
         self.files: list[Path] = []
+        # Kinds of the meshes, and whether a texture shows their colours.
+        self._meshes: dict[Path, str] = {}
+        self._colored = False
+
+    def read_whole(self, path: Path) -> None:
+        self.read(path, 0, ())
+        for mesh, kind in self._meshes.items():
+            check_mesh(mesh, kind, self._colored)
 
     def read(self, path: Path, depth: int, within: tuple[Path, ...]) -> None:
         whole = path.resolve()
@@ -164,12 +165,16 @@ class _Scene:
             except ValueError:
                 return  # Mitsuba names the line
             check_samples(count, f'the sampler of "{path}" (line {parser.CurrentLineNumber})')
+        elif value in ("vertex_color", "face_color") and name == "name" and parent[1] == "mesh_attribute":
+            self._colored = True
         elif name == "filename" and tag == "string":
             found = self._find(value)
             if found is None:
                 return
             self.files.append(found)
-            if parent[1] in _CHECKS:
+            if parent[1] in ("ply", "obj"):
+                self._meshes[found] = parent[1]
+            elif parent[1] in _CHECKS:
                 _CHECKS[parent[1]](found)
             elif parent[1] in ("bitmap", "envmap") and found.suffix.lower() in _PICTURES:
                 check_image(found, "texture")

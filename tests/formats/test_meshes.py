@@ -101,7 +101,7 @@ def test_what_is_not_used_is_named(tmp_path, normal):
     mesh = read_mesh_file(tmp_path / "a.ply")
     for said in ("normals are not used", "vertex that are not used: quality", "face that are not used: texnumbers"):
         assert said in "; ".join(mesh.notes)
-    assert mesh.normals is None and mesh.misread and mesh.unreadable
+    assert mesh.normals is None and mesh.unreadable
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_continued_lines_across_blocks(tmp_path, monkeypatch, lines):
 def test_colours_of_an_obj(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0 1 0 0.2 0.4\nf 1 2 3")
     mesh = read_mesh_file(tmp_path / "a.obj")
-    assert np.allclose(mesh.colors, [(1, 0, 0), (0.5, 0.5, 0.5), (0, 0.2, 0.4)]) and mesh.misread
+    assert np.allclose(mesh.colors, [(1, 0, 0), (0.5, 0.5, 0.5), (0, 0.2, 0.4)]) and mesh.hides_colors
     assert mesh.notes == ("1 of its vertices have no colour, and are grey",)
 
 

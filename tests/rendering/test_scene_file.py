@@ -178,3 +178,32 @@ def test_the_other_ways_in_are_guarded(tmp_path):
     with pytest.raises(NergError, match="deep"):
         options = DemoOptions(scene=tmp_path / "s.xml", defaults=write_standins(tmp_path), mode="llvm_ad_rgb")
         make_demo(tmp_path / "out", options)
+
+
+ROW = "0 0 0 {0}\n1 0 0 {0}\n0 1 0 {0}\n3 0 1 2\n"
+PROPERTIES = "".join(f"property float {name}\n" for name in "xyz")
+TINT = """<shape type="ply"><string name="filename" value="a.ply"/><bsdf type="diffuse"><texture name="reflectance"
+type="mesh_attribute"><string name="name" value="vertex_color"/></texture></bsdf></shape>"""
+
+
+@pytest.mark.parametrize(
+    "columns, value, shown, said",
+    [
+        ("red green blue alpha", "9 9 9 9", TINT, "alpha"),
+        ("red green blue alpha", "9 9 9 9", shape("ply", "a.ply"), None),
+        ("red green blue", "9 9 9", TINT, None),
+        ("nx ny nz", "0 0 0", shape("ply", "a.ply"), "normals are 0"),
+        ("nx ny nz", "0 0 1", shape("ply", "a.ply"), None),
+    ],
+)
+def test_meshes_that_would_be_black_are_refused(tmp_path, columns, value, shown, said):
+    kind = "float" if columns.startswith("n") else "uchar"
+    more = "".join(f"property {kind} {name}\n" for name in columns.split())
+    head = f"ply\nformat ascii 1.0\nelement vertex 3\n{PROPERTIES}{more}element face 1\n"
+    (tmp_path / "a.ply").write_text(f"{head}property list uchar int vertex_indices\nend_header\n{ROW.format(value)}")
+    (tmp_path / "a.xml").write_text(scene(shown))
+    if said is None:
+        check_scene_file(tmp_path / "a.xml")
+        return
+    with pytest.raises(NergError, match=f"a.ply.*{said}.*nerg scene"):
+        check_scene_file(tmp_path / "a.xml")

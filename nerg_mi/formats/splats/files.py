@@ -6,6 +6,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from nerg_mi.errors import NergError
 from nerg_mi.field.splats import Splats
 from nerg_mi.maths.coordinates import check_near_origin
@@ -58,6 +60,8 @@ def read_splats(path: str | os.PathLike) -> Splats:
         hint = f'npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
         other = f"; convert it: {hint}" if suffix in _AMONG_OTHERS else ""
         raise NergError(f'"{path}" is no file of Gaussian splats, which are read from {known}{other}')
-    splats = READERS[suffix](path)
+    # What overflows is not finite, and refused as that.
+    with np.errstate(all="ignore"):
+        splats = READERS[suffix](path)
     check_near_origin(splats.centers, f'the splat file "{path}"')
     return splats

@@ -12,6 +12,7 @@ import re
 
 import numpy as np
 
+from nerg_mi.errors import plain
 from nerg_mi.field.splats import Splats, logits_of, opacities_of, scales_of
 from nerg_mi.files.bounded import read_bytes, reading
 from nerg_mi.formats.ply import parse_ply, write_columns
@@ -64,36 +65,34 @@ def read_ply_splats(path: str | os.PathLike) -> Splats:
         base = take(_BASE)[:, None]
         # Stored channel by channel.
         more = take([n for _, n in rest]).reshape(len(base), 3, count - 1).swapaxes(1, 2) if rest else base[:, :0]
-        centers, rotations, notes = take(_CENTER), take(_ROTATION), []
-        scales, opacities = _activated(centers, take(_SCALE), columns.pop("opacity"), notes)
+        centers, rotations = take(_CENTER), take(_ROTATION)
+        scales, opacities, guesses = _activated(centers, take(_SCALE), columns.pop("opacity"))
         if scales.shape[1] == 2:
             scales = np.column_stack([scales, _THIN * scales.min(axis=1)])
         if _FILTER in columns:
             scales, opacities = _filtered(scales, opacities, columns.pop(_FILTER))
         extra = {name: column for name, column in columns.items() if name not in _NORMAL}
         unused = [*extra, *(f"those of {name}" for name in list(tables)[1:])]
-        if unused:
-            notes.append(f"columns that are not used: {', '.join(unused)}")
+        notes = (f"columns that are not used: {plain(', '.join(unused))}",) if unused else ()
         harmonics = np.concatenate([base, more], axis=1)
-        return Splats(centers, scales, rotations, opacities, harmonics, extra, notes=tuple(notes))
+        return Splats(centers, scales, rotations, opacities, harmonics, extra, guesses=guesses, notes=notes)
 
 
 def _activated(
-    centers: np.ndarray, scales: np.ndarray, opacities: np.ndarray, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Scales and opacities of what the columns hold, which ``notes`` say where it is not what trainings write."""
+    centers: np.ndarray, scales: np.ndarray, opacities: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Scales and opacities of what the columns hold, and sentences where that is not what trainings write."""
+    guesses = []
     if _are_lengths(centers, scales):
-        notes.append(
-            "its scales are lengths and no logarithms, which would be far larger than the Gaussians' distances"
-        )
+        guesses.append("its scales are taken as lengths: as logarithms they would far exceed the Gaussians' distances")
     else:
         scales = scales_of(scales)
     # As logits, all opacities of a training would lie between 0.5 and 0.73.
     if len(opacities) >= _SOME and 0 <= opacities.min() < opacities.max() <= 1:
-        notes.append("its opacities are shares from 0 to 1 and no logits, which would reach further")
+        guesses.append("its opacities are taken as they are, since all lie in 0..1: logits reach further")
     else:
         opacities = opacities_of(opacities)
-    return scales, opacities
+    return scales, opacities, tuple(guesses)
 
 
 def _are_lengths(centers: np.ndarray, scales: np.ndarray) -> bool:

@@ -49,7 +49,8 @@ def place_of_files(given: GivenFiles, output: Path) -> WrittenPlace:
     if given.kind == "field":
         contracted = "reach" in given.field_about.get("box", {})
         # A file that cannot be used is refused before a scene names it.
-        notes = read_splats(_file(given)).notes if given.splats else ()
+        splats = read_splats(_file(given)) if given.splats else None
+        notes = () if splats is None else (*splats.guesses, *splats.notes)
         make = lambda folder, lamps: _field(_file(given), folder)
         return WrittenPlace(make, _words(given), contracted, notes=notes)
     if given.kind == "mesh":

@@ -87,7 +87,7 @@ def _place_of_splats(path: Path, ns: ModuleType) -> GazePlace:
     pad = _AROUND * max(upper - lower) + float(splats.scales.max(axis=1).mean())
     box = Box(tuple(lower - pad), tuple(upper + pad))
     medium, about = SplatMedium(SplatArrays(splats, ns)), {"field_file": file_identity(path)}
-    return GazePlace(medium, box, "field", about, notes=splats.notes)
+    return GazePlace(medium, box, "field", about, notes=(*splats.guesses, *splats.notes))
 
 
 def place_of_scene(path: Path) -> GazePlace:

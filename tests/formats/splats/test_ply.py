@@ -108,7 +108,7 @@ def test_lengths_in_place_of_logarithms_are_recognised(tmp_path, size, room):
     splats = replace(splats, centers=splats.centers * np.float32([room, room, 0.01 * room]))
     write_columns_of(tmp_path / "a.ply", splats, **{f"scale_{i}": splats.scales[:, i] for i in range(3)})
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and "lengths" in read.notes[0]
+    assert equal(read, splats) and "lengths" in read.guesses[0]
 
 
 @pytest.mark.parametrize("low, high", [(0.001, 0.99), (0, 1), (0.5, 0.7)])
@@ -116,7 +116,7 @@ def test_shares_in_place_of_logits_are_recognised(tmp_path, low, high):
     splats = replace(random_splats(100, 1), opacities=np.linspace(low, high, 100, dtype=np.float32))
     write_columns_of(tmp_path / "a.ply", splats, opacity=splats.opacities)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and "no logits" in read.notes[0]
+    assert equal(read, splats) and "logits" in read.guesses[0]
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_what_trainings_write_is_not_taken_for_anything_else(tmp_path, change):
     splats = change(random_splats(300, 0))
     write_ply_splats(tmp_path / "a.ply", splats)
     read = read_ply_splats(tmp_path / "a.ply")
-    assert equal(read, splats) and not read.notes
+    assert equal(read, splats) and not read.guesses
 
 
 def test_the_3d_filter_widens_and_keeps_the_mass(tmp_path):
