@@ -64,6 +64,8 @@ with the number of hits. They do not see which Gaussians a ray meets, nor in whi
 
 from __future__ import annotations
 
+from typing import Any
+
 import mitsuba as mi
 
 from nerg_mi.errors import NergError
@@ -90,7 +92,8 @@ class SplatsVolume(mi.Volume):
         super().__init__(props)
         self.splats = splats if splats is not None else read_splats(self.filename)
         for guess in self.splats.guesses:
-            mi.Log(mi.LogLevel.Warn, f"{self.filename}: {guess}")
+            log: Any = mi.Log  # of which the stubs know nothing
+            log(mi.LogLevel.Warn, f"{self.filename}: {guess}")
         self.color_space = self.splats.color_space if color_space == "file" else color_space
         self.arrays = SplatArrays(self.splats, namespace(mi.Float), extent)
 

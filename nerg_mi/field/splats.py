@@ -102,9 +102,9 @@ def joined(parts: Sequence[Splats]) -> Splats:
     if len({(splats.degree, splats.color_space) for splats in parts}) > 1:
         raise ValueError("its splats have harmonics of several degrees, or several colour spaces")
     names = ("centers", "scales", "rotations", "opacities", "harmonics")
-    arrays = [np.concatenate([getattr(splats, name) for splats in parts]) for name in names]
+    arrays = {name: np.concatenate([getattr(splats, name) for splats in parts]) for name in names}
     notes = tuple(dict.fromkeys(note for splats in parts for note in splats.notes))
-    return Splats(*arrays, color_space=parts[0].color_space, notes=notes)
+    return replace(parts[0], **arrays, extra={}, notes=notes)
 
 
 def from_trained(

@@ -237,19 +237,16 @@ class _Obj:
     def _corners(self, tokens: list[bytes], before: np.ndarray) -> np.ndarray:
         """Vertices, from 0 on, that ``tokens`` (N,) of faces name, of which ``before`` (N,) precede the face; -1 where
         there is none."""
-        for k, named in enumerate(_parts(tokens)):
-            name = ("vertex", "texture coordinate", "normal")[k]
-            count = (self.count, self.textures, self.normals)[k]
-            if (named < 0).any():
-                self.unreadable = "it has negative indices"
-            if k == 0:
-                index = named
-                if (index == 0).any():
-                    raise ValueError("a face names vertex 0, and they are counted from 1")
-            elif (np.abs(named) > count).any():
-                wrong = named[np.abs(named) > count][0]
-                raise ValueError(f"a face names {name} {wrong}, of which there are {count:,} before it")
-        if (index > before).any():
+        index, *others = _parts(tokens)
+        if (index == 0).any():
+            raise ValueError("a face names vertex 0, and they are counted from 1")
+        for named, count, what in zip(others, (self.textures, self.normals), ("texture coordinate", "normal")):
+            wrong = named[np.abs(named) > count]
+            if len(wrong):
+                raise ValueError(f"a face names {what} {wrong[0]}, of which there are {count:,} before it")
+        if any((named < 0).any() for named in (index, *others)):
+            self.unreadable = "it has negative indices"
+        elif (index > before).any():
             self.unreadable = "its faces name vertices that come later"
         # Negative ones count from the last vertex before the face.
         return np.where(index > 0, index - 1, np.where(-index <= before, before + index, -1))

@@ -37,6 +37,10 @@ def test04_files_are_looked_at_first(rgb, tmp_path):
     path.write_bytes(path.read_bytes()[:-10])
     with pytest.raises(NergError, match="cube.ply"):
         mesh_child(path)
+    # Mitsuba reads no quads; what takes a mesh does, with the material that others have.
+    (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2 -1\n")
+    shape = rgb.load_dict({"type": "scene", **scene_children(tmp_path / "quad.obj", "quad")}).shapes()[0]
+    assert shape.face_count() == 2 and shape.id() == "quad" and shape.bsdf().class_name() == "TwoSidedBRDF"
     (tmp_path / "empty.obj").write_text("v 0 0 0\n")
     with pytest.raises(NergError, match="empty.obj"):
         mesh_child(tmp_path / "empty.obj")

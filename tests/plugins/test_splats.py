@@ -1,6 +1,7 @@
 """The volume `splats` in the integrator: against Mitsuba's own renderer of splats, and beside shapes and observers."""
 
 import re
+from dataclasses import replace
 
 import drjit as dr
 import numpy as np
@@ -221,6 +222,7 @@ def test_the_volume_says_what_it_is(rgb, tmp_path):
     with pytest.raises(Exception, match="no density at a point"):
         volume.eval_1(rgb.Interaction3f())
     kind = plugin_class("splats")
+    assert kind.of(replace(wall(), color_space="linear")).medium().color_space == "linear"
     assert "in memory" in str(kind.of(wall()))
     with pytest.raises(Exception, match="splats in memory are needed"):
         kind.of(3)
