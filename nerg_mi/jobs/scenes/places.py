@@ -100,6 +100,8 @@ def _mesh(path: Path, output: Path, words: str) -> WrittenPlace:
     mesh, shown = read_mesh_file(path), path
     if not mesh.is_plain:
         shown = mesh_of(output)
+        if shown.resolve() == path.resolve():
+            raise NergError(f'"{path}" would be written over by what Mitsuba shows of it; give the scene another name')
         write_mesh(shown, mesh)
     kind = shown.suffix.lower().lstrip(".")
     color = _mesh_color(mesh)

@@ -88,6 +88,14 @@ def test_a_mesh_that_mitsuba_does_not_show_is_written_again(rgb, tmp_path, name,
     assert np.array(params["faces"])[:3].tolist() == [0, 1, 2]
 
 
+def test_the_given_mesh_is_not_written_over(tmp_path):
+    text = PLY.format(colors="comment grey", a="").replace("3 0 1 2", "4 0 1 2 0")
+    (tmp_path / "out.mesh.ply").write_text(text)
+    with pytest.raises(NergError, match="another name"):
+        place_of_files(given(tmp_path / "out.mesh.ply", "mesh"), tmp_path / "out.xml")
+    assert (tmp_path / "out.mesh.ply").read_text() == text
+
+
 @pytest.mark.parametrize("shape", [(1, 6, 8), (6, 1, 8), (6, 8, 1), (2, 2, 2), (1, 1, 1)])
 def test_hit_points_of_one_cell_are_shaded(tmp_path, shape):
     write_volume(tmp_path / "a.vol", np.full(shape, 100.0), (0, 0, 0), (1, 1, 1))
