@@ -130,11 +130,11 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
         raise ValueError(f'its vertices have no property "{missing[0]}"')
     take = lambda table, names: [table.columns[name]() for name in names]
     vertices = np.stack(take(vertex, _CENTER), axis=1).astype(np.float64) if vertex.count else np.zeros((0, 3))
-    used, notes, scales, found = {"vertex": {*_CENTER, *_NORMAL}, "face": {names}}, [], {}, {}
+    used, notes, scales, tints_of = {"vertex": {*_CENTER, *_NORMAL}, "face": {names}}, [], {}, {}
     for name, table in (("vertex", vertex), ("face", face)):
         tints = next((c for c in _COLORS if all(n in table.columns for n in c[:3])), None)
         if tints:
-            found[name], scales[name] = _unit_colors(take(table, tints[:3]), table.kinds[tints[0]])
+            tints_of[name], scales[name] = _unit_colors(take(table, tints[:3]), table.kinds[tints[0]])
             used[name] |= set(tints[:3])
     normals = None
     if all(name in vertex.columns for name in _NORMAL):
@@ -162,14 +162,14 @@ def _read_ply(path: str | os.PathLike) -> MeshFile:
     elif len(face.lists) > 1 or any(t.lists for n, t in ply.tables.items() if n != "face"):
         # Each of them is taken for three values.
         unreadable = "it has other lists than the corners of its faces"
-    hides_colors = any({"alpha", "a"} & set(ply.tables[name].columns) for name in found)
+    hides_colors = any({"alpha", "a"} & set(ply.tables[name].columns) for name in tints_of)
     return MeshFile(
         vertices,
         faces,
         polygons,
         normals,
-        found.get("vertex"),
-        found["face"][polygons] if "face" in found else None,
+        tints_of.get("vertex"),
+        tints_of["face"][polygons] if "face" in tints_of else None,
         scales.get("vertex", scales.get("face", 1.0)),
         tuple(notes),
         unreadable,
@@ -322,12 +322,12 @@ def _read_obj(path: str | os.PathLike) -> MeshFile:
 
 
 def _read_glb(path: str | os.PathLike) -> MeshFile:
-    found = parse_glb(read_bytes(path, "mesh", GLTF_BYTES), path)
+    triangles = parse_glb(read_bytes(path, "mesh", GLTF_BYTES), path)
     # Its y is up.
-    vertices = np.stack([found.vertices[:, 0], -found.vertices[:, 2], found.vertices[:, 1]], axis=1)
-    faces = found.faces
+    vertices = np.stack([triangles.vertices[:, 0], -triangles.vertices[:, 2], triangles.vertices[:, 1]], axis=1)
+    faces = triangles.faces
     return MeshFile(
-        vertices, faces, np.arange(len(faces)), None, found.colors, notes=found.notes, unreadable="it is glTF"
+        vertices, faces, np.arange(len(faces)), None, triangles.colors, notes=triangles.notes, unreadable="it is glTF"
     )
 
 

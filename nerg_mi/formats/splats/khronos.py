@@ -55,7 +55,7 @@ def read_gltf_splats(path: str | os.PathLike) -> Splats:
         return joined(found)
 
 
-def _splats(document: dict[str, Any], data: bytes, attributes: dict[str, Any], about: dict[str, Any]) -> Splats:
+def _splats(document: dict[str, Any], data: bytes, attributes: dict[str, Any], extension: dict[str, Any]) -> Splats:
     take = lambda name, shape: accessor_values(document, data, attributes[name], shape)
     own = lambda name, shape: take(f"{EXTENSION}:{name}", shape)
     harmonics = []
@@ -67,7 +67,7 @@ def _splats(document: dict[str, Any], data: bytes, attributes: dict[str, Any], a
     if not harmonics:
         raise ValueError("its splats have no colour")
     xyzw, scales, opacities = own("ROTATION", "VEC4"), own("SCALE", "VEC3"), own("OPACITY", "SCALAR")[:, 0]
-    kernel, color_space = about.get("kernel", "ellipse"), about.get("colorSpace", "srgb_rec709_display")
+    kernel, color_space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
     if kernel != "ellipse":
         raise ValueError(f'its kernel is "{plain(kernel, 40)}", and "ellipse" is read')
     if color_space not in _COLOR_SPACES:
