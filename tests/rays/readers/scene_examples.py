@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from nerg_mi.rays.readers.glasses.frame_names import FrameNames
+from tests.files.movies import box_table, movie
 
 START = 1_700_000_000_000_000_000  # nanoseconds: what times of day look like
 LENS = {"k1": -0.13, "k2": 0.11, "p1": 0.0005, "p2": -0.0004, "k3": 0.01, "k4": 0.17, "k5": 0.05, "k6": 0.02}
@@ -61,6 +65,17 @@ CALIBRATION_G3 = {
 }
 
 
+def video(times: np.ndarray, ticks: int = 24_950) -> Callable[[Path], None]:
+    """Writes a video without pictures, whose frames are shown at ``times`` (F,), seconds, rising: the first one by an
+    edit that shows nothing before it, the others by the durations of those before them."""
+    shown = np.rint(np.asarray(times) * ticks).astype(int)
+    durations = np.diff(shown, append=2 * shown[-1:] - shown[-2:-1])
+    runs = struct.pack(f">{2 * len(durations)}I", *np.stack([np.ones_like(durations), durations], axis=1).ravel())
+    edits = struct.pack(">IiiIii", shown[0], -1, 1 << 16, durations.sum(), 0, 1 << 16)
+    data = movie(ticks, ticks, box_table(b"stts", len(durations), runs), edits=box_table(b"elst", 2, edits))
+    return lambda path: path.write_bytes(data) and None
+
+
 def sample_g3(t: float, gaze2d: list | None, gaze3d: list | None) -> str:
     data = {} if gaze2d is None else {"gaze2d": gaze2d, "gaze3d": gaze3d}
     return json.dumps({"type": "gaze", "timestamp": t, "data": data})
@@ -69,6 +84,7 @@ def sample_g3(t: float, gaze2d: list | None, gaze3d: list | None) -> str:
 TOBII = {
     "transforms.json": model(),
     "recording.g3": json.dumps({"name": "r", "scenecamera": {"camera-calibration": CALIBRATION_G3}}),
+    "scenevideo.mp4": video(np.arange(8) / 24.95),
     "gazedata.gz": "\n".join(sample_g3(0.01 + 0.04 * k, [955 / 1920, 0.5], [-1.5, 25.0, -1000.0]) for k in range(7))
     + "\n",
 }

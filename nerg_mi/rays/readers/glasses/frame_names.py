@@ -46,15 +46,20 @@ class FrameNames:
         """Whether names tell which recording a frame is of."""
         return "{recording}" in self.pattern
 
+    @property
+    def needs_frames(self) -> bool:
+        """Whether names are turned into times by those of the video's frames."""
+        return "{ns}" not in self.pattern
+
     def times(
         self, names: Sequence[str], recording: str, frames: np.ndarray | None, fps: float | None, start: float
     ) -> np.ndarray:
         """Seconds (N,) on the recording's clock at which images of these ``names`` were taken, NaN for those that are
         no frames of the ``recording``.
 
-        ``frames``: seconds of the video's frames, (F,). ``fps``: numbers count frames of this steady rate from the
-        first on, in place of ``frames``. ``start``: what {ns} is counted from, in nanoseconds. Raises `NergError` where
-        no name fits, or one counts a frame that there is not.
+        ``frames``: seconds of the video's frames, (F,), or None where they are not there. ``fps``: numbers count frames
+        of this steady rate, into which FFmpeg's filter of that name has turned the video. ``start``: what {ns} is
+        counted from, in nanoseconds. Raises `NergError` where no name fits, or one counts a frame that there is not.
         """
         parts = re.split(r"(\{frame0\}|\{frame1\}|\{s\}|\{ns\}|\{recording\}|\*)", self.pattern)
         known = {**_FIELDS, "{recording}": re.escape(recording), "*": "[^/]*"}
@@ -76,19 +81,38 @@ class FrameNames:
     def _time(
         self, kind: str, text: str, name: str, frames: np.ndarray | None, fps: float | None, start: float
     ) -> float:
-        first = 0.0 if frames is None or not len(frames) else float(frames[0])
-        if kind == "s":
-            return first + float(text)
         if kind == "ns":
             return (int(text) - int(start)) * 1e-9
+        if kind == "s":
+            return float(text) + (0.0 if frames is None or not len(frames) else float(frames[0]))
         index = int(text) - (kind == "frame1")
-        if fps is not None and index >= 0:
-            return first + index / fps
-        if frames is None:
-            raise NergError("the recording has no times of its video's frames; give the frames a second with --fps")
-        if not 0 <= index < len(frames):
+        if frames is None and fps is None:
             raise NergError(
-                f'"{plain(name, 80)}" is frame {index} of the video, counted from 0, which has {len(frames)}; check '
-                "--frames, and --fps where not every frame was taken"
+                "the recording has no times of its video's frames, which its numbers count; put the file that has them "
+                "beside the gaze (Tobii: the scene video, Neon: world_timestamps.csv), or give a steady rate with --fps"
             )
-        return float(frames[index])
+        if frames is None and index >= 0:
+            return index / fps
+        position = index if fps is None or frames is None else _resampled(index, frames, fps)
+        if frames is None or not 0 <= position < len(frames):
+            of = "" if frames is None else f", which has {len(frames)}"
+            of += "" if fps is None else f" ({fps:g} a second were counted)"
+            raise NergError(
+                f'"{plain(name, 80)}" is frame {index} of the video, counted from 0{of}; check --frames, and --fps '
+                "where not every frame was taken"
+            )
+        return float(frames[position])
+
+
+def _resampled(index: int, frames: np.ndarray, fps: float) -> int:
+    """Which of the ``frames`` (F,) FFmpeg's filter fps shows as its frame ``index``; F where there is none.
+
+    Each frame goes to the nearest tick of the steady rate, and a tick shows the last frame that came to it or before:
+    at five a second of 25, the third, eighth, thirteenth frame, 0.08 s later than a fifth of a second times the index.
+    """
+    ticks = np.floor((frames - frames[0]) * fps + 0.5)
+    # The last frame lasts as long as the others do.
+    lasting = np.median(np.diff(frames)) if len(frames) > 1 else 0.0
+    if index > np.floor((frames[-1] - frames[0] + lasting) * fps + 0.5):
+        return len(frames)
+    return int(np.searchsorted(ticks, index, side="right")) - 1

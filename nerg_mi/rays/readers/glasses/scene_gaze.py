@@ -52,7 +52,7 @@ class SceneOptions:
         recorded=False,
     )
     fps: float | None = option(
-        None, "Numbers of frames count this many a second (ffmpeg's -vf fps=5), not each frame of the video."
+        None, "Numbers count frames that ffmpeg's -vf fps=5 took, this many a second, not each frame of the video."
     )
     place: Path | None = option(
         None, "Checkpoint of the place (nerg train radiance): rays are in the coordinates that it was trained in."
@@ -192,6 +192,12 @@ def _of_model(
             f'as --frames "frame_{{frame1}}"; its first are {", ".join(plain(n, 60) for n in model.names[:3])}'
         )
     times = options.frames.times(model.names, recording.name, recording.frames, options.fps, recording.start)
+    if recording.frames is None and options.frames.needs_frames:
+        rate = "" if options.fps is None else f", {options.fps:g} a second exactly"
+        builder.complain(
+            f"the recording has no times of its video's frames: they are counted from the start of its clock{rate}; "
+            "put the file that has them beside the gaze (Tobii: the scene video, Neon: world_timestamps.csv)"
+        )
     track = _track(model, times)
     if track is None:
         raise NergError(

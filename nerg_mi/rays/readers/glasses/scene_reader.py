@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -31,9 +30,6 @@ class SceneReader(ABC, Generic[R]):
     accounts: str = ""
     """The two accounts of one gaze that are compared, as "pixels and angles"; empty where there is one."""
 
-    fps: float | None = None
-    """Frames a second that the video has where the recording has no times of its frames."""
-
     world = "the place's, whose axis `--up` points up"
     Options = SceneOptions
 
@@ -50,7 +46,6 @@ class SceneReader(ABC, Generic[R]):
 
     def read(self, files: Sequence[Path], options: SceneOptions, builder: RaysBuilder) -> None:
         _check_recordings(files, options)
-        options = replace(options, fps=options.fps or self.fps)
         about: list[dict[str, Any]] = []
         for given in files:
             folder, gaze = _recording_folder(given, self.gaze_file)

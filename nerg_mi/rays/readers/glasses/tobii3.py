@@ -12,6 +12,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import parse_json, read_json
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
+from nerg_mi.files.movie_tables import frame_times
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 
@@ -19,7 +20,7 @@ from .scene_camera import SceneCamera, angles_between
 from .scene_gaze import GazeBlock, Recording
 from .scene_reader import SceneReader
 
-_FPS = 25.0  # of the scene camera
+_RECORDING, _VIDEO = "recording.g3", "scenevideo.mp4"
 _BLOCK = 1 << 14  # lines taken apart at a time
 _JSON = 1 << 20  # bytes of recording.g3, at most
 
@@ -44,20 +45,25 @@ class Tobii3(SceneReader[_Tobii]):
 
     A ray starts at the scene camera's centre, and goes through the undistorted ``gaze2d``. ``gaze3d``, millimetres in
     the head unit's axes, is turned into the camera by the calibration's rotation and compared. Samples without gaze are
-    dropped. Seconds count from the recording's start, as those of its video, which is taken to have 25 frames a second
-    without ``fps``. The person is the folder.
+    dropped. Seconds count from the recording's start, as those of its video ``scenevideo.mp4``, whose frames have the
+    times that its tables tell: some 24.95 a second, with gaps where frames were lost. The person is the folder.
     """
 
     name = "tobii3"
-    files = "folders of Tobii Pro Glasses 3 (or the `gazedata.gz` in them), beside the scene camera's poses"
+    files = (
+        "folders of Tobii Pro Glasses 3 (or the `gazedata.gz` in them) with their scene video, beside the scene "
+        "camera's poses"
+    )
     checked_on = DESCRIPTION
     gaze_file = "gazedata.gz"
     accounts = "gaze2d and gaze3d"
-    fps = _FPS
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Tobii:
         name = folder.resolve().name
-        return _Tobii(name=name, person=name, glasses=_calibration(folder, builder))
+        camera = _scene_camera(folder, builder)
+        return _Tobii(
+            name=name, person=name, frames=_frames(folder, camera, builder), glasses=_calibration(folder, camera)
+        )
 
     def blocks(self, gaze: Path, recording: _Tobii, builder: RaysBuilder) -> Iterator[GazeBlock]:
         glasses = recording.glasses
@@ -81,12 +87,29 @@ def _seen_from_camera(points: np.ndarray, glasses: _Glasses, direction: np.ndarr
     return ways[int(np.argmin(off))]
 
 
-def _calibration(folder: Path, builder: RaysBuilder) -> _Glasses:
-    path = folder / "recording.g3"
-    found: Any = read_json(path, "Tobii recording", _JSON)
+def _scene_camera(folder: Path, builder: RaysBuilder) -> dict[str, Any]:
+    """What the recording says of its scene camera."""
+    path = folder / _RECORDING
+    recording: Any = read_json(path, "Tobii recording", _JSON)
     builder.source(path)
+    camera = recording.get("scenecamera") if isinstance(recording, dict) else None
+    return camera if isinstance(camera, dict) else {}
+
+
+def _frames(folder: Path, camera: dict[str, Any], builder: RaysBuilder) -> np.ndarray | None:
+    """Seconds of the scene video's frames on the recording's clock, where the video is there."""
+    name = camera.get("file")
+    video = folder / (Path(name).name if isinstance(name, str) and Path(name).name else _VIDEO)
+    if not video.is_file():
+        return None
+    builder.source(video)
+    return frame_times(video, "scene video")
+
+
+def _calibration(folder: Path, camera: dict[str, Any]) -> _Glasses:
+    path = folder / _RECORDING
     try:
-        c = found["scenecamera"]["camera-calibration"]
+        c = camera["camera-calibration"]
         (fx, fy), (cx, cy), (w, h) = c["focal-length"], c["principal-point"], c["resolution"]
         (k1, k2, k3), (p1, p2) = c["radial-distortion"], c["tangential-distortion"]
         rotation = np.array(c["rotation"], np.float64).reshape(3, 3)
@@ -99,8 +122,8 @@ def _calibration(folder: Path, builder: RaysBuilder) -> _Glasses:
         ) from error
     if not (np.isfinite(position).all() and np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-2):
         raise NergError(f'the calibration in "{path}" turns the camera by no rotation; copy the recording again')
-    camera = SceneCamera.of_opencv(matrix, [k1, k2, p1, p2, k3], size, f'the calibration in "{path}"')
-    return _Glasses(camera, size, rotation, position)
+    lens = SceneCamera.of_opencv(matrix, [k1, k2, p1, p2, k3], size, f'the calibration in "{path}"')
+    return _Glasses(lens, size, rotation, position)
 
 
 def _samples(path: Path, builder: RaysBuilder) -> Iterator[tuple[np.ndarray, np.ndarray]]:

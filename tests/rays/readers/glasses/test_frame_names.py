@@ -36,8 +36,19 @@ def test_times(pattern, name, seconds):
     assert np.allclose(found, [seconds, np.nan], equal_nan=True)
 
 
-def test_a_steady_rate():
-    assert np.allclose(FrameNames("{frame1}").times(["1", "6"], "", FRAMES, 5.0, 0), [0.5, 1.5])
+@pytest.mark.parametrize(
+    "fps, shown",
+    [
+        # What FFmpeg's filter fps gives of frames numbered from 0 at 24.95 a second.
+        (5.0, [2, 7, 12, 17, 22, 27, 32, 37, 42, 47, 52, 57]),
+        (10.0, [1, 3, 6, 8, 11, 13, 16, 18, 21, 23, 26, 28]),
+        (40.0, [0, 0, 1, 2, 2, 3, 4, 4, 5, 5, 6, 7]),
+    ],
+)
+def test_a_steady_rate(fps, shown):
+    frames = 0.5 + np.arange(60) / 24.95
+    found = FrameNames("{frame0}").times([str(k) for k in range(12)], "", frames, fps, 0)
+    assert np.allclose(found, frames[shown])
     assert np.allclose(FrameNames("{frame0}").times(["1", "6"], "", None, 2.0, 0), [0.5, 3.0])
 
 
@@ -46,8 +57,10 @@ def test_a_steady_rate():
     [
         ("{frame1}", "0", FRAMES, None, "frame -1 of the video"),
         ("{frame1}", "0", FRAMES, 5.0, "frame -1 of the video"),
+        ("{frame1}", "0", None, 5.0, "frame -1 of the video"),
         ("{frame1}", "5", FRAMES, None, "frame 4 of the video, counted from 0, which has 4"),
-        ("{frame0}", "5", None, None, "--fps"),
+        ("{frame0}", "2", FRAMES, 5.0, r"frame 2 .* which has 4 \(5 a second were counted\)"),
+        ("{frame0}", "5", None, None, "scene video.*--fps"),
     ],
 )
 def test_frames_that_there_are_not(pattern, name, frames, fps, message):

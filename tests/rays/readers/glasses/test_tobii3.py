@@ -10,7 +10,7 @@ from nerg_mi.errors import NergError
 from tests.rays.readers import own_camera
 from tests.rays.readers.examples import EXAMPLES
 from tests.rays.readers.reading import dropped, read
-from tests.rays.readers.scene_examples import CALIBRATION_G3, sample_g3
+from tests.rays.readers.scene_examples import CALIBRATION_G3, sample_g3, video
 
 MATRIX = [[920.0, 0, 955.0], [0, 921.0, 540.0], [0, 0, 1]]
 LENS = {"k1": -0.05, "k2": 0.06, "k3": -0.02, "p1": 0.0003, "p2": 0.0001}
@@ -32,21 +32,58 @@ def write_gaze(folder, t, gaze, points=None):
     (folder / "gazedata.gz").write_bytes(gzip.compress(text.encode()))
 
 
+def poses_of(options):
+    return np.array([f["transform_matrix"] for f in json.loads(options["poses"].read_text())["frames"][1:]])
+
+
 @pytest.mark.parametrize("of_the_camera", [False, True])
 def test_rays_are_those_of_the_pixels(tobii, of_the_camera):
-    """25 frames a second without a word about it; gaze3d agrees whichever of the two the position is."""
+    """gaze3d agrees whichever of the two the position is."""
     folder, options = tobii
     t, gaze = np.linspace(0.01, 0.27, 40), own_camera.gaze_in_camera(40, 2)
     points = gaze * 1500 @ ROTATION + POSITION if of_the_camera else None
     write_gaze(folder, t, gaze, points)
     rays = read("tobii3", folder, **options)
-    poses = np.array([f["transform_matrix"] for f in json.loads(options["poses"].read_text())["frames"][1:]])
-    origin, direction = own_camera.rays_at(t, np.arange(8) / 25, poses, gaze)
+    origin, direction = own_camera.rays_at(t, np.arange(8) / 24.95, poses_of(options), gaze)
     assert np.abs(rays.origin - origin).max() < 1e-5 and np.abs(rays.direction - direction).max() < 1e-5
     (about,) = rays.metadata["scene_camera"]
     assert about["p95_degrees"] < 1e-3 and "complaints" not in rays.metadata and rays.persons == ("ann",)
-    slower = read("tobii3", folder, **options, fps=10.0)
-    assert np.allclose(slower.origin[:, 0], t, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        0.2 + np.arange(8) / 24.95,
+        np.cumsum([0.0, 0.04, 0.05, 0.04, 0.12, 0.04, 0.03, 0.05]),
+        [0.3, 0.34, 0.38, 0.46, 0.5, 0.54, 0.58, 0.62],
+    ],
+)
+def test_frames_have_the_times_of_the_video(tobii, times):
+    """One that starts late, one whose rate varies, one that lost a frame."""
+    folder, options = tobii
+    folder.joinpath("scenevideo.mp4").rename(folder / "film.mp4")
+    video(times)(folder / "film.mp4")
+    about = {"scenecamera": {"file": "film.mp4", "camera-calibration": CALIBRATION_G3}}
+    (folder / "recording.g3").write_text(json.dumps(about))
+    t, gaze = np.linspace(times[0] + 1e-4, times[-1] - 1e-4, 30), own_camera.gaze_in_camera(30, 2)
+    write_gaze(folder, t, gaze)
+    rays = read("tobii3", folder, **options)
+    origin, direction = own_camera.rays_at(t, np.array(times), poses_of(options), gaze)
+    # A tick of the video's clock is 40 microseconds.
+    assert np.abs(rays.origin - origin).max() < 2e-4 and np.abs(rays.direction - direction).max() < 1e-3
+    assert "film.mp4" in [s["file"] for s in rays.metadata["sources"]]
+
+
+def test_without_the_video_no_rate_is_guessed(tobii):
+    folder, options = tobii
+    (folder / "scenevideo.mp4").unlink()
+    with pytest.raises(NergError, match="no times of its video's frames.*the scene video"):
+        read("tobii3", folder, **options)
+    t, gaze = np.linspace(0.01, 0.27, 40), own_camera.gaze_in_camera(40, 2)
+    write_gaze(folder, t, gaze)
+    rays = read("tobii3", folder, **options, fps=10.0)
+    assert np.allclose(rays.origin[:, 0], t, atol=1e-6)
+    assert "10 a second exactly" in rays.metadata["complaints"][0]
 
 
 def test_points_that_lie_elsewhere_are_told(tobii):
