@@ -1,7 +1,9 @@
-"""Pupil Labs Neon: the "Timeseries" download of Pupil Cloud (github: pupil-labs/pupil-docs)."""
+"""Pupil Labs Neon: the "Timeseries" download of Pupil Cloud (github: pupil-labs/pupil-docs), and exports of Neon Player
+(github: pupil-labs/neon-player)."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import read_json
+from nerg_mi.files.bounded import plain, read_json
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
 from nerg_mi.rays.readers.protocol import DESCRIPTION
@@ -23,7 +25,18 @@ _TIME = "timestamp [ns]"
 _PIXELS = ("gaze x [px]", "gaze y [px]")
 _ANGLES = ("azimuth [deg]", "elevation [deg]")
 _SIZE = (1600, 1200)  # of Neon's scene camera, pixels
+_OFF = re.compile(r"false|0+(\.([0-4]\d*)?)?")  # not worn: a truth, a number, or a share, by the version of the export
 _JSON = 1 << 20  # bytes of its JSON files, at most
+# Names of the scene camera's matrix and coefficients, in the files of Pupil Cloud and of Neon Player.
+_CALIBRATIONS = {
+    "scene_camera.json": ("camera_matrix", ("distortion_coefficients", "dist_coefs")),
+    "calibration.json": ("scene_camera_matrix", ("scene_distortion_coefficients",)),
+}
+# A lens of Neon's field of view, 103 by 77 degrees, whose axis meets the middle of the picture.
+_NOMINAL = (
+    [[891.0, 0, 799.5], [0, 891.0, 599.5], [0, 0, 1]],
+    [-0.1306, 0.1089, 0.0, 0.0, -0.0007, 0.1701, 0.0523, 0.0238],
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,35 +45,61 @@ class _Neon(Recording):
 
 
 class Neon(SceneReader[_Neon]):
-    """Folders with ``gaze.csv``, ``info.json``, ``scene_camera.json`` and ``world_timestamps.csv``.
+    """Folders with ``gaze.csv``, ``info.json``, ``scene_camera.json`` (Neon Player: ``calibration.json``) and
+    ``world_timestamps.csv``.
 
     A ray starts at the scene camera's centre. Its direction is that of azimuth (right) and elevation (up), or, where
     there are none, of the undistorted pixel; where there are both they are compared. Rows in blinks, and in which the
     glasses were not worn, are dropped. Times count from the recording's start. The person is the wearer that
     ``info.json`` names, or else the folder.
+
+    Exports of Neon Player may lack some of these. Without ``info.json`` times count from the first frame of the scene
+    video; without angles and a calibration pixels go through a nominal lens. Both are said.
     """
 
     name = "neon"
     files = (
-        'folders of Pupil Cloud\'s "Timeseries" download of a Neon (or the `gaze.csv` in them), beside the scene '
-        "camera's poses"
+        "folders of Pupil Cloud's \"Timeseries\" download of a Neon, or of Neon Player's export (or the `gaze.csv` in "
+        "them), beside the scene camera's poses"
     )
     checked_on = DESCRIPTION
     gaze_file = "gaze.csv"
     accounts = "pixels and angles"
 
     def open(self, folder: Path, builder: RaysBuilder) -> _Neon:
+        name = folder.resolve().name
+        frames = _frame_times(folder, builder)
         start, person = _info(folder, builder)
-        camera = _camera(folder, builder)
-        frames = _frame_times(folder, start, builder)
-        return _Neon(name=folder.resolve().name, person=person, frames=frames, start=start, camera=camera)
+        if start is None:
+            if frames is None or not len(frames):
+                raise NergError(
+                    f'"{folder}" has neither info.json nor world_timestamps.csv, by which the times of Neon\'s gaze '
+                    "count; export them beside the gaze"
+                )
+            builder.complain(
+                f'there is no info.json beside the gaze of "{plain(name, 60)}": times count from the first frame of '
+                "the scene video, not from the recording's start, and the person is the folder"
+            )
+        return _Neon(
+            name=name,
+            person=person or name,
+            frames=None if frames is None else (frames - (frames[0] if start is None else start)) * 1e-9,
+            start=float(frames[0]) if start is None else start,
+            starts_with_video=start is None,
+            camera=_camera(folder, builder),
+        )
 
     def blocks(self, gaze: Path, recording: _Neon, builder: RaysBuilder) -> Iterator[GazeBlock]:
         there = set(table_columns(gaze))
         angles = set(_ANGLES) <= there
         camera = recording.camera
         if not angles and camera is None:
-            raise NergError(f"{gaze} has no angles, and pixels need scene_camera.json; download it beside the gaze")
+            camera = SceneCamera.of_opencv(*_NOMINAL, _SIZE)
+            builder.complain(
+                f'the gaze of "{plain(recording.name, 60)}" has no angles, and no calibration of the scene camera '
+                f"({' or '.join(_CALIBRATIONS)}) lies beside it: pixels go through the nominal lens of Neon, some two "
+                "degrees off; export either"
+            )
         numbers = [_TIME, *_PIXELS, *(_ANGLES if angles else ())]
         texts = [name for name in ("worn", "blink id") if name in there]
         for v, words, lines in iterate_table(gaze, numbers, texts, on_bad=builder.on_bad):
@@ -78,39 +117,41 @@ def _unusable(word: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Rows that say no gaze, by reason, from the words of a block's columns."""
     drop = {}
     if "worn" in word:
-        # Spelt as a truth or as a number, by the version of the export.
-        drop["the glasses were not worn"] = np.isin(word["worn"], ["0", "0.0", "false"])
+        drop["the glasses were not worn"] = np.array([bool(_OFF.fullmatch(w)) for w in word["worn"].tolist()], bool)
     if "blink id" in word:
         drop["a blink"] = ~np.isin(word["blink id"], ["", "nan"])
     return drop
 
 
-def _info(folder: Path, builder: RaysBuilder) -> tuple[float, str]:
-    """Nanoseconds at which the recording started, and who wore the glasses."""
+def _info(folder: Path, builder: RaysBuilder) -> tuple[float | None, str]:
+    """Nanoseconds at which the recording started, and who wore the glasses; None and "" without the file."""
     path = folder / "info.json"
+    if not path.is_file():
+        return None, ""
     found: Any = read_json(path, "information of a Neon recording", _JSON)
     builder.source(path)
     start = found.get("start_time") if isinstance(found, dict) else None
     if not isinstance(start, int) or isinstance(start, bool) or not 0 <= start < 1 << 63:
         raise NergError(f'"{path}" says no "start_time" in nanoseconds; download the recording again')
     wearer = found.get("wearer_name")
-    return float(start), wearer.strip() if isinstance(wearer, str) and wearer.strip() else folder.resolve().name
+    return float(start), wearer.strip() if isinstance(wearer, str) else ""
 
 
 def _camera(folder: Path, builder: RaysBuilder) -> SceneCamera | None:
     """The scene camera, where its calibration is there."""
-    path = folder / "scene_camera.json"
-    if not path.is_file():
-        return None
-    found: Any = read_json(path, "calibration of a Neon scene camera", _JSON)
-    builder.source(path)
-    found = found if isinstance(found, dict) else {}
-    bent = found.get("distortion_coefficients", found.get("dist_coefs"))
-    return SceneCamera.of_opencv(found.get("camera_matrix"), bent, _SIZE, f'the calibration "{path}"')
+    for name, (matrix, coefficients) in _CALIBRATIONS.items():
+        path = folder / name
+        if path.is_file():
+            content: Any = read_json(path, "calibration of a Neon scene camera", _JSON)
+            builder.source(path)
+            content = content if isinstance(content, dict) else {}
+            distortion = next((content[key] for key in coefficients if key in content), None)
+            return SceneCamera.of_opencv(content.get(matrix), distortion, _SIZE, f'the calibration "{path}"')
+    return None
 
 
-def _frame_times(folder: Path, start: float, builder: RaysBuilder) -> np.ndarray | None:
-    """Seconds of the scene video's frames since the start, where they are there."""
+def _frame_times(folder: Path, builder: RaysBuilder) -> np.ndarray | None:
+    """Nanoseconds of the scene video's frames, where they are there."""
     path = folder / "world_timestamps.csv"
     if not path.is_file():
         return None
@@ -118,4 +159,4 @@ def _frame_times(folder: Path, start: float, builder: RaysBuilder) -> np.ndarray
     blocks = iterate_table(path, [_TIME], on_bad=builder.on_bad)
     times = np.concatenate([block.numbers[:, 0] for block in blocks] or [np.empty(0)])
     builder.count_lines(len(times))
-    return (times - start) * 1e-9
+    return times

@@ -79,12 +79,14 @@ class SceneOptions:
 class Recording:
     """What a reader has found of a recording: its ``name`` (of its folder), the ``person`` who wore the glasses, the
     seconds of the scene video's ``frames`` (F,) on the clock of the gaze, or None, and ``start``, the nanoseconds at
-    which that clock is 0."""
+    which that clock is 0: the recording's start, or, where that is not said (``starts_with_video``), the first frame.
+    """
 
     name: str
     person: str
     frames: np.ndarray | None = None
     start: float = 0.0
+    starts_with_video: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +169,11 @@ def _camera_track(options: SceneOptions, recording: Recording, builder: RaysBuil
         to_place = PlaceFrame.of_checkpoint(options.place)
         builder.source(options.place)
     if is_timed(options.poses):
+        if recording.starts_with_video:
+            raise NergError(
+                f'the poses of "{options.poses}" count from the start of the recording "{plain(recording.name, 60)}", '
+                "which no file of it says; put its info.json beside the gaze"
+            )
         builder.source(options.poses)
         track, count = read_timed_poses(options.poses, builder.on_bad)
         builder.count_lines(count)

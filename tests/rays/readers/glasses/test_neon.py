@@ -117,12 +117,47 @@ def test_accounts_that_differ_are_told(neon):
 
 
 def test_without_calibration_or_angles(neon):
+    """Pixels go through a nominal lens, which is said; Neon Player calls the calibration otherwise."""
     folder, options = neon
+    ns, gaze = np.array(frame_ns(7)) + 1_000_000, own_camera.gaze_in_camera(7)
+    write_gaze(folder, ns, gaze)
+    whole = read("neon", folder, **options)
     (folder / "scene_camera.json").unlink()
-    assert len(read("neon", folder, **options)) == 7
+    rays = read("neon", folder, **options)
+    assert np.allclose(rays.direction, whole.direction) and "complaints" not in rays.metadata
     text = (folder / "gaze.csv").read_text().replace("azimuth [deg]", "a")
     (folder / "gaze.csv").write_text(text)
-    with pytest.raises(NergError, match="pixels need scene_camera.json"):
+    rays = read("neon", folder, **options)
+    assert "nominal lens" in rays.metadata["complaints"][0]
+    off = np.degrees(np.arccos(np.sum(rays.direction * whole.direction, axis=1)))
+    assert 0.3 < off.max() < 2
+    (folder / "calibration.json").write_text(
+        json.dumps({"scene_camera_matrix": MATRIX, "scene_distortion_coefficients": list(LENS.values())})
+    )
+    rays = read("neon", folder, **options)
+    assert np.abs(rays.direction - whole.direction).max() < 1e-6 and "complaints" not in rays.metadata
+
+
+def test_exports_of_neon_player(neon):
+    """Without info.json the clock is the scene video's, and the person the folder, which is said."""
+    folder, options = neon
+    ns = np.array(frame_ns(7)) + 1_000_000
+    gaze = own_camera.gaze_in_camera(7)
+    # Shares of a sensor's 255 steps.
+    write_gaze(folder, ns, gaze, worn=[1.0, 0.996, 0.502, 0.498, 0.004, 0.0, 1.0])
+    whole = read("neon", folder, **options)
+    assert dropped(whole) == {"the glasses were not worn": [[5, 7]]}
+    (folder / "info.json").unlink()
+    rays = read("neon", folder, **options)
+    assert np.allclose(rays.origin, whole.origin) and np.allclose(rays.direction, whole.direction)
+    assert np.allclose(rays.t, (ns[[0, 1, 2, 6]] - frame_ns(1)[0]) * 1e-9, atol=1e-6) and rays.persons == ("2026-ann",)
+    (complaint,) = rays.metadata["complaints"]
+    assert 'no info.json beside the gaze of "2026-ann"' in complaint
+    (folder / "aligned_poses.csv").write_text("start_timestamp\n")
+    with pytest.raises(NergError, match="put its info.json beside"):
+        read("neon", folder, poses=folder / "aligned_poses.csv")
+    (folder / "world_timestamps.csv").unlink()
+    with pytest.raises(NergError, match="neither info.json nor world_timestamps.csv"):
         read("neon", folder, **options)
 
 
