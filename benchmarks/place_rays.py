@@ -86,14 +86,14 @@ def store(folder: Path) -> tuple[Path, dict]:
     """The demo store's shoppers among its radiance field."""
     from nerg_mi.jobs import demo
     from nerg_mi.jobs.tracking import ImportOptions, import_rays
-    from nerg_mi.rays.readers.skeleton22 import SkeletonOptions
+    from nerg_mi.rays.readers.skeleton import SkeletonOptions
     from nerg_mi.scenes.store import make
 
     csv = Path(make.__file__).parent / "build" / "shoppers.csv"
     if not csv.is_file():
         make.main(["--stage", "shoppers"])
     path = folder / "rays.npz"
-    import_rays([csv], ImportOptions(reader="skeleton22", settings=SkeletonOptions(tick=0.001), output=path))
+    import_rays([csv], ImportOptions(reader="skeleton", settings=SkeletonOptions(tick=0.001), output=path))
     return path, {"field": demo.store_scene().parent / "store.safetensors"}
 
 

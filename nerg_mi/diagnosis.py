@@ -21,6 +21,7 @@ EXTRAS = {
     "xatlas": 'textures of baked gaze: pip install "nerg-mi[bake]"',
     "pyarrow": 'ray tables in Parquet: pip install "nerg-mi[parquet]"',
     "pycolmap": 'poses of photos: pip install "nerg-mi[poses]"',
+    "c3d": 'C3D files of motion capture: pip install "nerg-mi[mocap]"',
 }
 """Optional distributions, each with what it is for and how to get it."""
 

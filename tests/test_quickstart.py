@@ -63,4 +63,4 @@ def test02_its_commands_run(rgb, tmp_path, monkeypatch, capsys):
         for name in re.findall(r"-o (\S+)", line):
             assert (tmp_path / name).stat().st_size > 0, line
     # What the guess prints stands on the page.
-    assert "preset skeleton22" in PAGE.read_text(encoding="utf-8")
+    assert "preset skeleton" in PAGE.read_text(encoding="utf-8")

@@ -108,6 +108,8 @@ def _shown(track: dict[bytes, bytes], scale: int) -> np.ndarray:
         at = at + offsets.view(np.int32)  # negative ones are written in version 0 too
     if b"elst" not in track:
         return at / ticks
+    if not scale:
+        raise ValueError("its edits count by a clock that it lacks")
     count = struct.unpack_from(">I", track[b"elst"], 4)[0]
     entry = struct.Struct(">Qqi" if track[b"elst"][0] == 1 else ">Iii")
     shown, begin = [np.empty(0)], 0.0

@@ -62,13 +62,13 @@ def make_field(job: Job) -> list[Path]:
 
 
 def make_rays(job: Job) -> list[Path]:
-    """Rays of attention from the tracking data, as `nerg rays import --preset skeleton22 --tick 0.001` makes them."""
+    """Rays of attention from the tracking data, as `nerg rays import --preset skeleton --tick 0.001` makes them."""
     from nerg_mi.rays.readers.registry import read_rays
-    from nerg_mi.rays.readers.skeleton22 import SkeletonOptions
+    from nerg_mi.rays.readers.skeleton import SkeletonOptions
 
     tracking, path = job.build / "shoppers.csv", job.build / "rays.npz"
     _require(tracking, "shoppers")
-    read_rays("skeleton22", tracking, SkeletonOptions(tick=1e-3)).save(path)
+    read_rays("skeleton", tracking, SkeletonOptions(tick=1e-3)).save(path)
     return [path]
 
 

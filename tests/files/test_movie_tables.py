@@ -145,6 +145,7 @@ def test_times_of_frames(tables, edited, seconds, version, tmp_path):
         (movie(1000, 24_950, STEADY, runs(b"ctts", (5, 0))), "tell of 6 and of 5 frames"),
         (movie(1000, 24_950, runs(b"stts", (1 << 30, 1))), "more than 16,777,216 frames"),
         (movie(1000, 24_950, STEADY, edits=edits((100, 9000, ONCE))), "has no frames"),
+        (movie(1000, 24_950, STEADY, edits=edits((100, 0, ONCE))).replace(b"mvhd", b"free"), "a clock that it lacks"),
         (movie(1000, 24_950, STEADY) + box(b"moof"), "in fragments.*ffmpeg -i VIDEO -c copy"),
         (movie(1000, 24_950, box(b"stts", bytes(5))), "cannot be read"),
     ],

@@ -106,9 +106,9 @@ def _recording(name: str, example: Example, kind: str = "") -> Reader:
         options = make_options(name, example.options_in(folder))
         _shown(read_rays(name, example.given(folder), options, skip_bad_lines=skip))
 
-    known = {".gz": "gzip", ".json": "json", ".g3": "json"}
-    kinds = {file: (known.get(Path(file).suffix, "text"),) for file in example.files}
-    return Reader(f"preset {name}{kind}", make, kinds, read)
+    known = {".gz": ("gzip",), ".json": ("json",), ".g3": ("json",), ".mp4": ("boxes",), ".c3d": ()}
+    kinds = {file: known.get(Path(file).suffix, ("text",)) for file in example.files}
+    return Reader(f"preset {name}{kind}", make, kinds, read, "c3d" if name == "c3d" else None)
 
 
 def _tables(name: str, make, *kinds: str) -> Reader:

@@ -205,7 +205,7 @@ def test_law_names_an_unknown_category():
 
 
 def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store, law, tmp_path):
-    from nerg_mi.rays.readers.parsing.bodies import head_poses
+    from nerg_mi.rays.readers.parsing.bodies import LEFT_EAR, NOSE, RIGHT_EAR, head_poses
     from nerg_mi.rays.readers.parsing.skeleton_file import read_skeleton
 
     ids, times, origins, directions = shoppers.simulate(store, shoppers=3, stops=(2, 4), seed=5, law=law)
@@ -221,6 +221,6 @@ def test_shoppers_keep_clear_of_furniture_and_return_to_the_skeleton_file(store,
         store, tmp_path / "s.csv", shoppers=3, stops=(2, 4), seed=5, law=law, say=lambda text: None
     )
     rows = read_skeleton(path)
-    o, d = head_poses(rows.keypoints)
+    o, d = head_poses(*(rows.keypoints[:, k] for k in (LEFT_EAR, RIGHT_EAR, NOSE)))
     assert np.array_equal(rows.ids, ids) and np.array_equal(rows.times, times)
     assert np.allclose(o, origins, atol=1e-4) and np.allclose(d, directions, atol=2e-3)

@@ -135,7 +135,7 @@ def _use_preset(out: Proposal, name: str, why: str) -> None:
         out.open.append("the up axis of the motion capture (--up)")
     if name == "motive":
         out.open.append("the axis along which the head's rigid body looks (--forward; -z if nothing is said)")
-    if name == "skeleton22":
+    if name == "skeleton":
         out.open.append("the unit of the time (--tick); the card tells which would give a device's rate")
 
 

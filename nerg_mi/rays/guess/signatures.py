@@ -11,6 +11,7 @@ from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
 # By the name of a file, in a folder or given itself; what is beside it tells some apart.
 _FILES = (
     ("neon", "gaze.csv", "info.json"),
+    ("neon", "gaze.csv", "world_timestamps.csv"),
     ("tobii3", "gazedata.gz", "recording.g3"),
     ("glassestools", "gazeData.tsv", "calibration.xml"),
     ("pupil", "gaze_positions.csv", "head_pose_tracker_poses.csv"),
@@ -38,6 +39,8 @@ def preset_of_files(path: Path) -> tuple[str, str] | None:
             return name, f"{file} with {beside} beside it"
     if path.name.endswith("_head_hand_eye.csv"):
         return "hololens", "its name ends in _head_hand_eye.csv"
+    if path.suffix.lower() == ".c3d":
+        return "c3d", "its name ends in .c3d"
     return None
 
 
@@ -46,7 +49,7 @@ def preset_of_text(path: Path) -> tuple[str, str] | None:
     for block in line_blocks(path, "tracking file", 1):
         words = block[0].split("|")
         if len(words) == 3 and words[2].lstrip().startswith("["):
-            return "skeleton22", "its lines are id|time|[keypoints]"
+            return "skeleton", "its lines are id|time|[keypoints]"
         if block[0].startswith("GAZE_VECTOR_NAME\t"):
             return "qualisys", "its first line names a gaze vector"
         if block[0].lstrip("\ufeff").startswith("Format Version,"):

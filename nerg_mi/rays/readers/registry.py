@@ -12,7 +12,7 @@ from typing import Any
 from nerg_mi.errors import NergError
 from nerg_mi.rays.rays import Rays
 
-from . import motive, qualisys, skeleton22, table
+from . import markers, motive, qualisys, skeleton, table
 from .builder import RaysBuilder
 from .glasses import aria, glassestools, neon, pupil, tobii3
 from .headsets import arett, eyenavgs, hololens, openxr, quest, sranipal, unity, varjo, vr_supermarket
@@ -23,6 +23,7 @@ TABLE = table.TABLE.name
 """The reader of tables through a column map; the others know their columns, and are the presets."""
 
 _READERS: dict[str, Reader[Any]] = {}
+_FORMER_NAMES = {"skeleton22": skeleton.SkeletonFile.name}
 
 
 def register(reader: Reader[Any]) -> None:
@@ -60,7 +61,8 @@ def preset_names() -> tuple[str, ...]:
 
 
 def reader_named(name: str) -> Reader[Any]:
-    """The reader of this name. Raises `NergError` naming those there are."""
+    """The reader of this name, or of one that it had. Raises `NergError` naming those there are."""
+    name = _FORMER_NAMES.get(name, name)
     if name not in _READERS:
         raise NergError(f'there is no preset "{name}"; choose one of {", ".join(preset_names())}, or give a column map')
     return _READERS[name]
@@ -192,7 +194,8 @@ def preset_table() -> str:
 
 
 for _module in (
-    skeleton22,
+    skeleton,
+    markers,
     unity,
     varjo,
     hololens,

@@ -15,7 +15,7 @@ def test_import_and_show_skeletons(tmp_path):
     body = keypoints_from_head(origin, np.tile([0.0, 1.0, 0.0], (20, 1)))
     body[4, 11] = np.nan
     write_skeleton(tmp_path / "day.csv", ["ann"] * 20, np.arange(20), body)
-    done = run("import", tmp_path / "day.csv", "-o", tmp_path / "rays.npz", "--preset", "skeleton22", "--tick", 0.1)
+    done = run("import", tmp_path / "day.csv", "-o", tmp_path / "rays.npz", "--preset", "skeleton", "--tick", 0.1)
     assert done.exit_code == 0, done.output
     assert (
         "19 of 20 rows" in done.output
@@ -85,8 +85,8 @@ def test_import_of_heads_and_their_options(tmp_path):
         "import", tmp_path / "h.csv", "-o", tmp_path / "h.npz", "--map", "origin=x,y,z ypr=yaw,pitch", "--marker", 0.05
     )
     assert "--marker belongs to a preset" in str(done.exception)
-    done = run("import", tmp_path / "h.csv", "-o", tmp_path / "h.npz", "--preset", "skeleton22", "--keypoints", "1,2")
-    assert "--keypoints is three numbers" in str(done.exception)
+    done = run("import", tmp_path / "h.csv", "-o", tmp_path / "h.npz", "--preset", "skeleton", "--keypoints", "1,2")
+    assert "--keypoints is three places" in str(done.exception)
 
 
 def test_pseudonyms(tmp_path):
@@ -157,7 +157,7 @@ def test_bad_lines_of_presets(tmp_path):
     write_skeleton(tmp_path / "day.csv", ["ann"] * 20, np.arange(20), body)
     with open(tmp_path / "day.csv", "a") as out:
         out.write("ann|20|[1.0, 2.")
-    arguments = ["import", tmp_path / "day.csv", "-o", tmp_path / "r.npz", "--preset", "skeleton22", "--tick", 0.1]
+    arguments = ["import", tmp_path / "day.csv", "-o", tmp_path / "r.npz", "--preset", "skeleton", "--tick", 0.1]
     assert "line 21" in str(run(*arguments).exception)
     done = run(*arguments, "--skip-bad-lines")
     assert done.exit_code == 0 and "20 of 21 rows" in done.output, done.output

@@ -125,6 +125,8 @@ def test_folders(tmp_path):
     proposal = propose_import(tmp_path)
     assert proposal.preset == "neon" and proposal.open and "--poses MODEL" in (proposal.command or "")
     (tmp_path / "info.json").unlink()
+    assert propose_import(tmp_path).preset == "neon"
+    (tmp_path / "world_timestamps.csv").unlink()
     with pytest.raises(NergError, match="of no recording that is known"):
         propose_import(tmp_path)
 

@@ -15,6 +15,7 @@ from nerg_mi.rays.readers.parsing.column_map import ColumnMap
 from nerg_mi.rays.readers.parsing.skeleton_file import write_skeleton
 from tests.rays.readers import headset_examples as headsets
 from tests.rays.readers import scene_examples as scenes
+from tests.rays.readers.c3d_examples import write_heads
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,8 @@ VARIANTS = {
 _SCENE = {"poses": Path("transforms.json"), "frames": scenes.FRAMES}
 
 EXAMPLES = {
-    "skeleton22": Example({"day.csv": write_walk}, {"tick": 0.1}),
+    "skeleton": Example({"day.csv": write_walk}, {"tick": 0.1}),
+    "c3d": Example({"ann.c3d": write_heads}),
     "unity": Example({"ann.csv": lines(_UNITY, lambda k: [0.02 * k, "ann", 0, 1.6, k, 0, 0, 1, "VALID"])}),
     "unity_local": Example({"ann.csv": lines(_LOCAL, lambda k: [0.02 * k, 0, 1.6, k, 0, 0, 0, 1, 0, 0.1, 1])}),
     "unity_head": Example({"ann.csv": lines(_LOCAL[:8], lambda k: [0.02 * k, 0, 1.6, k, 0, 0, 0, 1])}),

@@ -73,7 +73,11 @@ def video(times: np.ndarray, ticks: int = 24_950) -> Callable[[Path], None]:
     runs = struct.pack(f">{2 * len(durations)}I", *np.stack([np.ones_like(durations), durations], axis=1).ravel())
     edits = struct.pack(">IiiIii", shown[0], -1, 1 << 16, durations.sum(), 0, 1 << 16)
     data = movie(ticks, ticks, box_table(b"stts", len(durations), runs), edits=box_table(b"elst", 2, edits))
-    return lambda path: path.write_bytes(data) and None
+
+    def write(path: Path) -> None:
+        path.write_bytes(data)
+
+    return write
 
 
 def sample_g3(t: float, gaze2d: list | None, gaze3d: list | None) -> str:

@@ -70,6 +70,7 @@ class Neon(SceneReader[_Neon]):
         name = folder.resolve().name
         frames = _frame_times(folder, builder)
         start, person = _info(folder, builder)
+        starts_with_video = start is None
         if start is None:
             if frames is None or not len(frames):
                 raise NergError(
@@ -80,12 +81,13 @@ class Neon(SceneReader[_Neon]):
                 f'there is no info.json beside the gaze of "{plain(name, 60)}": times count from the first frame of '
                 "the scene video, not from the recording's start, and the person is the folder"
             )
+            start = float(frames[0])
         return _Neon(
             name=name,
             person=person or name,
-            frames=None if frames is None else (frames - (frames[0] if start is None else start)) * 1e-9,
-            start=float(frames[0]) if start is None else start,
-            starts_with_video=start is None,
+            frames=None if frames is None else (frames - start) * 1e-9,
+            start=start,
+            starts_with_video=starts_with_video,
             camera=_camera(folder, builder),
         )
 

@@ -1,10 +1,13 @@
-"""Head poses of 22-keypoint skeletons, and bodies for given head poses.
+"""Skeletons by the names of their keypoints, the head poses that they give, and bodies for given head poses.
 
 The paper's proxy for gaze (Section 5.1): a ray from the midpoint of the ears
-through the nose. Frame of the tracking data: metres, z up, right-handed.
+through the nose.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,8 +15,75 @@ from nerg_mi.errors import NergError
 
 from .skeleton_file import KEYPOINTS
 
-# The keypoints whose meaning is known: columns 6:9, 39:42 and 33:36 of the file.
+# Of the paper's skeleton these are documented: columns 6:9, 39:42 and 33:36 of the file.
 LEFT_EAR, RIGHT_EAR, NOSE = 2, 13, 11
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A convention of keypoints: how many there are, and the numbers, from 0, of those by which a body is oriented.
+
+    Left and right are the person's. ``sure``: the confidence from which a keypoint was seen for certain.
+    """
+
+    title: str
+    keypoints: int
+    joints: Mapping[str, int]
+    sure: float = 1.0
+
+    def numbers(self, place: int | str) -> list[int]:
+        """The keypoints of which ``place`` is the mean: a number, a name, or several of either, joined by "+".
+
+        Raises `NergError` naming those there are.
+        """
+        words = [self.joints.get(word.strip(), word.strip()) for word in str(place).split("+")]
+        numbers = [int(k) if str(k).isdecimal() and len(str(k)) < 9 else self.keypoints for k in words]
+        if max(numbers) >= self.keypoints:
+            raise NergError(
+                f'there is no keypoint "{place}" in {self.title}; name them by their numbers, 0 to '
+                f"{self.keypoints - 1}, or as {', '.join(self.joints)} (--keypoints)"
+            )
+        return numbers
+
+
+PAPER = "nerg22"
+SKELETONS = {
+    PAPER: Skeleton(
+        "the NeRG paper's skeleton", KEYPOINTS, {"left_ear": LEFT_EAR, "right_ear": RIGHT_EAR, "nose": NOSE}
+    ),
+    "coco17": Skeleton(
+        "COCO-17",
+        17,
+        {"nose": 0, "left_eye": 1, "right_eye": 2, "left_ear": 3, "right_ear": 4}
+        | {"left_shoulder": 5, "right_shoulder": 6, "left_hip": 11, "right_hip": 12},
+    ),
+    "body25": Skeleton(
+        "BODY_25 of OpenPose",
+        25,
+        {"nose": 0, "right_eye": 15, "left_eye": 16, "right_ear": 17, "left_ear": 18}
+        | {"right_shoulder": 2, "left_shoulder": 5, "right_hip": 9, "left_hip": 12},
+    ),
+    "mediapipe33": Skeleton(
+        "the pose of MediaPipe",
+        33,
+        {"nose": 0, "left_eye": 2, "right_eye": 5, "left_ear": 7, "right_ear": 8}
+        | {"left_shoulder": 11, "right_shoulder": 12, "left_hip": 23, "right_hip": 24},
+    ),
+    "kinect32": Skeleton(
+        "Azure Kinect",
+        32,
+        {"nose": 27, "left_eye": 28, "left_ear": 29, "right_eye": 30, "right_ear": 31, "head": 26, "pelvis": 0}
+        | {"left_shoulder": 5, "right_shoulder": 12, "left_hip": 18, "right_hip": 22},
+        sure=2.0,
+    ),
+    "kinect25": Skeleton(
+        "Kinect v2",
+        25,
+        {"head": 3, "pelvis": 0, "left_shoulder": 4, "right_shoulder": 8, "left_hip": 12, "right_hip": 16},
+        sure=2.0,
+    ),
+}
+"""By name. Of several with as many keypoints, the first is the one that is meant without a name."""
 
 EAR_DISTANCE = 0.15  # metres between the ears of an adult
 NOSE_DISTANCE = 0.12  # metres from the midpoint of the ears to the tip of the nose
@@ -44,31 +114,31 @@ _LEFT_EYE, _RIGHT_EYE = 4, 15
 
 
 def head_poses(
-    keypoints: np.ndarray, *, ears: tuple[int, int] = (LEFT_EAR, RIGHT_EAR), nose: int = NOSE, pitch: float = 0.0
+    left: np.ndarray, right: np.ndarray, front: np.ndarray, *, pitch: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of the heads: from the midpoint of the ears through the nose.
+    """Rays of the heads: from midway between their sides, which are the ears, through their front, the nose.
 
-    ``keypoints``: (N, 22, 3). ``ears``, ``nose``: which of them. ``pitch``: degrees by which a ray is turned up about
-    the line through the ears, since a nose lies below the ears and a level head then seems to look down. Returns
-    ``origin`` (N, 3) in the unit given and ``direction`` (N, 3), unit; where an ear or the nose is NaN or the nose lies
-    on the midpoint, the direction is NaN. NeRG, Section 5.1.
+    ``left``, ``right``, ``front``: (N, 3). ``pitch``: degrees by which a ray is turned up about the line through the
+    sides, since a nose lies below the ears and a level head then seems to look down. Returns ``origin`` (N, 3) in the
+    unit given and ``direction`` (N, 3), unit; where a side or the front is NaN or the front lies midway between the
+    sides, the direction is NaN. NeRG, Section 5.1.
     """
-    keypoints = np.asarray(keypoints, dtype=np.float64)
-    if keypoints.ndim != 3 or keypoints.shape[1:] != (KEYPOINTS, 3):
-        raise ValueError(f"keypoints have shape {keypoints.shape}, expected (N, {KEYPOINTS}, 3)")
-    if len({*ears, nose}) != 3 or not all(0 <= k < KEYPOINTS for k in (*ears, nose)):
-        raise NergError(f"ears {ears} and nose {nose} must be three different keypoints of 0 to {KEYPOINTS - 1}")
-    left, right = (keypoints[:, k] for k in ears)
+    left, right, front = (np.asarray(v, dtype=np.float64) for v in (left, right, front))
     origin = 0.5 * (left + right)
-    offset = keypoints[:, nose] - origin
-    direction = _unit(offset)
+    direction = _unit(front - origin)
     if pitch:
-        # Only the part across the ears turns; the ears' line need not be square to the nose.
+        # Only the part across the sides turns; their line need not be square to the front.
         side = _unit(left - right)
         along = np.sum(direction * side, axis=1, keepdims=True) * side
         angle = np.radians(pitch)
         direction = along + np.cos(angle) * (direction - along) + np.sin(angle) * np.cross(direction, side)
     return origin, direction
+
+
+def trunk_directions(left: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Where trunks face, (N, 3) unit: square to the line of the shoulders ``left``, ``right`` (N, 3) and to ``up``
+    (N, 3), along the spine; NaN where that is nowhere."""
+    return _unit(np.cross(left - right, up))
 
 
 def _unit(v: np.ndarray) -> np.ndarray:

@@ -1,0 +1,143 @@
+"""Heads by the markers of a motion capture system: C3D files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import plain
+
+from .builder import RaysBuilder
+from .frames import UNITS, UPS, Frame
+from .options import option
+from .parsing.bodies import head_poses
+from .parsing.c3d_file import MarkerHeader, iterate_markers, read_header
+from .protocol import DESCRIPTION
+from .skeleton import FACE, MISSING, PITCH, PlaceChecks, Places, parse_keypoints
+from .table import person_from_filename
+
+# Of Plug-in Gait (Vicon) and of Qualisys' animation marker set.
+_HEADS: tuple[Places, ...] = (FACE, ("LFHD+LBHD", "RFHD+RBHD", "LFHD+RFHD"), ("HeadL", "HeadR", "HeadFront"))
+_NAMED = 12  # markers, in messages
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerOptions:
+    """Which markers are on a head, and what the file does not say of the laboratory."""
+
+    keypoints: Places | None = option(
+        None,
+        "Markers at the left and the right of the head and at its front, or means of some: LFHD+LBHD.",
+        shown=" or ".join(",".join(map(str, head)) for head in _HEADS),
+        parse=parse_keypoints,
+        recorded=False,
+    )
+    pitch: float = option(0.0, PITCH)
+    units: str | None = option(None, "Unit of length: m, cm or mm.", shown="the file's", recorded=False)
+    up: str | None = option(None, "Up axis: x, y, z, -x, -y or -z.", shown="the file's, or z", recorded=False)
+
+
+class C3d:
+    """One ray a frame and person: from midway between the sides of a head through its front.
+
+    Markers are found by their labels; of ``Anna:LFHD`` the person is Anna, otherwise the person is the file. Frames in
+    which one of the head's markers was not seen are dropped. Seconds count from the first frame.
+    """
+
+    name = "c3d"
+    files = "`*.c3d` of motion capture with markers on the head (`pip install 'nerg-mi[mocap]'`)"
+    world = "the laboratory's, right-handed, in the file's unit, whose `POINT:Y_SCREEN` or `--up` points up"
+    checked_on = DESCRIPTION
+    Options = MarkerOptions
+
+    def frame(self, files: Sequence[Path], options: MarkerOptions) -> Frame:
+        ups = {options.up} if options.up else {_up(read_header(path)) or "z" for path in files}
+        if len(ups) > 1:
+            raise NergError(f"the files differ in which axis points up ({', '.join(sorted(ups))}); import them apart")
+        return Frame(up=next(iter(ups), "z"))
+
+    def read(self, files: Sequence[Path], options: MarkerOptions, builder: RaysBuilder) -> None:
+        for path in files:
+            builder.source(path)
+            header = read_header(path)
+            unit = _unit(path, header, options)
+            if options.up is None and _up(header) is None:
+                builder.complain(f'"{plain(path.name, 60)}" does not say which axis points up; z was taken (--up)')
+            if not header.rate > 0:
+                raise NergError(f'"{path}" does not say how many frames a second it has; export it again')
+            heads = _heads(path, header, options)
+            places = next(iter(heads.values()))[0]
+            builder.note(keypoints=list(places))
+            checks = PlaceChecks(path.name, 1.0, builder)
+            wanted = sorted({k for _, groups in heads.values() for group in groups for k in group})
+            count = 0
+            for frames, points in iterate_markers(path, wanted):
+                count += len(frames)
+                for person, (_, groups) in heads.items():
+                    at = [np.searchsorted(wanted, group) for group in groups]
+                    left, right, front = (unit * points[:, group].mean(axis=1) for group in at)
+                    origin, direction = head_poses(left, right, front, pitch=options.pitch)
+                    checks.add_sides(left, right)
+                    missing = np.asarray(np.isnan(points[:, np.concatenate(at)]).any(axis=(1, 2)))
+                    builder.add(
+                        frames / header.rate, person, origin, direction, rows=frames + 1, drop={MISSING: missing}
+                    )
+            if not count:
+                raise NergError(f'"{path}" holds none of the {header.frames:,} frames of its header; export it again')
+            if count < header.frames:
+                builder.complain(
+                    f'"{plain(path.name, 60)}" ends after {count:,} of the {header.frames:,} frames of its header: was '
+                    "it copied whole?"
+                )
+            checks.finish()
+
+
+READERS = (C3d(),)
+
+
+def _up(header: MarkerHeader) -> str | None:
+    """The axis that points up, where the file says so."""
+    axis = header.up.lower().removeprefix("+")
+    return axis if axis in UPS else None
+
+
+def _unit(path: Path, header: MarkerHeader, options: MarkerOptions) -> float:
+    """Metres of the file's unit of length."""
+    name = options.units or header.unit.lower()
+    if name not in UNITS:
+        said = f'is in "{plain(header.unit, 20)}"' if header.unit else "names no unit of length"
+        raise NergError(f'"{path}" {said}; say whether it is in m, cm or mm (--units)')
+    return UNITS[name]
+
+
+def _heads(path: Path, header: MarkerHeader, options: MarkerOptions) -> dict[str, tuple[Places, list[list[int]]]]:
+    """Of each person with markers on the head: these, and their numbers."""
+    bodies: dict[str, dict[str, int]] = {}
+    for k, label in enumerate(header.labels):
+        person, _, marker = label.rpartition(":")
+        bodies.setdefault(person, {}).setdefault(_plainly(marker), k)
+    heads = {}
+    for person, markers in bodies.items():
+        for places in _HEADS if options.keypoints is None else (options.keypoints,):
+            groups = [[markers.get(_plainly(word)) for word in str(place).split("+")] for place in places]
+            whole = [[k for k in group if k is not None] for group in groups]
+            if whole == groups:
+                heads[person or person_from_filename(path)] = places, whole
+                break
+    if not heads:
+        there = [plain(label, 40) for label in header.labels]
+        more = "" if len(there) <= _NAMED else f" and {len(there) - _NAMED} more"
+        raise NergError(
+            f'no markers of a head are known in "{path}", whose markers are {", ".join(there[:_NAMED])}{more}; name '
+            "those at its left, its right and its front, as in --keypoints LTEMP,RTEMP,NOSE"
+        )
+    return heads
+
+
+def _plainly(marker: str) -> str:
+    """The label of a marker in the spelling in which labels are compared."""
+    return marker.strip().replace("_", "").replace(" ", "").lower()
