@@ -14,14 +14,21 @@ from nerg_mi.files.bounded import plain
 from .builder import RaysBuilder
 from .frames import UNITS, UPS, Frame
 from .options import option
+from .parsing import poses
 from .parsing.bodies import head_poses
 from .parsing.c3d_file import MarkerHeader, iterate_markers, read_header
 from .protocol import DESCRIPTION
-from .skeleton import FACE, MISSING, PITCH, PlaceChecks, Places, parse_keypoints
+from .skeleton import FACE, MISSING, PITCH, PlaceChecks, Places, median_of, parse_keypoints
 from .table import person_from_filename
 
-# Of Plug-in Gait (Vicon) and of Qualisys' animation marker set.
-_HEADS: tuple[Places, ...] = (FACE, ("LFHD+LBHD", "RFHD+RBHD", "LFHD+RFHD"), ("HeadL", "HeadR", "HeadFront"))
+# Of Plug-in Gait (Vicon), and of Qualisys' markers of gait and of animation. Underscores are not compared.
+_HEADS: tuple[Places, ...] = (
+    FACE,
+    ("LFHD+LBHD", "RFHD+RBHD", "LFHD+RFHD"),
+    ("L_HDF+L_HDB", "R_HDF+R_HDB", "L_HDF+R_HDF"),
+    ("HeadL", "HeadR", "HeadFront"),
+)
+_LEVEL = 15.0  # degrees: heads look farther up or down, at the median, only where their markers are not level
 _NAMED = 12  # markers, in messages
 
 
@@ -44,7 +51,7 @@ class MarkerOptions:
 class C3d:
     """One ray a frame and person: from midway between the sides of a head through its front.
 
-    Markers are found by their labels; of ``Anna:LFHD`` the person is Anna, otherwise the person is the file. Frames in
+    Markers are chosen by their labels; of ``Anna:LFHD`` the person is Anna, otherwise the person is the file. Frames in
     which one of the head's markers was not seen are dropped. Seconds count from the first frame.
     """
 
@@ -64,17 +71,18 @@ class C3d:
         for path in files:
             builder.source(path)
             header = read_header(path)
+            heads = _heads(path, header, options)
             unit = _unit(path, header, options)
+            up = poses.axis(self.frame([path], options).up, "up")
             if options.up is None and _up(header) is None:
                 builder.complain(f'"{plain(path.name, 60)}" does not say which axis points up; z was taken (--up)')
             if not header.rate > 0:
                 raise NergError(f'"{path}" does not say how many frames a second it has; export it again')
-            heads = _heads(path, header, options)
             places = next(iter(heads.values()))[0]
             builder.note(keypoints=list(places))
             checks = PlaceChecks(path.name, 1.0, builder)
             wanted = sorted({k for _, groups in heads.values() for group in groups for k in group})
-            count = 0
+            count, elevations = 0, [np.empty(0)]
             for frames, points in iterate_markers(path, wanted):
                 count += len(frames)
                 for person, (_, groups) in heads.items():
@@ -82,26 +90,35 @@ class C3d:
                     left, right, front = (unit * points[:, group].mean(axis=1) for group in at)
                     origin, direction = head_poses(left, right, front, pitch=options.pitch)
                     checks.add_sides(left, right)
+                    elevations.append(np.degrees(np.arcsin(np.clip(direction @ up, -1, 1))))
                     missing = np.asarray(np.isnan(points[:, np.concatenate(at)]).any(axis=(1, 2)))
                     builder.add(
                         frames / header.rate, person, origin, direction, rows=frames + 1, drop={MISSING: missing}
                     )
             if not count:
                 raise NergError(f'"{path}" holds none of the {header.frames:,} frames of its header; export it again')
-            if count < header.frames:
+            # Whether frames count from 0 or 1 is not said.
+            if count < header.frames - 1:
                 builder.complain(
                     f'"{plain(path.name, 60)}" ends after {count:,} of the {header.frames:,} frames of its header: was '
                     "it copied whole?"
                 )
             checks.finish()
+            middle = median_of(elevations)
+            if abs(middle) > _LEVEL:
+                builder.complain(
+                    f'the heads in "{plain(path.name, 60)}" point {middle:.0f} degrees up (median): are the markers at '
+                    "the front of the head as high as those at its sides? "
+                    f"--pitch {options.pitch - middle:.0f} levels them"
+                )
 
 
 READERS = (C3d(),)
 
 
 def _up(header: MarkerHeader) -> str | None:
-    """The axis that points up, where the file says so."""
-    axis = header.up.lower().removeprefix("+")
+    """The axis that points up, where the file says so. Its sign is not that of up: Qualisys writes -Z of z up."""
+    axis = header.up.lower()[-1:]
     return axis if axis in UPS else None
 
 
@@ -109,13 +126,15 @@ def _unit(path: Path, header: MarkerHeader, options: MarkerOptions) -> float:
     """Metres of the file's unit of length."""
     name = options.units or header.unit.lower()
     if name not in UNITS:
-        said = f'is in "{plain(header.unit, 20)}"' if header.unit else "names no unit of length"
-        raise NergError(f'"{path}" {said}; say whether it is in m, cm or mm (--units)')
+        problem = f'is in "{plain(header.unit, 20)}"' if header.unit else "names no unit of length"
+        raise NergError(f'"{path}" {problem}; say whether it is in m, cm or mm (--units)')
     return UNITS[name]
 
 
 def _heads(path: Path, header: MarkerHeader, options: MarkerOptions) -> dict[str, tuple[Places, list[list[int]]]]:
     """Of each person with markers on the head: these, and their numbers."""
+    if not header.labels:
+        raise NergError(f'"{path}" holds no markers, but {len(header.analog)} analog channels; export the markers too')
     bodies: dict[str, dict[str, int]] = {}
     for k, label in enumerate(header.labels):
         person, _, marker = label.rpartition(":")
@@ -132,8 +151,8 @@ def _heads(path: Path, header: MarkerHeader, options: MarkerOptions) -> dict[str
         there = [plain(label, 40) for label in header.labels]
         more = "" if len(there) <= _NAMED else f" and {len(there) - _NAMED} more"
         raise NergError(
-            f'no markers of a head are known in "{path}", whose markers are {", ".join(there[:_NAMED])}{more}; name '
-            "those at its left, its right and its front, as in --keypoints LTEMP,RTEMP,NOSE"
+            f'no markers of a head are recognised in "{path}", whose markers are {", ".join(there[:_NAMED])}{more}; '
+            "name those at its left, its right and its front, as in --keypoints LTEMP,RTEMP,NOSE"
         )
     return heads
 

@@ -93,6 +93,8 @@ class SkeletonFile:
             skeleton = SKELETONS[name]
             places: tuple[int | str, ...] = options.keypoints or (FACE if "nose" in skeleton.joints else _TRUNK)
             groups = [skeleton.numbers(place) for place in places]
+            if len({tuple(sorted(group)) for group in groups}) < len(groups):
+                raise NergError(f"the places {', '.join(map(str, places))} are not all different (--keypoints)")
             head = [k for group in groups for k in group]
             hips = [skeleton.joints[hip] for hip in ("left_hip", "right_hip") if hip in skeleton.joints]
             builder.note(skeleton=name, keypoints=list(places))
@@ -149,7 +151,7 @@ class PlaceChecks:
 
     def finish(self) -> None:
         """Say on the card what no heads or bodies in a place can be."""
-        width, distance = (_median(values) for values in (self._widths, self._hips))
+        width, distance = (median_of(values) for values in (self._widths, self._hips))
         if not np.isnan(width) and not _EARS[0] < width < _EARS[1]:
             self._builder.complain(
                 f'the sides of the heads in "{plain(self._file, 60)}" are {width:.3g} m apart (median), which no ears '
@@ -162,7 +164,7 @@ class PlaceChecks:
             )
 
 
-def _median(values: list[np.ndarray]) -> float:
+def median_of(values: list[np.ndarray]) -> float:
     """The median of those that are not NaN; NaN where there are none."""
     finite = np.concatenate([v[np.isfinite(v)] for v in values] or [np.empty(0)])
     return float(np.median(finite)) if finite.size else np.nan

@@ -20,6 +20,10 @@ HEAD = {
     "RFHD": (0.08, -0.06, 0.05),
     "LBHD": (-0.1, 0.06, 0.05),
     "RBHD": (-0.1, -0.06, 0.05),
+    "L_HDF": (0.08, 0.06, 0.05),
+    "R_HDF": (0.08, -0.06, 0.05),
+    "L_HDB": (-0.1, 0.06, 0.05),
+    "R_HDB": (-0.1, -0.06, 0.05),
     "C7": (-0.05, 0, -0.3),
 }
 
@@ -39,6 +43,7 @@ def positions(names, turn, place):
     [
         (["C7", "LFHD", "RFHD", "LBHD", "RBHD"], None, (-0.01, 0, 0.05)),
         (["Nose", "Left_Ear", "Right_Ear", "LFHD"], None, (0, 0, 0)),
+        (["L_HDF", "R_HDF", "L_HDB", "R_HDB"], None, (-0.01, 0, 0.05)),
         (["LFHD", "RFHD", "C7"], ("LFHD", "RFHD", "LFHD+RFHD+C7"), (0.08, 0, 0.05)),
     ],
 )
@@ -57,7 +62,8 @@ def test_heads_in_all_directions(tmp_path, names, keypoints, centre, unit, size)
     assert "complaints" not in rays.metadata
 
 
-def test_people_axes_and_markers_that_were_not_seen(tmp_path):
+@pytest.mark.parametrize("up", ["+Y", "-Y"])
+def test_people_axes_and_markers_that_were_not_seen(tmp_path, up):
     """Two people in one file whose y points up; a marker that was lost, and one at exactly zero."""
     turn, place = turned()
     names = ["LFHD", "RFHD", "LBHD", "RBHD"]
@@ -67,7 +73,7 @@ def test_people_axes_and_markers_that_were_not_seen(tmp_path):
     both = np.concatenate([ann, bo], axis=1)
     upright = np.stack([both[..., 0], both[..., 2], -both[..., 1]], axis=-1)
     labels = [f"{person}:{name}" for person in ("Ann", "Bo") for name in names]
-    write_c3d(tmp_path / "trial.c3d", labels, 1000 * upright, up="+Y", rate=50)
+    write_c3d(tmp_path / "trial.c3d", labels, 1000 * upright, up=up, rate=50)
     rays = read("c3d", tmp_path / "trial.c3d")
     assert rays.persons == ("Ann", "Bo") and rays.metadata["source_frame"]["up"] == "y"
     assert dropped(rays) == {"a keypoint of the head is missing": [[4, 4], [6, 6]]}
@@ -88,13 +94,30 @@ def test_what_a_file_does_not_say(tmp_path):
     assert "which axis points up; z was taken" in said[0] and "ends after 12 of the 40 frames" in said[1]
     wide = read("c3d", path, units="mm", up="z").metadata["complaints"]
     assert "0.00012 m apart" in wide[1]
-    write_c3d(path, ["A", "B"], there[:, :2], units="in")
+    write_c3d(path, ["LFHD", "RFHD", "LBHD", "RBHD"], there, units="in")
     with pytest.raises(NergError, match='is in "in"'):
         read("c3d", path)
+    write_c3d(path, ["A", "B"], there[:, :2])
     with pytest.raises(NergError, match="whose markers are A, B; name those"):
         read("c3d", path, units="m")
-    with pytest.raises(NergError, match="no markers of a head"):
+    write_c3d(tmp_path / "forces.c3d", ["A"], there[:, :0])
+    with pytest.raises(NergError, match="holds no markers"):
+        read("c3d", tmp_path / "forces.c3d")
+    with pytest.raises(NergError, match="no markers of a head are recognised"):
         read("c3d", path, units="m", keypoints=("A", "B", "C"))
+
+
+@pytest.mark.parametrize("tilt", [10, 40, -25])
+def test_headbands_that_are_not_level(tmp_path, tilt):
+    """A walker who looks ahead, whose headband points up; levelled by the pitch that is proposed."""
+    names, path = ["LFHD", "RFHD", "LBHD", "RBHD"], tmp_path / "ann.c3d"
+    turn = Rotation.from_euler("z", np.linspace(0, 300, 30)[:, None], degrees=True)
+    band = turn * Rotation.from_euler("y", -tilt, degrees=True)
+    write_c3d(path, names, 1000 * positions(names, band, np.full((30, 3), 1.6)), units="mm  mm  mm", frames=31)
+    said = read("c3d", path).metadata.get("complaints", [])
+    assert said == [] if tilt == 10 else f"point {tilt} degrees up (median)" in said[0]
+    assert tilt == 10 or f"--pitch {-tilt} levels" in said[0]
+    assert np.abs(read("c3d", path, pitch=-tilt).direction - turn.apply([1, 0, 0])).max() < 1e-5
 
 
 @pytest.mark.parametrize("length", [1, 100, 600, 700])

@@ -125,6 +125,8 @@ def test_skeletons_that_are_none(tmp_path):
     for place in (17, "chin", "left_ear+", "-1"):
         with pytest.raises(NergError, match=r'no keypoint ".*" in COCO-17.*0 to 16, or as nose, '):
             read("skeleton", path, keypoints=(3, 4, place))
+    with pytest.raises(NergError, match="3, left_ear, 0 are not all different"):
+        read("skeleton", path, keypoints=(3, "left_ear", 0))
     path.write_text(path.read_text() + f"ann|3|[{', '.join(['1'] * 75)}]\n")
     with pytest.raises(NergError, match=r"line 3: 75 numbers, expected 51 \(17 keypoints of x, y, z\)"):
         read("skeleton", path)

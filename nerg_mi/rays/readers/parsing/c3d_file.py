@@ -48,7 +48,8 @@ def read_header(path: Path) -> MarkerHeader:
             labels[: file.point_used],
             float(file.point_rate),
             file.frame_count,
-            unit.string_value.strip() if unit is not None else "",
+            # Some write it once a marker.
+            " ".join(dict.fromkeys(unit.string_value.split())) if unit is not None else "",
             axes[1].strip().upper() if axes is not None else "",
             analog,
         )
