@@ -36,7 +36,7 @@ def card_lines(rays: Rays, summary: RaysSummary) -> list[tuple[str, str]]:
     unused = rays.metadata.get("unused_columns", [])
     if unused:
         more = f" and {len(unused) - _PERSONS} more" if len(unused) > _PERSONS else ""
-        lines.append(("not used", f"columns {', '.join(unused[:_PERSONS])}{more}"))
+        lines.append(("not used", f"{', '.join(unused[:_PERSONS])}{more}"))
     for step in rays.metadata.get("steps", []):
         name = f"{step['step']} {step.get('side', '')}".strip()
         lines.append(("then", f"{name}: {step['kept']:,} of {step['of']:,} rays kept"))

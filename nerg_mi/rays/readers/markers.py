@@ -82,6 +82,8 @@ class C3d:
             builder.note(keypoints=list(places))
             checks = PlaceChecks(path.name, 1.0, builder)
             wanted = sorted({k for _, groups in heads.values() for group in groups for k in group})
+            others = [label for k, label in enumerate(header.labels) if k not in wanted]
+            builder.note_unused([*others, *(f"analog channel {label}" for label in header.analog)])
             count, elevations = 0, [np.empty(0)]
             for frames, points in iterate_markers(path, wanted):
                 count += len(frames)

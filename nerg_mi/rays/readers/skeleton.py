@@ -98,6 +98,8 @@ class SkeletonFile:
             head = [k for group in groups for k in group]
             hips = [skeleton.joints[hip] for hip in ("left_hip", "right_hip") if hip in skeleton.joints]
             builder.note(skeleton=name, keypoints=list(places))
+            names = {k: joint for joint, k in skeleton.joints.items()}
+            builder.note_unused(names.get(k, f"keypoint {k}") for k in range(skeleton.keypoints) if k not in head)
             if places == _TRUNK:
                 builder.complain(
                     f"{skeleton.title} has no keypoints of the face: rays point where the trunk faces, square to the "

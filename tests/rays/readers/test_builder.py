@@ -247,4 +247,4 @@ def test_unused_columns_are_named_once(tmp_path):
     (sentence,) = rays.metadata["complaints"]
     assert sentence.startswith("'left_valid' may say by name which rows are valid")
     lines = dict(card_lines(rays, summarise(rays)))
-    assert lines["not used"] == "columns note, left_valid, c0, c1, c2, c3, c4, c5 and 14 more"
+    assert lines["not used"] == "note, left_valid, c0, c1, c2, c3, c4, c5 and 14 more"

@@ -39,16 +39,16 @@ def positions(names, turn, place):
 
 
 @pytest.mark.parametrize(
-    "names, keypoints, centre",
+    "names, keypoints, centre, unused",
     [
-        (["C7", "LFHD", "RFHD", "LBHD", "RBHD"], None, (-0.01, 0, 0.05)),
-        (["Nose", "Left_Ear", "Right_Ear", "LFHD"], None, (0, 0, 0)),
-        (["L_HDF", "R_HDF", "L_HDB", "R_HDB"], None, (-0.01, 0, 0.05)),
-        (["LFHD", "RFHD", "C7"], ("LFHD", "RFHD", "LFHD+RFHD+C7"), (0.08, 0, 0.05)),
+        (["C7", "LFHD", "RFHD", "LBHD", "RBHD"], None, (-0.01, 0, 0.05), ["C7"]),
+        (["Nose", "Left_Ear", "Right_Ear", "LFHD"], None, (0, 0, 0), ["LFHD"]),
+        (["L_HDF", "R_HDF", "L_HDB", "R_HDB"], None, (-0.01, 0, 0.05), []),
+        (["LFHD", "RFHD", "C7"], ("LFHD", "RFHD", "LFHD+RFHD+C7"), (0.08, 0, 0.05), []),
     ],
 )
 @pytest.mark.parametrize("unit, size", [("mm", 1e-3), ("m", 1.0)])
-def test_heads_in_all_directions(tmp_path, names, keypoints, centre, unit, size):
+def test_heads_in_all_directions(tmp_path, names, keypoints, centre, unused, unit, size):
     turn, place = turned()
     write_c3d(tmp_path / "ann.c3d", names, positions(names, turn, place) / size, units=unit)
     rays = read("c3d", tmp_path / "ann.c3d", **({"keypoints": keypoints} if keypoints else {}))
@@ -60,6 +60,7 @@ def test_heads_in_all_directions(tmp_path, names, keypoints, centre, unit, size)
     assert np.abs(rays.origin - turn.apply(centre) - place).max() < 1e-5
     assert np.allclose(rays.t, np.arange(12) / 100) and rays.persons == ("ann",)
     assert "complaints" not in rays.metadata
+    assert rays.metadata.get("unused_columns", []) == unused
 
 
 @pytest.mark.parametrize("up", ["+Y", "-Y"])

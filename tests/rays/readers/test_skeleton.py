@@ -147,6 +147,7 @@ def test_rays_of_the_papers_tracking(tmp_path):
         {"reason": "a keypoint of the head is missing", "file": "day.csv.gz", "count": 1, "rows": [[8, 8]]}
     ]
     assert rays.metadata["preset"] == "skeleton" and rays.metadata["skeleton"] == "nerg22"
+    assert rays.metadata["unused_columns"] == [f"keypoint {k}" for k in range(22) if k not in (2, 11, 13)]
     assert "complaints" not in rays.metadata
 
 

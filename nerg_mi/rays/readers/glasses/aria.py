@@ -155,7 +155,7 @@ def _add(recording: _Recording, world: str, builder: RaysBuilder) -> None:
     tracks = recording.trajectory.tracks
     builder.source(recording.gaze, f"{recording.person}/{recording.gaze.name}")
     R, t = cpf_in_device(recording.device)
-    for v, _, lines in iterate_table(recording.gaze, recording.schema.columns, on_bad=builder.on_bad):
+    for v, _, lines in builder.read_table(recording.gaze, recording.schema.columns):
         time = v[:, 0] * 1e-6
         eye, direction, distance = gaze_in_cpf(recording.schema, v)
         if world in tracks:

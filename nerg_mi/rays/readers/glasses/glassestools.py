@@ -13,7 +13,6 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import read_bytes
 from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.parsing.tables import iterate_table
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 
 from .scene_camera import SceneCamera
@@ -53,7 +52,7 @@ class GlassesTools(SceneReader[_Glasses]):
 
     def blocks(self, gaze: Path, recording: _Glasses, builder: RaysBuilder) -> Iterator[GazeBlock]:
         columns = ["timestamp", "gaze_pos_vid_x", "gaze_pos_vid_y"]
-        for v, _, lines in iterate_table(gaze, columns, on_bad=builder.on_bad):
+        for v, _, lines in builder.read_table(gaze, columns):
             none = np.asarray(~np.isfinite(v[:, 1:]).all(axis=1))
             direction = recording.camera.directions(v[:, 1:])
             yield GazeBlock(v[:, 0] * _MILLISECOND, direction, lines, {"there is no gaze": none})
@@ -90,7 +89,7 @@ def _frame_times(folder: Path, builder: RaysBuilder) -> np.ndarray | None:
     if not path.is_file():
         return None
     builder.source(path)
-    blocks = iterate_table(path, ["frame_idx", "timestamp"], on_bad=builder.on_bad)
+    blocks = builder.read_table(path, ["frame_idx", "timestamp"])
     rows = np.concatenate([block.numbers for block in blocks] or [np.empty((0, 2))])
     builder.count_lines(len(rows))
     if not np.array_equal(rows[:, 0], np.arange(len(rows))):

@@ -14,7 +14,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain, read_json
 from nerg_mi.rays.readers.builder import RaysBuilder
-from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
+from nerg_mi.rays.readers.parsing.tables import table_columns
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 
 from .scene_camera import SceneCamera, directions_from_angles
@@ -104,7 +104,7 @@ class Neon(SceneReader[_Neon]):
             )
         numbers = [_TIME, *_PIXELS, *(_ANGLES if angles else ())]
         texts = [name for name in ("worn", "blink id") if name in there]
-        for v, words, lines in iterate_table(gaze, numbers, texts, on_bad=builder.on_bad):
+        for v, words, lines in builder.read_table(gaze, numbers, texts):
             found = [directions_from_angles(v[:, 3:5])] if angles else []
             found += [] if camera is None else [camera.directions(v[:, 1:3])]
             t = (v[:, 0] - recording.start) * 1e-9
@@ -158,7 +158,7 @@ def _frame_times(folder: Path, builder: RaysBuilder) -> np.ndarray | None:
     if not path.is_file():
         return None
     builder.source(path)
-    blocks = iterate_table(path, [_TIME], on_bad=builder.on_bad)
+    blocks = builder.read_table(path, [_TIME])
     times = np.concatenate([block.numbers[:, 0] for block in blocks] or [np.empty(0)])
     builder.count_lines(len(times))
     return times

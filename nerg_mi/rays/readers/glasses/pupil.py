@@ -14,7 +14,6 @@ from nerg_mi.rays.readers.frames import Frame
 from nerg_mi.rays.readers.options import option
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing.pose_track import PoseTrack
-from nerg_mi.rays.readers.parsing.tables import iterate_table
 from nerg_mi.rays.readers.protocol import DESCRIPTION
 
 _GAP = 0.1  # seconds: between head poses farther apart than this nothing is interpolated
@@ -64,7 +63,7 @@ class Pupil:
             heads = _read_heads(gaze.with_name("head_pose_tracker_poses.csv"), person, builder)
             builder.source(gaze, f"{person}/{gaze.name}")
             columns = ["gaze_timestamp", "confidence", *_NORMALS, *_CENTRES]
-            for v, _, lines in iterate_table(gaze, columns, on_bad=builder.on_bad):
+            for v, _, lines in builder.read_table(gaze, columns):
                 turn, place, lost = heads.at(v[:, 0], _GAP)
                 # An eye that was not seen has no columns filled: the other one stands alone.
                 direction, eye = (poses.mean_of_two(v[:, a : a + 6].reshape(-1, 2, 3)) for a in (2, 8))
@@ -91,7 +90,7 @@ def _read_heads(path: Path, person: str, builder: RaysBuilder) -> PoseTrack:
     if not path.is_file():
         raise NergError(f"there is no {path}; run the head pose tracker in Pupil Player and export again")
     builder.source(path, f"{person}/{path.name}")
-    blocks = iterate_table(path, _POSES, on_bad=builder.on_bad)
+    blocks = builder.read_table(path, _POSES)
     track = np.concatenate([block.numbers for block in blocks] or [np.empty((0, 7))])
     builder.count_lines(len(track))
     heads = PoseTrack.of_samples(track[:, 0], track[:, 1:4], track[:, 4:])

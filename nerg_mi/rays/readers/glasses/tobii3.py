@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import parse_json, read_json
+from nerg_mi.files.bounded import parse_json, plain, read_json
 from nerg_mi.files.line_blocks import OnBadLine, line_blocks
 from nerg_mi.files.movie_tables import frame_times
 from nerg_mi.rays.readers.builder import RaysBuilder
@@ -21,6 +21,7 @@ from .scene_gaze import GazeBlock, Recording
 from .scene_reader import SceneReader
 
 _RECORDING, _VIDEO = "recording.g3", "scenevideo.mp4"
+_UNUSED = 100  # parts of samples that are not used and named
 _BLOCK = 1 << 14  # lines taken apart at a time
 _JSON = 1 << 20  # bytes of recording.g3, at most
 
@@ -128,26 +129,32 @@ def _calibration(folder: Path, camera: dict[str, Any]) -> _Glasses:
 
 def _samples(path: Path, builder: RaysBuilder) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Blocks of seconds, gaze2d and gaze3d (n, 6), NaN where there is none, and their lines (n,)."""
-    count = 0
+    count, unused = 0, dict[str, None]()
     for raw in line_blocks(path, "gaze of Tobii glasses", _BLOCK):
         rows, lines = [], []
         for line, text in enumerate(raw, count + 1):
-            row = _sample(text, path, line, builder.on_bad) if not text.isspace() else None
+            row = _sample(text, path, line, builder.on_bad, unused) if not text.isspace() else None
             if row is not None:
                 rows.append(row)
                 lines.append(line)
         count += len(raw)
+        builder.note_unused(unused)
         if rows:
             yield np.array(rows, np.float64), np.array(lines)
 
 
-def _sample(text: str, path: Path, line: int, on_bad: OnBadLine | None) -> list[float] | None:
-    """The six numbers of a line; None for one of another type, and for a bad one that ``on_bad`` is told of."""
+def _sample(text: str, path: Path, line: int, on_bad: OnBadLine | None, unused: dict[str, None]) -> list[float] | None:
+    """The six numbers of a line; None for one of another type, and for a bad one that ``on_bad`` is told of. What else
+    there is goes into ``unused`` by its name."""
     try:
         found: Any = parse_json(text, path, f"line {line} of the gaze")
         if found["type"] != "gaze":
+            _name_unused(f"lines of the type {found['type']}", unused)
             return None
         data = found["data"]
+        for key in data:
+            if key not in ("gaze2d", "gaze3d"):
+                _name_unused(key, unused)
         gaze = [float(x) for x in data.get("gaze2d") or (np.nan,) * 2]
         point = [float(x) for x in data.get("gaze3d") or (np.nan,) * 3]
         if len(gaze) != 2 or len(point) != 3:
@@ -161,3 +168,8 @@ def _sample(text: str, path: Path, line: int, on_bad: OnBadLine | None) -> list[
             ) from error
         on_bad(line, why)
         return None
+
+
+def _name_unused(name: str, unused: dict[str, None]) -> None:
+    if len(unused) < _UNUSED:
+        unused[plain(name, 60)] = None

@@ -95,6 +95,7 @@ def test_what_is_dropped(neon):
     }
     assert rays.persons == ("ann",) and np.allclose(rays.t, (ns[[0, 4, 5]] - START) * 1e-9, atol=1e-6)
     assert [s["file"] for s in rays.metadata["sources"]][-1] == "ann/gaze.csv"
+    assert rays.metadata["unused_columns"] == ["section id", "recording id", "fixation id"]
 
 
 def test_frames_far_apart_are_not_bridged(neon):

@@ -99,7 +99,7 @@ def test_samples_without_gaze_and_lines_that_are_none(tobii):
         sample_g3(0.0, [0.5, 0.5], None),
         sample_g3(0.01, None, None),
         json.dumps({"type": "sync", "timestamp": 0.02, "data": {}}),
-        sample_g3(0.03, [1.5, 0.5], None),
+        sample_g3(0.03, [1.5, 0.5], None).replace('"gaze3d"', '"eyeleft": {}, "gaze3d"'),
         "",
         sample_g3(0.05, [0.5, 0.4], [0, 0, 100])[:-3],
     ]
@@ -107,6 +107,7 @@ def test_samples_without_gaze_and_lines_that_are_none(tobii):
     with pytest.raises(NergError, match="line 6: it is no JSON object.*--skip-bad-lines"):
         read("tobii3", folder, **options)
     rays = read("tobii3", folder, **options, skip_bad_lines=True)
+    assert rays.metadata["unused_columns"] == ["lines of the type sync", "eyeleft"]
     assert len(rays) == 1 and dropped(rays) == {
         "there is no gaze": [[2, 2]],
         "gaze lies beyond the scene camera's picture": [[4, 4]],
