@@ -100,10 +100,12 @@ def try_missing_extras(there: Environment, out: Path) -> str:
         "nerg-mi[parquet]": ("nerg", "rays", "show", out / "rays.parquet"),
         "nerg-mi[poses]": ("nerg", "poses", out, "-o", out / "capture"),
         "nerg-mi[video]": ("nerg", "render", scene, "-o", out / "a.mp4", "--frames", out / "frames.csv"),
+        "nerg-mi[mocap]": ("nerg", "rays", "import", out / "a.c3d", "-o", out / "b.npz", "--preset", "c3d"),
         "nerg-mi[cluster]": ("nerg", "worker", "tcp://127.0.0.1:8786"),
         "nerg-mi[torch]": ("python", "-c", "import nerg_mi.interop.torch"),
     }
     (out / "rays.parquet").write_bytes(b"PAR1")
+    (out / "a.c3d").write_bytes(b"")
     for extra, (command, *arguments) in asked.items():
         printed = there.run(command, *arguments, code=1).strip().splitlines()
         if extra not in printed[-1] or (command == "nerg" and len(printed) != 1):
