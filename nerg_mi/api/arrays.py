@@ -18,6 +18,8 @@ def points(values: ArrayLike, name: str) -> Floats:
     """``values`` as (N, 3) float32; one point (3,) is one row. Raises `NergError`, which calls it ``name``."""
     try:
         array = np.asarray(values, np.float64)
+    except OverflowError as error:
+        raise NergError(f"{name} must be finite in single precision, and a number in them is not") from error
     except (TypeError, ValueError) as error:
         raise NergError(f"{name} must be numbers x, y, z, or rows of them, got {values!r}") from error
     array = array[None] if array.shape == (3,) else array

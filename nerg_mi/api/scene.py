@@ -67,7 +67,8 @@ class Scene:
         from nerg_mi.rendering.pictures import load_scene
 
         active_mitsuba()
-        return cls(load_scene(Path(path), {key: str(value) for key, value in values.items()}))
+        # Merged meshes lose their names.
+        return cls(load_scene(Path(path), {key: str(value) for key, value in values.items()}, merge=False))
 
     @property
     def integrator(self) -> Any:

@@ -17,7 +17,7 @@ from nerg_mi.figures.provenance import Provenance
 from nerg_mi.figures.provenance import versions as programs
 from nerg_mi.files.atomic import check_writable, write_text
 from nerg_mi.files.checksum import file_sha256
-from nerg_mi.formats.areas.kinds import Areas, BoxGroup
+from nerg_mi.formats.areas.kinds import Areas
 from nerg_mi.formats.areas.reading import read_areas
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.formats.regions import Region
@@ -30,13 +30,15 @@ from nerg_mi.rendering.channels import Channels, render_channels
 from nerg_mi.rendering.pictures import load_scene
 from nerg_mi.rendering.projection import pixel_of
 from nerg_mi.rendering.scene_parts import default_name
-from nerg_mi.report.glances import Eyes, Onlooker, eyes_of, points_of_rays
+from nerg_mi.report.glances import Eyes, Onlooker, eyes_of, land_rays
 from nerg_mi.report.names import Labels, rays_without_names, results_without_names
 from nerg_mi.report.objects import ObjectAttention, attention_on
 from nerg_mi.report.page import page
 from nerg_mi.report.proxy import place_proxy, spread_out
 from nerg_mi.report.run import Picture, Run
 from nerg_mi.report.stage import Camera, Stage, pack
+from nerg_mi.statistics.landing import MARGIN, Box
+from nerg_mi.statistics.shares import SumRule, gaze_shares
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.place import Place
@@ -58,8 +60,8 @@ from .versions import versions
 VIEWS = ("camera", "own", "sphere")
 """The pictures, which are those of the written scene's sensors."""
 
-MARGIN = 0.03
-"""Metres by which boxes of objects are taken to be larger: surfaces are known no better."""
+LOOKED = SumRule(tolerance=0.02, first=1 << 12)
+"""How finely shares of objects are summed at each eye."""
 
 OBSERVERS = 5
 """Observers whose gaze the 3D scene has."""
@@ -142,7 +144,7 @@ class _Work:
             place = self._place(scene)
             onlooker = Onlooker(self.field, place, self._kind())
             eyes = self._eyes(place, scene)
-            objects = self._objects(areas.solids, onlooker, place, eyes)
+            objects = self._objects(areas, onlooker, place, eyes)
             top = gaze_top(views.seen)
             stage, sizes = self._stage(scene, onlooker, place, eyes, areas.boxes)
         known = given.scene.kind != "none"
@@ -255,17 +257,17 @@ class _Work:
         at = scene.camera if scene.observer is None else scene.observer
         return Eyes(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
-    def _objects(
-        self, boxes: Sequence[Region | BoxGroup], onlooker: Onlooker, place: GazePlace, eyes: Eyes
-    ) -> tuple[ObjectAttention, ...]:
-        if not boxes or self.given.scene.kind == "none":
+    def _objects(self, areas: Areas, onlooker: Onlooker, place: GazePlace, eyes: Eyes) -> tuple[ObjectAttention, ...]:
+        if not areas.solids or self.given.scene.kind == "none":
             return ()
-        told = lambda done, total: self._step(0.55 + 0.2 * done / total, f"objects: place {done} of {total}")
-        glances = onlooker.glances(eyes, on_eye=told)
+        things, members = [Box(box) for box in areas.boxes], list(areas.solids.values())
+        count, margin = len(eyes.positions), MARGIN * self.align.scale
+        told = lambda done: self._step(0.55 + 0.2 * done / count, f"objects: place {done} of {count}")
+        shares = gaze_shares(onlooker.look_from, eyes.positions, things, members, margin, LOOKED, told)
         recorded = None
         if self.rays is not None:
-            recorded = points_of_rays(self.rays, place, onlooker, RAYS)
-        return attention_on(boxes, glances, MARGIN * self.align.scale, recorded)
+            recorded = land_rays(self.rays, place, onlooker, RAYS, things, members, margin)
+        return attention_on(list(areas.solids), shares, eyes.person, recorded)
 
     def _stage(
         self, scene: SceneResult, onlooker: Onlooker, place: GazePlace, eyes: Eyes, boxes: Sequence[Region]

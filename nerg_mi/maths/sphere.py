@@ -16,8 +16,9 @@ from .types import UInt32, Vector3f
 _GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 
-def fibonacci_directions(count: int) -> np.ndarray:
-    """``count`` directions of equal area on a golden-angle spiral, (count, 3).
+def fibonacci_directions(count: int, which: np.ndarray | None = None) -> np.ndarray:
+    """``count`` directions of equal area on a golden-angle spiral, (count, 3); ``which`` (N,): only those of these
+    numbers, (N, 3).
 
     Each stands for 4π/count sr. The spiral runs from +z to -z: direction i has
     z = 1 - (2i + 1)/count. Neighbours are about sqrt(4π/count) rad apart, 4.5
@@ -26,9 +27,22 @@ def fibonacci_directions(count: int) -> np.ndarray:
     """
     if count < 1:
         raise ValueError(f"count is {count}; a set of directions needs at least one")
-    i = np.arange(count)
+    i = np.arange(count) if which is None else np.asarray(which)
     z = 1.0 - (2.0 * i + 1.0) / count
     return _from_height(z, i * _GOLDEN_ANGLE)
+
+
+def numbers_in_cone(count: int, axis: np.ndarray, angle: float) -> np.ndarray:
+    """Numbers (N,), rising, of those of ``count`` `fibonacci_directions` that lie within ``angle`` (radian) of the unit
+    ``axis`` (3,). Only the turns of the spiral at the cone's heights are made."""
+    if angle >= np.pi:
+        return np.arange(count)
+    polar = np.arccos(np.clip(axis[2], -1.0, 1.0))
+    top, bottom = np.cos(max(polar - angle, 0.0)), np.cos(min(polar + angle, np.pi))
+    first = max(int(np.floor((1.0 - top) * count / 2 - 0.5)), 0)
+    last = min(int(np.ceil((1.0 - bottom) * count / 2 - 0.5)), count - 1)
+    numbers = np.arange(first, last + 1)
+    return numbers[fibonacci_directions(count, numbers) @ axis >= np.cos(angle)]
 
 
 def fibonacci_vectors(count: int, which: UInt32 | None = None) -> Vector3f:

@@ -4,24 +4,23 @@ directions. Everything is in the coordinates of the place."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from nerg_mi.field.gaze.protocol import AnyGazeField
 from nerg_mi.maths.arrays import vector_of
-from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
+from nerg_mi.statistics.landing import Landed, Thing, land, regroup
+from nerg_mi.statistics.shares import Look
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
 from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer.looking import look_from
 from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings, trace_depth
-
-DIRECTIONS = 4096
-"""Directions of equal area around an eye."""
 
 _GOLDEN = (math.sqrt(5) - 1) / 2
 # Directions of the integral of a normalised field: shares are divided by their own sum.
@@ -34,17 +33,6 @@ class Eyes:
 
     positions: np.ndarray
     person: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Glances:
-    """From each of the ``eyes`` in D directions of equal area: ``points`` (P, D, 3) of surfaces, whether there is one,
-    ``met`` (P, D), and the ``share`` (P, D) of the gaze, which adds up to one for each eye."""
-
-    eyes: Eyes
-    points: np.ndarray
-    met: np.ndarray
-    share: np.ndarray
 
 
 class Onlooker:
@@ -88,20 +76,9 @@ class Onlooker:
         seen = ~met | (depth >= distance - 2 * spacing)
         return np.where(seen, self.density(observer, directions), 0)
 
-    def glances(self, eyes: Eyes, count: int = DIRECTIONS, on_eye: Callable[[int, int], None] | None = None) -> Glances:
-        """What is looked at from all ``eyes``, in ``count`` directions. ``on_eye`` is told the eyes done, and of how
-        many."""
-        d, eye = fibonacci_directions(count), np.asarray(eyes.positions, float)
-        # All at once, since a launch takes as long to prepare as to run.
-        depth, met = self.meet(np.repeat(eye, count, axis=0), np.tile(d, (len(eye), 1)))
-        points = eye[:, None] + depth.reshape(len(eye), count, 1) * d
-        share = np.zeros((len(eye), count))
-        for number, position in enumerate(eye):
-            gaze = np.maximum(self.density(position, d).astype(np.float64), 0)
-            share[number] = gaze / gaze.sum() if gaze.sum() > 0 else 0
-            if on_eye is not None:
-                on_eye(number + 1, len(eye))
-        return Glances(eyes, points, met.reshape(len(eye), count), share)
+    def look_from(self, eye: np.ndarray) -> Look:
+        """What the observer at ``eye`` (3,) meets and gives their gaze, as `gaze_shares` wants it."""
+        return look_from(self._gaze, self._place, self._settings, eye)
 
 
 def eyes_of(rays: Rays, place: GazePlace, most: int) -> Eyes:
@@ -124,13 +101,26 @@ def eyes_of(rays: Rays, place: GazePlace, most: int) -> Eyes:
     return Eyes(place.points_from_rays(rays.origin[rows]), rays.person[rows])
 
 
-def points_of_rays(rays: Rays, place: GazePlace, onlooker: Onlooker, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """``(points (N, 3), person (N,))``: what up to ``most`` of the ``rays``, evenly chosen, end at: their own hit
-    point, or what they meet in the place. Those that end at nothing are NaN."""
+def land_rays(
+    rays: Rays,
+    place: GazePlace,
+    onlooker: Onlooker,
+    most: int,
+    things: Sequence[Thing],
+    members: Sequence[tuple[int, ...]],
+    margin: float,
+) -> tuple[Landed, np.ndarray]:
+    """What up to ``most`` of the ``rays``, evenly chosen, are on of objects that consist of ``things`` by their
+    numbers, ``members``, and whose each is (N,). Rays end at their own hit points, or else at what they meet in the
+    place. ``margin``: as of `landing.land`."""
     some = rays if len(rays) <= most else rays.select(np.linspace(0, len(rays) - 1, most).round().astype(int))
     origins, directions = place.points_from_rays(some.origin), place.directions_from_rays(some.direction)
-    depth, met = onlooker.meet(origins, directions)
-    points = np.where(met[:, None], origins + depth[:, None] * directions, np.nan)
+    met, hit = onlooker.meet(origins, directions)
+    depth = np.where(hit, met, np.inf)
     if some.hit is not None:
-        points = np.where(np.isfinite(some.hit), place.points_from_rays(some.hit), points)
-    return points, some.person
+        away = place.points_from_rays(some.hit) - origins
+        far = np.linalg.norm(away, axis=1)
+        ends = np.isfinite(far) & (far > 0)
+        directions = np.where(ends[:, None], away / np.where(ends, far, 1)[:, None], directions)
+        depth = np.where(ends, far, depth)
+    return regroup(land(things, origins, directions, depth, margin), members), some.person

@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.evaluation.gaze.verdict import widening
-from nerg_mi.formats.areas.kinds import BoxGroup
-from nerg_mi.formats.regions import Region
-
-from .glances import Glances
+from nerg_mi.statistics.landing import Landed
+from nerg_mi.statistics.shares import Shares
 
 LEAST_PEOPLE = 3
 """Fewer people than these give no interval."""
@@ -47,33 +45,27 @@ class ObjectAttention:
 
 
 def attention_on(
-    boxes: Sequence[Region | BoxGroup],
-    glances: Glances,
-    margin: float,
-    recorded: tuple[np.ndarray, np.ndarray] | None = None,
+    names: Sequence[str], shares: Shares, who: np.ndarray, recorded: tuple[Landed, np.ndarray] | None = None
 ) -> tuple[ObjectAttention, ...]:
-    """Attention on each of ``boxes`` or groups of them, which are taken to be larger by ``margin`` (scene units) on all
-    sides, for surfaces are known no better.
+    """Attention on each of the objects called ``names``, by the ``shares`` of eyes, which are those of ``who`` (P,).
 
-    ``recorded``: ``(points (N, 3), person (N,))`` of `glances.points_of_rays`, NaN where a ray ends at nothing; without
-    it the eyes are nobody's.
+    ``recorded``: what people's rays land on, object by object, and whose each is (N,); without it the eyes are
+    nobody's.
     """
-    out, who = [], glances.eyes.person
-    for box in boxes:
-        inside = box.holds(glances.points, margin) & glances.met
-        share = np.where(inside, glances.share, 0).sum(axis=1)
+    out = []
+    for k, name in enumerate(names):
+        share = shares.share[:, k]
         if recorded is None:
-            out.append(
-                ObjectAttention(box.name, Share(float(share.mean()), math.nan, math.nan), None, None, None, None)
-            )
+            out.append(ObjectAttention(name, Share(float(share.mean()), math.nan, math.nan), None, None, None, None))
             continue
-        points, person = recorded
-        on = box.holds(np.nan_to_num(points, nan=np.inf), margin).astype(float)
+        landed, person = recorded
+        on = np.zeros(len(person))
+        on[landed.rows[k]] = 1.0
         rays = _each(on, person)
-        saw = _each(inside.any(axis=1).astype(float), who)
+        saw = _each(shares.seen[:, k].astype(float), who)
         field, people = mean_over_people(_each(share, who)), len(np.unique(person))
         seen, looked = int(np.sum(saw > 0)), int(np.sum(rays > 0))
-        out.append(ObjectAttention(box.name, field, mean_over_people(rays), max(seen, looked), looked, people))
+        out.append(ObjectAttention(name, field, mean_over_people(rays), max(seen, looked), looked, people))
     return tuple(out)
 
 

@@ -1,8 +1,9 @@
 """Which things rays land on: boxes in closed form, whatever else by what somebody has cast, and what hides them.
 
-A ray is on a thing if it enters it before it meets a surface: at ``near`` <= depth + margin, where the thing is the box
-or the mesh itself, and the depth that of the place's surfaces. A box around a shelf has the looks that enter the shelf,
-whatever in it they end at. Whoever stands within a box looks at it only where the surface that they meet lies in it.
+A ray is on a box if it crosses it and the first surface that it meets lies in the box: near - margin <= depth < far +
+margin, where it enters at ``near`` and leaves at ``far``. So a larger box never has less, boxes that fill space without
+overlap share out all rays that meet a surface (with a margin of 0), and a ray that crosses a box and ends behind it is
+not on it. A ray is on a mesh or a shape if it meets it before it meets another surface: at ``near`` <= depth + margin.
 Where no surfaces are known, things are solid: one hides another that the ray enters after it has left the first; things
 that overlap along the ray both have the look.
 """
@@ -17,6 +18,9 @@ import numpy as np
 
 from nerg_mi.formats.regions import Region
 from nerg_mi.maths.ray_box import box_interval
+
+MARGIN = 0.03
+"""In metres: of surfaces that are known as exactly as a radiance field has them."""
 
 
 class Thing(Protocol):
@@ -35,6 +39,15 @@ class Thing(Protocol):
     def interval(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """``(near, far)`` (N,): where rays (N, 3) enter and leave it; ``near`` >= ``far`` where they miss it, and
         ``near`` < 0 from within. Of a surface both are its distance, and infinite where it is missed."""
+        ...
+
+    @property
+    def ball(self) -> tuple[np.ndarray, float]:
+        """Middle (3,) and radius of a ball around it."""
+        ...
+
+    def may_meet(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """Whether rays (N, 3) may be on it (N,): they cross a box around it."""
         ...
 
     def samples(self, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -58,6 +71,15 @@ class Box:
         region = self.region
         turned = d if region.turn is None else d @ region.matrix
         return box_interval(region.to_own(np.asarray(o, float)), turned, *region.corners)
+
+    @property
+    def ball(self) -> tuple[np.ndarray, float]:
+        lower, upper = self.region.corners
+        return self.region.middle, float(np.linalg.norm(upper - lower)) / 2
+
+    def may_meet(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        near, far = self.interval(o, d)
+        return (near < far) & (far > 0)
 
     def samples(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = self.region.corners
@@ -100,34 +122,48 @@ class Landed:
 
 
 def land(
-    things: Sequence[Thing], o: np.ndarray, d: np.ndarray, depth: np.ndarray | None, margin: float = 0.0
+    things: Sequence[Thing],
+    o: np.ndarray,
+    d: np.ndarray,
+    depth: np.ndarray | None,
+    margin: float = 0.0,
+    among: Sequence[np.ndarray] | None = None,
 ) -> Landed:
     """What rays (N, 3) with unit directions land on.
 
     ``depth`` (N,): of the surface that each meets, infinite where it meets none; None: no surfaces are known.
-    ``margin``: a surface may lie so far in front of a thing and yet be its own.
+    ``margin``: a surface may lie so far in front of a thing, or behind the end of a box, and yet be its own.
+    ``among``: of each thing the rows, rising, of the rays that may be on it; None: all.
     """
-    spans = [thing.interval(o, d) for thing in things]
-    reach = depth
-    if reach is None:
-        reach = np.full(len(o), np.inf)
-        for thing, (near, far) in zip(things, spans):
-            met = (far > 0) & (near >= 0) & (near <= far) & (np.isfinite(near) if thing.open else near < far)
-            reach = np.where(met, np.minimum(reach, far), reach)
+    if depth is None:
+        return _land_on_solids(things, o, d, margin)
     rows, distance = [], []
-    for thing, (near, far) in zip(things, spans):
+    for k, thing in enumerate(things):
+        some = slice(None) if among is None else among[k]
+        near, far = thing.interval(o[some], d[some])
+        reach = depth[some]
         if thing.open:
-            on = np.isfinite(near) & (near >= 0) & (near <= reach + margin)
-            at = near
+            on, at = np.isfinite(near) & (near >= 0) & (near <= reach + margin), near
         else:
-            within = near < 0
-            known = within & (depth is not None) & np.isfinite(reach) & (reach <= far + margin)
-            on = (near < far) & (far > 0) & np.where(within, known, near <= reach + margin)
-            at = np.where(within, reach, near)
+            ends = (near - margin <= reach) & (reach < far + margin)
+            on, at = (near < far) & (far > 0) & ends & np.isfinite(reach), np.where(near < 0, reach, near)
         found = np.flatnonzero(on)
-        rows.append(found)
+        rows.append(found if among is None else among[k][found])
         distance.append(at[found].astype(np.float64))
     return Landed(len(o), tuple(rows), tuple(distance))
+
+
+def _land_on_solids(things: Sequence[Thing], o: np.ndarray, d: np.ndarray, margin: float) -> Landed:
+    """What rays land on where nothing is known but the things."""
+    spans = [thing.interval(o, d) for thing in things]
+    entered = [
+        (near >= 0) & (np.isfinite(near) if thing.open else near < far) for thing, (near, far) in zip(things, spans)
+    ]
+    reach = np.full(len(o), np.inf)
+    for (_, far), met in zip(spans, entered):
+        reach = np.where(met, np.minimum(reach, far), reach)
+    rows = [np.flatnonzero(met & (near <= reach + margin)) for (near, _), met in zip(spans, entered)]
+    return Landed(len(o), tuple(rows), tuple(near[r].astype(np.float64) for (near, _), r in zip(spans, rows)))
 
 
 def regroup(landed: Landed, members: Sequence[tuple[int, ...]]) -> Landed:

@@ -93,7 +93,7 @@ class Place:
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the bounding box of all shapes, (3,) each. There must be shapes."""
-        corners = [_corners(shape) for shape in ([] if self.scene is None else self.scene.shapes())]
+        corners = [corners_of(shape) for shape in ([] if self.scene is None else self.scene.shapes())]
         return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
 
     def trace(self, ray: Ray3f | SceneRay, active: Bool, settings: MarchSettings, **options: Any) -> View:
@@ -137,7 +137,8 @@ def as_place(subject: Medium | Place) -> Place:
     return subject if isinstance(subject, Place) else Place(subject)
 
 
-def _corners(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+def corners_of(shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner of the bounding box of ``shape``, (3,) each, in scene units."""
     box = shape.bbox()
     if box.valid():
         return np.array(box.min), np.array(box.max)

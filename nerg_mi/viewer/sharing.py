@@ -6,15 +6,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from nerg_mi.api.attention import shares
+from nerg_mi.api.attention import box_shares, mesh_shares
 from nerg_mi.api.scene import Scene
-from nerg_mi.api.shapes import box_dict
 from nerg_mi.formats.regions import Region
 
 from .refining import rough_integrals
 
-DIVISIONS = 8
-"""A side of a triangle of an area is cut into so many parts."""
+TOLERANCE = 0.02
+"""Error of the share of an area, as a share of it, until which directions are added."""
 
 FACES = 1 << 17
 """Faces of shapes whose shares are counted in one step, but for a shape that has more."""
@@ -26,13 +25,11 @@ def shares_in_steps(
     """The share of the observer at ``at`` (3,) of each of ``regions``, together, then of the meshes whose ids are
     ``shapes``, so many at a time as a step can count."""
     if regions:
-        surfaces = [box_dict(r.corners[0], r.corners[1], r.matrix) for r in regions]
-        with rough_integrals(scene):
-            boxes = shares(scene, surfaces, at, divisions=DIVISIONS)
+        boxes = box_shares(scene, regions, np.asarray(at, np.float32)[None], tolerance=TOLERANCE).share[0]
         yield dict(zip([region.name for region in regions], boxes.tolist()))
     for names in shape_groups(scene, shapes):
         with rough_integrals(scene):
-            meshes = shares(scene, names, at, divisions=1, two_sided=True)
+            meshes = mesh_shares(scene, names, at, divisions=1, two_sided=True)
         yield dict(zip(names, meshes.tolist()))
 
 

@@ -4,9 +4,20 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from nerg_mi.api.attention import box_shares
 from nerg_mi.api.shapes import box_dict
+from nerg_mi.formats.regions import Region
+from nerg_mi.jobs.options.statistics import StatisticsOptions
+from nerg_mi.jobs.report import LOOKED
+from nerg_mi.jobs.statistics import statistics
+from nerg_mi.report.glances import Onlooker
+from nerg_mi.statistics.landing import MARGIN, Box
+from nerg_mi.statistics.shares import gaze_shares
+from nerg_mi.training.geometry.places import GazePlace
+from tests.jobs.counting.place import SIGN, STAND, write_place
 
 BOX = [(-0.2, 1.8, -0.1), (0.2, 2.2, 0.1)]
+EYE = (1.2, 2.2, 1.5)
 FAR = {"type": "sphere", "radius": 0.01, "center": [0, 0, -50]}
 
 
@@ -29,21 +40,30 @@ def empty(files):
     return nerg.make_scene(gaze=files / "gaze.safetensors", shapes=FAR)
 
 
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A room with a sign, a stand before it for some, and one side open, as a file; and its scene."""
+    path = write_place(tmp_path_factory.mktemp("room"))
+    return path, nerg.Scene.load(path)
+
+
 def test01_the_share_is_the_integral_over_directions(empty):
     eye = np.array((0.4, 0.1, 0.2))
-    seen = nerg.attention(empty, BOX, eye, divisions=16)
+    seen = nerg.attention(empty, box_dict(*np.array(BOX)), eye, divisions=16)
     d = on_sphere(400_000)
     d = d[hits_box(eye, d, *BOX) & (d @ (np.mean(BOX, axis=0) - eye) > 0)]
     # Where the rays enter the box is where its gaze is.
     low, high = ((np.array(corner) - eye) / d for corner in BOX)
     entry = eye + d * np.minimum(low, high).max(axis=1)[:, None]
     gaze = nerg.observe(empty, entry, eye, "gaze").gaze[0]
-    assert np.isclose(seen.share[0], gaze.sum() * 4 * np.pi / 400_000, rtol=1e-2)
+    # A field that is not normalised is divided by its own integral.
+    whole = box_shares(empty, [], eye[None].astype(np.float32)).whole[0]
+    assert np.isclose(seen.share[0], gaze.sum() * 4 * np.pi / 400_000 / whole, rtol=1e-2) and abs(whole - 1) > 0.1
 
 
 def test02_density_times_area_is_the_share(empty):
     eyes = [(0.4, 0.1, 0.2), (-1, 0.5, 0.3), (0, 5, 0)]
-    seen = nerg.attention(empty, BOX, eyes, divisions=3)
+    seen = nerg.attention(empty, box_dict(*np.array(BOX)), eyes, divisions=3)
     assert seen.density.shape == (3, 12 * 9) and seen.points.shape == seen.normals.shape == (108, 3)
     assert np.allclose(seen.density @ seen.area, seen.share, rtol=1e-5)
     assert np.isclose(seen.area.sum(), 2 * (0.4 * 0.4 + 0.4 * 0.2 + 0.4 * 0.2), rtol=1e-5)
@@ -52,14 +72,14 @@ def test02_density_times_area_is_the_share(empty):
     away = (np.array(eyes)[:, None] - seen.points) @ np.eye(3) * seen.normals
     assert np.array_equal(seen.density[away.sum(axis=-1) < -1e-5], np.zeros((away.sum(axis=-1) < -1e-5).sum()))
     assert seen.mean == pytest.approx(float(seen.share.mean()))
-    assert repr(seen).startswith("<Attention: mean share ") and "3 observers" in repr(seen)
+    assert repr(seen).startswith("<Attention: mean share ") and "3 observers" in repr(seen) and seen.error is None
 
 
 def test03_what_stands_before_it_hides_it(files, empty):
     wall = box_dict(np.array((-3.0, 1.0, -3.0)), np.array((3.0, 1.1, 3.0)))
     hidden = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=wall)
     eyes = [(0, 0, 0), (0, 4, 0)]
-    seen, before = nerg.attention(hidden, BOX, eyes), nerg.attention(empty, BOX, eyes)
+    seen, before = (nerg.attention(scene, box_dict(*np.array(BOX)), eyes) for scene in (hidden, empty))
     assert before.share.min() > 0 and seen.share[0] == 0
     assert np.isclose(seen.share[1], before.share[1], rtol=1e-3)
 
@@ -74,7 +94,7 @@ def test04_a_shape_of_the_scene_by_its_id(files, rgb, tmp_path):
     # It does not hide itself.
     assert by_id.share[0] > 0
     alone = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=FAR)
-    for surface in (BOX, np.array(BOX), box, path, str(path), rgb.load_dict(box)):
+    for surface in (box, path, str(path), rgb.load_dict(box)):
         assert np.isclose(nerg.attention(alone, surface, eye).share[0], by_id.share[0], rtol=1e-4)
 
 
@@ -110,17 +130,23 @@ def test07_errors_are_sentences(files, empty):
         nerg.attention(nerg.make_scene(files / "field.safetensors"), BOX, (0, 0, 0))
     for wrong in (0, 2.5, True):
         with pytest.raises(nerg.NergError, match="divisions must be a whole number from 1"):
-            nerg.attention(empty, BOX, (0, 0, 0), divisions=wrong)
+            nerg.attention(empty, box_dict(*np.array(BOX)), (0, 0, 0), divisions=wrong)
+    for wrong in ({"margin": -1}, {"margin": "a"}, {"tolerance": 0}, {"tolerance": float("nan")}):
+        with pytest.raises(nerg.NergError, match=f"{next(iter(wrong))} must be a"):
+            nerg.attention(empty, BOX, (0, 0, 0), **wrong)
+    with pytest.raises(nerg.NergError, match="divisions and two_sided are of meshes"):
+        nerg.attention(empty, BOX, (0, 0, 0), divisions=2)
     with pytest.raises(nerg.NergError, match="no observer of its own"):
         nerg.attention(empty, BOX)
 
 
 def test09_pieces_are_small_against_their_distance(empty):
-    near, far = nerg.attention(empty, BOX, (0, 1.5, 0)), nerg.attention(empty, BOX, [(0, 0, 0), (0, -30, 0)])
+    cube = box_dict(*np.array(BOX))
+    near, far = nerg.attention(empty, cube, (0, 1.5, 0)), nerg.attention(empty, cube, [(0, 0, 0), (0, -30, 0)])
     assert len(near.area) > len(far.area)
-    finer = nerg.attention(empty, BOX, (0, 1.5, 0), divisions=32)
+    finer = nerg.attention(empty, cube, (0, 1.5, 0), divisions=32)
     assert np.isclose(near.share[0], finer.share[0], rtol=5e-3)
-    assert len(nerg.attention(empty, BOX, np.mean(BOX, axis=0)).area) == 12 * 32**2
+    assert len(nerg.attention(empty, cube, np.mean(BOX, axis=0)).area) == 12 * 32**2
 
 
 def test08_progress_is_told(empty):
@@ -132,5 +158,106 @@ def test08_progress_is_told(empty):
         def progress(self, share, text=""):
             told.append(share)
 
-    nerg.attention(empty, BOX, [(0, 0, 0), (0.1, 0, 0)], reporter=Reporter())
+    nerg.attention(empty, box_dict(*np.array(BOX)), [(0, 0, 0), (0.1, 0, 0)], reporter=Reporter())
     assert told == [0.5, 1.0]
+
+
+def rays_of_gaze(scene, eye, count=40_000, seed=0):
+    """Where so many rays end that are drawn from an observer's gaze by rejection: (count, 3)."""
+    d = np.random.default_rng(seed).normal(size=(20 * count, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    seen = nerg.trace(scene, eye, d, ["gaze", "depth"], observers=[eye])
+    gaze, depth = seen.gaze[0], np.ravel(seen.depth)
+    chosen = np.flatnonzero(np.random.default_rng(seed + 1).random(len(d)) * gaze.max() < gaze)[:count]
+    assert len(chosen) == count and (depth[chosen] > 0).all()
+    return eye + depth[chosen, None] * d[chosen]
+
+
+def test10_a_larger_box_never_has_less_and_has_what_rays_say(room):
+    _, scene = room
+    grown = (0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 9.0)
+    regions = [Region.of("sign", SIGN[0] - g, SIGN[1] + g) for g in grown]
+    found = box_shares(scene, regions, np.float32([EYE]))
+    share, error = found.share[0], found.error[0]
+    assert (np.diff(share) >= -error[1:]).all() and share[-1] == pytest.approx(1, abs=2e-6)
+    assert (error < 0.01 * share + 1e-4).all()
+    ends = rays_of_gaze(scene, EYE)
+    for region, value, err in zip(regions, share, error):
+        rays = region.holds(ends, 1e-4).mean()
+        assert abs(value - rays) < 3 * np.sqrt(rays * (1 - rays) / len(ends)) + err
+    alone = nerg.attention(scene, "sign", EYE)
+    assert share[0] == pytest.approx(alone.share[0], abs=error[0] + 5e-3 * share[0])
+    one = nerg.attention(scene, SIGN, EYE)
+    assert one.share[0] == pytest.approx(share[0], abs=error[0]) and one.error[0] < 0.01 * one.share[0]
+
+
+@pytest.mark.parametrize("eye", [EYE, (5.5, 3.5, 0.4)])
+def test11_boxes_that_fill_space_share_out_all_of_the_gaze(files, eye):
+    """With what escapes; planes between them pass through the observer, too."""
+    shapes = {"floor": box_dict(np.array((0.0, 0, -1)), np.array((6.0, 4, 0)))}
+    shapes["stand"] = box_dict(*STAND)
+    scene = nerg.make_scene(gaze=files / "gaze.safetensors", shapes=shapes)
+    cuts = [(-1e6, eye[0], 2.5, 1e6), (-1e6, 1.0, eye[1], 1e6), (-1e6, 0.001, 1.1, 1e6)]
+    cuts = [sorted(set(c)) for c in cuts]
+    spans = [list(zip(c[:-1], c[1:])) for c in cuts]
+    corners = [np.transpose((a, b, c)) for a in spans[0] for b in spans[1] for c in spans[2]]
+    regions = [Region.of(f"{k}", *corner) for k, corner in enumerate(corners)]
+    found = box_shares(scene, regions, np.float32([eye]), margin=0.0)
+    assert 0.2 < found.escaped[0] < 0.8
+    assert found.share.sum() + found.escaped[0] == pytest.approx(1, abs=3 * np.linalg.norm(found.error))
+    assert np.linalg.norm(found.error) < 2e-3
+    # Of two boxes beside each other it is the sum.
+    whole = nerg.attention(scene, [(2.0, 0.5, -0.5), (4.0, 3.0, 2.3)], eye, margin=0)
+    parts = [nerg.attention(scene, [(2 + k, 0.5, -0.5), (3 + k, 3.0, 2.3)], eye, margin=0) for k in range(2)]
+    assert sum(p.share[0] for p in parts) == pytest.approx(whole.share[0], abs=3 * float(whole.error[0]))
+    everything = nerg.attention(scene, [(-1e29,) * 3, (1e29,) * 3], eye)
+    assert everything.share[0] + everything.escaped[0] == pytest.approx(1, abs=1e-5)
+
+
+def test12_small_things_are_seen(files):
+    """A cube of 2 cm, three metres away, which no direction of a coarse rule meets; and none of what it hides."""
+    thing = np.array([(-0.01, 2.99, 0.2), (0.01, 3.01, 0.22)])
+    scene = nerg.make_scene(gaze=files / "gaze.safetensors", shapes={"thing": box_dict(*thing), "far": FAR})
+    by_id = nerg.attention(scene, "thing", (0, 0, 0.1))
+    by_box = nerg.attention(scene, thing, (0, 0, 0.1), tolerance=1e-3)
+    assert 0 < by_id.share[0] < 1e-4 and by_box.share[0] == pytest.approx(by_id.share[0], rel=0.05)
+    assert nerg.attention(scene, thing + (0, 0, 0.5), (0, 0, 0.1)).share[0] == 0
+    assert nerg.attention(scene, thing + (0, 1, 0), (0, 0, 0.1)).share[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("box", "eye", "said"),
+    [
+        ([(-1e30,) * 3, (1e30,) * 3], EYE, "reaches to 1e"),
+        ([(0, 0, 0), (10**400, 1, 1)], EYE, "the corners of a box must be finite in single precision"),
+        (BOX, (10**400, 0, 0), "observers must be finite in single precision"),
+        (BOX, (float("nan"), 0, 0), "observers must be finite in single precision"),
+    ],
+)
+def test13_what_is_beyond_all_measure_is_told(empty, box, eye, said):
+    with pytest.raises(nerg.NergError, match=said):
+        nerg.attention(empty, box, eye)
+
+
+def test14_statistics_viewer_and_report_say_the_same(room):
+    from nerg_mi.viewer.sharing import shares_in_steps
+
+    path, scene = room
+    regions = [Region.of("the sign", *SIGN), Region.of("corner", (4.5, 2.5, 0), (6.1, 4.1, 3.1), 20)]
+    eye = np.array(EYE)
+    here = nerg.attention(scene, SIGN, eye)
+    options = StatisticsOptions(
+        areas=path.parent / "areas.json", observers=(",".join(map(str, EYE)),), resamples=199, mode="llvm_ad_rgb"
+    )
+    told = {row["thing"]: row["share"] for row in statistics([path], options=options).things}
+    assert options.margin == MARGIN
+    assert told["the sign"] == pytest.approx(here.share[0], rel=0.03)
+    assert told["the stand"] == pytest.approx(nerg.attention(scene, "stand", eye).share[0], rel=0.03)
+    (viewer, *_) = shares_in_steps(scene, eye, regions, [])
+    assert viewer["the sign"] == pytest.approx(here.share[0], rel=0.03)
+    field = scene.integrator.gaze.field
+    onlooker = Onlooker(field, GazePlace(scene.place, field.box, "scene"))
+    things = [Box(region) for region in regions]
+    report = gaze_shares(onlooker.look_from, eye[None], things, [(0,), (1,)], MARGIN, LOOKED)
+    assert report.share[0, 0] == pytest.approx(here.share[0], rel=0.03)
+    assert report.share[0, 1] == pytest.approx(viewer["corner"], rel=0.03) and viewer["corner"] > 1e-3

@@ -24,7 +24,8 @@ def _read_areas(folder: Path) -> object:
     from nerg_mi.formats.areas.reading import read_areas
 
     areas = read_areas(folder / "areas.json")
-    for box in areas.solids:
+    assert all(of for of in areas.solids.values())
+    for box in areas.boxes:
         box.holds(areas.boxes[0].vertices if areas.boxes else [[0.0, 0, 0]])
     return areas.members()
 

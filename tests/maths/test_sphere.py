@@ -92,3 +92,12 @@ def test_neighbours_follow_each_other():
     apart = lambda d: np.degrees(np.arccos(np.clip((d[1:] * d[:-1]).sum(axis=1), -1, 1))).mean()
     # Neighbours are 4.5 degrees apart; along the spiral the next one is on the other side.
     assert apart(d[order]) < 9 < 90 < apart(d)
+
+
+@pytest.mark.parametrize("angle", [1e-3, 0.2, 1.7, 3.1, np.pi])
+def test_numbers_in_a_cone_are_those_of_the_directions_in_it(angle):
+    d = sphere.fibonacci_directions(5000)
+    for axis in np.concatenate([np.eye(3), -np.eye(3), d[[17]]]):
+        numbers = sphere.numbers_in_cone(5000, axis, angle)
+        assert np.array_equal(numbers, np.flatnonzero(d @ axis >= np.cos(angle)))
+        assert np.array_equal(sphere.fibonacci_directions(5000, numbers), d[numbers])

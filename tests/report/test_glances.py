@@ -10,11 +10,13 @@ import pytest
 from nerg_mi.field.backend import namespace
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.product import GazeConfig, GazeField
+from nerg_mi.formats.regions import Region
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.maths.sphere import fibonacci_directions
 from nerg_mi.rays.rays import Rays
-from nerg_mi.report.glances import Eyes, Onlooker, eyes_of, points_of_rays
+from nerg_mi.report.glances import Onlooker, eyes_of, land_rays
+from nerg_mi.statistics.landing import Box as Solid
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.place import Place
 from tests.evaluation.gaze.test_evaluation import crowd
@@ -34,6 +36,10 @@ def hall(rgb):
     return Onlooker(field, place), place
 
 
+def things(boxes):
+    return [Solid(box) for box in boxes], [(k,) for k in range(len(boxes))]
+
+
 def to_wall(o, d):
     """Distance from ``o`` within the box to its walls along ``d``, axis by axis."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -42,14 +48,11 @@ def to_wall(o, d):
 
 def test_all_around_an_eye(hall):
     onlooker, _ = hall
-    eyes = Eyes(np.array([[0.3, -2.0, 1.6], [-1.0, 4.0, 1.5]]), np.array([0, 1]))
-    seen = onlooker.glances(eyes, 512)
-    assert seen.met.all() and np.allclose(seen.share.sum(axis=1), 1) and (seen.share >= 0).all()
-    for eye, points in zip(eyes.positions, seen.points):
-        d = points - eye
-        distance = np.linalg.norm(d, axis=1)
-        assert np.allclose(distance, to_wall(eye, d / distance[:, None]), atol=1e-4)
-    assert np.ptp(seen.share) > 0
+    d = fibonacci_directions(512)
+    for eye in np.array([[0.3, -2.0, 1.6], [-1.0, 4.0, 1.5]]):
+        (gaze,), distance = onlooker.look_from(eye)(d)
+        assert np.allclose(distance, to_wall(eye, d), atol=1e-4)
+        assert np.allclose(gaze, onlooker.density(eye, d), rtol=1e-5) and np.ptp(gaze) > 0
 
 
 def test_gaze_on_points_is_the_density_where_nothing_hides_them(hall):
@@ -98,15 +101,17 @@ def test_eyes_are_spread_over_whole_visits(hall):
 def test_rays_end_at_their_own_points_or_at_the_place(hall):
     onlooker, place = hall
     rays = crowd(300)
-    points, person = points_of_rays(rays, place, onlooker, 100)
-    assert points.shape == (100, 3) and person.shape == (100,) and np.isfinite(points).all()
     rows = np.linspace(0, 299, 100).round().astype(int)
-    assert np.allclose(points, rays.hit[rows])
-    met, _ = points_of_rays(replace(rays, hit=None), place, onlooker, 300)
-    inside = ((rays.origin > LOW) & (rays.origin < HIGH)).all(axis=1)
-    assert np.allclose(
-        met[inside], (rays.origin + to_wall(rays.origin, rays.direction)[:, None] * rays.direction)[inside], atol=1e-4
-    )
+    boxes = [Region.of("left", (-9, -9, -9), (9, 0.1, 9)), Region.of("low", (-9, -9, -9), (9, 9, 1.2))]
+    landed, person = land_rays(rays, place, onlooker, 100, *things(boxes), 0.0)
+    assert landed.count == 100 and np.array_equal(person, rays.person[rows])
+    expected = [np.flatnonzero(box.holds(rays.hit[rows])) for box in boxes]
+    assert all(np.array_equal(a, b) and len(b) for a, b in zip(landed.rows, expected))
+    landed, _ = land_rays(replace(rays, hit=None), place, onlooker, 300, *things(boxes), 0.0)
+    inside = np.flatnonzero(((rays.origin > LOW) & (rays.origin < HIGH)).all(axis=1))
+    met = rays.origin + to_wall(rays.origin, rays.direction)[:, None] * rays.direction
+    for box, found in zip(boxes, landed.rows):
+        assert np.array_equal(np.intersect1d(found, inside), inside[box.holds(met[inside])])
 
 
 def test_rays_of_another_frame(hall, rgb):
@@ -118,8 +123,10 @@ def test_rays_of_another_frame(hall, rgb):
     eyes = eyes_of(rays, turned, 4)
     every = rays.origin @ matrix[:3, :3].T + matrix[:3, 3]
     assert all(np.isclose(every, e).all(axis=1).any() for e in eyes.positions)
-    points, _ = points_of_rays(rays, turned, onlooker, 50)
-    assert np.allclose(points, rays.hit @ matrix[:3, :3].T + matrix[:3, 3])
+    box = Region.of("some", (-9, -9, -9), (9, 9, 0.65))
+    landed, _ = land_rays(rays, turned, onlooker, 50, *things([box]), 0.0)
+    expected = np.flatnonzero(box.holds(rays.hit @ matrix[:3, :3].T + matrix[:3, 3]))
+    assert np.array_equal(landed.rows[0], expected) and 0 < len(expected) < 50
 
 
 def test_where_no_place_is_known_nothing_is_met(rgb):

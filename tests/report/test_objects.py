@@ -8,62 +8,49 @@ import numpy as np
 import pytest
 
 from nerg_mi.evaluation.gaze.verdict import widening
-from nerg_mi.formats.regions import Region
-from nerg_mi.report.glances import Eyes, Glances
 from nerg_mi.report.objects import attention_on, mean_over_people
+from nerg_mi.statistics.landing import Landed
+from nerg_mi.statistics.shares import Shares
 
-UNIT = Region.of("unit", np.zeros(3), np.ones(3))
+
+def of_field(share, seen=None):
+    share = np.array(share, float)[:, None]
+    seen = share > 0 if seen is None else np.array(seen)[:, None]
+    none = np.zeros(len(share))
+    return Shares(share, 0 * share, seen, share, none, none + 1, share[None])
 
 
-def glances(person, rng):
-    P, D = len(person), 50
-    share = rng.random((P, D))
-    met = rng.random((P, D)) < 0.8
-    points = rng.uniform(-1, 2, (P, D, 3))
-    return Glances(Eyes(np.zeros((P, 3)), np.array(person)), points, met, share / share.sum(axis=1, keepdims=True))
+def on_rows(rows, count):
+    return Landed(count, (np.array(rows, int),), (np.ones(len(rows)),))
 
 
 def test_shares_of_people_count_alike():
     rng = np.random.default_rng(0)
-    seen = glances([3, 3, 3, 5, 9, 9, 9, 9], rng)
-    points, person = rng.uniform(-1, 2, (300, 3)), rng.choice([3, 5, 9], 300)
-    points[::7] = np.nan
-    (found,) = attention_on([UNIT], seen, 0.1, (points, person))
-
-    def inside(p):
-        return all(-0.1 <= c <= 1.1 for c in p)
-
+    who, person = np.array([3, 3, 3, 5, 9, 9, 9, 9]), rng.choice([3, 5, 9], 300)
+    share, rows = rng.random(len(who)), np.flatnonzero(rng.random(300) < 0.3)
+    (found,) = attention_on(["unit"], of_field(share), who, (on_rows(rows, 300), person))
     field, rays = {}, {}
-    for p, who in enumerate(seen.eyes.person):
-        total = sum(s for s, m, x in zip(seen.share[p], seen.met[p], seen.points[p]) if m and inside(x))
-        field.setdefault(int(who), []).append(total)
-    for x, who in zip(points, person):
-        rays.setdefault(int(who), []).append(inside(x))
+    for value, one in zip(share, who.tolist()):
+        field.setdefault(one, []).append(value)
+    for k, one in enumerate(person.tolist()):
+        rays.setdefault(one, []).append(k in rows)
     mean = lambda each: sum(sum(v) / len(v) for v in each.values()) / len(each)
     assert found.field.mean == pytest.approx(mean(field)) and found.recorded.mean == pytest.approx(mean(rays))
     assert (found.saw, found.looked, found.people) == (3, 3, 3)
 
 
 def test_who_could_see_it():
-    person = np.array([0, 0, 1, 2])
-    points = np.full((4, 5, 3), 5.0)
-    points[1, 2] = 0.5  # the second place of person 0 sees the box
-    points[3, 0] = 0.5  # where person 2 is something is in the box, but no surface
-    met = np.ones((4, 5), bool)
-    met[3, 0] = False
-    seen = Glances(Eyes(np.zeros((4, 3)), person), points, met, np.full((4, 5), 0.2))
-    away = np.full((4, 3), 9.0)
-    (found,) = attention_on([UNIT], seen, 0.0, (away, np.array([0, 1, 2, 3])))
+    # The second place of person 0 sees the box; no gaze goes there.
+    field, who, person = of_field([0, 0, 0, 0], [False, True, False, False]), np.array([0, 0, 1, 2]), np.arange(4)
+    (found,) = attention_on(["unit"], field, who, (on_rows([], 4), person))
     assert (found.saw, found.looked, found.people) == (1, 0, 4)
     # Somebody who looks at it could see it.
-    away[1:3] = 0.5
-    (found,) = attention_on([UNIT], seen, 0.0, (away, np.array([0, 1, 2, 3])))
+    (found,) = attention_on(["unit"], field, who, (on_rows([1, 2], 4), person))
     assert (found.saw, found.looked) == (2, 2)
 
 
 def test_nobody_recorded():
-    rng = np.random.default_rng(1)
-    (found,) = attention_on([UNIT], glances([0], rng), 0.0)
+    (found,) = attention_on(["unit"], of_field([0.25]), np.zeros(1, int))
     assert found.recorded is None and found.people is None and math.isnan(found.field.low)
 
 

@@ -36,7 +36,7 @@ def some_rays(n=2000, seed=0):
     return o, d / np.linalg.norm(d, axis=1, keepdims=True), rng.uniform(0.2, 6, n)
 
 
-def test01_boxes_before_surfaces():
+def test01_surfaces_in_boxes():
     things = [
         box("a", [-1, -1, -1], [1, 0.5, 1]),
         box("b", [0, 0, 0], [2, 1, 1], 35),
@@ -51,7 +51,7 @@ def test01_boxes_before_surfaces():
             if span is None:
                 continue
             near, far = span
-            expected[i, k] = depth[i] <= far + 0.03 if near < 0 else near <= depth[i] + 0.03
+            expected[i, k] = near - 0.03 <= depth[i] < far + 0.03
     assert np.array_equal(found, expected) and 20 < expected.sum() and not expected.all(axis=1).all()
     inside = np.array([thing.region.holds(o) for thing in things]).T
     assert (inside & expected).any() and (inside & ~expected).any()
@@ -62,9 +62,10 @@ def test02_distances_are_those_of_the_entrance_or_from_within_of_the_surface():
     o, d = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
     landed = land(things, o, d, np.array([1.7]))
     assert [v.tolist() for v in landed.distance] == [[1.0], [1.7]]
-    # Beyond the box that they stand in, or nowhere: they look out of it.
-    assert [len(v) for v in land(things, o, d, np.array([3.5])).rows] == [1, 0]
-    assert [len(v) for v in land(things, o, d, np.array([np.inf])).rows] == [1, 0]
+    # Beyond a box, or nowhere: they look through it, or out of that in which they stand.
+    assert [len(v) for v in land(things, o, d, np.array([2.5])).rows] == [0, 1]
+    assert [len(v) for v in land(things, o, d, np.array([3.5])).rows] == [0, 0]
+    assert [len(v) for v in land(things, o, d, np.array([np.inf])).rows] == [0, 0]
 
 
 def test03_without_surfaces_things_are_solid():
@@ -83,13 +84,13 @@ def test04_a_box_that_is_grazed_or_behind_is_not_met():
     thing = box("a", [1, 0, 0], [2, 1, 1])
     o = np.array([[0.0, 1, 0.5], [3, 0.5, 0.5], [0, 0.5, 0.5]])
     d = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0]])
-    assert land([thing], o, d, np.full(3, np.inf)).matrix()[1:, 0].tolist() == [False, True]
+    assert land([thing], o, d, np.array([1.5, 0.5, 1.5])).matrix()[1:, 0].tolist() == [False, True]
 
 
 def test05_groups_are_unions_at_their_least_distance():
     things = [box("a", [1, -1, -1], [2, 1, 1]), box("b", [1.5, 0, -1], [4, 1, 1])]
     o, d = np.array([[0, 0.5, 0.0], [0, -0.5, 0], [3, 0.5, -5]]), np.array([[1.0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    landed = regroup(land(things, o, d, np.full(3, np.inf)), [(0,), (1,), (0, 1)])
+    landed = regroup(land(things, o, d, np.array([1.6, 1.0, 5.0])), [(0,), (1,), (0, 1)])
     assert [rows.tolist() for rows in landed.rows] == [[0, 1], [0, 2], [0, 1, 2]]
     assert landed.distance[2].tolist() == [1.0, 1.0, 4.0]
 

@@ -88,12 +88,13 @@ def test05_it_is_what_attention_says(rgb, tmp_path):
     from nerg_mi.scenes import store
 
     import nerg_mi as nerg
+    from nerg_mi.api.shapes import box_dict
 
     here = files(store)
     eye = (4.4, 2.8, 1.6)
     scene = nerg.make_scene(gaze=here / "shoppers.safetensors", shapes=here / "twin.ply", falloff=0.0)
     thing = box((4.4, 4.65, 0.0), (4.9, 5.0, 1.45))
-    expected = nerg.attention(scene, [(4.4, 4.65, 0.0), (4.9, 5.0, 1.45)], observers=[eye], divisions=24)
+    expected = nerg.attention(scene, box_dict(*np.array([(4.4, 4.65, 0.0), (4.9, 5.0, 1.45)])), [eye], divisions=24)
     from nerg_mi.formats.meshes import read_mesh_file
     from nerg_mi.surfaces.gaze_source import lookers_of_field
 

@@ -1,6 +1,7 @@
 """Tracked rays as cones: what passes a gap, and what parts of them add up to."""
 
 import numpy as np
+import pytest
 from scipy.stats import norm
 
 from nerg_mi.surfaces.ray_source import RaySettings, TrackedRays, ray_sums
@@ -55,3 +56,18 @@ def test03_parts_give_the_same_as_often_as_they_are_made(rgb):
     assert np.isclose(first.total, 1) and abs(first.unaccounted) < 1e-12
     other = ray_sums(target, parts[0], RaySettings(cone=SIGMA, bundle=8, seed=6))
     assert not np.array_equal(other.vertex, ray_sums(target, parts[0], settings).vertex)
+
+
+@pytest.mark.parametrize("cone", [0.0, SIGMA])
+def test04_on_elsewhere_and_escaped_add_up_where_something_hides_the_surface(rgb, cone):
+    """A plate across x < 0 at z = 2, of which a shape at z = 1 hides y < 0 and reaches beyond it; the rest escapes."""
+    plate_left = (np.array([(-9.0, -9, 2), (0, -9, 2), (0, 9, 2), (-9, 9, 2)]), np.array([(0, 1, 2), (0, 2, 3)]))
+    hiding = (np.array([(-9.0, -9, 1), (9, -9, 1), (9, 0, 1), (-9, 0, 1)]), np.array([(0, 1, 2), (0, 2, 3)]))
+    some = rays(4000, spread=0.3, seed=2)
+    some = TrackedRays(some.origins, some.directions, np.linspace(0.5, 1.5, 4000))
+    sums = ray_sums(Target(joined(plate_left), [hiding]), some, RaySettings(cone=cone, bundle=8))
+    hidden, left = some.directions[:, 1] < 0, some.directions[:, 0] < 0
+    expected = [some.weights[rows].sum() for rows in (~hidden & left, hidden, ~hidden & ~left)]
+    found = [sums.on_surface, sums.elsewhere, sums.escaped]
+    assert np.allclose(found, expected, rtol=1e-9 if cone == 0 else 0.03)
+    assert sum(found) == pytest.approx(sums.weight, rel=1e-12) and sums.total == sums.weight == some.weights.sum()

@@ -26,8 +26,8 @@ def test01_areas_in_one_step_and_meshes_in_groups(scene, monkeypatch):
     shapes = [name for name in faces if name in {s.id() for s in scene.mitsuba.shapes() if s.is_mesh()}]
     steps = list(sharing.shares_in_steps(scene, AT, regions, shapes))
     assert [sorted(step) for step in steps] == [["left", "right"], sorted(shapes)]
-    one = nerg.attention(scene, regions[0].corners, observers=AT[None], divisions=8).share[0]
-    assert steps[0]["left"] == pytest.approx(float(one), rel=1e-3) and steps[0]["left"] > 0
+    one = nerg.attention(scene, regions[0].corners, observers=AT[None]).share[0]
+    assert steps[0]["left"] == pytest.approx(float(one), rel=0.03) and steps[0]["left"] > 0
     monkeypatch.setattr(sharing, "FACES", 1)
     assert list(sharing.shape_groups(scene, shapes)) == [[name] for name in shapes]
 

@@ -53,18 +53,6 @@ class Group:
     parts: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class BoxGroup:
-    """Several ``boxes`` under one name."""
-
-    name: str
-    boxes: tuple[Region, ...]
-
-    def holds(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Whether one of the boxes holds ``points`` (..., 3), as `Region.holds` has it."""
-        return np.any([box.holds(points, margin) for box in self.boxes], axis=0)
-
-
 Area = Region | MeshPart | SceneShape | Group
 
 
@@ -108,14 +96,11 @@ class Areas:
         return tuple(a for a in self.areas if not isinstance(a, Group))
 
     @property
-    def solids(self) -> list[Region | BoxGroup]:
-        """Those that are boxes, or groups of boxes alone."""
-        found: list[Region | BoxGroup] = []
-        for area, members in zip(self.areas, self.members().values()):
-            boxes = tuple(thing for k in members if isinstance(thing := self.things[k], Region))
-            if len(boxes) == len(members):
-                found.append(area if isinstance(area, Region) else BoxGroup(area.name, boxes))
-        return found
+    def solids(self) -> dict[str, tuple[int, ...]]:
+        """Those that are boxes, or groups of boxes alone, by name: the numbers of the `boxes` that each consists of."""
+        number = {k: n for n, k in enumerate(k for k, thing in enumerate(self.things) if isinstance(thing, Region))}
+        every = self.members().items()
+        return {name: tuple(number[k] for k in of) for name, of in every if all(k in number for k in of)}
 
     def members(self) -> dict[str, tuple[int, ...]]:
         """Of each area, which of the `things` it consists of, by their numbers."""

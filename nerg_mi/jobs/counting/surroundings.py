@@ -13,24 +13,21 @@ from nerg_mi.errors import NergError
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.jobs.gaze_places import align_of_training, place_of_training
 from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
-from nerg_mi.maths.arrays import vector_of
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rendering.asked import is_nerg
 from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.statistics.shares import Look
 from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.training.geometry.surfaces import SURFACE_OPACITY
 from nerg_mi.transport.observer.gaze import PlacedGaze
+from nerg_mi.transport.observer.looking import look_from
 from nerg_mi.transport.observer.settings import ObserverSettings
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings, trace_depth
 
 if TYPE_CHECKING:
     import mitsuba as mi
-
-_INTEGRAL = 2048
-"""Directions of the integral of a normalised field, at most: of one field it cancels out of the shares, and of an
-ensemble only the members' weights beside each other rest on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,21 +63,18 @@ class Surroundings:
         depth, opacity = trace_depth(self.place, o, d, kind=self.kind)
         return np.where((opacity >= SURFACE_OPACITY) & (depth > 0), depth, np.inf).astype(np.float64)
 
-    def densities(self, eye: np.ndarray, d: np.ndarray) -> np.ndarray:
-        """Gaze (M, D) in 1/sr of an observer at ``eye`` (3,) in unit directions ``d`` (D, 3), by each of M members of
-        an ensemble, or by one field."""
-        import mitsuba as mi
-
+    def look_from(self, eye: np.ndarray) -> Look:
+        """A function of unit directions (D, 3), as `nerg_mi.statistics.shares.gaze_shares` wants it of an observer at
+        ``eye`` (3,)."""
         assert self.gaze is not None
         place = self.place if self.place is not None else Place(None)
         settings = self.settings or ObserverSettings(
             march=default_settings(place), depth=self.kind, surface_opacity=SURFACE_OPACITY
         )
-        settings = replace(settings, directions=min(settings.directions, _INTEGRAL))
-        center = mi.Point3f(*np.asarray(eye, float).tolist())
-        observed = self.gaze.at([center], place, settings)
-        found = observed.members_along(center, vector_of(mi.Vector3f, d))
-        return np.array([np.broadcast_to(np.array(gaze, np.float64), (len(d),)) for gaze in found])
+        look = look_from(self.gaze, place, settings, eye)
+        if self.place is not None:
+            return look
+        return lambda directions: (look(directions)[0], None)
 
     def support(self, eye: np.ndarray) -> float:
         """Rays that the field learnt from around ``eye`` (3,); NaN where it does not say."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,8 +13,10 @@ from nerg_mi.errors import NergError, mitsuba_says, plain
 from nerg_mi.formats.areas.kinds import MeshPart, SceneShape
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.regions import Region
+from nerg_mi.maths.ray_box import box_interval
 from nerg_mi.statistics.landing import Box, Thing
 from nerg_mi.surfaces.target import mitsuba_mesh
+from nerg_mi.transport.place import corners_of
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -40,6 +43,22 @@ class ShapeThing:
             found = np.array(self.alone.ray_intersect_preliminary(ray, coherent=False).t, np.float64)
             out[a : a + _RAYS] = found
         return out, out
+
+    @cached_property
+    def _corners(self) -> np.ndarray:
+        """Corners (2, 3) of a box around it that is no flatter than single precision is exact."""
+        lower, upper = (np.array(c, np.float64) for c in corners_of(self.shape))
+        room = 1e-6 * np.maximum(np.abs([lower, upper]).max(), np.linalg.norm(upper - lower))
+        return np.array([lower - room, upper + room])
+
+    @property
+    def ball(self) -> tuple[np.ndarray, float]:
+        lower, upper = self._corners
+        return (lower + upper) / 2, float(np.linalg.norm(upper - lower)) / 2
+
+    def may_meet(self, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+        near, far = box_interval(o, d, *self._corners)
+        return (near < far) & (far > 0)
 
     def samples(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         import mitsuba as mi

@@ -20,7 +20,9 @@ class StatisticsOptions(PartOptions):
         None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
     )
     tolerance: float = option(0.0, "Degrees by which a ray may miss what of a thing is in nobody's way.", min=0, max=20)
-    margin: float = option(0.03, "Metres by which surfaces may stand before a thing and yet be its own.", min=0)
+    margin: float = option(
+        0.03, "Metres by which surfaces may lie in front of a thing, or behind a box, and yet be its own.", min=0
+    )
     gap: float = option(1.0, "A ray stands for the time to the next, unless that is longer than this.", min=0)
     pause: float = option(60.0, "A longer pause of a person begins another sitting.", min=0)
     merge: float = option(0.15, "Rays on a thing are one look if nothing else lasts longer between them.", min=0)

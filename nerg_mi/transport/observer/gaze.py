@@ -24,7 +24,7 @@ from nerg_mi.transport.place import Place
 from .cache import Known, ObserverCache, fingerprint_of
 from .integral import Integral, integrate
 from .settings import ObserverSettings
-from .surroundings import AllAround, Surroundings, distance_along
+from .surroundings import AllAround, Filling, Surroundings, distance_along, met_along
 from .viewpoint import select_nearest
 
 STEP = 1 / 256
@@ -208,18 +208,36 @@ class ObservedGaze:
 
     def members_along(self, p_o: Point3f, r_o: Vector3f) -> list[Float]:
         """``along`` of each member of an ensemble by itself; of one field that alone."""
+        return self._look(p_o, r_o)[0]
+
+    def look(self, p_o: Point3f, r_o: Vector3f, filling: Filling | None = None) -> tuple[list[Float], Float]:
+        """``members_along``, and the distance of the surface that is met along each, infinite where there is none.
+        ``filling``: that of the observer, if it has been traced."""
+        import mitsuba as mi
+
+        found, distance, escaped = self._look(p_o, r_o, filling)
+        if not self._placed.field.config.needs_surfaces:
+            with dr.suspend_grad():
+                met, distance = met_along(self._place, mi.Point3f(dr.detach(p_o)), r_o, self._settings)
+                escaped = ~met
+        return found, dr.select(escaped, dr.inf, distance)
+
+    def _look(self, p_o: Point3f, r_o: Vector3f, filling: Filling | None = None) -> tuple[list[Float], Float, Bool]:
+        """``(gaze of each member, distance, escaped)``, the last two as of ``surroundings.distance_along``."""
         import mitsuba as mi
 
         with dr.suspend_grad():
             center = mi.Point3f(dr.detach(p_o))
             dr.make_opaque(center)
             placed, width = self._placed, dr.width(r_o)
-            distance, escaped = distance_along(placed.field, placed.to_world, self._place, center, r_o, self._settings)
+            distance, escaped = distance_along(
+                placed.field, placed.to_world, self._place, center, r_o, self._settings, filling
+            )
             o = center + dr.zeros(mi.Point3f, width)
             everywhere = dr.full(mi.Bool, True, width)
             found = self._each(o + r_o * distance, o, r_o, everywhere, None, escaped)
             # A constant variant returns one lane for all.
-            return [gaze + dr.zeros(mi.Float, width) for gaze, *_ in found]
+            return [gaze + dr.zeros(mi.Float, width) for gaze, *_ in found], distance, escaped
 
     def _each(
         self, p_od: Point3f, p_o: Point3f, r_o: Vector3f, active: Bool, semantic: list[Float] | None, escaped: Bool

@@ -22,7 +22,8 @@ PARTS = 8
 the angle, and no rounder; parts err in opposite ways more often than not, so that the error is told too large, by two
 or three times in the mean."""
 
-_POWER = 0.75
+POWER = 0.75
+"""Of the number of points, with which the error of a sum over them falls."""
 
 
 @dataclass(frozen=True)
@@ -53,5 +54,5 @@ def _sum(values: np.ndarray) -> Integral:
     mean = float(values.mean())
     parts = [values[k::PARTS].mean() for k in range(min(PARTS, len(values)))]
     scatter = float(np.std(parts, ddof=1)) if len(parts) > 1 else math.inf
-    error = scatter * PARTS**-_POWER / abs(mean) if mean else math.inf if scatter else 0.0
+    error = scatter * PARTS**-POWER / abs(mean) if mean else math.inf if scatter else 0.0
     return Integral(4 * math.pi * mean, len(values), error)

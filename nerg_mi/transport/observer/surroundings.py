@@ -43,7 +43,8 @@ class AllAround:
 
     def __init__(self) -> None:
         self._traced: dict[int, Surroundings] = {}
-        self._filling: Filling | None = None
+        self.filling: Filling | None = None
+        """What fills directions that escape, once that has been asked for."""
 
     def of(
         self,
@@ -56,9 +57,9 @@ class AllAround:
     ) -> Surroundings:
         """Those in ``count`` directions; the other arguments are those of ``trace_surroundings``, always the same."""
         if count not in self._traced:
-            if field.config.fills_escaped and self._filling is None:
-                self._filling = trace_filling(field, to_world, place, center, settings)
-            self._traced[count] = trace_surroundings(field, to_world, place, center, settings, count, self._filling)
+            if field.config.fills_escaped and self.filling is None:
+                self.filling = trace_filling(field, to_world, place, center, settings)
+            self._traced[count] = trace_surroundings(field, to_world, place, center, settings, count, self.filling)
         return self._traced[count]
 
 
@@ -111,7 +112,7 @@ def distance_along(
     width = dr.width(directions)
     if not field.config.needs_surfaces:
         return dr.ones(mi.Float, width), dr.full(mi.Bool, False, width)
-    met, depth = _trace(place, center, directions, settings, _beyond(field, to_world, center, directions))
+    met, depth = met_along(place, center, directions, settings, _beyond(field, to_world, center, directions))
     if field.config.fills_escaped:
         escaped = ~np.array(met)
         if escaped.any():
@@ -129,7 +130,7 @@ def trace_filling(
     """Of the observer at ``center``; see ``distance_along``."""
     few = fibonacci_vectors(_FILL)
     with dr.suspend_grad():
-        traced = _trace(place, center, few, settings, _beyond(field, to_world, center, few))
+        traced = met_along(place, center, few, settings, _beyond(field, to_world, center, few))
     known, distance = (np.array(v) for v in traced)
     return Filling(np.array(few).T[known], distance[known])
 
@@ -146,10 +147,11 @@ def nearest_depth(known: np.ndarray, depth: np.ndarray, wanted: np.ndarray) -> n
     return np.exp((weight * log).sum(axis=1) / weight.sum(axis=1)).astype(np.float32)
 
 
-def _trace(
-    place: Place, center: Point3f, directions: Vector3f, settings: ObserverSettings, beyond: Float
+def met_along(
+    place: Place, center: Point3f, directions: Vector3f, settings: ObserverSettings, beyond: Float = 0.0
 ) -> tuple[Bool, Float]:
-    """Whether a surface is met along ``directions``, and where; ``beyond`` where none is."""
+    """Whether a surface is met along unit ``directions`` (lanes) from ``center``, and its distance in scene units;
+    ``beyond`` where none is."""
     import mitsuba as mi
 
     everywhere = dr.full(mi.Bool, True, dr.width(directions))

@@ -19,8 +19,8 @@ from tests.jobs.recorder import Recorder
 class Law(Surroundings):
     """A gaze that is known: twice as dense ahead (x > 0) as behind, and seven units of support."""
 
-    def densities(self, eye, d):
-        return np.where(d[:, 0] > 0, 2.0, 1.0)[None]
+    def look_from(self, eye):
+        return lambda d: (np.where(d[:, 0] > 0, 2.0, 1.0)[None], None)
 
     def support(self, eye):
         return 7.0
@@ -66,8 +66,8 @@ def test02_people():
 class Two(Law):
     """Two members who look to opposite sides, ten times as long at one as at the other."""
 
-    def densities(self, eye, d):
-        return np.array([np.where(s * d[:, 0] > 0, 10.0, 1.0) for s in (1, -1)])
+    def look_from(self, eye):
+        return lambda d: (np.array([np.where(s * d[:, 0] > 0, 10.0, 1.0) for s in (1, -1)]), None)
 
 
 def test03_members_of_an_ensemble():

@@ -35,10 +35,9 @@ def test02_gaze_of_the_scene_or_beside_it(folder):
     own = surroundings_of_files(folder / "scene.xml", None, None, None, ns)
     beside = surroundings_of_files(folder / "bare" / "scene.xml", None, folder / "gaze.safetensors", None, ns)
     eye = np.array([1.0, 1.0, 1.5])
-    assert np.allclose(own.densities(eye, d), beside.densities(eye, d), rtol=1e-4) and own.densities(eye, d).shape == (
-        1,
-        2,
-    )
+    found, other = own.look_from(eye)(d), beside.look_from(eye)(d)
+    assert found[0].shape == (1, 2) and np.allclose(found[0], other[0], rtol=1e-4)
+    assert np.allclose(found[1], own.depth(np.broadcast_to(eye, d.shape), d)) and np.allclose(found[1], other[1])
     assert np.isnan(own.support(eye))
 
 

@@ -1,0 +1,279 @@
+"""Shares of observers' gaze on things: of the integral over all directions, the part that ends on each.
+
+A direction counts for a thing by the rule of `landing`: the first surface that the observer meets lies in the box, or
+is the mesh or the shape. Sums are over directions of equal area on a golden spiral, and every thing is summed over as
+many as its error asks for: of a finer spiral only those are looked along that cross the thing, so that small things
+take no more than large ones, and things that ask for the same spiral share its directions. What a sum is a share of is
+summed in the same way over the whole sphere, with what escapes and meets no surface.
+
+Errors are those of the integral over an observer's sphere (`nerg_mi.transport.observer.integral`): told from the
+scatter of sums over every eighth direction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nerg_mi.errors import NergError
+from nerg_mi.maths.sphere import fibonacci_directions, numbers_in_cone
+from nerg_mi.transport.observer.integral import PARTS, POWER
+
+from .landing import Thing, land, regroup
+
+FIRST = 1 << 13
+"""Directions over the sphere that are looked along first."""
+
+MOST = 1 << 20
+"""A spiral has so many directions over the sphere at most, a fifth of a degree apart."""
+
+WHOLE = 1 << 17
+"""And if all of them are looked along."""
+
+LEAST = 256
+"""So many directions cross a thing at least, where a spiral has them."""
+
+ENOUGH = 1 << 14
+"""A thing that so many directions cross is summed over no more."""
+
+FLOOR = 1e-5
+"""A share is known well enough, whatever the tolerance, when its error is less than this."""
+
+_RAYS = 1 << 17
+_SPHERE = 4 * math.pi
+
+Look = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray | None]]
+"""Of unit directions (N, 3): the gaze (M, N) of an observer in 1/sr, or in proportion to it, by each member of an
+ensemble or by one field; and the distance (N,) of the surface that is met, infinite where there is none, or None where
+no surfaces are known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shares:
+    """Of E eyes and A areas: ``share`` (E, A) of the gaze, and the ``error`` (E, A) that it is likely to have at most;
+    ``seen`` (E, A): whether any direction ends on the area;
+    ``distance`` (E, A): the mean distance to the area, times the share; ``escaped`` (E,): the share that meets no
+    surface, NaN where none are known; ``whole`` (E,): the integral of the gaze, of which these are shares; ``members``
+    (M, E, A): the share by each member of an ensemble, by one field the same again."""
+
+    share: np.ndarray
+    error: np.ndarray
+    seen: np.ndarray
+    distance: np.ndarray
+    escaped: np.ndarray
+    whole: np.ndarray
+    members: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class SumRule:
+    """How finely is summed: to an error of ``tolerance``, a share of what is summed, over ``first`` directions around
+    an eye or more."""
+
+    tolerance: float = 1e-2
+    first: int = FIRST
+
+
+def gaze_shares(
+    look_from: Callable[[np.ndarray], Look],
+    eyes: np.ndarray,
+    things: Sequence[Thing],
+    members: Sequence[tuple[int, ...]],
+    margin: float,
+    rule: SumRule | None = None,
+    on_eyes: Callable[[int], None] | None = None,
+) -> Shares:
+    """The shares of gaze that ``eyes`` (E, 3) give to areas, which consist of ``things`` by their numbers, ``members``.
+
+    ``look_from`` makes the look of an eye (3,); ``margin``: as of `landing.land`. ``on_eyes`` is told how many eyes are
+    done, after some of them each time. Raises `NergError` where the gaze is not finite.
+    """
+    rule = rule or SumRule()
+    eyes = np.asarray(eyes, float)
+    found: list[Shares] = []
+    each = max(1, _RAYS // rule.first)
+    for a in range(0, len(eyes), each):
+        some = eyes[a : a + each]
+        found.append(_Sums(look_from, some, things, members, margin, rule).shares())
+        if on_eyes is not None:
+            on_eyes(a + len(some))
+    if not found:
+        none = np.zeros((0, len(members)))
+        return Shares(none, none, none.astype(bool), none, np.zeros(0), np.zeros(0), none[None])
+    names = ("share", "error", "seen", "distance", "escaped", "whole")
+    joined = {name: np.concatenate([getattr(f, name) for f in found]) for name in names}
+    return Shares(**joined, members=np.concatenate([f.members for f in found], axis=1))
+
+
+class _Sums:
+    """Sums of some eyes. Column A of what is kept of A areas is the whole sphere."""
+
+    def __init__(
+        self,
+        look_from: Callable[[np.ndarray], Look],
+        eyes: np.ndarray,
+        things: Sequence[Thing],
+        members: Sequence[tuple[int, ...]],
+        margin: float,
+        rule: SumRule,
+    ):
+        self.look_from, self.eyes, self.things, self.members = look_from, eyes, things, members
+        self.looks: dict[int, Look] = {}
+        self.margin, self.rule = margin, rule
+        E, A = len(eyes), len(members)
+        # Integrals over the parts of a spiral: of the mean density, and of members apart.
+        self.parts: np.ndarray = np.zeros((1, E, A + 1, PARTS))
+        self.distance, self.escaped = np.zeros((E, A)), np.zeros(E)
+        self.seen = np.zeros((E, A), bool)
+        self.count = np.full((E, A + 1), rule.first)
+        # Of an area the directions of the spiral that was last asked for.
+        self._crossing: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
+        for e in range(E):
+            for a in range(A):
+                self.count[e, a] = self._first_count(e, a)
+        open_ = np.ones((E, A + 1), bool)
+        while open_.any():
+            for count in np.unique(self.count[open_]).tolist():
+                self._sum(int(count), open_ & (self.count == count))
+            open_ = self._refine(open_)
+
+    def shares(self) -> Shares:
+        value, error = self._integrals()
+        whole = value[:, :, -1]
+        if not np.isfinite(value).all():
+            eye = self.eyes[np.flatnonzero(~np.isfinite(value).all(axis=(0, 2)))[0]]
+            raise NergError(f"the gaze of the observer at {eye.tolist()} is not finite; place them within the scene")
+        some = np.where(whole > 0, whole, 1)
+        share = value[:, :, :-1] / some[:, :, None]
+        relative = error / some[0, :, None]
+        error = np.hypot(relative[:, :-1], share[0] * relative[:, -1:])
+        members = share[1:] if len(share) > 1 else share
+        distance, escaped = self.distance / some[0, :, None], self.escaped / some[0]
+        return Shares(share[0], error, self.seen, distance, escaped, whole[0], members)
+
+    def _integrals(self) -> tuple[np.ndarray, np.ndarray]:
+        """``(value (M, E, A + 1), error (E, A + 1))``, the error of the mean density."""
+        scatter = self.parts[0].std(axis=-1, ddof=1)
+        return self.parts.mean(axis=-1), scatter * PARTS**-POWER
+
+    def _refine(self, open_: np.ndarray) -> np.ndarray:
+        """Give more directions to those sums of ``open_`` (E, A + 1) that err by more than the tolerance, and say
+        which these are."""
+        value, error = self._integrals()
+        enough = self.rule.tolerance * np.abs(value[0]) + FLOOR * value[0, :, -1:]
+        most = np.full(self.count.shape, MOST)
+        most[:, -1] = WHOLE
+        more = open_ & (error > enough) & (self.count < most)
+        for e, a in np.argwhere(more).tolist():
+            # What is told falls nearly as their number grows.
+            times = 1 << max(1, math.ceil(math.log2(error[e, a] / enough[e, a])))
+            if a < len(self.members):
+                crossing = max(1, len(self._numbers(int(self.count[e, a]), e, a)))
+                times = min(times, ENOUGH // crossing)
+            count = min(int(self.count[e, a]) * times, int(most[e, a]))
+            more[e, a] = count > self.count[e, a]
+            self.count[e, a] = count
+        return more
+
+    def _first_count(self, e: int, a: int) -> int:
+        """Directions around an eye of which enough cross an area, or as many as may be."""
+        count = self.rule.first
+        while count < MOST and (crossing := len(self._numbers(count, e, a))) < LEAST:
+            count = min(MOST, count << max(1, math.ceil(math.log2(LEAST / max(crossing, 0.5)))))
+        return count
+
+    def _numbers(self, count: int, e: int, a: int) -> np.ndarray:
+        """Numbers of those of ``count`` directions around an eye that may be on an area."""
+        if self._crossing.get((e, a), (0, None))[0] == count:
+            return self._crossing[e, a][1]
+        found = []
+        for k in self.members[a]:
+            center, radius = self.things[k].ball
+            away = center - self.eyes[e]
+            apart = float(np.linalg.norm(away))
+            axis = away / apart if apart > 0 else np.array([0.0, 0.0, 1.0])
+            numbers = numbers_in_cone(count, axis, math.asin(min(radius / apart, 1.0)) if apart > radius else math.pi)
+            d = fibonacci_directions(count, numbers)
+            found.append(numbers[self.things[k].may_meet(np.broadcast_to(self.eyes[e], d.shape), d)])
+        numbers = found[0] if len(found) == 1 else np.unique(np.concatenate(found))
+        self._crossing[e, a] = count, numbers
+        return numbers
+
+    def _sum(self, count: int, wanted: np.ndarray) -> None:
+        """Sum those of ``wanted`` (E, A + 1) over ``count`` directions around the eyes."""
+        batch: list[_Looked] = []
+        for e in np.flatnonzero(wanted.any(axis=1)).tolist():
+            areas = np.flatnonzero(wanted[e, :-1]).tolist()
+            among = {a: self._numbers(count, e, a) for a in areas}
+            if wanted[e, -1]:
+                numbers = np.arange(count)
+            else:
+                numbers = np.unique(np.concatenate(list(among.values())))
+            d = fibonacci_directions(count, numbers)
+            if not len(d):
+                continue
+            if e not in self.looks:
+                self.looks[e] = self.look_from(self.eyes[e])
+            gaze, depth = self.looks[e](d)
+            gaze = np.maximum(gaze, 0)
+            gaze = np.concatenate([gaze.mean(axis=0)[None], gaze]) if len(gaze) > 1 else gaze
+            rows = {a: np.searchsorted(numbers, n) for a, n in among.items()}
+            batch.append(_Looked(e, numbers, d, gaze, depth, rows))
+            if sum(len(b.numbers) for b in batch) >= _RAYS:
+                self._add(count, batch, wanted)
+                batch = []
+        if batch:
+            self._add(count, batch, wanted)
+
+    def _add(self, count: int, batch: Sequence[_Looked], wanted: np.ndarray) -> None:
+        E, A = len(self.eyes), len(self.members)
+        gaze = np.concatenate([b.gaze for b in batch], axis=1)
+        if len(gaze) != len(self.parts):
+            self.parts = np.repeat(self.parts, len(gaze), axis=0)
+        starts = np.cumsum([0, *(len(b.numbers) for b in batch)])
+        eye = np.repeat([b.eye for b in batch], np.diff(starts))
+        place = eye * PARTS + np.concatenate([b.numbers for b in batch]) % PARTS
+        # Directions in each part of the spiral.
+        size = (count - np.arange(PARTS) + PARTS - 1) // PARTS
+        part = lambda rows, w: (
+            np.bincount(place[rows], w, E * PARTS).reshape(E, PARTS) * (_SPHERE / np.maximum(size, 1))
+        )
+        d = np.concatenate([b.directions for b in batch])
+        known = batch[0].depth is not None
+        depth = np.concatenate([b.depth for b in batch if b.depth is not None]) if known else None
+        among: list[list[np.ndarray]] = [[] for _ in self.things]
+        for b, start in zip(batch, starts):
+            for a, rows in b.rows.items():
+                for k in self.members[a]:
+                    among[k].append(rows + start)
+        which = [np.unique(np.concatenate(r)) if r else np.zeros(0, np.int64) for r in among]
+        landed = regroup(land(self.things, self.eyes[eye], d, depth, self.margin, which), self.members)
+        wanted = wanted & np.isin(np.arange(E), [b.eye for b in batch])[:, None]
+        for a in np.flatnonzero(wanted[:, :A].any(axis=0)).tolist():
+            mine, rows = wanted[:, a], landed.rows[a]
+            for m, g in enumerate(gaze):
+                self.parts[m, mine, a] = part(rows, g[rows])[mine]
+            self.seen[eye[rows], a] = True
+            self.distance[mine, a] = part(rows, gaze[0, rows] * landed.distance[a]).mean(axis=1)[mine]
+        mine = wanted[:, A]
+        if mine.any():
+            every = np.arange(len(eye))
+            for m, g in enumerate(gaze):
+                self.parts[m, mine, A] = part(every, g)[mine]
+            out = every[:0] if depth is None else np.flatnonzero(~np.isfinite(depth))
+            self.escaped[mine] = np.nan if depth is None else part(out, gaze[0, out]).mean(axis=1)[mine]
+
+
+@dataclass(frozen=True, eq=False)
+class _Looked:
+    """What the ``eye`` meets in ``directions`` with these ``numbers``; of areas the ``rows`` that may be on them."""
+
+    eye: int
+    numbers: np.ndarray
+    directions: np.ndarray
+    gaze: np.ndarray
+    depth: np.ndarray | None
+    rows: dict[int, np.ndarray]
