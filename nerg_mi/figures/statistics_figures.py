@@ -5,10 +5,12 @@ Each returns a matplotlib ``Figure``; `saving.save` writes it. Rows are those of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+from nerg_mi.statistics.tables import is_too_low
 
 from .sheet import INK, new_page
 
@@ -18,12 +20,12 @@ MOST = 40
 _COLORS = {"tracked": "#2b6cb0", "field": "#d9730d"}
 _GRID = "#dddddd"
 
-Row = Mapping[str, Any]
+Row = dict[str, Any]
 
 
 def things_figure(rows: Sequence[Row], title: str = "Attention on things") -> Any:
     """Share of time, reach and dwell of each thing, from ``rows`` of one cell: a bar for what was counted and a point
-    for what the field foretells, with 95 % intervals."""
+    for what the field foretells, with 95 % intervals; hollow, and said to be so, where it comes out too low."""
     panels = (("share", "share of time [%]", 100), ("reach", "reach [% of people]", 100), ("dwell", "dwell [s]", 1))
     best: dict[str, float] = {}
     for row in rows:
@@ -44,7 +46,11 @@ def things_figure(rows: Sequence[Row], title: str = "Attention on things") -> An
             if source == "tracked":
                 axis.barh(y, x, 0.62, color=_COLORS[source], alpha=0.6, zorder=2)
             else:
-                axis.plot(x, y + shift, "o", markersize=4.5, color=color, zorder=4)
+                hollow = [is_too_low(r, key) for r in some]
+                face = "white" if any(hollow) else color
+                axis.plot(x, y + shift, "o", markersize=4.5, color=color, markerfacecolor=face, zorder=4)
+                places = min((r["places"] for r, is_low in zip(some, hollow) if is_low), default=None)
+                label += "" if places is None else f"\n○ too low: from {places:.1f} places a person"
             for r, at in zip(some, y):
                 low, high = r.get(f"{key}_low"), r.get(f"{key}_high")
                 if low is not None and high is not None:
@@ -61,7 +67,7 @@ def things_figure(rows: Sequence[Row], title: str = "Attention on things") -> An
     words = {"tracked": "counted in rays", "field": "foretold by the field"}
     handles = [axes[0].plot([], [], "s", markersize=5, color=_COLORS[s], label=words[s])[0] for s in sources]
     page.legend(handles=handles, fontsize=8, frameon=False, loc="upper right", ncols=2)
-    page.subplots_adjust(left=0.24, right=0.985, wspace=0.08, top=1 - 44 / height, bottom=46 / height)
+    page.subplots_adjust(left=0.24, right=0.985, wspace=0.08, top=1 - 44 / height, bottom=58 / height)
     return page
 
 

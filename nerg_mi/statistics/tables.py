@@ -18,6 +18,9 @@ from .sums import BINS, Cell, Sums
 TRACKED, FIELD = "tracked", "field"
 """Sources of numbers: rays that were recorded, and what the gaze field foretells."""
 
+PLACES = 16
+"""From so many places a person a field should be asked for their reach: from fewer it comes out too low."""
+
 COMPARED = ("share", "dwell", "reach", "looks", "given_visible")
 """Measures of which differences are told."""
 
@@ -160,9 +163,15 @@ def duration_rows(sums: Sums, floor: Floor) -> list[Row]:
     return rows
 
 
+def is_too_low(row: Row, measure: str) -> bool:
+    """Whether a number comes out too low: the reach by a field that was asked from few ``places`` a person."""
+    places = row.get("places")
+    return measure == "reach" and row.get(measure) is not None and places is not None and places < PLACES
+
+
 def shown(row: Row, measure: Measure) -> str:
     """A value with its interval as Markdown has it, and, after ±, its spread over the members of an ensemble: shares in
-    percent, small ones with two digits behind the point."""
+    percent, small ones with two digits behind the point. What comes out too low says so."""
     value = row.get(measure.name)
     if value is None:
         return ""
@@ -172,4 +181,5 @@ def shown(row: Row, measure: Measure) -> str:
     if low is not None and high is not None:
         text += f" [{scale * low:.{digits}f}, {scale * high:.{digits}f}]"
     spread = row.get(measure.name + "_spread")
-    return text if spread is None else text + f" ± {scale * spread:.{digits}f}"
+    text = text if spread is None else text + f" ± {scale * spread:.{digits}f}"
+    return f"{text} (too low: {row['places']:.1f} places a person)" if is_too_low(row, measure.name) else text

@@ -11,7 +11,7 @@ import numpy as np
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.statistics.measures import BY_NAME
 from nerg_mi.statistics.sums import Cell
-from nerg_mi.statistics.tables import FIELD, Row
+from nerg_mi.statistics.tables import FIELD, PLACES, Row
 
 from .foretold import Foretold, foretold_people
 from .tracked import Eyes
@@ -20,29 +20,29 @@ SPREAD = ("share", "dwell", "reach")
 """Numbers whose spread over members is told."""
 
 
-PLACES = 16
-"""From so many places a person a field should be asked for their reach."""
-
-
 def add_trust(
     rows: Sequence[Row], foretold: Foretold, eyes: Eyes, times: Mapping[Cell, dict[str, float]], glance: float
 ) -> None:
-    """Give ``rows`` of the table of things ``support``, the median over the eyes of their cell, and ``share_spread``,
-    ``dwell_spread`` and ``reach_spread``, the standard deviations over the members of an ensemble; None for what was
-    counted, is blank, or is not known."""
-    found: dict[tuple[str, str], tuple[float | None, dict[str, np.ndarray]]] = {}
+    """Give ``rows`` of the table of things ``support``, the median over the eyes of their cell, ``places``, the eyes of
+    the cell for each of its people, and ``share_spread``, ``dwell_spread`` and ``reach_spread``, the standard
+    deviations over the members of an ensemble; None for what was counted, is blank, or is not known."""
+    found: dict[tuple[str, str], tuple[float | None, float | None, dict[str, np.ndarray]]] = {}
     areas: dict[str, int] = {}
     for cell in times:
         mine = np.array([cell in cells for cells in eyes.cells], bool)
-        found[cell.dimension, cell.value] = support_of(foretold, mine), _spreads(foretold, eyes, cell, times, glance)
+        people = {person for person, own in zip(eyes.person, mine.tolist()) if own}
+        places = float(mine.sum()) / len(people) if people else None
+        spreads = _spreads(foretold, eyes, cell, times, glance)
+        found[cell.dimension, cell.value] = support_of(foretold, mine), places, spreads
     for row in rows:
         place = areas.setdefault(row["thing"], len(areas))
-        support, spreads = found[row["cell"], row["value"]]
+        support, places, spreads = found[row["cell"], row["value"]]
         told = row["source"] == FIELD
         for name in SPREAD:
             known = told and name in spreads and row[name] is not None
             row[f"{name}_spread"] = float(spreads[name][place]) if known else None
         row["support"] = support if told and row["people"] is not None else None
+        row["places"] = places if told and row["people"] is not None else None
 
 
 def support_of(foretold: Foretold, mine: np.ndarray | None = None) -> float | None:

@@ -7,8 +7,9 @@ import pytest
 
 from nerg_mi.jobs.counting.foretold import Foretold
 from nerg_mi.jobs.counting.tracked import Eyes
-from nerg_mi.jobs.counting.trust import PLACES, add_trust, support_of, tell_places, tell_support
+from nerg_mi.jobs.counting.trust import add_trust, support_of, tell_places, tell_support
 from nerg_mi.statistics.sums import ALL, Cell
+from nerg_mi.statistics.tables import PLACES
 from tests.jobs.recorder import Recorder
 
 ZONE = Cell("zone", "z")
@@ -38,6 +39,7 @@ def test01_spread_and_support_of_each_cell():
     tracked, field, _, zone = found
     assert tracked["support"] is tracked["share_spread"] is None
     assert field["support"] == 3 and zone["support"] == 8
+    assert (field["places"], zone["places"], tracked["places"]) == (1.5, 1.0, None)
     # Ada's mean and Bo's, of the first member 0.3 over both, of the second 0.2.
     assert field["share_spread"] == pytest.approx(0.1 / np.sqrt(2))
     assert field["dwell_spread"] == pytest.approx((0.2 * 2 + 0.4 * 6 - 0.2 * 2 - 0.2 * 6) / 2 / np.sqrt(2))

@@ -6,9 +6,11 @@ import csv
 
 import pytest
 
+from nerg_mi.figures.statistics_figures import things_figure
 from nerg_mi.jobs.counting import writing
 from nerg_mi.statistics.persons import PersonRows
 from nerg_mi.statistics.sums import ALL, Sums
+from nerg_mi.statistics.tables import PLACES
 
 ROWS = [
     {"cell": "all", "value": "", "thing": "a|b", "n": 3, "x": 0.125},
@@ -49,6 +51,19 @@ def test04_what_a_field_foretells_with_its_spread_and_support():
         cells(row | {"support": None})[-1] == "not in the checkpoint" and cells(row | {"source": "tracked"})[-1] == ""
     )
     assert cells(row | {"share": 0.0004, "share_low": 0, "share_high": 0.001})[-2] == "0.04 % [0.00, 0.10] ± 2.10"
+
+
+def test06_reach_from_few_places_is_marked_in_table_and_picture():
+    row = {"cell": "all", "value": "", "thing": "a", "source": "field", "people": 5, "share": 0.1, "reach": 0.45}
+    row |= {"dwell": 2.0, "support": 9.0}
+    for places, low in ((2.56, True), (PLACES - 0.01, True), (PLACES, False), (None, False)):
+        one = row | {"places": places}
+        texts = writing.thing_columns([one])[1](one)
+        said = [text for text in texts if "too low" in str(text)]
+        assert said == ([f"45.0 % (too low: {places:.1f} places a person)"] if low else [])
+        share, reach, dwell = things_figure([one]).axes
+        assert ("too low" in reach.get_xlabel()) == low and "low" not in share.get_xlabel() + dwell.get_xlabel()
+        assert (reach.lines[0].get_markerfacecolor() == "white") == low
 
 
 def test05_what_a_change_does():
