@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import nerg_mi as nerg
+from tests.jobs.recorder import Recorder
+from tests.plugins import fields
 
 BALL = {"type": "sphere", "radius": 0.5}
 
@@ -141,3 +143,12 @@ def test11_mono(mono, files):
     assert nerg.trace(scene, (0, -3, 0), (0, 1, 0), "color").color.shape == (1, 1)
     camera = nerg.Camera((0, -3, 0), (0, 0, 0), width=4, height=3)
     assert nerg.render(scene, quantities="color", camera=camera, spp=1).color.shape == (1, 3, 4, 1)
+
+
+@pytest.mark.parametrize(("normalized", "expected"), [(True, [0.5, 1.0]), (False, [])])
+def test_progress_is_told_where_every_origin_is_integrated(tmp_path, rgb, normalized, expected):
+    fields.gaze(tmp_path / "gaze.safetensors", normalized=normalized)
+    scene = nerg.make_scene(gaze=tmp_path / "gaze.safetensors", shapes=BALL)
+    told = Recorder()
+    nerg.trace(scene, [(0, -3, 0), (0, 3, 0), (0, -3, 0)], (0, 1, 0), "gaze", reporter=told)
+    assert [share for share, _ in told.steps] == expected

@@ -15,7 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 FIRST = 1 << 13
-"""Directions that are tried first."""
+"""Directions that are tried first for a tolerance of `USUAL`, which they mostly keep; fewer for a wider one, `FEWEST`
+at least."""
+
+USUAL, FEWEST = 5e-3, 1 << 11
 
 PARTS = 8
 """Parts of a sum whose scatter tells its error. Every eighth point of a golden spiral lies on one too, of eight times
@@ -39,7 +42,8 @@ def integrate(values: Callable[[int], np.ndarray], most: int, tolerance: float) 
     """The integral of what ``values(count)`` (count,) are in that many directions of equal area, as
     `maths.sphere.fibonacci_directions` numbers them: over as few as err by ``tolerance``, a share of it, or over
     ``most``."""
-    count = min(FIRST, most) if tolerance > 0 else most
+    first = FIRST >> max(0, math.floor(math.log2(tolerance / USUAL) / POWER)) if tolerance > 0 else most
+    count = min(max(first, FEWEST), most)
     while True:
         found = _sum(values(count))
         if count == most or found.error <= tolerance:
