@@ -32,8 +32,8 @@ from .scene import Scene
 from .shapes import mesh_child
 from .variant import active_mitsuba
 
-TOLERANCE = 0.01
-"""Error of a share of a box, as a share of it, until which directions are added."""
+FINE = SumRule()
+"""How finely the share of a box is summed, unless another tolerance is asked for."""
 
 PIECE = 4
 """A piece of a surface is so many times shorter than its distance from the nearest observer."""
@@ -92,7 +92,7 @@ def attention(
     observers: ArrayLike | None = None,
     *,
     margin: float = MARGIN,
-    tolerance: float = TOLERANCE,
+    tolerance: float = FINE.tolerance,
     divisions: int | None = None,
     two_sided: bool = False,
     reporter: Reporter = SILENT,
@@ -138,7 +138,8 @@ def attention(
         if divisions is not None or two_sided:
             raise NergError("divisions and two_sided are of meshes, and this is a box; leave them out, or give a mesh")
         eyes = given_observers(scene, observers)
-        found = box_shares(scene, [region], eyes, margin=float(margin), tolerance=float(tolerance), reporter=reporter)
+        rule = SumRule(tolerance=float(tolerance))
+        found = box_shares(scene, [region], eyes, margin=float(margin), rule=rule, reporter=reporter)
         single = lambda v: np.ascontiguousarray(v, np.float32)
         return Attention(single(found.share[:, 0]), eyes, single(found.error[:, 0]), single(found.escaped))
     whole = isinstance(divisions, (int, np.integer)) and not isinstance(divisions, bool)
@@ -167,11 +168,11 @@ def box_shares(
     observers: Floats,
     *,
     margin: float = MARGIN,
-    tolerance: float = TOLERANCE,
+    rule: SumRule = FINE,
     reporter: Reporter = SILENT,
 ) -> Shares:
-    """The shares of ``observers`` (M, 3) on N boxes, which may be turned, all of them at once: (M, N); arguments and
-    errors as of `attention`."""
+    """The shares of ``observers`` (M, 3) on N boxes, which may be turned, all of them at once, (M, N), as finely as
+    the ``rule`` says; arguments and errors as of `attention`."""
     from nerg_mi.transport.observer.looking import look_from
 
     _check(scene)
@@ -184,7 +185,7 @@ def box_shares(
             [Box(region) for region in regions],
             [(k,) for k in range(len(regions))],
             margin,
-            SumRule(tolerance=tolerance),
+            rule,
             told,
         )
 

@@ -38,7 +38,7 @@ from nerg_mi.report.proxy import place_proxy, spread_out
 from nerg_mi.report.run import Picture, Run
 from nerg_mi.report.stage import Camera, Stage, pack
 from nerg_mi.statistics.landing import MARGIN, Box
-from nerg_mi.statistics.shares import SumRule, gaze_shares
+from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.training.geometry.places import GazePlace
 from nerg_mi.transport.observer.viewpoint import center
 from nerg_mi.transport.place import Place
@@ -59,9 +59,6 @@ from .versions import versions
 
 VIEWS = ("camera", "own", "sphere")
 """The pictures, which are those of the written scene's sensors."""
-
-LOOKED = SumRule(tolerance=0.02, first=1 << 12)
-"""How finely shares of objects are summed at each eye."""
 
 OBSERVERS = 5
 """Observers whose gaze the 3D scene has."""
@@ -263,7 +260,7 @@ class _Work:
         things, members = [Box(box) for box in areas.boxes], list(areas.solids.values())
         count, margin = len(eyes.positions), MARGIN * self.align.scale
         told = lambda done: self._step(0.55 + 0.2 * done / count, f"objects: place {done} of {count}")
-        shares = gaze_shares(onlooker.look_from, eyes.positions, things, members, margin, LOOKED, told)
+        shares = gaze_shares(onlooker.look_from, eyes.positions, things, members, margin, ROUGH, told)
         recorded = None
         if self.rays is not None:
             recorded = land_rays(self.rays, place, onlooker, RAYS, things, members, margin)

@@ -33,14 +33,11 @@ MOST = 1 << 20
 WHOLE = 1 << 17
 """And if all of them are looked along."""
 
-LEAST = 256
+LEAST = 64
 """So many directions cross a thing at least, where a spiral has them."""
 
 ENOUGH = 1 << 14
 """A thing that so many directions cross is summed over no more."""
-
-FLOOR = 1e-5
-"""A share is known well enough, whatever the tolerance, when its error is less than this."""
 
 _RAYS = 1 << 17
 _SPHERE = 4 * math.pi
@@ -70,11 +67,16 @@ class Shares:
 
 @dataclass(frozen=True, kw_only=True)
 class SumRule:
-    """How finely is summed: to an error of ``tolerance``, a share of what is summed, over ``first`` directions around
-    an eye or more."""
+    """How finely is summed: to an error of ``tolerance``, a share of what is summed, or of ``least``, a share of the
+    gaze, over ``first`` directions around an eye or more."""
 
     tolerance: float = 1e-2
+    least: float = 1e-5
     first: int = FIRST
+
+
+ROUGH = SumRule(tolerance=0.02, least=5e-5)
+"""For many areas at once, or many eyes over which is averaged."""
 
 
 def gaze_shares(
@@ -163,7 +165,7 @@ class _Sums:
         """Give more directions to those sums of ``open_`` (E, A + 1) that err by more than the tolerance, and say
         which these are."""
         value, error = self._integrals()
-        enough = self.rule.tolerance * np.abs(value[0]) + FLOOR * value[0, :, -1:]
+        enough = self.rule.tolerance * np.abs(value[0]) + self.rule.least * value[0, :, -1:]
         most = np.full(self.count.shape, MOST)
         most[:, -1] = WHOLE
         more = open_ & (error > enough) & (self.count < most)

@@ -9,11 +9,9 @@ import numpy as np
 from nerg_mi.api.attention import box_shares, mesh_shares
 from nerg_mi.api.scene import Scene
 from nerg_mi.formats.regions import Region
+from nerg_mi.statistics.shares import ROUGH
 
 from .refining import rough_integrals
-
-TOLERANCE = 0.02
-"""Error of the share of an area, as a share of it, until which directions are added."""
 
 FACES = 1 << 17
 """Faces of shapes whose shares are counted in one step, but for a shape that has more."""
@@ -25,7 +23,7 @@ def shares_in_steps(
     """The share of the observer at ``at`` (3,) of each of ``regions``, together, then of the meshes whose ids are
     ``shapes``, so many at a time as a step can count."""
     if regions:
-        boxes = box_shares(scene, regions, np.asarray(at, np.float32)[None], tolerance=TOLERANCE).share[0]
+        boxes = box_shares(scene, regions, np.asarray(at, np.float32)[None], rule=ROUGH).share[0]
         yield dict(zip([region.name for region in regions], boxes.tolist()))
     for names in shape_groups(scene, shapes):
         with rough_integrals(scene):

@@ -8,11 +8,10 @@ from nerg_mi.api.attention import box_shares
 from nerg_mi.api.shapes import box_dict
 from nerg_mi.formats.regions import Region
 from nerg_mi.jobs.options.statistics import StatisticsOptions
-from nerg_mi.jobs.report import LOOKED
 from nerg_mi.jobs.statistics import statistics
 from nerg_mi.report.glances import Onlooker
 from nerg_mi.statistics.landing import MARGIN, Box
-from nerg_mi.statistics.shares import gaze_shares
+from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.training.geometry.places import GazePlace
 from tests.jobs.counting.place import SIGN, STAND, write_place
 
@@ -258,6 +257,6 @@ def test14_statistics_viewer_and_report_say_the_same(room):
     field = scene.integrator.gaze.field
     onlooker = Onlooker(field, GazePlace(scene.place, field.box, "scene"))
     things = [Box(region) for region in regions]
-    report = gaze_shares(onlooker.look_from, eye[None], things, [(0,), (1,)], MARGIN, LOOKED)
+    report = gaze_shares(onlooker.look_from, eye[None], things, [(0,), (1,)], MARGIN, ROUGH)
     assert report.share[0, 0] == pytest.approx(here.share[0], rel=0.03)
     assert report.share[0, 1] == pytest.approx(viewer["corner"], rel=0.03) and viewer["corner"] > 1e-3

@@ -9,7 +9,7 @@ each other: 1 - Π (1 - s_i) over their time, s_i the share at glance i.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
@@ -17,16 +17,12 @@ import numpy as np
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.statistics.landing import Thing
 from nerg_mi.statistics.measures import People
-from nerg_mi.statistics.shares import SumRule, gaze_shares
+from nerg_mi.statistics.shares import ROUGH, gaze_shares
 from nerg_mi.statistics.sums import Cell
 from nerg_mi.statistics.visibility import Targets, in_view, unhidden
 
 from .surroundings import Surroundings
 from .tracked import Eyes
-
-TOLERANCE = 0.05
-"""Error of a share at one eye, as a share of it, for which directions are added: of the mean over hundreds it is some
-thousandths."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +66,9 @@ def foretell(
     so many ``directions`` around each or, where a thing is small, more."""
     E = len(eyes.positions)
     told = lambda done: reporter.progress(done / E, f"the field: place {done} of {E}")
-    rule = SumRule(tolerance=TOLERANCE, first=directions)
-    found = gaze_shares(around.look_from, eyes.positions, things, members, margin, rule, told)
+    found = gaze_shares(
+        around.look_from, eyes.positions, things, members, margin, replace(ROUGH, first=directions), told
+    )
     targets = Targets.of(things, samples)
     seen = in_view(targets, eyes.positions, eyes.ahead, unhidden(targets, eyes.positions, around.depth, margin), view)
     visible = np.stack([seen[:, list(of)].any(axis=1) for of in members], axis=1)
