@@ -122,7 +122,7 @@ def errors() -> None:
                 d, o = rays.direction[i, axis], rays.origin[i, axis]
                 one, two = sorted(((box.lower[axis] - o) / d, (box.upper[axis] - o) / d))
                 near, far = max(near, one), min(far, two)
-            if near < far and far > 0 and 0 <= near <= depth[i] + 0.03:
+            if near < far and far > 0 and near - 0.03 <= depth[i] < far + 0.03:
                 dwell[rays.person[i], k] += weight
                 reached[rays.person[i], k] = 1
     print("| number | against | largest error |\n| --- | --- | ---: |")
