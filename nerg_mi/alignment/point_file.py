@@ -25,7 +25,7 @@ def read_surface(path: Path, count: int = POINTS) -> np.ndarray:
     same result every time. Raises `NergError` for a file without finite points."""
     if not path.name.lower().endswith(SUFFIXES):
         raise NergError(f'"{path}" is no surface that is read; give a mesh or points in {", ".join(SUFFIXES)}')
-    if not path.is_file():
+    if not path.exists():
         raise MissingFile(f'there is no surface "{path}"; correct its name')
     if path.name.lower().endswith((".csv", ".csv.gz")):
         points = _table(path)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
+from nerg_mi.files.bounded import size_of
 
 from .colmap import count_images, model_files, read_image_poses
 from .posed import name_some
@@ -31,7 +32,8 @@ def find_source(dataset: str | Path) -> Path:
     """The transforms file of ``dataset``, or the folder of its COLMAP model, of several the one with the most images.
     ``dataset``: a folder, or that file itself."""
     dataset = Path(dataset)
-    if dataset.is_file():
+    if dataset.exists() and not dataset.is_dir():
+        size_of(dataset, "posed image set")
         # A file of a COLMAP model stands for the model.
         return dataset.parent if dataset.suffix in (".bin", ".txt") else dataset
     for name in ("transforms.json", "transforms_train.json"):

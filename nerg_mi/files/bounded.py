@@ -19,7 +19,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -56,12 +56,12 @@ _DAMAGED = (
 )
 
 
+_REMEDY = "copy it again, or make it anew"
+
+
 @contextmanager
 def reading(
-    path: str | os.PathLike,
-    what: str = "file",
-    remedy: str = "copy it again, or make it anew",
-    also: tuple[type[Exception], ...] = (),
+    path: str | os.PathLike, what: str = "file", remedy: str = _REMEDY, also: tuple[type[Exception], ...] = ()
 ) -> Iterator[None]:
     """Whatever a damaged file makes the block raise, as one `NergError` that names ``path`` and the ``remedy``.
 
@@ -106,19 +106,32 @@ def _remedy(error: BaseException, remedy: str) -> str:
     return remedy
 
 
+_KINDS = {
+    stat.S_IFDIR: ("a folder", "give the name of a file"),
+    stat.S_IFIFO: ("a pipe", "write what comes out of it to a file, and give that"),
+    stat.S_IFSOCK: ("a socket", "give the name of a file"),
+    stat.S_IFCHR: ("a device", "give the name of a file"),
+    stat.S_IFBLK: ("a device", "give the name of a file"),
+}
+
+
 def is_count(value: object) -> bool:
     """Whether ``value``, read from a file, is a whole number from 0 on that 64 bits hold with room to add."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 62
 
 
 def size_of(path: str | os.PathLike, what: str = "file", most: int | None = None) -> int:
-    """Bytes of the ordinary file ``path``; `NergError` for a folder, a device or a pipe, and beyond ``most`` bytes."""
+    """Bytes of the ordinary file ``path``; `NergError` for a folder, a device or a pipe, and beyond ``most`` bytes.
+
+    A pipe may keep its reader waiting for ever, and a device may have no end. So every path is checked by this before
+    it is opened, here or by a library. A link counts as what it leads to: ``/dev/stdin`` is read where it is a file.
+    """
     with reading(path, what):
         # A name may hold what no file's can, such as a zero byte.
         found = os.stat(path)
     if not stat.S_ISREG(found.st_mode):
-        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "no ordinary file"
-        raise NergError(f'the {what} "{path}" is {kind}; give the name of a file')
+        kind, remedy = _KINDS.get(stat.S_IFMT(found.st_mode), ("no ordinary file", "give the name of a file"))
+        raise NergError(f'the {what} "{path}" is {kind}; {remedy}')
     if most is not None and found.st_size > most:
         raise NergError(
             f'the {what} "{path}" has {found.st_size:,} bytes, more than the {most:,} that are read; give a smaller one'
@@ -126,11 +139,21 @@ def size_of(path: str | os.PathLike, what: str = "file", most: int | None = None
     return found.st_size
 
 
+@contextmanager
+def open_file(
+    path: str | os.PathLike, what: str = "file", remedy: str = _REMEDY, most: int | None = None
+) -> Iterator[BinaryIO]:
+    """The ordinary file ``path``, open to be read in the block; see `size_of`, and `reading` for errors of the
+    block."""
+    size_of(path, what, most)
+    with reading(path, what, remedy), open(path, "rb") as file:
+        yield file
+
+
 def read_bytes(path: str | os.PathLike, what: str = "file", most: int | None = None) -> bytes:
     """The bytes of the ordinary file ``path``, at most ``most``; see `size_of`."""
-    size_of(path, what, most)
-    with reading(path, what):
-        return Path(path).read_bytes()
+    with open_file(path, what, most=most) as file:
+        return file.read()
 
 
 def read_json(path: str | os.PathLike, what: str = "file", most: int = JSON_BYTES) -> object:

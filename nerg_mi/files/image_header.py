@@ -10,7 +10,7 @@ from math import ceil
 
 from nerg_mi.errors import NergError
 
-from .bounded import plain, reading, size_of
+from .bounded import open_file, plain
 
 PIXELS = 1 << 27
 """A picture may have so many pixels: 16,384 x 8,192."""
@@ -44,8 +44,8 @@ def check_image(
 ) -> ImageHeader:
     """The header of the picture ``path``; `NergError` where it is damaged, beyond ``most`` pixels of three bytes and
     beyond `WARRANTED` times its file, or where the file has more than ``most_bytes``."""
-    length = size_of(path, what, most_bytes)
-    with reading(path, what), open(path, "rb") as file:
+    with open_file(path, what, most=most_bytes) as file:
+        length = os.fstat(file.fileno()).st_size
         header = _header(file, length)
     width, height = header.size
     if not (width > 0 and height > 0):

@@ -7,6 +7,7 @@ architecture, units, bounding box, colour space and provenance.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +16,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.atomic import write_bytes
-from nerg_mi.files.bounded import parse_json, plain, reading, size_of
+from nerg_mi.files.bounded import open_file, parse_json, plain, reading
 
 FORMAT = 1
 """The version of the files, raised when an earlier version of this package could misread them."""
@@ -56,7 +57,7 @@ def _read(path: str | Path, contents: Callable[[Any], _Contents]) -> _Contents:
     from safetensors import SafetensorError, safe_open
 
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise MissingFile(f'the checkpoint "{path}" does not exist: correct its name, or make one with "nerg train"')
     _check_header(path)
     # The library asks NumPy for types that it has not (bfloat16), which is the file's doing.
@@ -71,9 +72,8 @@ def _read(path: str | Path, contents: Callable[[Any], _Contents]) -> _Contents:
 
 
 def _check_header(path: Path) -> None:
-    size = size_of(path, "checkpoint")
-    with reading(path, "checkpoint"), open(path, "rb") as file:
-        header = int.from_bytes(file.read(8), "little")
+    with open_file(path, "checkpoint") as file:
+        size, header = os.fstat(file.fileno()).st_size, int.from_bytes(file.read(8), "little")
     if size < 8 or header > size - 8:
         if path.suffix.lower() != ".safetensors":
             raise NergError(f'"{path}" is no checkpoint of a field; name one (.safetensors), as "nerg train" makes it')

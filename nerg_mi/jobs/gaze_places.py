@@ -121,7 +121,7 @@ def file_of_training(gaze: Path, provenance: dict, given: Path | None, where: st
     """
     about = provenance[place_key(gaze, provenance)]
     path = gaze.parent / about["file"] if given is None else Path(given)
-    if not path.is_file():
+    if not path.exists():
         raise NergError(f'"{path}", which the field was trained in, does not exist; {where}')
     if not is_field(path, about["sha256"]):
         raise NergError(f'"{path}" is not the file that "{gaze}" was trained in; {other}')

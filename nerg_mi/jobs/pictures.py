@@ -74,7 +74,7 @@ def asked_pictures(scene: Path, output: Path, options: PictureOptions) -> AskedP
         raise NergError(f"the memory to render in is {options.memory} GB: give it more than 0")
     if options.spp:
         check_samples(options.spp, "the picture")
-    if not scene.is_file():
+    if not scene.exists():
         raise NergError(f'there is no scene file "{scene}"')
     check_overlay(output, options)
     video = _check_video(output, options)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.bounded import reading, size_of
+from nerg_mi.files.bounded import open_file, reading, size_of
 from nerg_mi.formats.meshes import MeshFile, read_mesh_file
 from nerg_mi.formats.ply import parse_ply, write_columns
 
@@ -51,7 +51,7 @@ def write_mesh(path: str | os.PathLike, mesh: MeshFile) -> None:
 def check_vol(path: str | os.PathLike) -> None:
     """Raise `NergError` for a volume (Mitsuba's .vol) with counts below 1, or with fewer values than it announces."""
     path = Path(path)
-    with reading(path, "volume"), path.open("rb") as file:
+    with open_file(path, "volume") as file:
         head = file.read(48)
         magic, version, kind, *size = struct.unpack("<3sB5i", head[:24])
         if magic != b"VOL" or version != 3:

@@ -49,7 +49,7 @@ def load_scene(path: str | Path, defaults: Mapping[str, str] | None = None, merg
     """
     import mitsuba as mi
 
-    if not Path(path).is_file():
+    if not Path(path).exists():
         raise NergError(f'there is no scene file "{path}"')
     # Values of any type, among which Mitsuba looks for its own parameters.
     given: dict[str, Any] = dict(defaults or {})

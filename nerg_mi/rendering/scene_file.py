@@ -7,11 +7,13 @@ and the meshes, volumes and pictures that it names are looked at by their header
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from xml.parsers import expat
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.bounded import open_file, size_of
 from nerg_mi.files.image_header import check_image
 from nerg_mi.properties import resolved
 
@@ -119,17 +121,13 @@ class _Scene:
         parser.StartElementHandler = start
         parser.EndElementHandler = lambda tag: stack.pop()
         try:
-            with path.open("rb") as file:
+            with open_file(path, "scene file") as file:
                 while part := file.read(1 << 16):
                     self._count(len(part), path, parser)
                     parser.Parse(part, False)
             parser.Parse(b"", True)
         except expat.ExpatError as error:
             raise NergError(f'the scene file "{path}" is no well-formed XML ({error}); correct it') from error
-        except OSError as error:
-            raise NergError(
-                f'the scene file "{path}" could not be read ({error.strerror}); check its name and permissions'
-            ) from error
 
     def _refuse(self, path, parser, why):
         raise NergError(f'the scene file "{path}" (line {parser.CurrentLineNumber}) {why}')
@@ -155,10 +153,14 @@ class _Scene:
         elif tag == "path":
             self._folders.append(self._folders[0] / value)
         elif tag == "include":
-            found = self._find(values.get("filename", ""))
+            found = self._find(values.get("filename", ""), "scene file")
             if found is not None:
                 self.files.append(found)
                 self.read(found, depth, within)
+        elif tag == "spectrum" and "filename" in values:
+            found = self._find(values["filename"], "spectrum")
+            if found is not None:
+                self.files.append(found)
         elif name == "sample_count" and parent[0] == "sampler" and tag == "integer":
             try:
                 count = int(value)
@@ -168,7 +170,7 @@ class _Scene:
         elif value in ("vertex_color", "face_color") and name == "name" and parent[1] == "mesh_attribute":
             self._colored = True
         elif name == "filename" and tag == "string":
-            found = self._find(value)
+            found = self._find(value, "file")
             if found is None:
                 return
             self.files.append(found)
@@ -179,6 +181,11 @@ class _Scene:
             elif parent[1] in ("bitmap", "envmap") and found.suffix.lower() in _PICTURES:
                 check_image(found, "texture")
 
-    def _find(self, name: str) -> Path | None:
+    def _find(self, name: str, what: str) -> Path | None:
+        """The file that Mitsuba opens as ``name``, None where there is none. Raises `NergError` for a pipe, a device or
+        a folder."""
         places = [folder / name for folder in self._folders] + [Path(resolved(name))]
-        return next((place for place in places if name and place.is_file()), None)
+        found = next((place for place in places if name and os.path.exists(place)), None)
+        if found is not None:
+            size_of(found, what)
+        return found

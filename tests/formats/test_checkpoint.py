@@ -63,7 +63,7 @@ def test03_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch, fail):
 def test04_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match='"[^"]*gone.safetensors" does not exist'):
         read_checkpoint(tmp_path / "gone.safetensors", "radiance")
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(NergError, match="is a folder"):
         read_checkpoint(tmp_path, "radiance")
 
 

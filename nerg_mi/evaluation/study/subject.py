@@ -74,7 +74,7 @@ def open_subject(
         if scene not in study_scenes.SCENES:
             raise NergError(f'there is no analytic scene "{scene}": choose one of {", ".join(study_scenes.SCENES)}')
         return AnalyticSubject(study_scenes.SCENES[scene], width, height)
-    if not Path(scene).is_file():
+    if not Path(scene).exists():
         names = ", ".join(study_scenes.SCENES)
         raise NergError(f'there is no scene file "{scene}", and no analytic scene of that name; those are {names}')
     return load_subject(Path(scene), width, height, defaults or {}, surfaces)

@@ -10,7 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.field.splats import Splats, joined
-from nerg_mi.files.bounded import JSON_BYTES, read_bytes, reading
+from nerg_mi.files.bounded import JSON_BYTES, open_file, read_bytes, reading
 from nerg_mi.formats.gltf import BYTES, accessor_values, instances, read_parts
 from nerg_mi.maths.similarity import Similarity
 
@@ -23,7 +23,7 @@ _SLACK = 1e-4
 
 def has_gltf_splats(path: str | os.PathLike) -> bool:
     """Whether the document of the .glb file ``path``, which may be a mesh, names `EXTENSION`."""
-    with reading(path, "splat file"), open(path, "rb") as file:
+    with open_file(path, "splat file") as file:
         head = file.read(20)
         length = int.from_bytes(head[12:16], "little")
         return EXTENSION.encode() in file.read(min(length, JSON_BYTES))

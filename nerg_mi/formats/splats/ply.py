@@ -14,7 +14,7 @@ import numpy as np
 
 from nerg_mi.errors import plain
 from nerg_mi.field.splats import Splats, logits_of, opacities_of, scales_of
-from nerg_mi.files.bounded import read_bytes, reading
+from nerg_mi.files.bounded import open_file, read_bytes, reading
 from nerg_mi.formats.ply import parse_ply, write_columns
 from nerg_mi.maths.harmonics import DEGREES
 
@@ -36,7 +36,7 @@ _NEIGHBOR, _SAMPLE = 4, 2000
 
 def has_splats(path: str | os.PathLike) -> bool:
     """Whether the header of the PLY file ``path`` names what Gaussian splats have: their colours, or their shape."""
-    with reading(path, "PLY file"), open(path, "rb") as file:
+    with open_file(path, "PLY file") as file:
         names = re.findall(rb"^property [a-z0-9]+ (\w+)\s*$", file.read(HEADER_BYTES), re.MULTILINE)
         return b"f_dc_0" in names or {b"opacity", b"scale_0", b"rot_0"} <= set(names)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.field.splats import Splats, from_trained, logits_of
-from nerg_mi.files.bounded import reading
+from nerg_mi.files.bounded import open_file, reading
 from nerg_mi.files.inflating import open_gzip
 
 COUNT = 50_000_000
@@ -24,9 +24,8 @@ _COLOR_SCALE = 0.15
 
 def read_spz(path: str | os.PathLike) -> Splats:
     """The Gaussian splats in ``path``; `NergError` for a damaged file and for a later version."""
-    with reading(path, "splat file"):
-        with open(path, "rb") as file:
-            start = file.read(4)
+    with open_file(path, "splat file") as file:
+        start = file.read(4)
     convert = f'convert it by: npx @playcanvas/splat-transform "{Path(path).name}" out.ply'
     with reading(path, "splat file", convert):
         if start == struct.pack("<I", _MAGIC):

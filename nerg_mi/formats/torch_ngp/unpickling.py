@@ -291,7 +291,7 @@ def read_torch(path: str | Path):
     plain data.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
     size_of(path, "checkpoint")
     with reading(path, "checkpoint"):

@@ -92,7 +92,7 @@ def read_baked(path: Path) -> BakedSurface:
     """A mesh with values in a PLY file, as `nerg bake` writes it. Raises `NergError` for any other file."""
     if path.suffix.lower() != ".ply":
         raise NergError(f'"{path}" is no baked surface that is drawn; give the .ply that "nerg bake" writes')
-    if not path.is_file():
+    if not path.exists():
         raise MissingFile(f'there is no file "{path}"; correct its name')
     if is_splats(path):
         raise NergError(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nerg_mi.errors import MissingFile, NergError, plain
+from nerg_mi.files.bounded import size_of
 from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.formats.fields import is_field
 from nerg_mi.formats.meshes import READERS
@@ -56,6 +57,7 @@ def kind_of_file(path: Path) -> str:
         raise MissingFile(f'there is no file "{path}"; correct its name')
     if is_dataset(path):
         return "rays"
+    size_of(path)
     suffix = path.suffix.lower()
     if suffix == ".safetensors":
         kind = read_metadata(path).get("kind")

@@ -130,7 +130,7 @@ def place_of_volume(path: Path, about: dict | None = None) -> GazePlace:
     """A volume that ``place_of_hits`` has written. Raises `NergError` for one that is missing or damaged."""
     import mitsuba as mi
 
-    if not path.is_file():
+    if not path.exists():
         raise MissingFile(f'the place of hit points "{path}" does not exist; it is written beside the gaze field')
     check_vol(path)
     box = np.fromfile(path, "<f4", 6, offset=24)
