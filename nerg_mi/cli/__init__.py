@@ -14,12 +14,14 @@ import sys
 import traceback
 from typing import Annotated
 
-import typer
-
 from nerg_mi import __version__
 
-from .completion import completed_command
-from .ending import INTERRUPTED, CtrlC, end_of, flush_output
+from .ending import INTERRUPTED, CtrlC, end_of, open_streams, quiet_ctrl_c
+
+with quiet_ctrl_c():
+    import typer
+
+    from .completion import completed_command
 
 COMMANDS = {
     "demo": "Render the demo store: pictures of what a gaze field is.",
@@ -59,6 +61,7 @@ def main(arguments: list[str] | None = None) -> None:
     that ends early on Ctrl-C leaves its outputs whole or absent and raises `KeyboardInterrupt`, whose message, where it
     has one, says how to go on.
     """
+    open_streams()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     asked_by_environment = os.environ.get("NERG_TRACEBACK", "0") not in ("", "0")
     debug = asked_by_environment or not set(_DEBUG).isdisjoint(arguments)
@@ -67,13 +70,15 @@ def main(arguments: list[str] | None = None) -> None:
     with CtrlC() as ctrl_c:
         try:
             asked = completed_command(os.environ, COMMANDS) or next((a for a in arguments if a[:1] != "-"), None)
-            build_app(asked)(arguments, prog_name="nerg")
+            try:
+                build_app(asked)(arguments, prog_name="nerg")
+            finally:
+                sys.stdout.flush()
         except BaseException as error:
             interrupt = ctrl_c.behind(error)
             if interrupt is not None:
                 print(str(interrupt) or "Interrupted.", file=sys.stderr)
                 sys.exit(INTERRUPTED)
-            flush_output()
             if not isinstance(error, Exception):  # the end of a command
                 raise
             if debug:

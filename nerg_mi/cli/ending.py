@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from nerg_mi.errors import expected, sentence
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
 
 MENDABLE = 1
 """Exit code of what the user can mend."""
@@ -30,13 +37,45 @@ def end_of(error: Exception) -> tuple[int, str]:
     )
 
 
-def flush_output() -> None:
-    """Write what is left for the standard output; where nobody reads it any more, the interpreter must not try
-    again."""
+def open_streams() -> None:
+    """Make the standard streams safe to print to, whatever they lead to.
+
+    One that is closed (``nerg ... >&-``) leads to nothing: else an output file could get its number, and what is
+    printed would be written into it. A command goes on, and says nothing, where nobody reads its output any more
+    (``nerg ... | head -1``). A disk that is full is an `OSError`, once.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            # The lowest free number, which is that of the stream.
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "w" if number else "r", encoding="utf-8"))
+        elif number and stream is getattr(sys, f"__{name}__"):
+            stream.flush()
+            raw = io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False))
+            like = {key: getattr(stream, key) for key in ("encoding", "errors", "line_buffering")}
+            setattr(sys, name, io.TextIOWrapper(raw, **like))
+
+
+class _Output(io.FileIO):
+    def write(self, data: Buffer, /) -> int | None:
+        try:
+            return super().write(data)
+        except OSError as error:
+            # Also for what is left in buffers, which the interpreter writes at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            if isinstance(error, BrokenPipeError):
+                return memoryview(data).nbytes
+            raise
+
+
+@contextmanager
+def quiet_ctrl_c() -> Iterator[None]:
+    """A block of imports, before a command runs: Ctrl-C ends the process as it ends a command."""
     try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        yield
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        sys.exit(INTERRUPTED)
 
 
 class CtrlC:

@@ -3,11 +3,12 @@
 import io
 import os
 import signal
+import subprocess
 import sys
 
 import pytest
 
-from nerg_mi.cli.ending import FAULT, MENDABLE, CtrlC, end_of, flush_output
+from nerg_mi.cli.ending import FAULT, INTERRUPTED, MENDABLE, CtrlC, end_of, open_streams
 from nerg_mi.errors import NergError
 
 
@@ -32,12 +33,46 @@ def test_ctrl_c_is_found_behind_what_others_made_of_it():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_output_that_nobody_reads_is_given_up(monkeypatch):
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_output_that_nobody_reads_is_given_up(monkeypatch, name):
     read, write = os.pipe()
     os.close(read)
-    stream = io.TextIOWrapper(os.fdopen(write, "wb"), write_through=False)
+    stream = io.TextIOWrapper(os.fdopen(write, "wb"), encoding="utf-8")
+    monkeypatch.setattr(sys, name, stream)
+    monkeypatch.setattr(sys, f"__{name}__", stream)
+    open_streams()
+    for _ in range(2):
+        print("a line", file=getattr(sys, name), flush=True)
+
+
+def test_a_disk_that_is_full_is_told_once(monkeypatch):
+    stream = open("/dev/full", "w", encoding="utf-8")
     monkeypatch.setattr(sys, "stdout", stream)
-    stream.write("a line\n")
-    flush_output()
-    stream.flush()
-    stream.close()
+    monkeypatch.setattr(sys, "__stdout__", stream)
+    open_streams()
+    with pytest.raises(OSError, match="No space left"):
+        print("a line", flush=True)
+    sys.stdout.flush()
+
+
+@pytest.mark.parametrize("closed", [">&-", ">&- 2>&-", "<&- >&- 2>&-", "| true"])
+def test_a_command_without_standard_streams(closed):
+    line = f'"{sys.executable}" -c "from nerg_mi.cli import main; main([\'--version\'])" {closed}'
+    done = subprocess.run(["bash", "-o", "pipefail", "-c", line], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_ctrl_c_while_the_command_line_is_imported():
+    child = """
+import sys
+
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupting())
+import nerg_mi.cli
+"""
+    done = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (INTERRUPTED, "Interrupted.\n")
