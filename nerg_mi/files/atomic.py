@@ -7,6 +7,7 @@ step (POSIX rename), so that a reader, a killed process, a full disk or a power 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import secrets
 import shutil
@@ -146,6 +147,64 @@ def make_folder(path: str | os.PathLike) -> Path:
     with writing(path):
         Path(path).mkdir(parents=True, exist_ok=True)
     return Path(path)
+
+
+@contextmanager
+def locked(path: str | os.PathLike, busy: str) -> Iterator[None]:
+    """A block in which nobody else has the lock on the file ``path``, which is made if it is not there.
+
+    Raises `NergError`, which says ``busy``, where somebody has it. The system takes it from a process that is killed.
+    """
+    with writing(path):
+        handle = os.open(path, os.O_RDONLY | os.O_CREAT, 0o666)
+    try:
+        with writing(path):
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # Its last owner may have removed it since it was opened.
+                if not os.path.exists(path) or not os.path.samestat(os.fstat(handle), os.stat(path)):
+                    raise BlockingIOError
+            except BlockingIOError as error:
+                raise NergError(busy) from error
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def reserving(path: str | os.PathLike | None) -> Iterator[None]:
+    """A block, of long work, in which no other process writes the output ``path``; None: no output.
+
+    Raises `NergError` where one does. A hidden file beside ``path`` is locked meanwhile; a process that is killed
+    leaves it, without a lock.
+    """
+    if path is None:
+        yield
+        return
+    target = Path(os.path.realpath(path))
+    lock = target.with_name(f".{target.name}.lock")
+    with removing_empty_parents(lock):
+        make_folder(lock.parent)
+        busy = f'"{path}" is being made by another process: wait for its end, or choose another name'
+        with locked(lock, busy):
+            try:
+                yield
+            finally:
+                lock.unlink(missing_ok=True)
+
+
+@contextmanager
+def removing_empty_parents(path: str | os.PathLike) -> Iterator[None]:
+    """A block after which those parents of ``path`` are removed that were not there before, and are empty."""
+    missing = [parent for parent in Path(os.path.realpath(path)).parents if not parent.exists()]
+    try:
+        yield
+    finally:
+        for parent in missing:
+            try:
+                parent.rmdir()
+            except OSError:
+                break
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from nerg_mi.alignment.record import read_similarity
 from nerg_mi.capture.salience.views import SalienceSet, open_salience
 from nerg_mi.errors import NergError
 from nerg_mi.field.gaze.protocol import AnyGazeField
-from nerg_mi.files.atomic import check_writable
+from nerg_mi.files.atomic import check_writable, reserving
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_gaze
 from nerg_mi.maths.similarity import Similarity
@@ -71,8 +71,11 @@ def train_gaze(
 
     Raises `NergError` for what the user can mend, before any time is spent on it.
     """
-    options = options or GazeOptions()
-    output = None if output is None else Path(output)
+    with reserving(output):
+        return _train(rays, None if output is None else Path(output), options or GazeOptions(), reporter)
+
+
+def _train(rays: Rays | str | Path | None, output: Path | None, options: GazeOptions, reporter: Reporter) -> GazeResult:
     probes = check_plan(options, views_alone=rays is None)
     state = None if output is None else output.with_suffix(".run")
     if output is not None and state is not None:

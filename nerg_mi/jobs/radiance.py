@@ -10,7 +10,7 @@ from nerg_mi.capture.dataset import Dataset, open_dataset
 from nerg_mi.errors import NergError, chosen
 from nerg_mi.evaluation.images import ViewScores, score_views
 from nerg_mi.field.radiance import RadianceField
-from nerg_mi.files.atomic import check_folder, check_writable
+from nerg_mi.files.atomic import check_folder, check_writable, reserving
 from nerg_mi.files.tables import write_json
 from nerg_mi.formats.checkpoint import read_checkpoint
 from nerg_mi.formats.fields import save_radiance
@@ -56,8 +56,11 @@ def train_radiance(
 
     Raises `NergError` for what the user can mend, before any time is spent on it.
     """
-    options = options or RadianceOptions()
-    output = None if output is None else Path(output)
+    with reserving(output):
+        return _train(photos, None if output is None else Path(output), options or RadianceOptions(), reporter)
+
+
+def _train(photos: str | Path, output: Path | None, options: RadianceOptions, reporter: Reporter) -> RadianceResult:
     state = preview = None
     if output is not None:
         state, preview = output.with_suffix(".run"), output.with_suffix(".preview.png")

@@ -18,6 +18,7 @@ from nerg_mi.files.atomic import (
     make_folder,
     replacing,
     replacing_folder,
+    reserving,
     write_bytes,
     write_text,
 )
@@ -184,3 +185,38 @@ def test_a_folder_with_something_in_it_is_left_alone(tmp_path):
     with pytest.raises(NergError, match="one of its parents is a file"):
         check_new_folder(tmp_path / "empty" / "a")
     assert os.listdir(tmp_path) == ["empty"] and os.listdir(tmp_path / "empty") == ["a"]
+
+
+HOLD = """
+import sys, time
+from nerg_mi.files.atomic import reserving
+with reserving(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_an_output_is_made_by_one_process_at_a_time(tmp_path):
+    path = tmp_path / "new" / "a.bin"
+    with reserving(path), pytest.raises(NergError, match='a.bin" is being made by another process'):
+        with reserving(tmp_path / "new" / ".." / "new" / "a.bin"):
+            raise AssertionError("two at a time")
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(KeyboardInterrupt), reserving(path), reserving(path.with_name("b.bin")):
+        raise KeyboardInterrupt
+    assert not list(tmp_path.iterdir())
+    with reserving(None):
+        pass
+
+
+def test_a_killed_process_reserves_nothing(tmp_path):
+    path = tmp_path / "a.bin"
+    with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        with pytest.raises(NergError, match="another process"), reserving(path):
+            pass
+        process.kill()
+        process.wait()
+    with reserving(path):
+        write_bytes(path, b"x")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.bin"]

@@ -12,9 +12,11 @@ from nerg_mi.cli import main
 from nerg_mi.errors import NergError
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.gaze.log_density import LogGazeConfig
+from nerg_mi.files.atomic import reserving
 from nerg_mi.formats.fields import load_gaze
 from nerg_mi.jobs.gaze import train_gaze
 from nerg_mi.jobs.options.gaze import GazeOptions
+from nerg_mi.jobs.radiance import train_radiance
 from nerg_mi.training.gaze import recipes
 from nerg_mi.training.gaze.likelihood import LikelihoodTrainer
 from nerg_mi.training.gaze.recipes import Recipe, register
@@ -280,3 +282,9 @@ def test_an_ensemble_is_one_option(tmp_path):
 def test_a_place_of_hits_needs_a_file(rays):
     with pytest.raises(NergError, match="need a file for the gaze field"):
         train_gaze(rays, options=replace(QUICK, geometry="hits"))
+
+
+@pytest.mark.parametrize("train", [train_gaze, train_radiance])
+def test_an_output_is_trained_once_at_a_time(tmp_path, train):
+    with reserving(tmp_path / "a.safetensors"), pytest.raises(NergError, match="made by another process"):
+        train(tmp_path / "nothing", tmp_path / "a.safetensors")

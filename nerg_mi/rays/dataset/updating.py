@@ -6,15 +6,14 @@ have no account yet. Sources that are not named stay as they are.
 
 from __future__ import annotations
 
-import fcntl
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from nerg_mi.errors import NergError
-from nerg_mi.files.atomic import check_folder, writing
+from nerg_mi.files.atomic import check_folder, locked, removing_empty_parents, writing
 from nerg_mi.rays.io import pyarrow_modules
 
 from .identity import Marks
@@ -60,9 +59,13 @@ def update_dataset(
     mark, marks = recipe.mark, Marks(recipe.key)
     named = {marks.where(path): path for path in files}
     stamps = {where: marks.stamp(path) for where, path in named.items()}
-    head = _opened(folder, recipe)
-    done = Update()
-    with _locked(folder):
+    done, is_new = Update(), not (folder / HEAD).is_file()
+    with ExitStack() as ends:
+        ends.enter_context(removing_empty_parents(folder / HEAD))
+        head = _opened(folder, recipe)
+        ends.enter_context(locked(folder / HEAD, f'another import into "{folder}" is at work; wait for its end'))
+        if is_new:
+            ends.callback(_remove_if_empty, folder, head)
         known = {source.where: source for source in read_sources(folder, head)}
         _clean(folder, list(known.values()))
         tasks = []
@@ -138,18 +141,17 @@ def _opened(folder: Path, recipe: Recipe) -> Head:
     return read_head(folder)
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """A block in which nobody else imports into the dataset. Raises `NergError` where somebody does."""
-    handle = os.open(folder / HEAD, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise NergError(f'another import into "{folder}" is at work; wait for its end') from error
-        yield
-    finally:
-        os.close(handle)
+def _remove_if_empty(folder: Path, head: Head) -> None:
+    """Remove the account of a new dataset into which nothing was imported, with what imports have left."""
+    if read_sources(folder, head):
+        return
+    _clean(folder, [])
+    with writing(folder):
+        (folder / HEAD).unlink()
+    for path in sorted(folder.rglob("*"), reverse=True):
+        # What is not of an import stays.
+        with suppress(OSError):
+            path.rmdir()
 
 
 def _clean(folder: Path, sources: Sequence[Source]) -> int:

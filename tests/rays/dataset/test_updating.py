@@ -13,9 +13,11 @@ from pathlib import Path
 import pytest
 
 from nerg_mi.errors import NergError
+from nerg_mi.files.atomic import locked
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.rays.dataset import updating
 from nerg_mi.rays.dataset.dataset import RayDataset
+from nerg_mi.rays.dataset.layout import HEAD
 from nerg_mi.rays.dataset.updating import update_dataset
 from nerg_mi.rays.readers.registry import read_rays
 from tests.conftest import ROOT
@@ -164,13 +166,40 @@ def test_what_stands_in_the_way_of_all(tmp_path):
         update_dataset(tmp_path / "a.rays", [], recipe())
     assert not (tmp_path / "a.rays").exists()
     update_dataset(tmp_path / "a.rays", files, recipe())
-    with updating._locked(tmp_path / "a.rays"), pytest.raises(NergError, match="another import"):
+    with locked(tmp_path / "a.rays" / HEAD, "busy"), pytest.raises(NergError, match="another import"):
         update_dataset(tmp_path / "a.rays", files, recipe())
+
+
+def test_an_import_of_nothing_leaves_no_dataset(tmp_path):
+    bad, good = tmp_path / "bad.csv", sources(tmp_path, 1)
+    bad.write_text("a,b\n1,2\n")
+    for folder in (tmp_path / "new" / "a.rays", tmp_path / "b.rays"):
+        assert update_dataset(folder, [bad], recipe()).errors
+        assert not (tmp_path / "new").exists() and not (tmp_path / "b.rays").exists()
+    # A folder that was there stays, and so does a dataset with a source.
+    (tmp_path / "c.rays").mkdir()
+    assert update_dataset(tmp_path / "c.rays", [bad], recipe()).errors and not any((tmp_path / "c.rays").iterdir())
+    done = update_dataset(tmp_path / "c.rays", [bad, *good], recipe())
+    assert done.imported == 1 and done.errors
+    assert update_dataset(tmp_path / "c.rays", [bad], recipe()).errors
+    assert update_dataset(tmp_path / "c.rays", good, recipe()).unchanged == 1
+
+
+def test_an_import_that_is_interrupted_leaves_no_empty_dataset(tmp_path, monkeypatch):
+    def interrupt(*_):
+        (tmp_path / "a.rays" / "place=x" / "day=y").mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(updating, "run_tasks", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        update_dataset(tmp_path / "a.rays", sources(tmp_path), recipe())
+    assert not (tmp_path / "a.rays").exists()
 
 
 IMPORT = """
 import sys
 from pathlib import Path
+from nerg_mi.rays.dataset.layout import HEAD
 from nerg_mi.rays.dataset.updating import update_dataset
 from tests.rays.dataset.making import recipe
 
