@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from nerg_mi.files.tables import markdown_table, write_csv, write_json
+from nerg_mi.files.tables import markdown_table, with_formula, write_csv, write_json
 
 
 def test_rows_come_back_and_what_they_lack_is_empty(tmp_path):
@@ -33,6 +33,41 @@ def test_a_table_that_cannot_be_made_leaves_the_old_one(tmp_path):
         "a.csv",
         "a.json",
     ]
+
+
+FORMULAS = ["=1+1", "+cmd|' /C calc'!A0", "-A1", "@SUM(A1)", "\t=1", "\r=1", "-1-2", "'=1", "''+a", "\uff1d1"]
+HARMLESS = ["a=b", "-1", "+1e-3", "-inf", "-1, 2.5, -3", "'a", "-", "", "Ada", 1.5, -2, None]
+
+
+@pytest.mark.parametrize("name", [*FORMULAS, *HARMLESS])
+def test_no_cell_is_a_formula(tmp_path, name):
+    write_csv(tmp_path / "a.csv", [{"person": name, "b": 1}])
+    with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
+        (cell, _) = list(csv.reader(file))[1]
+    assert cell == ("" if name is None else f"'{name}" if name in FORMULAS else str(name))
+    assert with_formula(cell) == ("" if name is None else str(name))
+
+
+def test_no_column_is_a_formula(tmp_path):
+    write_csv(tmp_path / "a.csv", [{"=a": 1}])
+    assert (tmp_path / "a.csv").read_bytes() == b"'=a\r\n1\r\n"
+
+
+@pytest.mark.parametrize(
+    "text, cell",
+    [
+        ("<img src=x>", "\\<img src=x>"),
+        ("a</td><!-- b", "a\\</td>\\<!-- b"),
+        ("![a](http://b)", "\\![a](http://b)"),
+        ("`--at <path>`, [a](b.md), \\<b>", "`--at <path>`, [a](b.md), \\<b>"),
+        ("\\`<b>`", "\\`\\<b>`"),
+        ("\\\\<b>", "\\\\\\<b>"),
+        ("p < 0.05, a<3", "p < 0.05, a<3"),
+        ("a\r\nb", "a b"),
+    ],
+)
+def test_no_cell_of_markdown_is_html(text, cell):
+    assert markdown_table(["a"], [[text]]).splitlines()[-1] == f"| {cell} |"
 
 
 def test_a_markdown_table():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,9 +13,9 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.figures.overlay import Heat, overlay
 from nerg_mi.figures.provenance import Provenance
-from nerg_mi.files.atomic import write_bytes, write_text
+from nerg_mi.files.atomic import write_bytes
 from nerg_mi.files.png import encode_png
-from nerg_mi.files.tables import write_json
+from nerg_mi.files.tables import write_csv, write_json
 from nerg_mi.formats.gltf import Attribute, shown_unlit
 from nerg_mi.formats.ply import write_columns
 from nerg_mi.maths.color import decode_srgb
@@ -102,15 +100,14 @@ def _csv(baked: Baked, path: Path, pixels: int | None) -> None:
     given, square = baked.receivers, baked.scale**2
     shares, area, center = baked.of_given_faces(), given.mesh.area, given.mesh.corners.mean(axis=1)
     factor = float(baked.summary["factor"])
-    text = io.StringIO(newline="")
-    writer = csv.writer(text)
-    writer.writerow(("shape", "face", "x", "y", "z", "area_m2", "value", "share"))
-    for k, (x, y, z) in enumerate(center):
+    columns = ("shape", "face", "x", "y", "z", "area_m2", "value", "share")
+
+    def row(k: int) -> tuple:
         value = factor * shares[k] / area[k] * square
-        place = (f"{x:.9g}", f"{y:.9g}", f"{z:.9g}")
-        row = (given.names[given.shape[k]], int(given.index[k]), *place)
-        writer.writerow((*row, f"{area[k] / square:.9g}", f"{value:.9g}", f"{shares[k]:.9g}"))
-    write_text(path, text.getvalue())
+        numbers = (f"{v:.9g}" for v in (*center[k], area[k] / square, value, shares[k]))
+        return given.names[given.shape[k]], int(given.index[k]), *numbers
+
+    write_csv(path, (dict(zip(columns, row(k))) for k in range(len(center))), columns)
 
 
 def _json(baked: Baked, path: Path, pixels: int | None) -> None:

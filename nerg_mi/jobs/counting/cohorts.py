@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from nerg_mi.errors import NergError, plain
+from nerg_mi.files.tables import with_formula
 from nerg_mi.rays.readers.parsing.tables import iterate_table
 
 MOST = 10_000_000
@@ -16,7 +17,7 @@ def read_cohorts(path: Path) -> dict[str, str]:
     without them, and for somebody who is of two."""
     found: dict[str, str] = {}
     for block in iterate_table(path, (), ("person", "cohort")):
-        for person, cohort in block.texts.tolist():
+        for person, cohort in (map(with_formula, row) for row in block.texts.tolist()):
             if found.setdefault(person, cohort) != cohort:
                 raise NergError(f'"{path}" has "{plain(person, 40)}" in two cohorts; leave one')
         if len(found) > MOST:
