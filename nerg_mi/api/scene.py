@@ -15,6 +15,7 @@ from nerg_mi.field.splats import Splats
 from nerg_mi.formats.splats.files import plugin_of_field
 from nerg_mi.registration import plugin_class
 from nerg_mi.rendering.asked import is_nerg
+from nerg_mi.rendering.projection import clip_distances
 
 from .arrays import Floats, listed, points
 from .camera import Camera
@@ -117,7 +118,7 @@ class Scene:
 
         if isinstance(camera, Camera):
             with mitsuba_says():
-                return mi.load_dict(camera.to_dict())
+                return self._fitted(mi.load_dict(camera.to_dict()), camera)
         if isinstance(camera, mi.Sensor):
             return camera
         if not (camera is None or isinstance(camera, (int, np.integer))):
@@ -127,6 +128,17 @@ class Scene:
             have = f"{len(sensors)} of its own" if sensors else "none of its own"
             raise NergError(f"the scene has {have}, and camera {number} was asked for; give camera=Camera(...)")
         return sensors[number]
+
+    def _fitted(self, sensor: mi.Sensor, camera: Camera) -> mi.Sensor:
+        """The ``sensor`` of ``camera``, made to see as near and as far as this scene needs."""
+        import mitsuba as mi
+
+        params: Any = mi.traverse(sensor)
+        near, far = clip_distances(self.place.extent(camera.origin))
+        if near < params["near_clip"] or far > params["far_clip"]:
+            params["near_clip"], params["far_clip"] = near, far
+            params.update()
+        return sensor
 
     def __repr__(self) -> str:
         medium, shapes = self.integrator.medium, len(self.mitsuba.shapes())
@@ -198,7 +210,10 @@ def make_scene(
         children["camera"] = camera.to_dict() if isinstance(camera, Camera) else camera
     with mitsuba_says():
         # Merged meshes lose their names.
-        return Scene(mi.load_dict({"type": "scene", "integrator": integrator, **children}, optimize=False))
+        scene = Scene(mi.load_dict({"type": "scene", "integrator": integrator, **children}, optimize=False))
+    if isinstance(camera, Camera):
+        scene._fitted(next(s for s in scene.mitsuba.sensors() if s.id() == "camera"), camera)
+    return scene
 
 
 def _observer_sensor(position: ArrayLike) -> dict:

@@ -25,12 +25,24 @@ from nerg_mi.training.geometry.places import place_of_hits
 from .backend import select_backend
 from .options.scene import SceneOptions
 from .reporter import SILENT, Reporter
-from .scenes.cameras import Probe, best_camera, best_photo, given_point, probe_values, turned_ahead, upright
+from .scenes.cameras import (
+    Probe,
+    best_camera,
+    best_photo,
+    given_point,
+    probe_values,
+    shows_anything,
+    turned_ahead,
+    upright,
+)
 from .scenes.files import GivenFiles, recognise
 from .scenes.observers import Walk, eye_of_person, support_of_rays, to_place, walk_of_person
 from .scenes.photos import camera_of_photo, cameras_of_photos
 from .scenes.places import LAMP, WrittenPlace, colors_of, place_of_files
 from .scenes.scene_rays import check_rays, load_scene_rays
+
+SMALLEST = 0.05
+"""Places of shapes below this extent, in units, are lit inexactly: a surface's rays begin some 1e-4 units off it."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +115,22 @@ def write_scene(
             scene = replace(scene, observer=observer)
         reporter.progress(0.5, "looking for the best overview")
         camera, lens, chosen = _camera(scene, probe, seen, options, reporter)
-    camera = upright(camera, up)
-    usual = seen.usual if seen is not None and seen.usual > 0 else 0.0
-    away = float(np.linalg.norm(camera.target - camera.origin))
-    scene = replace(scene, usual=(max(away, usual), usual))
+        camera = upright(camera, up)
+        usual = seen.usual if seen is not None and seen.usual > 0 else 0.0
+        away = float(np.linalg.norm(camera.target - camera.origin))
+        scene = replace(scene, usual=(max(away, usual), usual), extent=probe.extent(camera, scene.observer))
+        if given.kind in ("mesh", "scene") and scene.extent < SMALLEST:
+            reporter.warn(
+                f"the place is {scene.extent:.3g} units large, and Mitsuba moves rays off surfaces by 1e-4 units at "
+                "least, so that light leaks through walls; scale the place to metres"
+            )
+        reporter.progress(0.8, "looking at the picture")
+        write_text(probe_file, scene.text(probe_file.parent, camera, lens, 96).xml())
+        if not shows_anything(load_scene(probe_file, values)):
+            raise NergError(
+                "the camera shows nothing of the place, and its picture would be empty; give another one with --from "
+                "and --to"
+            )
     text = scene.text(output.parent, camera, lens, options.width)
     text = replace(text, about=_about(output, text, place, scene), about_camera=chosen, about_observer=about)
     write_text(output, text.xml())
@@ -138,6 +162,7 @@ class _Draft:
     tracked: bool
     # How far away things are usually from the camera and from the observer, for lamps.
     usual: tuple[float, float] = (1.0, 1.0)
+    extent: float = 10.0
 
     @property
     def unit(self) -> float:
@@ -159,7 +184,9 @@ class _Draft:
     def text(self, folder: Path, camera: Eye, lens: Lens, width: int) -> SceneText:
         """The scene in ``folder``."""
         place = self.place.make(folder, self.lamps(*self.usual))
-        return SceneText(place, self.attention(folder), camera, self.observer, self.up, lens, width, self.unit)
+        return SceneText(
+            place, self.attention(folder), camera, self.observer, self.up, lens, width, self.unit, self.extent
+        )
 
 
 def _check_options(options: SceneOptions) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .projection import clip_distances
 from .scene_writer import Blank, Comment, Element, Node, document, element, matrix, numbers, prop, transform
 
 
@@ -71,8 +72,9 @@ class Attention:
 
 @dataclass(frozen=True)
 class SceneText:
-    """All that a scene file says. ``unit``: scene units of a metre, or what stands for one; ``observer``: None where
-    the camera is the observer."""
+    """All that a scene file says. ``unit``: scene units of a metre, or what stands for one; ``extent``: length of the
+    diagonal of a box around the place and its cameras, in scene units; ``observer``: None where the camera is the
+    observer."""
 
     place: Place
     attention: Attention
@@ -82,10 +84,17 @@ class SceneText:
     lens: Lens = Lens()
     width: int = 480
     unit: float = 1.0
+    extent: float = 10.0
     # Sentences for whoever opens the file: of the file, of the camera, of the observer.
     about: str = ""
     about_camera: str = ""
     about_observer: str = ""
+
+    @property
+    def falloff(self) -> float:
+        """Distance over which gaze fades behind what the observer sees: 5 cm, within what a place of this size shows
+        and single precision resolves."""
+        return float(np.clip(0.05 * self.unit, 1e-4 * self.extent, 0.02 * self.extent))
 
     def xml(self) -> str:
         """The text of the file."""
@@ -158,7 +167,7 @@ def _defaults(scene: SceneText, names: _Names) -> list[Node]:
         names.default("aovs", ",".join(aovs)),
         names.default("depth", "median"),
         falloff,
-        names.default("falloff", numbers([0.05 * scene.unit])),
+        names.default("falloff", numbers([scene.falloff])),
         names.default("visibility", "depth"),
         names.default("tolerance", "0"),
         names.default("occlusion", "true"),
@@ -223,7 +232,7 @@ def ahead_level(eye: Eye, up: np.ndarray) -> np.ndarray:
 def _perspective(name: str, pose: Node, scene: SceneText, names: _Names, offset: Sequence[float] = (0, 0)) -> Element:
     lens: list[Node] = [prop("float", "fov", names.use("fov")), prop("string", "fov_axis", "x")]
     lens += [prop("float", f"principal_point_offset_{a}", numbers([v])) for a, v in zip("xy", offset) if v]
-    near, far = numbers([0.01 * scene.unit]), numbers([1e4 * scene.unit])
+    near, far = (numbers([distance]) for distance in clip_distances(scene.extent, scene.unit))
     film = _film(names.use("width"), names.use("height"))
     clip = [prop("float", "near_clip", near), prop("float", "far_clip", far)]
     return element("sensor", *lens, *clip, pose, _sampler(names), film, type="perspective", id=names(name))

@@ -62,8 +62,14 @@ def prop(kind: str, name: str, value: object) -> Element:
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Numbers with commas between them, as short as single precision allows; no "-0"."""
-    return ", ".join(f"{float(np.float32(v)) + 0.0:.7g}" for v in values)
+    """Numbers with commas between them, with nine digits or, of single precision, as many as tell them apart; no
+    "-0"."""
+    return ", ".join(f"{_shortest(float(v)) + 0.0:.9g}" for v in values)
+
+
+def _shortest(value: float) -> float:
+    single = np.float32(value)
+    return float(str(single)) if float(single) == value else value
 
 
 def transform(*steps: Node, name: str = "to_world") -> Element:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
 from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f, Vector3f
@@ -95,6 +96,17 @@ class Place:
         """Lower and upper corner of the bounding box of all shapes, (3,) each. There must be shapes."""
         corners = [corners_of(shape) for shape in ([] if self.scene is None else self.scene.shapes())]
         return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Lower and upper corner (3,) of the medium and the shapes; of a medium without an end those of its inner cube.
+        None where there is neither."""
+        corners = [] if self.medium is None else [self.medium.bounds()]
+        corners += [] if self.scene is None else [self.corners()]
+        return (np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)) if corners else None
+
+    def extent(self, *points: ArrayLike) -> float:
+        """Length of the diagonal of a box around what there is and ``points`` (3,), in scene units."""
+        return float(np.linalg.norm(np.ptp([*(self.bounds() or ()), *(np.asarray(p, float) for p in points)], axis=0)))
 
     def trace(self, ray: Ray3f | SceneRay, active: Bool, settings: MarchSettings, **options: Any) -> View:
         """What ``ray`` meets up to its ``maxt``; without shapes a ``SceneRay`` will do.

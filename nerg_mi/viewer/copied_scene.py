@@ -21,6 +21,9 @@ from .view import View
 CAMERA, TARGET, OBSERVER = "view_camera", "view_target", "view_observer"
 """`<default>`s of a copied scene."""
 
+CLIP = {"near_clip": 1e-6, "far_clip": 1e12}
+"""Distances at which its camera begins and ends to see: a page's rays have no limits."""
+
 SENSOR = "view"
 """The name of its camera."""
 
@@ -57,10 +60,9 @@ def copied(path: Path, shown: Shown) -> str:
         raise NergError(f'"{path}" has {len(integrators)} integrators, and a copy needs one; leave one of them')
     name_files(own, path, children)
     _observe(integrators[0], shown)
-    target = shown.view.origin + shown.view.ahead
     nodes = [
         element("default", name=CAMERA, value=numbers(shown.view.origin)),
-        element("default", name=TARGET, value=numbers(target)),
+        element("default", name=TARGET, value=numbers(shown.view.target)),
         *eye,
         _sensor(shown),
         Comment("What follows is from the scene that was viewed; its sensors are counted after ours."),
@@ -104,6 +106,7 @@ def _sensor(shown: Shown):
         "sensor",
         prop("float", "fov", f"{across:.9g}"),
         prop("string", "fov_axis", "x"),
+        *(prop("float", name, f"{distance:g}") for name, distance in CLIP.items()),
         element("transform", look, name="to_world"),
         element("sampler", prop("integer", "sample_count", shown.spp), type="independent"),
         film,

@@ -41,5 +41,5 @@ def frames_csv(views: Sequence[View]) -> str:
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow([CAMERA, TARGET])
-    writer.writerows([numbers(v.origin), numbers(v.origin + v.ahead)] for v in views)
+    writer.writerows([numbers(v.origin), numbers(v.target)] for v in views)
     return text.getvalue()

@@ -55,6 +55,11 @@ class View:
         return cls.of(pose[:3, 3], pose[:3, 3] + pose[:3, 2], pose[:3, 1], fov, width / height)
 
     @property
+    def target(self) -> np.ndarray:
+        """A point (3,) that it looks at, so far away that rounding it to the digits of a file does not turn it."""
+        return self.origin + max(1.0, float(np.linalg.norm(self.origin))) * self.ahead
+
+    @property
     def across(self) -> float:
         """Degrees between the left and the right border."""
         return math.degrees(2 * math.atan(math.tan(self.fov / 2) * self.aspect))

@@ -200,3 +200,14 @@ def test_constant_weights_change_nothing_and_are_taken_back(files, camera):
     assert expected.color.max() > 0 and np.array_equal(found.color, expected.color)
     scene.set_constant_weights(False)
     assert not any(net.constant for net in nets)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1, 1e6])
+def test_a_camera_sees_a_scene_of_any_unit(rgb, scale):
+    import mitsuba as mi
+
+    box = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(scale)}
+    camera = nerg.Camera((4 * scale, 3 * scale, 0), (0, 0, 0), width=6, height=4)
+    scene = nerg.make_scene(shapes=box, camera=camera)
+    for number in (0, camera):
+        assert nerg.render(scene, quantities=["opacity"], camera=number).opacity[..., 1:3, 2:4].min() == 1

@@ -11,6 +11,7 @@ import pytest
 from nerg_mi.errors import NergError
 from nerg_mi.field.radiance import RadianceConfig, RadianceField
 from nerg_mi.formats.fields import load_gaze, save_gaze, save_radiance
+from nerg_mi.formats.volumes import write_volume
 from nerg_mi.jobs.gaze_places import make_place
 from nerg_mi.jobs.options.pictures import PictureOptions
 from nerg_mi.jobs.options.place import PlaceOptions
@@ -116,6 +117,35 @@ def test_a_place_alone_is_shown_from_where_it_can_be_seen(rgb, folder, tmp_path)
     assert result.observer is None and result.quantity is None and scene.integrator().observer is None
     assert found.mask.mean() > 0.5 and found.color[found.mask].mean() > 0.05
     assert f"wrote {result.path}" in told.messages and any("best overview" in line for line in told.messages)
+
+
+@pytest.mark.parametrize("kind, scale", [("mesh", 1e-4), ("mesh", 1e6), ("hits", 1e-4), ("hits", 3e4)])
+def test_places_of_any_unit(rgb, tmp_path, kind, scale):
+    import mitsuba as mi
+
+    corner = np.array([3, 2, 1.5]) * scale
+    path = tmp_path / ("a.ply" if kind == "mesh" else "a.vol")
+    if kind == "mesh":
+        mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(corner.tolist())}).write_ply(str(path))
+    else:
+        walls = np.pad(np.zeros((10, 14, 18), np.float32), 1, constant_values=50 / scale)
+        write_volume(path, walls, -corner, corner)
+    told, eye = Recorder(), tuple(0.1 * corner)
+    result = write_scene([path], tmp_path / "a.xml", SceneOptions(observer=eye, mode=MODE), told)
+    for sensor in (0, 1):
+        _, found = shown(result.path, sensor)
+        assert found.mask.mean() > 0.9 and found.color.mean() > 0.1
+    # Own eyes see all that is visible, whatever the unit; and near what is seen gaze fades within the place.
+    assert found.aovs["visibility"][found.mask].min() == 1
+    assert 1e-4 * np.linalg.norm(corner) < float(defaults(result.path)["falloff"]) < 0.1 * np.linalg.norm(corner)
+    assert any("light leaks" in line for line in told.warnings) == (kind == "mesh" and scale < 1)
+
+
+def test_a_picture_that_would_be_empty_is_refused(rgb, folder, tmp_path):
+    away = SceneOptions(camera_from=(9, 0, 0), camera_to=(20, 0, 0), mode=MODE)
+    with pytest.raises(NergError, match="its picture would be empty; give another one with --from"):
+        write_scene([folder / "mesh.ply"], tmp_path / "a.xml", away)
+    assert not (tmp_path / "a.xml").exists()
 
 
 def test_a_field_without_an_end(rgb, tmp_path):

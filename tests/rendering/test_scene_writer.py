@@ -60,7 +60,8 @@ def test_names_that_no_scene_file_holds(name):
 
 
 def test_numbers_and_matrices():
-    assert numbers([1, -0.0, 0.1, 1e-7, 123456.789]) == "1, 0, 0.1, 1e-07, 123456.8"
+    assert numbers([np.float32(0.1), 5_600_000.25, np.float32(16777217)]) == "0.1, 5600000.25, 16777216"
+    assert numbers([1, -0.0, 0.1, 1e-7, 123456.789]) == "1, 0, 0.1, 1e-07, 123456.789"
     values = np.arange(16).reshape(4, 4) / 3
     found = ElementTree.fromstring(document([transform(matrix(values))], "h"))[0][0].get("value")
     np.testing.assert_allclose(np.array(found.split(), float).reshape(4, 4), values, rtol=1e-14)

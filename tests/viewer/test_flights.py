@@ -29,7 +29,8 @@ def test02_frames_are_read_again(tmp_path):
     (tmp_path / "f.csv").write_text(frames_csv(flight([view(0), view(1)], 1.0, 4)), newline="")
     frames = read_frames(tmp_path / "f.csv")
     assert len(frames) == 5 and list(frames[0]) == ["view_camera", "view_target"]
-    assert [float(v) for v in frames[-1]["view_target"].split(",")] == [1, 1, 1]
+    origin, target = (np.array([float(v) for v in frames[-1][name].split(",")]) for name in frames[-1])
+    assert np.allclose((target - origin) / np.linalg.norm(target - origin), view(1).ahead, atol=1e-8)
 
 
 @pytest.mark.parametrize("views, seconds, fps", [([], 1, 25), ([view(0)], 1, 25), ([view(0), view(1)], 1e6, 120)])

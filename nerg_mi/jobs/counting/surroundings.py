@@ -87,12 +87,10 @@ class Surroundings:
 
     def bounds(self) -> np.ndarray:
         """Corners (2, 3) of the place. Raises `NergError` where none is known."""
-        if self.place is None:
+        bounds = None if self.place is None else self.place.bounds()
+        if bounds is None:
             raise NergError("there is no place whose bounds are known; give a scene or a radiance field")
-        found = [] if self.place.medium is None else [self.place.medium.bounds()]
-        if self.place.scene is not None:
-            found.append(self.place.corners())
-        return np.array([np.min([f[0] for f in found], axis=0), np.max([f[1] for f in found], axis=0)], float)
+        return np.array(bounds, float)
 
     def within(self, scene: mi.Scene) -> Surroundings:
         """The same with the shapes of another ``scene``."""

@@ -20,6 +20,9 @@ from nerg_mi.transport.trace import trace_depth
 
 from .photos import PhotoCamera
 
+GLANCE = (48, 32)
+"""Pixels of the picture by which it is found out whether a camera shows anything."""
+
 PANORAMA = (96, 48)
 """Pixels of the picture of what an observer meets."""
 
@@ -74,12 +77,13 @@ class Probe:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of what there is; of a field without an end those of its inner cube."""
-        place, corners = self.place, []
-        if place.medium is not None:
-            corners.append(place.medium.bounds())
-        if place.scene is not None:
-            corners.append(place.corners())
-        return np.min([c[0] for c in corners], axis=0), np.max([c[1] for c in corners], axis=0)
+        bounds = self.place.bounds()
+        assert bounds is not None, "a scene that is written shows something"
+        return bounds
+
+    def extent(self, *eyes: Eye | None) -> float:
+        """Length of the diagonal of a box around what there is and ``eyes``."""
+        return self.place.extent(*(eye.origin for eye in eyes if eye is not None))
 
     def around(self, eye: Eye) -> Seen:
         """What somebody at ``eye`` meets, as the sensor of the sphere shows it."""
@@ -103,14 +107,21 @@ class Probe:
 
 def probe_values() -> dict[str, str]:
     """Values of `<default>`s for the scene of a `Probe`."""
-    return {"sphere_width": str(PANORAMA[0]), "sphere_height": str(PANORAMA[1]), "radiance": "false", "spp": "1"}
+    sizes = dict(zip(("width", "height", "sphere_width", "sphere_height"), map(str, (*GLANCE, *PANORAMA))))
+    return {**sizes, "radiance": "false", "spp": "1"}
+
+
+def shows_anything(scene: Any) -> bool:
+    """Whether the first camera of ``scene``, loaded with `probe_values`, sees anything at all."""
+    with mitsuba_says():
+        return bool(render_channels(scene, scene.sensors()[0], spp=1).aovs["opacity"].any())
 
 
 def turned_ahead(eye: Eye, seen: Seen) -> Eye:
     """The observer at ``eye``, turned to where most of the attention goes."""
     towards = seen.main_direction()
     at = int(np.argmax(seen.directions @ towards))
-    away = seen.depth[at] if seen.met[at] else max(seen.usual, 1.0)
+    away = seen.depth[at] if seen.met[at] else seen.usual or 1.0
     return replace(eye, target=eye.origin + away * towards)
 
 

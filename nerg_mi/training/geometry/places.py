@@ -97,15 +97,13 @@ def place_of_scene(path: Path) -> GazePlace:
     """
     scene = load_scene(path)
     place = Place(getattr(scene.integrator(), "medium", None), scene)
-    bounds = [] if place.medium is None else [place.medium.bounds()]
-    if place.scene is not None:
-        bounds.append(place.corners())
-    if not bounds:
+    bounds = place.bounds()
+    if bounds is None:
         raise NergError(
             f'the scene "{path}" has neither shapes nor a field in which people could have looked around; '
             "name one that has"
         )
-    lower, upper = np.min([b[0] for b in bounds], axis=0), np.max([b[1] for b in bounds], axis=0)
+    lower, upper = bounds
     # A plane has no thickness, and a field needs some.
     pad = 0.01 * max(upper - lower)
     return GazePlace(place, Box(tuple(lower - pad), tuple(upper + pad)), "scene", {"scene_file": file_identity(path)})
