@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerg_mi.jobs.reporter import SILENT, Reporter
 
 from .fields import FilePath
-from .options import options_of
+from .options import options_of, rays_of
 
 if TYPE_CHECKING:
     from nerg_mi.alignment.record import Alignment
@@ -44,5 +43,4 @@ def align(
     from nerg_mi.jobs.options.alignment import AlignOptions
 
     job = options_of(AlignOptions, "align", options, changes)
-    given = Path(rays) if isinstance(rays, str) else rays
-    return alignment.align(given, output, job, reporter).alignment
+    return alignment.align(None if rays is None else rays_of(rays), output, job, reporter).alignment

@@ -26,6 +26,7 @@ from nerg_mi.statistics.shares import Shares, SumRule, gaze_shares
 
 from . import arrays
 from .arrays import Floats
+from .fields import FilePath
 from .observed import ObserverOf
 from .queries import given_observers
 from .scene import Scene
@@ -87,7 +88,7 @@ class SurfaceAttention(Attention):
 
 
 def attention(
-    scene: Scene,
+    scene: Scene | FilePath,
     surface: ArrayLike | os.PathLike[str] | str | Mapping[str, Any] | object,
     observers: ArrayLike | None = None,
     *,
@@ -129,6 +130,7 @@ def attention(
 
     from nerg_mi.density.received import patches
 
+    scene = Scene.of(scene)
     _check(scene)
     if not (isinstance(margin, Real) and 0 <= margin < LARGEST):
         raise NergError(f"margin must be a length from 0, in scene units, got {margin!r}")

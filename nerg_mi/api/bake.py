@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from nerg_mi.jobs.reporter import SILENT, Reporter
 
 from .fields import FilePath
-from .options import options_of
+from .options import file_of, options_of
 
 if TYPE_CHECKING:
     from nerg_mi.jobs.bake import Bake, BakeOptions
@@ -45,8 +45,7 @@ def bake(
 
     in_memory = rays if isinstance(rays, Rays) else None
     if rays is not None and in_memory is None:
-        changes = {**changes, "rays": Path(str(rays))}
-    changes = {k: Path(str(v)) if k in ("gaze", "path", "align") and v is not None else v for k, v in changes.items()}
+        changes = {**changes, "rays": rays}
     job = options_of(BakeOptions, "bake", options, changes)
     files = [outputs] if isinstance(outputs, (str, Path)) or not isinstance(outputs, Sequence) else list(outputs)
-    return baking.bake(Path(str(surface)), [Path(str(f)) for f in files], job, reporter, in_memory)
+    return baking.bake(file_of(surface, "surface"), [Path(str(f)) for f in files], job, reporter, in_memory)

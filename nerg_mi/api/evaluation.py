@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerg_mi.jobs.reporter import SILENT, Reporter
 
-from .fields import FilePath
-from .options import options_of
+from .fields import FilePath, TrainedField
+from .options import checkpoint_of, file_of, options_of, rays_of
 
 if TYPE_CHECKING:
     from nerg_mi.evaluation.images import ViewScores
+    from nerg_mi.field.gaze.protocol import AnyGazeField
+    from nerg_mi.field.radiance import RadianceField
     from nerg_mi.jobs.ablation import AblationResult
     from nerg_mi.jobs.evaluation import GazeEvaluation
     from nerg_mi.jobs.options.ablation import AblationOptions
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def evaluate_radiance(
-    field: FilePath,
+    field: FilePath | TrainedField[RadianceField],
     photos: FilePath,
     *,
     options: RadianceScoreOptions | None = None,
@@ -31,8 +32,8 @@ def evaluate_radiance(
 ) -> ViewScores:
     """Score a radiance field on posed photos: PSNR, SSIM and, where their depth is known, its error.
 
-    ``field``: a checkpoint. ``photos``: as for `train_radiance`; those that were held out are scored. ``changes``:
-    options one by one (``spp=16``, ``pictures="folder"``, ...) on top of ``options``;
+    ``field``: a checkpoint, or a field in memory. ``photos``: as for `train_radiance`; those that were held out are
+    scored. ``changes``: options one by one (``spp=16``, ``pictures="folder"``, ...) on top of ``options``;
     `nerg_mi.jobs.radiance.RadianceScoreOptions` says what there is. Raises `NergError`.
 
     >>> import nerg_mi as nerg
@@ -45,11 +46,12 @@ def evaluate_radiance(
     from nerg_mi.jobs import radiance
 
     job = options_of(radiance.RadianceScoreOptions, "evaluate_radiance", options, changes)
-    return radiance.evaluate_radiance(Path(field), photos, job, reporter)
+    with checkpoint_of(field, "field") as path:
+        return radiance.evaluate_radiance(path, file_of(photos, "photos"), job, reporter)
 
 
 def evaluate_gaze(
-    gaze: FilePath,
+    gaze: FilePath | TrainedField[AnyGazeField],
     rays: Rays | FilePath,
     output: FilePath | None = None,
     *,
@@ -59,16 +61,16 @@ def evaluate_gaze(
 ) -> GazeEvaluation:
     """Score a gaze field at positions and of people that it was not trained on, beside what needs no field.
 
-    ``gaze``: a checkpoint that was trained with ``test_zones``. ``rays``: those that it was trained on, or their file.
-    ``output``: folder for tables and pictures, which is made. ``changes``: options one by one (``split="pos"``,
-    ``resamples=200``, ...) on top of ``options``; `nerg_mi.jobs.options.evaluation.GazeEvaluationOptions` says what
-    there is. Raises `NergError`.
+    ``gaze``: a checkpoint that was trained with ``test_zones``, or what that training gave. ``rays``: those that it
+    was trained on, or their file. ``output``: folder for tables and pictures, which is made. ``changes``: options
+    one by one (``split="pos"``, ``resamples=200``, ...) on top of ``options``;
+    `nerg_mi.jobs.options.evaluation.GazeEvaluationOptions` says what there is. Raises `NergError`.
 
     >>> import nerg_mi as nerg
     >>> held_out = {"test_zones": 1, "test_positions": 4, "geometry": "none", "zones": 0}
     >>> small = {"steps": 2, "probes": 8, "directions": 64}
-    >>> _ = nerg.train_gaze(rays, folder / "gaze.safetensors", **held_out, **small)
-    >>> scores = nerg.evaluate_gaze(folder / "gaze.safetensors", rays, directions=64, resamples=2, min_rays=8)
+    >>> gaze = nerg.train_gaze(rays, **held_out, **small)
+    >>> scores = nerg.evaluate_gaze(gaze, rays, directions=64, resamples=2, min_rays=8)
     >>> scores.rows[0]["method"], scores.split
     ('gaze field', 'pos')
     """
@@ -76,7 +78,9 @@ def evaluate_gaze(
     from nerg_mi.jobs.options.evaluation import GazeEvaluationOptions
 
     job = options_of(GazeEvaluationOptions, "evaluate_gaze", options, changes)
-    return evaluation.evaluate_gaze(Path(gaze), rays, output, job, reporter)
+    data = rays_of(rays)
+    with checkpoint_of(gaze, "gaze") as path:
+        return evaluation.evaluate_gaze(path, data, output, job, reporter)
 
 
 def ablate(
@@ -105,7 +109,7 @@ def ablate(
     from nerg_mi.jobs.options.ablation import AblationOptions
 
     job = options_of(AblationOptions, "ablate", options, changes)
-    return ablation.ablate(rays, output, job, reporter)
+    return ablation.ablate(rays_of(rays), output, job, reporter)
 
 
 def study(
@@ -131,4 +135,4 @@ def study(
     from nerg_mi.jobs import study as studies
 
     job = options_of(studies.StudyOptions, "study", options, changes)
-    return studies.run_study(str(scene), output, job, reporter)
+    return studies.run_study(str(scene if isinstance(scene, str) else file_of(scene, "scene")), output, job, reporter)

@@ -31,11 +31,13 @@ class TrainedField(Generic[Network]):
 
     ``network``: the field itself (`nerg_mi.field`), whose arrays belong to the variant that was active when it was
     made. ``provenance``: what it was trained on and with, as its file keeps it. ``name``: the file's, or what it is.
+    ``path``: the checkpoint that holds it, None where there is none.
     """
 
     network: Network
     provenance: Mapping[str, Any] = field(default_factory=dict)
     name: str = "in memory"
+    path: Path | None = None
 
     @property
     def kind(self) -> str:
@@ -88,7 +90,7 @@ def load_field(path: FilePath) -> TrainedField[RadianceField]:
     [[-0.1, -0.1, -0.1], [8.1, 6.1, 3.1]]
     """
     network, metadata = load_radiance(_existing(path), array_module())
-    return TrainedField(network, metadata.get("provenance", {}), Path(path).name)
+    return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
 
 
 def load_gaze(path: FilePath) -> TrainedField[AnyGazeField]:
@@ -105,7 +107,7 @@ def load_gaze(path: FilePath) -> TrainedField[AnyGazeField]:
     'gaze'
     """
     network, metadata = read_gaze(_existing(path), array_module())
-    return TrainedField(network, metadata.get("provenance", {}), Path(path).name)
+    return TrainedField(network, metadata.get("provenance", {}), Path(path).name, Path(path))
 
 
 def load_rays(path: FilePath) -> Rays:
@@ -131,4 +133,4 @@ def _existing(path: FilePath) -> Path:
     try:
         return Path(path)
     except TypeError as error:
-        raise NergError(f"a file is named by a string or a path, got {path!r}") from error
+        raise NergError(f"a file is named by a string or a path, got {type(path).__name__}") from error

@@ -14,6 +14,7 @@ from nerg_mi.jobs.reporter import SILENT, Reporter
 
 from .arrays import Floats, Labelled, points, same_for_all
 from .camera import Camera
+from .fields import FilePath
 from .scene import COLOR, Scene, asked_integrator, asked_quantities
 from .variant import active_mitsuba
 
@@ -30,7 +31,7 @@ class Pictures(Labelled):
 
 
 def render(
-    scene: Scene,
+    scene: Scene | FilePath,
     observers: ArrayLike | None = None,
     quantities: str | Sequence[str] | None = None,
     *,
@@ -39,7 +40,7 @@ def render(
     seed: int = 0,
     reporter: Reporter = SILENT,
 ) -> Pictures:
-    """Render a scene for one or many observers.
+    """Render a scene, or a scene file, for one or many observers.
 
     ``observers``: positions (M, 3) in scene units of those whose gaze is shown, or one (3,); None: the scene's own,
     which is the camera where it has none. ``quantities``: ``"color"`` (linear rgb; the luminance in mono variants) and
@@ -62,6 +63,7 @@ def render(
       depth  (2, 32, 48), float32
       gaze   (2, 32, 48), float32
     """
+    scene = Scene.of(scene)
     active_mitsuba()
     asked = asked_quantities(scene, quantities)
     sensor = scene.sensor(camera)

@@ -15,6 +15,7 @@ from nerg_mi.maths.arrays import vector_of
 
 from . import arrays
 from .arrays import Floats, Labelled, same_for_all
+from .fields import FilePath
 from .observed import ObserverOf
 from .scene import COLOR, Scene, asked_integrator, asked_quantities
 from .variant import active_mitsuba
@@ -38,7 +39,7 @@ class Observed(Labelled):
 
 
 def trace(
-    scene: Scene,
+    scene: Scene | FilePath,
     origins: ArrayLike,
     directions: ArrayLike,
     quantities: str | Sequence[str] | None = None,
@@ -68,6 +69,7 @@ def trace(
     >>> seen.depth.shape, seen.color.shape, bool(abs(seen.depth[0] - 1.6) < 0.1)
     ((2,), (2, 3), True)
     """
+    scene = Scene.of(scene)
     active_mitsuba()
     asked = asked_quantities(scene, quantities)
     o, d = _rays(origins, directions)
@@ -161,7 +163,10 @@ def _starts(rows: Any) -> range:
 
 
 def observe(
-    scene: Scene, points: ArrayLike, observers: ArrayLike | None = None, quantities: str | Sequence[str] | None = None
+    scene: Scene | FilePath,
+    points: ArrayLike,
+    observers: ArrayLike | None = None,
+    quantities: str | Sequence[str] | None = None,
 ) -> Observed:
     """How observers see points of a scene: whether they do, and how much gaze they give what is there.
 
@@ -179,6 +184,7 @@ def observe(
     >>> seen.visibility.round(2).tolist()
     [[1.0], [0.0]]
     """
+    scene = Scene.of(scene)
     active_mitsuba()
     known = AT_POINTS if scene.has_gaze else AT_POINTS[1:]
     asked = known if quantities is None else asked_quantities(scene, quantities, known)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,7 @@ from nerg_mi.rendering.projection import clip_distances
 from .arrays import Floats, listed, points
 from .camera import Camera
 from .fields import FilePath, TrainedField
+from .options import check_names, file_of
 from .shapes import scene_children
 from .variant import active_mitsuba
 
@@ -38,8 +41,9 @@ class Scene:
     """A Mitsuba scene whose integrator is ``nerg``: what `render`, `trace`, `observe` and `attention` work on.
 
     ``mitsuba``: the scene itself, with which everything works that works with Mitsuba's scenes (``mi.traverse``,
-    ``mi.render``, ...). `make_scene` makes one of fields; ``Scene(scene)`` takes one that is loaded already, and
-    ``Scene.load(path)`` a file. Raises `NergError` for a scene with another integrator.
+    ``mi.render``, ...). ``path``: its file, where it is what that says. `make_scene` makes one of fields;
+    ``Scene(scene)`` takes one that is loaded already, and ``Scene.load(path)`` a file. Raises `NergError` for a
+    scene with another integrator.
 
     >>> import nerg_mi as nerg
     >>> from importlib.resources import files
@@ -58,6 +62,7 @@ class Scene:
                 "make one around its shapes with make_scene(shapes=scene)"
             )
         self.mitsuba = mitsuba
+        self.path: Path | None = None
 
     @classmethod
     def load(cls, path: FilePath, **values: object) -> Scene:
@@ -69,7 +74,24 @@ class Scene:
 
         active_mitsuba()
         # Merged meshes lose their names.
-        return cls(load_scene(Path(path), {key: str(value) for key, value in values.items()}, merge=False))
+        scene = cls(load_scene(Path(path), {key: str(value) for key, value in values.items()}, merge=False))
+        scene.path = None if values else Path(path)
+        return scene
+
+    @classmethod
+    def of(cls, given: Scene | FilePath | mi.Scene) -> Scene:
+        """A scene as a call is given it: one of these, a file of one, or Mitsuba's. Raises `NergError` for anything
+        else."""
+        if isinstance(given, Scene):
+            return given
+        if isinstance(given, (str, os.PathLike)):
+            return cls.load(given)
+        import mitsuba as mi
+
+        active_mitsuba()
+        if isinstance(given, mi.Scene):
+            return cls(given)
+        raise NergError(f"a scene is what make_scene and Scene.load give, or a scene file, got {type(given).__name__}")
 
     @property
     def integrator(self) -> Any:
@@ -191,6 +213,8 @@ def make_scene(
     import mitsuba as mi
 
     active_mitsuba()
+    # Objects may be nested by any name.
+    check_names("make_scene", (k for k, v in settings.items() if isinstance(v, _PLAIN)), _parameters(), "setting")
     integrator: dict[str, Any] = {"type": "nerg", **settings}
     where = None if to_world is None else _transform(to_world)
     if field is not None:
@@ -214,6 +238,16 @@ def make_scene(
     if isinstance(camera, Camera):
         scene._fitted(next(s for s in scene.mitsuba.sensors() if s.id() == "camera"), camera)
     return scene
+
+
+_PLAIN = (str, bool, int, float, np.number)
+
+
+def _parameters() -> list[str]:
+    """The parameters of the integrator ``nerg``, which its manual lists."""
+    manual = sys.modules[plugin_class("nerg").__module__].__doc__ or ""
+    rows = re.findall(r"^ \* - ([a-z_]+(?:, [a-z_]+)*)$", manual, re.MULTILINE)
+    return [name for row in rows for name in row.split(", ")]
 
 
 def _observer_sensor(position: ArrayLike) -> dict:
@@ -253,6 +287,7 @@ def _volume(given: object, role: str, to_world: Any) -> Any:
     """The volume of a field, which is a file or in memory, for the integrator's property ``role``."""
     plugin = {"field": "splats" if isinstance(given, Splats) else "nerf", "gaze": "gazefield"}[role]
     if isinstance(given, (str, os.PathLike)):
+        given = file_of(given, role)
         plugin = plugin_of_field(given) if role == "field" else plugin
         where = {} if to_world is None else {"to_world": to_world}
         return {"type": plugin, "filename": os.path.abspath(given), **where}

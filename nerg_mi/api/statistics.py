@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from nerg_mi.jobs.reporter import SILENT, Reporter
 from nerg_mi.rays.rays import Rays
 
-from .options import options_of
+from .options import file_of, options_of
 
 if TYPE_CHECKING:
     from nerg_mi.jobs.statistics import StatisticsResult
@@ -45,7 +45,7 @@ def stats(
 
     given = [files] if isinstance(files, (str, os.PathLike, Rays)) else list(files)
     if areas is not None:
-        options["areas"] = os.fspath(areas)
-    paths = [f if isinstance(f, Rays) else os.fspath(f) for f in given]
-    out = None if output is None else Path(output)
-    return statistics(paths, out, options_of(StatisticsOptions, "stats", None, options), reporter)
+        options["areas"] = areas
+    job = options_of(StatisticsOptions, "stats", None, options)
+    paths = [f if isinstance(f, Rays) else file_of(f, "files") for f in given]
+    return statistics(paths, None if output is None else Path(output), job, reporter)

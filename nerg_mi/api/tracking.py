@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
+from nerg_mi.errors import NergError
 from nerg_mi.jobs.reporter import SILENT, Reporter
+
+from .options import check_names, file_of
 
 if TYPE_CHECKING:
     from nerg_mi.rays.rays import Rays
@@ -40,15 +44,25 @@ def import_rays(
     """
     from nerg_mi.jobs import tracking
     from nerg_mi.rays.readers.options import options_of
-    from nerg_mi.rays.readers.registry import make_options, reader_named
+    from nerg_mi.rays.readers.registry import make_options, reader_named, reader_names
 
+    several = [files] if isinstance(files, (str, os.PathLike)) or not isinstance(files, Sequence) else files
+    if not all(isinstance(file, (str, os.PathLike)) for file in several):
+        raise NergError(
+            f"import_rays reads files, named by strings or paths, got {type(files).__name__}; "
+            'write a table to a file (df.to_csv("day.csv")), and name its columns (columns="origin=x,y,z ...")'
+        )
+    of_readers = options_of(reader_named(reader).Options)
     ours = {f.name for f in fields(tracking.ImportOptions)} - {"reader", "settings", "output"}
+    every = {option.name for name in reader_names() for option in options_of(reader_named(name).Options)}
+    check_names("import_rays", options, sorted(every | ours))
+    paths = [file_of(file, "files") for file in several]
     of_job = {name: value for name, value in options.items() if name in ours}
-    parse = {option.name: option.parse for option in options_of(reader_named(reader).Options)}
+    parse = {option.name: option.parse for option in of_readers}
     of_reader = {name: value for name, value in options.items() if name not in ours}
     for name, value in of_reader.items():
         # Values may be written as for the command.
         if isinstance(value, str) and (read := parse.get(name)) is not None:
             of_reader[name] = read(value)
     job = tracking.ImportOptions(reader=reader, settings=make_options(reader, of_reader), output=output, **of_job)
-    return tracking.import_rays(files, job, reporter).rays
+    return tracking.import_rays(paths, job, reporter).rays

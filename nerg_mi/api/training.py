@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from nerg_mi.jobs.reporter import SILENT, Reporter
 
 from .fields import FilePath, TrainedField
-from .options import options_of
+from .options import file_of, options_of, rays_of
 
 if TYPE_CHECKING:
     from nerg_mi.field.gaze.protocol import AnyGazeField
@@ -43,8 +43,8 @@ def train_radiance(
     from nerg_mi.jobs import radiance
 
     job = options_of(radiance.RadianceOptions, "train_radiance", options, changes)
-    result = radiance.train_radiance(photos, output, job, reporter)
-    return TrainedField(result.field, result.provenance, _name(output))
+    result = radiance.train_radiance(file_of(photos, "photos"), output, job, reporter)
+    return _trained(result.field, result.provenance, output)
 
 
 def train_gaze(
@@ -59,8 +59,8 @@ def train_gaze(
 
     ``rays``: what `load_rays` or `import_rays` gave, or a file of them; None: salience images alone (``views=``,
     ``salience=``). Where people looked around is said by one of the options ``field="field.safetensors"``,
-    ``scene="scene.xml"`` and ``geometry="hits"`` or ``"none"``. ``changes``: these and other options one by one
-    (``minutes=5``, ``recipe="small"``, ``test_zones=3``, ...) on top of ``options``;
+    ``scene="scene.xml"`` (or a mesh) and ``geometry="hits"`` or ``"none"``. ``changes``: these and other options one by
+    one (``minutes=5``, ``recipe="small"``, ``test_zones=3``, ...) on top of ``options``;
     `nerg_mi.jobs.options.gaze.GazeOptions` says what there is. ``output`` and ``reporter``: as for `train_radiance`.
     What comes back has its scores on held-out positions in its ``provenance``. Raises `NergError`.
 
@@ -73,9 +73,11 @@ def train_gaze(
     from nerg_mi.jobs.options.gaze import GazeOptions
 
     job = options_of(GazeOptions, "train_gaze", options, changes)
-    result = gaze.train_gaze(rays, output, job, reporter)
-    return TrainedField(result.field, result.provenance, _name(output))
+    result = gaze.train_gaze(None if rays is None else rays_of(rays), output, job, reporter)
+    return _trained(result.field, result.provenance, output)
 
 
-def _name(output: FilePath | None) -> str:
-    return "in memory" if output is None else Path(output).name
+def _trained(network: Any, provenance: dict[str, Any], output: FilePath | None) -> TrainedField[Any]:
+    if output is None:
+        return TrainedField(network, provenance)
+    return TrainedField(network, provenance, Path(output).name, Path(output))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
 
@@ -37,7 +38,7 @@ class Rays:
     """
 
     t: np.ndarray  # (N,) seconds, on any clock
-    person: np.ndarray  # (N,) int32 index into persons
+    person: np.ndarray  # (N,) int32 index into persons; names of theirs become that
     persons: tuple[str, ...]  # names
     origin: np.ndarray  # (N, 3) metres: the eye, or the head
     direction: np.ndarray  # (N, 3) unit
@@ -53,17 +54,17 @@ class Rays:
 
     def __post_init__(self) -> None:
         put = lambda name, value: object.__setattr__(self, name, value)
-        put("t", np.ascontiguousarray(self.t, dtype=np.float64))
-        put("persons", tuple(str(p) for p in self.persons))
-        put("cohorts", tuple(str(c) for c in self.cohorts))
+        for name in ("persons", "cohorts"):
+            names = getattr(self, name)
+            if isinstance(names, str):
+                raise NergError(f'{name} are several names, as in {name}=("Ada", "Bob"), got {names!r}')
+            put(name, tuple(str(one) for one in names))
         for name in ("person", "cohort"):
             if getattr(self, name) is not None:
-                put(name, np.asarray(getattr(self, name)))
-        for name in ("origin", "direction", "confidence", "hit"):
-            if getattr(self, name) is not None:
-                put(name, np.ascontiguousarray(getattr(self, name), dtype=np.float64))
-        if self.head is not None:
-            put("head", np.ascontiguousarray(self.head, dtype=np.float32))
+                put(name, _numbers_of(getattr(self, name), getattr(self, name + "s"), name))
+        for name in ("t", "origin", "direction", "confidence", "hit", "head"):
+            if (value := getattr(self, name)) is not None:
+                put(name, _floats(value, name, np.float32 if name == "head" else np.float64))
 
         n = len(self.t)
         shapes = {
@@ -151,6 +152,25 @@ class Rays:
             raise NergError(
                 f"\"{path}\" is damaged ({why}); copy it again, or make it anew with 'nerg rays import'"
             ) from error
+
+
+def _floats(values: ArrayLike, name: str, dtype: type[np.floating[Any]]) -> np.ndarray:
+    try:
+        return np.ascontiguousarray(values, dtype=dtype)
+    except (TypeError, ValueError) as error:
+        raise NergError(f'"{name}" of rays holds what is no number ({error}); give an array of numbers') from error
+
+
+def _numbers_of(values: ArrayLike, names: tuple[str, ...], what: str) -> np.ndarray:
+    """``values`` (N,), numbers that count ``names`` from 0 on, or some of these names, as numbers."""
+    values = np.asarray(values)
+    if not any(isinstance(value, str) for value in values.ravel()[:1].tolist()):
+        return values
+    numbers = {name: number for number, name in enumerate(names)}
+    unknown = next((value for value in values.ravel().tolist() if value not in numbers), None)
+    if unknown is not None:
+        raise NergError(f"{unknown!r} is a {what} of the rays and none of {what}s; name all of them in {what}s=(...)")
+    return np.array([numbers[value] for value in values.ravel().tolist()], np.int32).reshape(values.shape)
 
 
 def _refuse(bad: np.ndarray | np.bool_, what: str, remedy: str) -> None:

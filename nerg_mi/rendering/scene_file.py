@@ -15,6 +15,7 @@ from xml.parsers import expat
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import open_file, size_of
 from nerg_mi.files.image_header import check_image
+from nerg_mi.formats.meshes import READERS as MESHES
 from nerg_mi.properties import resolved
 
 from .mesh_file import check_mesh, check_points, check_vol
@@ -53,8 +54,10 @@ def check_scene_file(path: str | Path, defaults: Mapping[str, str] | None = None
 
 def files_of_scene(path: str | Path, defaults: Mapping[str, str] | None = None) -> list[Path]:
     """The scene file ``path`` and the files that it names, as far as they are there: what it includes, meshes, fields,
-    textures; ``defaults`` and errors as of `check_scene_file`."""
+    textures; a mesh is its own only file. ``defaults`` and errors as of `check_scene_file`."""
     path = Path(path)
+    if path.suffix.lower() in MESHES:
+        return [path]
     reader = _Scene(path.parent, {k: str(v) for k, v in (defaults or {}).items()})
     reader.read_whole(path)
     return list(dict.fromkeys([path, *reader.files]))

@@ -27,7 +27,7 @@ def raise_it(*arguments):
             lambda: nerg.evaluate_radiance("f.safetensors", "photos", spp=3, pictures="out"),
             (
                 Path("f.safetensors"),
-                "photos",
+                Path("photos"),
                 radiance.RadianceScoreOptions(spp=3, pictures=Path("out"), mode="llvm_ad_rgb"),
             ),
         ),
@@ -35,13 +35,13 @@ def raise_it(*arguments):
             evaluation,
             "evaluate_gaze",
             lambda: nerg.evaluate_gaze("g.safetensors", "r.npz", "out", split="pos"),
-            (Path("g.safetensors"), "r.npz", "out", GazeEvaluationOptions(split="pos", mode="llvm_ad_rgb")),
+            (Path("g.safetensors"), Path("r.npz"), "out", GazeEvaluationOptions(split="pos", mode="llvm_ad_rgb")),
         ),
         (
             ablation,
             "ablate",
             lambda: nerg.ablate("r.npz", "out", options=AblationOptions(seeds=2), recipes="small"),
-            ("r.npz", "out", AblationOptions(seeds=2, recipes="small", mode="llvm_ad_rgb")),
+            (Path("r.npz"), "out", AblationOptions(seeds=2, recipes="small", mode="llvm_ad_rgb")),
         ),
         (
             study,
@@ -51,7 +51,10 @@ def raise_it(*arguments):
         ),
     ],
 )
-def test01_options_reach_the_jobs(monkeypatch, module, job, call, expected):
+def test01_options_reach_the_jobs(monkeypatch, tmp_path, module, job, call, expected):
+    monkeypatch.chdir(tmp_path)
+    for name in ("f.safetensors", "g.safetensors", "r.npz", "photos"):
+        Path(name).touch()
     monkeypatch.setattr(module, job, raise_it)
     with pytest.raises(Asked) as found:
         call()

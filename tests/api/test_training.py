@@ -25,11 +25,11 @@ def asked(monkeypatch):
     monkeypatch.setattr(radiance_job, "train_radiance", raise_it)
 
 
-def test01_options_reach_the_jobs(asked):
+def test01_options_reach_the_jobs(asked, tmp_path):
     with pytest.raises(Asked) as found:
-        nerg.train_radiance("photos", "out.safetensors", options=RadianceOptions(seed=3), steps=7)
+        nerg.train_radiance(str(tmp_path), "out.safetensors", options=RadianceOptions(seed=3), steps=7)
     photos, output, options, _ = found.value.args
-    assert (photos, output) == ("photos", "out.safetensors")
+    assert (photos, output) == (tmp_path, "out.safetensors")
     assert options == RadianceOptions(seed=3, steps=7, mode="llvm_ad_rgb")
     with pytest.raises(Asked) as found:
         nerg.train_gaze(None, geometry="none", kappa=9.0)
@@ -43,9 +43,9 @@ def test02_wrong_options_are_told(asked):
         nerg.train_radiance("photos", mode="scalar_rgb")
 
 
-def test03_the_variant_in_use_stays(mono, asked):
+def test03_the_variant_in_use_stays(mono, asked, tmp_path):
     with pytest.raises(Asked) as found:
-        nerg.train_radiance("photos")
+        nerg.train_radiance(tmp_path)
     assert found.value.args[2].mode == "llvm_ad_mono" and mono.variant() == "llvm_ad_mono"
 
 

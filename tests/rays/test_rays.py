@@ -36,12 +36,24 @@ def broken(name, row, value):
         (broken("confidence", 0, 1.5), r"confidence outside \[0, 1\]"),
         ({"head": np.tile([[0.0, 0, 2], [np.nan, 0, 0]], (3, 1))}, r"head that is not of unit length \(rays 0, 2, 4\)"),
         ({"origin": np.zeros((5, 3))}, r"origin has shape \(5, 3\)"),
+        ({"t": ["now"] * 6}, '"t" of rays holds what is no number'),
+        ({"head": [["x"] * 3] * 6}, '"head" of rays holds what is no number'),
+        ({"person": ["ann"] * 5 + ["cy"]}, r"'cy' is a person of the rays and none of persons"),
+        ({"cohort": ["old"] * 6}, r"'old' is a cohort of the rays and none of cohorts"),
+        ({"persons": "ann"}, "persons are several names"),
         ({"metadata": {}}, "state units, up axis and handedness"),
     ],
 )
 def test_refuses_by_row(change, message):
     with pytest.raises(ValueError, match=message):
         some(**change)
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.array, lambda names: np.array(names, object)])
+def test_people_may_be_named(kind):
+    rays = some(person=kind(["bo", "ann", "bo", "bo", "ann", "ann"]), cohort=kind(["old"] * 6), cohorts=("new", "old"))
+    assert rays.person.tolist() == [1, 0, 1, 1, 0, 0] and rays.person.dtype == np.int32
+    assert rays.cohort is not None and rays.cohort.tolist() == [1] * 6
 
 
 def test_whole_numbers_are_taken_as_what_they_stand_for():

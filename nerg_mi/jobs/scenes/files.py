@@ -125,7 +125,8 @@ def _trained_in(gaze: Path, about: dict) -> tuple[str, Path | None]:
         "put it beside the gaze field, or name the file: nerg scene PLACE GAZE",
         "name that one: nerg scene PLACE GAZE",
     )
-    return {"field_file": "field", "scene_file": "scene", "geometry_file": "hits"}[key], path
+    kinds = {"field_file": "field", "scene_file": KINDS.get(path.suffix.lower(), "scene"), "geometry_file": "hits"}
+    return kinds[key], path
 
 
 def _compare(place: Path, gaze: Path, about: dict, reporter: Reporter) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,9 @@ from nerg_mi.errors import MissingFile, NergError, mitsuba_says
 from nerg_mi.field.radiance import RadianceField
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.formats.fields import load_radiance
-from nerg_mi.formats.splats.files import READERS, read_splats, refuse_others
+from nerg_mi.formats.meshes import READERS as MESHES
+from nerg_mi.formats.meshes import read_mesh_file
+from nerg_mi.formats.splats.files import READERS, is_splats, read_splats, refuse_others
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.contraction import AnyBox
@@ -20,6 +23,7 @@ from nerg_mi.maths.similarity import Similarity
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rendering.mesh_file import check_vol
 from nerg_mi.rendering.pictures import load_scene
+from nerg_mi.surfaces.target import mitsuba_mesh
 from nerg_mi.transport.media.field import FieldMedium
 from nerg_mi.transport.media.splats.arrays import SplatArrays
 from nerg_mi.transport.media.splats.medium import SplatMedium
@@ -91,11 +95,12 @@ def _place_of_splats(path: Path, ns: ModuleType) -> GazePlace:
 
 
 def place_of_scene(path: Path) -> GazePlace:
-    """The shapes of a Mitsuba scene, and the field or volume of its integrator where that is a ``nerg``.
+    """The shapes of a Mitsuba scene, and the field or volume of its integrator where that is a ``nerg``; or a mesh
+    (.ply, .obj, .glb).
 
     Raises `NergError` for a scene with neither.
     """
-    scene = load_scene(path)
+    scene = _scene_of_mesh(path) if path.suffix.lower() in MESHES else load_scene(path)
     place = Place(getattr(scene.integrator(), "medium", None), scene)
     bounds = place.bounds()
     if bounds is None:
@@ -107,6 +112,16 @@ def place_of_scene(path: Path) -> GazePlace:
     # A plane has no thickness, and a field needs some.
     pad = 0.01 * max(upper - lower)
     return GazePlace(place, Box(tuple(lower - pad), tuple(upper + pad)), "scene", {"scene_file": file_identity(path)})
+
+
+def _scene_of_mesh(path: Path) -> Any:
+    import mitsuba as mi
+
+    if path.suffix.lower() in READERS and is_splats(path):
+        raise NergError(f'"{path}" holds Gaussian splats, which are a field: give it by --field')
+    mesh = read_mesh_file(path)
+    with mitsuba_says():
+        return mi.load_dict({"type": "scene", "mesh": mitsuba_mesh(mesh.vertices, mesh.faces, "mesh")})
 
 
 def place_of_hits(rays: Rays, path: Path, voxel: float | None = None) -> GazePlace:

@@ -14,6 +14,7 @@ from nerg_mi.formats.splats.ply import write_ply_splats
 from nerg_mi.formats.volumes import write_volume
 from nerg_mi.maths.box import Box
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.training.geometry.places import (
     GazePlace,
     place_of_field,
@@ -88,6 +89,23 @@ def test_a_scenes_box_holds_its_field_and_its_shapes_and_a_hundredth_more(rgb, t
       <shape type="cube"><transform name="to_world"><translate x="-2" y="-2" z="-3"/></transform></shape></scene>""")
     box = place_of_scene(tmp_path / "both.xml").box
     np.testing.assert_allclose([box.lower, box.upper], [[-3.05, -3.05, -4.05], [1.05, 1.05, 1.05]], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.obj"])
+def test_a_mesh_is_a_scene_of_its_own(rgb, tmp_path, name):
+    rgb.load_dict({"type": "cube"}).write_ply(str(tmp_path / "a.ply"))
+    corners, faces = "-1 -1 -1|1 -1 -1|1 1 -1|-1 1 1".split("|"), ("1 2 3", "1 3 4")
+    (tmp_path / "a.obj").write_text("".join(f"v {c}\n" for c in corners) + "".join(f"f {f}\n" for f in faces))
+    place = place_of_scene(tmp_path / name)
+    np.testing.assert_allclose([place.box.lower, place.box.upper], [[-1.02] * 3, [1.02] * 3], atol=1e-6)
+    assert place.kind == "scene" and place.about["scene_file"]["file"] == name
+    assert files_of_scene(tmp_path / name) == [tmp_path / name]
+
+
+def test_splats_are_no_scene(rgb, tmp_path):
+    write_ply_splats(tmp_path / "a.ply", random_splats(10))
+    with pytest.raises(NergError, match="Gaussian splats, which are a field: give it by --field"):
+        place_of_scene(tmp_path / "a.ply")
 
 
 def test_a_scene_without_anything_is_no_place(rgb, tmp_path):
