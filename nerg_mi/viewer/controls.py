@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from typing import Any
@@ -66,7 +67,8 @@ class Controls:
         automatic = gui.add_checkbox("Automatic range", True)
         ends = gui.add_vector2("Range", (0.0, 1.0), step=0.01, disabled=True)
         # As Mitsuba has it, in single precision, it would be written with all its digits.
-        falloff = gui.add_slider("Fall-off", 0.0, 1.0, 0.01, round(min(session.falloff, 1.0), 4))
+        top = 10.0 ** math.ceil(math.log10(3 * session.falloff)) if session.falloff > 0 else 1.0
+        falloff = gui.add_slider("Fall-off", 0.0, top, 0.01 * top, float(f"{session.falloff:.4g}"))
 
         def change(event: Any) -> None:
             if event.client is None:

@@ -13,7 +13,7 @@ class PlaceOptions:
     """Exactly one of them is given."""
 
     field: Path | None = option(None, "Radiance field, or Gaussian splats, in which people looked around.")
-    scene: Path | None = option(None, "Or: a Mitsuba scene, or a mesh (.ply, .obj), whose shapes they looked at.")
+    scene: Path | None = option(None, "Or: a Mitsuba scene, or a mesh (.ply, .obj, .glb), whose shapes they looked at.")
     geometry: str | None = option(
         None, 'Or: "hits" makes a place from the rays\' own hit points, "none" does without any.'
     )
