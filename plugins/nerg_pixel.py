@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, cast
@@ -51,6 +50,12 @@ class Pixel:
       ``spread``: with the standard deviation over its members.
     """
 
+    # What does not depend on the observer: all that a pixel for another observer takes over.
+    _SHARED = (
+        *("nerg", "sensors", "camera_ray", "active", "ray", "ahead", "place", "lit", "painter", "counting", "view"),
+        *("some", "depth", "surface", "p_d", "penetration"),
+    )
+
     def __init__(self, nerg, scene, sensors: list, ray, active, offset):
         self.nerg, self.sensors, self.camera_ray, self.active = nerg, sensors, ray, active
         # What is traced, and how far the camera's ray went before it.
@@ -73,11 +78,10 @@ class Pixel:
     def for_observer(self, p_o, observers: list, aligned: bool, cache) -> Self:
         """The same ray for another observer at ``p_o`` (Point3f), one of ``observers``, of whom ``cache`` knows; what
         does not depend on the observer is found once. ``aligned``: they stand where the camera does."""
-        # What observers have in common is found before it is copied.
-        _ = self.depth, self.surface, self.p_d, self.penetration
-        other = copy(self)
-        for name in ("distance_and_direction", "sight", "gaze", "attention"):
-            other.__dict__.pop(name, None)
+        other = type(self).__new__(type(self))
+        # Nothing else is taken over, so that no cached property keeps a value of this pixel's observer.
+        for name in self._SHARED:
+            setattr(other, name, getattr(self, name))
         other.p_o, other.observers, other.aligned, other.cache = p_o, observers, aligned, cache
         other._evaluations = []
         return other

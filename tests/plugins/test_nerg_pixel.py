@@ -1,5 +1,7 @@
 """What is found along one camera ray, and when."""
 
+from functools import cached_property
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -106,3 +108,25 @@ def test06_colour_is_found_where_it_is_wanted(rgb, files):
     assert np.array(lit.color).shape[0] == 3
     for a, b in zip(lit.accumulated_features, dark.accumulated_features):
         np.testing.assert_allclose(a.numpy(), b.numpy(), rtol=1e-5, atol=1e-6)
+
+
+def test07_another_observer_takes_over_nothing_of_the_first(rgb, files):
+    """Every cached property, of subclasses too, is either shared by all observers or found anew for each."""
+    from nerg_mi.plugins.nerg_asked import AskedPixel
+    from nerg_mi.plugins.nerg_pixel import Pixel
+
+    cached = {n for kind in AskedPixel.__mro__ for n, v in vars(kind).items() if isinstance(v, cached_property)}
+    assert {"depth", "sight", "gaze", "attention", "color"} <= cached
+    first = pixel(rgb, with_gaze(files, "gaze,visibility,density_evals", observer=observer_at(rgb, -2, 0.3, -2)))
+    values = {name: getattr(first, name) for name in cached}
+    at = rgb.Point3f(2, 0.3, -2)
+    other = first.for_observer(at, [at], False, first.cache)
+    # The observer is said by the caller, and nothing else is there that is not shared.
+    said = {"p_o", "observers", "aligned", "cache", "_evaluations"}
+    assert set(vars(other)) - set(Pixel._SHARED) == said
+    assert {n for n in cached - said if vars(other).get(n) is values[n]} == cached & set(Pixel._SHARED)
+    # What is shared does not follow the observer, and the rest does.
+    for name in cached & set(Pixel._SHARED):
+        np.testing.assert_array_equal(np.array(getattr(other, name)), np.array(values[name]))
+    assert not np.allclose(np.array(other.r_o), np.array(first.r_o)) and not other._evaluations
+    assert not np.allclose(other.attention.gaze.numpy(), first.attention.gaze.numpy())

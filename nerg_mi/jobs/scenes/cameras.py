@@ -121,7 +121,8 @@ def turned_ahead(eye: Eye, seen: Seen) -> Eye:
     """The observer at ``eye``, turned to where most of the attention goes."""
     towards = seen.main_direction()
     at = int(np.argmax(seen.directions @ towards))
-    away = seen.depth[at] if seen.met[at] else seen.usual or 1.0
+    # An observer within matter meets it at once, and a direction needs a length.
+    away = seen.depth[at] if seen.met[at] and seen.depth[at] > 0 else seen.usual or 1.0
     return replace(eye, target=eye.origin + away * towards)
 
 
