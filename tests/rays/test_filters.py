@@ -50,6 +50,11 @@ def test_conditions():
         and where(min_confidence=1.0) == [0, 1, 2, 3, 4, 5]
     )
     assert where(persons=["bo"], cohorts=["old"]) == [1]
+    # Bounds that rays lie on: times from the first up to the second, boxes and confidences with both.
+    exact = walk(line(np.arange(6.0)), t=np.arange(6) * 0.25)
+    at = lambda **c: np.flatnonzero(select_mask(exact, **c)).tolist()
+    assert at(time=(0.25, 0.75)) == [1, 2] and at(time=(None, 0.25)) == [0] and at(time=(1.25, None)) == [5]
+    assert at(time=(0.5, 0.5)) == [] and at(box=[2, 3, 0, 1, 0, 1.6]) == [2, 3]
     for wrong, message in [
         ({"persons": ["cy"]}, "no person is called 'cy'"),
         ({"box": [0, 1, 0, 1]}, "a box is"),

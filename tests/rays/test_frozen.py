@@ -27,6 +27,29 @@ def test_gaze_that_stands_still(monkeypatch, block):
     assert not found(type(rays)(**{**vars(as_head), "head": None})).any()
 
 
+@pytest.mark.parametrize("turns, moves", [(True, False), (False, True)])
+def test_a_head_that_only_turns_or_only_moves(turns, moves):
+    rays, rows = watch(), slice(3100, 3400)
+    columns = {"direction": rays.direction[3100]}
+    if not turns:
+        columns["head"] = rays.head[3100]
+    if not moves:
+        columns["origin"] = rays.origin[3100]
+    frozen_rays = change(rays, rows, **columns)
+    assert np.flatnonzero(found(frozen_rays)).tolist() == list(range(3100, 3400))
+    # Where no head is recorded, only a movement tells.
+    assert found(type(rays)(**{**vars(frozen_rays), "head": None}))[3101:3399].all() == moves
+
+
+@pytest.mark.parametrize("seconds, expected", [(1.0, True), (0.98, False)])
+def test_a_second_is_long_enough(seconds, expected):
+    rays = watch(1)
+    t = np.arange(len(rays)) / 64
+    rays = change(rays, slice(None), t=lambda _: t)
+    count = round(seconds * 64) + 1
+    assert found(change(rays, slice(640, 640 + count), direction=rays.direction[640])).any() == expected
+
+
 def test_a_headset_on_a_table_is_not_frozen_gaze():
     rays = watch()
     rows = slice(3100, 3400)

@@ -172,3 +172,33 @@ def test12_a_difference_from_what_one_has_done_has_no_interval():
     assert (gone.high < 0).all() and (gone.p <= 0.05).all()
     two = ratio_differences((after, there), (0 * after, there), resamples=199)
     assert np.isnan(two.low).all() and np.isnan(two.p).all()
+
+
+def test13_groups_of_unequal_size_are_drawn_apart():
+    """Against a loop: of each group as many are drawn as there are, whatever the other one does."""
+    rng, few, many, resamples = np.random.default_rng(10), 4, 30, 300
+    n = few + many
+    first = (np.arange(n) < few).astype(float)[:, None]
+    x, u = rng.gamma(2, 1, (n, 1)) * first, rng.gamma(3, 1, (n, 1)) * (1 - first)
+    found = ratio_differences((x, first), (u, 1 - first), resamples=resamples, seed=3)
+    sides = x[:few, 0], u[few:, 0]
+    error = lambda v: v.std(ddof=1) ** 2 / len(v)
+    value, whole = sides[1].mean() - sides[0].mean(), error(sides[0]) + error(sides[1])
+    draws, t = np.random.default_rng(3), []
+    counts = [draws.multinomial(len(v), np.full(len(v), 1 / len(v)), size=resamples) for v in sides]
+    for one, two in zip(*counts):
+        a, b = (np.repeat(v, k) for v, k in zip(sides, (one, two)))
+        spread = a.var() / (few - 1) + b.var() / (many - 1)
+        t.append(abs(b.mean() - a.mean() - value) / np.sqrt(0.99 * spread + 0.01 * whole))
+    reach = np.quantile(t, 0.95) * np.sqrt(whole)
+    assert found.value[0] == pytest.approx(value)
+    assert found.low[0] == pytest.approx(value - reach) and found.high[0] == pytest.approx(value + reach)
+    assert found.p[0] == pytest.approx((1 + sum(v >= value / np.sqrt(whole) for v in t)) / (resamples + 1))
+
+
+@pytest.mark.parametrize("resamples", [9, 99, 399])
+def test14_a_p_value_is_no_less_than_draws_can_tell(resamples):
+    rng = np.random.default_rng(11)
+    x = rng.random((12, 5))
+    found = ratio_differences((x, ONES(x.shape)), (x + 100 + rng.random(x.shape), ONES(x.shape)), resamples=resamples)
+    assert found.p == pytest.approx(1 / (resamples + 1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -73,6 +73,8 @@ def slow_sums(rays, on, far, visible, cells):
                     continue
                 who = rays.persons[person[first]]
                 out["looks", cell, who, a] += 1
+                out["first", cell, who, a] = min(out.get(("first", cell, who, a), np.inf), start)
+                out["last", cell, who, a] = max(out.get(("last", cell, who, a), -np.inf), end)
                 bin_ = max(b for b in range(len(BINS) - 1) if end - start >= BINS[b])
                 out["lasted", cell, a, bin_] += 1
                 if sitting[first] not in known:
@@ -101,6 +103,9 @@ def test01_against_loops(seed):
             assert getattr(sums, name)[r] == pytest.approx(slow[name, cell, who])
         for name in ("on_time", "on_rays", "distance", "looks", "visible", "first_sum", "first_count"):
             assert getattr(sums, name)[r] == pytest.approx([slow[name, cell, who, a] for a in range(3)]), name
+        for name, none in (("first", np.inf), ("last", -np.inf)):
+            expected = [slow.get((name, cell, who, a), none) for a in range(3)]
+            assert getattr(sums, name)[r] == pytest.approx(expected), name
     for c, (cell, _) in enumerate(cells):
         assert sums.lasted[c].tolist() == [[slow["lasted", cell, a, b] for b in range(len(BINS) - 1)] for a in range(3)]
         assert sums.moves[c].tolist() == [[slow["moves", cell, a, b] for b in range(3)] for a in range(3)]
@@ -149,6 +154,20 @@ def test04_others_cannot_be_added():
         merge([one, other])
     with pytest.raises(ValueError, match="nothing"):
         merge([])
+
+
+def test03b_the_last_visit_ends_when_its_last_ray_does():
+    """Not when that begins, nor when the look before it ended; of two parts it is the later one."""
+    t = np.arange(8) * 0.25
+    d = np.tile([1.0, 0, 0], (8, 1))
+    rays = Rays(t, np.zeros(8, int), ("ann",), d, d, np.ones(8))
+    on = np.array([1, 2, 5, 6])
+    landed = Landed(8, (on,), (np.ones(4),))
+    early = partial_sums(rays, landed, ("a",), [(ALL, None)], LookRules())
+    assert early.looks[0, 0] == 2 and early.first[0, 0] == 0.25 and early.last[0, 0] == 1.75
+    late = partial_sums(replace(rays, t=t + 100), landed, ("a",), [(ALL, None)], LookRules())
+    for parts in ([early, late], [late, early]):
+        assert merge(parts).first[0, 0] == 0.25 and merge(parts).last[0, 0] == 101.75
 
 
 def test05_no_rays_at_all():

@@ -52,6 +52,25 @@ def test_a_file_is_read_once_while_it_stays(place, monkeypatch):
     assert checksums.of(file) == hashlib.sha256(b"other").hexdigest() and len(read) == 2
 
 
+def test_a_file_that_changes_while_it_is_read_is_not_remembered(place, monkeypatch):
+    """Bytes that were there for the length of a reading are not those of the file that was there before, though its
+    time of change is put back with its bytes."""
+    file, checksums, original = place / "field.safetensors", Checksums(), module.file_sha256
+    before = os.stat(file)
+
+    def change_and_read(path):
+        file.write_bytes(b"FIELD")
+        os.utime(file, ns=(1, 1))
+        return original(path)
+
+    monkeypatch.setattr(module, "file_sha256", change_and_read)
+    assert checksums.of(file) == hashlib.sha256(b"FIELD").hexdigest()
+    monkeypatch.setattr(module, "file_sha256", original)
+    file.write_bytes(b"field")
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert checksums.of(file) == hashlib.sha256(b"field").hexdigest()
+
+
 def test_a_change_is_told(place):
     file, checksums = place / "field.safetensors", Checksums()
     planned, where = read_input("field", file), {"field": file}

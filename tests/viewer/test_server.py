@@ -71,9 +71,20 @@ def test02_forged_headers_are_refused(local):
     assert opening(local, Host=f"evil.example:{port}", Origin=f"http://evil.example:{port}") == 403
 
 
-def test03_two_headers_of_a_kind_are_refused(local):
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("Host: {own}", "Host: evil.example"),
+        ("Host: evil.example", "Host: {own}"),
+        ("Host: {own}", "Host: {own}"),
+        ("Host: {own}", "host: evil.example"),
+        ("Host: {own}", "Origin: http://{own}", "Origin: http://evil.example"),
+        ("Host: {own}", "Origin: http://evil.example", "Origin: http://{own}"),
+    ],
+)
+def test03_two_headers_of_a_kind_are_refused(local, lines):
     port = local.get_port()
-    lines = ["GET / HTTP/1.1", f"Host: localhost:{port}", "Host: evil.example", "", ""]
+    lines = ["GET / HTTP/1.1", *(line.format(own=f"localhost:{port}") for line in lines), "", ""]
     with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
         connection.sendall("\r\n".join(lines).encode())
         assert connection.recv(4096).split()[1] in (b"403", b"400")

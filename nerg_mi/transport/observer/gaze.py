@@ -166,6 +166,11 @@ class ObservedGaze:
         """Arrays that gaze depends on, for derivatives."""
         return self._placed.parameters()
 
+    @property
+    def made_of(self) -> tuple:
+        """What densities depend on besides the place and the observers, comparable with ``==``."""
+        return self._placed, self._settings, Fingerprint(self.parameters())
+
     def integrals(self, p_o: Point3f) -> list[Float]:
         """Of each member the integral over the sphere of that observer who is nearest to ``p_o``, lane by lane;
         empty for a field that is not normalised."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import drjit as dr
 
 from nerg_mi.maths.types import Bool, Float, Point3f, Ray3f
-from nerg_mi.transport.fingerprint import Fingerprint
 from nerg_mi.transport.march.depth import DEPTHS
 from nerg_mi.transport.march.occlusion import Occlusion
 from nerg_mi.transport.place import Place, View
@@ -148,7 +147,7 @@ def _map_of(
     around = known[0].value
     if gaze is None or dr.grad_enabled(p_o, *gaze.parameters()):
         return around, None
-    of_map = (around, Fingerprint(gaze.parameters()))
+    of_map = (around, gaze.made_of)
     table = cache.of_known("gaze of map", known, of_map, lambda k: k.value.gaze_table(gaze))[0].value
     return around, table
 

@@ -23,6 +23,7 @@ from nerg_mi.transport.march.settings import MarchSettings
 from nerg_mi.transport.observer.cache import ObserverCache
 from nerg_mi.transport.observer.gaze import PlacedGaze
 from nerg_mi.transport.observer.settings import ObserverSettings
+from nerg_mi.transport.observer.sight import trace_sight
 from nerg_mi.transport.place import Place
 from nerg_mi.transport.trace import default_settings
 from tests.field.gaze.test_log_density import BOX, SMALL
@@ -213,3 +214,26 @@ def test_derivatives_of_the_observer_pass_the_integral(rgb, trained):
     assert np.linalg.norm(true) > 0.1 * integral(o)
     assert np.linalg.norm(np.array(dr.grad(p_o)).ravel() - true) < 0.03 * np.linalg.norm(true)
     assert not trained or np.abs(np.array(dr.grad(field.grid.table))).max() > 0
+
+
+def test_a_cache_tells_tolerances_of_the_integral_apart(rgb):
+    """Of integrals, and of the densities that a map of them holds."""
+    field, eye = normalized(), rgb.Point3f(0.1, 0.2, 0.3)
+    # Steep, so that sums over few directions are off.
+    field.set_parameters({k: 16 * v for k, v in field.parameters().items() if k in ("emit_net.2", "capture_net.2")})
+    gaze, place, cache = PlacedGaze(field), room(rgb), ObserverCache()
+    point, ray = rgb.Point3f(0.2, 1, 0.4), rgb.Ray3f(rgb.Point3f(0.2, 0, 0.4), rgb.Vector3f(0, 1, 0))
+
+    def ask(cache, **settings):
+        chosen = replace(SETTINGS, directions=1 << 15, visibility="map", map_height=16, **settings)
+        observed = gaze.at([eye], place, chosen, cache)
+        sight = trace_sight(
+            place, ray, point, eye, rgb.Float(0), rgb.Bool(True), 0.0, chosen, gaze=observed, cache=cache
+        )
+        return float(observed.integrals(eye)[0][0]), float(sight.gaze[0])
+
+    rough, exact = {"integral_tolerance": 0.9}, {"integral_tolerance": 0.0}
+    alone = [ask(ObserverCache(), **s) for s in (rough, exact)]
+    assert alone[0][0] != alone[1][0] and alone[0][1] != alone[1][1] and min(alone[0][1], alone[1][1]) > 0
+    for s, expected in zip((rough, exact, rough, exact), 2 * alone):
+        assert ask(cache, **s) == expected
