@@ -55,7 +55,7 @@ def test_everything_of_a_folder(run, tmp_path):
     options = replace(SMALL, objects=run / "objects.json")
     result = make_report([run], tmp_path / "a.html", options, told)
     text = result.path.read_text(encoding="utf-8")
-    assert told.messages[0] == "Better than nearest rays for new people at new places." in text
+    assert told.messages[0] == "Better than nearest rays, the strongest baseline, for new people at new places." in text
     assert told.messages[-1].startswith(f"wrote {tmp_path / 'a.html'} (") and len(text) < 6_000_000
     found = result.run
     assert {"color", "own", "sphere", "plan", "layout"} <= set(found.pictures)

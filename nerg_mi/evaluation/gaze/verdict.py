@@ -4,12 +4,14 @@ The rule, for one split:
 
 1. Fewer than `LEAST_PEOPLE` people or `LEAST_POSITIONS` positions give no verdict, whatever the scores are.
 2. The field is compared with three references: the uniform density; the position-blind one, of whose kernels that
-   with the higher log score is taken; and the nearest rays. The scores are the log score (bits a ray), CC and KLD.
-   One of them decides where the 95 % interval of the field's lead leaves out zero.
+   with the higher log score is taken; and the nearest rays. Where another baseline has a higher log score than all of
+   these, with that one, too. The scores are the log score (bits a ray), CC and KLD. One of them decides where the 95 %
+   interval of the field's lead leaves out zero.
 3. The field is better where at least two of the three scores decide for it and none against it, worse where two decide
    against it and none for it, and undecided otherwise.
 4. Worse than uniform or than position-blind: do not use it. Undecided beside position-blind: not shown to be of use.
-   Better than position-blind: of use, and the nearest rays say whether it is worth a field.
+   Better than position-blind: of use, and the nearest rays, with whatever is stronger, say whether it is worth a field.
+   The sentence names the strongest baseline, which is the one with the highest log score.
 
 Intervals are those of the bootstrap over people (`evaluation.evaluate_gaze`), made wider for few: by sqrt(n / (n -
 1)), since a bootstrap of n people is too narrow by as much, and by Student's quantile of n - 1 degrees of freedom in
@@ -100,13 +102,15 @@ def judge(rows: Sequence[Mapping[str, Any]], split: str, people: int, positions:
             f"No verdict for {whom}: {_count(people, 'person', 'people')} at {_count(positions, 'place', 'places')} "
             f"are too few; it takes {LEAST_PEOPLE} people and {LEAST_POSITIONS} places.",
         )
-    field, blind = rows[0], _blind(rows)
+    field, blind, strongest = rows[0], _blind(rows), _strongest(rows)
     found = {name: _row(rows, name) for name in (UNIFORM, NEAREST)}
     compare = lambda name, row: Comparison(name, tuple(lead_of(field, row, score, people) for score in DECIDING))
     pairs = [(UNIFORM, found[UNIFORM]), (BLIND, blind), (NEAREST, found[NEAREST])]
+    if strongest not in ("", *(name for name, _ in pairs)):
+        pairs.append((strongest, _row(rows, strongest)))
     comparisons = tuple(compare(name, row) for name, row in pairs if row is not None)
     half = _way_to_half(field, blind, _row(rows, HALF))
-    grade, sentence = _words(comparisons, whom, people)
+    grade, sentence = _words(comparisons, strongest, whom, people)
     return Verdict(grade, sentence, comparisons, half)
 
 
@@ -130,7 +134,7 @@ def widening(people: int) -> float:
     return float(math.sqrt(people / (people - 1)) * stdtrit(people - 1, 0.975) / 1.96)
 
 
-def _words(comparisons: Sequence[Comparison], whom: str, people: int) -> tuple[str, str]:
+def _words(comparisons: Sequence[Comparison], strongest: str, whom: str, people: int) -> tuple[str, str]:
     outcome = {c.reference: c.outcome for c in comparisons}
     if BLIND not in outcome:
         return "none", f"No verdict for {whom}: the evaluation has no position-blind density to compare with."
@@ -143,18 +147,34 @@ def _words(comparisons: Sequence[Comparison], whom: str, people: int) -> tuple[s
             f"Not shown to be better than position-blind for {whom}: do not rely on where people stand without more of "
             "them.",
         )
-    nearest = outcome.get(NEAREST)
-    if nearest == BETTER:
+    if NEAREST not in outcome:
+        return "limited", f"Better than position-blind for {whom}; it was not compared with nearest rays."
+    others = {name: result for name, result in outcome.items() if name not in (UNIFORM, BLIND)}
+    shown = {NEAREST: "nearest rays"}
+    for name, result in others.items():
+        if result == WORSE:
+            worse = shown.get(name, name)
+            return "limited", f"Better than position-blind, but worse than {worse} for {whom}: use the rays."
+    for name, result in others.items():
+        if result == UNDECIDED:
+            return (
+                "limited",
+                f"Better than position-blind for {whom}; whether it is better than {shown.get(name, name)} is "
+                f"undecided with {people} people.",
+            )
+    if not strongest:
         return "use", f"Better than nearest rays for {whom}."
-    if nearest == WORSE:
-        return "limited", f"Better than position-blind, but worse than nearest rays for {whom}: use the rays."
-    if nearest == UNDECIDED:
-        return (
-            "limited",
-            f"Better than position-blind for {whom}; whether it is better than nearest rays is undecided with {people} "
-            "people.",
-        )
-    return "limited", f"Better than position-blind for {whom}; it was not compared with nearest rays."
+    rest = "" if strongest == NEAREST else "and than nearest rays "
+    return "use", f"Better than {shown.get(strongest, strongest)}, the strongest baseline, {rest}for {whom}."
+
+
+def _strongest(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The baseline whose log score is the highest, by its name; "" where none has one. The other half of the people is
+    no baseline, and kernels of the position-blind density have one name."""
+    scored = [r for r in rows[1:] if r.get("method") != HALF and not math.isnan(_number(r, "bits"))]
+    best = max(scored, key=lambda r: _number(r, "bits"), default={})
+    name = str(best.get("method", ""))
+    return BLIND if name.startswith(BLIND) else name
 
 
 def _blind(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | None:

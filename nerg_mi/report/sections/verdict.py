@@ -16,7 +16,8 @@ def body(run: Run) -> Html:
     basis = (
         f"By {results.people} people at {results.positions} places that were kept from the training. What decides is "
         "whether the 95 % interval over people of the lead in log score, CC and KLD leaves out zero; two of three must "
-        f"agree and none may object. {BLIND.capitalize()} is where people look wherever they stand."
+        f"agree and none may object. {BLIND.capitalize()} is where people look wherever they stand. The strongest "
+        "baseline is the one with the highest log score."
     )
     half = next((v.half for _, v in run.verdicts if v.half is not None), None)
     way = (

@@ -33,7 +33,7 @@ def scored(field, nearest=(0.4, 0.65, 0.55), **more):
 @pytest.mark.parametrize(
     "field, grade, words",
     [
-        ((0.9, 0.85, 0.3), "use", "Better than nearest rays for new people at new places."),
+        ((0.9, 0.85, 0.3), "use", "Better than nearest rays, the strongest baseline, for new people at new places."),
         ((0.42, 0.66, 0.54), "limited", "whether it is better than nearest rays is undecided with 30 people"),
         ((0.2, 0.5, 0.65), "limited", "worse than nearest rays for new people at new places: use the rays"),
         ((0.01, 0.41, 0.74), "unclear", "Not shown to be better than position-blind for new people"),
@@ -75,6 +75,35 @@ def test_scores_that_contradict_each_other_decide_nothing():
     ]
     for ends, outcome in cases:
         assert Comparison("r", leads(*ends)).outcome == outcome, ends
+
+
+@pytest.mark.parametrize(
+    "strongest, words",
+    [
+        ("position-blind", "Better than position-blind, the strongest baseline, and than nearest rays for"),
+        ("position-blind, kappa 50", "Better than position-blind, the strongest baseline, and than nearest rays for"),
+        ("uniform", "Better than uniform, the strongest baseline, and than nearest rays for"),
+        ("16 nearest probes", "Better than 16 nearest probes, the strongest baseline, and than nearest rays for"),
+        ("4,096 nearest rays", "Better than nearest rays, the strongest baseline, for"),
+    ],
+)
+def test_the_strongest_baseline_is_named(strongest, words):
+    rows = [*scored((0.9, 0.85, 0.3), reach=0.02), row("16 nearest probes", 0.1, 0.5, 0.6, 0.02)]
+    next(r for r in rows if r["method"] == strongest).update(row(strongest, 0.5, 0.6, 0.6, 0.02))
+    verdict = judge(rows, "both", 30, 60)
+    assert verdict.grade == "use" and verdict.sentence.startswith(words)
+    # The other half of the people is no baseline, however well it does.
+    rows[5]["bits"] = 2.0
+    assert judge(rows, "both", 30, 60).sentence == verdict.sentence
+
+
+def test_a_baseline_stronger_than_nearest_rays_decides_too():
+    rows = lambda bits, reach: [*scored((0.9, 0.85, 0.3), reach=0.02), row("16 nearest probes", bits, *reach)]
+    better = judge(rows(1.2, (0.9, 0.2, 0.02)), "both", 30, 60)
+    assert better.grade == "limited" and "worse than 16 nearest probes for" in better.sentence
+    level = judge(rows(0.91, (0.84, 0.31, 0.2)), "both", 30, 60)
+    assert level.grade == "limited" and "better than 16 nearest probes is undecided" in level.sentence
+    assert {c.reference for c in level.comparisons} >= {"uniform", "position-blind", "16 nearest probes"}
 
 
 def test_the_stronger_of_the_blind_densities_is_the_reference():

@@ -36,7 +36,7 @@ def test_names_are_apart():
 
 def test_what_is_said():
     said = {s.name: text_of(s, whole()) for s in SECTIONS}
-    assert said["verdict"].startswith("Better than nearest rays for new people at new places.")
+    assert said["verdict"].startswith("Better than nearest rays, the strongest baseline, for new people at new places.")
     assert "4.00 × 4.00 × 4.00" in said["place"] and "9 that it was trained on" in said["place"]
     assert "400 of 400 rows" in said["data"] and "median number of people within 0.25 m is 3" in said["people"]
     assert "The observer stands somewhere. Densities are in 1/sr" in said["gaze"]
