@@ -7,6 +7,7 @@ the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -51,7 +52,16 @@ MAKE = "python -m nerg_mi.scenes.store.make"
 REPORT_POINTS = 60_000
 """Points of the report's 3D scene."""
 
-STAGES = ("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures", "surfaces", "report")
+TRACKED, TRACKED_SEED = "shoppers.npz", 0
+"""The file of the tracked gaze that the store's field was trained on, and the seed that it is made from."""
+
+REPORT_EYES = 100
+"""Places of people that the report looks from: one of each shopper's."""
+
+STAGES = (
+    *("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures", "surfaces", "tracked gaze"),
+    "report",
+)
 OBJECTS, TWIN = "regions.json", "twin.ply"
 """Files of named objects and of the place as a mesh, where they stand beside the scene."""
 
@@ -124,6 +134,11 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     eye = tuple(float(v) for v in np.ravel(center(seen.sensors()[OWN])))
     if (scene.parent / TWIN).is_file():
         files.append(_bake(scene.parent / TWIN, inputs[2], eye, out / "heatmap.glb", mode, seed))
+    clock.start("tracked gaze")
+    tracked = []
+    if scene == store_scene() and inputs[2] == scene.parent / CHECKPOINTS["gaze"]:
+        tracked = [make_tracked(out / TRACKED)]
+        files += tracked
     clock.start("report")
     # Named by the scene, or that beside it of which the demo is made.
     objects = scene.parent / OBJECTS
@@ -131,6 +146,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
         objects=objects if objects.is_file() else None,
         observer=eye,
         **_camera_of(seen.sensors()[CAMERA]),
+        eyes=REPORT_EYES,
         width=min(max(width, 24), 1200),
         points=REPORT_POINTS,
         seed=seed,
@@ -139,10 +155,10 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     )
     rendered = {"camera": camera, "own": own, "sphere": sphere}
     evaluation = evaluation_beside(scene, inputs[2])
-    made = make_report([*inputs[1:], *evaluation], out / "report.html", shown, rendered=rendered)
+    made = make_report([*inputs[1:], *tracked, *evaluation], out / "report.html", shown, rendered=rendered)
     files.append(made.path)
-    if made.run.objects:
-        rows = [{"object": o.name, "observer_share": round(o.field.mean, 6)} for o in made.run.objects]
+    if made.run.observed_objects:
+        rows = [{"object": o.name, "observer_share": round(o.field.mean, 6)} for o in made.run.observed_objects]
         write_csv(out / "aoi.csv", rows)
         files.append(out / "aoi.csv")
     clock.stop()
@@ -198,6 +214,23 @@ def evaluation_beside(scene: Path, gaze: Path) -> list[Path]:
     """The evaluation that stands beside ``scene``, if it is of this ``gaze`` field."""
     path = scene.parent / RESULTS
     return [path] if path.is_file() and read_results(path).sha256 == file_sha256(gaze) else []
+
+
+def make_tracked(path: Path, people: int = 100) -> Path:
+    """Write the tracked gaze of the store's shoppers as the file ``path`` of rays, which is not packed with the store:
+    it is simulated again, as it was for the training. ``people``: fewer are other ones than the field was trained
+    on."""
+    from nerg_mi.rays.readers.registry import read_rays
+    from nerg_mi.rays.readers.skeleton22 import SkeletonOptions
+    from nerg_mi.scenes.store import layout, shoppers, twin  # pyright: ignore[reportMissingImports] as in `store_scene`
+
+    place = layout.build(TRACKED_SEED)
+    shape = twin.load_twin(store_scene().parent / "twin.xml")
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / "shoppers.csv"
+        shoppers.write_shoppers(place, table, seed=TRACKED_SEED, scene=shape, shoppers=people, say=lambda text: None)
+        read_rays("skeleton22", table, SkeletonOptions(tick=1e-3)).save(path)
+    return path
 
 
 def _bake(twin: Path, gaze: Path, eye: tuple[float, ...], output: Path, mode: str, seed: int) -> Path:

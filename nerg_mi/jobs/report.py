@@ -141,7 +141,9 @@ class _Work:
             place = self._place(scene)
             onlooker = Onlooker(self.field, place, self._kind())
             eyes = self._eyes(place, scene)
-            objects = self._objects(areas, onlooker, place, eyes)
+            objects = observed = self._objects(areas, onlooker, place, eyes, self.rays)
+            if self.rays is not None and options.observer is not None:
+                observed = self._objects(areas, onlooker, place, self._observer(scene), None)
             top = gaze_top(views.seen)
             stage, sizes = self._stage(scene, onlooker, place, eyes, areas.boxes)
         known = given.scene.kind != "none"
@@ -180,6 +182,7 @@ class _Work:
             settings,
             views.basis,
             about.json(),
+            observed,
         )
 
     def _inputs(self) -> list[tuple[str, str, str]]:
@@ -251,10 +254,15 @@ class _Work:
         """Where people stood, or where the observer is."""
         if self.rays is not None:
             return eyes_of(self.rays, place, self.options.eyes)
+        return self._observer(scene)
+
+    def _observer(self, scene: SceneResult) -> Eyes:
         at = scene.camera if scene.observer is None else scene.observer
         return Eyes(np.asarray(at.origin, float)[None], np.zeros(1, int))
 
-    def _objects(self, areas: Areas, onlooker: Onlooker, place: GazePlace, eyes: Eyes) -> tuple[ObjectAttention, ...]:
+    def _objects(
+        self, areas: Areas, onlooker: Onlooker, place: GazePlace, eyes: Eyes, rays: Rays | None
+    ) -> tuple[ObjectAttention, ...]:
         if not areas.solids or self.given.scene.kind == "none":
             return ()
         things, members = [Box(box) for box in areas.boxes], list(areas.solids.values())
@@ -262,8 +270,8 @@ class _Work:
         told = lambda done: self._step(0.55 + 0.2 * done / count, f"objects: place {done} of {count}")
         shares = gaze_shares(onlooker.look_from, eyes.positions, things, members, margin, ROUGH, told)
         recorded = None
-        if self.rays is not None:
-            recorded = land_rays(self.rays, place, onlooker, RAYS, things, members, margin)
+        if rays is not None:
+            recorded = land_rays(rays, place, onlooker, RAYS, things, members, margin)
         return attention_on(list(areas.solids), shares, eyes.person, recorded)
 
     def _stage(

@@ -67,6 +67,8 @@ class Run:
     basis: str = ""
     # Where all of this comes from (`figures.provenance`), as JSON.
     made: str = ""
+    # ``objects`` of the observer alone, where one was named; of people otherwise.
+    observed_objects: tuple[ObjectAttention, ...] = ()
 
     @property
     def provenance(self) -> Mapping[str, Any]:

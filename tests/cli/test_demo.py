@@ -135,8 +135,12 @@ def test05b_its_evaluation_is_of_the_field_that_it_carries(standins):
     assert demo.evaluation_beside(store, Path(standins["gaze"])) == []
     results = read_results(store.parent / "gaze.json")
     verdict = judge(results.rows, results.split, results.people, results.positions)
-    assert results.people == 100 and results.positions == 64 and verdict.sentence.startswith(
-        "Better than position-blind, the strongest baseline, and than nearest rays for known people"
+    assert (
+        results.people == 100
+        and results.positions == 64
+        and verdict.sentence.startswith(
+            "Better than position-blind, the strongest baseline, and than nearest rays for known people"
+        )
     )
 
 
