@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from nerg_mi.rendering.scene_file import files_of_scene
 
 from . import layers
 from .copied_scene import copied_view
+from .layers import Scale
 from .page import Page, Window
 from .view import View, heading_of
 
@@ -34,12 +36,36 @@ def tell(event_or_client: Any, title: str, text: str) -> None:
         client.add_notification(title=title, body=text, with_close_button=True, auto_close_seconds=12.0)
 
 
+class Inset:
+    """A small picture of the panel, ``title``, which is greyed while another one is made."""
+
+    def __init__(self, gui: Any, title: str, height: int):
+        self._title, self._colors = title, np.zeros((height, INSET, 3), np.uint8)
+        self._handle = gui.add_image(self._colors, label=title)
+        self._stale = False
+        self.set_stale()
+
+    def set_stale(self) -> None:
+        """What it shows is out of date."""
+        if not self._stale:
+            self._stale = True
+            self._handle.image = layers.greyed(self._colors)
+            self._handle.label = f"{self._title} (grey: out of date)"
+
+    def show(self, colors: np.ndarray) -> None:
+        """Show ``colors`` (height, width, 3) uint8, which are up to date."""
+        self._stale, self._colors = False, colors
+        self._handle.image = colors
+        self._handle.label = self._title
+
+
 class Controls:
     """The panel of a `Page`."""
 
     def __init__(self, page: Page):
         self.page, self.session, self.gui = page, page.session, page.server.gui
         self._insets_at, self._insets_late = 0.0, False
+        self._insets_of: tuple[Any, ...] = ()
         self._lock, self._scaling = threading.Lock(), threading.Lock()
         with self.gui.add_folder("Show"):
             self._show()
@@ -47,11 +73,11 @@ class Controls:
             self._observer()
         if self.session.scene.has_gaze:
             with self.gui.add_folder("Attention"):
-                self._table = self.gui.add_markdown("…")
+                self._table = self.gui.add_html("")
         with self.gui.add_folder("Camera", expand_by_default=False):
             self._camera()
         page.on_moved.append(self.refresh)
-        page.on_ranged.append(self._rescale)
+        page.on_marked.append(self.refresh)
 
     # What is shown
 
@@ -61,7 +87,7 @@ class Controls:
         variant = gui.add_dropdown("Gaze field", names, initial_value=session.gaze_name) if len(names) > 1 else None
         titles = [layer.title for layer in session.layers]
         layer = gui.add_dropdown("Layer", titles, initial_value=session.shade.layer.title)
-        self._legend = gui.add_html(layers.legend(session.shade.layer, session.scale()))
+        self._legend = gui.add_html(layers.legend(session.shade.layer, session.scale(), self.page.stale))
         basis = gui.add_html(basis_note(session))
         colors = gui.add_dropdown("Colours", (_USUAL, *layers.MAPS), initial_value=_USUAL)
         automatic = gui.add_checkbox("Automatic range", True)
@@ -88,9 +114,12 @@ class Controls:
                 fixed = ends.value
             else:
                 fixed = ends.value
-            if fixed is not None and not fixed[0] < fixed[1]:
-                tell(event, "Range", "The range goes from a number to a larger one.")
-                return
+            if fixed is not None:
+                try:
+                    Scale(*fixed)
+                except NergError as error:
+                    tell(event, "Range", sentence(error))
+                    return
             session.set_shade(layer=chosen, colors=None if colors.value == _USUAL else colors.value, fixed=fixed)
             self._shown_anew()
 
@@ -117,7 +146,11 @@ class Controls:
 
         @falloff.on_update
         def _(event: Any) -> None:
-            session.set_falloff(falloff.value)
+            try:
+                session.set_falloff(falloff.value)
+            except NergError as error:
+                tell(event, "Fall-off", sentence(error))
+                return
             self.page.follow()
             self._shown_anew()
 
@@ -133,14 +166,16 @@ class Controls:
         self._at = gui.add_vector3("At", rounded(session.observer), step=0.05)
         to_camera = gui.add_button("Observer to the camera")
         to_observer = gui.add_button("Camera to the observer")
-        empty = np.zeros((INSET * 2 // 3, INSET, 3), np.uint8)
-        self._own = gui.add_image(empty, label="Own view")
-        self._sphere = gui.add_image(np.zeros((INSET // 2, INSET, 3), np.uint8), label="All around")
+        self._own, self._sphere = Inset(gui, "Own view", INSET * 2 // 3), Inset(gui, "All around", INSET // 2)
 
         @self._at.on_update
         def _(event: Any) -> None:
             if event.client is not None and not np.allclose(self._at.value, session.observer, atol=1e-3):
-                self.page.place_observer(np.array(self._at.value))
+                try:
+                    self.page.place_observer(np.array(self._at.value))
+                except NergError as error:
+                    tell(event, "Observer", sentence(error))
+                    self._at.value = rounded(session.observer)
 
         @to_camera.on_click
         def _(event: Any) -> None:
@@ -155,12 +190,14 @@ class Controls:
         """Numbers, scale and insets as they are now; insets not more often than they can be looked at."""
         session = self.session
         self._rescale()
-        if session.scene.has_gaze:
-            self._table.content = table(session.shares)
         at = rounded(session.observer)
         if not np.allclose(self._at.value, at, atol=1e-3):
             self._at.value = at
         with self._lock:
+            if self._inset_key() == self._insets_of:
+                return
+            self._own.set_stale()
+            self._sphere.set_stale()
             if time.monotonic() - self._insets_at < _AGAIN:
                 if not self._insets_late:
                     self._insets_late = True
@@ -174,7 +211,16 @@ class Controls:
     def _rescale(self) -> None:
         # Several threads come here, and the last to write should be the last to have looked.
         with self._scaling:
-            self._legend.content = layers.legend(self.session.shade.layer, self.session.scale())
+            session = self.session
+            self._legend.content = layers.legend(session.shade.layer, session.scale(), self.page.stale)
+            if session.scene.has_gaze:
+                self._table.content = table(session.shares, session.stale_shares)
+
+    def _inset_key(self) -> tuple[Any, ...]:
+        """What the insets depend on."""
+        session = self.session
+        at = session.observer.tolist(), session.heading.tolist()
+        return *at, session.shade, session.scale(), session.version, session.ceiling
 
     def _insets_later(self) -> None:
         with self._lock:
@@ -183,13 +229,15 @@ class Controls:
 
     def _insets(self) -> None:
         session = self.session
+        key = self._insets_of = self._inset_key()
 
         def own(picture: Any, colors: np.ndarray) -> None:
-            if picture.whole:
-                self._own.image = colors
+            if picture.whole and key == self._inset_key():
+                self._own.show(colors)
 
         def sphere(colors: np.ndarray) -> None:
-            self._sphere.image = colors
+            if key == self._inset_key():
+                self._sphere.show(colors)
 
         ahead, up = session.heading[:, 0], session.heading[:, 2]
         view = View.of(session.observer, session.observer + ahead, up, np.radians(60), 1.5)
@@ -285,20 +333,20 @@ def look(client: Any, origin: np.ndarray, target: np.ndarray, up: np.ndarray) ->
         client.camera.look_at = tuple(target)
 
 
-def table(shares: dict[str, float]) -> str:
-    """Shares of attention as Markdown, the largest first."""
+def table(shares: dict[str, float], stale: bool = False) -> str:
+    """Shares of attention as HTML, the largest first; ``stale``: they are out of date."""
     if not shares:
-        return "Name areas to see their share of attention."
+        return layers.note("Computing." if stale else "Name areas to see their share of attention.")
     rows = sorted(shares.items(), key=lambda item: -item[1])
-    lines = ["| area | share |", "|---|---:|"]
-    lines += [f"| {plain_cell(name)} | {100 * share:.1f} % |" for name, share in rows[:_ROWS]]
     rest = sum(share for _, share in rows[_ROWS:])
-    return "\n".join([*lines, *([f"| {len(rows) - _ROWS} more | {100 * rest:.1f} % |"] if len(rows) > _ROWS else [])])
-
-
-def plain_cell(name: str) -> str:
-    """``name`` as text in a cell of Markdown, where nothing of it is markup."""
-    return "".join(c if c.isalnum() or c in " -." else f"&#{ord(c)};" for c in name)
+    shown = [*rows[:_ROWS], *([(f"{len(rows) - _ROWS} more", rest)] if len(rows) > _ROWS else [])]
+    cells = "".join(
+        f"<tr><td>{escape(name)}</td><td style='text-align:right'>{100 * share:.1f} %</td></tr>"
+        for name, share in shown
+    )
+    style = f"font-size:0.85em;margin:0 1em;{layers.STALE if stale else ''}"
+    text = f"<table style='{style}'><tr><th>area</th><th>share</th></tr>{cells}</table>"
+    return text + (layers.note("Out of date: computing.") if stale else "")
 
 
 def rounded(at: np.ndarray) -> tuple[float, float, float]:

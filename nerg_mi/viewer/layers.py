@@ -142,13 +142,25 @@ def colored(
     return to_bytes(shown).reshape(*shape, 3)
 
 
+def greyed(colors: np.ndarray) -> np.ndarray:
+    """uint8 ``colors`` (..., 3) as what is out of date is shown: in grey, and with little contrast."""
+    grey = 80 + 0.45 * (colors @ np.array([0.2126, 0.7152, 0.0722]))
+    return np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8)
+
+
+STALE = "opacity:0.35;filter:grayscale(1)"
+"""The style of what is out of date, in HTML."""
+
+
 def note(text: str) -> str:
     """``text`` in small letters, as HTML."""
     return f"<div style='font-size:0.85em;padding:0 1em'>{escape(text)}</div>"
 
 
-def legend(layer: Layer, scale: Scale) -> str:
-    """The scale as HTML; empty where there is none."""
+def legend(layer: Layer, scale: Scale, stale: str = "") -> str:
+    """The scale as HTML; empty where there is none. ``stale``: why it is not that of what is shown; "": it is."""
+    if stale:
+        return f"<div style='{STALE}'>{legend(layer, scale)}</div>{note(stale)}"
     import matplotlib
     from matplotlib.colors import to_hex
 

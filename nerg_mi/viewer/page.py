@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nerg_mi.errors import expected, sentence
+from nerg_mi.errors import NergError, expected, sentence
 
+from . import layers
 from .refining import Picture
 from .server import stop_server
 from .session import Session
@@ -44,11 +45,14 @@ class Page:
         self._observer: Any = None
         self._clock = threading.Thread(target=self._tick, name="nerg-view-clock", daemon=True)
         self.on_moved: list[Any] = []
-        self.on_ranged: list[Any] = []
+        # The scale, or what is out of date, is another one.
+        self.on_marked: list[Any] = []
+        self._marked: tuple[Any, ...] = ()
+        self._free: np.ndarray
 
     def open(self, session: Session) -> None:
         """Show ``session``, which has started."""
-        self.session = session
+        self.session, self._free = session, session.observer
         scene, home = self.server.scene, session.home
         scene.set_up_direction(tuple(session.place.up))
         camera = self.server.initial_camera
@@ -86,18 +90,36 @@ class Page:
     # The observer
 
     def place_observer(self, at: np.ndarray, heading: np.ndarray | None = None) -> None:
-        """Let the observer stand at ``at`` (3,), as if dragged there."""
+        """Let the observer stand at ``at`` (3,), as if dragged there. Raises `NergError` for what is no position."""
         self.session.place_observer(at, heading)
         self._observer.position = tuple(np.asarray(at, float))
         self._observer.wxyz = self._turn()
         self._observer_moved(True)
 
     def _dragged(self, phase: str) -> None:
-        w, x, y, z = self._observer.wxyz
-        self.session.place_observer(self._observer.position, Rotation.from_quat([x, y, z, w]).as_matrix())
+        session, (w, x, y, z) = self.session, np.asarray(self._observer.wxyz, float)
+        try:
+            if not 0 < np.linalg.norm([w, x, y, z]) < np.inf:
+                raise NergError("the page sent no rotation of the observer; drag them again")
+            session.place_observer(self._observer.position, Rotation.from_quat([x, y, z, w]).as_matrix())
+        except NergError as error:
+            self._observer.position, self._observer.wxyz = tuple(session.observer), self._turn()
+            self.on_error(error)
+            return
         self._observer_moved(phase == "end")
+        if phase == "end":
+            at = session.observer
+            session.clear_way("observer", at, self._free, lambda found: self._put_out(at, found))
+
+    def _put_out(self, at: np.ndarray, found: np.ndarray) -> None:
+        """The observer, who was dragged to ``at`` (3,), stands at ``found`` (3,): elsewhere if that is in something."""
+        if self.session.observer is at:
+            self._free = found
+            if found is not at:
+                self.place_observer(found)
 
     def _observer_moved(self, at_rest: bool) -> None:
+        self.problem = ""
         with self._lock:
             self._follow, self._count = True, True
             if self.session.shade.layer.of_observer:
@@ -144,11 +166,15 @@ class Page:
         window.version += 1
         window.moved, window.noticed = when, False
         self.session.cancel(window.client.client_id)
-        if window.picture and window.cloud is not None:
+        if window.picture:
             window.picture = False
             with window.client.atomic():
-                window.cloud.visible = True
-                window.client.scene.set_background_image(None)
+                if window.cloud is not None:
+                    window.cloud.visible = True
+                    window.client.scene.set_background_image(None)
+                elif window.last is not None:
+                    # There is nothing to take its place yet.
+                    window.client.scene.set_background_image(layers.greyed(window.last[1]), format="jpeg")
 
     def _refine(self, window: Window) -> None:
         version, began = window.version, time.monotonic()
@@ -168,14 +194,51 @@ class Page:
                 height, width = colors.shape[:2]
                 took = time.monotonic() - began
                 window.lines.append(f"{width} × {height}, {picture.samples} a pixel: {took:.2f} s")
-                self._say(window, " — done" if picture.whole else " …")
 
         assert window.view is not None
-        self.session.picture(client.client_id, window.view, deliver, self.session.options.width, self.session.spp)
+        session, at = self.session, window.view.origin
+        session.picture(client.client_id, window.view, deliver, session.options.width, session.spp)
+        free = session.home.origin if window.free is None else window.free
+        session.clear_way(client.client_id, at, free, lambda found: self._move_out(window, at, found))
 
-    def _say(self, window: Window, end: str) -> None:
-        text = (window.lines[-1] if window.lines else "points") + end
-        window.status.content = text + (f"\n\n**{self.problem}**" if self.problem else "")
+    def _move_out(self, window: Window, at: np.ndarray, found: np.ndarray) -> None:
+        """The camera of ``window``, which was moved to ``at`` (3,), stands at ``found`` (3,)."""
+        with self._lock:
+            if window.view is not None and window.view.origin is at:
+                window.free = found
+                if found is not at:
+                    window.note = "The camera was inside of something; it stands before it now."
+                    window.client.camera.position = tuple(found)
+
+    def _mark(self, window: Window) -> None:
+        """Say what ``window`` shows, what of it is out of date, and what is computed; grey the points that are."""
+        stale = self.session.stale_points
+        if stale != window.stale:
+            window.stale = stale
+            self._draw_points(window)
+        if window.picture:
+            whole = window.last is not None and window.last[0].whole
+            text = (window.lines[-1] if window.lines else "picture") + (" — done" if whole else " …")
+        elif window.cloud is None and window.last is not None:
+            text = "**Grey: an earlier picture**"
+        else:
+            text = f"**Grey: {stale}**" if stale else "points"
+        computing = self.session.computing
+        parts = [text, *([f"Computing: {', '.join(computing)}"] if computing else []), window.note]
+        parts += [f"**{self.problem}**"] if self.problem else []
+        content = "\n\n".join(part for part in parts if part)
+        if window.status.content != content:
+            window.status.content = content
+
+    @property
+    def stale(self) -> str:
+        """Why the scale is that of nothing that is shown; "" where it is of a picture, or of the points."""
+        if not self.session.has_scale:
+            return "No scale yet: it is being computed."
+        why = self.session.stale_points
+        if not why or any(window.picture for window in list(self.windows.values())):
+            return ""
+        return f"Out of date: {why}."
 
     def _draw_points(self, window: Window) -> None:
         shown = self.session.points(window.level)
@@ -196,6 +259,8 @@ class Page:
             precision="float32",
             visible=not window.picture,
         )
+        if not window.picture:
+            window.client.scene.set_background_image(None)
 
     # The session's listener
 
@@ -217,16 +282,13 @@ class Page:
 
     def on_range(self) -> None:
         """Have the scale beside the picture be that of the picture."""
-        for told in self.on_ranged:
+        for told in self.on_marked:
             told()
 
     def on_error(self, error: BaseException) -> None:
         """Show what went wrong; a mistake of the program by its name as well."""
         text = sentence(error)
         self.problem = text if expected(error) else f"{type(error).__name__}: {text} (a mistake in the program)"
-        with self._lock:
-            for window in self.windows.values():
-                self._say(window, "")
 
     # Browsers
 
@@ -246,8 +308,10 @@ class Page:
             self._draw_points(window)
 
     def _look(self, window: Window) -> None:
-        view = View.of_page(window.client.camera)
-        old = window.view
+        view, old = View.of_page(window.client.camera), window.view
+        if not np.isfinite([*view.origin, *view.ahead, *view.up, view.fov, view.aspect]).all():
+            self.on_error(NergError("the page sent a camera without a position; reload it"))
+            return
         # The browser tells its camera again where nothing has changed.
         names = ("origin", "ahead", "up", "fov", "aspect")
         if old is not None and all(np.allclose(getattr(view, n), getattr(old, n), atol=1e-6) for n in names):
@@ -257,6 +321,8 @@ class Page:
             # Also after what seemed to be a rest: of a browser that is slow, each frame does.
             window.learn_pace(now - window.looked)
             self._keep_pace(window, at_rest=False)
+            if window.free is None or not np.allclose(view.origin, window.free):
+                window.note = ""
         window.looked = now
         window.view = view
         self._moving(window, now)
@@ -297,6 +363,13 @@ class Page:
                 self._follow = not self.session.follow_observer()
             if self._count:
                 self._count = not self.session.follow_shares()
+            for window in self.windows.values():
+                self._mark(window)
+        marked = self.stale, self.session.stale_shares
+        if marked != self._marked:
+            self._marked = marked
+            for told in self.on_marked:
+                told()
 
     def _reach(self) -> float:
         """How far ahead of the first camera its centre of rotation is: where the place's middle is level with it."""

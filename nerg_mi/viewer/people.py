@@ -32,7 +32,7 @@ class People:
         first, last = tracks.times
         with gui.add_folder("People"):
             self._group = gui.add_dropdown("Who", tracks.groups, initial_value=ALL)
-            self._drawn = gui.add_checkbox("Paths", True)
+            self._drawn = gui.add_checkbox("Paths", False)
             self._rays = gui.add_checkbox("Rays", False)
             self._probes = gui.add_checkbox("Probes", False)
             step = max((last - first) / _STEPS, 1e-3)

@@ -8,7 +8,7 @@ that draws slowly is given fewer, and a step of their gaze says roughly that of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from nerg_mi.api.queries import observe, trace
 from nerg_mi.api.scene import Scene
 from nerg_mi.maths.sphere import fibonacci_directions
 
-from .refining import rough_integrals
+from .refining import filled, rough_integrals
 
 RAYS = 1 << 14
 """Rays from each place."""
@@ -29,6 +29,9 @@ POINTS = 60_000
 
 BATCH = 1 << 14
 """Points whose gaze is computed in one step."""
+
+FREE = 1 << 11
+"""Places in free air that are remembered at most."""
 
 LEVELS = 4
 """Numbers of points that a browser may be given: at each next one, cells are wider by a factor of √2."""
@@ -50,13 +53,14 @@ class Points:
 class Proxy:
     """``points`` (N, 3) in scene units, their linear ``color`` (N, 3), and the ``size`` of the cells that they
     lie in. ``levels``: how many of the first points lie in cells of a size, ``(N, size)`` and fewer. ``near`` (N,): of
-    the first `BATCH` points the one nearest to each."""
+    the first `BATCH` points the one nearest to each. ``free`` (F, 3): places in free air."""
 
     points: np.ndarray
     color: np.ndarray
     size: float
     levels: tuple[tuple[int, float], ...]
     near: np.ndarray
+    free: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -75,7 +79,7 @@ def gather(scene: Scene, eyes: Sequence[np.ndarray], places: int = PLACES) -> It
     waiting = [np.asarray(eye, float) for eye in eyes]
     while len(visited) < places:
         if len(visited) == len(eyes) and found:
-            yield thin(found)
+            yield replace(thin(found), free=_some(free))
         at = waiting.pop(0) if waiting else _farthest(free, visited)
         if at is None:
             break
@@ -95,7 +99,39 @@ def gather(scene: Scene, eyes: Sequence[np.ndarray], places: int = PLACES) -> It
         # Half way to a surface that is not near there is room to look from.
         roomy = np.flatnonzero(met & (depth > np.median(depth[met])))[::97] if met.any() else []
         free += [at + 0.5 * depth[k] * directions[k] for k in roomy]
-    yield thin(found)
+    yield replace(thin(found), free=_some(free))
+
+
+def _some(free: Sequence[np.ndarray]) -> np.ndarray:
+    places = np.array(free, float).reshape(-1, 3)
+    return places[:: max(-(-len(places) // FREE), 1)]
+
+
+def way_out(scene: Scene, proxy: Proxy, at: np.ndarray, free: np.ndarray) -> np.ndarray | None:
+    """A position (3,) a little before the surface that hides ``at`` (3,) from the ``free`` one, where ``at`` lies
+    within something: where none of the places in free air is seen from it, though it is not outside of the place.
+    None where it does not."""
+    lower, upper = proxy.bounds
+    if (at < lower).any() or (at > upper).any():
+        return None
+    away = np.concatenate([free[None], proxy.free]) - at
+    distance = np.linalg.norm(away, axis=1)
+    if not distance[0] > proxy.size:
+        return None
+    directions = away / np.maximum(distance, 1e-12)[:, None]
+    if (_depth(scene, at, directions) >= distance).any():
+        return None
+    depth = float(_depth(scene, free, -directions[:1])[0])
+    return free - directions[0] * max(min(depth, distance[0]) - 4 * proxy.size, 0.0)
+
+
+def _depth(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Distance (N,) to the surfaces in unit ``directions`` (N, 3), infinite where there is none."""
+    # As many rays as `gather` traces, whose kernel it is.
+    seen = trace(scene, origin, filled(directions, RAYS), ["color", "depth", "opacity"])
+    depth = np.asarray(seen.depth, float).ravel()
+    met = (np.asarray(seen.opacity).ravel() > 0.5) & np.isfinite(depth)
+    return np.where(met, depth, np.inf)[: len(directions)]
 
 
 def thin(found: Sequence[tuple[np.ndarray, np.ndarray]], most: int = POINTS) -> Proxy:
@@ -144,10 +180,9 @@ def bake(scene: Scene, proxy: Proxy, observer: np.ndarray) -> Iterator[dict[str,
     points, found = proxy.points, {}
     for a in range(0, len(points), BATCH):
         part = points[a : a + BATCH]
-        # Kernels are compiled for a number of points.
-        filled = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)])
         with rough_integrals(scene):
-            seen = observe(scene, filled, observers=observer[None], quantities=names)
+            # Kernels are compiled for a number of points.
+            seen = observe(scene, filled(part, BATCH), observers=observer[None], quantities=names)
         for name in names:
             values = np.asarray(seen[name][0, : len(part)])
             if a == 0:

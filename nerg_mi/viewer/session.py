@@ -30,7 +30,7 @@ from nerg_mi.transport.ceiling import Ceiling
 from . import layers
 from .layers import Layer, Scale, Shade
 from .listener import Listener
-from .proxy import Points, Proxy, bake, gather
+from .proxy import Points, Proxy, bake, gather, way_out
 from .refining import SIZES, Pace, Picture, filled, refine
 from .sharing import shares_in_steps
 from .tracks import Tracks
@@ -42,6 +42,17 @@ URGENCY = 1
 
 UNHURRIED = 2
 """Of small pictures, which nobody waits for."""
+
+_COMPUTED = {
+    "proxy": "points on surfaces",
+    "picture": "picture",
+    "gaze": "gaze on the points",
+    "shares": "shares of attention",
+    "inset": "the observer's views",
+    "people": "recorded rays",
+    "film": "video",
+}
+"""Tasks of the worker, in words."""
 
 _MOST_SPP = 256
 _SHAPES = 60
@@ -58,6 +69,9 @@ class Session:
         self.proxy: Proxy | None = None
         self.baked: dict[str, np.ndarray] = {}
         self.baked_for: np.ndarray | None = None
+        # Whose values `baked` and `shares` are: an observer's, with areas or without, of a `version`.
+        self._baked_of: tuple[np.ndarray, int] | None = None
+        self._shares_of: tuple[np.ndarray, tuple[Region, ...], int] | None = None
         self.shares: dict[str, float] = {}
         self.ceiling: float | None = None
         self.regions: list[Region] = []
@@ -68,7 +82,7 @@ class Session:
         self._busy: set[str] = set()
         self._shares_for: tuple[np.ndarray, tuple[Region, ...], int] | None = None
         # Of the gaze field and its settings: what was begun with others is not kept.
-        self._version = 0
+        self.version = 0
 
     def start(self) -> None:
         """Load the place, and begin to gather its points. Raises `NergError` for what cannot be shown."""
@@ -124,14 +138,25 @@ class Session:
     # What changes
 
     def place_observer(self, at: np.ndarray, heading: np.ndarray | None = None) -> None:
-        """The observer stands at ``at`` (3,), turned by ``heading`` (3, 3): columns ahead, left and up."""
+        """The observer stands at ``at`` (3,), turned by ``heading`` (3, 3): columns ahead, left and up.
+
+        Raises `NergError` for what is no position.
+        """
+        with np.errstate(over="ignore"):
+            position = np.asarray(at, float)
+            finite = np.isfinite(position.astype(np.float32)).all()
+        if position.shape != (3,) or not finite or not (heading is None or np.isfinite(heading).all()):
+            text = ", ".join(f"{v:g}" for v in position.ravel()[:3])
+            raise NergError(f"an observer cannot stand at ({text}); give three numbers in scene units")
         with self.lock:
             self.observer = np.array(at, float)
             if heading is not None:
                 self.heading = np.array(heading, float)
 
     def set_falloff(self, value: float) -> None:
-        """How far behind a surface is still seen a little, in scene units."""
+        """How far behind a surface is still seen a little, in scene units. Raises `NergError` for what is no length."""
+        if not 0 <= value < np.inf:
+            raise NergError(f"the fall-off is a length from 0 on, in scene units, got {value:g}")
 
         def change() -> None:
             self.falloff = float(value)
@@ -167,7 +192,7 @@ class Session:
     def _forget(self) -> None:
         """Have the gaze on the points, and the shares, computed anew."""
         with self.lock:
-            self._version += 1
+            self.version += 1
             self.baked_for = self._shares_for = None
 
     def set_shade(self, **changes: Any) -> None:
@@ -175,7 +200,50 @@ class Session:
         with self.lock:
             self.shade = replace(self.shade, **changes)
 
-    # What is computed
+    # What is computed, and what is out of date
+
+    @property
+    def stale_points(self) -> str:
+        """Why the points do not show the layer as it is for the observer as they stand now; "" where they do."""
+        # Without the lock, which the thread that is told of a new range may hold: what was read a moment too early is
+        # read again.
+        layer, of = self.shade.layer, self._baked_of
+        if not layer.quantity:
+            return ""
+        if layer.quantity not in self.baked:
+            return f"the points do not show {layer.title}"
+        if of is None or not np.array_equal(of[0], self.observer):
+            return f"{layer.title} of an earlier observer"
+        return "" if of[1] == self.version else f"{layer.title} of earlier settings"
+
+    @property
+    def stale_shares(self) -> bool:
+        """Whether the shares of attention are not those of the observer, the areas and the settings of now."""
+        of = self._shares_of
+        return of is None or not _same(of, self._asked_shares())
+
+    @property
+    def has_scale(self) -> bool:
+        """Whether the scale of the layer is known: until then it goes from 0 to 1."""
+        shade = self.shade
+        return shade.layer.kind in ("color", "shade") or shade.fixed is not None or shade.layer.title in self._ranges
+
+    @property
+    def computing(self) -> list[str]:
+        """What is being computed, in words."""
+        names = {name[0] if isinstance(name, tuple) else name for name in self.worker.names}
+        words = _COMPUTED | {"gaze": f"{'gaze' if self.scene.has_gaze else 'visibility'} on the points"}
+        return [text for name, text in words.items() if name in names]
+
+    def clear_way(
+        self, name: Hashable, at: np.ndarray, free: np.ndarray, deliver: Callable[[np.ndarray], None]
+    ) -> None:
+        """Call ``deliver`` with ``at`` (3,), or, where that lies within something, with a position before the surface
+        that hides it from the ``free`` one (3,)."""
+        self.worker.submit(("way", name), URGENCY, self._way(at, free, deliver))
+
+    def _asked_shares(self) -> tuple[np.ndarray, tuple[Region, ...], int]:
+        return self.observer, tuple(self.regions), self.version
 
     def follow_observer(self) -> bool:
         """Begin to compute the gaze on the points, and the shares of attention, of the observer as they stand now,
@@ -193,7 +261,7 @@ class Session:
         with self.lock:
             if not self.scene.has_gaze:
                 return True
-            asked = self.observer, tuple(self.regions), self._version
+            asked = self._asked_shares()
             fresh = self._shares_for is not None and _same(self._shares_for, asked)
             if not fresh and "shares" not in self._busy:
                 self._busy.add("shares")
@@ -242,6 +310,8 @@ class Session:
         colors = layers.colored(
             layer, color, values, np.ones(count, bool), self.scale() if values is not None else Scale()
         )
+        if self.stale_points:
+            colors = layers.greyed(colors)
         if ceiling is not None:
             below = points @ self.cut_up <= ceiling
             points, colors = points[below], colors[below]
@@ -257,13 +327,14 @@ class Session:
 
     def _bake(self, at: np.ndarray) -> Iterator[None]:
         try:
-            proxy, version = self.proxy, self._version
+            proxy, version = self.proxy, self.version
             assert proxy is not None
             for step, found in enumerate(bake(self.scene, proxy, at)):
                 with self.lock:
-                    if self.proxy is not proxy or self._version != version:
+                    if self.proxy is not proxy or self.version != version:
                         return
-                    self.baked, gone = found, not np.array_equal(self.observer, at)
+                    self.baked, self._baked_of = found, (at, version)
+                    gone = not np.array_equal(self.observer, at)
                     if step == 0:
                         for name, values in found.items():
                             self._learn(name, values, found["visibility"] > 0.5)
@@ -273,7 +344,7 @@ class Session:
                     return
                 yield None
             with self.lock:
-                if self._version == version:
+                if self.version == version:
                     self.baked_for = at
         except NergError:
             self.baked_for = at
@@ -288,10 +359,10 @@ class Session:
             for more in shares_in_steps(self.scene, at, regions, self.shapes):
                 found |= more
                 yield None
-                if version != self._version:
+                if version != self.version:
                     return
             with self.lock:
-                self.shares, self._shares_for = found, asked
+                self.shares, self._shares_for, self._shares_of = found, asked, asked
             self.listener.on_shares()
         except NergError:
             # What cannot be counted is told once, not at each tick of a clock.
@@ -299,6 +370,15 @@ class Session:
             raise
         finally:
             self._busy.discard("shares")
+
+    def _way(self, at: np.ndarray, free: np.ndarray, deliver: Callable[[np.ndarray], None]) -> Iterator[None]:
+        with self.lock:
+            proxy, height = self.proxy, self.ceiling
+        found = None
+        if proxy is not None and (height is None or at @ self.cut_up <= height):
+            found = way_out(self.scene, proxy, at, free)
+        deliver(at if found is None else found)
+        yield None
 
     def _refined(
         self, view: View, deliver: Callable[[Picture, np.ndarray], None], width: int, spp: int, leads: bool = True
@@ -340,7 +420,9 @@ class Session:
         for layer in self.layers:
             if layer.quantity == quantity:
                 found = layers.automatic(layer, values, mask)
-                if found is not None and found != self._ranges.get(layer.title):
+                if found is None:
+                    self._ranges.setdefault(layer.title, (0.0, 1.0))
+                elif found != self._ranges.get(layer.title):
                     self._ranges[layer.title] = found
                     if layer == self.shade.layer and self.shade.fixed is None:
                         self.listener.on_range()

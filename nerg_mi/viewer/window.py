@@ -27,8 +27,9 @@ _LONGEST_REST = 0.8
 class Window:
     """One browser: its ``client`` and the points in it; when it or what it shows ``moved`` last and whether that was
     ``noticed``, and when it ``looked`` elsewhere last; the ``version`` of its view, and whether it shows a ``picture``;
-    the ``last`` one, with its colours. ``level``: which of the proxy's numbers of points it is given; ``frames``:
-    seconds between the last views of a movement."""
+    ``stale``: why its points are greyed, "" where they are not; ``note``: what was done to its camera; ``free``: where
+    that last stood in free air; the ``last`` picture, with its colours. ``level``: which of the proxy's numbers of
+    points it is given; ``frames``: seconds between the last views of a movement."""
 
     client: Any
     status: Any
@@ -39,6 +40,9 @@ class Window:
     noticed: bool = False
     version: int = 0
     picture: bool = False
+    stale: str = ""
+    note: str = ""
+    free: np.ndarray | None = None
     last: tuple[Picture, np.ndarray] | None = None
     lines: list[str] = field(default_factory=list)
     level: int = LEVELS - 2

@@ -58,6 +58,12 @@ class Worker:
         return future
 
     @property
+    def names(self) -> list[Hashable]:
+        """The tasks that are not done yet."""
+        with self._changed:
+            return list(self._tasks)
+
+    @property
     def idle(self) -> bool:
         """Whether nothing is left to do."""
         with self._changed:

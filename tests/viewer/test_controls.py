@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,19 +10,42 @@ import pytest
 
 import nerg_mi as nerg
 from nerg_mi.errors import NergError
-from nerg_mi.viewer.controls import png_bytes, table
+from nerg_mi.viewer.controls import Inset, png_bytes, table
 from nerg_mi.viewer.copied_scene import copied_view
-from nerg_mi.viewer.layers import LAYERS, Shade
+from nerg_mi.viewer.layers import LAYERS, STALE, Shade
 from nerg_mi.viewer.view import View
 from nerg_mi.viewer.worker import Worker
 
 
 def test01_the_largest_share_first():
+    cells = lambda text: re.findall(r"<td[^>]*>(.*?)</td>", text)
     text = table({"a": 0.1, "b|<b>": 0.25, "c": 0.0})
-    assert text.splitlines()[2:] == ["| b&#124;&#60;b&#62; | 25.0 % |", "| a | 10.0 % |", "| c | 0.0 % |"]
-    many = table({f"n{k}": 0.01 for k in range(20)}).splitlines()
-    assert len(many) == 15 and many[-1] == "| 8 more | 8.0 % |"
-    assert "Name areas" in table({})
+    assert cells(text) == ["b|&lt;b&gt;", "25.0 %", "a", "10.0 %", "c", "0.0 %"]
+    many = cells(table({f"n{k}": 0.01 for k in range(20)}))
+    assert len(many) == 26 and many[-2:] == ["8 more", "8.0 %"]
+    assert "Name areas" in table({}) and "Computing" in table({}, True)
+    # Out of date, they are pale, and it is said.
+    assert "Out of date" not in text and STALE not in text
+    assert "Out of date" in (old := table({"a": 0.1}, True)) and STALE in old
+
+
+def test01_a_small_picture_is_greyed_while_another_is_made():
+    shown = []
+    gui = SimpleNamespace(
+        add_image=lambda image, label: shown.append(SimpleNamespace(image=image, label=label)) or shown[0]
+    )
+    inset = Inset(gui, "Own view", 8)
+    assert "out of date" in shown[0].label
+    red = np.full((8, 6, 3), (250, 10, 10), np.uint8)
+    inset.show(red)
+    assert np.array_equal(shown[0].image, red) and shown[0].label == "Own view"
+    inset.set_stale()
+    grey = shown[0].image.astype(int)
+    assert np.ptp(grey, axis=-1).max() == 0 and "out of date" in shown[0].label
+    inset.set_stale()
+    assert np.array_equal(shown[0].image, grey), "not twice"
+    inset.show(red)
+    assert np.array_equal(shown[0].image, red) and shown[0].label == "Own view"
 
 
 def test02_a_scene_of_what_is_shown(store, tmp_path):

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 
 from nerg_mi.jobs.options.view import ViewOptions
+from nerg_mi.viewer.layers import LAYERS
 from nerg_mi.viewer.serving import viewer
 from nerg_mi.viewer.view import View
 from tests.viewer.browser import chromium, require
@@ -174,6 +177,81 @@ def test05_reloaded_it_is_as_before(running, driver):
     assert np.allclose(running.page.session.observer, [6.2, 3.0, 1.6])
     drawn(driver)
     assert running.page.problem == ""
+
+
+def test05b_what_is_out_of_date_is_grey_and_named(running, driver):
+    """While the render thread has something else to do, the heat of the observer before is not that of this one."""
+    session, window = running.page.session, window_of(running)
+    refined(running, window)
+    until(lambda: not session.stale_points and not session.stale_shares, 120)
+    colorful = lambda: np.ptp(pixels(driver)[250:600, :800], axis=-1).mean()
+    text = lambda: driver.find_element("tag name", "body").text
+    fresh, go = colorful(), threading.Event()
+    assert "Grey:" not in text() and "out of date" not in text()
+
+    def wait():
+        go.wait(60)
+        yield
+
+    def held(change, words):
+        go.clear()
+        session.worker.submit("film", 0, wait())
+        until(lambda: session.computing == ["video"])
+        change()
+        until(lambda: words in text() and colorful() < 0.5 * fresh, 20)
+        assert "Own view (grey: out of date)" in text() and "Computing: picture" in text()
+        go.set()
+        refined(running, window)
+        until(lambda: "Grey:" not in text() and "out of date" not in text())
+
+    held(lambda: running.page.place_observer(np.array([4.4, 2.8, 1.6])), "Grey: gaze of an earlier observer")
+
+    def show(title):
+        session.set_shade(layer=LAYERS[title])
+        running.page.recolor()
+        running.page.renew()
+        for told in running.page.on_marked:
+            told()
+
+    held(lambda: show("depth"), "Grey: the points do not show depth")
+    show("gaze")
+    refined(running, window)
+
+
+def test05c_nobody_is_left_in_a_shelf(running, driver):
+    """The camera, nor the observer where they are dragged."""
+    session, window = running.page.session, window_of(running)
+    refined(running, window)
+    shelf = np.array([5.4, 3.6, 0.8])
+    window.client.camera.position = tuple(shelf)
+    until(lambda: window.note, 30)
+    refined(running, window)
+    assert np.linalg.norm(window.view.origin - shelf) > 0.2 and "stands before it now" in window.status.content
+    before = session.observer.copy()
+    running.page._observer.position = tuple(shelf)
+    running.page._dragged("end")
+    assert np.allclose(session.observer, shelf)
+    until(lambda: not np.allclose(session.observer, shelf), 30)
+    refined(running, window)
+    away = session.observer - before
+    assert np.linalg.norm(np.cross(away, shelf - before)) < 1e-3 and 0 < np.linalg.norm(away)
+    assert np.allclose(running.page._observer.position, session.observer) and running.page.problem == ""
+
+
+def test05d_what_is_no_position_is_refused(running, driver, monkeypatch):
+    """As a page that is not ours could send it."""
+    page, session = running.page, running.page.session
+    before = session.observer.copy()
+    for position, turn in (((np.nan, 0, 1), (1, 0, 0, 0)), ((4, 3, 1), (0, 0, 0, 0)), ((4, 3, 1), (np.nan, 0, 0, 1))):
+        sent = SimpleNamespace(position=position, wxyz=turn)
+        with monkeypatch.context() as patched:
+            patched.setattr(page, "_observer", sent)
+            page._dragged("end")
+        assert np.array_equal(session.observer, before) and page.problem
+        # The gizmo goes back to where they stand.
+        assert np.allclose(sent.position, before) and np.isfinite(sent.wxyz).all()
+    page.place_observer(before)
+    assert page.problem == ""
 
 
 def test06_no_request_leaves_the_machine(running, driver):

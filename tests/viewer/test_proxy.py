@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial import KDTree
 
 import nerg_mi as nerg
 from nerg_mi.field.splats import Splats
-from nerg_mi.viewer.proxy import BATCH, LEVELS, bake, gather, ordered, thin
+from nerg_mi.viewer.proxy import BATCH, LEVELS, bake, gather, ordered, thin, way_out
 
 
 def last(steps):
@@ -95,3 +96,23 @@ def test06_each_step_of_the_gaze_is_better(store):
     final = steps[-1]["gaze"]
     off = [np.abs(step["gaze"] - final).mean() / final.mean() for step in steps]
     assert off[0] < 0.35 and sorted(off, reverse=True) == off and off[-1] == 0
+
+
+def test07_who_is_put_into_something_is_put_out_before_it(room_scene):
+    """The box reaches from 1 to 2 along x."""
+    eyes = [np.array([0, 0, 0.5]), np.array([-2, 0, 1.0])]
+    proxy = last(gather(room_scene, eyes, places=4))
+    assert len(proxy.free) > 50 and (proxy.free[:, 2] > 0).all()
+    inside = lambda p: np.abs(np.asarray(p) - (1.5, 0, 0.5)).max() < 0.5
+    assert not any(map(inside, proxy.free))
+    for at, free in (
+        ((1.5, 0, 0.5), eyes[0]),
+        ((1.02, 0.3, 0.2), eyes[1]),
+        ((1.9, -0.4, 0.9), np.array([2.6, -1, 0.5])),
+    ):
+        out = way_out(room_scene, proxy, np.array(at), free)
+        assert not inside(out) and np.abs(out - (1.5, 0, 0.5)).max() < 0.6
+        # On the way that was taken.
+        assert np.cross(out - free, np.array(at) - free) == pytest.approx(0, abs=1e-6)
+    for at in ((0.5, 0, 0.5), (2.5, 0, 0.3), (1.5, 0, 1.4), (1.5, 1.2, 0.1), (9, 9, 9)):
+        assert way_out(room_scene, proxy, np.array(at, float), eyes[0]) is None, at

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +80,64 @@ def test01_points_and_what_is_seen_of_them(session_of, room):
         not np.array_equal(before, session.baked["visibility"])
         and not (session.baked["visibility"] < 0.5)[behind].any()
     )
+
+
+def test01_what_is_out_of_date_is_known(session_of, room, gaze_fields):
+    session = session_of(room, gaze_fields[0])
+    assert session.stale_points == "the points do not show gaze" and session.stale_shares and not session.has_scale
+    assert "points on surfaces" in session.computing
+    settle(session)
+    assert session.stale_points == "" and not session.stale_shares and session.has_scale and session.computing == []
+    fresh = session.points().colors.astype(int)
+    session.place_observer(np.array([3.0, 0, 0.5]))
+    assert session.stale_points == "gaze of an earlier observer" and session.stale_shares
+    grey = session.points().colors.astype(int)
+    assert np.ptp(grey, axis=1).max() == 0 < np.ptp(fresh, axis=1).max()
+    started, finish = threading.Event(), threading.Event()
+
+    def wait():
+        started.set()
+        finish.wait(60)
+        yield
+
+    session.worker.submit("film", 0, wait())
+    assert started.wait(60)
+    session.follow_observer()
+    session.follow_shares()
+    assert session.computing == ["gaze on the points", "shares of attention", "video"]
+    finish.set()
+    settle(session)
+    assert session.stale_points == "" and not session.stale_shares
+    # Colours under the scale of a depth are no depth.
+    session.set_shade(layer=LAYERS["depth"])
+    assert session.stale_points == "the points do not show depth" and not session.has_scale
+    session.set_shade(layer=LAYERS["colour"])
+    assert session.stale_points == "" and session.has_scale
+    session.set_shade(layer=LAYERS["gaze"])
+    session.set_falloff(0.2)
+    assert session.stale_points == "gaze of earlier settings" and session.stale_shares
+    settle(session)
+    session.regions = [Region.of("a", (1, -1, 0), (2, 1, 1))]
+    assert session.stale_points == "" and session.stale_shares
+
+
+@pytest.mark.parametrize(
+    "at", [(np.nan, 0, 1), (0, np.inf, 1), (0, 0, -np.inf), (1e39, 0, 0), (0, 1), (0, 1, 2, 3)], ids=str
+)
+def test01_an_observer_has_a_position(at):
+    session = Session.__new__(Session)
+    session.lock, session.observer = threading.RLock(), np.zeros(3)
+    with pytest.raises(NergError, match="an observer cannot stand at"):
+        session.place_observer(np.array(at))
+    with pytest.raises(NergError, match="an observer cannot stand at"):
+        session.place_observer(np.ones(3), np.full((3, 3), np.nan))
+    assert (session.observer == 0).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.1])
+def test01_a_fall_off_is_a_length(value):
+    with pytest.raises(NergError, match="fall-off is a length"):
+        Session.__new__(Session).set_falloff(value)
 
 
 def test02_a_picture_is_replaced_by_the_next(session_of, room):
