@@ -109,3 +109,14 @@ def test_what_is_no_json_is_told_with_the_file(tmp_path, raw):
 
 def test_words_of_a_file_are_made_fit_for_a_message():
     assert plain("a\x1b[2J\nb") == "a?[2J?b" and plain("x" * 400) == "x" * 300 + "..."
+
+
+def test_limits_themselves_are_within(tmp_path, monkeypatch):
+    monkeypatch.setattr(bounded, "JSON_VALUES", 100)
+    monkeypatch.setattr(bounded, "JSON_DEPTH", 3)
+    # As many values as brackets are opened and commas stand there.
+    assert parse_json("[[[" + "1," * 97 + "1]]]", "a.json") == [[[1] * 98]]
+    for beyond in ("[[[" + "1," * 98 + "1]]]", "[[[[1]]]]"):
+        with pytest.raises(NergError, match="more than the 100 values|nested 4 deep"):
+            parse_json(beyond, "a.json")
+    assert [bounded.is_count(v) for v in (0, (1 << 62) - 1, 1 << 62, -1, True, 1.0)] == [True, True, *[False] * 4]

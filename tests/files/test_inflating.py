@@ -116,3 +116,20 @@ def test_errors_of_the_block_are_its_own(tmp_path):
     path = _zip(tmp_path / "a.zip", a=b"1")
     with pytest.raises(KeyError), open_zip(path):
         raise KeyError("mine")
+
+
+def test_limits_themselves_are_within(tmp_path, monkeypatch):
+    path = tmp_path / "a.gz"
+    path.write_bytes(gzip.compress(bytes(1000)))
+    with open_gzip(path, most=1000) as stream:
+        assert stream.read() == bytes(1000)
+    with open_gzip(path, most=999) as stream, pytest.raises(NergError, match="inflates to more than 999"):
+        stream.read()
+    archive = _zip(tmp_path / "a.zip", a=b"1")
+    listed = inflating._directory_bytes(archive, archive.stat().st_size)
+    monkeypatch.setattr(inflating, "DIRECTORY_BYTES", listed)
+    with open_zip(archive) as found:
+        assert found.namelist() == ["a"]
+    monkeypatch.setattr(inflating, "DIRECTORY_BYTES", listed - 1)
+    with pytest.raises(NergError, match="fewer members"), open_zip(archive):
+        pass

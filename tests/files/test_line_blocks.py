@@ -69,3 +69,13 @@ def test_a_gzip_file_that_is_cut_off(tmp_path, cut):
     path.write_bytes(gzip.compress("".join(f"{i},{i * 7}\n" for i in range(3000)).encode())[:cut])
     with pytest.raises(NergError, match="t.csv.gz"):
         lines(path)
+
+
+def test_limits_themselves_are_within(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "LINE_CHARACTERS", 4)
+    path = tmp_path / "t.csv"
+    path.write_text("abc\n" * 4)
+    assert [len(b) for b in line_blocks(path, "table", 2)] == [2, 2]
+    path.write_text("abcd\n")
+    with pytest.raises(NergError, match="line 1 of the table"):
+        lines(path)

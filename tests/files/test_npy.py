@@ -113,3 +113,15 @@ def test_headers_and_versions_are_bounded(tmp_path):
     (tmp_path / "a.npy").write_bytes(npy("(1,)", data=bytes(8), version=(3, 0)))
     with pytest.raises(NergError, match="version 3.0"):
         read_npy(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("axes, good", [(32, True), (33, False)])
+def test_arrays_have_so_many_axes(tmp_path, axes, good):
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {(1,) * axes}, }}".encode()
+    header += b" " * (-(len(header) + 11) % 64) + b"\n"
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(8))
+    if good:
+        assert read_npy(tmp_path / "a.npy").shape == (1,) * axes
+    else:
+        with pytest.raises(NergError, match="claims the shape"):
+            read_npy(tmp_path / "a.npy")

@@ -115,3 +115,9 @@ def test_thinning_counts_a_stop_as_long_as_asked():
         thin_mask(walk(line(x)), seconds=0)
     with pytest.raises(ValueError, match="positive"):
         thin_mask(walk(line(x)), distance=0)
+
+
+def test_stays_as_long_and_as_far_as_they_may_be():
+    t = np.array([0, 1, 2, 3.25])
+    assert label_stays(walk(line(np.zeros(4)), t=t), gap=1.0).tolist() == [0, 0, 0, 1]
+    assert label_stays(walk(line(np.array([0, 0.5, -0.5, 0.75])), t=t * 0), distance=0.5).tolist() == [0, 0, 0, 1]

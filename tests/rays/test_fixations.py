@@ -148,3 +148,9 @@ def test_a_fixation_has_the_mean_head():
     one, _ = fixation_rays(replace(rays, head=head), idt(rays))
     want = np.array([8.0, 1, 0])
     assert np.allclose(one.head[0], want / np.linalg.norm(want)) and np.isnan(one.head[1]).all()
+
+
+@pytest.mark.parametrize("find", [ivt, idt])
+def test_a_pause_as_long_as_it_may_be(find):
+    still = gaze([0] * 9, dt=0.125)
+    assert (find(still, gap=0.125) == 0).all() and (find(still, gap=0.12) == -1).all()

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -69,3 +71,14 @@ def test_pauses_end_what_stands_still():
     still = change(rays, slice(0, 90), direction=rays.direction[0])
     paused = change(still, slice(45, None), t=lambda t: t + 0.6)
     assert found(still)[:90].all() and not found(paused).any()
+
+
+def test_a_pause_as_long_as_it_may_be_and_the_next_person():
+    """Neither is a run of two people, of whom each stands still for less than a second."""
+    rays, rows = watch(1), slice(1470, 1530)
+    still = change(rays, rows, direction=rays.direction[1470])
+    assert found(still)[1470:1530].all()
+    two = replace(still, person=(np.arange(len(rays)) >= 1500).astype(int), persons=("ann", "bo"))
+    assert not found(two).any()
+    slow = change(change(rays, slice(0, 4), direction=rays.direction[0]), slice(0, 4), t=np.array([-2, -1.5, -1, -0.5]))
+    assert found(slow)[:4].all()

@@ -149,3 +149,27 @@ def test_the_metadata_tell_how_rays_were_split(rays):
 def test_of_two_people_one_is_on_each_side(rays, share):
     train, test = split_by_person(rays.select(rays.person < 2), test_share=share)
     assert train.any() and test.any()
+
+
+def test_distances_and_times_on_the_bounds():
+    """Rays at R from a test centre are of the test, those at 2R of neither side."""
+    near = [[0.5, 0, 0], [-0.5, 0, 0], [0, 0.5, 0], [0, -0.5, 0]]
+    twice, far = [[1.0, 0, 0]], [[5.0 + 3 * k, 0, 0] for k in range(9)]
+    origin = np.array([[0.0, 0, 0]] * 70 + near + twice + far)
+    n = len(origin)
+    rays = Rays(np.arange(n) * 1.0, np.zeros(n), ("ann",), origin, np.tile([1.0, 0, 0], (n, 1)), np.ones(n))
+    # Of all places the first alone has so many rays within R.
+    split = split_by_position(rays, 0.5, zones=1, test_probes=1, min_rays=73, min_train=1)
+    assert split.test.tolist() == [True] * 74 + [False] * 10 and split.train.tolist() == [False] * 75 + [True] * 9
+    assert purge(rays, np.zeros((1, 3)), 1.0).tolist() == split.train.tolist()
+    some = rays.select(np.arange(11))
+    train, test = split_by_time(some, test_share=0.5, gap=2.0)
+    assert some.t[train].tolist() == [0, 1, 2] and some.t[test].tolist() == [5, 6, 7, 8, 9, 10]
+
+
+@pytest.mark.parametrize("missing", [0, 1])
+def test_both_sides_of_several_splits_have_rays(missing):
+    a, b = np.array([True, False, False]), np.array([False, True, False])
+    sides = (a, b), ((b, b) if missing == 0 else (a, a))
+    with pytest.raises(ValueError, match="together the splits leave"):
+        combine(*sides)

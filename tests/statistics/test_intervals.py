@@ -202,3 +202,41 @@ def test14_a_p_value_is_no_less_than_draws_can_tell(resamples):
     x = rng.random((12, 5))
     found = ratio_differences((x, ONES(x.shape)), (x + 100 + rng.random(x.shape), ONES(x.shape)), resamples=resamples)
     assert found.p == pytest.approx(1 / (resamples + 1))
+
+
+def test15_the_least_number_of_people():
+    x = np.array([[0.1], [0.2], [0.4]])
+    assert np.isfinite(ratios(x, ONES(x.shape)).low).all() and np.isnan(ratios(x[:2], ONES((2, 1))).low).all()
+
+
+def test16_half_of_the_people_are_few():
+    """Twenty of forty, whose weights differ, have Student's t of the effective number of them; of thirty-nine they are
+    more than half."""
+    rng = np.random.default_rng(7)
+    far = rng.random(20) < 0.1
+    y = np.where(far, 1.0, 0.3) * rng.gamma(2, 1, 20)
+    x = y * np.where(far, 4.0, 1.0)
+    without = np.array([np.delete(x, k).sum() / np.delete(y, k).sum() for k in range(20)])
+    parts = (x.sum() / y.sum() - without) * np.sqrt(19 / 20)
+    people = (parts**2).sum() ** 2 / (parts**4).sum()
+    least = stats.t.ppf(0.975, max(people - 1, 1.0)) * np.sqrt((parts**2).sum())
+    reach = []
+    for others in (20, 19):
+        pad = lambda v: np.r_[v, np.zeros(others)][:, None]
+        found = ratios(pad(x), pad(y), resamples=199)
+        reach.append(found.high[0] - found.value[0])
+    assert reach[0] == pytest.approx(least) and reach[1] < 0.9 * least
+
+
+def test17_people_of_both_are_drawn_together():
+    """Against a loop: what is alike in both of a person's numbers leaves the spread of a draw as well."""
+    rng, n, resamples = np.random.default_rng(12), 10, 300
+    x = rng.gamma(2, 1, (n, 1))
+    u = x + rng.normal(0.3, 0.1, (n, 1))
+    found = ratio_differences((x, ONES(x.shape)), (u, ONES(x.shape)), resamples=resamples, seed=4)
+    apart = (u - x)[:, 0]
+    error, value, t = apart.std(ddof=1) / np.sqrt(n), apart.mean(), []
+    for draw in np.random.default_rng(4).multinomial(n, np.full(n, 1 / n), size=resamples):
+        star = np.repeat(apart, draw)
+        t.append(abs(star.mean() - value) / np.sqrt(0.99 * star.var() / (n - 1) + 0.01 * error**2))
+    assert found.high[0] - value == pytest.approx(np.quantile(t, 0.95) * error, rel=1e-6)

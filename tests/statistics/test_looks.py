@@ -86,3 +86,14 @@ def test05_times_that_are_none_or_unsorted(t):
 def test06_rules_that_are_none(bad):
     with pytest.raises(NergError, match="--"):
         LookRules(**bad)
+
+
+def test07_times_on_the_bounds():
+    """A pause as long as it may be joins sittings, an interruption as long as it may be looks."""
+    rules = LookRules(gap=0.5, pause=4.0, merge=0.25, least=0.25)
+    line = timeline(np.zeros(4, int), np.array([0.0, 4.0, 8.0, 12.5]), rules)
+    assert line.sitting.tolist() == [0, 0, 0, 1]
+    line = timeline(np.zeros(6, int), np.arange(6) * 0.25, rules)
+    at = lambda *rows: looks_at(np.array(rows), line, rules).first.tolist()
+    assert at(0, 2) == [0] and at(0, 3) == [0, 3] and at(1) == [1]
+    assert timeline(np.zeros(3, int), np.array([0.0, 0.5, 1.25]), rules).weight.tolist() == [0.5, 0.5, 0.5]

@@ -95,3 +95,12 @@ def test07_few_and_nobody():
     assert np.isnan([found.low, found.high, found.p]).all() and found.value == 0
     nobody = proportions(np.zeros((0, 2)), np.zeros((0, 2)))
     assert np.isnan(nobody.value).all() and np.isnan(nobody.high).all() and nobody.people.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("m, n, known", [(3, 3, True), (2, 3, False), (3, 2, False)])
+def test08_three_people_have_an_interval_and_two_have_none(m, n, known):
+    found = proportions(*column(1, m))
+    assert np.isfinite(found.low).all() == np.isfinite(found.high).all() == (m == 3)
+    first, second = np.r_[np.ones(m), np.zeros(n)][:, None], np.r_[np.zeros(m), np.ones(n)][:, None]
+    difference = proportion_differences((first * 0, first), (second, second))
+    assert [np.isfinite(v).all() for v in (difference.low, difference.high, difference.p)] == [known] * 3

@@ -86,3 +86,13 @@ def test_what_is_held_for_parts_that_nobody_asks_for_is_left_over(store):
     found = read_account(store)
     assert found.jobs[0].done == 1 and found.leftovers == (Path(other.path),) and found.bytes == 65 + 8
     assert remove_stale(store, found) == 3 and Path(asked.path).exists()
+
+
+def test_bytes_that_another_file_still_has_are_not_out_of_date(store, tmp_path):
+    for name in "ab":
+        (tmp_path / name).write_text("alike")
+    tasks = [*works.tasks(1, {"a": tmp_path / "a"}), *works.tasks(2, {"b": tmp_path / "b"})[1:]]
+    carry_out(Plan("p", tasks), store, Local())
+    (tmp_path / "a").write_text("other")
+    found = read_account(store)
+    assert found.jobs[0].changed == (str(tmp_path / "a"),) and found.jobs[0].outdated == 0 and found.stale == ()

@@ -122,6 +122,10 @@ def test_equal_tasks_are_run_once_and_given_as_often_as_they_are_planned(store, 
     shares = []
     found = contents(carry_out(Plan("p", [task, task, task]), store, Local(), lambda p: shares.append(p.share)))
     assert found == [works.expected(0)] * 3 and works.runs_of(runs) == {0: 1} and shares == [0.0, 1.0]
+    # And what is kept counts as often as well.
+    counts = []
+    carry_out(Plan("p", [task, task]), store, Local(), lambda p: counts.append((p.kept, p.done, p.total)))
+    assert counts == [(2, 2, 2)]
 
 
 def test_an_error_of_a_task_is_the_jobs(store):

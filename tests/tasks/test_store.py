@@ -152,3 +152,10 @@ def test_what_is_held_is_named_by_its_bytes(store):
     path.write_bytes(b"ways")
     assert Path(store.hold("a.npy", b"rays").path).read_bytes() == b"rays"
     assert store.held(3600) == [] and store.held(-1) == [path]
+
+
+def test_a_receipt_is_of_its_own_key(store):
+    one, other = works.tasks(2)
+    made(store, one), made(store, other)
+    shutil.copy(store.receipt_file(other.key), store.receipt_file(one.key))
+    assert store.receipt(one.key) is None and [r.key for r in store.receipts()] == [other.key]

@@ -63,6 +63,8 @@ def test04_other_sites_are_refused(origin):
 
 def test05_the_page_itself_is_let_in():
     assert status(LOCAL, host="localhost:8080", origin="http://localhost:8080", upgrade="websocket") == 200
+    # Browsers write names in small letters, and whoever typed the address need not.
+    assert status(LOCAL, host="LocalHost:8080", origin="http://localhost:8080", upgrade="websocket") == 200
 
 
 def test06_a_token_is_asked_for_elsewhere():
