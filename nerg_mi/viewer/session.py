@@ -108,8 +108,8 @@ class Session:
         own = self.scene.observer
         if given is None:
             given = self._ahead_of_home() if own is None else np.asarray(own, float)
-        self.observer = np.array(given, float)
-        self.heading = heading_of(self.home.ahead if own is None else ahead_of(self.scene), self.place.up)
+        ahead = self.home.ahead if own is None else ahead_of(self.scene)
+        self.place_observer(np.asarray(given, float), heading_of(ahead, self.place.up))
         self.falloff = float(np.ravel(np.array(self.scene.integrator.falloff))[0])
         cut = self.scene.integrator.ceiling
         self.cut_up, self.ceiling = (self.place.up, None) if cut is None else (cut.up, cut.height)

@@ -222,8 +222,7 @@ def test16_half_of_the_people_are_few():
     least = stats.t.ppf(0.975, max(people - 1, 1.0)) * np.sqrt((parts**2).sum())
     reach = []
     for others in (20, 19):
-        pad = lambda v: np.r_[v, np.zeros(others)][:, None]
-        found = ratios(pad(x), pad(y), resamples=199)
+        found = ratios(*(np.pad(v, (0, others))[:, None] for v in (x, y)), resamples=199)
         reach.append(found.high[0] - found.value[0])
     assert reach[0] == pytest.approx(least) and reach[1] < 0.9 * least
 

@@ -50,6 +50,10 @@ def test_a_file_is_read_once_while_it_stays(place, monkeypatch):
     file.write_text("other")
     os.utime(file, ns=(1, 1))
     assert checksums.of(file) == hashlib.sha256(b"other").hexdigest() and len(read) == 2
+    # A file of another size is another one, whatever its time of change says.
+    file.write_text("longer")
+    os.utime(file, ns=(1, 1))
+    assert checksums.of(file) == hashlib.sha256(b"longer").hexdigest() and len(read) == 3
 
 
 def test_a_file_that_changes_while_it_is_read_is_not_remembered(place, monkeypatch):

@@ -223,6 +223,8 @@ def test06_what_cannot_be_shown_is_told(session_of, room, tmp_path):
         session_of(Path("nowhere.xml"))
     with pytest.raises(NergError, match="three numbers"):
         session_of(room, observer=(1.0, 2.0))
+    with pytest.raises(NergError):
+        session_of(room, observer=(1.0, 2.0, float("nan")))
 
 
 def test07_variants_are_shown_in_turn(session_of, room, gaze_fields):
