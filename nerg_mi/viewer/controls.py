@@ -116,7 +116,7 @@ class Controls:
                 fixed = ends.value
             if fixed is not None:
                 try:
-                    Scale(*fixed)
+                    Scale(fixed[0], fixed[1])
                 except NergError as error:
                     tell(event, "Range", sentence(error))
                     return

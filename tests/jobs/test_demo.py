@@ -24,6 +24,7 @@ def test_every_stage_is_told_and_every_file_is_there(tmp_path):
     assert told.messages == [f"wrote {path}" for path in result.files]
 
 
+@pytest.mark.nightly
 def test_its_report_has_the_tracked_gaze(tmp_path, monkeypatch):
     """Of the store's own field; what is written of the observer is theirs alone, as without."""
     monkeypatch.setattr(demo, "make_tracked", partial(make_tracked, people=3))
