@@ -92,6 +92,8 @@ class Page:
     def place_observer(self, at: np.ndarray, heading: np.ndarray | None = None) -> None:
         """Let the observer stand at ``at`` (3,), as if dragged there. Raises `NergError` for what is no position."""
         self.session.place_observer(at, heading)
+        # Who was put somewhere on purpose is dragged from there.
+        self._free = self.session.observer
         self._observer.position = tuple(np.asarray(at, float))
         self._observer.wxyz = self._turn()
         self._observer_moved(True)
@@ -113,10 +115,12 @@ class Page:
 
     def _put_out(self, at: np.ndarray, found: np.ndarray) -> None:
         """The observer, who was dragged to ``at`` (3,), stands at ``found`` (3,): elsewhere if that is in something."""
-        if self.session.observer is at:
-            self._free = found
-            if found is not at:
-                self.place_observer(found)
+        if self.session.observer is not at:
+            return
+        if found is at:
+            self._free = at
+        else:
+            self.place_observer(found)
 
     def _observer_moved(self, at_rest: bool) -> None:
         self.problem = ""
