@@ -23,7 +23,7 @@ from nerg_mi.figures.provenance import Provenance, provenance
 from nerg_mi.figures.saving import save
 from nerg_mi.figures.sphere_figures import sphere_figure
 from nerg_mi.figures.tonemap import srgb, write_png
-from nerg_mi.files.atomic import check_folder
+from nerg_mi.files.atomic import check_folder, write_bytes
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.exr import write_bitmap_exr
 from nerg_mi.files.tables import write_csv, write_json
@@ -220,16 +220,15 @@ def make_tracked(path: Path, people: int = 100) -> Path:
     """Write the tracked gaze of the store's shoppers as the file ``path`` of rays, which is not packed with the store:
     it is simulated again, as it was for the training. ``people``: fewer are other ones than the field was trained
     on."""
-    from nerg_mi.rays.readers.registry import read_rays
-    from nerg_mi.rays.readers.skeleton22 import SkeletonOptions
-    from nerg_mi.scenes.store import layout, shoppers, twin  # pyright: ignore[reportMissingImports] as in `store_scene`
+    from nerg_mi.scenes.store import layout, make, shoppers, twin  # pyright: ignore[reportMissingImports] as in `store_scene`
 
-    place = layout.build(TRACKED_SEED)
     shape = twin.load_twin(store_scene().parent / "twin.xml")
     with tempfile.TemporaryDirectory() as folder:
-        table = Path(folder) / "shoppers.csv"
-        shoppers.write_shoppers(place, table, seed=TRACKED_SEED, scene=shape, shoppers=people, say=lambda text: None)
-        read_rays("skeleton22", table, SkeletonOptions(tick=1e-3)).save(path)
+        job = make.Job(TRACKED_SEED, build=Path(folder))
+        place, table = layout.build(job.seed), job.build / "shoppers.csv"
+        shoppers.write_shoppers(place, table, seed=job.seed, scene=shape, shoppers=people, say=lambda text: None)
+        (rays,) = make.make_rays(job)
+        write_bytes(path, rays.read_bytes())
     return path
 
 
