@@ -7,7 +7,6 @@ the observer's sphere (a `panorama`); its integrator is `nerg` with a gaze field
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -52,11 +51,11 @@ MAKE = "python -m nerg_mi.scenes.store.make"
 REPORT_POINTS = 60_000
 """Points of the report's 3D scene."""
 
-TRACKED, TRACKED_SEED = "shoppers.npz", 0
-"""The file of the tracked gaze that the store's field was trained on, and the seed that it is made from."""
+TRACKED = "shoppers.npz"
+"""Every tenth ray of the tracked gaze that the store's field was trained on."""
 
-REPORT_EYES = 100
-"""Places of people that the report looks from: one of each shopper's."""
+REPORT_EYES = 24
+"""Places of people that the report looks from: few, since a demo must be quick."""
 
 STAGES = (
     *("load", "camera", "own view", "gaze sphere", "without occlusion", "pictures", "surfaces", "tracked gaze"),
@@ -137,7 +136,7 @@ def make_demo(out: str | Path, options: DemoOptions | None = None, reporter: Rep
     clock.start("tracked gaze")
     tracked = []
     if scene == store_scene() and inputs[2] == scene.parent / CHECKPOINTS["gaze"]:
-        tracked = [make_tracked(out / TRACKED)]
+        tracked = [write_tracked(out / TRACKED)]
         files += tracked
     clock.start("report")
     # Named by the scene, or that beside it of which the demo is made.
@@ -216,19 +215,9 @@ def evaluation_beside(scene: Path, gaze: Path) -> list[Path]:
     return [path] if path.is_file() and read_results(path).sha256 == file_sha256(gaze) else []
 
 
-def make_tracked(path: Path, people: int = 100) -> Path:
-    """Write the tracked gaze of the store's shoppers as the file ``path`` of rays, which is not packed with the store:
-    it is simulated again, as it was for the training. ``people``: fewer are other ones than the field was trained
-    on."""
-    from nerg_mi.scenes.store import layout, make, shoppers, twin  # pyright: ignore[reportMissingImports] as in `store_scene`
-
-    shape = twin.load_twin(store_scene().parent / "twin.xml")
-    with tempfile.TemporaryDirectory() as folder:
-        job = make.Job(TRACKED_SEED, build=Path(folder))
-        place, table = layout.build(job.seed), job.build / "shoppers.csv"
-        shoppers.write_shoppers(place, table, seed=job.seed, scene=shape, shoppers=people, say=lambda text: None)
-        (rays,) = make.make_rays(job)
-        write_bytes(path, rays.read_bytes())
+def write_tracked(path: Path) -> Path:
+    """Write the store's sample of the tracked gaze that its field was trained on as the file ``path`` of rays."""
+    write_bytes(path, (store_scene().parent / TRACKED).read_bytes())
     return path
 
 

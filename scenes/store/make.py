@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
+SAMPLED = 10
+"""One in so many of each shopper's rays is packed with the store."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,21 @@ def make_field(job: Job) -> list[Path]:
 
 
 def make_rays(job: Job) -> list[Path]:
-    """Rays of attention from the tracking data, as `nerg rays import --preset skeleton --tick 0.001` makes them."""
+    """Rays of attention from the tracking data, as `nerg rays import --preset skeleton --tick 0.001` makes them, and
+    every tenth of them for the demo's report."""
+    import numpy as np
+
     from nerg_mi.rays.readers.registry import read_rays
     from nerg_mi.rays.readers.skeleton import SkeletonOptions
 
     tracking, path = job.build / "shoppers.csv", job.build / "rays.npz"
     _require(tracking, "shoppers")
-    read_rays("skeleton", tracking, SkeletonOptions(tick=1e-3)).save(path)
-    return [path]
+    rays = read_rays("skeleton", tracking, SkeletonOptions(tick=1e-3))
+    rays.save(path)
+    sample = job.store / "shoppers.npz"
+    some = rays.select(np.sort(np.lexsort((rays.t, rays.person))[::SAMPLED]))
+    some.with_step(step="sample", kept=len(some), of=len(rays)).save(sample)
+    return [path, sample]
 
 
 def make_gaze(job: Job) -> list[Path]:

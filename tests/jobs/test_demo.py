@@ -1,13 +1,12 @@
 """The demo as a job: its stages, and its result. `tests/cli/test_demo` looks at the pictures."""
 
 import csv
-from functools import partial
 
 import numpy as np
 import pytest
 
 from nerg_mi.jobs import demo
-from nerg_mi.jobs.demo import STAGES, DemoOptions, make_demo, make_tracked
+from nerg_mi.jobs.demo import STAGES, DemoOptions, make_demo
 from nerg_mi.rays.rays import Rays
 from tests.figures.standins import write_standins
 from tests.jobs.recorder import Recorder
@@ -25,13 +24,12 @@ def test_every_stage_is_told_and_every_file_is_there(tmp_path):
 
 
 @pytest.mark.nightly
-def test_its_report_has_the_tracked_gaze(tmp_path, monkeypatch):
+def test_its_report_has_the_tracked_gaze(tmp_path):
     """Of the store's own field; what is written of the observer is theirs alone, as without."""
-    monkeypatch.setattr(demo, "make_tracked", partial(make_tracked, people=3))
     result = make_demo(tmp_path, DemoOptions(width=24, spp=1, mode="llvm_ad_rgb"))
     text = (tmp_path / "report.html").read_text("utf-8")
     rays = Rays.load(tmp_path / demo.TRACKED)
-    assert tmp_path / demo.TRACKED in result.files and len(rays.persons) == 3 and len(rays) > 1000
+    assert tmp_path / demo.TRACKED in result.files and len(rays.persons) == 100 and len(rays) > 10_000
     assert "Where people were" in text and "not at hand" not in text and f"{len(rays):,} of {len(rays):,} rows" in text
     assert "places where they stood" in text
     with (tmp_path / "aoi.csv").open() as file:
