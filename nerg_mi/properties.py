@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from .errors import NergError
+from .errors import NergError, plain
+from .ranges import FARTHEST, VALUES, Range, check_number
 
 
-def number(props, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
-    """A finite number in ``low .. high``."""
+def number(props, name: str, default: float, within: Range) -> float:
+    """A number ``within`` a range."""
     value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise NergError(f'"{name}" must be a number, got {value!r}')
-    if not (math.isfinite(value) and low <= value <= high):
-        raise NergError(f'"{name}" must lie in {low:g} .. {high:g}, got {value}')
+    check_number(value, within, f'"{name}"')
     return float(value)
 
 
-def integer(props, name: str, default: int, low: int, high: int) -> int:
-    """A whole number in ``low .. high``."""
-    value = number(props, name, default, low, high)
+def integer(props, name: str, default: int, within: Range) -> int:
+    """A whole number ``within`` a range."""
+    value = number(props, name, default, within)
     if value != int(value):
         raise NergError(f'"{name}" must be a whole number, got {value}')
     return int(value)
@@ -56,7 +53,7 @@ def text(props, name: str, default: str | None = None) -> str:
 
 
 def color(props, name: str, default: float) -> list[float]:
-    """A linear rgb colour that is finite and not negative; a number is a grey."""
+    """A linear rgb colour that is finite in single precision and not negative; a number is a grey."""
     import mitsuba as mi
 
     value = props.get(name, default)
@@ -66,20 +63,22 @@ def color(props, name: str, default: float) -> list[float]:
         raise NergError(f'"{name}" must be a number or an rgb colour, got {value!r}')
     rgb = [float(c) for c in np.ravel(value)]
     rgb = rgb * 3 if len(rgb) == 1 else rgb
-    if len(rgb) != 3 or not all(math.isfinite(c) and c >= 0 for c in rgb):
+    if len(rgb) != 3 or not all(0 <= c <= VALUES.high for c in rgb):
         raise NergError(f'"{name}" must be one number or three, finite and not negative, got {value}')
     return rgb
 
 
 def vector(props, name: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Three finite numbers."""
+    """Three coordinates."""
     value = props.get(name, None)
     try:
         found = np.asarray(default if value is None else value, float).ravel()
     except (TypeError, ValueError):
         found = np.empty(0)
-    if found.shape != (3,) or not np.isfinite(found).all():
-        raise NergError(f'"{name}" must be three finite numbers, got {value!r}')
+    if found.shape != (3,) or not (np.abs(found) <= FARTHEST).all():
+        raise NergError(
+            f'"{name}" must be three numbers from {-FARTHEST:g} to {FARTHEST:g}, got {plain(repr(value), 60)}'
+        )
     x, y, z = found.tolist()
     return x, y, z
 

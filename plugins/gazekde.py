@@ -57,6 +57,7 @@ from nerg_mi.density.kde.view import KdeView
 from nerg_mi.field.backend import namespace
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.properties import integer, number, resolved, text, transform
+from nerg_mi.ranges import Range
 from nerg_mi.rays.rays import Rays
 from nerg_mi.registration import register
 
@@ -67,7 +68,7 @@ class GazeKdeVolume(mi.Volume):
     def __init__(self, props):
         super().__init__(props)
         self.filename = resolved(text(props, "filename"))
-        count, kappa = integer(props, "count", 4096, low=1, high=1 << 24), number(props, "kappa", 20.0, low=0, high=1e8)
+        count, kappa = integer(props, "count", 4096, Range(1, 1 << 24)), number(props, "kappa", 20.0, Range(0, 1e8))
         to_world = Similarity(transform(props, "to_world"))
         rays = Rays.load(self.filename)
         self.rays = len(rays)

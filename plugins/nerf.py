@@ -71,6 +71,7 @@ from nerg_mi.field.radiance import RadianceField
 from nerg_mi.formats.fields import load_radiance
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.properties import boolean, expose_parameters, number, trained, transform, volume_of
+from nerg_mi.ranges import VALUES, Range
 from nerg_mi.registration import register
 from nerg_mi.transport.media.field import FieldMedium
 
@@ -87,7 +88,7 @@ class NerfVolume(mi.Volume):
         props["to_world"] = mi.ScalarTransform4f().translate(lower.tolist()).scale((upper - lower).tolist())
         super().__init__(props)
         self.filename, self.field, self.metadata, self._similarity = filename, field, metadata, similarity
-        self.max_density = number(props, "max_density", 0, low=0)
+        self.max_density = number(props, "max_density", 0, Range(0, VALUES.high))
         if boolean(props, "constant_weights", False):
             set_constant_weights(field)
 

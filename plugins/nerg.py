@@ -212,6 +212,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.interruption import give_back_ctrl_c
 from nerg_mi.maths.types import Bool, UInt32
 from nerg_mi.properties import boolean, number, text
+from nerg_mi.ranges import VALUES, Range
 from nerg_mi.registration import register
 from nerg_mi.transport.freezing import no_collection, recording
 from nerg_mi.transport.observer import viewpoint
@@ -242,7 +243,7 @@ class NergIntegrator(mi.SamplingIntegrator):
         nerg_properties.check_observer(self.observer)
 
         self.occlusion = boolean(props, "occlusion", True)
-        self.falloff = mi.Float(number(props, "falloff", 0.1, low=0))
+        self.falloff = mi.Float(number(props, "falloff", 0.1, Range(0, VALUES.high)))
         self.radiance = boolean(props, "radiance", True)
         self.background = nerg_properties.background_of(props)
         self.ceiling = nerg_properties.ceiling_of(props)

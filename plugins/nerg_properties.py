@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from nerg_mi.errors import NergError
 from nerg_mi.properties import boolean, choice, color, integer, number, vector
+from nerg_mi.ranges import COORDINATES, FARTHEST, VALUES, Range
 from nerg_mi.transport.ceiling import Ceiling
 from nerg_mi.transport.march.depth import DEPTHS
 from nerg_mi.transport.march.rules import RULES, boundaries
@@ -73,11 +74,14 @@ def _nested(props):
 
 
 def check_observer(observer) -> None:
-    """Raise ``NergError`` for an observer (a sensor, or None) who stands nowhere."""
+    """Raise ``NergError`` for an observer (a sensor, or None) who stands nowhere, or too far away."""
     if observer is not None:
         viewpoint.require_center(observer, '"observer"')
-        if not dr.all(dr.isfinite(dr.detach(viewpoint.center(observer))), axis=None):
-            raise NergError('"observer" stands at a position that is not finite; correct its to_world')
+        if not dr.all(dr.abs(dr.detach(viewpoint.center(observer))) <= FARTHEST, axis=None):
+            raise NergError(
+                f'"observer" stands at a position with a coordinate that is not from {-FARTHEST:g} to {FARTHEST:g}; '
+                "correct its to_world"
+            )
 
 
 def medium_of(children: dict) -> tuple[Medium | None, KnownEmpty | None]:
@@ -128,14 +132,14 @@ def views_of(aovs: list[str], children: dict, gaze: PlacedGaze | None) -> dict[s
 
 def march_settings(props, medium: Medium | None) -> MarchSettings:
     """Of the camera's and the observer's rays."""
-    step = number(props, "step", 0, low=0)
+    step = number(props, "step", 0, Range(0, FARTHEST))
     settings = MarchSettings(
         step=step or default_step(medium),
-        dt_gamma=number(props, "dt_gamma", default_growth(medium), low=0, high=1),
-        stop=number(props, "stop", default_stop(medium), low=0, high=1),
-        color_cutoff=number(props, "color_cutoff", MarchSettings.color_cutoff, low=0, high=1),
+        dt_gamma=number(props, "dt_gamma", default_growth(medium), Range(0, 1)),
+        stop=number(props, "stop", default_stop(medium), Range(0, 1)),
+        color_cutoff=number(props, "color_cutoff", MarchSettings.color_cutoff, Range(0, 1)),
         quadrature=choice(props, "quadrature", MarchSettings.quadrature, RULES.names()),
-        coarse=number(props, "coarse", MarchSettings.coarse, low=1),
+        coarse=number(props, "coarse", MarchSettings.coarse, Range(1, 1e6)),
         refined=boolean(props, "refined", MarchSettings.refined),
         cell_step=step or math.inf,
     )
@@ -150,19 +154,19 @@ def observer_settings(props, march: MarchSettings) -> ObserverSettings:
     return ObserverSettings(
         march=march,
         depth=choice(props, "depth", defaults.depth, DEPTHS.names()),
-        surface_opacity=number(props, "surface_opacity", defaults.surface_opacity, low=0, high=1),
+        surface_opacity=number(props, "surface_opacity", defaults.surface_opacity, Range(0, 1)),
         visibility=choice(props, "visibility", defaults.visibility, VISIBILITIES),
-        tolerance=number(props, "tolerance", defaults.tolerance, low=0),
-        map_height=integer(props, "map_height", defaults.map_height, low=2, high=16384),
-        directions=integer(props, "directions", defaults.directions, low=64, high=1 << 24),
-        integral_tolerance=number(props, "integral_tolerance", defaults.integral_tolerance, low=0, high=1),
+        tolerance=number(props, "tolerance", defaults.tolerance, Range(0, VALUES.high)),
+        map_height=integer(props, "map_height", defaults.map_height, Range(2, 16384)),
+        directions=integer(props, "directions", defaults.directions, Range(64, 1 << 24)),
+        integral_tolerance=number(props, "integral_tolerance", defaults.integral_tolerance, Range(0, 1)),
     )
 
 
 def ceiling_of(props) -> Ceiling | None:
     """What is left out of views from above."""
     up = vector(props, "up", (0.0, 0.0, 1.0))
-    return Ceiling(number(props, "ceiling", 0), up) if "ceiling" in props else None
+    return Ceiling(number(props, "ceiling", 0, COORDINATES), up) if "ceiling" in props else None
 
 
 def background_of(props):

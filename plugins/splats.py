@@ -74,6 +74,7 @@ from nerg_mi.field.splats import Splats
 from nerg_mi.formats.splats.files import read_splats
 from nerg_mi.maths.similarity import Similarity
 from nerg_mi.properties import choice, number, resolved, text, transform, volume_of
+from nerg_mi.ranges import Range
 from nerg_mi.registration import register
 from nerg_mi.transport.freezing import recording
 from nerg_mi.transport.media.splats.arrays import SplatArrays
@@ -87,7 +88,7 @@ class SplatsVolume(mi.Volume):
         # ``splats``: Gaussians in memory in place of a file; see ``of``.
         self._similarity = Similarity(transform(props, "to_world"))
         color_space = choice(props, "color_space", "file", ("file", "srgb", "linear"))
-        extent = number(props, "extent", 3, low=0.1, high=10)
+        extent = number(props, "extent", 3, Range(0.1, 10))
         self.filename = "" if splats is not None else resolved(text(props, "filename"))
         super().__init__(props)
         self.splats = splats if splats is not None else read_splats(self.filename)

@@ -9,14 +9,17 @@ import pytest
 
 from nerg_mi import properties
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import Range
+
+ANY = Range(-1e9, 1e9)
 
 
 @pytest.mark.parametrize(
     "read, given, found",
     [
-        (lambda p: properties.number(p, "x", 1.5), {}, 1.5),
-        (lambda p: properties.number(p, "x", 1.5, low=0), {"x": 2}, 2.0),
-        (lambda p: properties.integer(p, "x", 4, 1, 9), {"x": 9.0}, 9),
+        (lambda p: properties.number(p, "x", 1.5, ANY), {}, 1.5),
+        (lambda p: properties.number(p, "x", 1.5, Range(0, 9)), {"x": 2}, 2.0),
+        (lambda p: properties.integer(p, "x", 4, Range(1, 9)), {"x": 9.0}, 9),
         (lambda p: properties.boolean(p, "x", True), {"x": False}, False),
         (lambda p: properties.choice(p, "x", "a", ("a", "b")), {"x": "b"}, "b"),
         (lambda p: properties.text(p, "x"), {"x": "name"}, "name"),
@@ -37,11 +40,11 @@ def test_a_colour_of_a_texture(rgb):
 @pytest.mark.parametrize(
     "read, value, words",
     [
-        (lambda p: properties.number(p, "x", 1, low=0, high=2), 3, "0 .. 2, got 3"),
-        (lambda p: properties.number(p, "x", 1), math.nan, "nan"),
-        (lambda p: properties.number(p, "x", 1), True, "must be a number"),
-        (lambda p: properties.number(p, "x", 1), "1", "must be a number, got '1'"),
-        (lambda p: properties.integer(p, "x", 1, 0, 9), 2.5, "whole number"),
+        (lambda p: properties.number(p, "x", 1, Range(0, 2)), 3, "0 .. 2, got 3"),
+        (lambda p: properties.number(p, "x", 1, ANY), math.nan, "nan"),
+        (lambda p: properties.number(p, "x", 1, ANY), True, "must be a number"),
+        (lambda p: properties.number(p, "x", 1, ANY), "1", "must be a number, got '1'"),
+        (lambda p: properties.integer(p, "x", 1, Range(0, 9)), 2.5, "whole number"),
         (lambda p: properties.boolean(p, "x", True), 1, "true or false"),
         (lambda p: properties.choice(p, "x", "a", ("a", "b")), "c", "one of a, b, got 'c'"),
         (lambda p: properties.text(p, "x"), None, "a string, got nothing"),

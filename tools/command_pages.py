@@ -55,7 +55,7 @@ def _tables(command: Any, context: Any) -> Iterator[str]:
             yield table((kind, "meaning", "default"), found)
 
 
-_RANGE = re.compile(r"(?:[-\w.]+<=?)?x(?:[<>]=?[-\w.]+)?")
+_RANGE = re.compile(r"(?:[-+\w.]+<=?)?x(?:[<>]=?[-+\w.]+)?")
 
 
 def split_default(text: str) -> tuple[str, str]:

@@ -9,7 +9,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, plain
+from nerg_mi.maths.arrays import check_coordinates
 
 Floats: TypeAlias = NDArray[np.float32]
 
@@ -18,16 +19,12 @@ def points(values: ArrayLike, name: str) -> Floats:
     """``values`` as (N, 3) float32; one point (3,) is one row. Raises `NergError`, which calls it ``name``."""
     try:
         array = np.asarray(values, np.float64)
-    except OverflowError as error:
-        raise NergError(f"{name} must be finite in single precision, and a number in them is not") from error
-    except (TypeError, ValueError) as error:
-        raise NergError(f"{name} must be numbers x, y, z, or rows of them, got {values!r}") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise NergError(f"{name} must be numbers x, y, z, or rows of them, got {plain(repr(values), 60)}") from error
     array = array[None] if array.shape == (3,) else array
     if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
         raise NergError(f"{name} must have the shape (3,) or (N, 3), got {array.shape}")
-    if not np.all(np.abs(array) < np.finfo(np.float32).max):
-        row = int(np.flatnonzero(~(np.abs(array) < np.finfo(np.float32).max).all(axis=1))[0])
-        raise NergError(f"{name} must be finite in single precision, and row {row} is {array[row].tolist()}")
+    check_coordinates(array, name)
     return np.ascontiguousarray(array, np.float32)
 
 

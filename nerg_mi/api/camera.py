@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import FIELDS_OF_VIEW, Range, check_number
 
 from .arrays import points
 
@@ -47,10 +47,9 @@ class Camera:
             raise NergError(f"a camera at {self.origin} cannot look at the same point; give it another target")
         if np.linalg.norm(np.cross(ahead, self.up)) <= 1e-6 * np.linalg.norm(ahead) * np.linalg.norm(self.up):
             raise NergError(f"a camera cannot look along its own up {self.up}; give it another up")
-        if not (isinstance(self.fov, (int, float)) and math.isfinite(self.fov) and 0 < self.fov < 180):
-            raise NergError(f"the fov of a camera must lie between 0 and 180 degrees, got {self.fov!r}")
-        if not all(isinstance(n, (int, np.integer)) and n >= 1 for n in (self.width, self.height)):
-            raise NergError(f"a picture has at least 1 x 1 pixels, got {self.width!r} x {self.height!r}")
+        check_number(self.fov, FIELDS_OF_VIEW, "the fov of a camera")
+        for name in ("width", "height"):
+            check_number(getattr(self, name), Range(1, PIXELS), f"the {name} of a picture", whole=True)
         if self.width * self.height > PIXELS:
             raise NergError(f"a picture has at most {PIXELS:,} pixels, got {self.width:,} x {self.height:,}")
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from nerg_mi.errors import MissingFile, NergError
 from nerg_mi.files.bounded import plain
+from nerg_mi.ranges import LENGTHS, check_number
 
 from .colmap import read_colmap
 from .images import split_holdout
@@ -154,8 +155,7 @@ def _test_file(source: Path) -> Path | None:
 
 def _similarity(posed: PosedImages, coordinates: str, scale: float) -> np.ndarray:
     """From the file's coordinates to those asked for."""
-    if not (np.isfinite(scale) and scale > 0):
-        raise NergError(f"scale must be a positive number, got {scale}")
+    check_number(scale, LENGTHS, "scale")
     original = np.eye(4) if posed.original is None else posed.original
     if coordinates == "file":
         to = np.eye(4)

@@ -13,6 +13,8 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import typer
 
+from nerg_mi.ranges import RANGE
+
 
 def takes(kind: type, *leave_out: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Decorator of a command with a parameter of the dataclass ``kind``: in its place the command line has one option
@@ -56,7 +58,11 @@ def _parameter(field: Field, kind: type) -> inspect.Parameter:
         hint, default = list[get_args(hint)[0]] | None, None
     if hint is bool and default is False and not names:
         names = ("--" + field.name.replace("_", "-"),)
-    info = typer.Option(*names, help=about["help"], **about["more"])
+    more = dict(about["more"])
+    if about[RANGE] is not None and about["parse"] is None and get_origin(hint) is not list:
+        # Shown in the help; the dataclass checks it, as for Python.
+        more |= {"min": about[RANGE].low, "max": about[RANGE].high}
+    info = typer.Option(*names, help=about["help"], **more)
     return inspect.Parameter(
         field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[hint, info]
     )

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import DECADES
 
 from .colors import color_values, find_colors
 from .hatching import hatch
 from .tonemap import LUMINANCE, srgb
 
-MOST_DECADES = 30.0
+MOST_DECADES = float(DECADES.high)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 
 from nerg_mi.errors import NergError, plain
 from nerg_mi.files.bounded import read_json
+from nerg_mi.ranges import FARTHEST
 
 BYTES = 4 << 20
 """A file of areas may have so many bytes."""

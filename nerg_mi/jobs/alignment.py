@@ -32,7 +32,7 @@ from nerg_mi.training.geometry import places
 from nerg_mi.training.geometry.places import GazePlace
 
 from .backend import select_backend
-from .options import parse_numbers
+from .options import parse_point
 from .options.alignment import AlignOptions
 from .reporter import SILENT, Reporter
 
@@ -131,8 +131,6 @@ def _target(options: AlignOptions, kind: str, reporter: Reporter) -> tuple[GazeP
     given = [n for n in ("field", "scene", "surface") if getattr(options, n) is not None]
     if len(given) > 1:
         raise NergError(f"the place is one: give --{' or --'.join(given)}")
-    if options.scale is not None and not (np.isfinite(options.scale) and options.scale > 0):
-        raise NergError(f"--scale is a positive number, got {options.scale}")
     up = "z" if options.up is None and kind == Tracking.kind and options.start is None else options.up
     if up is not None and options.up is None:
         reporter.message("z is taken for up in the place; say --up where it is another axis")
@@ -169,9 +167,9 @@ def _turn(up: str | None) -> np.ndarray:
     turn = np.eye(4)
     if up is None:
         return turn
-    axis = np.array(_AXES.get(up.strip().lower()) or parse_numbers(up, "--up"), float)
-    length = np.linalg.norm(axis) if axis.shape == (3,) else 0.0
-    if not (np.isfinite(length) and length > 0):
+    axis = np.array(_AXES.get(up.strip().lower()) or parse_point(up, "--up"), float)
+    length = np.linalg.norm(axis)
+    if length == 0:
         raise NergError(f"--up is an axis (x, y, z, -x, -y, -z) or three numbers x,y,z that are not all 0, got {up!r}")
     turn[:3, :3] = turn_to_z(axis / length)
     return turn

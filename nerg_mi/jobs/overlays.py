@@ -13,7 +13,6 @@ import numpy as np
 from nerg_mi.errors import NergError, mitsuba_says
 from nerg_mi.figures import saving
 from nerg_mi.figures.colors import find_colors
-from nerg_mi.figures.overlay import MOST_DECADES
 from nerg_mi.figures.overlays import Layers, Limits, Overlay, Style, find_overlay, shared_limits
 from nerg_mi.files.atomic import write_bytes
 from nerg_mi.interruption import Interruption
@@ -67,10 +66,6 @@ def check_overlay(output: Path, options: PictureOptions) -> None:
             f'an overlay is a picture to look at, and "{output}" is none: let its name end in '
             f"{' or '.join(OVERLAY_FORMATS)} (an .exr holds the quantity itself, if the scene's aovs name it)"
         )
-    if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
-        raise NergError(f"--top must be positive, got {options.top}")
-    if not 0 <= options.decades <= MOST_DECADES:
-        raise NergError(f"--decades must be from 0 (a linear scale) to {MOST_DECADES:.0f}, got {options.decades}")
     if options.cmap is not None:
         find_colors(options.cmap)
 

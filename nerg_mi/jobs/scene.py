@@ -203,8 +203,6 @@ def _check_options(options: SceneOptions) -> None:
         raise NergError("a camera is given by --from and --to, by --photo or by --own; give one of these")
     if options.times is not None and len(options.times) != 2:
         raise NergError(f"--times is two times, A,B, got {len(options.times)}")
-    if options.fov is not None and not 0 < options.fov < 180:
-        raise NergError(f"--fov must lie between 0 and 180 degrees, got {options.fov:g}")
 
 
 def _with_hits(

@@ -33,7 +33,7 @@ from .counting.setting import Setting, setting_of
 from .counting.tracked import Counting, EyePicker, Eyes, blocks_of, cohort_names, count_block, ray_count
 from .counting.trust import add_trust, tell_places, tell_support
 from .counting.what_if import what_if_rows
-from .options import parse_numbers
+from .options import parse_point
 from .options.statistics import StatisticsOptions
 from .parts import Parts
 from .reporter import SILENT, Reporter
@@ -258,10 +258,7 @@ class _Work:
         """Observers who were not tracked."""
         o = self.options
         if o.observers:
-            given = [parse_numbers(text, "--observer") for text in o.observers]
-            if any(len(p) != 3 for p in given):
-                raise NergError("--observer is three numbers, x,y,z")
-            return places_of(np.array(given, float))
+            return places_of(np.array([parse_point(text, "--observer") for text in o.observers]))
         if self.around.observer is not None:
             return places_of(self.around.observer[None])
         found = look_around(self.around, o.height, o.step, o.floor)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import FARTHEST
 
 from .io import COLUMNS, read_rays_file, write_rays_file
 
@@ -27,8 +28,9 @@ FRAME = {"units": "m", "up": "z", "handedness": "right"}
 class Rays:
     """N rays of attention, checked on construction.
 
-    Raises `NergError` naming the first offending ray for NaN, zero or non-unit directions, non-finite origins or times,
-    and persons out of range; ``ValueError`` for arrays of different lengths.
+    Raises `NergError` naming the first offending ray for NaN, zero or non-unit directions, origins that are not finite,
+    origins and hit points beyond `FARTHEST`, non-finite times, and persons out of range; ``ValueError`` for arrays of
+    different lengths.
 
     >>> import nerg_mi as nerg
     >>> eye, ahead = [[1.0, 1.0, 1.6], [1.0, 1.0, 1.6]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
@@ -90,8 +92,11 @@ class Rays:
         _refuse(~np.isfinite(length), "a direction that is not finite", "drop it before building Rays")
         _refuse(length == 0, "a zero direction", "drop it before building Rays")
         _refuse(np.abs(length - 1) > 1e-4, "a direction that is not of unit length", "divide it by its length")
-        nowhere = np.asarray(~np.isfinite(self.origin).all(axis=1))
-        _refuse(nowhere, "an origin that is not finite", "drop it before building Rays")
+        nowhere = np.asarray(~(np.abs(self.origin) <= FARTHEST).all(axis=1))
+        _refuse(nowhere, f"an origin that is not finite or beyond {FARTHEST:g} m", "drop it before building Rays")
+        if self.hit is not None:
+            far = np.asarray((np.abs(self.hit) > FARTHEST).any(axis=1))
+            _refuse(far, f"a hit point beyond {FARTHEST:g} m", "drop it, or make it NaN, which is unknown")
         _refuse(~np.isfinite(self.t), "a time that is not finite", "drop it before building Rays")
         # Before they become 32 bits wide, in which numbers that are too large would be those of somebody else.
         _refuse(~((self.person >= 0) & (self.person < len(self.persons))), "an unknown person", "extend persons")

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import SECONDS, check_number
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,7 @@ class LookRules:
     def __post_init__(self) -> None:
         for name in ("gap", "pause", "merge", "least"):
             value = getattr(self, name)
-            if not 0 <= value < 1e9:
-                raise NergError(f"--{name} is a time in seconds, got {value:g}")
+            check_number(value, SECONDS, f"--{name}")
         if not self.pause >= self.gap > 0:
             raise NergError(f"--pause ({self.pause:g} s) is at least --gap ({self.gap:g} s), which is more than 0")
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import LENGTHS, check_number
 
 from .landing import Thing
 
@@ -91,8 +92,7 @@ class CellsInView:
     """Bytes of what is known of cells."""
 
     def __init__(self, targets: Targets, depth: Depth, cell: float, margin: float):
-        if not 0 < cell < 1e6:
-            raise NergError(f"--cell is an edge in metres, got {cell:g}")
+        check_number(cell, LENGTHS, "--cell")
         self._targets, self._depth, self._cell, self._margin = targets, depth, cell, margin
         self._known: dict[tuple[int, int, int], np.ndarray] = {}
         self.traced = 0

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.maths.arrays import check_coordinates
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +97,7 @@ def weld(vertices: np.ndarray, faces: np.ndarray, what: str = "the mesh") -> tup
     # A zero may be negative, and is the same place.
     vertices = np.ascontiguousarray(vertices, np.float64).reshape(-1, 3) + 0.0
     faces = np.asarray(faces, np.int64).reshape(-1, 3)
-    if not np.isfinite(vertices).all():
-        raise NergError(f"{what} has vertices that are not finite; export it again")
+    check_coordinates(vertices, f"the vertices of {what}")
     kept = np.unique(faces)
     one, number = _unique_rows(vertices[kept])
     place = vertices[kept[one]]

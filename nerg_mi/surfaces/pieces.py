@@ -13,10 +13,15 @@ from functools import cached_property
 
 import numpy as np
 
+from nerg_mi.errors import NergError
+
 from .mesh import Mesh
 
 LEVELS = 40
 """A face is cut in four so many times at most: to 10^-12 of its size."""
+
+MOST = 1 << 25
+"""Pieces of a mesh at most, as one observer sees it: five gigabytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +66,7 @@ def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float, faces: slice = slice(No
     ``angle`` (radian).
 
     An edge counts as seen from the nearest point of the ball around its piece; a piece that holds the eye itself is cut
-    `LEVELS` times.
+    `LEVELS` times. Raises `NergError` for more than `MOST` pieces.
     """
     relative = mesh.corners[faces] - eye
     number = np.arange(len(mesh.faces))[faces]
@@ -72,12 +77,18 @@ def pieces_of(mesh: Mesh, eye: np.ndarray, angle: float, faces: slice = slice(No
         middle = here.mean(axis=1)
         radius = np.sqrt(_square(here - middle[:, None]).max(axis=1))
         edge = np.sqrt(_square(here - here[:, [2, 0, 1]]).max(axis=1))
-        small = edge <= angle * np.maximum(np.sqrt(_square(middle)) - radius, 0)
+        # Not "<=": what is not finite is cut no further.
+        small = ~(edge > angle * np.maximum(np.sqrt(_square(middle)) - radius, 0))
         if level == LEVELS:
             small[:] = True
         found.append(left.part(small))
         if small.all():
             break
+        if sum(map(len, found)) + 4 * np.count_nonzero(~small) > MOST:
+            raise NergError(
+                f"the observer at {','.join(f'{v:g}' for v in eye)} sees the surfaces in more than {MOST:,} pieces of "
+                f"{np.degrees(angle):g} degrees; give a larger --angle"
+            )
         left = left.part(~small).quartered()
     joined = (np.concatenate([getattr(part, name) for part in found]) for name in ("face", "cut", "relative"))
     return Pieces(eye, *joined)

@@ -23,7 +23,9 @@ def test01_points_of_every_shape():
         (np.zeros((0, 3)), r"shape .* got \(0, 3\)"),
         ("here", "eyes must be numbers x, y, z"),
         ([(0, 0, 0), (0, np.nan, 0)], r"row 1 is \[0.0, nan, 0.0\]"),
-        ([(0, 0, 0), (0, 0, 1e39)], "finite in single precision, and row 1"),
+        ([(0, 0, 0), (0, 0, 1.1e7)], "coordinates from -1e.07 to 1e.07, and row 1"),
+        ((1e308, 0, 0), "row 0 is"),
+        ((10**400, 0, 0), "eyes must be numbers x, y, z"),
         ([(0, 0), (0, 0, 1)], "eyes must be numbers"),
     ],
 )

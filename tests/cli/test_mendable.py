@@ -38,7 +38,6 @@ def ended(capsys, *arguments) -> tuple[int, list[str]]:
         (["--recipe", "small", "--activation", "sine"], "give other values by --variant and --activation"),
         (["--recipe", "large"], "the recipe must be one of default, small, paper"),
         (["--recipe", "small", "--loss", "none"], "the loss must be one of"),
-        (["--steps", "-1"], "must last longer than 0"),
         (["--mode", "scalar_rgb"], 'not "scalar_rgb"'),
         (["--mode", "llvm_rgb"], 'there is no variant "llvm_rgb"'),
         (["--ensemble", "1"], "at least two members"),

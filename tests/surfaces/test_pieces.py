@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from nerg_mi.errors import NergError
 from nerg_mi.surfaces.pieces import pieces_of, solid_angles
 from tests.surfaces.meshes import box, joined
+
+ROOM = joined(box((0, 0, 0), (1.0, 1.0, 1.0)))
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
@@ -33,3 +36,15 @@ def test03_an_observer_on_a_face_ends():
     sheet = joined((np.array([(-1.0, -1, 0), (2, -1, 0), (-1, 2, 0)]), np.array([(0, 1, 2)])))
     found = pieces_of(sheet, np.zeros(3), 0.5)
     assert found.solid_angle.sum() == 0 and len(found.face) < 20_000
+
+
+@pytest.mark.parametrize("far", [1e155, 1e200, 1e308, np.inf, np.nan])
+def test04_an_observer_beyond_what_can_be_squared_ends(far):
+    with np.errstate(all="ignore"):
+        assert len(pieces_of(ROOM, np.array([far, 0, 0]), 0.03).face) == len(ROOM.faces)
+
+
+def test05_pieces_are_counted_before_they_are_cut(monkeypatch):
+    monkeypatch.setattr("nerg_mi.surfaces.pieces.MOST", 1000)
+    with pytest.raises(NergError, match="sees the surfaces in more than 1,000 pieces of .* larger --angle"):
+        pieces_of(ROOM, np.full(3, 0.5), 0.02)

@@ -29,8 +29,6 @@ def source_of(options: BakeOptions, rays: Rays | None, with_gaze: bool = False) 
         raise NergError("--observer and --path look with a gaze field; give --gaze, or leave them out")
     if source == "field" and (options.unit == "seconds" or options.halves):
         raise NergError("--unit seconds and --halves are of rays, whose time is known; add --from rays")
-    if not (np.isfinite(options.smooth) and options.smooth >= 0):
-        raise NergError(f"--smooth is a length in metres, got {options.smooth:g}")
     return source
 
 

@@ -13,11 +13,12 @@ from nerg_mi.formats.checkpoint import read_metadata
 from nerg_mi.jobs.gaze_places import align_of_training
 from nerg_mi.jobs.options.bake import BakeOptions
 from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.maths.arrays import check_coordinates
 from nerg_mi.maths.similarity import Similarity
+from nerg_mi.ranges import VALUES
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.readers.parsing.tables import iterate_table, table_columns
-from nerg_mi.surfaces.cones import WIDEST
 from nerg_mi.surfaces.population import WEIGHTS, Crowd, ray_weights, thin
 from nerg_mi.surfaces.ray_source import TrackedRays
 
@@ -38,12 +39,10 @@ def read_path(path: Path) -> Crowd:
     rows = np.concatenate(blocks) if blocks else np.zeros((0, 3 + weighted))
     if not 0 < len(rows) <= POSITIONS:
         raise NergError(f'the path "{path}" has {len(rows):,} positions; give 1 to {POSITIONS:,}')
-    if not np.isfinite(rows).all():
-        line = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0]) + 1
-        raise NergError(f'the path "{path}" has a position that is no number, the {line:,}th; correct it')
+    check_coordinates(rows[:, :3], f'the positions of the path "{path}"')
     weights = rows[:, 3] if weighted else np.ones(len(rows))
-    if (weights < 0).any() or not weights.sum() > 0:
-        raise NergError(f'the path "{path}" has weights that are negative, or all 0; correct them')
+    if not ((weights >= 0) & (weights <= VALUES.high)).all() or not weights.sum() > 0:
+        raise NergError(f'the path "{path}" has weights that are no numbers, negative, or all 0; correct them')
     return Crowd(rows[:, :3], weights / weights.sum())
 
 
@@ -64,7 +63,7 @@ def find_crowd(options: BakeOptions, rays: Rays | None, align: Similarity, repor
     if len(given) > 1:
         raise NergError("--observer is one place and --path are many; give one of them")
     if options.observer is not None:
-        if len(options.observer) != 3 or not np.isfinite(options.observer).all():
+        if len(options.observer) != 3:
             raise NergError(f"--observer is three numbers x,y,z, got {options.observer}")
         return Crowd(np.array([options.observer], np.float64), np.ones(1))
     if options.path is not None:
@@ -96,10 +95,6 @@ def check_values(options: BakeOptions) -> None:
     """Raise `NergError` for weights, a cone or a scale of colours that are none."""
     if options.weights not in WEIGHTS:
         raise NergError(f'--weights is {", ".join(WEIGHTS)}, got "{options.weights}"')
-    if options.cone is not None and not 0 <= options.cone <= WIDEST:
-        raise NergError(f"--cone is 0 to {WIDEST:g} degrees, got {options.cone:g}")
-    if options.top is not None and not (np.isfinite(options.top) and options.top > 0):
-        raise NergError(f"--top must be positive, got {options.top}")
     find_colors(options.cmap)
 
 

@@ -72,8 +72,6 @@ def cut(receivers: Receivers, longest: float | None, scale: float) -> Refined:
     ``scale``: scene units a metre."""
     mesh = receivers.mesh
     if longest is not None:
-        if not (np.isfinite(longest) and longest > 0):
-            raise NergError(f"--detail is a length in metres, got {longest:g}")
         return refine(mesh, longest * scale)
     # Equilateral triangles of such edges would be so many; halving makes triangles up to four times smaller.
     return refine(mesh, float(np.sqrt(4 * mesh.area.sum() / (np.sqrt(3) * FACES)) * 1.5))

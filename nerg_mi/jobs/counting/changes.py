@@ -26,6 +26,7 @@ from nerg_mi.files.bounded import read_json
 from nerg_mi.formats.areas.kinds import Area, Areas, Group, SceneShape
 from nerg_mi.formats.meshes import read_mesh_file
 from nerg_mi.formats.regions import Entry, Region, check_name, is_number, parse_box
+from nerg_mi.ranges import COORDINATES
 from nerg_mi.surfaces.target import mitsuba_mesh
 
 from .things import scene_of, shape_named, shapes_of
@@ -149,8 +150,8 @@ def _word(given: Any, what: str) -> str:
 
 def _three(given: Any, what: str) -> tuple[float, float, float]:
     numbers = isinstance(given, list) and len(given) == 3 and all(is_number(v) for v in given)
-    if not numbers or not all(abs(v) < 1e6 for v in given):
-        raise NergError(f'"{what}" is three numbers x, y, z')
+    if not numbers or not all(v in COORDINATES for v in given):
+        raise NergError(f'"{what}" is three numbers x, y, z of {COORDINATES}')
     return float(given[0]), float(given[1]), float(given[2])
 
 

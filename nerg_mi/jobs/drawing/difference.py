@@ -13,17 +13,18 @@ from nerg_mi.figures.colors import find_colors
 from nerg_mi.figures.plots import difference_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.ranges import VALUES, Checked
 
 from .files import read_stored, shared_note
 from .kind import Drawing, Kind
 
 
 @dataclass(frozen=True, kw_only=True)
-class DifferenceOptions:
+class DifferenceOptions(Checked):
     """How a difference is drawn."""
 
     channel: str = option("gaze", "Channel of both files.")
-    top: float | None = option(None, "Both ends of the scale.  [default: the 99.5th percentile]")
+    top: float | None = option(None, "Both ends of the scale.  [default: the 99.5th percentile]", within=VALUES)
     cmap: str = option("RdBu_r", "Colour map: RdBu_r, PuOr_r, BrBG_r, PRGn_r.")
 
 

@@ -12,6 +12,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.figures.floor_figures import Sight, Walk, floor_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.ranges import COORDINATES, Checked, Range
 from nerg_mi.rays.dataset.opening import load_rays
 from nerg_mi.rays.rays import Rays
 from nerg_mi.rays.sessions import find_sessions
@@ -25,17 +26,17 @@ _REACH = 1.2  # metres that a field of view, or a ray whose hit is not known, is
 
 
 @dataclass(frozen=True, kw_only=True)
-class FloorOptions:
+class FloorOptions(Checked):
     """What a floor plan shows."""
 
     scene: Path | None = option(None, "Scene file of the place, whose walls and furniture are drawn.")
     defaults: Mapping[str, str] | None = option(None, "Values for $KEYs and <default>s of the scene, by name.")
-    cut: float = option(1.2, "Height at which the place is cut, metres above its floor.")
-    floor: float = option(0.0, "Height of the floor (z).")
+    cut: float = option(1.2, "Height at which the place is cut, metres above its floor.", within=COORDINATES)
+    floor: float = option(0.0, "Height of the floor (z).", within=COORDINATES)
     paths: bool = option(True, "Draw where people walked.")
-    rays: int = option(0, "Draw so many rays, from the eye to what was looked at.", min=0, max=20000)
-    views: int = option(0, "Draw so many fields of view of each person.", min=0, max=1000)
-    fov: float = option(60.0, "Degrees that a field of view is wide.", min=1, max=180)
+    rays: int = option(0, "Draw so many rays, from the eye to what was looked at.", within=Range(0, 20000))
+    views: int = option(0, "Draw so many fields of view of each person.", within=Range(0, 1000))
+    fov: float = option(60.0, "Degrees that a field of view is wide.", within=Range(1, 180))
     people: str | None = option(None, "Draw these people alone: names with commas between them.")
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"

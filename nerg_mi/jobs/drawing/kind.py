@@ -7,14 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from nerg_mi.errors import NergError
 from nerg_mi.figures.colors import find_colors
-from nerg_mi.figures.overlay import MOST_DECADES
 from nerg_mi.figures.overlays import Overlay, Style
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.ranges import DECADES, SEEDS, SPP, VALUES, Checked, Range
 
 
 @dataclass(frozen=True)
@@ -42,19 +40,17 @@ class Kind:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ColorOptions:
+class ColorOptions(Checked):
     """The colours of a figure's values."""
 
-    top: float | None = option(None, "Upper end of the scale, in its unit.  [default: the 99.5th percentile]")
+    top: float | None = option(
+        None, "Upper end of the scale, in its unit.  [default: the 99.5th percentile]", within=VALUES
+    )
     cmap: str | None = option(None, "Colour map: inferno, magma, plasma, viridis, cividis.  [default: inferno]")
-    decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.")
+    decades: float = option(0.0, "Powers of ten that the scale spans; 0: a linear scale.", within=DECADES)
 
     def style(self, title: str | None = None) -> Style:
         """How overlays are drawn by these options. Raises `NergError` for what cannot be drawn."""
-        if self.top is not None and not (np.isfinite(self.top) and self.top > 0):
-            raise NergError(f"--top must be positive, got {self.top}")
-        if not 0 <= self.decades <= MOST_DECADES:
-            raise NergError(f"--decades must be from 0 (a linear scale) to {MOST_DECADES:.0f}, got {self.decades}")
         if self.cmap is not None:
             find_colors(self.cmap)
         return Style(self.cmap, self.decades, False, title)
@@ -76,8 +72,8 @@ class SceneOptions(ScaleOptions):
     """How a scene file is rendered for a figure."""
 
     defaults: Mapping[str, str] | None = option(None, "Values for $KEYs and <default>s of the scene, by name.")
-    spp: int = option(0, "Samples a pixel; 0: as the scene says.", min=0)
-    seed: int = option(0, "Seed of the random numbers.", min=0)
+    spp: int = option(0, "Samples a pixel; 0: as the scene says.", within=Range(0, SPP.high))
+    seed: int = option(0, "Seed of the random numbers.", within=SEEDS)
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
     )

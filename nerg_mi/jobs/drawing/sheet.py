@@ -12,6 +12,7 @@ from nerg_mi.figures.contact_sheet import contact_sheet, shrink
 from nerg_mi.figures.overlay import Heat, overlay, top_of
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.ranges import Range
 
 from .files import EXR, read_stored, shared_note
 from .kind import Drawing, Kind, ScaleOptions
@@ -26,8 +27,8 @@ class SheetOptions(ScaleOptions):
     overlay: str | None = option(
         None, "Lay this channel of .exr files over their colour, with one scale: gaze, kde, gaze_std, ..."
     )
-    columns: int | None = option(None, "Pictures in a row.  [default: about as many as rows]", min=1)
-    width: int = option(480, "Pixels that a picture is wide at most; larger ones are shrunk.", min=16, max=4096)
+    columns: int | None = option(None, "Pictures in a row.  [default: about as many as rows]", within=Range(1, 1000))
+    width: int = option(480, "Pixels that a picture is wide at most; larger ones are shrunk.", within=Range(16, 4096))
 
 
 def draw(files: Sequence[Path], options: SheetOptions, reporter: Reporter) -> Drawing:

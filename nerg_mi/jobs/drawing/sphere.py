@@ -14,6 +14,7 @@ from nerg_mi.figures.projections import find_projection
 from nerg_mi.figures.sphere_figures import sphere_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.ranges import Range
 from nerg_mi.transport.panorama import pixel_solid_angles
 
 from .kind import Drawing, Kind, SceneOptions, need_scale
@@ -23,9 +24,11 @@ from .kind import Drawing, Kind, SceneOptions, need_scale
 class SphereOptions(SceneOptions):
     """How an observer's sphere is drawn."""
 
-    sensor: int = option(0, "Where no observer is: whose place it is, counted from 0.", "-s", "--sensor")
+    sensor: int = option(
+        0, "Where no observer is: whose place it is, counted from 0.", "-s", "--sensor", within=Range(0, 65535)
+    )
     projection: str = option("mollweide", "Projection: mollweide (equal areas) or equirectangular.")
-    width: int = option(800, "Width of the map in pixels; it is half as high.", min=64, max=5792)
+    width: int = option(800, "Width of the map in pixels; it is half as high.", within=Range(64, 5792))
 
 
 def draw(files: Sequence[Path], options: SphereOptions, reporter: Reporter) -> Drawing:

@@ -20,6 +20,7 @@ from nerg_mi.jobs.options import option, parse_numbers
 from nerg_mi.jobs.reporter import Reporter
 from nerg_mi.jobs.scenes.cameras import given_point
 from nerg_mi.maths.arrays import vector_of
+from nerg_mi.ranges import COORDINATES, Range
 from nerg_mi.rendering.pictures import activate
 from nerg_mi.surfaces.mesh import Mesh
 from nerg_mi.surfaces.target import mitsuba_mesh
@@ -36,16 +37,23 @@ class SurfaceOptions(ColorOptions):
     """From where a baked surface is drawn; positions in its own units."""
 
     camera: tuple[float, ...] | None = option(
-        None, "Position of the camera, x,y,z.  [default: where all of it is seen from above]", parse=parse_numbers
+        None,
+        "Position of the camera, x,y,z.  [default: where all of it is seen from above]",
+        parse=parse_numbers,
+        within=COORDINATES,
     )
     target: tuple[float, ...] | None = option(
-        None, "What the camera looks at, x,y,z.  [default: the middle]", parse=parse_numbers
+        None, "What the camera looks at, x,y,z.  [default: the middle]", parse=parse_numbers, within=COORDINATES
     )
-    up: tuple[float, ...] | None = option(None, "Which way is up, x,y,z.  [default: 0,0,1]", parse=parse_numbers)
-    below: float | None = option(None, "Leave out what is higher than this along up: a ceiling, for instance.")
-    fov: float = option(50.0, "Degrees that the picture is wide.", min=1.0, max=170.0)
-    width: int = option(960, "Width of the picture in pixels.", min=16, max=4096)
-    height: int = option(640, "Height of the picture in pixels.", min=16, max=4096)
+    up: tuple[float, ...] | None = option(
+        None, "Which way is up, x,y,z.  [default: 0,0,1]", parse=parse_numbers, within=COORDINATES
+    )
+    below: float | None = option(
+        None, "Leave out what is higher than this along up: a ceiling, for instance.", within=COORDINATES
+    )
+    fov: float = option(50.0, "Degrees that the picture is wide.", within=Range(1.0, 170.0))
+    width: int = option(960, "Width of the picture in pixels.", within=Range(16, 4096))
+    height: int = option(640, "Height of the picture in pixels.", within=Range(16, 4096))
     title: str | None = option(None, "Title.  [default: what its values are]")
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"

@@ -15,6 +15,7 @@ from nerg_mi.figures.overlays import find_overlay, shared_limits
 from nerg_mi.figures.plots import occlusion_figure
 from nerg_mi.jobs.options import option
 from nerg_mi.jobs.reporter import Reporter
+from nerg_mi.ranges import Range
 from nerg_mi.rendering.projection import pixel_of
 
 from .kind import Drawing, Kind, SceneOptions, need_scale
@@ -24,7 +25,7 @@ from .kind import Drawing, Kind, SceneOptions, need_scale
 class TriptychOptions(SceneOptions):
     """How occlusion is shown."""
 
-    sensor: int = option(0, "The other camera, counted from 0.", "-s", "--sensor")
+    sensor: int = option(0, "The other camera, counted from 0.", "-s", "--sensor", within=Range(0, 65535))
 
 
 def draw(files: Sequence[Path], options: TriptychOptions, reporter: Reporter) -> Drawing:

@@ -10,17 +10,37 @@ from collections.abc import Callable
 from dataclasses import field
 from typing import Any
 
-from nerg_mi.errors import NergError
+from nerg_mi.errors import NergError, plain
+from nerg_mi.ranges import COORDINATES, FLAG, RANGE, Range, check_number
 
 
-def option(default: Any, help: str, *names: str, parse: Callable[[str, str], Any] | None = None, **more: Any) -> Any:
-    """A field of a dataclass of options.
+def option(
+    default: Any,
+    help: str,
+    *names: str,
+    within: Range | None = None,
+    parse: Callable[[str, str], Any] | None = None,
+    **more: Any,
+) -> Any:
+    """A field of a dataclass of options, which derives from `nerg_mi.ranges.Checked`.
 
     ``default``: its value where none is given; ``help``: what it means, in one line. ``names``: how the command spells
-    it ("-s", "--seed"), where that is not ``--`` and the field's name; ``parse(text, flag)``: its value from a word of
-    the command line, where the type alone does not tell; ``more``: what else ``typer.Option`` takes, such as ``min``.
+    it ("-s", "--seed"), where that is not ``--`` and the field's name; ``within``: the range of its numbers, which each
+    option that has any needs; ``parse(text, flag)``: its value from a word of the command line, where the type alone
+    does not tell; ``more``: what else ``typer.Option`` takes, such as ``metavar``.
     """
-    return field(default=default, metadata={"help": help, "names": names, "parse": parse, "more": more})
+    about = {"help": help, "names": names, "parse": parse, "more": more}
+    return field(default=default, metadata={**about, RANGE: within, FLAG: names[-1] if names else ""})
+
+
+def parse_point(text: str, flag: str) -> tuple[float, ...]:
+    """Three coordinates with commas between them. Raises `NergError` naming ``flag`` for other texts."""
+    numbers = parse_numbers(text, flag)
+    if len(numbers) != 3:
+        raise NergError(f"{flag} is three numbers x,y,z, got {plain(text, 60)!r}")
+    for number in numbers:
+        check_number(number, COORDINATES, flag)
+    return numbers
 
 
 def parse_numbers(text: str, flag: str) -> tuple[float, ...]:

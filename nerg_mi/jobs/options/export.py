@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nerg_mi.ranges import VALUES, Checked, Range
+
 from . import option
 
 
 @dataclass(frozen=True, kw_only=True)
-class LatticeOptions:
+class LatticeOptions(Checked):
     """Where a radiance field is evaluated."""
 
-    resolution: int = option(256, "Lattice cells along the longest edge of the field's box.", min=2, max=2048)
+    resolution: int = option(256, "Lattice cells along the longest edge of the field's box.", within=Range(2, 2048))
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
 
 
@@ -21,7 +23,9 @@ class SurfaceOptions(LatticeOptions):
     """Where the surface of a field lies."""
 
     density: float | None = option(
-        None, "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]"
+        None,
+        "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]",
+        within=VALUES,
     )
     up: str = option("z", "Up axis of the field, for .glb: z or y.")
 
@@ -30,8 +34,8 @@ class SurfaceOptions(LatticeOptions):
 class MeshOptions(SurfaceOptions):
     """What is left out of a mesh, and what is added to it."""
 
-    fill: int = option(1, "Close holes of up to twice so many cells; 0: none.", min=0)
-    keep: float = option(0.001, "Drop pieces with less than this share of the largest one's area.", min=0, max=1)
+    fill: int = option(1, "Close holes of up to twice so many cells; 0: none.", within=Range(0, 2048))
+    keep: float = option(0.001, "Drop pieces with less than this share of the largest one's area.", within=Range(0, 1))
     unseen: bool = option(False, "Keep the backs and insides that training never looked at.")
 
 
@@ -39,7 +43,7 @@ class MeshOptions(SurfaceOptions):
 class PointOptions(SurfaceOptions):
     """Which points of a surface are written."""
 
-    count: int | None = option(None, "Points at most.  [default: all]", min=1)
+    count: int | None = option(None, "Points at most.  [default: all]", within=Range(1, 10**9))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +51,9 @@ class SplatOptions(LatticeOptions):
     """How many Gaussians a surface becomes, and where it lies."""
 
     density: float | None = option(
-        None, "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]"
+        None,
+        "Density, 1/unit, at which the surface lies.  [default: half of the light absorbed in a cell]",
+        within=VALUES,
     )
 
 
@@ -59,7 +65,7 @@ class VolumeOptions(LatticeOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TorchNgpOptions:
+class TorchNgpOptions(Checked):
     """How a field is read that becomes a torch-ngp checkpoint."""
 
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

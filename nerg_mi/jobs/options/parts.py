@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nerg_mi.ranges import Checked
+
 from . import option
 from .pictures import PictureOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartOptions:
+class PartOptions(Checked):
     """Where finished parts of a job are kept, and who makes them."""
 
     store: Path | None = option(

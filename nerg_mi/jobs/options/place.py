@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nerg_mi.ranges import Checked
+
 from . import option
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlaceOptions:
+class PlaceOptions(Checked):
     """Exactly one of them is given."""
 
     field: Path | None = option(None, "Radiance field, or Gaussian splats, in which people looked around.")

@@ -5,16 +5,36 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nerg_mi.ranges import (
+    COORDINATES,
+    LENGTHS,
+    LOSS_WEIGHTS,
+    MINUTES,
+    SECONDS,
+    SEEDS,
+    SPP,
+    STEPS,
+    THREADS,
+    Checked,
+    Range,
+)
+
 from . import option, parse_numbers
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhotoOptions:
+class PhotoOptions(Checked):
     """How a posed image set is read."""
 
-    holdout: int | None = option(None, "Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.")
-    width: int | None = option(None, "Width of the pictures in pixels. Default: as they are, or as it was trained.")
-    scale: float = option(1.0, "Multiply all lengths by this: what a unit of the data set measures, in metres.")
+    holdout: int | None = option(
+        None, "Hold out every so many frames, 0 none. Default: transforms_test.json, else 8.", within=Range(0, 10**6)
+    )
+    width: int | None = option(
+        None, "Width of the pictures in pixels. Default: as they are, or as it was trained.", within=Range(1, 65536)
+    )
+    scale: float = option(
+        1.0, "Multiply all lengths by this: what a unit of the data set measures, in metres.", within=LENGTHS
+    )
     coordinates: str = option(
         "file",
         "Of the field: file, upright (+z up), original (applied_transform undone), a dataparser_transforms.json.",
@@ -29,25 +49,34 @@ class RadianceOptions(PhotoOptions):
 
     size: str = option("small", "Size of the field: small, medium or paper.")
     deferred: bool = option(False, "Ask the colour network once a ray, not at every sample: faster frames.")
-    downscale: float | None = option(None, "In place of a width: divide the pictures' size by this.")
-    minutes: float | None = option(None, "Train for this long. Default: 5.")
-    steps: int | None = option(None, "Or: train for so many steps.")
+    downscale: float | None = option(
+        None, "In place of a width: divide the pictures' size by this.", within=Range(0.001, 1000)
+    )
+    minutes: float | None = option(None, "Train for this long. Default: 5.", within=MINUTES)
+    steps: int | None = option(None, "Or: train for so many steps.", within=STEPS)
     aabb: tuple[float, ...] | None = option(
-        None, "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field.", parse=parse_numbers
+        None,
+        "Bounds of what is seen: x0,y0,z0,x1,y1,z1, in the coordinates of the field.",
+        parse=parse_numbers,
+        within=COORDINATES,
     )
     unbounded: bool | None = option(
         None,
         "Whether anything is to be seen beyond those bounds. Default: as the points tell, and no without any.",
         "--unbounded/--bounded",
     )
-    seed: int = option(0, "Seed of the weights, rays and jitter.")
-    threads: int | None = option(None, "CPU threads. Default: all.")
+    seed: int = option(0, "Seed of the weights, rays and jitter.", within=SEEDS)
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
     half: bool = option(False, "Store the weights in fp16.")
-    depth_weight: float | None = option(None, "Weight of the depth's loss.")
-    distortion_weight: float = option(0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.")
+    depth_weight: float | None = option(None, "Weight of the depth's loss.", within=LOSS_WEIGHTS)
+    distortion_weight: float = option(
+        0.0, "Weight of mip-NeRF 360's distortion loss, against fog; 0 is none.", within=LOSS_WEIGHTS
+    )
     photo_colors: bool = option(True, "Learn the exposure and white balance of each photo.")
     resume: bool = option(False, "Go on with the interrupted run of this output.")
-    save_every: float = option(60.0, "Seconds between two states for --resume; 0: only one, when it ends early.")
+    save_every: float = option(
+        60.0, "Seconds between two states for --resume; 0: only one, when it ends early.", within=SECONDS
+    )
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")
 
 
@@ -56,8 +85,8 @@ class RadianceScoreOptions(PhotoOptions):
     """On which views a radiance field is scored, and how they are rendered. The photos are read as in its training."""
 
     train: bool = option(False, "Score the training views instead.")
-    spp: int = option(16, "Rays a pixel. The scatter of few is part of the score.", min=1)
+    spp: int = option(16, "Rays a pixel. The scatter of few is part of the score.", within=SPP)
     pictures: Path | None = option(None, "Folder for the pictures, each beside its photo.", "-o", "--output")
     json_file: Path | None = option(None, "Write the scores to this file.", "--json")
-    threads: int | None = option(None, "CPU threads. Default: all.")
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
     mode: str = option("llvm_ad_rgb", "Mitsuba variant.", "-m", "--mode")

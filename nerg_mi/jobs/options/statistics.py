@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from nerg_mi.ranges import COORDINATES, SECONDS, SEEDS, THREADS, TIMES, Range
+
 from . import option, parse_numbers
 from .parts import PartOptions
 
@@ -19,26 +21,34 @@ class StatisticsOptions(PartOptions):
     align: Path | None = option(
         None, "JSON file with the 4x4 similarity from the rays' frame to the place's.  [default: the gaze field's]"
     )
-    tolerance: float = option(0.0, "Degrees by which a ray may miss what of a thing is in nobody's way.", min=0, max=20)
-    margin: float = option(
-        0.03, "Metres by which surfaces may lie in front of a thing, or behind a box, and yet be its own.", min=0
+    tolerance: float = option(
+        0.0, "Degrees by which a ray may miss what of a thing is in nobody's way.", within=Range(0, 20)
     )
-    gap: float = option(1.0, "A ray stands for the time to the next, unless that is longer than this.", min=0)
-    pause: float = option(60.0, "A longer pause of a person begins another sitting.", min=0)
-    merge: float = option(0.15, "Rays on a thing are one look if nothing else lasts longer between them.", min=0)
-    least: float = option(0.1, "A look lasts so long at least.", min=0)
+    margin: float = option(
+        0.03, "Metres by which surfaces may lie in front of a thing, or behind a box, and yet be its own.", within=Range(0, 10**6)
+    )
+    gap: float = option(1.0, "A ray stands for the time to the next, unless that is longer than this.", within=SECONDS)
+    pause: float = option(60.0, "A longer pause of a person begins another sitting.", within=SECONDS)
+    merge: float = option(
+        0.15, "Rays on a thing are one look if nothing else lasts longer between them.", within=SECONDS
+    )
+    least: float = option(0.1, "A look lasts so long at least.", within=SECONDS)
     seen: bool = option(False, "Also count what could be seen: visible share, looked at given visible, unseen.")
     view: float = option(
-        120.0, "Degrees that a view is wide, about where the head, or else the ray, points.", min=1, max=360
+        120.0, "Degrees that a view is wide, about where the head, or else the ray, points.", within=Range(1, 360)
     )
-    cell: float = option(0.1, "What could be seen is traced from middles of cells of this edge, in metres.", min=0.001)
-    samples: int = option(48, "Points of a thing that are looked for.", min=1, max=4096)
+    cell: float = option(
+        0.1, "What could be seen is traced from middles of cells of this edge, in metres.", within=Range(0.001, 10**6)
+    )
+    samples: int = option(48, "Points of a thing that are looked for.", within=Range(1, 4096))
     windows: tuple[str, ...] = option((), "A window of time on the rays' clock: NAME=FROM,TO.", "--window")
     zones: Path | None = option(None, "JSON file of boxes on whose floor areas people stand.")
     cohorts: Path | None = option(None, "CSV file of person,cohort.  [default: the cohorts in the rays]")
-    eyes: int = option(256, "Places from which the field is asked, about.", min=1, max=100_000)
-    directions: int = option(8192, "Directions around each.", min=64, max=1 << 20)
-    glance: float = option(0.3, "Seconds of a glance: the field's reach takes glances for independent.", min=0.001)
+    eyes: int = option(256, "Places from which the field is asked, about.", within=Range(1, 100_000))
+    directions: int = option(8192, "Directions around each.", within=Range(64, 1 << 20))
+    glance: float = option(
+        0.3, "Seconds of a glance: the field's reach takes glances for independent.", within=Range(0.001, 10**6)
+    )
     what_if: Path | None = option(None, "JSON file of changes to shapes and observers, which the field foretells.")
     visibility: bool = option(False, "Isovists on a grid: what can be seen from where, without any tracking.")
     observers: tuple[str, ...] = option(
@@ -46,15 +56,15 @@ class StatisticsOptions(PartOptions):
         "Position of somebody, x,y,z, where there are no rays.  [default: the scene's, or all of the floor]",
         "--observer",
     )
-    height: float = option(1.6, "Height of eyes above the floor, of people on a grid.", min=0.01)
-    floor: float = option(0.0, "Height of the floor.")
-    step: float = option(0.25, "Metres between the places of a grid.", min=0.01)
-    min_people: int = option(1, "Blank numbers that rest on fewer people.", min=1)
+    height: float = option(1.6, "Height of eyes above the floor, of people on a grid.", within=Range(0.01, 10**6))
+    floor: float = option(0.0, "Height of the floor.", within=COORDINATES)
+    step: float = option(0.25, "Metres between the places of a grid.", within=Range(0.01, 10**6))
+    min_people: int = option(1, "Blank numbers that rest on fewer people.", within=Range(1, 10**6))
     names: bool = option(False, "Write the names of people. Without it they have pseudonyms.")
     salt: Path | None = option(None, "Secret file from which pseudonyms are made.  [default: a random one, not kept]")
-    resamples: int = option(1999, "Draws of people for intervals.", min=199, max=100_000)
-    seed: int = option(0, "Seed of the draws.", min=0)
-    threads: int | None = option(None, "CPU threads. Default: all.")
+    resamples: int = option(1999, "Draws of people for intervals.", within=Range(199, 100_000))
+    seed: int = option(0, "Seed of the draws.", within=SEEDS)
+    threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)
     mode: str | None = option(
         None, "Mitsuba variant.  [default: cuda_ad_rgb if it works, else llvm_ad_rgb]", "-m", "--mode"
     )
@@ -66,6 +76,6 @@ def parse_window(text: str) -> tuple[str, float, float]:
 
     name, sign, rest = text.partition("=")
     ends = parse_numbers(rest, "--window") if sign else ()
-    if not name.strip() or len(ends) != 2 or not ends[0] < ends[1]:
+    if not name.strip() or len(ends) != 2 or not TIMES.low <= ends[0] < ends[1] <= TIMES.high:
         raise NergError(f'--window is NAME=FROM,TO in seconds, as in morning=0,3600; got "{plain(text, 60)}"')
     return name.strip(), ends[0], ends[1]

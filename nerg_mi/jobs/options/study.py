@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from nerg_mi.ranges import Range
+
 from . import option
 from .parts import PartOptions
 
@@ -14,9 +16,9 @@ class StudyOptions(PartOptions):
     """What a study renders, and how often."""
 
     scene_kind: str = option("auto", "What SCENE is: auto, analytic or file.")
-    width: int = option(192, "Width of a picture in pixels.")
-    height: int = option(128, "Height of a picture in pixels.")
-    repeats: int = option(5, "Timed renders of each setting; their median counts.")
+    width: int = option(192, "Width of a picture in pixels.", within=Range(1, 16384))
+    height: int = option(128, "Height of a picture in pixels.", within=Range(1, 16384))
+    repeats: int = option(5, "Timed renders of each setting; their median counts.", within=Range(1, 10000))
     quick: bool = option(False, "A few settings only, each timed once.")
     only: str = option("", "Only the default, and settings whose name matches.", metavar="REGEX")
     defaults: Mapping[str, str] | None = option(None, "Values for <default>s of the scene file, by name.")

@@ -154,7 +154,7 @@ def given_point(values: tuple[float, ...] | None, option: str) -> np.ndarray | N
     """Three numbers that were given by ``option``, (3,), or None. Raises `NergError` for other ones."""
     if values is None:
         return None
-    if len(values) != 3 or not np.isfinite(values).all():
+    if len(values) != 3:
         raise NergError(f"{option} is three numbers x,y,z, got {','.join(f'{v:g}' for v in values)}")
     return np.array(values, float)
 

@@ -54,11 +54,12 @@ def walk_of_person(
     that are more than ``gap`` seconds apart has no frame, nor has one that is farther than that from the first or the
     last ray. Raises `NergError` where no frame is left.
     """
-    if not (np.isfinite([first, last]).all() and first < last):
+    if not first < last:
         raise NergError(f"--times is two times, the earlier first, got {first:g},{last:g}")
-    if not (np.isfinite(fps) and fps > 0) or (last - first) * fps > FRAMES:
+    if (last - first) * fps > FRAMES:
         raise NergError(
-            f"--fps must be positive, and a walk has at most {FRAMES:,} frames; got {fps:g} frames a second"
+            f"a walk has at most {FRAMES:,} frames, and {last - first:g} s with {fps:g} frames a second have "
+            "more; give a smaller --fps, or a shorter time"
         )
     own = _own(rays, person)
     own = own[np.argsort(rays.t[own], kind="stable")]

@@ -13,6 +13,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.files.checksum import file_sha256
 from nerg_mi.files.line_blocks import OnBadLine
 from nerg_mi.maths.coordinates import check_near_origin
+from nerg_mi.ranges import FARTHEST
 from nerg_mi.rays.io import COLUMNS
 from nerg_mi.rays.rays import FRAME, Rays
 
@@ -209,6 +210,7 @@ class RaysBuilder:
             **{f"direction is the fill value {f:g}, {f:g}, {f:g}": fill == f for f in np.unique(fill[abs(fill) > 0])},
             "time is missing": ~np.isfinite(t),
             "origin is missing": ~np.isfinite(origin).all(axis=1),
+            f"origin is beyond {FARTHEST:g} m": ~(np.abs(self._moved(origin)) <= FARTHEST).all(axis=1),
             "direction is missing": ~np.isfinite(length),
             "direction is zero": length == 0,
             "confidence is missing or outside [0, 1]": ~((confidence >= 0) & (confidence <= 1)),
@@ -221,18 +223,22 @@ class RaysBuilder:
                 keep &= ~mask
         self._rows_read += n
         self._lines += n
-        R, shift = self._transform[:3, :3], self._transform[:3, 3]
+        R = self._transform[:3, :3]
         scale = np.cbrt(abs(np.linalg.det(R)))
         part = {
             "t": np.asarray(t, dtype=np.float64)[keep],
             "person": person[keep],
-            "origin": origin[keep] @ R.T + shift,
+            "origin": self._moved(origin[keep]),
             "direction": (direction[keep] / length[keep, None]) @ (R / scale).T,
             "confidence": confidence[keep],
         }
         if hit is not None:
             hit = self._without_filled(hit, origin, direction, keep)
-            part["hit"] = hit[keep] @ R.T + shift
+            part["hit"] = self._moved(hit[keep])
+            beyond = (np.abs(part["hit"]) > FARTHEST).any(axis=1)
+            if beyond.any():
+                part["hit"][beyond] = np.nan
+                self._missing[f"hit points beyond {FARTHEST:g} m"] += int(np.count_nonzero(beyond))
         if head is not None:
             with np.errstate(invalid="ignore", divide="ignore"):
                 unit = head[keep] / np.linalg.norm(head[keep], axis=1, keepdims=True)
@@ -260,6 +266,11 @@ class RaysBuilder:
         hit = hit.copy()
         hit[rows] = np.nan
         return hit
+
+    def _moved(self, points: np.ndarray) -> np.ndarray:
+        """``points`` (N, 3) in the frame of rays."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return points @ self._transform[:3, :3].T + self._transform[:3, 3]
 
     def _drop(self, reason: str, rows: np.ndarray) -> None:
         name = self._sources[-1]["file"] if self._sources else ""

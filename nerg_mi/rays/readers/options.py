@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from nerg_mi.errors import NergError
+from nerg_mi.ranges import FLAG, RANGE, TICKS, Checked, Range
 
 _KEY = "nerg_mi.reader_option"
 
@@ -36,23 +36,25 @@ def option(
     *,
     flag: str | None = None,
     shown: str | None = None,
+    within: Range | None = None,
     parse: Callable[[str], Any] | None = None,
     recorded: bool = True,
 ) -> Any:
     """A field of a reader's options, with what is said of it on the command line and in the manual.
 
     ``flag``: on the command line, where that is not the field's name with hyphens. ``shown``: the default in words,
-    where it does not speak for itself. ``parse``: makes the value of the command line's text, and raises `NergError`
-    naming the flag; without it the field's type is that of the command line (str, int, float, bool or Path, or None
-    besides). ``recorded``: false for what the metadata of rays tell in another way, as the frame.
+    where it does not speak for itself. ``within``: the range of its numbers, which each option that has any needs, and
+    for which the dataclass derives from `Checked`. ``parse``: makes the value of the command line's text, and raises
+    `NergError` naming the flag; without it the field's type is that of the command line (str, int, float, bool or Path,
+    or None besides). ``recorded``: false for what the metadata of rays tell in another way, as the frame.
     """
     about = {"help": help, "flag": flag, "shown": shown, "parse": parse, "recorded": recorded}
-    return dataclasses.field(default=default, metadata={_KEY: about})
+    return dataclasses.field(default=default, metadata={_KEY: about, RANGE: within, FLAG: flag or ""})
 
 
-def tick_option() -> Any:
-    """The unit of the file's time, in seconds; `check_tick` is to be asked of it."""
-    return option(1.0, "Seconds in one unit of the file's time.")
+def tick_option(default: float = 1.0) -> Any:
+    """The unit of the file's time, in seconds."""
+    return option(default, "Seconds in one unit of the file's time.", within=TICKS)
 
 
 def valid_option() -> Any:
@@ -70,19 +72,10 @@ class NoOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TickOption:
+class TickOption(Checked):
     """For readers of files whose unit of time is not known. Raises `NergError` for what is no length of time."""
 
     tick: float = tick_option()
-
-    def __post_init__(self) -> None:
-        check_tick(self.tick)
-
-
-def check_tick(tick: float) -> None:
-    """Raise `NergError` where ``tick`` (seconds) is no unit of time."""
-    if not 0 < tick < 1e12:
-        raise NergError(f"a unit of the file's time is a positive number of seconds, got {tick} (--tick)")
 
 
 # Annotations are evaluated as code: once, when a reader is registered, and not beside files that are read.

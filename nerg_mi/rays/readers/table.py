@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import Checked, Range
 
 from .builder import RaysBuilder
 from .frames import Frame
-from .options import check_tick, option, tick_option, valid_option
+from .options import option, tick_option, valid_option
 from .parsing import poses
 from .parsing.column_finder import ColumnFinder, is_counter
 from .parsing.column_map import ColumnMap
@@ -24,7 +25,7 @@ from .protocol import RECORDINGS
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableOptions:
+class TableOptions(Checked):
     """What no table says of itself. Raises `NergError` for words that are not known."""
 
     columns: ColumnMap | None = option(  # needed
@@ -47,12 +48,12 @@ class TableOptions:
     )
     radians: bool = option(False, "Angles of a mapped table are in radians.", recorded=False)
     person_from: str = option("column", "Persons of a mapped table: column or filename.", recorded=False)
-    min_confidence: float = option(0.0, "Drop rows below this confidence.")
+    min_confidence: float = option(0.0, "Drop rows below this confidence.", within=Range(0, 1))
     valid: str | None = valid_option()
     tick: float = tick_option()
 
     def __post_init__(self) -> None:
-        check_tick(self.tick)
+        super().__post_init__()
         parse_valid(self.valid)
         poses.axis(self.looks_along, "forward")
         if self.person_from not in ("column", "filename"):

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import LENGTHS, check_number
 from nerg_mi.rays.rays import Rays
 
 VOXEL = 0.08
@@ -83,8 +84,8 @@ def hit_extent(rays: Rays, voxel: float | None = None, most: int = MOST) -> HitE
     """
     if rays.hit is None or not (known := np.isfinite(rays.hit).all(axis=1)).any():
         raise NergError("these rays have no hit points to make a place from; give a radiance field instead (--field)")
-    if voxel is not None and not (voxel > 0 and np.isfinite(voxel)):
-        raise NergError(f"a voxel's edge must be positive, got {voxel} m; leave out --voxel")
+    if voxel is not None:
+        check_number(voxel, LENGTHS, "--voxel")
     hits = rays.hit[known]
     first, last = np.quantile(hits, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
     low, high = np.minimum(first, rays.origin.min(axis=0)), np.maximum(last, rays.origin.max(axis=0))

@@ -8,6 +8,7 @@ from nerg_mi.errors import NergError
 from nerg_mi.field.encoding.hashgrid import HashGridConfig
 from nerg_mi.field.radiance import RadianceConfig
 from nerg_mi.maths.contraction import AnyBox
+from nerg_mi.ranges import LEARNING_RATES, LOSS_WEIGHTS, MINUTES, SEEDS, STEPS, Checked, Range, ranged
 
 # (levels, log2 rows, base and finest resolution, width, hidden layers of the colour net). "paper" has the paper's
 # sizes; "small" is what trains in minutes on two CPU cores and stores in 2 MB as fp16; "medium" holds the texture of a
@@ -34,100 +35,85 @@ def sized_config(size: str, box: AnyBox, deferred: bool = False) -> RadianceConf
 
 
 @dataclass(frozen=True)
-class RadianceSettings:
+class RadianceSettings(Checked):
     """Controls of a training run; lengths are shares of the scene box's side. Exactly one of ``steps`` and ``minutes``
     says how long it takes."""
 
     # How many steps.
-    steps: int | None = None
+    steps: int | None = ranged(None, STEPS)
     # Or: how many minutes.
-    minutes: float | None = None
+    minutes: float | None = ranged(None, MINUTES)
     # Of the weights, rays and jitter.
-    seed: int = 0
+    seed: int = ranged(0, SEEDS)
     # Samples a step. Not a power of two: arrays that many bytes apart share their place in the caches, which costs a
     # factor of two.
-    batch: int = 2**14 + 240
+    batch: int = ranged(2**14 + 240, Range(1, 1 << 26))
     # Held for the share ``hold`` of the run.
-    learning_rate: float = 1.5e-2
+    learning_rate: float = ranged(1.5e-2, LEARNING_RATES)
     # What it decays to exponentially after that, times itself.
-    final_rate: float = 0.03
+    final_rate: float = ranged(0.03, Range(0, 1))
     # Share of the run for which the learning rate is held.
-    hold: float = 0.4
+    hold: float = ranged(0.4, Range(0, 0.999))
     # Decay a step of the averaged weights, which are the result.
-    average: float = 0.99
+    average: float = ranged(0.99, Range(0, 1))
     # Shortest step, as instant-ngp has it.
-    march_step: float = 3**0.5 / 1024
+    march_step: float = ranged(3**0.5 / 1024, Range(1e-6, 1))
     # Steps are at least this share of their distance.
-    growth: float = 1 / 128
+    growth: float = ranged(1 / 128, Range(0, 1))
     # Where rays start, and distance to every camera within which nothing is.
-    near: float = 0.02
+    near: float = ranged(0.02, Range(0, 1))
     # Derivatives of samples nearer than this are scaled by the square of their share of it (Philip and Deschaintre
     # 2023, "Floaters No More"); 0: none are.
-    reach: float = 0.4
+    reach: float = ranged(0.4, Range(0, 1000))
     # Share of the run over which ``reach`` falls to 0, as surfaces come to stand where fog was.
-    reach_share: float = 0.5
+    reach_share: float = ranged(0.5, Range(1e-6, 1e6))
     # Samples that less light reaches are left out.
-    stop: float = 2e-3
+    stop: float = ranged(2e-3, Range(0, 1))
     # Weight from which on a sample is always kept; others are by chance, in proportion to their weight.
-    thin_sure: float = 1 / 32
+    thin_sure: float = ranged(1 / 32, Range(1e-30, 1e30))
     # Least chance of a sample to be kept; 1: all are.
-    thin_least: float = 1 / 32
+    thin_least: float = ranged(1 / 32, Range(1e-30, 1))
     # Cells of the density grid along an edge.
-    resolution: int = 128
+    resolution: int = ranged(128, Range(8, 2048))
     # Steps after which the density grid is looked over.
-    grid_every: int = 16
+    grid_every: int = ranged(16, Range(1, 10**6))
     # Cells that fewer cameras see stay empty.
-    min_views: int = 2
+    min_views: int = ranged(2, Range(0, 10**6))
     # Share of the run from which on the cells that rendering will visit are found, all of which are then sampled.
-    settle: float = 0.8
+    settle: float = ranged(0.8, Range(0, 1e6))
     # Samples of the density-only pass, in batches: what it costs is then of the order of the rest of a step.
-    look_most: float = 8.0
+    look_most: float = ranged(8.0, Range(1, 1e6))
     # How many times coarser the run marches at first, each for a like part of ``stride_share``, which clears early fog
     # cheaply; while the pass has no room for enough rays at the next, it waits, for as long again.
-    strides: tuple[int, ...] = (16, 8, 4, 2)
+    strides: tuple[int, ...] = ranged((16, 8, 4, 2), Range(1, 10**6))
     # Share of the run that is marched coarser.
-    stride_share: float = 0.33
+    stride_share: float = ranged(0.33, Range(0, 1e6))
     # Error at which the colour loss turns linear; colours are in 0..1.
-    huber: float = 1.0
+    huber: float = ranged(1.0, Range(0, 1e6))
     # Weight of the penalty on density in cells that are not sampled.
-    empty_weight: float = 0.003
+    empty_weight: float = ranged(0.003, LOSS_WEIGHTS)
     # Weight of the mean square of the hash grid's features, which lets go of what few rays have shaped (Barron et al.
     # 2023, Zip-NeRF, there level by level).
-    grid_decay: float = 0.1
+    grid_decay: float = ranged(0.1, LOSS_WEIGHTS)
     # Whether each photo has an exposure and a white balance of its own.
     photo_colors: bool = True
     # Weight of the squares of how far they are from the average, the mean over the photos.
-    photo_decay: float = 0.01
+    photo_decay: float = ranged(0.01, LOSS_WEIGHTS)
     # Weight of the depth terms where depth is known.
-    depth_weight: float = 0.02
+    depth_weight: float = ranged(0.02, LOSS_WEIGHTS)
     # What ``depth_weight`` falls to, times itself.
-    final_depth: float = 0.25
+    final_depth: float = ranged(0.25, Range(0, 1e6))
     # Distance from the true surface, in march steps, within which a ray's weight should lie.
-    depth_margin: float = 1.5
+    depth_margin: float = ranged(1.5, Range(0, 1e6))
     # Share of the rays drawn from those whose depth was wrong.
-    replay: float = 0.25
+    replay: float = ranged(0.25, Range(0, 1))
     # Weight of the loss that draws a ray's weight together (mip-NeRF 360); 0: none.
-    distortion_weight: float = 0.0
+    distortion_weight: float = ranged(0.0, LOSS_WEIGHTS)
 
     def __post_init__(self):
+        super().__post_init__()
         if (self.steps is None) == (self.minutes is None):
             raise NergError("give the length of the training either in steps or in minutes")
-        if (self.steps or self.minutes or 0) <= 0:
-            raise NergError(f"a training must last longer than 0, got steps={self.steps}, minutes={self.minutes}")
-        given = self.depth_weight, self.distortion_weight, self.grid_decay, self.photo_decay
-        if min(given) < 0:
-            raise NergError(f"weights of losses must be 0 or more, got {', '.join(map(str, given))}")
-        if not (self.thin_sure > 0 and 0 < self.thin_least <= 1):
-            raise NergError(
-                f"thin_sure must be above 0 and thin_least in (0, 1], got {self.thin_sure} and {self.thin_least}"
-            )
-        if not (self.stride_share >= 0 and self.reach_share > 0):
-            shares = f"{self.stride_share} and {self.reach_share}"
-            raise NergError(f"stride_share must be 0 or more and reach_share above 0, got {shares}")
-        if self.look_most < 1:
-            raise NergError(
-                f"look_most must be 1 or more, room for a batch in the density-only pass, got {self.look_most}"
-            )
         if self.resolution % 8:
             raise NergError(f"the density grid's resolution must be a multiple of 8, got {self.resolution}")
 

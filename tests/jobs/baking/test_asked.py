@@ -33,7 +33,6 @@ def test01_whose_gaze(options, with_gaze, source):
         ({"rays": RAYS, "unit": "hours"}, "--unit is share or seconds"),
         ({"gaze": GAZE, "halves": True}, "add --from rays"),
         ({"rays": RAYS, "observer": (0.0, 0.0, 0.0)}, "--observer and --path"),
-        ({"rays": RAYS, "smooth": -1.0}, "--smooth is a length"),
     ],
 )
 def test02_what_contradicts_itself(options, said):

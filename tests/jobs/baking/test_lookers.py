@@ -32,7 +32,11 @@ def test01_a_path(tmp_path):
     [
         ("x,y\n1,2\n", 'no column "z"'),
         ("x,y,z\n", "0 positions"),
-        ("x,y,z\n1,2,nan\n", "the 1th"),
+        ("x,y,z\n1,2,nan\n", "positions of the path .* row 0 is"),
+        ("x,y,z\n1,2,3\n1,2,1e200\n", r"coordinates from -1e\+07 to 1e\+07, and row 1 is \[1.0, 2.0, 1e\+200\]"),
+        ("x,y,z\n-1.1e7,2,3\n", "row 0 is"),
+        ("x,y,z,weight\n1,2,3,inf\n", "no numbers"),
+        ("x,y,z,weight\n1,2,3,nan\n", "no numbers"),
         ("x,y,z,weight\n1,2,3,-1\n", "negative"),
     ],
 )

@@ -42,9 +42,8 @@ def test_what_is_met_around(probe):
 
 def test_points_and_ups():
     assert given_point(None, "--to") is None and given_point((1, 2, 3), "--to").tolist() == [1, 2, 3]
-    for wrong in ((1.0, 2.0), (1.0, 2.0, float("nan"))):
-        with pytest.raises(NergError, match="--to is three numbers"):
-            given_point(wrong, "--to")
+    with pytest.raises(NergError, match="--to is three numbers"):
+        given_point((1.0, 2.0), "--to")
     up = np.array([0.0, 0, 1])
     assert upright(EYE, up) is EYE
     down = upright(Eye(np.zeros(3), np.array([0, 0, -2.0])), up)

@@ -87,6 +87,19 @@ def test_builder_drops_with_an_account(tmp_path):
     assert rays.metadata["sources"][0]["file"] == "walk.csv" and len(rays.metadata["sources"][0]["sha256"]) == 64
 
 
+@pytest.mark.parametrize("far", [1.1e9, -1e38, 1e200, 1e308])
+def test_points_beyond_all_places_are_accounted_for(far):
+    """The bound is in metres, of what files have in centimetres."""
+    builder, points, d = RaysBuilder(Frame(units="cm")), np.full((3, 3), 9e8), np.tile([0.0, 0.0, 1.0], (3, 1))
+    hits = points.copy()
+    points[1, 2], hits[2, 0] = far, far
+    builder.add(np.arange(3.0), "ann", points, d, rows=np.arange(3), hit=hits)
+    rays = builder.build()
+    assert [(d["reason"], d["rows"]) for d in rays.metadata["dropped"]] == [("origin is beyond 1e+07 m", [[1, 1]])]
+    assert np.isnan(rays.hit).all(axis=1).tolist() == [False, True]
+    assert rays.metadata["complaints"] == ["hit points beyond 1e+07 m are taken as unknown; check the unit of length"]
+
+
 def test_builder_with_nothing_left(tmp_path):
     builder = RaysBuilder()
     builder.add(np.zeros(2), "ann", np.zeros((2, 3)), np.zeros((2, 3)), rows=np.arange(2))

@@ -10,30 +10,6 @@ from nerg_mi.errors import NergError
 from nerg_mi.training.gaze.settings import GazeSettings, ProbeSettings
 
 
-def test_limits_are_where_they_are_said_to_be():
-    assert ProbeSettings(count=1, directions=16).count == 1
-    for wrong in ({"count": 0}, {"directions": 15}):
-        with pytest.raises(ValueError, match="at least one probe and 16 directions"):
-            ProbeSettings(**wrong)
-    least = {
-        "probes": 1,
-        "directions": 1,
-        "rays": 1,
-        "looks": 1,
-        "weight_decay": 0.0,
-        "integral": 0.0,
-        "zones": 0,
-        "patience": 0,
-    }
-    GazeSettings(steps=1, **least)
-    for name in least:
-        with pytest.raises(ValueError, match="nothing negative"):
-            GazeSettings(steps=1, **{**least, name: least[name] - 1})
-    for length in ({"steps": 0}, {"minutes": 0.0}, {"minutes": -1.0}):
-        with pytest.raises(ValueError, match="longer than 0"):
-            GazeSettings(**length)
-
-
 def test_the_learning_rate_is_held_and_then_falls_to_its_last():
     s = GazeSettings(steps=10, learning_rate=0.02, final_rate=0.04, hold=0.25)
     assert s.rate(0) == s.rate(0.25) == 0.02

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import LENGTHS, Checked, Range
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import Frame
 from nerg_mi.rays.readers.options import option
@@ -23,12 +24,12 @@ _CENTRES = [f"eye_center{eye}_3d_{axis}" for eye in "01" for axis in "xyz"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PupilOptions:
+class PupilOptions(Checked):
     """What the exports do not say."""
 
-    marker: float | None = option(None, "Edge of a tracking marker in metres.")  # needed
+    marker: float | None = option(None, "Edge of a tracking marker in metres.", within=LENGTHS)  # needed
     up: str = option("y", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
-    min_confidence: float = option(0.6, "Drop rows below this confidence.")
+    min_confidence: float = option(0.6, "Drop rows below this confidence.", within=Range(0, 1))
 
 
 class Pupil:

@@ -17,6 +17,7 @@ from nerg_mi.capture.named_poses import NamedPoses, find_source, read_named_pose
 from nerg_mi.capture.upright import find_up
 from nerg_mi.errors import NergError
 from nerg_mi.files.bounded import plain
+from nerg_mi.ranges import LENGTHS, RATES, Checked, Range
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import Frame
 from nerg_mi.rays.readers.options import option
@@ -36,7 +37,7 @@ _COMPARED = 1 << 20  # rows of a recording whose two accounts are compared
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions:
+class SceneOptions(Checked):
     """Where the scene camera was. Raises `NergError` for a scale beside a place, or a rate or gap that is none."""
 
     poses: Path | None = option(  # needed
@@ -52,22 +53,24 @@ class SceneOptions:
         recorded=False,
     )
     fps: float | None = option(
-        None, "Numbers count frames that ffmpeg's -vf fps=5 took, this many a second, not each frame of the video."
+        None, "Numbers count frames that ffmpeg's -vf fps=5 took, this many a second, not each frame of the video.",
+        within=RATES,
     )
     place: Path | None = option(
         None, "Checkpoint of the place (nerg train radiance): rays are in the coordinates that it was trained in."
     )
-    scale: float = option(1.0, "Without --place: length of a unit of the model in metres, as in training.")
-    gap: float = option(0.2, "Seconds between posed frames; farther apart, nothing is interpolated.")
+    scale: float = option(
+        1.0, "Without --place: length of a unit of the model in metres, as in training.", within=LENGTHS
+    )
+    gap: float = option(
+        0.2, "Seconds between posed frames; farther apart, nothing is interpolated.", within=Range(1e-06, 3600)
+    )
     up: str = option("z", "Up axis: x, y, z, -x, -y or -z.", recorded=False)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.place is not None and self.scale != 1.0:
             raise NergError("the checkpoint of the place knows its scale; leave out --scale, or --place")
-        if self.fps is not None and not 0 < self.fps <= 1e5:
-            raise NergError(f"a rate of frames is a positive number a second, got {self.fps} (--fps)")
-        if not 0 < self.gap <= 3600:
-            raise NergError(f"the gap between posed frames is a positive number of seconds, got {self.gap} (--gap)")
 
     @property
     def frame(self) -> Frame:

@@ -12,7 +12,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import OPENGL, Frame
-from nerg_mi.rays.readers.options import TickOption, option
+from nerg_mi.rays.readers.options import TickOption, tick_option
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing import usual_names as names
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
@@ -38,7 +38,7 @@ _KNOWN = 0b11  # XR_SPACE_LOCATION_ORIENTATION_VALID_BIT and XR_SPACE_LOCATION_P
 class OpenXrOptions(TickOption):
     """XrTime counts nanoseconds."""
 
-    tick: float = option(1e-9, "Seconds in one unit of the file's time.")
+    tick: float = tick_option(1e-9)
 
 
 class OpenXr:

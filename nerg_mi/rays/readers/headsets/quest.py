@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from nerg_mi.errors import NergError
+from nerg_mi.ranges import Range
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
 from nerg_mi.rays.readers.options import TickOption, option
@@ -28,7 +29,7 @@ _RIG = ("rig_", "camera_rig_", "tracking_space_", "tracking_origin_")
 class QuestOptions(TickOption):
     """What is kept."""
 
-    min_confidence: float = option(0.5, "Drop rows below this confidence.")
+    min_confidence: float = option(0.5, "Drop rows below this confidence.", within=Range(0, 1))
 
 
 class Quest:

@@ -11,7 +11,7 @@ import numpy as np
 from nerg_mi.errors import NergError
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
-from nerg_mi.rays.readers.options import TickOption, option
+from nerg_mi.rays.readers.options import TickOption, tick_option
 from nerg_mi.rays.readers.parsing import poses
 from nerg_mi.rays.readers.parsing import usual_names as names
 from nerg_mi.rays.readers.parsing.column_finder import ColumnFinder
@@ -36,7 +36,7 @@ _TIMES = ("time_stamp", "timestamp", "sranipal_timestamp", *names.TIMES)
 class SranipalOptions(TickOption):
     """SRanipal counts milliseconds."""
 
-    tick: float = option(1e-3, "Seconds in one unit of the file's time.")
+    tick: float = tick_option(1e-3)
 
 
 @dataclass(frozen=True)

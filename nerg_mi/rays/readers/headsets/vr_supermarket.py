@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nerg_mi.ranges import Checked, Range
 from nerg_mi.rays.readers.builder import RaysBuilder
 from nerg_mi.rays.readers.frames import UNITY, Frame
 from nerg_mi.rays.readers.options import option
@@ -30,10 +31,12 @@ _FLIP = np.array([1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True, kw_only=True)
-class SupermarketOptions:
+class SupermarketOptions(Checked):
     """Which rows are kept."""
 
-    min_openness: float = option(0.5, "Drop rows in which an eye is open no more than this, from 0 to 1.")
+    min_openness: float = option(
+        0.5, "Drop rows in which an eye is open no more than this, from 0 to 1.", within=Range(0, 1)
+    )
 
 
 class VrSupermarket:

@@ -1,0 +1,114 @@
+"""Ranges of numbers, declared where a value is declared and checked by one function wherever it enters."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Any
+
+from .errors import NergError, plain
+
+RANGE, FLAG = "nerg_mi.range", "nerg_mi.flag"
+"""Keys in the metadata of a dataclass's field: the `Range` of its value, and its spelling on the command line, "" for
+that of its name; without one, it is none of the command line."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers from ``low`` to ``high``, both included. Both are finite, so that neither NaN nor infinity is in."""
+
+    low: float
+    high: float
+
+    def __contains__(self, value: float) -> bool:
+        return self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        return " .. ".join(str(v) if isinstance(v, int) else f"{v:g}" for v in (self.low, self.high))
+
+
+FARTHEST = 1e7
+"""No coordinate is farther from 0, in scene units or metres. Single precision, in which rays are traced, resolves about
+one unit there; a room in millimetres and UTM coordinates in metres are nearer."""
+
+COORDINATES = Range(-FARTHEST, FARTHEST)
+SEEDS = Range(0, 2**31 - 1)
+THREADS = Range(1, 1024)
+TIMES = Range(-1e18, 1e18)
+"""Seconds on a clock of any origin."""
+LENGTHS = Range(1e-6, 1e6)
+"""Lengths that are not 0, and factors between units of length."""
+KAPPAS = Range(1e-6, 1e8)
+"""Concentrations of von Mises-Fisher kernels; beyond, single precision cannot resolve a kernel's width."""
+VALUES = Range(1e-30, 1e30)
+"""Positive values, such as densities and the ends of colour scales, whose products single precision can hold."""
+TEST_SHARES = Range(0, 0.99)
+"""Shares held out, of which something is left to train on."""
+SECONDS = Range(0, 1e9)
+MINUTES = Range(1e-6, 1e6)
+STEPS = Range(1, 10**9)
+RAYS = Range(1, 2**31 - 1)
+LOSS_WEIGHTS = Range(0, 1e6)
+DIRECTIONS = Range(16, 1 << 20)
+SPP = Range(1, 1 << 20)
+DECADES = Range(0, 30)
+"""Powers of ten of a colour scale."""
+RATES = Range(1e-3, 1e5)
+"""Pictures, or samples, a second."""
+FIELDS_OF_VIEW = Range(1e-4, 179.9)
+TICKS = Range(1e-12, 1e12)
+"""Seconds in a unit of time."""
+LEARNING_RATES = Range(0, 1)
+WEIGHT_DECAYS = Range(0, 1000)
+
+
+def check_number(value: Any, within: Range, name: str, whole: bool = False) -> None:
+    """Raise `NergError`, which calls it ``name``, unless ``value`` is a number in a range, and an integer if it is to
+    be ``whole``."""
+    kind, noun = (Integral, "a whole number") if whole else (Real, "a number")
+    if isinstance(value, bool) or not isinstance(value, kind):
+        raise NergError(f"{name} must be {noun}, got {plain(repr(value), 60)}")
+    if value not in within:
+        raise NergError(f"{name} must lie in {within}, got {_shown(value)}")
+
+
+def ranged(default: Any, within: Range) -> Any:
+    """A field of a `Checked` dataclass whose numbers lie ``within`` a range."""
+    return dataclasses.field(default=default, metadata={RANGE: within})
+
+
+class Checked:
+    """Base of dataclasses that check their numbers on construction, whoever makes them.
+
+    A field with a `Range` in its metadata holds a number in it, or several of them; None where its type allows that.
+    Raises `NergError` for others.
+    """
+
+    def __post_init__(self) -> None:
+        assert dataclasses.is_dataclass(self)
+        for field in dataclasses.fields(self):
+            within, value, kind = field.metadata.get(RANGE), getattr(self, field.name), str(field.type)
+            if within is None or (value is None and "None" in kind):
+                continue
+            several = "tuple" in kind
+            if several and not isinstance(value, Iterable):
+                raise NergError(f"{_name(field)} must be several numbers, got {plain(repr(value), 60)}")
+            for number in value if several else (value,):
+                check_number(number, within, _name(field), bool(re.search(r"\bint\b", kind)))
+
+
+def _name(field: dataclasses.Field) -> str:
+    """What a message calls ``field``."""
+    flag = field.metadata.get(FLAG)
+    return field.name if flag is None else flag or "--" + field.name.replace("_", "-")
+
+
+def _shown(value: Real) -> str:
+    """``value`` in a few characters: an integer may have more digits than Python prints."""
+    if isinstance(value, int) and abs(value) >= 10**20:
+        return f"an integer of {int(math.log10(abs(value))) + 1} digits"
+    return str(value)
