@@ -37,6 +37,8 @@ one unit there; a room in millimetres and UTM coordinates in metres are nearer."
 
 COORDINATES = Range(-FARTHEST, FARTHEST)
 SEEDS = Range(0, 2**31 - 1)
+FIRST_SEEDS = Range(0, 2 * 10**9)
+"""Seeds that others follow."""
 THREADS = Range(1, 1024)
 TIMES = Range(-1e18, 1e18)
 """Seconds on a clock of any origin."""

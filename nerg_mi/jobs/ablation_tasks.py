@@ -24,14 +24,18 @@ from nerg_mi.threads import use_share
 
 from .ablation_bench import Bench, bench_of, train_variant
 from .backend import select_backend
+from .options import other_fields
 from .options.ablation import AblationOptions
 from .parts import Parts
 from .reporter import SILENT, Reporter
 
 _FIELD, _ROW = "gaze.safetensors", "row.json"
 _RAYS = "of-the-job/rays.npz"
-_OF_TRAINING = ("geometry", "steps", "default_steps", "probes", "zones", "positions", "people", "radius", "kappa")
-_OF_TRAINING += ("first", "min_rays", "law", "refit", "mode")
+# But for files, which are inputs, what is ablated, and how it is timed and shared out.
+_OF_TRAINING = other_fields(
+    AblationOptions,
+    *("field", "scene", "recipes", "variant", "seeds", "cameras", "size", "threads", "store", "scheduler"),
+)
 
 _last: dict[str, tuple[Bench, TemporaryDirectory]] = {}
 

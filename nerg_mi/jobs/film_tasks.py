@@ -21,12 +21,13 @@ from nerg_mi.rendering.scene_file import files_of_scene
 from nerg_mi.tasks.inputs import InputFile
 from nerg_mi.threads import use_share
 
+from .options import other_fields
 from .options.pictures import PictureOptions
 from .overlays import check_memory, layers_of, stacked, style_of, unstacked
 from .pictures import render_file, sensor_of
 
-OF_PICTURES = ("sensor", "mode", "spp", "seed", "memory", "overlay", "top", "cmap", "decades", "hatching")
-"""The options on which a picture depends."""
+OF_PICTURES = other_fields(PictureOptions, "defaults", "frames", "fps", "threads")
+"""The options on which a picture depends, but for the values of a scene's <default>s."""
 
 
 def make_picture(parameters: Mapping[str, Any], inputs: Mapping[str, Path], output: Path) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def test_bad_and_mirrored_fits_are_refused_unless_forced(tmp_path):
         ({"pairs": "PAIRS", "refine": True}, None, "--refine needs the tracking"),
         ({"pairs": "PAIRS", "up": "north"}, None, "--up is numbers"),
         ({"pairs": "PAIRS", "up": "0,0,0"}, None, "--up is an axis"),
-        ({"pairs": "PAIRS", "scale": -1.0}, None, "--scale is a positive number"),
+        ({"pairs": "PAIRS", "scale": -1.0}, None, "--scale must lie in"),
         ({"pairs": "PAIRS", "field": "a", "scene": "b"}, None, "the place is one"),
     ],
 )

@@ -69,9 +69,9 @@ def test03_units_of_the_place_are_not_metres(rgb, tmp_path):
         ({"gaze": GAZE}, "nobody looks"),
         ({"gaze": GAZE, "observer": (1, 2, 3), "unit": "seconds"}, "add --from rays"),
         ({"unit": "hours"}, "--unit is share or seconds"),
-        ({"gaze": GAZE, "observer": (1, 2, 3), "smooth": -1.0}, "--smooth is a length"),
-        ({"gaze": GAZE, "observer": (1, 2, 3), "cone": 99.0}, "--cone is 0 to 30"),
-        ({"gaze": GAZE, "observer": (1, 2, 3), "top": 0.0}, "--top must be positive"),
+        ({"gaze": GAZE, "observer": (1, 2, 3), "smooth": -1.0}, "--smooth must lie in"),
+        ({"gaze": GAZE, "observer": (1, 2, 3), "cone": 99.0}, "--cone must lie in"),
+        ({"gaze": GAZE, "observer": (1, 2, 3), "top": 0.0}, "--top must lie in"),
         ({"gaze": GAZE, "observer": (1, 2, 3), "cmap": "jet"}, "no perceptually uniform"),
     ],
 )

@@ -78,7 +78,7 @@ def test_pseudonyms(files, tmp_path):
     [
         ({"place_name": "x"}, "--place-name belongs to datasets"),
         ({"day": "2024-01-01", "output": "a.npz"}, "--day belongs to datasets"),
-        ({"workers": 0, "output": "a.rays"}, "--workers is a number"),
+        ({"workers": 0, "output": "a.rays"}, "--workers must lie in"),
         ({"align_output": "a.json", "output": "a.rays"}, "--write-align belongs to files"),
     ],
 )

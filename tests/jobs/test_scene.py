@@ -279,7 +279,7 @@ def test_a_walk(rgb, folder, tmp_path):
         (["mesh.ply"], {"camera_from": (1, 2, 3), "camera_to": (1, 2, 3)}, "cannot look at the point"),
         (["mesh.ply"], {"own": True}, "--own is the observer's view"),
         (["mesh.ply"], {"up": (0, 0, 0)}, "up must be a direction"),
-        (["mesh.ply"], {"fov": 200.0}, "--fov must lie between"),
+        (["mesh.ply"], {"fov": 200.0}, "--fov must lie in"),
     ],
 )
 def test_what_makes_no_scene(rgb, folder, tmp_path, names, options, said):

@@ -24,7 +24,7 @@ def test02_a_hair_keeps_plates_apart_and_zeros_of_both_signs_are_one_place():
     assert len(mesh.vertices) == 4
 
 
-@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
 def test03_flat_and_repeated_faces_are_left_out_at_any_scale(scale):
     v = scale * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, 0), (9, 9, 9)])
     mesh, index, repairs = weld(v, [(0, 1, 2), (0, 1, 3), (1, 1, 2), (2, 0, 1), (2, 1, 0)])
@@ -35,7 +35,9 @@ def test03_flat_and_repeated_faces_are_left_out_at_any_scale(scale):
 
 
 def test04_what_is_no_surface():
-    with pytest.raises(NergError, match="the wall has vertices that are not finite"):
+    with pytest.raises(NergError, match="the vertices of the wall must have coordinates from"):
         weld([(0, 0, np.nan)], [(0, 0, 0)], "the wall")
+    with pytest.raises(NergError, match="row 1 is"):
+        weld([(0, 0, 0), (0, 0, 1.1e7), (1, 0, 0)], [(0, 1, 2)])
     with pytest.raises(NergError, match="no face with an area"):
         weld([(0, 0, 0), (1, 0, 0), (2, 0, 0)], [(0, 1, 2)])

@@ -7,7 +7,7 @@ A field tells its meaning once, by ``option``: a notebook reads it here, and the
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import field
+from dataclasses import field, fields
 from typing import Any
 
 from nerg_mi.errors import NergError, plain
@@ -31,6 +31,14 @@ def option(
     """
     about = {"help": help, "names": names, "parse": parse, "more": more}
     return field(default=default, metadata={**about, RANGE: within, FLAG: names[-1] if names else ""})
+
+
+def other_fields(kind: type, *names: str) -> tuple[str, ...]:
+    """The fields of the dataclass ``kind`` but for ``names``, which it must have: a new one is among them."""
+    every = tuple(f.name for f in fields(kind))
+    if not set(names) <= set(every):
+        raise ValueError(f"{kind.__name__} has no {', '.join(sorted(set(names) - set(every)))}")
+    return tuple(name for name in every if name not in names)
 
 
 def parse_point(text: str, flag: str) -> tuple[float, ...]:

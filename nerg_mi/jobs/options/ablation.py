@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from nerg_mi.ranges import KAPPAS, LENGTHS, SEEDS, STEPS, TEST_SHARES, THREADS, Range
+from nerg_mi.ranges import FIRST_SEEDS, KAPPAS, LENGTHS, STEPS, TEST_SHARES, THREADS, Range
 
 from . import option
 from .parts import PartOptions
@@ -20,7 +20,7 @@ class AblationOptions(PlaceOptions, PartOptions):
         (), 'Only this one, such as emit_capture or "semantic snapshot"; may be given several times.'
     )
     seeds: int = option(3, "Seeds of the default recipe; the others have one.", within=Range(1, 1000))
-    first: int = option(0, "Seed of what is held out, and of the first training.", within=SEEDS)
+    first: int = option(0, "Seed of what is held out, and of the first training.", within=FIRST_SEEDS)
     steps: int | None = option(None, "Steps of every recipe but the default one. Default: the recipe's.", within=STEPS)
     default_steps: int | None = option(None, "Steps of the default recipe. Default: its own.", within=STEPS)
     probes: int | None = option(None, "Probes of a training at most. Default: the recipe's.", within=Range(1, 10**6))

@@ -24,7 +24,7 @@ class GazeEvaluationOptions(Checked):
     blind_kappa: float = option(50.0, "That of the blind density which bits are counted from.", within=KAPPAS)
     directions: int = option(2048, "Directions that maps are compared in.", within=DIRECTIONS)
     min_rays: int = option(64, "Rays at a test position at least.", within=Range(1, 10**6))
-    resamples: int = option(200, "Of the people, for the intervals.", within=Range(1, 10**5))
+    resamples: int = option(200, "Of the people, for the intervals.", within=Range(0, 10**5))
     pictures: int = option(4, "Test positions to draw.", within=Range(0, 10000))
     seed: int = option(0, "Seed of rays, resamples and halves.", within=SEEDS)
     threads: int | None = option(None, "CPU threads. Default: all.", within=THREADS)

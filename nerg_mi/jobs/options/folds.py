@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from nerg_mi.ranges import DIRECTIONS, KAPPAS, LENGTHS, RAYS, SEEDS, STEPS, THREADS, Range
+from nerg_mi.ranges import DIRECTIONS, FIRST_SEEDS, KAPPAS, LENGTHS, RAYS, STEPS, THREADS, Range
 
 from . import option
 from .parts import PartOptions
@@ -17,7 +17,7 @@ class FoldOptions(PlaceOptions, PartOptions):
     """How many folds there are, what each holds out, and how its field is trained and scored. Lengths are metres."""
 
     folds: int = option(5, "Folds: each holds out other people and other zones.", within=Range(2, 10_000))
-    first: int = option(0, "Seed of the first fold; the others have those that follow.", within=SEEDS)
+    first: int = option(0, "Seed of the first fold; the others have those that follow.", within=FIRST_SEEDS)
     splits: str = option(
         "both,pos,people", "What is new, with commas between: both (people and positions), pos, people."
     )

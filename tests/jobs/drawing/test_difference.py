@@ -32,7 +32,7 @@ def test_what_is_refused(tmp_path):
         ([a], {}, "two pictures, and 1 were given"),
         ([a, tmp_path / "b.exr"], {}, "8 x 6 and 4 x 3 pixels cannot be compared"),
         ([a, a], {"cmap": "viridis"}, "no diverging colour map"),
-        ([a, a], {"top": -1.0}, "--top must be positive"),
+        ([a, a], {"top": -1.0}, "--top must lie in"),
         ([a, a, a], {}, "1 to 2 files, and 3 were given"),
     ):
         with pytest.raises(NergError, match=said):
